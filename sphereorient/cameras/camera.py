@@ -1,0 +1,48 @@
+"""What a camera is to the rest of the package: points to pixels, pixels to rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rays:
+    """Half lines in the lab along which pixels see; made by cameras, read by triangulation and renderers."""
+
+    origin_lab_mm: Tensor  # (..., 3), a point of the ray: the projection centre, unless something bends the ray
+    direction_lab: Tensor  # (..., 3), unit length, away from the camera
+
+
+class Camera(Protocol):
+    """A calibrated camera. Later models may bend rays, so ask only for pictures of points and for rays.
+
+    All methods take any leading shape, compute in the dtype of the argument, and are differentiable in the argument
+    and in those parameters of the camera that require gradients. What has no picture is NaN, with gradient 0.
+    """
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the picture, px."""
+
+    @property
+    def R_cam_lab(self) -> Tensor:
+        """(3, 3) float64, takes lab components to camera components (x right, y down, z forward)."""
+
+    @property
+    def T_cam_lab_mm(self) -> Tensor:
+        """(3,) float64: X_cam = R_cam_lab X_lab + T_cam_lab_mm."""
+
+    def project(self, x_lab_mm: Tensor) -> Tensor:
+        """Return the pixels (..., 2) as (u, v), px, where lab points (..., 3), mm, appear; NaN behind the camera."""
+
+    def rays(self, uv_px: Tensor) -> Rays:
+        """Return the lines of sight of pixels (..., 2)."""
+
+    def undistort(self, uv_px: Tensor) -> Tensor:
+        """Return where the same camera without lens distortion would show what pixels (..., 2) show, (..., 2) px."""
+
+    def distort(self, uv_px: Tensor) -> Tensor:
+        """Return the pixels (..., 2) that `undistort` takes to `uv_px`, px."""

@@ -1,0 +1,78 @@
+"""What every camera model asks of its parameters before it is a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from sphereorient.errors import CameraError, ShapeError, check_tail, refusal
+
+ROTATION_TOLERANCE = 1e-5  # of |R R^T - I|: moves a point at the rim of a 1000 px picture by less than 0.01 px
+
+
+def as_parameter(name: str, value: Tensor | float | Sequence[float], *shape: int) -> Tensor:
+    """Return a camera parameter as float64 tensor, still part of its graph.
+
+    Raises:
+        CameraError: another shape, or a number that is not finite.
+    """
+    tensor = torch.as_tensor(value).to(torch.float64)
+    if tuple(tensor.shape) != shape:
+        expected, got = f"shape {shape}", f"shape {tuple(tensor.shape)}"
+        raise CameraError(refusal(name, expected=expected, got=got, do="correct the camera"))
+    if not bool(torch.isfinite(tensor.detach()).all()):
+        got = str(tensor.detach().tolist())
+        raise CameraError(refusal(name, expected="finite numbers", got=got, do="correct the camera"))
+    return tensor
+
+
+def check_positive(name: str, value: Tensor) -> None:
+    """Refuse parameters that are not above zero.
+
+    Raises:
+        CameraError: one of the numbers is zero or negative.
+    """
+    if not bool((value.detach() > 0).all()):
+        raise CameraError(
+            refusal(name, expected="above zero", got=str(value.detach().tolist()), do="correct the camera")
+        )
+
+
+def check_image_size(name: str, size: Sequence[int]) -> None:
+    """Refuse a picture size that is not two positive whole numbers.
+
+    Raises:
+        CameraError: it is not.
+    """
+    if len(size) != 2 or not all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in size):
+        do = "write width and height in pixels"
+        raise CameraError(refusal(name, expected="two whole numbers above zero", got=str(tuple(size)), do=do))
+
+
+def check_rotation(name: str, R: Tensor) -> None:
+    """Refuse a (3, 3) matrix that is no rotation, and say by how much.
+
+    Raises:
+        CameraError: rows not orthonormal to ROTATION_TOLERANCE, or a mirror image.
+    """
+    R = R.detach()
+    error = float((R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max())
+    det = float(torch.linalg.det(R))
+    if error > ROTATION_TOLERANCE or det < 0:
+        expected = f"a rotation, |R R^T - I| below {ROTATION_TOLERANCE:g} and det 1"
+        do = "write R_cam_lab row by row with at least 7 digits, x right, y down, z forward"
+        raise CameraError(refusal(name, expected=expected, got=f"|R R^T - I| = {error:.2g}, det = {det:.6g}", do=do))
+
+
+def check_points(name: str, points: Tensor, size: int) -> None:
+    """Refuse points that are not (..., size) numbers with a fraction.
+
+    Raises:
+        ShapeError: another last axis, or whole numbers, to whose type the camera would have to be rounded.
+    """
+    check_tail(name, points, size)
+    if not points.is_floating_point():
+        do = "convert it with .double() or .float()"
+        raise ShapeError(refusal(name, expected="a floating-point tensor", got=str(points.dtype), do=do))

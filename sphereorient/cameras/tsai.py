@@ -1,0 +1,112 @@
+"""Tsai's camera: the radial polynomial acts on the distorted point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sphereorient.cameras.central import CentralCamera
+from sphereorient.cameras.checks import check_points, check_positive
+from sphereorient.errors import CameraError, refusal
+
+FOLD = -4.0 / 27.0  # below this value of kappa1 r_u^2 the cubic has no root on the branch that holds the picture
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TsaiCamera(CentralCamera):
+    """Perspective with x_u = x_d (1 + kappa1 r_d^2), r_d the distorted radius on the sensor, mm.
+
+    Source: DESIGN section 2 (Tsai). OpenCV's polynomial acts on the undistorted point instead.
+    """
+
+    f_mm: Tensor  # (), effective focal length
+    pixel_pitch_mm: Tensor  # (2,)
+    sx: Tensor  # (), horizontal scale
+    kappa1_per_mm2: Tensor  # ()
+
+    def __post_init__(self) -> None:
+        """Refuse what is no camera, and a distortion that folds the picture."""
+        super().__post_init__()
+        for name, shape in (("f_mm", ()), ("pixel_pitch_mm", (2,)), ("sx", ()), ("kappa1_per_mm2", ())):
+            self._set_parameter(name, *shape)
+        for name in ("f_mm", "pixel_pitch_mm", "sx"):
+            check_positive(name, getattr(self, name))
+        self._check_invertible()
+
+    def _check_invertible(self) -> None:
+        width, height = self.image_size
+        corners = self.centre_px.new_tensor([(u, v) for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])
+        r2 = float((self._sensor_mm(corners).square().sum(-1)).max())
+        slope = 1.0 + 3.0 * float(self.kappa1_per_mm2) * r2  # d r_u / d r_d at the farthest corner
+        if slope <= 0:
+            expected = f"above {-1.0 / (3.0 * r2):.4g} 1/mm^2, where the picture's farthest corner folds over"
+            got = f"{float(self.kappa1_per_mm2):.4g}"
+            raise CameraError(refusal("kappa1", expected=expected, got=got, do="correct the camera or calibrate again"))
+
+    @property
+    def focal_px(self) -> Tensor:
+        """(2,), pixels per unit of slope."""
+        return self.f_mm / self._mm_per_px
+
+    @property
+    def _mm_per_px(self) -> Tensor:
+        return self.pixel_pitch_mm / torch.stack([self.sx, torch.ones_like(self.sx)])
+
+    def _sensor_mm(self, uv_px: Tensor) -> Tensor:
+        return (uv_px - self.centre_px.to(uv_px)) * self._mm_per_px.to(uv_px)
+
+    def _scaled_about_centre(self, uv_px: Tensor, scale: Tensor) -> Tensor:
+        return self.centre_px.to(uv_px) + (uv_px - self.centre_px.to(uv_px)) * scale[..., None]
+
+    def undistort(self, uv_px: Tensor) -> Tensor:
+        """Return where the same camera without lens distortion would show what a pixel shows.
+
+        Args:
+            uv_px: (..., 2), px.
+
+        Returns:
+            (..., 2), px; NaN beyond the fold of the polynomial, which lies outside the picture.
+        """
+        check_points("uv_px", uv_px, 2)
+        bend = self.kappa1_per_mm2.to(uv_px) * self._sensor_mm(uv_px).square().sum(-1)
+        unfolded = 1.0 + 3.0 * bend > 0
+        return self._scaled_about_centre(uv_px, torch.where(unfolded, 1.0 + bend, torch.full_like(bend, torch.nan)))
+
+    def distort(self, uv_px: Tensor) -> Tensor:
+        """Return the pixel that `undistort` takes to `uv_px`.
+
+        Args:
+            uv_px: (..., 2), px.
+
+        Returns:
+            (..., 2), px; NaN where no pixel does (only with kappa1 < 0, outside the picture).
+        """
+        check_points("uv_px", uv_px, 2)
+        bend = self.kappa1_per_mm2.to(uv_px) * self._sensor_mm(uv_px).square().sum(-1)
+        return self._scaled_about_centre(uv_px, shrinkage(bend))
+
+
+def shrinkage(bend: Tensor) -> Tensor:
+    """Return s = r_d / r_u, the root of s (1 + bend s^2) = 1 on the branch through s(0) = 1.
+
+    Args:
+        bend: (...), kappa1 r_u^2, no unit.
+
+    Returns:
+        (...), no unit; NaN, with gradient 0, at and below -4/27, where there is no such root.
+
+    Source: Cardano's closed form; z = sqrt(27 |bend| / 4), s = 3 sin(asin(z) / 3) / z (bend < 0; sinh for bend > 0).
+    """
+    exists = bend > FOLD
+    bend = torch.where(exists, bend, torch.zeros_like(bend))
+    with torch.no_grad():
+        # The floor avoids 0/0; what it changes (1e-9) the Newton steps mend.
+        z = (27.0 / 4.0 * bend.abs()).sqrt().clamp_min(1e-4)
+        s = torch.where(bend < 0, (z.clamp_max(1.0).asin() / 3).sin(), (z.asinh() / 3).sinh()) * 3 / z
+    # The root itself has no gradient at bend = 0 (sqrt); Newton steps from it carry the implicit derivative:
+    # one makes the first derivative right, two also the second.
+    for _ in range(2):
+        s = s - (s * (1 + bend * s * s) - 1) / (1 + 3 * bend * s * s)
+    return torch.where(exists, s, torch.full_like(s, torch.nan))

@@ -1,0 +1,87 @@
+"""All errors that sphereorient raises on purpose.
+
+    SphereOrientError
+    ├── ShapeError (ValueError)     a tensor of another shape than the function works on
+    ├── CameraError                 cameras that are no cameras, or do not belong to the picture
+    ├── MovieError                  a movie that is missing, unreadable, empty or of another size
+    ├── TextureError                a texture map that is none
+    ├── ExperimentError             experiment.yaml: missing, malformed, inconsistent
+    ├── SettingsError (ValueError)  an unknown or impossible setting
+    ├── TrackError                  a file that is no track, or of another schema
+    └── OutputError                 a result that cannot be written
+
+Every message is worded by `refusal`: what was looked at, what was expected, what came, what to do.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+class SphereOrientError(Exception):
+    """Base of all errors that a user can mend; the command line prints it as one line."""
+
+
+class ShapeError(SphereOrientError, ValueError):
+    """A tensor has another shape than the function works on."""
+
+
+class CameraError(SphereOrientError):
+    """Camera parameters are missing, impossible, or do not belong to the picture."""
+
+
+class MovieError(SphereOrientError):
+    """A movie is missing, unreadable, empty, or does not fit the other one."""
+
+
+class TextureError(SphereOrientError):
+    """A texture map is missing, unreadable or not 2:1."""
+
+
+class ExperimentError(SphereOrientError):
+    """An experiment file is missing, malformed or inconsistent."""
+
+
+class SettingsError(SphereOrientError, ValueError):
+    """A setting is unknown or its value impossible."""
+
+
+class TrackError(SphereOrientError):
+    """A file is not a track that this version reads."""
+
+
+class OutputError(SphereOrientError):
+    """A result cannot be written."""
+
+
+def refusal(name: str, *, expected: str, got: str, do: str) -> str:
+    """Word a refusal in one line: subject first, remedy last.
+
+    Args:
+        name: what was looked at, with its file.
+        expected: what would have been accepted.
+        got: what came instead.
+        do: the remedy, as an imperative without the full stop.
+    """
+    return f"{name}: expected {expected}, got {got}; {do}."
+
+
+def check_tail(name: str, tensor: Tensor, *tail: int) -> None:
+    """Refuse a tensor whose last axes are not `tail`.
+
+    Args:
+        name: the argument's name, for the message.
+        tensor: (..., *tail), any leading shape.
+        tail: the sizes that the last axes must have.
+
+    Raises:
+        ShapeError: the last axes differ.
+    """
+    if tuple(tensor.shape[-len(tail) :]) != tail:
+        expected = ", ".join(["...", *map(str, tail)])
+        raise ShapeError(
+            refusal(name, expected=f"shape ({expected})", got=str(tuple(tensor.shape)), do="put these axes last")
+        )

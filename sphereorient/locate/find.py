@@ -1,0 +1,97 @@
+"""Find the ball in single frames: background, blobs, outline, in this order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sphereorient.locate.background import Background
+from sphereorient.locate.blob import Blob, find_blobs
+from sphereorient.locate.outline import Outline, fit_outline
+from sphereorient.locate.settings import LocateSettings
+from sphereorient.locate.sightings import Sightings
+from sphereorient.trajectory import Reason
+
+Found = tuple[Outline | None, Reason]
+
+
+def find_ball(
+    frame: NDArray[np.generic], background: Background, diameter_px: float, settings: LocateSettings
+) -> Found:
+    """Find the outline of the ball in one frame, or the reason why there is none.
+
+    Args:
+        frame: (H, W), grey levels.
+        background: of the same movie.
+        diameter_px: expected diameter, px.
+        settings: of the room.
+
+    Returns:
+        The outline and `Reason.OK`, or None and `NOT_FOUND` (no blob of that size), `OUTLINE` (no circle that enough
+        directions support), `DARK` or `SATURATED`.
+
+    Source: paper section III A.
+    """
+    difference = background.difference(frame)
+    blobs = find_blobs(difference, background.noise, diameter_px, settings)
+    best: Outline | None = None
+    for blob in blobs:
+        outline = fit_outline(difference, background.typical_noise, blob, diameter_px, settings)
+        if outline is not None and (best is None or outline.coverage > best.coverage):
+            best = outline
+        # The likeliest blob usually is the ball; the others are looked at only where its rim is not convincing.
+        if best is not None and best.coverage >= max(settings.coverage_min, 0.5):
+            break
+    if best is None or best.coverage < settings.coverage_min:
+        return None, _why_not(difference, background, blobs[:1], settings)
+    reason = _why_unreadable(frame, difference, background, best, settings)
+    return (best, Reason.OK) if reason is Reason.OK else (None, reason)
+
+
+def _why_not(
+    difference: NDArray[np.float32], background: Background, blobs: list[Blob], settings: LocateSettings
+) -> Reason:
+    if not blobs or blobs[0].merit <= 0:
+        return Reason.NOT_FOUND
+    u, v = int(blobs[0].u_px), int(blobs[0].v_px)
+    contrast = np.percentile(difference[max(0, v - 8) : v + 9, max(0, u - 8) : u + 9], 90)
+    return Reason.DARK if contrast < settings.contrast_min * background.full_scale / 255 else Reason.OUTLINE
+
+
+def _why_unreadable(
+    frame: NDArray[np.generic],
+    difference: NDArray[np.float32],
+    background: Background,
+    outline: Outline,
+    settings: LocateSettings,
+) -> Reason:
+    """Tell a ball that is too dark or too bright to read; OK otherwise."""
+    half = int(0.7 * outline.radius_px)  # the square inside the disk
+    u, v = round(outline.u_px), round(outline.v_px)
+    inside = np.s_[max(0, v - half) : v + half + 1, max(0, u - half) : u + half + 1]
+    if np.percentile(difference[inside], 90) < settings.contrast_min * background.full_scale / 255:
+        return Reason.DARK
+    if np.mean(frame[inside] >= background.full_scale) > settings.saturated_share:  # type: ignore[operator]
+        return Reason.SATURATED
+    return Reason.OK
+
+
+def sightings_of(found: Iterable[Found]) -> Sightings:
+    """Collect what `find_ball` found in consecutive frames."""
+    rows = list(found)
+    table = torch.full((len(rows), 5), torch.nan, dtype=torch.float64)
+    for k, (outline, _) in enumerate(rows):
+        if outline is not None:
+            values = (outline.u_px, outline.v_px, outline.radius_px, outline.rms_px, outline.coverage)
+            table[k] = torch.tensor(values, dtype=torch.float64)
+    return Sightings(
+        centre_px=table[:, :2],
+        radius_px=table[:, 2],
+        outline_rms_px=table[:, 3],
+        coverage=table[:, 4],
+        flags=torch.zeros(len(rows), dtype=torch.int64),
+        reason=tuple(reason for _, reason in rows),
+    )

@@ -1,0 +1,250 @@
+"""The ball's outline to a fraction of a pixel: edges, the circle that most directions support, a robust fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.locate.blob import Blob
+from sphereorient.locate.settings import LocateSettings
+
+DIRECTIONS = 72  # bins of 5 degrees in which the support of a circle is counted
+BEYOND = 1.0  # weight of a rim place beyond a circle against one on it
+NOISE_FLOOR = 2.0  # below so many sigmas the root is linear: noise is not magnified
+PROFILES = 180  # radial profiles of the sub-pixel fit; more only repeat the same pixels
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outline:
+    """The circle fitted to a ball's rim; made by `fit_outline`, read by locate."""
+
+    u_px: float
+    v_px: float
+    radius_px: float
+    rms_px: float  # of the edges that support the circle about it
+    coverage: float  # share of directions with a supporting edge
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Edges:
+    """Edge pixels with the unit vector from dark to bright."""
+
+    point: NDArray[np.float64]  # (E, 2), px
+    inward: NDArray[np.float64]  # (E, 2)
+
+
+def _edge_points(window: NDArray[np.float32], steepness: float) -> _Edges:
+    """Canny edges of a blurred window, in window pixels, moved to the gradient's maximum between pixels."""
+    du = cv2.Scharr(window, cv2.CV_32F, 1, 0) / 32
+    dv = cv2.Scharr(window, cv2.CV_32F, 0, 1) / 32
+    scale = 8192 / max(float(np.abs(du).max()), float(np.abs(dv).max()), 1e-6)
+    low, high = 0.5 * steepness * scale, steepness * scale
+    edges = cv2.Canny((du * scale).astype(np.int16), (dv * scale).astype(np.int16), low, high, L2gradient=True)
+    rows, columns = np.nonzero(edges)
+    gradient = np.stack([du[rows, columns], dv[rows, columns]], axis=1).astype(np.float64)
+    norm = np.linalg.norm(gradient, axis=1, keepdims=True)
+    keep = norm[:, 0] > 0
+    point = np.stack([columns, rows], axis=1).astype(np.float64)[keep]
+    return _Edges(point=point, inward=gradient[keep] / norm[keep])
+
+
+def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Circles (n, 3: u, v, r) through triples of points (n, 3, 2); NaN where they lie on a line."""
+    a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    cross = 2 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a2, b2 = (a**2).sum(1) / cross, (b**2).sum(1) / cross
+        offset = np.stack([b[:, 1] * a2 - a[:, 1] * b2, a[:, 0] * b2 - b[:, 0] * a2], axis=1)
+    return np.column_stack([p[:, 0] + offset, np.linalg.norm(offset, axis=1)])
+
+
+def _support(circles: NDArray[np.float64], edges: _Edges, tolerance: float) -> NDArray[np.float64]:
+    """How well edges support circles: directions with an edge on the circle, less those with edges just outside.
+
+    An edge supports where it lies on the circle and falls outwards along the radius. The rim's edges are the
+    outermost: a circle through texture edges has more of the ball's edges beyond it.
+    """
+    away = edges.point[None] - circles[:, None, :2]
+    distance = np.linalg.norm(away, axis=2)
+    radial = -(away * edges.inward[None]).sum(2) / np.maximum(distance, 1e-9) > 0.8
+    offset = distance - circles[:, 2:3]
+    direction = ((np.arctan2(away[..., 1], away[..., 0]) + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
+    on = radial & (np.abs(offset) < tolerance)
+    beyond = radial & (offset >= tolerance) & (offset < 0.25 * circles[:, 2:3])
+    row = np.arange(len(circles))[:, None] * DIRECTIONS + direction
+    counted = [
+        np.bincount(row[which], minlength=len(circles) * DIRECTIONS).reshape(-1, DIRECTIONS) > 0 for which in (on, beyond)
+    ]
+    return np.asarray(counted[0].sum(1) - 0.5 * counted[1].sum(1), np.float64)
+
+
+def _best_circle(
+    edges: _Edges, radius_range: tuple[float, float], tolerance: float, tries: int = 400
+) -> NDArray[np.float64] | None:
+    """The circle of an allowed size with the most support, from seeded random triples (RANSAC)."""
+    if len(edges.point) < 8:
+        return None
+    # A fixed seed: the same picture gives the same circle.
+    choice = np.random.default_rng(0).integers(0, len(edges.point), (4 * tries, 3))
+    circles = _circles_through(edges.point[choice])
+    good = np.isfinite(circles).all(1) & (circles[:, 2] > radius_range[0]) & (circles[:, 2] < radius_range[1])
+    circles = circles[good]
+    if not len(circles):
+        return None
+    # All three edges must fall outwards: most triples through paint fail here, before anything dear is computed.
+    away = edges.point[choice[good]] - circles[:, None, :2]
+    outwards = -(away * edges.inward[choice[good]]).sum(2) / circles[:, 2:3] > 0.8
+    circles = circles[outwards.all(1)][:tries]
+    if not len(circles):
+        return None
+    best: NDArray[np.float64] = circles[int(_support(circles, edges, tolerance).argmax())]
+    return best
+
+
+def _radial_edges(
+    window: NDArray[np.float32], circle: NDArray[np.float64], reach: tuple[float, float], steepness: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Sub-pixel places of the outermost steep fall along radial profiles about a circle.
+
+    The outermost and not the steepest: inside, paint against paint falls as steeply as the rim and often steeper.
+
+    Returns:
+        Unit directions (n, 2), signed distances from the circle (n,), px, and steepness (n,) where there is such a fall.
+    """
+    step = 0.5
+    offset = np.arange(-reach[0], reach[1] + step / 2, step)
+    angle = np.arange(PROFILES) * (2 * np.pi / PROFILES)
+    outward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    at = circle[:2] + outward[:, None] * (circle[2] + offset)[None, :, None]
+    profile = cv2.remap(
+        window,
+        at[..., 0].astype(np.float32),
+        at[..., 1].astype(np.float32),
+        cv2.INTER_CUBIC,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    fall = cv2.blur(profile[:, :-2] - profile[:, 2:], (3, 1)) / (2 * step)
+    # A maximum within 1 px to both sides: the blurred rim's own tail ripples with the interpolation.
+    peak = (fall >= cv2.dilate(fall, np.ones((1, 5), np.uint8))) & (fall > steepness)
+    peak[:, [0, -1]] = False
+    last = peak.shape[1] - 1 - peak[:, ::-1].argmax(1)
+    rows = np.arange(PROFILES)
+    last = np.where(peak.any(1), last, 1)
+    left, middle, right = fall[rows, last - 1], fall[rows, last], fall[rows, last + 1]
+    bend = left - 2 * middle + right
+    limit = np.array(window.shape[::-1]) - 1
+    keep = peak.any(1) & (bend < 0) & ((at[:, -1] >= 0) & (at[:, -1] <= limit)).all(1)
+    shift = 0.5 * (left - right)[keep] / bend[keep]
+    return outward[keep], offset[last[keep] + 1] + shift * step, middle[keep]
+
+
+def _consensus(
+    outward: NDArray[np.float64], offset: NDArray[np.float64], trust: NDArray[np.float64], tolerance: float
+) -> NDArray[np.float64]:
+    """The move (du, dv, dr) of a circle on which most rim places agree, from seeded random triples.
+
+    Where black paint hides the rim, the outermost fall lies further inside, on a texture edge: such places are on
+    one side only, so a mean or a median would shrink the circle; the largest agreeing set does not.
+    """
+    design = np.column_stack([outward, np.ones(len(outward))])
+    choice = np.random.default_rng(0).integers(0, len(offset), (300, 3))
+    triple = design[choice]
+    solvable = np.abs(np.linalg.det(triple)) > 0.2  # triples spread over less than about 60 degrees say little
+    if not solvable.any():
+        return np.zeros(3)
+    moves = np.linalg.solve(triple[solvable], offset[choice[solvable]][..., None])[..., 0]
+    residual = offset - moves @ design.T
+    # Nothing of the ball lies beyond its rim: places beyond count against a circle more than places on it count for it.
+    merit = (np.abs(residual) < tolerance) @ trust - BEYOND * ((residual > 2 * tolerance) @ trust)
+    best: NDArray[np.float64] = moves[int(merit.argmax())]
+    return best
+
+
+def _fit_circle(
+    window: NDArray[np.float32], circle: NDArray[np.float64], tolerance: float, steepness: float
+) -> Outline | None:
+    """Consensus and then a least-squares circle with Tukey weights on the sub-pixel places of the rim."""
+    for reach in ((0.35 * circle[2], 0.25 * circle[2]), (0.1 * circle[2], 0.1 * circle[2])):
+        outward, offset, fall = _radial_edges(window, circle, reach, steepness)
+        if len(offset) < 12:
+            return None
+        # Faint falls are the halo of a patch's corner as often as the rim.
+        trust = np.minimum(fall / np.percentile(fall, 75), 1.0)
+        design = np.column_stack([outward, np.ones(len(outward))])
+        move = _consensus(outward, offset, trust, 0.4 * tolerance)
+        residual = offset - design @ move
+        for _ in range(6):
+            near = np.abs(residual) < tolerance
+            scale = max(1.4826 * float(np.median(np.abs(residual[near]))) if near.any() else 0.0, 0.05)
+            weight = np.clip(1 - (residual / (4 * scale)) ** 2, 0, None) ** 2 * near * trust
+            if np.count_nonzero(weight) < 8:
+                return None
+            root = np.sqrt(weight)
+            move = np.linalg.lstsq(design * root[:, None], offset * root, rcond=None)[0]
+            residual = offset - design @ move
+        circle = circle + move
+    used = weight > 0
+    rms = float(np.sqrt((residual[used] ** 2).mean()))
+    angle = np.arctan2(outward[used, 1], outward[used, 0])
+    coverage = len(np.unique(np.floor((angle + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int))) / DIRECTIONS
+    return Outline(u_px=float(circle[0]), v_px=float(circle[1]), radius_px=float(circle[2]), rms_px=rms, coverage=coverage)
+
+
+def _stabilised(window: NDArray[np.float32], noise: float, blur_px: float) -> NDArray[np.float32]:
+    """Blur, and take the root, as for shot noise: a dim rim then counts beside a bright one, noise equally everywhere."""
+    blurred = cv2.GaussianBlur(window, (0, 0), blur_px)
+    out: NDArray[np.float32] = np.sqrt(blurred + noise) - np.float32(np.sqrt(noise))
+    return out
+
+
+def fit_outline(
+    difference: NDArray[np.float32],
+    noise: float,
+    blob: Blob,
+    diameter_px: float,
+    settings: LocateSettings,
+) -> Outline | None:
+    """Fit the circle of a ball near a rough place.
+
+    Survives the texture's own edges (they do not lie on one circle), bubbles (few directions), and black paint that
+    vanishes into a dark background (those directions are simply missing).
+
+    Args:
+        difference: (H, W), |frame - background|, grey levels.
+        noise: typical standard deviation of a pixel of the background, grey levels.
+        blob: rough place.
+        diameter_px: expected diameter.
+        settings: of the room.
+
+    Returns:
+        The outline in the picture's pixels, or None where no circle of an allowed size is supported.
+
+    Source: paper section III A (Canny edges and a circle's fit); the robust part is ours.
+    """
+    reach = int(np.ceil(0.5 * diameter_px * (1 + settings.diameter_tolerance) + 8))
+    left, top = max(0, int(blob.u_px) - reach), max(0, int(blob.v_px) - reach)
+    window = difference[top : int(blob.v_px) + reach + 1, left : int(blob.u_px) + reach + 1]
+    if min(window.shape) < 8:
+        return None
+    window = _stabilised(window, NOISE_FLOOR * noise, settings.edge_blur_px)
+    contrast = float(np.percentile(window, 90))
+    # A step blurred by sigma is contrast / (sigma sqrt(2 pi)) steep.
+    steepness = settings.edge_fraction * contrast / (settings.edge_blur_px * 2.5)
+    edges = _edge_points(window, steepness)
+    sizes = tuple(0.5 * diameter_px * (1 + sign * settings.diameter_tolerance) for sign in (-1, 1))
+    circle = _best_circle(edges, (sizes[0], sizes[1]), settings.edge_tolerance_px)
+    if circle is None:
+        return None
+    fit = _fit_circle(window, circle, settings.edge_tolerance_px, 0.5 * steepness)
+    if fit is None or not sizes[0] < fit.radius_px < sizes[1]:
+        return None
+    return Outline(
+        u_px=fit.u_px + left,
+        v_px=fit.v_px + top,
+        radius_px=fit.radius_px,
+        rms_px=fit.rms_px,
+        coverage=fit.coverage,
+    )

@@ -1,0 +1,52 @@
+"""Settings of the room locate."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class LocateSettings(BaseModel):
+    """How the sphere is found in a picture (paper section III A)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    background_frames: int = Field(
+        100, ge=1, description="evenly spread frames whose mean is the background; more smear a passing sphere out better"
+    )
+    reduction: int = Field(
+        2, ge=1, le=8, description="blobs are looked for on frames reduced by this whole factor; 2 is fastest per frame"
+    )
+    diameter_px: float | None = Field(
+        None, gt=4, description="expected diameter, px; null takes it from the sphere's diameter and the camera"
+    )
+    diameter_tolerance: float = Field(
+        0.4, gt=0, lt=1, description="accepted relative deviation from the expected diameter: the depth of the volume"
+    )
+    blob_candidates: int = Field(4, ge=1, description="round blobs whose variance and roundness are compared")
+    noise_factor: float = Field(
+        5.0, gt=0, description="a pixel belongs to the ball above this many standard deviations of the background's noise"
+    )
+    contrast_min: float = Field(
+        8.0, gt=0, description="faintest ball: 90th percentile of the difference inside it, in 255ths of full scale"
+    )
+    saturated_share: float = Field(
+        0.5, gt=0, le=1, description="share of saturated pixels in the ball from which on it cannot be read"
+    )
+    edge_fraction: float = Field(
+        0.2, gt=0, lt=1, description="an edge of the outline is at least this share of the ball's contrast steep"
+    )
+    edge_blur_px: float = Field(
+        0.6, gt=0, description="Gaussian blur before edges are taken, px; tames the paint's grain, more moves corners"
+    )
+    edge_tolerance_px: float = Field(
+        1.5, gt=0, description="an edge this near to the circle supports it; texture edges lie further inside"
+    )
+    coverage_min: float = Field(
+        0.35, gt=0, lt=1, description="share of the outline's directions that must show an edge; black paint hides some"
+    )
+    gap_frames_max: int = Field(4, ge=0, description="longest gap that is interpolated, frames; the paper: under 5")
+    spline_knot_frames: int = Field(
+        12, ge=2, description="knot spacing of the least-squares spline, frames; well below the shortest motion (20 ms)"
+    )
+    outlier_px: float = Field(1.0, gt=0, description="smallest deviation from the spline that can be an outlier, px")
+    outlier_factor: float = Field(6.0, gt=0, description="an outlier deviates by this many robust sigmas of its movie")

@@ -1,0 +1,285 @@
+"""The trajectory: every dataset always there, written whole or not at all, read back bit by bit."""
+
+from __future__ import annotations
+
+import builtins
+import json
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from sphereorient.errors import OutputError, ShapeError, TrackError
+from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
+
+FRAMES = 7
+# DESIGN.md section 3, written out once more so that the code's own table cannot vouch for itself
+DESIGN_SHAPES: dict[str, tuple[int, ...]] = {"time": (), "valid": (), "segment": (), "flags": (), "confidence": ()}
+DESIGN_SHAPES |= dict.fromkeys(("position", "position_smooth"), (3,))
+DESIGN_SHAPES |= dict.fromkeys(("position_cov", "position_smooth_cov", "orientation", "orientation_cov"), (3, 3))
+DESIGN_SHAPES |= dict.fromkeys(("orientation_smooth", "orientation_smooth_cov"), (3, 3))
+MOTIONS = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
+DESIGN_SHAPES |= {f"{name}{end}": (3,) for name in MOTIONS for end in ("", "_sigma")}
+DESIGN_CAMERA = {"centre_px", "radius_px", "outline_rms_px", "orientation", "orientation_cov", "score", "xi", "reason"}
+DESIGN_CAMERA |= {"candidates/offset", "candidates/orientation", "candidates/score"}
+
+
+def full_trajectory() -> Trajectory:
+    """Return a trajectory in which every array holds numbers, and some of them NaN."""
+    rng = np.random.default_rng(7)
+    track = Trajectory.empty(
+        np.arange(40, 40 + FRAMES) / 600.0,
+        cameras=("cam2", "cam1"),
+        frame_rate=600.0,
+        method="precise",
+        settings="motion:\n  separations: [1, 2]\n",
+        experiment="mixer-3Hz",
+        provenance={"versions": {"sphereorient": "0"}, "command": ["sphereorient", "track"]},
+    )
+    drawn = {
+        entry.name: rng.standard_normal(getattr(track, entry.name).shape)
+        for entry in fields(track)
+        if isinstance(getattr(track, entry.name), np.ndarray) and getattr(track, entry.name).dtype == float
+    }
+    drawn |= {"valid": rng.random(FRAMES) > 0.5, "segment": np.repeat([0, -1, 1], [3, 1, 3])}
+    drawn["flags"] = np.full(FRAMES, Flag.SPIKE | Flag.ONE_CAMERA, np.uint32)
+    drawn["time"] = track.time
+    drawn["position"][3] = np.nan
+    camera = replace(
+        CameraTrack.empty(FRAMES),
+        centre_px=rng.standard_normal((FRAMES, 2)),
+        reason=(Reason.OK, Reason.DARK, Reason.OK, Reason.NOT_FOUND, Reason.DARK, Reason.UNDECODABLE, Reason.OK),
+        candidate_offset=np.array([0, 2, 2, 3, 3, 3, 3, 5]),
+        candidate_orientation=rng.standard_normal((5, 3, 3)),
+        candidate_score=rng.random(5),
+    )
+    return replace(track, cameras=dict(track.cameras) | {"cam1": camera}, **drawn)
+
+
+def arrays(record: object) -> dict[str, np.ndarray]:
+    return {e.name: getattr(record, e.name) for e in fields(record) if isinstance(getattr(record, e.name), np.ndarray)}
+
+
+def datasets(path: Path) -> dict[str, h5py.Dataset]:
+    found: dict[str, Any] = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+# convention: the file is the one of DESIGN.md
+
+
+def test_an_empty_trajectory_has_every_dataset_of_the_design_in_its_shape(tmp_path: Path) -> None:
+    Trajectory.empty(np.arange(FRAMES) / 600.0, cameras=("cam1",)).save(tmp_path / "track.h5")
+    found = datasets(tmp_path / "track.h5")
+    assert set(found) == set(DESIGN_SHAPES) | {f"cameras/cam1/{name}" for name in DESIGN_CAMERA}
+    assert {name: found[name].shape for name in DESIGN_SHAPES} == {n: (FRAMES, *s) for n, s in DESIGN_SHAPES.items()}
+    assert found["cameras/cam1/candidates/offset"].shape == (FRAMES + 1,)
+    assert found["flags"].dtype == np.uint32
+    assert found["valid"].dtype == bool
+
+
+def test_what_was_not_measured_is_nan_and_outside_any_segment() -> None:
+    track = Trajectory.empty(np.arange(FRAMES) / 600.0, cameras=("cam1",))
+    for name, values in arrays(track).items():
+        if name not in ("time", "valid", "segment", "flags"):
+            assert np.isnan(values).all(), name
+    assert not track.valid.any()
+    assert (track.segment == -1).all()
+    assert set(track.cameras["cam1"].reason) == {"not_found"}
+
+
+def test_every_dataset_says_its_units_and_what_it_is(tmp_path: Path) -> None:
+    full_trajectory().save(tmp_path / "track.h5")
+    with h5py.File(tmp_path / "track.h5") as file:
+        silent: list[str] = []
+
+        def look(name: str, item: object) -> None:
+            if isinstance(item, h5py.Dataset) and not (item.attrs.get("units") and item.attrs.get("description")):
+                silent.append(name)
+
+        file.visititems(look)
+        assert not silent
+        assert file["velocity"].attrs["units"] == "m/s"
+        assert file["position"].attrs["units"] == "mm"
+        assert file["alpha_body_sigma"].attrs["units"] == "rad/s^2"
+
+
+def test_the_root_and_the_flags_are_named_as_in_the_design(tmp_path: Path) -> None:
+    full_trajectory().save(tmp_path / "track.h5")
+    with h5py.File(tmp_path / "track.h5") as file:
+        assert file.attrs["schema"] == "sphereorient-track/1"
+        assert file.attrs["frame_rate"] == 600.0
+        assert (file.attrs["method"], file.attrs["experiment"]) == ("precise", "mixer-3Hz")
+        assert json.loads(file.attrs["provenance"])["command"] == ["sphereorient", "track"]
+        bits = json.loads(file["flags"].attrs["bits"])
+        assert bits["SPIKE"] == 128
+        assert sorted(bits.values()) == [2**k for k in range(9)]
+        assert file["cameras/cam1/reason"].asstr()[1] == "dark"
+
+
+# property: what is written is what is read
+
+
+def test_saving_and_loading_gives_back_every_number_and_every_nan(tmp_path: Path) -> None:
+    track = full_trajectory()
+    track.save(tmp_path / "track.h5")
+    read = Trajectory.load(tmp_path / "track.h5")
+    for before, after in [(track, read), *((track.cameras[name], read.cameras[name]) for name in track.cameras)]:
+        for name, values in arrays(before).items():
+            np.testing.assert_array_equal(values, arrays(after)[name], err_msg=name)
+            assert arrays(after)[name].dtype == values.dtype, name
+    assert read.cameras["cam1"].reason == track.cameras["cam1"].reason
+    assert isinstance(read.cameras["cam1"].reason[0], Reason)
+    for name in ("frame_rate", "method", "settings", "experiment", "provenance"):
+        assert getattr(read, name) == getattr(track, name)
+
+
+@pytest.mark.parametrize("frames", [0, 1])
+def test_a_trajectory_of_no_frame_or_one_is_a_trajectory(tmp_path: Path, frames: int) -> None:
+    Trajectory.empty(np.arange(frames) / 600.0, cameras=("cam1",)).save(tmp_path / "track.h5")
+    read = Trajectory.load(tmp_path / "track.h5")
+    assert len(read) == frames
+    assert len(read.to_pandas()) == frames
+    assert read.summary()["frames"] == frames
+
+
+def test_the_same_arrays_give_the_same_bytes(tmp_path: Path) -> None:
+    track = full_trajectory()
+    track.save(tmp_path / "a.h5")
+    turned = replace(track, cameras=dict(reversed(list(track.cameras.items()))))
+    turned.save(tmp_path / "b.h5")
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_a_reason_of_a_later_version_is_kept(tmp_path: Path) -> None:
+    camera = replace(CameraTrack.empty(2), reason=("ok", "swallowed_by_a_very_large_bubble"))
+    replace(Trajectory.empty(np.zeros(2)), cameras={"cam1": camera}).save(tmp_path / "track.h5")
+    assert Trajectory.load(tmp_path / "track.h5").cameras["cam1"].reason == camera.reason
+
+
+# files: whole or not at all
+
+
+def test_a_failure_while_writing_leaves_the_old_file_and_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "track.h5"
+    path.write_bytes(b"the old one")
+
+    def disk_full(*_: object) -> None:
+        assert path.read_bytes() == b"the old one"
+        assert len(list(tmp_path.iterdir())) == 2
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("sphereorient.trajectory._write_camera", disk_full)
+    with pytest.raises(OutputError, match="No space left"):
+        full_trajectory().save(path)
+    assert path.read_bytes() == b"the old one"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_saving_into_a_missing_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"nowhere.*create it"):
+        full_trajectory().save(tmp_path / "nowhere" / "track.h5")
+
+
+def test_saving_where_nothing_can_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "track.h5").mkdir()
+    with pytest.raises(OutputError, match=r"track\.h5"):
+        full_trajectory().save(tmp_path / "track.h5")
+    assert [p.name for p in tmp_path.iterdir()] == ["track.h5"]
+
+
+def test_what_is_no_track_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(TrackError, match=r"absent\.h5.*no file"):
+        Trajectory.load(tmp_path / "absent.h5")
+    (tmp_path / "text.h5").write_text("hello")
+    with pytest.raises(TrackError, match=r"text\.h5.*something else"):
+        Trajectory.load(tmp_path / "text.h5")
+
+
+def test_another_schema_is_refused(tmp_path: Path) -> None:
+    full_trajectory().save(tmp_path / "track.h5")
+    with h5py.File(tmp_path / "track.h5", "a") as file:
+        file.attrs["schema"] = "sphereorient-track/9"
+    with pytest.raises(TrackError, match="expected sphereorient-track/1, got sphereorient-track/9"):
+        Trajectory.load(tmp_path / "track.h5")
+
+
+@pytest.mark.parametrize("name", ["alpha_body_sigma", "cameras/cam1/reason", "cameras/cam2/candidates/offset"])
+def test_a_missing_dataset_is_named(tmp_path: Path, name: str) -> None:
+    full_trajectory().save(tmp_path / "track.h5")
+    with h5py.File(tmp_path / "track.h5", "a") as file:
+        del file[name]
+    with pytest.raises(TrackError, match=f"/{name}: expected a dataset"):
+        Trajectory.load(tmp_path / "track.h5")
+
+
+def test_a_dataset_of_wrong_length_is_named(tmp_path: Path) -> None:
+    full_trajectory().save(tmp_path / "track.h5")
+    with h5py.File(tmp_path / "track.h5", "a") as file:
+        del file["velocity"]
+        file["velocity"] = np.zeros((FRAMES - 1, 3))
+    with pytest.raises(TrackError, match=r"Trajectory\.velocity: expected shape \(7, 3\), got \(6, 3\)"):
+        Trajectory.load(tmp_path / "track.h5")
+
+
+def test_arrays_of_unequal_length_make_no_trajectory() -> None:
+    track = full_trajectory()
+    with pytest.raises(ShapeError, match=r"Trajectory\.position"):
+        replace(track, position=np.zeros((FRAMES, 2)))
+    with pytest.raises(ShapeError, match="cam1"):
+        replace(track, cameras={"cam1": CameraTrack.empty(FRAMES + 1)})
+    with pytest.raises(ShapeError, match="candidate_score"):
+        replace(track.cameras["cam1"], candidate_score=np.zeros(4))
+
+
+# table and summary
+
+
+def test_the_table_has_units_in_its_names_and_quaternions_w_first() -> None:
+    quarter_about_z = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    track = full_trajectory()
+    R = np.full((FRAMES, 3, 3), np.nan)
+    R[2] = quarter_about_z
+    table = replace(track, orientation=R, orientation_smooth=R).to_pandas()
+    assert len(table) == FRAMES
+    np.testing.assert_array_equal(table["velocity_y_m_s"], track.velocity[:, 1])
+    np.testing.assert_array_equal(table["alpha_lab_sigma_z_rad_s2"], track.alpha_lab_sigma[:, 2])
+    assert {"time_s", "valid", "segment", "flags", "confidence", "position_x_mm"} <= set(table)
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(table.loc[2, ["quat_w", "quat_x", "quat_y", "quat_z"]].astype(float), [half, 0, 0, half])
+    assert table.loc[3, ["quat_w", "quat_smooth_z", "position_x_mm"]].isna().all()
+
+
+def test_the_table_names_the_extra_where_pandas_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    real_import = builtins.__import__
+
+    def no_pandas(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "pandas":
+            raise ImportError(name)
+        return real_import(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", no_pandas)
+    with pytest.raises(OutputError, match=r"pip install sphereorient\[table\]"):
+        full_trajectory().to_pandas()
+
+
+def test_the_summary_counts_lost_frames_by_reason() -> None:
+    summary = full_trajectory().summary()
+    assert summary["frames"] == FRAMES
+    assert summary["valid"] == int(full_trajectory().valid.sum())
+    assert list(summary["lost"]["cam1"].items()) == [("dark", 2), ("not_found", 1), ("undecodable", 1)]
+    assert json.loads(json.dumps(summary)) == summary
+
+
+def test_the_noun_does_not_bring_torch_along() -> None:
+    look = "import sys, sphereorient.trajectory; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", look], check=False).returncode == 0
