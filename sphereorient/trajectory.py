@@ -238,7 +238,7 @@ class Trajectory:
             with h5py.File(aside, "w", track_order=False) as file:
                 _write(self, file)
             aside.replace(path)
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # a full disk comes out of HDF5 as either
             do = "check the space left and the permissions of the folder"
             raise OutputError(refusal(str(path), expected="a file to write", got=str(error), do=do)) from error
         finally:

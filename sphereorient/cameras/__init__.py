@@ -1,0 +1,19 @@
+"""Cameras: one file per model; pictures of points, lines of sight, triangulation."""
+
+from sphereorient.cameras.camera import Camera, Rays
+from sphereorient.cameras.files import load_cameras, save_cameras
+from sphereorient.cameras.pinhole import PinholeCamera
+from sphereorient.cameras.triangulate import triangulate
+from sphereorient.cameras.tsai import TsaiCamera
+from sphereorient.cameras.view import R_cam_view
+
+__all__ = [
+    "Camera",
+    "PinholeCamera",
+    "R_cam_view",
+    "Rays",
+    "TsaiCamera",
+    "load_cameras",
+    "save_cameras",
+    "triangulate",
+]

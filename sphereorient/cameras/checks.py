@@ -18,7 +18,8 @@ def as_parameter(name: str, value: Tensor | float | Sequence[float], *shape: int
     Raises:
         CameraError: another shape, or a number that is not finite.
     """
-    tensor = torch.as_tensor(value).to(torch.float64)
+    # Not as_tensor alone: it would round plain numbers to float32 first.
+    tensor = value.to(torch.float64) if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
     if tuple(tensor.shape) != shape:
         expected, got = f"shape {shape}", f"shape {tuple(tensor.shape)}"
         raise CameraError(refusal(name, expected=expected, got=got, do="correct the camera"))

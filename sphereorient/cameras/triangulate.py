@@ -27,16 +27,19 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
     for name, rays in (("rays_a", rays_a), ("rays_b", rays_b)):
         check_points(f"{name}.origin_lab_mm", rays.origin_lab_mm, 3)
         check_points(f"{name}.direction_lab", rays.direction_lab, 3)
-    a, b = torch.broadcast_tensors(rays_a.direction_lab, rays_b.direction_lab)
+    a, b = rays_a.direction_lab, rays_b.direction_lab
     baseline = rays_b.origin_lab_mm - rays_a.origin_lab_mm
-    baseline = baseline.expand(torch.broadcast_shapes(baseline.shape, a.shape))
-    normal = torch.linalg.cross(a, b)  # its length is the sine of the angle: no cancellation at small angles
+    normal = _cross(a, b)  # its length is the sine of the angle: no cancellation at small angles
     sine2 = normal.square().sum(-1, keepdim=True)
     crossing = sine2 > (16 * torch.finfo(sine2.dtype).eps) ** 2  # below it the sine is rounding only
     sine2 = torch.where(crossing, sine2, torch.ones_like(sine2))
-    along_a = (torch.linalg.cross(baseline, b.expand_as(baseline)) * normal).sum(-1, keepdim=True) / sine2
-    along_b = (torch.linalg.cross(baseline, a.expand_as(baseline)) * normal).sum(-1, keepdim=True) / sine2
+    along_a = (_cross(baseline, b) * normal).sum(-1, keepdim=True) / sine2
+    along_b = (_cross(baseline, a) * normal).sum(-1, keepdim=True) / sine2
     point = 0.5 * (rays_a.origin_lab_mm + along_a * a + rays_b.origin_lab_mm + along_b * b)
     gap = ((baseline * normal).sum(-1, keepdim=True) / sine2.sqrt()).abs()
     nan = torch.full_like(gap, torch.nan)
     return torch.where(crossing, point, nan), torch.where(crossing, gap, nan)[..., 0]
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return torch.linalg.cross(*torch.broadcast_tensors(a, b))  # type: ignore[no-untyped-call]

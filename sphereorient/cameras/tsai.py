@@ -24,12 +24,12 @@ class TsaiCamera(CentralCamera):
     f_mm: Tensor  # (), effective focal length
     pixel_pitch_mm: Tensor  # (2,)
     sx: Tensor  # (), horizontal scale
-    kappa1_per_mm2: Tensor  # ()
+    kappa1: Tensor  # (), 1/mm^2; DESIGN's symbol
 
     def __post_init__(self) -> None:
         """Refuse what is no camera, and a distortion that folds the picture."""
         super().__post_init__()
-        for name, shape in (("f_mm", ()), ("pixel_pitch_mm", (2,)), ("sx", ()), ("kappa1_per_mm2", ())):
+        for name, shape in (("f_mm", ()), ("pixel_pitch_mm", (2,)), ("sx", ()), ("kappa1", ())):
             self._set_parameter(name, *shape)
         for name in ("f_mm", "pixel_pitch_mm", "sx"):
             check_positive(name, getattr(self, name))
@@ -38,11 +38,12 @@ class TsaiCamera(CentralCamera):
     def _check_invertible(self) -> None:
         width, height = self.image_size
         corners = self.centre_px.new_tensor([(u, v) for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])
-        r2 = float((self._sensor_mm(corners).square().sum(-1)).max())
-        slope = 1.0 + 3.0 * float(self.kappa1_per_mm2) * r2  # d r_u / d r_d at the farthest corner
+        r2 = float(self._sensor_mm(corners).detach().square().sum(-1).max())
+        kappa1 = float(self.kappa1.detach())
+        slope = 1.0 + 3.0 * kappa1 * r2  # d r_u / d r_d at the farthest corner
         if slope <= 0:
             expected = f"above {-1.0 / (3.0 * r2):.4g} 1/mm^2, where the picture's farthest corner folds over"
-            got = f"{float(self.kappa1_per_mm2):.4g}"
+            got = f"{kappa1:.4g}"
             raise CameraError(refusal("kappa1", expected=expected, got=got, do="correct the camera or calibrate again"))
 
     @property
@@ -58,7 +59,10 @@ class TsaiCamera(CentralCamera):
         return (uv_px - self.centre_px.to(uv_px)) * self._mm_per_px.to(uv_px)
 
     def _scaled_about_centre(self, uv_px: Tensor, scale: Tensor) -> Tensor:
-        return self.centre_px.to(uv_px) + (uv_px - self.centre_px.to(uv_px)) * scale[..., None]
+        exists = ~torch.isnan(scale)[..., None]
+        scale = torch.where(exists, scale[..., None], torch.ones_like(scale[..., None]))  # NaN would reach the gradient
+        moved = self.centre_px.to(uv_px) + (uv_px - self.centre_px.to(uv_px)) * scale
+        return torch.where(exists, moved, torch.full_like(moved, torch.nan))
 
     def undistort(self, uv_px: Tensor) -> Tensor:
         """Return where the same camera without lens distortion would show what a pixel shows.
@@ -70,7 +74,7 @@ class TsaiCamera(CentralCamera):
             (..., 2), px; NaN beyond the fold of the polynomial, which lies outside the picture.
         """
         check_points("uv_px", uv_px, 2)
-        bend = self.kappa1_per_mm2.to(uv_px) * self._sensor_mm(uv_px).square().sum(-1)
+        bend = self.kappa1.to(uv_px) * self._sensor_mm(uv_px).square().sum(-1)
         unfolded = 1.0 + 3.0 * bend > 0
         return self._scaled_about_centre(uv_px, torch.where(unfolded, 1.0 + bend, torch.full_like(bend, torch.nan)))
 
@@ -84,7 +88,7 @@ class TsaiCamera(CentralCamera):
             (..., 2), px; NaN where no pixel does (only with kappa1 < 0, outside the picture).
         """
         check_points("uv_px", uv_px, 2)
-        bend = self.kappa1_per_mm2.to(uv_px) * self._sensor_mm(uv_px).square().sum(-1)
+        bend = self.kappa1.to(uv_px) * self._sensor_mm(uv_px).square().sum(-1)
         return self._scaled_about_centre(uv_px, shrinkage(bend))
 
 

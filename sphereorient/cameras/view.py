@@ -29,5 +29,5 @@ def R_cam_view(direction_cam: Tensor) -> Tensor:
     defined = 1 + z > 4 * torch.finfo(z.dtype).eps
     share = 1 / torch.where(defined, 1 + z, torch.ones_like(z))  # (1 - cos) / sin^2: exact also at direction = z
     rows = [1 - x * x * share, -x * y * share, x, -x * y * share, 1 - y * y * share, y, -x, -y, z]
-    R = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    R = torch.stack(rows, dim=-1).reshape(*x.shape, 3, 3)
     return torch.where(defined[..., None, None], R, torch.full_like(R, torch.nan))

@@ -67,7 +67,7 @@ def _plane_0(frame: av.VideoFrame) -> Grey:
     # top row, the last one in memory. Read by address: releases of PyAV differ in where their buffer begins.
     reach = (height - 1) * plane.line_size
     size = abs(reach) + width * dtype.itemsize
-    memory = (ctypes.c_uint8 * size).from_address(plane.buffer_ptr + min(reach, 0))
+    memory = memoryview((ctypes.c_uint8 * size).from_address(plane.buffer_ptr + min(reach, 0))).cast("B")
     strides = (plane.line_size, dtype.itemsize)
     rows: Grey = np.ndarray((height, width), stored, buffer=memory, offset=max(-reach, 0), strides=strides)
     return rows.astype(dtype, order="C")  # a copy: the memory is the frame's

@@ -45,7 +45,8 @@ class NpyMovie:
     @property
     def dtype(self) -> np.dtype[Any]:
         """uint8 or uint16, in this machine's byte order."""
-        return self._array.dtype.newbyteorder("=")
+        dtype: np.dtype[Any] = self._array.dtype.newbyteorder("=")
+        return dtype
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -58,7 +59,9 @@ class NpyMovie:
 
     def sample(self, indices: Sequence[int]) -> Grey:
         """Return any frames in the order asked for, (n, H, W)."""
-        return self._array[np.array(check_indices(self.path, len(self), indices), dtype=np.intp)].astype(self.dtype)
+        rows = np.array(check_indices(self.path, len(self), indices), dtype=np.intp)
+        pictures: Grey = self._array[rows].astype(self.dtype)
+        return pictures
 
     def close(self) -> None:
         """Let go of the map; the movie is empty afterwards."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -16,31 +14,9 @@ import numpy as np
 from sphereorient.errors import MovieError, refusal
 from sphereorient.movies.grey import check_format, grey_dtype, grey_values
 from sphereorient.movies.movie import Grey, check_indices, check_range
+from sphereorient.movies.packets import Packet, PacketIndex, index_packets
 
 THREADS = 2  # slices of one frame in parallel: 1.8 times faster for FFV1 on 2 cores, and errors keep their frame
-
-
-@dataclass(frozen=True)
-class PacketIndex:
-    """What demuxing alone tells: how many frames there are and where decoding may start."""
-
-    count: int
-    number_of: dict[int, int]  # presentation time stamp -> frame number; empty where stamps do not tell
-    keys: tuple[tuple[int, int], ...]  # (frame number, time stamp) of the key frames, increasing
-
-    def key_before(self, number: int) -> tuple[int, int]:
-        """Return number and time stamp of the last key frame at or before frame `number`."""
-        return self.keys[max(bisect_right(self.keys, number, key=lambda key: key[0]) - 1, 0)]
-
-    def runs(self, numbers: list[int]) -> list[list[int]]:
-        """Cut increasing frame numbers where a seek saves decoding: where a key frame lies in a gap."""
-        runs: list[list[int]] = []
-        for number in numbers:
-            if runs and self.key_before(number)[0] <= runs[-1][-1] + 1:
-                runs[-1].append(number)
-            else:
-                runs.append([number])
-        return runs
 
 
 class VideoMovie:
@@ -96,15 +72,17 @@ class VideoMovie:
     def _index(self) -> PacketIndex:
         with self._container() as container:
             try:
-                packets = [
-                    (packet.pts, packet.is_keyframe)
+                packets: list[Packet] = [
+                    (packet.pts, packet.dts, packet.is_keyframe)
                     for packet in container.demux(container.streams.video[0])
                     if packet.size and not packet.is_discard
                 ]
             except av.FFmpegError as error:
                 do = "export the movie again; the file is damaged"
                 raise self._refusal("readable packets", _words(error), do) from error
-        return _index_of(packets)
+            # AVI stores no presentation stamps: where frames are reordered, FFmpeg's guesses are wrong after a seek.
+            guessed = container.format.name == "avi" and any(pts != dts for pts, dts, _ in packets)
+        return index_packets(packets, guessed)
 
     def _container(self) -> av.container.InputContainer:
         try:
@@ -115,9 +93,12 @@ class VideoMovie:
         if not container.streams.video:
             container.close()
             raise self._refusal("a movie with pictures", "no video stream", "name the movie's own file")
-        context = container.streams.video[0].codec_context
+        context: Any = container.streams.video[0].codec_context  # None for a codec that FFmpeg does not know
+        if context is None:
+            container.close()
+            raise self._refusal("a movie that FFmpeg decodes", "an unknown codec", "export it as FFV1 in .mkv")
         context.thread_type, context.thread_count = "SLICE", THREADS
-        context.options = {"err_detect": "crccheck+bitstream+buffer+explode"}
+        context.options = {"err_detect": "crccheck+explode"}
         return container
 
     def _wanted(self, numbers: list[int]) -> Iterator[Grey]:
@@ -127,9 +108,7 @@ class VideoMovie:
                 yield from self._run(container, run)
 
     def _run(self, container: av.container.InputContainer, numbers: list[int]) -> Iterator[Grey]:
-        key, stamp = self._index.key_before(numbers[0])
-        if key > 0:
-            container.seek(stamp, stream=container.streams.video[0])
+        key = self._seek(container, numbers[0])
         waiting = iter(numbers)
         wanted = next(waiting, None)
         for number, frame in self._numbered(container, self._index.number_of, key):
@@ -139,8 +118,17 @@ class VideoMovie:
             if wanted is None or number > wanted:
                 break
         if wanted is not None:
-            do = "export the movie again, or leave the frame out with frames: in the experiment"
-            raise self._refusal("a picture", "none from the decoder", do, wanted)
+            raise self._damage("none from the decoder", wanted)
+
+    def _seek(self, container: av.container.InputContainer, number: int) -> int:
+        """Go to the last key frame at or before frame `number`, and return that key frame's number."""
+        key, stamp = self._index.key_before(number)
+        if key > 0:  # a fresh container stands at frame 0 already
+            try:
+                container.seek(stamp, stream=container.streams.video[0])
+            except av.FFmpegError as error:
+                raise self._damage(_words(error), number) from error
+        return key
 
     def _numbered(
         self, container: av.container.InputContainer, number_of: dict[int, int], number: int = 0
@@ -165,16 +153,6 @@ class VideoMovie:
             expected, got = f"{self.frame_shape} {self._format}", f"{(frame.height, frame.width)} {frame.format.name}"
             raise self._refusal(f"pictures of one kind, {expected}", got, "split the movie where it changes", number)
         return grey_values(frame)
-
-
-def _index_of(packets: list[tuple[int | None, bool]]) -> PacketIndex:
-    """Number the packets by their time stamps, if those are all there and differ."""
-    stamps = sorted({stamp for stamp, _ in packets if stamp is not None})
-    if len(stamps) < len(packets):  # absent, or two of one value: MKV counts whole ms, so above 1 kHz stamps repeat
-        return PacketIndex(count=len(packets), number_of={}, keys=((0, 0),))
-    number_of = {stamp: number for number, stamp in enumerate(stamps)}
-    keys = sorted((number_of[stamp], stamp) for stamp, is_key in packets if is_key and stamp is not None)
-    return PacketIndex(count=len(packets), number_of=number_of, keys=tuple(keys) or ((0, 0),))
 
 
 def _words(error: Exception) -> str:

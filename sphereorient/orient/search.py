@@ -56,20 +56,14 @@ class TemplateSearch:
             Proposals; a disk that fits nearly everywhere gives none (`RUNAWAY`), as does one whose best T stays below
             `score_min` (`LOW_SCORE`).
         """
-        rows: list[tuple[Tensor, Tensor, Reason]] = []
+        parts: list[Proposals] = []
         for first in range(0, len(disks), BATCH):
             batch = disks[first : first + BATCH]
             filled = torch.cat([batch, batch.new_zeros(BATCH - len(batch), *batch.shape[1:])])
             paint = extract_paint(filled, self._fine.inside, self._settings)
             groups = self._groups(self._coarse_scores(paint))
-            rows += [self._fine_search(paint[f], groups[f]) for f in range(len(batch))]
-        counts = torch.tensor([0] + [len(score) for _, score, _ in rows])
-        return Proposals(
-            offset=counts.cumsum(0),
-            R_view_body=torch.cat([R for R, _, _ in rows]) if rows else torch.zeros(0, 3, 3, dtype=torch.float64),
-            score=torch.cat([score for _, score, _ in rows]) if rows else torch.zeros(0, dtype=torch.float64),
-            reason=tuple(reason for _, _, reason in rows),
-        )
+            parts += [self._fine_search(paint[f], groups[f]) for f in range(len(batch))]
+        return Proposals.joined(parts) if parts else Proposals.none(())
 
     def _coarse_scores(self, paint: Tensor) -> Tensor:
         """T of every coarse template, (F, K): 1/2 + sum of products / (2 pixels counted) (ERRATA A2)."""
@@ -93,24 +87,28 @@ class TemplateSearch:
             possible &= flat[best] @ flat.T < near
         return [torch.stack(pick) if pick else torch.zeros(0, dtype=torch.long) for pick in picks]
 
-    def _fine_search(self, paint: Tensor, group: Tensor) -> tuple[Tensor, Tensor, Reason]:
-        """Climb from each group's best on the fine grid; candidates (M, 3, 3) with T (M,), best first."""
-        none = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+    def _fine_search(self, paint: Tensor, group: Tensor) -> Proposals:
+        """Climb from each group's best on the fine grid: the proposals of one disk, best first."""
         if len(group) > self._settings.groups_max:
-            return *none, Reason.RUNAWAY
-        found = [self._climb(paint[self._fine.inside][self._fine_used], self._grid[g]) for g in group]
-        R = torch.stack([R for R, _ in found]).double()
+            return Proposals.none([Reason.RUNAWAY])
+        seen = paint[self._fine.inside][self._fine_used]
+        found = [self._climb(seen, self._grid[g]) for g in group]
         score = torch.stack([score for _, score in found]).double()
         order = score.argsort(descending=True, stable=True)
         order = order[score[order] >= self._settings.score_min]
         if not len(order):
-            return *none, Reason.LOW_SCORE
-        R, score = R[order], score[order]
+            return Proposals.none([Reason.LOW_SCORE])
+        # The float32 products back to rotations of float64.
+        R = so3.nearest_rotation(torch.stack([R for R, _ in found]).double()[order])
         # Two groups may climb to one place: keep the first of those within two fine steps.
         gap = so3.geodesic_distance(R[:, None], R[None])
-        again = torch.tril(gap < 2 * math.radians(self._settings.fine_step_deg), -1).any(1)
-        # One polar step takes the float32 products back to rotations.
-        return so3.nearest_rotation(R[~again]), score[~again], Reason.OK
+        first = ~torch.tril(gap < 2 * math.radians(self._settings.fine_step_deg), -1).any(1)
+        return Proposals(
+            offset=torch.tensor([0, int(first.sum())]),
+            R_view_body=R[first],
+            score=score[order][first],
+            reason=(Reason.OK,),
+        )
 
     def _climb(self, seen: Tensor, R_start: Tensor) -> tuple[Tensor, Tensor]:
         """Best of the fine grid about a rotation; where it sits at the grid's edge, once more about it."""

@@ -1,0 +1,208 @@
+"""The command line: parse, call, print. Heavy packages are imported inside the commands, so that help is quick."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sphereorient import __version__
+from sphereorient.errors import OutputError, SphereOrientError, refusal
+
+if TYPE_CHECKING:
+    from sphereorient.trajectory import Trajectory
+
+app = typer.Typer(
+    name="sphereorient",
+    help="Measure position and absolute orientation of a painted sphere from high-speed movies.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+EXIT_REFUSED = 2  # something that the user can mend
+EXIT_INTERRUPTED = 130  # Ctrl-C, as shells have it
+
+ExperimentPath = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="experiment.yaml (docs/data-format.md)")]
+
+
+@app.callback(invoke_without_command=True)
+def common(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+) -> None:
+    """Measure position and absolute orientation of a painted sphere from high-speed movies."""
+    if version:
+        typer.echo(f"sphereorient {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def track(
+    experiment: ExperimentPath,
+    out: Annotated[Path, typer.Option("--out", "-o", help="HDF5 file to write (schema sphereorient-track/1).")],
+    method: Annotated[str, typer.Option(help="paper: Zimmermann et al. 2011, corrected.")] = "paper",
+    settings: Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set orient.fine_step_deg=2.")
+    ] = None,
+    cameras: Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
+) -> None:
+    """Track the sphere of an experiment: position and orientation of every frame."""
+    _check_writable(out)
+    from sphereorient.pipeline import silent, track_movies
+    from sphereorient.settings import load_settings
+
+    chosen = load_settings(settings, set_ or [])
+    command = " ".join(["sphereorient", *sys.argv[1:]])
+    names = None if cameras is None else [name.strip() for name in cameras.split(",") if name.strip()]
+    with _bar(quiet) as advance:
+        result = track_movies(
+            experiment, method=method, settings=chosen, cameras=names, progress=advance or silent, command=command
+        )
+    result.save(out)
+    if not quiet:
+        _print_summary(result, out)
+
+
+@app.command()
+def synth(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write the experiment into.")],
+    settings: Annotated[Path | None, typer.Option(help="YAML with keys of configs/synth.yaml.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="Override one key, e.g. --set frames=60.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
+) -> None:
+    """Render a two-camera experiment with exact truth, to try the tracker or to test another."""
+    _check_writable(out)
+    from sphereorient.settings import load_synth_settings
+    from sphereorient.synth import write_experiment
+
+    chosen = load_synth_settings(settings, set_ or [])
+    total = 2 * chosen.frames
+    with _bar(quiet) as advance:
+        done = 0
+
+        def rendered(count: int) -> None:
+            nonlocal done
+            done += count
+            if advance is not None:
+                advance("render", done, total)
+
+        path = write_experiment(out, chosen, rendered)
+    if not quiet:
+        typer.echo(f"Wrote {path}. Next: sphereorient track {path} --out {out / 'track.h5'}")
+
+
+@app.command()
+def settings(
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write; the screen without it.")] = None,
+) -> None:
+    """Write all settings of the method with their defaults, each one explained."""
+    from sphereorient.settings import settings_yaml
+
+    if out is None:
+        typer.echo(settings_yaml())
+        return
+    _check_writable(out)
+    aside = out.with_name(out.name + ".partial")
+    aside.write_text(settings_yaml(), encoding="utf-8")
+    aside.replace(out)
+
+
+@app.command()
+def info() -> None:
+    """Print versions, threads and device."""
+    import torch
+
+    from sphereorient.provenance import versions
+
+    for package, number in versions().items():
+        typer.echo(f"{package:24} {number}")
+    typer.echo(f"{'threads':24} {torch.get_num_threads()} of {os.cpu_count()} cores")
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu (no GPU found)"
+    typer.echo(f"{'device':24} {device}")
+
+
+def _check_writable(out: Path) -> None:
+    """Refuse an output place before hours of work, not after."""
+    folder = out.parent
+    do = "choose another --out"
+    if not folder.is_dir():
+        raise OutputError(refusal(f"--out {out}", expected=f"an existing folder {folder}", got="none", do="make it first"))
+    if not os.access(folder, os.W_OK):
+        raise OutputError(refusal(f"--out {out}", expected="a writable folder", got=f"{folder}, which is not", do=do))
+
+
+Advance = Callable[[str, int, int], None]
+
+
+@contextmanager
+def _bar(quiet: bool) -> Iterator[Advance | None]:
+    """Show one line of progress a stage: share done, frames per second, time left."""
+    if quiet:
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns: list[Any] = [
+        TextColumn("{task.description:16}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    ]
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        tasks: dict[str, Any] = {}
+
+        def advance(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total, rate="")
+            task = bar.tasks[bar.task_ids.index(tasks[stage])]
+            rate = done / task.elapsed if done and task.elapsed else 0.0
+            bar.update(tasks[stage], completed=done, rate=f"{rate:6.1f} frames/s" if rate else "")
+
+        yield advance
+
+
+def _print_summary(result: Trajectory, out: Path) -> None:
+    """Say what came out: frames valid, and for each camera what was lost and why."""
+    summary = result.summary()
+    typer.echo(f"{summary['valid']} of {summary['frames']} frames valid (position and orientation measured)")
+    for name, lost in summary["lost"].items():
+        text = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"
+        typer.echo(f"  {name}: frames lost: {text}")
+    typer.echo(f"Wrote {out}")
+
+
+def main() -> None:
+    """Run the command line; errors that a user can mend become one line and a non-zero exit code."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(EXIT_INTERRUPTED))
+    try:
+        app(standalone_mode=False)
+    except SphereOrientError as error:
+        typer.echo(f"sphereorient: {error}", err=True)
+        sys.exit(EXIT_REFUSED)
+    except (KeyboardInterrupt, typer.Abort):
+        typer.echo("sphereorient: interrupted; nothing was written.", err=True)
+        sys.exit(EXIT_INTERRUPTED)
+    except typer.Exit as exit_:
+        sys.exit(exit_.exit_code)
+    except Exception as error:
+        sys.exit(_usage_error(error))
+
+
+def _usage_error(error: Exception) -> int:
+    """Print a mistake in the arguments as the parser words it; let faults of the program through."""
+    show = getattr(error, "show", None)
+    if show is None:
+        raise error
+    show()
+    return int(getattr(error, "exit_code", EXIT_REFUSED))

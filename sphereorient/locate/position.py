@@ -1,0 +1,108 @@
+"""From outlines to a place in the lab: two rays where two cameras see the sphere, ray and size where one does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sphereorient.cameras import Camera, Rays, triangulate
+from sphereorient.locate.sightings import Sightings
+from sphereorient.trajectory import Flag
+
+NOT_MEASURED = int(Flag.POSITION_INTERPOLATED | Flag.POSITION_OUTLIER_REPLACED)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Positions:
+    """Centre of the sphere in the lab in N frames; made by locate, read by motion and the pipeline."""
+
+    position_lab_mm: Tensor  # (N, 3), NaN where no camera has a centre
+    covariance_mm2: Tensor  # (N, 3, 3), NaN where the position is not measured
+    gap_mm: Tensor  # (N,), distance of the two rays, NaN with one
+    flags: Tensor  # (N,) int64
+
+    @property
+    def measured(self) -> Tensor:
+        """Frames whose position comes from outlines measured in them, (N,) bool."""
+        return torch.isfinite(self.position_lab_mm).all(-1) & ((self.flags & NOT_MEASURED) == 0)
+
+
+def find_positions(
+    sightings: Mapping[str, Sightings], cameras: Mapping[str, Camera], diameter_mm: float | None
+) -> Positions:
+    """Place the sphere in the lab.
+
+    Args:
+        sightings: of one or two cameras, the same N frames.
+        cameras: of the same names.
+        diameter_mm: of the sphere; None: lengths are in radii of the sphere (one camera only).
+
+    Returns:
+        Positions. Where one camera alone has the outline, the distance comes from its radius, is far less sure, and
+        the frame carries `ONE_CAMERA`.
+
+    Source: paper section III A (triangulation). The sigma of one camera's centre, per axis, is the rms of its
+    outline; the rays carry it into space.
+    """
+    radius_mm = 1.0 if diameter_mm is None else diameter_mm / 2
+    views = [_view(seen, cameras[name], radius_mm) for name, seen in sightings.items()]
+    placed = torch.stack([seen.placed for seen in sightings.values()])
+    alone = views[-1].from_size_mm
+    if len(views) == 1:
+        position, gap = alone, torch.full_like(alone[:, 0], torch.nan)
+    else:
+        alone = torch.where(placed[0][:, None], views[0].from_size_mm, alone)
+        crossing, gap = triangulate(views[0].rays, views[1].rays)
+        position = torch.where(placed.all(0)[:, None], crossing, alone)
+    one = placed.sum(0) == 1
+    across = sum(torch.where(ok[:, None, None], view.across, 0.0) for view, ok in zip(views, placed, strict=True))
+    # Distance from size: only where no second ray says better.
+    along = sum(torch.where((ok & one)[:, None, None], view.along, 0.0) for view, ok in zip(views, placed, strict=True))
+    flags = torch.zeros(len(position), dtype=torch.int64)
+    for seen, ok in zip(sightings.values(), placed, strict=True):
+        flags |= torch.where(ok, seen.flags, 0)
+    flags |= torch.where(one, int(Flag.ONE_CAMERA), 0)
+    return Positions(
+        position_lab_mm=position, covariance_mm2=_inverse(torch.as_tensor(across + along)), gap_mm=gap, flags=flags
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _View:
+    """What one camera says of the sphere's place."""
+
+    rays: Rays  # (N), to the outline's centre
+    from_size_mm: Tensor  # (N, 3), on the ray, at the distance that the radius tells
+    across: Tensor  # (N, 3, 3), information (1/mm^2) across the ray
+    along: Tensor  # (N, 3, 3), information along the ray, from the size
+
+
+def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
+    rays = camera.rays(seen.centre_px)
+    rim = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=seen.centre_px.dtype)
+    limb = camera.rays(seen.centre_px[:, None] + rim * seen.radius_px[:, None, None]).direction_lab
+    # sin of the angle between the centre's ray and the limb's: the cross product is exact for small angles.
+    sine = torch.linalg.cross(limb, rays.direction_lab[:, None].expand_as(limb)).norm(dim=-1).mean(1)
+    distance = radius_mm / sine
+    per_px = distance * sine / seen.radius_px  # mm in space per px, at the sphere
+    sigma = seen.outline_rms_px * per_px
+    outer = rays.direction_lab[:, :, None] * rays.direction_lab[:, None, :]
+    eye = torch.eye(3, dtype=outer.dtype)
+    sigma_along = distance * seen.outline_rms_px / seen.radius_px
+    return _View(
+        rays=rays,
+        from_size_mm=rays.origin_lab_mm + distance[:, None] * rays.direction_lab,
+        across=(eye - outer) / sigma[:, None, None].square(),
+        along=outer / sigma_along[:, None, None].square(),
+    )
+
+
+def _inverse(information: Tensor) -> Tensor:
+    """Inverse of (N, 3, 3) where it exists, NaN elsewhere."""
+    finite = torch.isfinite(information).all(-1).all(-1) & (torch.linalg.det(torch.nan_to_num(information)) > 0)
+    eye = torch.eye(3, dtype=information.dtype)
+    inverse = torch.linalg.inv(torch.where(finite[:, None, None], information, eye))
+    return torch.where(finite[:, None, None], inverse, torch.nan)

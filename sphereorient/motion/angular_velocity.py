@@ -1,0 +1,171 @@
+"""Angular velocity from orientations: the turn between two frames around a third, over several separations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
+from sphereorient.motion.stencil import neighbours_there
+
+
+def omega_from_orientations(
+    R_lab_body: Tensor,
+    dt_s: float,
+    separations: Sequence[int],
+    *,
+    segment: Tensor | None = None,
+    min_separations: int = 1,
+) -> tuple[Tensor, Tensor]:
+    """Return the angular velocity in lab components, averaged over several symmetric separations.
+
+    Each separation m gives log(R[k + m] R[k - m]^T) / (2 m dt); this product is the turn in lab components. The mean
+    has weights m^2, which is optimal for white attitude noise: the pairs share no frame and their variance falls as
+    m^-2. The orientation of frame k itself is not used, so a single lost frame costs its neighbours one separation
+    each and itself none. The mean over +-m frames damps what changes within them: a component that oscillates with f
+    cycles per frame is damped by sin(2 pi f m) / (2 pi f m) per separation. Turns of pi and above cannot be told from
+    smaller ones the other way round: 2 max(m) |omega| dt must stay well below pi, which is not checked.
+
+    Args:
+        R_lab_body: (..., N, 3, 3), orientations; NaN where missing; orthogonality is not checked.
+        dt_s: time between frames, s.
+        separations: values of m, frames, from 1 up, each once.
+        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
+        min_separations: how many separations must be measurable in a frame.
+
+    Returns:
+        omega_lab (..., N, 3), rad/s, NaN where fewer separations are measurable; and its standard error (..., N, 3),
+        rad/s, from the scatter of the separations around their mean, NaN where there are fewer than two.
+
+    Raises:
+        ShapeError: R_lab_body does not end in (N, 3, 3).
+        SettingsError: separations that are none.
+
+    Source: the paper, section III, angular velocity from the increment T; frames by ERRATA E4 and E6.
+    """
+    check_tail("R_lab_body", R_lab_body, 3, 3)
+    if R_lab_body.dim() < 3:
+        got = str(tuple(R_lab_body.shape))
+        raise ShapeError(refusal("R_lab_body", expected="shape (..., N, 3, 3)", got=got, do="pass all frames at once"))
+    check_separations(separations)
+    there = R_lab_body.isfinite().all(-1).all(-1)
+    R = torch.where(there[..., None, None], R_lab_body, torch.eye(3, dtype=R_lab_body.dtype, device=R_lab_body.device))
+    usable = usable_separations(there, separations, segment)  # (..., N, S)
+    turns = torch.stack([_shifted(R, m) @ _shifted(R, -m).mT for m in separations], dim=-3)  # (..., N, S, 3, 3)
+    # a turn that is not used may be half a turn, where log has no gradient
+    turns = torch.where(usable[..., None, None], turns, torch.eye(3, dtype=turns.dtype, device=turns.device))
+    return mean_over_separations(turns, usable, dt_s, separations, min_separations)
+
+
+def to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
+    """Turn vectors from lab to body components, R^T x.
+
+    The derivative of R^T omega_lab is R^T alpha_lab, because omega x omega vanishes: it serves omega and alpha alike.
+
+    Args:
+        R_lab_body: (..., 3, 3), orientations.
+        x_lab: (..., 3), any unit, lab components.
+
+    Returns:
+        (..., 3), x's unit, body components.
+
+    Raises:
+        ShapeError: wrong last axes.
+
+    Source: ERRATA E6; alpha_lab = R alpha_body, as printed.
+    """
+    check_tail("R_lab_body", R_lab_body, 3, 3)
+    check_tail("x_lab", x_lab, 3)
+    return (R_lab_body.mT @ x_lab[..., None])[..., 0]
+
+
+def check_separations(separations: Sequence[int]) -> None:
+    """Refuse separations that are not different numbers from 1 up.
+
+    Args:
+        separations: frames.
+
+    Raises:
+        SettingsError: none, one below 1, or one given twice.
+    """
+    if not separations or min(separations) < 1 or len(set(separations)) < len(separations):
+        expected, do = "different numbers from 1 up", "give each separation once"
+        raise SettingsError(refusal("separations", expected=expected, got=str(tuple(separations)), do=do))
+
+
+def usable_separations(there: Tensor, separations: Sequence[int], segment: Tensor | None) -> Tensor:
+    """Say in which frames which separations can be measured.
+
+    Args:
+        there: (..., N) bool, frames that hold an orientation.
+        separations: values of m, frames; S of them.
+        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
+
+    Returns:
+        (..., N, S) bool: both frames k - m and k + m are there and in the segment of frame k.
+    """
+    half = max(separations)
+    near = neighbours_there(there, segment, half)
+    m = torch.as_tensor(separations, device=there.device)
+    return near[..., half + m] & near[..., half - m]
+
+
+def omega_stencil(usable: Tensor, separations: Sequence[int], min_separations: int, dtype: torch.dtype) -> Tensor:
+    """Return the weights that small errors of the orientations have in omega, for the propagation of noise.
+
+    Args:
+        usable: (..., N, S) bool, from `usable_separations`.
+        separations: values of m, frames; S of them.
+        min_separations: how many separations must be measurable in a frame.
+        dtype: of the result.
+
+    Returns:
+        (..., N, 2 max(m) + 1), per frame; NaN where omega is.
+    """
+    m = torch.as_tensor(separations, device=usable.device)
+    half, weight = max(separations), m.to(dtype) ** 2 * usable
+    total = weight.sum(-1, keepdim=True)
+    slope = weight / (2 * m * torch.where(total > 0, total, 1))
+    stencil = usable.new_zeros(*usable.shape[:-1], 2 * half + 1, dtype=dtype)
+    stencil[..., half + m], stencil[..., half - m] = slope, -slope
+    return torch.where((usable.sum(-1) >= max(min_separations, 1))[..., None], stencil, torch.nan)
+
+
+def mean_over_separations(
+    turns: Tensor, usable: Tensor, dt_s: float, separations: Sequence[int], min_separations: int
+) -> tuple[Tensor, Tensor]:
+    """Return the weighted mean of the angular velocities of several separations, and its standard error.
+
+    Args:
+        turns: (..., N, S, 3, 3), turn from frame k - m to k + m in lab components; unit where not usable.
+        usable: (..., N, S) bool.
+        dt_s: time between frames, s.
+        separations: values of m, frames; S of them.
+        min_separations: how many separations must be measurable in a frame.
+
+    Returns:
+        omega_lab and its standard error from the scatter, both (..., N, 3), rad/s.
+    """
+    m = torch.as_tensor(separations, dtype=turns.dtype, device=turns.device)
+    omega = so3.log(turns) / (2 * dt_s * m[:, None])  # (..., N, S, 3)
+    weight = (m**2 * usable)[..., None]
+    total, count = weight.sum(-2), usable.sum(-1)[..., None]
+    safe_total = torch.where(total > 0, total, 1)
+    mean = (weight * omega).sum(-2) / safe_total
+    chi2 = (weight * (omega - mean[..., None, :]).square()).sum(-2)
+    variance = chi2 / ((count - 1).clamp(min=1) * safe_total)
+    enough = count >= max(min_separations, 1)
+    scattered = enough & (count > 1) & (variance > 0)
+    # the root's gradient at 0 is infinite: without any scatter the answer is 0 by itself
+    error = torch.where(
+        scattered, torch.where(scattered, variance, 1).sqrt(), torch.where(enough & (count > 1), 0.0, torch.nan)
+    )
+    return torch.where(enough, mean, torch.nan), error
+
+
+def _shifted(R: Tensor, m: int) -> Tensor:
+    """Return R[..., k + m, :, :] at frame k; what wraps around an end is never used."""
+    return R.roll(-m, dims=-3)

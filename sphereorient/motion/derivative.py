@@ -1,0 +1,147 @@
+"""Derivatives by convolution with derivatives of a Gaussian."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from sphereorient.errors import SettingsError, refusal
+from sphereorient.motion.stencil import paired, windows
+
+Order = Literal[0, 1, 2]
+TRUNCATE = 3.0  # holds 99.7 % of the Gaussian
+
+
+def gaussian_derivative(
+    x: Tensor, dt_s: float, sigma_frames: float, order: Order, truncate: float = TRUNCATE
+) -> Tensor:
+    """Smooth with a Gaussian and take the derivative, wherever the whole window was measured.
+
+    The kernel's discrete moments are exact, so polynomials come out exactly: constants and lines for order 0, up to
+    quadratics for order 1, up to cubics for order 2. A sine of f cycles per frame is damped by about
+    exp(-(2 pi f sigma)^2 / 2).
+
+    Args:
+        x: (..., N, D), any unit; NaN where missing.
+        dt_s: time between frames, s.
+        sigma_frames: width of the Gaussian, frames.
+        order: of the derivative, 0 (only smooth), 1 or 2.
+        truncate: half width of the window in units of sigma.
+
+    Returns:
+        (..., N, D), x's unit / s^order; NaN where the window reaches a missing value or an end: nothing is padded.
+
+    Raises:
+        SettingsError: another order, or a width that is not positive.
+
+    Source: the paper, section III, differentiation of trajectories with a Gaussian kernel.
+    """
+    kernel = _full_kernel(sigma_frames, order, truncate, x)
+    near = windows(x.mT, kernel.shape[-1] // 2)
+    return (near * kernel).sum(-1).mT / dt_s**order
+
+
+def noise_gain(sigma_frames: float, order: Order, truncate: float = TRUNCATE) -> float:
+    """Return what white noise of standard deviation 1 becomes in `gaussian_derivative` with dt_s = 1.
+
+    For sigma above about 1.5 frames the three orders give 0.531 sigma^-0.5, 0.376 sigma^-1.5 and 0.460 sigma^-2.5.
+    Noise that is correlated over frames gives more, up to the square root of its correlation length.
+
+    Args:
+        sigma_frames: width of the Gaussian, frames.
+        order: of the derivative, 0, 1 or 2.
+        truncate: half width of the window in units of sigma.
+
+    Returns:
+        Standard deviation of the output; divide by dt_s^order.
+
+    Raises:
+        SettingsError: another order, or a width that is not positive.
+    """
+    return float(_full_kernel(sigma_frames, order, truncate, torch.empty(0, dtype=torch.float64)).norm())
+
+
+def gap_aware_stencil(
+    there: Tensor,
+    segment: Tensor | None,
+    sigma_frames: float,
+    order: Order,
+    *,
+    truncate: float = TRUNCATE,
+    min_share: float = 1.0,
+    dtype: torch.dtype = torch.float64,
+) -> Tensor:
+    """Return the kernel of `gaussian_derivative` for every frame, corrected for frames that are not there.
+
+    A neighbour is used where its mirror image is there too and both are in the frame's own segment; the moments are
+    corrected for what is left, so polynomials still come out exactly. Towards an end the window shrinks evenly.
+
+    Args:
+        there: (..., N) bool, frames that hold a measurement.
+        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
+        sigma_frames: width of the Gaussian, frames.
+        order: of the derivative, 0, 1 or 2.
+        truncate: half width of the window in units of sigma.
+        min_share: share of the Gaussian's weight that must be there; 1 asks for the whole window.
+        dtype: of the result.
+
+    Returns:
+        (..., N, 2 h + 1), per frame^order; NaN for frames outside a segment or with too little around them.
+
+    Raises:
+        SettingsError: another order, or a width that is not positive.
+    """
+    half = _half_width(sigma_frames, order, truncate)
+    like = torch.empty(0, dtype=dtype, device=there.device)
+    gauss, step = _gaussian(sigma_frames, half, like)
+    kept = gauss * paired(there, segment, half)
+    share = kept.sum(-1) / gauss.sum()
+    # half a millionth: the sums of equal terms may differ in their last digits
+    enough = (share >= min_share - 5e-7) & (_determinant(kept, step, order) > 0)
+    stencil = _with_exact_moments(torch.where(enough[..., None], kept, gauss), step, order)
+    return torch.where(enough[..., None], stencil, torch.nan)
+
+
+def _half_width(sigma_frames: float, order: int, truncate: float) -> int:
+    """Return the half width of the window; at least 1, which a derivative needs."""
+    if order not in (0, 1, 2):
+        raise SettingsError(refusal("order", expected="0, 1 or 2", got=str(order), do="differentiate twice"))
+    if not (sigma_frames > 0 and truncate > 0):
+        got = f"sigma_frames {sigma_frames}, truncate {truncate}"
+        raise SettingsError(refusal("Gaussian", expected="a positive width", got=got, do="raise it"))
+    return max(1, math.ceil(truncate * sigma_frames))
+
+
+def _gaussian(sigma_frames: float, half: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the Gaussian and the places it is taken at, in units of sigma."""
+    step = torch.arange(-half, half + 1, dtype=like.dtype, device=like.device)
+    return torch.exp(-0.5 * (step / sigma_frames) ** 2), step
+
+
+def _full_kernel(sigma_frames: float, order: Order, truncate: float, like: Tensor) -> Tensor:
+    """Return the kernel (2 h + 1) where nothing is missing."""
+    gauss, step = _gaussian(sigma_frames, _half_width(sigma_frames, order, truncate), like)
+    return _with_exact_moments(gauss, step, order)
+
+
+def _determinant(gauss: Tensor, step: Tensor, order: int) -> Tensor:
+    """Return a number that is zero where the weights that are left do not determine the derivative, (...)."""
+    m0, m2, m4 = ((gauss * step**power).sum(-1) for power in (0, 2, 4))
+    return (m0, m2, m0 * m4 - m2**2)[order]
+
+
+def _with_exact_moments(gauss: Tensor, step: Tensor, order: int) -> Tensor:
+    """Turn symmetric weights (..., 2 h + 1) into a kernel whose moments of powers 0 .. order + 1 are the derivative's.
+
+    It is the Gaussian times the polynomial that the Gaussian's derivative has, with coefficients from the discrete
+    sums; the same as a least-squares fit of a polynomial with Gaussian weights (Savitzky-Golay, weighted).
+    """
+    m0, m2, m4 = ((gauss * step**power).sum(-1, keepdim=True) for power in (0, 2, 4))
+    if order == 0:
+        return gauss / m0
+    if order == 1:
+        return gauss * step / m2
+    return gauss * 2 * (m0 * step**2 - m2) / (m0 * m4 - m2**2)

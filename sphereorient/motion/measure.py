@@ -1,0 +1,186 @@
+"""Velocities and accelerations of one sphere, with their noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from sphereorient.errors import ShapeError, check_tail, refusal
+from sphereorient.motion.angular_velocity import (
+    check_separations,
+    omega_from_orientations,
+    omega_stencil,
+    to_body,
+    usable_separations,
+)
+from sphereorient.motion.derivative import Order, gap_aware_stencil
+from sphereorient.motion.settings import MotionSettings
+from sphereorient.motion.stencil import apply, compose, spread
+
+M_PER_MM = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """Velocities and accelerations of N frames; made by motion, read by pipeline.
+
+    All are (..., N, 3), NaN where unknown. Each sigma is the standard deviation that white measurement noise leaves;
+    the low-pass bias is not in it.
+    """
+
+    velocity_m_s: Tensor
+    velocity_sigma_m_s: Tensor
+    acceleration_m_s2: Tensor
+    acceleration_sigma_m_s2: Tensor
+    omega_lab_rad_s: Tensor
+    omega_lab_sigma_rad_s: Tensor
+    omega_body_rad_s: Tensor
+    omega_body_sigma_rad_s: Tensor
+    alpha_lab_rad_s2: Tensor
+    alpha_lab_sigma_rad_s2: Tensor
+    alpha_body_rad_s2: Tensor
+    alpha_body_sigma_rad_s2: Tensor
+
+
+def measure_motion(
+    position_mm: Tensor,
+    R_lab_body: Tensor,
+    segment: Tensor,
+    frame_rate_hz: float,
+    settings: MotionSettings,
+    *,
+    position_sigma_mm: Tensor | None = None,
+    orientation_sigma_rad: Tensor | None = None,
+) -> Motion:
+    """Return velocity, acceleration, omega and alpha of every frame whose neighbours determine them.
+
+    Nothing is measured across the ends of a segment. Single lost frames inside one are stepped over; a long gap and
+    the frames next to an end give NaN. Body components need the frame's own orientation, lab components do not.
+
+    Args:
+        position_mm: (..., N, 3), mm, lab; NaN where missing.
+        R_lab_body: (..., N, 3, 3), orientations; NaN where missing.
+        segment: (..., N) int, number of the segment, -1 outside any.
+        frame_rate_hz: frames per second, even.
+        settings: widths and limits.
+        position_sigma_mm: (..., N) or (..., N, 3), mm, standard deviation of a coordinate; NaN where unknown.
+        orientation_sigma_rad: (..., N) or (..., N, 3), rad, standard deviation of a component of the small turn delta
+            in R_true = exp([delta]x) R; NaN where unknown.
+
+    Returns:
+        The motion; each sigma is NaN where a sigma that goes into it is unknown.
+
+    Raises:
+        ShapeError: wrong last axes, or unequal numbers of frames.
+        SettingsError: separations that are none.
+
+    Source: the paper, section III; frames by ERRATA E4 and E6.
+    """
+    check_tail("position_mm", position_mm, 3)
+    check_tail("R_lab_body", R_lab_body, 3, 3)
+    check_separations(settings.separations)
+    if not position_mm.shape[:-1] == R_lab_body.shape[:-2] == segment.shape or segment.dim() == 0:
+        shapes = ", ".join(str(tuple(x.shape)) for x in (position_mm, R_lab_body, segment))
+        do = "give all three the same frames"
+        raise ShapeError(refusal("motion", expected="(..., N, 3), (..., N, 3, 3), (..., N)", got=shapes, do=do))
+    dt_s = 1.0 / frame_rate_hz
+    velocity, velocity_sigma = _translation(position_mm, position_sigma_mm, segment, dt_s, 1, settings)
+    acceleration, acceleration_sigma = _translation(position_mm, position_sigma_mm, segment, dt_s, 2, settings)
+    (omega, omega_sigma), (alpha, alpha_sigma) = _rotation(R_lab_body, orientation_sigma_rad, segment, dt_s, settings)
+    return Motion(
+        velocity_m_s=velocity,
+        velocity_sigma_m_s=velocity_sigma,
+        acceleration_m_s2=acceleration,
+        acceleration_sigma_m_s2=acceleration_sigma,
+        omega_lab_rad_s=omega,
+        omega_lab_sigma_rad_s=omega_sigma,
+        omega_body_rad_s=_to_body(R_lab_body, omega),
+        omega_body_sigma_rad_s=_sigma_in_body(R_lab_body, omega, omega_sigma, orientation_sigma_rad),
+        alpha_lab_rad_s2=alpha,
+        alpha_lab_sigma_rad_s2=alpha_sigma,
+        alpha_body_rad_s2=_to_body(R_lab_body, alpha),
+        alpha_body_sigma_rad_s2=_sigma_in_body(R_lab_body, alpha, alpha_sigma, orientation_sigma_rad),
+    )
+
+
+def _translation(
+    position_mm: Tensor,
+    sigma_mm: Tensor | None,
+    segment: Tensor,
+    dt_s: float,
+    order: Literal[1, 2],
+    settings: MotionSettings,
+) -> tuple[Tensor, Tensor]:
+    """Return a derivative of the position and its sigma, m/s^order."""
+    width = {1: settings.velocity_sigma_frames, 2: settings.acceleration_sigma_frames}[order]
+    stencil = _stencil(position_mm, segment, width, order, settings)
+    scale = M_PER_MM / dt_s**order
+    return apply(stencil, position_mm) * scale, spread(stencil, _by_axis(sigma_mm, position_mm)) * scale
+
+
+def _rotation(
+    R_lab_body: Tensor, sigma_rad: Tensor | None, segment: Tensor, dt_s: float, settings: MotionSettings
+) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Return omega_lab and its sigma, alpha_lab and its sigma."""
+    separations, fewest = settings.separations, settings.min_separations
+    omega, _ = omega_from_orientations(R_lab_body, dt_s, separations, segment=segment, min_separations=fewest)
+    slope = _stencil(omega, segment, settings.alpha_sigma_frames, 1, settings)
+    alpha = apply(slope, omega) / dt_s
+    # neighbouring omegas share orientations: their noise is not white, that of the orientations is
+    turn = omega_stencil(
+        usable_separations(_oriented(R_lab_body), separations, segment), separations, fewest, omega.dtype
+    )
+    sigma = _by_axis(sigma_rad, omega)
+    return (omega, spread(turn, sigma) / dt_s), (alpha, spread(compose(slope, turn), sigma) / dt_s**2)
+
+
+def _stencil(x: Tensor, segment: Tensor, sigma_frames: float, order: Order, settings: MotionSettings) -> Tensor:
+    """Return the gap-aware stencil for x (..., N, 3) with the settings' limits."""
+    return gap_aware_stencil(
+        x.isfinite().all(-1),
+        segment,
+        sigma_frames,
+        order,
+        truncate=settings.truncate,
+        min_share=settings.min_share,
+        dtype=x.dtype,
+    )
+
+
+def _by_axis(sigma: Tensor | None, like: Tensor) -> Tensor:
+    """Return sigma (..., N, 3); one number a frame counts for all three axes, none is NaN."""
+    if sigma is None:
+        return torch.full_like(like, torch.nan)
+    sigma = sigma.to(like)
+    return (sigma if sigma.dim() == like.dim() else sigma[..., None]).expand_as(like)
+
+
+def _oriented(R_lab_body: Tensor) -> Tensor:
+    """Say which frames have an orientation, (..., N)."""
+    return R_lab_body.isfinite().all(-1).all(-1)
+
+
+def _to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
+    """Turn to body components where there is an orientation, NaN elsewhere."""
+    there = (_oriented(R_lab_body) & x_lab.isfinite().all(-1))[..., None]
+    # numbers in place of NaN, whose gradient would be NaN
+    unit = torch.eye(3, dtype=R_lab_body.dtype, device=R_lab_body.device)
+    R, x = torch.where(there[..., None], R_lab_body, unit), torch.where(there, x_lab, 0.0)
+    return torch.where(there, to_body(R, x), torch.nan)
+
+
+def _sigma_in_body(R_lab_body: Tensor, x_lab: Tensor, x_sigma: Tensor, sigma_rad: Tensor | None) -> Tensor:
+    """Return the standard deviations of R^T x from those of the lab components x and of the orientation, all by axis.
+
+    An orientation that is off by delta turns the result by delta x x. This is independent of omega, which does not use
+    the frame's own orientation, and small in alpha.
+    """
+    from_x = _to_body(R_lab_body.square(), x_sigma.square())
+    unit = torch.eye(3, dtype=x_lab.dtype, device=x_lab.device).expand(*x_lab.shape, 3)
+    turned = torch.linalg.cross(unit, x_lab[..., None, :])  # (..., 3, 3), row j: delta along axis j crossed with x
+    lever = torch.stack([_to_body(R_lab_body, turned[..., j, :]) for j in range(3)], dim=-1)  # (..., 3 body, 3 lab)
+    from_R = (lever.square() * _by_axis(sigma_rad, x_lab)[..., None, :].square()).sum(-1)
+    return (from_x + from_R).sqrt()

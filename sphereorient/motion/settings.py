@@ -1,0 +1,60 @@
+"""Settings of the room motion."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from sphereorient.errors import SettingsError, refusal
+
+
+class MotionSettings(BaseModel):
+    """How positions and orientations become velocities and accelerations.
+
+    The defaults fit the experiment of the paper, 600 Hz and 1 degree of attitude noise; they are widths in frames, so
+    double them at twice the frame rate. Wider means less noise and more low-pass bias.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    velocity_sigma_frames: float = Field(
+        3.5,
+        gt=0,
+        description="width of the Gaussian that velocity is taken with, frames; 0.1 mm of noise gives 0.02 m/s",
+    )
+    acceleration_sigma_frames: float = Field(
+        5.0,
+        gt=0,
+        description="width of the Gaussian that acceleration is taken with, frames; noise falls as its power 2.5",
+    )
+    alpha_sigma_frames: float = Field(
+        2.0, gt=0, description="width of the Gaussian that takes alpha from omega, frames; omega is already an average"
+    )
+    truncate: float = Field(
+        3.0, gt=0, description="half width of these windows in units of their sigma; 3 holds 99.7 % of the Gaussian"
+    )
+    min_share: float = Field(
+        0.55,
+        gt=0,
+        le=1,
+        description="share of a Gaussian's weight whose frames must be there, else NaN; lower reaches closer to ends "
+        "and across more lost frames, with more noise; 0.55 passes two neighbouring lost frames",
+    )
+    separations: tuple[int, ...] = Field(
+        (1, 2, 3, 4, 5),
+        min_length=1,
+        description="omega is averaged over the turns from frame k - m to k + m for these m, frames; the turn, "
+        "2 m omega / frame_rate, must stay well below 180 degrees",
+    )
+    min_separations: int = Field(
+        3,
+        ge=1,
+        description="how many of the separations must be measurable, else omega is NaN; 3 loses 3 frames at ends",
+    )
+
+    @field_validator("separations")
+    @classmethod
+    def _positive_and_different(cls, separations: tuple[int, ...]) -> tuple[int, ...]:
+        if min(separations) < 1 or len(set(separations)) < len(separations):
+            expected, do = "different numbers from 1 up", "give each separation once"
+            raise SettingsError(refusal("motion.separations", expected=expected, got=str(separations), do=do))
+        return separations

@@ -1,0 +1,111 @@
+"""Weighted sums over windows of neighbouring frames, each frame with weights of its own.
+
+A stencil is a tensor of weights (..., N, 2 h + 1): entry [k, h + j] is the weight of frame k + j in the result for
+frame k. Weights of frames that are not there are zero; a frame whose result is not determined has NaN weights.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+
+def windows(x: Tensor, half: int, fill: float = torch.nan) -> Tensor:
+    """Return every frame's neighbours.
+
+    Args:
+        x: (..., N), anything by frame.
+        half: how many neighbours to either side.
+        fill: what lies beyond the ends.
+
+    Returns:
+        (..., N, 2 half + 1); entry [k, half + j] is x[k + j].
+    """
+    if x.shape[-1] == 0:
+        return x.new_empty(*x.shape, 2 * half + 1)
+    return pad(x, (half, half), value=fill).unfold(-1, 2 * half + 1, 1)
+
+
+def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
+    """Say which neighbours of a frame were measured and belong to its segment.
+
+    Args:
+        there: (..., N) bool, frames that hold a measurement.
+        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
+        half: how many neighbours to either side.
+
+    Returns:
+        (..., N, 2 half + 1) bool; all False for a frame outside any segment.
+    """
+    near = windows(there.to(torch.int8), half, fill=0).bool()
+    if segment is None:
+        return near
+    return near & (windows(segment, half, fill=-1) == segment[..., None]) & (segment >= 0)[..., None]
+
+
+def paired(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
+    """Say which neighbours of a frame can be used together with their mirror images.
+
+    Only pairs k - j, k + j are used, because their weights are then of one parity and no lower power of time leaks
+    into the result, whichever frames are missing.
+
+    Args:
+        there: (..., N) bool, frames that hold a measurement.
+        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
+        half: how many neighbours to either side.
+
+    Returns:
+        (..., N, 2 half + 1) bool; in the middle: whether the frame itself is there.
+    """
+    near = neighbours_there(there, segment, half)
+    return near & near.flip(-1)
+
+
+def apply(stencil: Tensor, x: Tensor) -> Tensor:
+    """Return the weighted sums.
+
+    Args:
+        stencil: (..., N, 2 h + 1), weights.
+        x: (..., N, D); values with weight zero may be NaN.
+
+    Returns:
+        (..., N, D), NaN where the stencil is.
+    """
+    undetermined = stencil.isnan().any(-1)[..., None]
+    # zeros in place of NaN first: the gradient of an unselected NaN is NaN, too
+    weights = torch.where(undetermined, 0.0, stencil)[..., None, :]
+    near = windows(x.mT, stencil.shape[-1] // 2).transpose(-3, -2)  # (..., N, D, 2 h + 1)
+    sums = (weights * torch.where(weights == 0, 0.0, near)).sum(-1)
+    return torch.where(undetermined, torch.nan, sums)
+
+
+def spread(stencil: Tensor, sigma: Tensor) -> Tensor:
+    """Return the standard deviation of the weighted sums for independent errors.
+
+    Args:
+        stencil: (..., N, 2 h + 1), weights.
+        sigma: (..., N, D), standard deviation of every value; NaN where unknown.
+
+    Returns:
+        (..., N, D), NaN where the stencil is or where a sigma with weight is.
+    """
+    return apply(stencil.square(), sigma.square()).sqrt()
+
+
+def compose(outer: Tensor, inner: Tensor) -> Tensor:
+    """Return the stencil that acts like `outer` on the result of `inner`.
+
+    Args:
+        outer: (..., N, 2 a + 1), weights.
+        inner: (..., N, 2 b + 1), weights.
+
+    Returns:
+        (..., N, 2 (a + b) + 1), NaN where outer is.
+    """
+    a = outer.shape[-1] // 2
+    near = windows(inner.mT, a).movedim(-3, -1)  # (..., N, 2 a + 1, 2 b + 1)
+    weights = outer[..., None]
+    product = weights * torch.where(weights == 0, 0.0, near)
+    rows = [pad(product[..., i, :], (i, 2 * a - i)) for i in range(2 * a + 1)]
+    return torch.stack(rows).sum(0)

@@ -1,0 +1,272 @@
+"""The paper's method on one page: the only place that knows the order.
+
+movies -> locate -> orient -> assemble -> motion -> Trajectory
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient import assemble, locate, motion
+from sphereorient.assemble import Fused, Path
+from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.errors import ExperimentError, SettingsError, refusal
+from sphereorient.experiment import Experiment, frame_numbers, load_experiment, movie_span, open_movies, time_s
+from sphereorient.locate import Positions, Sightings
+from sphereorient.motion import Motion
+from sphereorient.movies import Movie
+from sphereorient.orient import Candidates, Proposals, Proposer, TemplateSearch, crop_disk
+from sphereorient.provenance import provenance
+from sphereorient.settings import DEFAULT_METHOD, METHODS, Settings, settings_yaml
+from sphereorient.sphere import load_texture
+from sphereorient.trajectory import CameraTrack, Reason, Trajectory
+
+CHUNK = 64  # frames held at once; a result does not depend on it
+
+
+class Progress(Protocol):
+    """Told how far a stage is; the command line draws a bar."""
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """`done` of `total` frames of a stage are finished."""
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Tell nobody."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reel:
+    """One camera's share of the experiment; made by `track_movies`, read by the stages."""
+
+    name: str
+    camera: Camera
+    movie: Movie
+    frames: range  # the experiment's frames in the movie's own counting
+
+    def pictures(self) -> Iterator[NDArray[Any]]:
+        """Yield the experiment's frames of this camera, in order."""
+        return self.movie.frames(self.frames.start, self.frames.stop)
+
+
+def track_movies(
+    experiment: Experiment | str | FilePath,
+    *,
+    method: str = DEFAULT_METHOD,
+    settings: Settings | None = None,
+    cameras: Sequence[str] | None = None,
+    progress: Progress = silent,
+    command: str = "sphereorient.track_movies",
+) -> Trajectory:
+    """Measure position and absolute orientation of the sphere in every frame.
+
+    Args:
+        experiment: as loaded, or the path of its experiment.yaml.
+        method: "paper", Zimmermann et al. 2011 with the corrections of docs/paper-map.md.
+        settings: None: the method's defaults.
+        cameras: names of those to use; None: all.
+        progress: told how far each stage is.
+        command: what the track's provenance names as its origin.
+
+    Returns:
+        The trajectory, frame by frame; lengths mm, angles rad, see docs/data-format.md.
+
+    Raises:
+        SphereOrientError: inputs that are missing, unreadable or do not fit together.
+    """
+    if method not in METHODS:
+        raise SettingsError(refusal("method", expected=" or ".join(METHODS), got=repr(method), do="name one of these"))
+    if not isinstance(experiment, Experiment):
+        experiment = load_experiment(FilePath(experiment))
+    settings = settings or Settings()
+    names = _chosen(experiment, cameras)
+    if experiment.texture_path is None:
+        do = "give sphere.texture; learning it from the movie is not part of this version"
+        raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
+    texture = load_texture(experiment.texture_path)
+    movies = open_movies(experiment, names)
+    try:
+        frames = frame_numbers(experiment, movies)
+        reels = [
+            Reel(name=n, camera=experiment.cameras[n], movie=movies[n], frames=range(*movie_span(experiment, n, frames)))
+            for n in names
+        ]
+        clock = torch.from_numpy(time_s(experiment, frames))
+        track = _paper(experiment, reels, clock, texture, settings, progress)
+        text = settings_yaml(settings)
+        return replace(track, method=method, settings=text, provenance=provenance(experiment, names, command))
+    finally:
+        for movie in movies.values():
+            movie.close()
+
+
+def _paper(
+    experiment: Experiment,
+    reels: Sequence[Reel],
+    clock: Tensor,
+    texture: Tensor,
+    settings: Settings,
+    progress: Progress,
+) -> Trajectory:
+    """Section III of the paper, step by step."""
+    cameras = {reel.name: reel.camera for reel in reels}
+    sightings = {reel.name: locate_sphere(reel, cameras, experiment, settings, progress) for reel in reels}
+    positions = locate.find_positions(sightings, cameras, experiment.diameter_mm)
+    candidates = {
+        reel.name: propose_orientations(reel, sightings[reel.name], texture, settings, progress) for reel in reels
+    }
+    paths = assemble.assemble_paths(candidates, clock, settings.assemble)
+    fused = assemble.fuse(paths, candidates, clock, settings.assemble)
+    moved = motion.measure_motion(
+        positions.position_lab_mm,
+        fused.R_lab_body,
+        fused.segment,
+        experiment.frame_rate_hz,
+        settings.motion,
+        position_sigma_mm=positions.covariance_mm2.diagonal(dim1=-2, dim2=-1).sqrt(),
+        orientation_sigma_rad=fused.sigma_rad,
+    )
+    tracks = {name: _camera_track(sightings[name], candidates[name], paths[name]) for name in cameras}
+    return _trajectory(experiment, clock, positions, fused, moved, tracks)
+
+
+def locate_sphere(
+    reel: Reel, cameras: Mapping[str, Camera], experiment: Experiment, settings: Settings, progress: Progress
+) -> Sightings:
+    """Find the sphere's outline in every frame of one camera, outliers replaced and short gaps filled."""
+    stage = f"{reel.name}: locate"
+    progress(stage, 0, len(reel.frames))
+    spread = locate.spread_frames(reel.frames, settings.locate.background_frames)
+    background = locate.measure_background(reel.movie, spread)
+    diameter_px = settings.locate.diameter_px or locate.expected_diameter_px(
+        reel.name, cameras, experiment.diameter_mm
+    )
+    found = []
+    for done, picture in enumerate(reel.pictures(), 1):
+        found.append(locate.find_ball(picture, background, diameter_px, settings.locate))
+        if done % CHUNK == 0 or done == len(reel.frames):
+            progress(stage, done, len(reel.frames))
+    return locate.repair(locate.sightings_of(found), settings.locate)
+
+
+def propose_orientations(
+    reel: Reel, sightings: Sightings, texture: Tensor, settings: Settings, progress: Progress
+) -> Candidates:
+    """Propose orientations for every frame in which one camera has the sphere, in the lab frame."""
+    stage = f"{reel.name}: orient"
+    total = len(reel.frames)
+    progress(stage, 0, total)
+    proposer: Proposer = TemplateSearch(texture, locate.size_of(sightings, settings.orient.size_px), settings.orient)
+    proposals = [Proposals.none(sightings.reason[:0])]
+    waiting: list[NDArray[np.float32]] = []
+    done = 0
+    for k, picture in enumerate(reel.pictures()):
+        if sightings.placed[k]:
+            u, v = sightings.centre_px[k].tolist()
+            waiting.append(crop_disk(picture, u, v, float(sightings.radius_px[k]), proposer.size_px))
+        if (k + 1) % CHUNK == 0 or k + 1 == total:
+            placed = sightings.placed[done : k + 1]
+            found = proposer.propose(torch.from_numpy(np.stack(waiting))) if waiting else Proposals.none(())
+            proposals.append(found.spread(placed, sightings.reason[done : k + 1]))
+            waiting, done = [], k + 1
+            progress(stage, done, total)
+    return in_the_lab(Proposals.joined(proposals), reel.camera, sightings.centre_px)
+
+
+def in_the_lab(proposals: Proposals, camera: Camera, centre_px: Tensor) -> Candidates:
+    """Turn orientations from the view frame of each frame into the lab, the perspective removed (ERRATA A1).
+
+    Args:
+        proposals: of N frames.
+        camera: that saw them.
+        centre_px: (N, 2), the outline's centre.
+    """
+    direction_cam = camera.rays(centre_px).direction_lab @ camera.R_cam_lab.mT
+    R_lab_view = camera.R_cam_lab.mT @ R_cam_view(direction_cam)
+    frame = torch.repeat_interleave(torch.arange(len(centre_px)), proposals.offset.diff())
+    return Candidates(
+        offset=proposals.offset,
+        R_lab_body=R_lab_view[frame] @ proposals.R_view_body,
+        score=proposals.score,
+        reason=proposals.reason,
+    )
+
+
+def _camera_track(sightings: Sightings, candidates: Candidates, path: Path) -> CameraTrack:
+    """Collect what one camera saw."""
+    track = CameraTrack.empty(len(sightings))
+    lost = torch.isnan(path.score)
+    reason = [
+        Reason.LOW_SCORE if reason is Reason.OK and lost[k] else reason for k, reason in enumerate(candidates.reason)
+    ]
+    return replace(
+        track,
+        centre_px=sightings.centre_px.numpy(),
+        radius_px=sightings.radius_px.numpy(),
+        outline_rms_px=sightings.outline_rms_px.numpy(),
+        orientation=path.R_lab_body.numpy(),
+        score=path.score.numpy(),
+        xi=path.xi.numpy(),
+        reason=tuple(str(why) for why in reason),
+        candidate_offset=candidates.offset.numpy(),
+        candidate_orientation=candidates.R_lab_body.numpy(),
+        candidate_score=candidates.score.numpy(),
+    )
+
+
+def _trajectory(
+    experiment: Experiment,
+    clock: Tensor,
+    positions: Positions,
+    fused: Fused,
+    moved: Motion,
+    tracks: Mapping[str, CameraTrack],
+) -> Trajectory:
+    """Put everything into the noun that comes out."""
+    empty = Trajectory.empty(
+        clock.numpy(), cameras=tuple(tracks), frame_rate=experiment.frame_rate_hz, experiment=experiment.name
+    )
+    oriented = torch.isfinite(fused.R_lab_body).all(-1).all(-1)
+    variance = fused.sigma_rad.square()[:, None, None] * torch.eye(3, dtype=torch.float64)
+    return replace(
+        empty,
+        valid=(oriented & positions.measured).numpy(),
+        position=positions.position_lab_mm.numpy(),
+        position_cov=positions.covariance_mm2.numpy(),
+        orientation=fused.R_lab_body.numpy(),
+        orientation_cov=variance.numpy(),
+        velocity=moved.velocity_m_s.numpy(),
+        velocity_sigma=moved.velocity_sigma_m_s.numpy(),
+        acceleration=moved.acceleration_m_s2.numpy(),
+        acceleration_sigma=moved.acceleration_sigma_m_s2.numpy(),
+        omega_lab=moved.omega_lab_rad_s.numpy(),
+        omega_lab_sigma=moved.omega_lab_sigma_rad_s.numpy(),
+        omega_body=moved.omega_body_rad_s.numpy(),
+        omega_body_sigma=moved.omega_body_sigma_rad_s.numpy(),
+        alpha_lab=moved.alpha_lab_rad_s2.numpy(),
+        alpha_lab_sigma=moved.alpha_lab_sigma_rad_s2.numpy(),
+        alpha_body=moved.alpha_body_rad_s2.numpy(),
+        alpha_body_sigma=moved.alpha_body_sigma_rad_s2.numpy(),
+        segment=fused.segment.numpy(),
+        flags=(fused.flags | positions.flags).numpy().astype(np.uint32),
+        cameras=dict(tracks),
+    )
+
+
+def _chosen(experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:
+    """Names of the cameras to use, in the experiment's order."""
+    known = list(experiment.movie_paths)
+    wanted = known if cameras is None else list(cameras)
+    unknown = [name for name in wanted if name not in known]
+    if unknown or not wanted:
+        got = ", ".join(unknown) or "none"
+        raise ExperimentError(refusal("cameras", expected=" or ".join(known), got=got, do="name cameras of the experiment"))
+    return [name for name in known if name in wanted]

@@ -1,0 +1,47 @@
+"""Where a result comes from: versions, command, fingerprints of the inputs."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from sphereorient.experiment import Experiment
+
+PACKAGES = ("sphereorient", "torch", "kornia", "numpy", "scipy", "opencv-python-headless", "h5py", "av")
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages whose numbers enter a result."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal digits, read in pieces."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def provenance(experiment: Experiment, cameras: Sequence[str], command: str) -> dict[str, Any]:
+    """Return what the track's attribute `provenance` holds, all of it fit for JSON."""
+    inputs = [experiment.path, experiment.cameras_path, *(experiment.movie_paths[name] for name in cameras)]
+    if experiment.texture_path is not None:
+        inputs.append(experiment.texture_path)
+    return {
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": command,
+        "platform": f"{platform.system()} {platform.machine()}, {sys.implementation.name}",
+        "versions": versions(),
+        "sha256": {path.name: sha256(path) for path in inputs},
+    }

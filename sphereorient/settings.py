@@ -1,0 +1,147 @@
+"""The settings of all rooms in one tree: defaults, files, single overrides, and the commented file."""
+
+from __future__ import annotations
+
+import difflib
+import textwrap
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from sphereorient.assemble.settings import AssembleSettings
+from sphereorient.errors import SettingsError, refusal
+from sphereorient.locate.settings import LocateSettings
+from sphereorient.motion.settings import MotionSettings
+from sphereorient.orient.settings import OrientSettings
+from sphereorient.synth.settings import SynthSettings
+
+Model = TypeVar("Model", bound=BaseModel)
+METHODS = ("paper",)
+DEFAULT_METHOD = "paper"
+
+
+class Settings(BaseModel):
+    """All settings of the paper's method, one branch a room; the defaults are the paper's numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    locate: LocateSettings = Field(default_factory=LocateSettings, description="where is the sphere")
+    orient: OrientSettings = Field(default_factory=OrientSettings, description="where could it point")
+    assemble: AssembleSettings = Field(default_factory=AssembleSettings, description="which candidate is true")
+    motion: MotionSettings = Field(default_factory=MotionSettings, description="velocities and accelerations")
+
+
+def load_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> Settings:
+    """Read settings from a file and single overrides.
+
+    Args:
+        path: YAML as `sphereorient settings` writes it, any keys left out; None: the defaults.
+        overrides: texts `room.key=value`, value in YAML; later ones win.
+
+    Raises:
+        SettingsError: no such file, unknown key (the nearest known one is named), impossible value.
+    """
+    return _load(Settings, path, overrides)
+
+
+def load_synth_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> SynthSettings:
+    """Read the settings of a synthetic experiment from a file and from overrides `key=value`; as `load_settings`."""
+    return _load(SynthSettings, path, overrides)
+
+
+def _load(model: type[Model], path: Path | None, overrides: Iterable[str]) -> Model:
+    tree = {} if path is None else _read(path)
+    for text in overrides:
+        _override(tree, text, depth=2 if model is Settings else 1)
+    try:
+        return model.model_validate(tree)
+    except ValidationError as error:
+        raise SettingsError(_explain(error, str(path) if path else "settings", model)) from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        got = " ".join(str(error).split())
+        raise SettingsError(
+            refusal(f"settings {path}", expected="a YAML file", got=got, do="write one with `sphereorient settings`")
+        ) from None
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise SettingsError(
+            refusal(f"settings {path}", expected="keys and values", got=type(tree).__name__, do="see configs/paper.yaml")
+        )
+    return tree
+
+
+def _override(tree: dict[str, Any], text: str, depth: int) -> None:
+    """Put `key=value` into a tree, the key with a room before it where there are rooms."""
+    key, equals, value = text.partition("=")
+    *rooms, leaf = key.strip().split(".")
+    if not equals or len(rooms) != depth - 1:
+        expected = "room.key=value" if depth == 2 else "key=value"
+        raise SettingsError(refusal(f"--set {text}", expected=expected, got=repr(text), do="give one key and its value"))
+    for room in rooms:
+        branch = tree.setdefault(room, {})
+        tree = branch if isinstance(branch, dict) else {}
+    try:
+        tree[leaf] = yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise SettingsError(
+            refusal(f"--set {text}", expected="a YAML value", got=repr(value), do="quote it for the shell")
+        ) from None
+
+
+def _explain(error: ValidationError, source: str, model: type[BaseModel]) -> str:
+    """Word pydantic's first complaint in one line."""
+    first = error.errors()[0]
+    parts = [str(part) for part in first["loc"]]
+    key = ".".join(parts)
+    if first["type"] == "extra_forbidden":
+        known = _known_keys(model, parts[:-1])
+        near = difflib.get_close_matches(parts[-1], known, 1)
+        do = f"did you mean {'.'.join([*parts[:-1], near[0]])}" if near else f"use one of {', '.join(known)}"
+        return refusal(f"{source}, {key}", expected="a known key", got="an unknown one", do=do)
+    expected = first["msg"].replace("Input should be ", "")
+    return refusal(f"{source}, {key}", expected=expected, got=repr(first["input"]), do="correct the value")
+
+
+def _known_keys(model: Any, parts: list[str]) -> list[str]:
+    for part in parts:
+        model = model.model_fields[part].annotation
+    return list(model.model_fields)
+
+
+def settings_yaml(settings: Settings | None = None) -> str:
+    """Write settings as YAML with each key's description as a comment above it."""
+    settings = settings or Settings()
+    lines = ["# Settings of sphereorient; any key may be left out. --set room.key=value overrides one.", ""]
+    for room, field in Settings.model_fields.items():
+        lines += [f"{room}:  # {field.description}", *_commented(getattr(settings, room), "  "), ""]
+    return "\n".join(lines)
+
+
+def synth_settings_yaml() -> str:
+    """Write the settings of a synthetic experiment as YAML, commented likewise."""
+    head = "# A synthetic experiment; any key may be left out. --set key=value overrides one."
+    return "\n".join([head, "", *_commented(SynthSettings(), ""), ""])
+
+
+def _commented(branch: BaseModel, indent: str) -> list[str]:
+    lines = []
+    for key, field in type(branch).model_fields.items():
+        lines += [f"{indent}# {line}" for line in textwrap.wrap(field.description or "", 110)]
+        lines.append(f"{indent}{key}: {_scalar(getattr(branch, key))}")
+    return lines
+
+
+def _scalar(value: Any) -> str:
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_scalar(item) for item in value) + "]"
+    text: str = yaml.safe_dump(value, default_flow_style=True).strip()
+    return text.removesuffix("...").strip()

@@ -1,0 +1,36 @@
+"""Settings of the room synth."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class SynthSettings(BaseModel):
+    """A synthetic experiment: motion, light, cameras and noise."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = Field("synthetic", description="name of the experiment")
+    frames: int = Field(120, ge=2, description="frames of each movie")
+    frame_rate: float = Field(600.0, gt=0, description="Hz")
+    exposure: float = Field(0.0004, ge=0, description="s; the picture is the mean over it")
+    exposure_samples: int = Field(2, ge=1, description="instants within the exposure that are averaged")
+    diameter_mm: float = Field(18.0, gt=0, description="of the sphere")
+    texture: Literal["blobs", "patches", "dots"] = Field("blobs", description="kind of the random paint")
+    velocity_rms: float = Field(0.25, ge=0, description="m/s per component")
+    omega_rms: float = Field(8.0, ge=0, description="rad/s per component; the paper's sphere: 7.8")
+    correlation_time: float = Field(0.04, gt=0, description="s, of velocity and angular velocity")
+    volume_mm: float = Field(45.0, gt=0, description="the centre stays within about this distance from the origin")
+    image_size: tuple[int, int] = Field((650, 650), description="width and height, px")
+    distance_mm: float = Field(520.0, gt=0, description="of the cameras from the origin")
+    diameter_px: float = Field(78.0, gt=8, description="of the sphere's picture at the origin")
+    white: float = Field(170.0, gt=0, le=255, description="grey level of lit white paint")
+    black: float = Field(20.0, ge=0, le=255, description="grey level of lit black paint")
+    background: float = Field(15.0, ge=0, le=255, description="grey level behind the sphere")
+    ambient: float = Field(0.5, ge=0, le=1, description="share of the light that comes evenly from everywhere")
+    read_noise: float = Field(1.5, ge=0, description="standard deviation of a dark pixel, grey levels")
+    shot_noise: float = Field(0.3, ge=0, description="grey levels per root of grey level")
+    blur_px: float = Field(0.55, ge=0, description="Gaussian blur of the optics, px")
+    seed: int = Field(0, ge=0, description="same seed, same bytes")

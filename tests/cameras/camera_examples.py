@@ -1,0 +1,67 @@
+"""Cameras that the tests of this room share."""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from sphereorient.cameras import PinholeCamera, TsaiCamera
+
+SIZE = (650, 480)
+ROTVEC = (0.3, -0.2, 0.5)
+T_MM = (4.0, -3.0, 520.0)
+
+
+def f64(value: object) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def turned(rotvec: tuple[float, float, float] = ROTVEC) -> Tensor:
+    return torch.from_numpy(Rotation.from_rotvec(rotvec).as_matrix())
+
+
+def tsai(kappa1: float | Tensor = 2.2e-4, **changes: object) -> TsaiCamera:
+    parameters: dict[str, object] = {
+        "image_size": SIZE,
+        "R_cam_lab": turned(),
+        "T_cam_lab_mm": f64(T_MM),
+        "centre_px": f64((331.0, 228.5)),
+        "f_mm": f64(45.0),
+        "pixel_pitch_mm": f64((0.02, 0.021)),
+        "sx": f64(1.03),
+        "kappa1": kappa1,
+    }
+    return TsaiCamera(**(parameters | changes))
+
+
+def pinhole(**changes: object) -> PinholeCamera:
+    parameters: dict[str, object] = {
+        "image_size": SIZE,
+        "R_cam_lab": turned(),
+        "T_cam_lab_mm": f64(T_MM),
+        "centre_px": f64((331.0, 228.5)),
+        "f_px": f64(700.0),
+    }
+    return PinholeCamera(**(parameters | changes))
+
+
+def level(kappa1: float) -> TsaiCamera:
+    """A camera whose numbers can be worked by hand: f = 10 mm, pixels of 1 mm, axis at pixel (20, 20)."""
+    return TsaiCamera(
+        image_size=(41, 41),
+        R_cam_lab=torch.eye(3, dtype=torch.float64),
+        T_cam_lab_mm=torch.zeros(3, dtype=torch.float64),
+        centre_px=f64((20.0, 20.0)),
+        f_mm=f64(10.0),
+        pixel_pitch_mm=f64((1.0, 1.0)),
+        sx=f64(1.0),
+        kappa1=f64(kappa1),
+    )
+
+
+def whole_picture(size: tuple[int, int] = SIZE, steps: int = 9) -> Tensor:
+    """Pixels over the whole picture, its corners (-0.5 .. W - 0.5) among them, (steps^2, 2)."""
+    u = torch.linspace(-0.5, size[0] - 0.5, steps, dtype=torch.float64)
+    v = torch.linspace(-0.5, size[1] - 0.5, steps, dtype=torch.float64)
+    return torch.cartesian_prod(u, v)

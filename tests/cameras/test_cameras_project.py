@@ -1,0 +1,175 @@
+"""What holds for every camera: pictures of points, lines of sight, and their being inverse."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from camera_examples import ROTVEC, T_MM, f64, pinhole, tsai, whole_picture
+from conftest import assert_close
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sphereorient.cameras import Camera, TsaiCamera
+from sphereorient.errors import ShapeError
+
+CAMERAS = {"tsai": tsai(), "tsai_barrel": tsai(-3e-4), "pinhole": pinhole()}
+
+
+@pytest.fixture(params=CAMERAS.values(), ids=CAMERAS)
+def camera(request: pytest.FixtureRequest) -> Camera:
+    return request.param
+
+
+def points(rng: torch.Generator, *shape: int) -> torch.Tensor:
+    return (torch.rand(*shape, 3, generator=rng, dtype=torch.float64) - 0.5) * 150
+
+
+def oracle(camera: Camera, x_lab_mm: torch.Tensor) -> torch.Tensor:
+    K = np.eye(3)
+    K[[0, 1], [0, 1]] = camera.focal_px.numpy()
+    K[:2, 2] = camera.centre_px.numpy()
+    uv, _ = cv2.projectPoints(x_lab_mm.numpy(), np.array(ROTVEC), np.array(T_MM), K, None)
+    return torch.from_numpy(uv[:, 0])
+
+
+@pytest.mark.parametrize("camera", [tsai(0.0), pinhole()], ids=["tsai", "pinhole"])
+def test_without_distortion_points_appear_where_opencv_puts_them(camera, rng):
+    x_lab_mm = points(rng, 200)
+    assert_close(camera.project(x_lab_mm), oracle(camera, x_lab_mm), atol=1e-9)
+
+
+def test_a_ray_goes_through_every_point_of_its_pixel(camera, rng):
+    x_lab_mm = points(rng, 200)
+    rays = camera.rays(camera.project(x_lab_mm))
+    along = ((x_lab_mm - rays.origin_lab_mm) * rays.direction_lab).sum(-1, keepdim=True)
+    assert (along > 0).all()
+    assert_close(rays.origin_lab_mm + along * rays.direction_lab, x_lab_mm, atol=1e-9)
+    assert_close(rays.direction_lab.norm(dim=-1), torch.ones(200, dtype=torch.float64))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    kappa1=st.floats(-5e-3, 5e-3),
+    sx=st.floats(0.8, 1.2),
+    f_mm=st.floats(5, 200),
+    centre=st.tuples(st.floats(200, 450), st.floats(150, 330)),
+    distance_mm=st.floats(50, 5000),
+)
+def test_project_undoes_rays_over_the_whole_picture(kappa1, sx, f_mm, centre, distance_mm):
+    # The farthest corner lies up to 11.6 mm off the axis: -1 / (3 * 11.6^2) = -2.5e-3 is the fold; stay inside it.
+    camera = tsai(max(kappa1, -1.8e-3), sx=f64(sx), f_mm=f64(f_mm), centre_px=f64(centre))
+    uv_px = whole_picture()
+    rays = camera.rays(uv_px)
+    x_lab_mm = rays.origin_lab_mm + distance_mm * rays.direction_lab
+    assert_close(camera.project(x_lab_mm), uv_px, atol=1e-9)
+
+
+def test_distort_and_undistort_are_inverse_over_the_whole_picture(camera):
+    uv_px = whole_picture()
+    assert_close(camera.distort(camera.undistort(uv_px)), uv_px, atol=1e-9)
+    assert_close(camera.undistort(camera.distort(uv_px)), uv_px, atol=1e-9)
+
+
+def test_both_float_types_are_kept(camera, rng, dtype):
+    x_lab_mm = points(rng, 50)
+    uv_px = camera.project(x_lab_mm.to(dtype))
+    rays = camera.rays(uv_px)
+    assert uv_px.dtype == rays.origin_lab_mm.dtype == rays.direction_lab.dtype == dtype
+    atol = 1e-10 if dtype == torch.float64 else 5e-4  # float32 holds a distance of 520 mm to 3e-5 mm
+    assert_close(uv_px.double(), camera.project(x_lab_mm), atol=atol)
+
+
+def test_a_batch_is_the_stack_of_its_singles(camera, rng, dtype, batch):
+    x_lab_mm = points(rng, *batch).to(dtype)
+    uv_px = camera.project(x_lab_mm)
+    rays = camera.rays(uv_px)
+    assert uv_px.shape == (*batch, 2)
+    assert rays.origin_lab_mm.shape == rays.direction_lab.shape == (*batch, 3)
+    for point, uv, direction in zip(
+        x_lab_mm.reshape(-1, 3), uv_px.reshape(-1, 2), rays.direction_lab.reshape(-1, 3), strict=True
+    ):
+        assert_close(camera.project(point), uv, atol=1e-3 if dtype == torch.float32 else 1e-10)
+        assert_close(camera.rays(uv).direction_lab, direction, atol=1e-6 if dtype == torch.float32 else 1e-12)
+
+
+def test_gradients_with_respect_to_points_and_pixels_are_right(camera, rng):
+    x_lab_mm = points(rng, 5).requires_grad_()
+    assert torch.autograd.gradcheck(camera.project, x_lab_mm)
+    uv_px = camera.project(x_lab_mm).detach().requires_grad_()
+    assert torch.autograd.gradcheck(lambda uv: camera.rays(uv).direction_lab, uv_px)
+
+
+@pytest.mark.parametrize("name", ["centre_px", "f_mm", "pixel_pitch_mm", "sx", "kappa1", "T_cam_lab_mm", "R_cam_lab"])
+def test_gradients_with_respect_to_parameters_are_right(name, rng):
+    x_lab_mm = points(rng, 5)
+    start = getattr(tsai(), name).clone().requires_grad_()
+
+    def project(parameter: torch.Tensor) -> torch.Tensor:
+        return tsai(**{name: parameter}).project(x_lab_mm)
+
+    assert torch.autograd.gradcheck(project, start)
+    (gradient,) = torch.autograd.grad(project(start).square().sum(), start)
+    assert gradient.abs().max() > 0
+
+
+def test_a_point_on_the_axis_has_finite_gradients_even_of_second_order(dtype):
+    camera = tsai(1e-3)
+    on_axis = camera.rays(camera.centre_px).direction_lab * 300 + camera.rays(camera.centre_px).origin_lab_mm
+    x_lab_mm = on_axis.to(dtype).requires_grad_()
+    (first,) = torch.autograd.grad(camera.project(x_lab_mm).sum(), x_lab_mm, create_graph=True)
+    (second,) = torch.autograd.grad(first.sum(), x_lab_mm)
+    assert torch.isfinite(first).all()
+    assert torch.isfinite(second).all()
+
+
+def test_a_point_behind_the_camera_has_no_picture_and_no_gradient(camera):
+    centre = camera.rays(f64((0.0, 0.0))).origin_lab_mm
+    axis_lab = camera.R_cam_lab[2]
+    x_lab_mm = torch.stack([centre - 100 * axis_lab, centre, centre + 100 * axis_lab]).requires_grad_()
+    uv_px = camera.project(x_lab_mm)
+    assert torch.isnan(uv_px).all(-1).tolist() == [True, True, False]
+    (gradient,) = torch.autograd.grad(torch.nan_to_num(uv_px).sum(), x_lab_mm)
+    assert torch.isfinite(gradient).all()
+    assert (gradient[:2] == 0).all()
+
+
+def test_R_cam_lab_takes_lab_axes_to_camera_axes_and_v_counts_downwards():
+    # A camera that looks along lab +y with lab z up: camera x = lab x, camera y = -lab z, camera z = lab y.
+    R_cam_lab = f64([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    camera = pinhole(R_cam_lab=R_cam_lab, T_cam_lab_mm=f64((0.0, 0.0, 100.0)), centre_px=f64((300.0, 200.0)))
+    assert_close(camera.project(f64((0.0, 0.0, 0.0))), f64((300.0, 200.0)))
+    assert_close(camera.project(f64((1.0, 0.0, 0.0))), f64((307.0, 200.0)))  # lab x: to the right, 700 px / 100
+    assert_close(camera.project(f64((0.0, 0.0, 1.0))), f64((300.0, 193.0)))  # lab up: upwards, smaller v
+    assert_close(camera.rays(f64((300.0, 200.0))).origin_lab_mm, f64((0.0, -100.0, 0.0)))
+    turned_wrongly = pinhole(
+        R_cam_lab=R_cam_lab.mT, T_cam_lab_mm=f64((0.0, 0.0, 100.0)), centre_px=f64((300.0, 200.0))
+    )
+    assert turned_wrongly.project(f64((0.0, 0.0, 1.0)))[1] > 200
+
+
+def test_parameters_given_as_plain_numbers_keep_all_their_digits():
+    camera = TsaiCamera(
+        image_size=(650, 480),
+        R_cam_lab=[[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        T_cam_lab_mm=[0.1, 0.2, 0.3],
+        centre_px=(324.1, 239.7),
+        f_mm=45.1,
+        pixel_pitch_mm=(0.02, 0.021),
+        sx=1.03,
+        kappa1=2.2e-4,
+    )
+    assert camera.f_mm.item() == 45.1
+    assert camera.T_cam_lab_mm.tolist() == [0.1, 0.2, 0.3]
+
+
+@pytest.mark.parametrize("method", ["project", "rays", "distort", "undistort"])
+def test_another_last_axis_is_refused(camera, method):
+    with pytest.raises(ShapeError, match=r"expected shape \(\.\.\., [23]\), got \(5, 4\)"):
+        getattr(camera, method)(torch.zeros(5, 4))
+
+
+def test_whole_numbers_are_refused_because_the_camera_would_be_rounded(camera):
+    with pytest.raises(ShapeError, match="floating-point"):
+        camera.project(torch.zeros(3, dtype=torch.int64))
