@@ -172,12 +172,15 @@ def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> d
         Name -> movie; close them when done.
 
     Raises:
+        ExperimentError: a name that the experiment does not have.
         MovieError: a movie is missing or unreadable, of another size than its camera's picture, too short for
             `frames`, or, without `frames`, of another length than the other one.
     """
     movies: dict[str, Movie] = {}
     try:
         for name in experiment.movie_paths if names is None else names:
+            if name not in experiment.movie_paths:
+                raise ExperimentError(refuse_unknown(name, experiment.movie_paths, f"{experiment.path}, movies"))
             movies[name] = open_movie(experiment.movie_paths[name])
             _check_size(experiment, name, movies[name])
         _check_lengths(experiment, movies)

@@ -42,4 +42,5 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    return torch.linalg.cross(*torch.broadcast_tensors(a, b))  # type: ignore[no-untyped-call]
+    product: Tensor = torch.linalg.cross(*torch.broadcast_tensors(a, b))  # type: ignore[no-untyped-call]
+    return product

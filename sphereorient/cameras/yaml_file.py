@@ -116,7 +116,8 @@ def _umask() -> int:
 
 
 def _worded(fault: ValidationError, model: type[BaseModel], where: str) -> str:
-    first = fault.errors(include_url=False)[0]
+    # An unknown key first: it is often a missing one, mistyped.
+    first = min(fault.errors(include_url=False), key=lambda error: error["type"] != "extra_forbidden")
     place, kind, message = first["loc"], first["type"], first["msg"]
     name = ", ".join([where, ".".join(map(str, place))]) if place else where
     if kind == "extra_forbidden":

@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.errors import ExperimentError, refusal
 from sphereorient.movies import Movie
 
-# A pixel's scatter is read off at this share of its frames: things that turn and glitter move it in more of them, the
-# passing ball in fewer. For Gaussian noise that is so many standard deviations.
-QUIET = 0.8
-QUIET_SIGMAS = 1.2816
+# A pixel's scatter is read off at this share of its frames, and divided by what that is for Gaussian noise in standard
+# deviations. About a background taken from the movie: things that turn and glitter move a pixel in more frames than
+# that, the passing ball in fewer. About a picture of the scene without the ball: also where the ball stays for most
+# of the movie, a tenth of the frames shows the scene.
+MEASURED_SHARE, MEASURED_SIGMAS = 0.8, 1.2816
+GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,14 +51,38 @@ def spread_frames(frames: range, count: int) -> list[int]:
     return [frames[int(i)] for i in np.linspace(0, len(frames) - 1, count).round()]
 
 
-def measure_background(movie: Movie, frames: Sequence[int]) -> Background:
+def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Read a picture of the scene without the ball, (H, W), grey levels.
+
+    Raises:
+        ExperimentError: the file is missing, no picture, or of another size than the movie's frames.
+    """
+    name, do = f"background {path}", "save a frame without the ball as PNG, in the movie's own grey levels"
+    picture = None
+    if path.is_file():
+        data = np.fromfile(path, dtype=np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if data.size else None
+    if picture is None:
+        got = "a file that is none" if path.exists() else "no such file"
+        raise ExperimentError(refusal(name, expected="a picture", got=got, do=do))
+    if picture.shape != frame_shape:
+        expected, got = (f"{shape[1]} x {shape[0]} px as the movie" for shape in (frame_shape, picture.shape))
+        raise ExperimentError(refusal(name, expected=expected, got=got.removesuffix(" as the movie"), do=do))
+    return np.asarray(picture, np.float32)
+
+
+def measure_background(
+    movie: Movie, frames: Sequence[int], empty: NDArray[np.float32] | None = None
+) -> Background:
     """Average frames of a movie and measure how much each pixel scatters without the ball.
 
-    Turning, glittering things scatter in every frame and the passing ball only in some: a median tells them apart.
+    Turning, glittering things scatter in every frame and the passing ball only in some: a quantile tells them apart.
 
     Args:
         movie: the movie.
         frames: numbers of the frames, in the movie's own counting; all are held in memory at once.
+        empty: (H, W), the scene without the ball, where there is such a picture: for short movies, or a ball that
+            hardly moves; only the noise is then measured.
 
     Returns:
         The background. The paper's plain mean keeps 1/n of the ball's brightness wherever it passed, as much as black
@@ -63,14 +92,16 @@ def measure_background(movie: Movie, frames: Sequence[int]) -> Background:
     pictures = movie.sample(frames)
     full_scale = float(np.iinfo(movie.dtype).max)
     rounding = full_scale / 255 / 12**0.5  # scatters by this much also where all frames are equal
+    share, sigmas = (MEASURED_SHARE, MEASURED_SIGMAS) if empty is None else (GIVEN_SHARE, GIVEN_SIGMAS)
     mean = np.empty(movie.frame_shape, np.float32)
     noise = np.empty_like(mean)
     for row in range(0, len(mean), 16):  # by strips: a float copy of all frames would be four times the frames
-        strip = pictures[:, row : row + 16].astype(np.float32)
-        middle = np.median(strip, axis=0)
+        these = np.s_[row : row + 16]
+        strip = pictures[:, these].astype(np.float32)
+        middle = np.median(strip, axis=0) if empty is None else empty[these]
         scatter = np.abs(strip - middle)
-        sigma = np.maximum(np.quantile(scatter, QUIET, axis=0) / QUIET_SIGMAS, rounding)
+        sigma = np.maximum(np.quantile(scatter, share, axis=0) / sigmas, rounding)
         usual = scatter <= 4 * sigma
-        mean[row : row + 16] = np.where(usual, strip, 0).sum(0) / usual.sum(0)
-        noise[row : row + 16] = sigma
+        mean[these] = middle if empty is not None else np.where(usual, strip, 0).sum(0) / usual.sum(0)
+        noise[these] = sigma
     return Background(mean=mean, noise=noise, full_scale=full_scale)

@@ -99,8 +99,8 @@ def gap_aware_stencil(
     gauss, step = _gaussian(sigma_frames, half, like)
     kept = gauss * paired(there, segment, half)
     share = kept.sum(-1) / gauss.sum()
-    # half a millionth: the sums of equal terms may differ in their last digits
-    enough = (share >= min_share - 5e-7) & (_determinant(kept, step, order) > 0)
+    # sums of equal terms may differ in their last digits, in float32 by 1e-6
+    enough = (share >= min_share - 1e-5) & (_determinant(kept, step, order) > 0)
     stencil = _with_exact_moments(torch.where(enough[..., None], kept, gauss), step, order)
     return torch.where(enough[..., None], stencil, torch.nan)
 

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.motion.angular_velocity import (
-    check_separations,
     omega_from_orientations,
     omega_stencil,
     to_body,
@@ -75,13 +74,11 @@ def measure_motion(
 
     Raises:
         ShapeError: wrong last axes, or unequal numbers of frames.
-        SettingsError: separations that are none.
 
     Source: the paper, section III; frames by ERRATA E4 and E6.
     """
     check_tail("position_mm", position_mm, 3)
     check_tail("R_lab_body", R_lab_body, 3, 3)
-    check_separations(settings.separations)
     if not position_mm.shape[:-1] == R_lab_body.shape[:-2] == segment.shape or segment.dim() == 0:
         shapes = ", ".join(str(tuple(x.shape)) for x in (position_mm, R_lab_body, segment))
         do = "give all three the same frames"

@@ -109,6 +109,22 @@ class VideoMovie:
 
     def _run(self, container: av.container.InputContainer, numbers: list[int]) -> Iterator[Grey]:
         key = self._seek(container, numbers[0])
+        pictures = self._pictures(container, numbers, key)
+        try:
+            first = next(pictures)
+        except MovieError:
+            if key == 0:
+                raise
+            # Frames beside a key frame may lean on frames before it (open groups of pictures): only the way from
+            # the start tells whether the fault is the file's or the seek's.
+            with self._container() as fresh:
+                yield from self._pictures(fresh, numbers, 0)
+            return
+        yield first
+        yield from pictures
+
+    def _pictures(self, container: av.container.InputContainer, numbers: list[int], key: int) -> Iterator[Grey]:
+        """Yield the pictures of increasing frame numbers, decoding from frame `key`, where the container stands."""
         waiting = iter(numbers)
         wanted = next(waiting, None)
         for number, frame in self._numbered(container, self._index.number_of, key):

@@ -1,0 +1,44 @@
+"""Rotations and grids of rotations; knows nothing of pictures.
+
+Rotations are (..., 3, 3) matrices that act on columns; rotation vectors (..., 3) are axis times angle in rad, by the
+right-hand rule. No function checks that a matrix is a rotation; `nearest_rotation` makes one.
+"""
+
+from __future__ import annotations
+
+from sphereorient.so3.distance import angle, geodesic_distance
+from sphereorient.so3.exp import exp, hat, log, vee
+from sphereorient.so3.lattman import from_lattman, lattman_grid, lattman_steps, to_lattman
+from sphereorient.so3.local_grid import local_grid
+from sphereorient.so3.mean import weighted_mean
+from sphereorient.so3.project import nearest_rotation
+from sphereorient.so3.random import random_rotations
+from sphereorient.so3.tait_bryan import (
+    from_tait_bryan,
+    rate_matrix_body,
+    rate_matrix_lab,
+    second_triplet,
+    to_tait_bryan,
+)
+
+__all__ = [
+    "angle",
+    "exp",
+    "from_lattman",
+    "from_tait_bryan",
+    "geodesic_distance",
+    "hat",
+    "lattman_grid",
+    "lattman_steps",
+    "local_grid",
+    "log",
+    "nearest_rotation",
+    "random_rotations",
+    "rate_matrix_body",
+    "rate_matrix_lab",
+    "second_triplet",
+    "to_lattman",
+    "to_tait_bryan",
+    "vee",
+    "weighted_mean",
+]

@@ -143,9 +143,7 @@ def test_R_cam_lab_takes_lab_axes_to_camera_axes_and_v_counts_downwards():
     assert_close(camera.project(f64((1.0, 0.0, 0.0))), f64((307.0, 200.0)))  # lab x: to the right, 700 px / 100
     assert_close(camera.project(f64((0.0, 0.0, 1.0))), f64((300.0, 193.0)))  # lab up: upwards, smaller v
     assert_close(camera.rays(f64((300.0, 200.0))).origin_lab_mm, f64((0.0, -100.0, 0.0)))
-    turned_wrongly = pinhole(
-        R_cam_lab=R_cam_lab.mT, T_cam_lab_mm=f64((0.0, 0.0, 100.0)), centre_px=f64((300.0, 200.0))
-    )
+    turned_wrongly = pinhole(R_cam_lab=R_cam_lab.mT, T_cam_lab_mm=f64((0.0, 0.0, 100.0)), centre_px=f64((300.0, 200.0)))
     assert turned_wrongly.project(f64((0.0, 0.0, 1.0)))[1] > 200
 
 

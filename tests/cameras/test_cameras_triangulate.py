@@ -108,5 +108,5 @@ def test_one_ray_meets_many(rng):
 
 def test_another_shape_is_refused():
     bad = Rays(origin_lab_mm=torch.zeros(4, 2), direction_lab=torch.zeros(4, 2))
-    with pytest.raises(ShapeError, match="rays_a.origin_lab_mm"):
+    with pytest.raises(ShapeError, match="rays_a"):
         triangulate(bad, bad)

@@ -98,7 +98,7 @@ def test_a_distortion_that_folds_inside_the_picture_is_refused():
     camera = tsai(fold * 0.99)
     uv_px = whole_picture()
     assert_close(camera.distort(camera.undistort(uv_px)), uv_px, atol=1e-9)
-    with pytest.raises(CameraError, match="kappa1: expected above .* corner folds over"):
+    with pytest.raises(CameraError, match=r"kappa1: expected above .* corner folds over"):
         tsai(fold * 1.01)
 
 

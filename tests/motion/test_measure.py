@@ -204,7 +204,8 @@ def test_unequal_numbers_of_frames_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"separations": (0, 1)}, {"min_share": 0.0}, {"velocity_sigma_frames": -1.0}, {"a": 1}]
+    "wrong",
+    [{"separations": (0, 1)}, {"separations": (1, 2)}, {"min_share": 0.0}, {"velocity_sigma_frames": -1.0}, {"a": 1}],
 )
 def test_impossible_settings_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):

@@ -1,0 +1,169 @@
+"""The picture that comes with a track: what was seen, what was measured, how far it is from the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from sphereorient import so3
+from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.evaluate import Score
+from sphereorient.experiment import Experiment, movie_span, open_movies
+from sphereorient.sphere import SphereRenderer, load_texture, orthographic_view, reduced_texture
+from sphereorient.trajectory import Trajectory
+
+# Okabe and Ito's colours: told apart by colour-blind readers, and in grey print.
+AXIS_COLOURS = ("#D55E00", "#009E73", "#0072B2")
+TRUTH_COLOUR = "#444444"
+CROP_PX = 96
+
+
+def demo_figure(track: Trajectory, experiment: Experiment, path: Path, score: Score | None = None) -> None:
+    """Draw frames with the re-rendered sphere, outline and axes, the track with its angles, and the error.
+
+    Args:
+        track: what was measured.
+        experiment: what it was measured from; movies and texture are opened.
+        path: of the PNG or PDF to write.
+        score: errors against the truth, where it is known.
+    """
+    figure = Figure(figsize=(12, 10), layout="constrained")
+    FigureCanvasAgg(figure)
+    top, bottom = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
+    _frames_part(top, track, experiment)
+    _curves_part(bottom, track, score)
+    figure.savefig(path, dpi=110)
+
+
+def _frames_part(part: Any, track: Trajectory, experiment: Experiment) -> None:
+    """Per camera two rows: the crop with outline and body axes, and the sphere re-rendered at the measured attitude."""
+    assert experiment.texture_path is not None  # a track cannot come from an experiment without one
+    chosen = _spread_valid(track, 6)
+    names = list(track.cameras)
+    axes = part.subplots(2 * len(names), len(chosen), squeeze=False)
+    movies = open_movies(experiment, names)
+    texture = load_texture(experiment.texture_path)
+    first = round(track.time[0] * track.frame_rate)
+    for row, name in enumerate(names):
+        shift = movie_span(experiment, name, range(first, first + len(track)))[0]
+        pictures = movies[name].sample([shift + k for k in chosen])
+        for column, (k, picture) in enumerate(zip(chosen, pictures, strict=True)):
+            _draw_sighting(axes[2 * row, column], picture, track, experiment.cameras[name], name, k)
+            _draw_render(axes[2 * row + 1, column], texture, track, experiment.cameras[name], name, k)
+        axes[2 * row, 0].set_ylabel(f"{name}\nfilmed")
+        axes[2 * row + 1, 0].set_ylabel(f"{name}\nre-rendered")
+        movies[name].close()
+    for column, k in enumerate(chosen):
+        axes[0, column].set_title(f"t = {1e3 * track.time[k]:.1f} ms", fontsize=9)
+    part.suptitle("Body axes x, y, z (solid: towards the camera) and outline, as measured", fontsize=10)
+
+
+def _spread_valid(track: Trajectory, count: int) -> list[int]:
+    valid = np.flatnonzero(track.valid)
+    if not len(valid):
+        valid = np.arange(len(track))
+    return [int(valid[int(i)]) for i in np.linspace(0, len(valid) - 1, min(count, len(valid)))]
+
+
+def _draw_sighting(
+    axes: Any, picture: NDArray[Any], track: Trajectory, camera: Camera, name: str, k: int
+) -> None:
+    seen = track.cameras[name]
+    u, v = seen.centre_px[k]
+    radius = seen.radius_px[k]
+    reach = 1.25 * radius if np.isfinite(radius) else CROP_PX / 2
+    axes.imshow(picture, cmap="gray", vmin=0, vmax=np.percentile(picture, 99.8), interpolation="nearest")
+    angle = np.linspace(0, 2 * np.pi, 100)
+    axes.plot(u + radius * np.cos(angle), v + radius * np.sin(angle), color="#F0E442", linewidth=1)
+    R_cam_body = camera.R_cam_lab.numpy() @ track.orientation[k]
+    for label, colour, tip in zip("xyz", AXIS_COLOURS, R_cam_body.T, strict=True):
+        style = "-" if tip[2] < 0 else ":"
+        axes.plot([u, u + radius * tip[0]], [v, v + radius * tip[1]], style, color=colour, linewidth=1.6)
+        axes.text(u + 1.12 * radius * tip[0], v + 1.12 * radius * tip[1], label, color=colour, fontsize=8)
+    axes.set(xlim=(u - reach, u + reach), ylim=(v + reach, v - reach))
+    _bare(axes)
+
+
+def _draw_render(axes: Any, texture: torch.Tensor, track: Trajectory, camera: Camera, name: str, k: int) -> None:
+    seen = track.cameras[name]
+    size = max(16, round(2 * float(np.nan_to_num(seen.radius_px[k], nan=40.0))))
+    renderer = SphereRenderer(reduced_texture(texture, size), orthographic_view(size))
+    ray_lab = camera.rays(torch.from_numpy(seen.centre_px[k])).direction_lab
+    R_view_cam = R_cam_view(camera.R_cam_lab @ ray_lab).mT
+    R_view_body = R_view_cam @ camera.R_cam_lab @ torch.from_numpy(track.orientation[k])
+    if torch.isfinite(R_view_body).all():
+        picture = renderer(R_view_body.float()).numpy()
+        half = size / 2
+        axes.imshow(picture, cmap="gray", vmin=0, vmax=1.2, extent=(-half, half, half, -half), interpolation="nearest")
+        axes.set(xlim=(-1.25 * half, 1.25 * half), ylim=(1.25 * half, -1.25 * half))
+    axes.set_facecolor("black")
+    _bare(axes)
+
+
+def _bare(axes: Any) -> None:
+    axes.set(xticks=[], yticks=[], aspect="equal")
+
+
+def _curves_part(part: Any, track: Trajectory, score: Score | None) -> None:
+    """The track in six dimensions, omega, and the errors."""
+    axes = part.subplots(2, 2, sharex=True)
+    time_ms = 1e3 * track.time
+    _curves(axes[0, 0], time_ms, track.position, "position, lab (mm)", ("x", "y", "z"))
+    theta = np.rad2deg(so3.to_tait_bryan(torch.from_numpy(track.orientation)).numpy())
+    _curves(axes[0, 1], time_ms, _cut_wraps(theta), "angles (degrees)", (r"$\theta_x$", r"$\theta_y$", r"$\theta_z$"))
+    axes[0, 1].set(ylim=(-190, 190), yticks=range(-180, 181, 90))
+    _curves(axes[1, 0], time_ms, track.omega_lab, r"$\omega$, lab (rad/s)", ("x", "y", "z"))
+    if score is None:
+        _cameras_apart(axes[1, 1], time_ms, track)
+    else:
+        _errors(axes[1, 1], time_ms, score)
+    for ax in axes[1]:
+        ax.set_xlabel("time (ms)")
+
+
+def _curves(axes: Any, time_ms: NDArray[Any], values: NDArray[Any], label: str, names: Sequence[str]) -> None:
+    for name, colour, column in zip(names, AXIS_COLOURS, values.T, strict=True):
+        axes.plot(time_ms, column, ".-", color=colour, markersize=3, linewidth=1, label=name)
+    axes.set_ylabel(label)
+    axes.grid(alpha=0.3)
+    axes.legend(ncols=3, fontsize=8, loc="best")
+
+
+def _cut_wraps(theta_deg: NDArray[Any]) -> NDArray[Any]:
+    """Put NaN where an angle jumps from +180 to -180, so that no line crosses the panel."""
+    out = theta_deg.copy()
+    jump = np.abs(np.diff(theta_deg, axis=0)) > 180
+    out[1:][jump] = np.nan
+    return out
+
+
+def _errors(axes: Any, time_ms: NDArray[Any], score: Score) -> None:
+    for (name, values), colour in zip(score.camera_orientation_deg.items(), ("#56B4E9", "#E69F00"), strict=False):
+        axes.plot(time_ms, values, ".", color=colour, markersize=4, label=f"{name} alone")
+    axes.plot(time_ms, score.orientation_deg, "-", color="black", linewidth=1.3, label="measured")
+    median = score.percentiles_deg()[0]
+    axes.axhline(median, color=TRUTH_COLOUR, linestyle="--", linewidth=1, label=f"median {median:.2f}°")
+    axes.set_ylabel("orientation error (degrees)")
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, ncols=2, loc="best")
+
+
+def _cameras_apart(axes: Any, time_ms: NDArray[Any], track: Trajectory) -> None:
+    """Without a truth: how far apart the two cameras are, or the score of the one."""
+    seen = list(track.cameras.values())
+    if len(seen) == 2:
+        a, b = (torch.from_numpy(each.orientation) for each in seen)
+        axes.plot(time_ms, np.rad2deg(so3.geodesic_distance(a, b).numpy()), ".-", color="black", markersize=3)
+        axes.set_ylabel("distance of the cameras' orientations (degrees)")
+    else:
+        axes.plot(time_ms, seen[0].score, ".-", color="black", markersize=3)
+        axes.set_ylabel("quality T")
+    axes.grid(alpha=0.3)

@@ -1,0 +1,54 @@
+"""How far a rotation turns, and how far two orientations are apart."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sphereorient.errors import check_tail
+from sphereorient.so3.exp import vee
+
+
+def angle(R: Tensor) -> Tensor:
+    """Return the angle by which a rotation turns.
+
+    Args:
+        R: (..., 3, 3), rotations, not checked.
+
+    Returns:
+        (...), rad, 0 .. pi, with an error of a few roundings of pi everywhere; the gradient at exactly 0 and pi,
+        where there is none, is set to 0.
+
+    Raises:
+        ShapeError: the last axes are not (3, 3).
+
+    Source: ERRATA A3; acos((Tr - 1)/2), the paper's, loses half the digits near 0 and pi.
+    """
+    check_tail("R", R, 3, 3)
+    cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    # vector_norm has gradient 0 at 0, which is the branch at 0 and pi; atan2 itself is smooth at both.
+    return torch.atan2(torch.linalg.vector_norm(vee(R), dim=-1), cosine)
+
+
+def geodesic_distance(A: Tensor, B: Tensor) -> Tensor:
+    """Return the angle of the smallest rotation between two orientations, angle(A^T B).
+
+    Args:
+        A: (..., 3, 3), rotations, not checked.
+        B: (..., 3, 3), rotations of the same two frames; broadcasts against A.
+
+    Returns:
+        (...), rad, 0 .. pi; exactly 0 for equal inputs; gradient as `angle`.
+
+    Raises:
+        ShapeError: the last axes are not (3, 3).
+
+    Source: the paper's d(A, B), worked out by ERRATA A3; the cosine from Tr((A-B)(A-B)^T) = 4 (1 - cos d).
+    """
+    check_tail("A", A, 3, 3)
+    check_tail("B", B, 3, 3)
+    D = B - A
+    # A^T A is symmetric, so A^T B and A^T (B - A) have the same vee: with rows a, d it is half the sum of d × a.
+    # The difference keeps its digits where A and B are close; the product A^T B would not.
+    sine = torch.linalg.vector_norm(torch.linalg.cross(D, A).sum(-2), dim=-1) / 2
+    return torch.atan2(sine, 1 - D.square().sum((-2, -1)) / 4)

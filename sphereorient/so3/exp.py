@@ -1,0 +1,81 @@
+"""Rotation vectors and rotation matrices, vectors and cross product matrices."""
+
+from __future__ import annotations
+
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
+from torch import Tensor
+
+from sphereorient.errors import check_tail
+
+
+def exp(rotvec: Tensor) -> Tensor:
+    """Return the rotation about an axis by an angle.
+
+    Args:
+        rotvec: (..., 3), axis times angle, rad, any length; the axis by the right-hand rule.
+
+    Returns:
+        (..., 3, 3), the rotation; its columns are the turned unit vectors, in the frame of `rotvec`.
+
+    Raises:
+        ShapeError: the last axis is not 3.
+
+    Source: Rodrigues' formula, as the paper prints it.
+    """
+    check_tail("rotvec", rotvec, 3)
+    return axis_angle_to_rotation_matrix(rotvec)
+
+
+def log(R: Tensor) -> Tensor:
+    """Return the rotation vector of a rotation, the shortest one.
+
+    Args:
+        R: (..., 3, 3), rotations; not checked, and a reflection gives a value without meaning.
+
+    Returns:
+        (..., 3), axis times angle, rad, of length <= pi up to rounding. A turn by exactly pi has two; one of them
+        comes, always the same. Its gradient is finite there too.
+
+    Raises:
+        ShapeError: the last axes are not (3, 3).
+
+    Source: textbook; through the quaternion's largest component, so it keeps all digits at 0 and at pi.
+    """
+    check_tail("R", R, 3, 3)
+    return rotation_matrix_to_axis_angle(R)
+
+
+def hat(v: Tensor) -> Tensor:
+    """Return the matrix whose product with a vector x is the cross product v × x.
+
+    Args:
+        v: (..., 3), any unit, any frame.
+
+    Returns:
+        (..., 3, 3), antisymmetric, unit and frame of `v`.
+
+    Raises:
+        ShapeError: the last axis is not 3.
+    """
+    check_tail("v", v, 3)
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*v.shape[:-1], 3, 3)
+
+
+def vee(M: Tensor) -> Tensor:
+    """Return the vector of a matrix' antisymmetric part, the inverse of `hat`.
+
+    Args:
+        M: (..., 3, 3), any unit, any frame; of a rotation the vector is axis times sine of the angle.
+
+    Returns:
+        (..., 3), unit and frame of `M`.
+
+    Raises:
+        ShapeError: the last axes are not (3, 3).
+    """
+    check_tail("M", M, 3, 3)
+    twice = M - M.mT
+    return torch.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], -1) / 2

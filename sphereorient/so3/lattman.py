@@ -1,0 +1,112 @@
+"""Lattman's angles, in which the metric of SO(3) is diagonal, and his grid over all rotations."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from sphereorient.errors import SettingsError, check_tail, refusal
+from sphereorient.so3.tait_bryan import from_tait_bryan
+
+# A count that is a whole number by geometry must not be rounded up for the last bits of a sine.
+ROUNDING = 1e-9
+
+
+def to_lattman(theta: Tensor) -> Tensor:
+    """Return the Lattman angles of a triplet of Tait-Bryan angles.
+
+    Args:
+        theta: (..., 3), theta_x, theta_y, theta_z, rad.
+
+    Returns:
+        (..., 3), theta_plus = theta_x + theta_z, theta = theta_y, theta_minus = theta_x - theta_z, rad.
+
+    Raises:
+        ShapeError: the last axis is not 3.
+    """
+    check_tail("theta", theta, 3)
+    x, y, z = theta.unbind(-1)
+    return torch.stack([x + z, y, x - z], -1)
+
+
+def from_lattman(lattman: Tensor) -> Tensor:
+    """Return the Tait-Bryan angles of Lattman angles.
+
+    Args:
+        lattman: (..., 3), theta_plus, theta, theta_minus, rad; once around SO(3) are 4 pi, -pi/2 .. pi/2, 2 pi.
+
+    Returns:
+        (..., 3), theta_x, theta_y, theta_z, rad.
+
+    Raises:
+        ShapeError: the last axis is not 3.
+    """
+    check_tail("lattman", lattman, 3)
+    plus, y, minus = lattman.unbind(-1)
+    return torch.stack([(plus + minus) / 2, y, (plus - minus) / 2], -1)
+
+
+def lattman_steps(theta_y: Tensor, delta: float) -> tuple[Tensor, Tensor]:
+    """Return the steps of theta_plus and theta_minus that turn by delta.
+
+    Args:
+        theta_y: (...), rad, -pi/2 .. pi/2.
+        delta: rad.
+
+    Returns:
+        (...) and (...), step of theta_plus and of theta_minus, rad; infinite at theta_y = -pi/2 and pi/2, where the
+        angle does not turn anything.
+
+    Source: d^2 = dtheta^2 + sin^2(pi/4 + theta/2) dtheta_plus^2 + sin^2(pi/4 - theta/2) dtheta_minus^2, the paper's
+        own metric; the steps that it prints are not of it (ERRATA E5).
+    """
+    quarter = math.pi / 4
+    return delta / (quarter + theta_y / 2).sin(), delta / (quarter - theta_y / 2).sin()
+
+
+def lattman_grid(
+    step_rad: float, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
+) -> Tensor:
+    """Return rotations spread evenly over SO(3).
+
+    Every rotation is within (1/2 + 1/sqrt 2) step_rad of one of them: half a step to the nearest row, then half a step
+    in each of two orthogonal directions along it. Measured over random rotations: within 0.87 step_rad, as in a cubic
+    lattice (sqrt(3)/2).
+
+    Args:
+        step_rad: rad, at most pi.
+        dtype: of the result.
+        device: of the result.
+
+    Returns:
+        (K, 3, 3), row by row of theta_y from -pi/2, within it by theta_plus, then theta_minus; K is about
+        8 pi^2 / step^3: 9,119 at 12 degrees, 557,515 at 3 degrees.
+
+    Raises:
+        SettingsError: the step is not in 0 .. pi.
+
+    Source: Lattman 1972 as in the paper, with the steps of ERRATA E5.
+    """
+    if not 0 < step_rad <= math.pi:
+        raise SettingsError(refusal("step_rad", expected="0 .. pi", got=f"{step_rad}", do="give the step in rad"))
+    rows = max(math.ceil(math.pi / step_rad - ROUNDING), 1) + 1
+    theta_y = torch.linspace(-math.pi / 2, math.pi / 2, rows, dtype=torch.float64)
+    step_plus, step_minus = lattman_steps(theta_y, step_rad)
+    plus_counts, minus_counts = _count(4 * math.pi, step_plus), _count(2 * math.pi, step_minus)
+    angles = [
+        torch.cartesian_prod(_circle(4 * math.pi, plus), y[None], _circle(2 * math.pi, minus))
+        for y, plus, minus in zip(theta_y, plus_counts, minus_counts, strict=True)
+    ]
+    return from_tait_bryan(from_lattman(torch.cat(angles))).to(dtype=dtype, device=device)
+
+
+def _count(length: float, step: Tensor) -> list[int]:
+    """Return how many steps at least go around a circle, 1 or more."""
+    return [int(n) for n in (length / step - ROUNDING).ceil().clamp_min(1).tolist()]
+
+
+def _circle(length: float, count: int) -> Tensor:
+    """Return (count,) evenly spaced angles, rad, the first 0."""
+    return torch.arange(count, dtype=torch.float64) * (length / count)

@@ -1,0 +1,55 @@
+"""Rotations spread evenly around the unit rotation."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from sphereorient.errors import SettingsError, refusal
+from sphereorient.so3.exp import exp
+
+# Half the cube's edge of the body-centred cubic lattice that has one point per unit of volume: its points are all
+# multiples of it by three even or three odd whole numbers, two to a cube.
+HALF_EDGE = 2 ** (1 / 3) / 2
+
+
+def local_grid(
+    step_rad: float, radius_rad: float, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
+) -> Tensor:
+    """Return rotations spread evenly over those that turn by at most an angle.
+
+    Their rotation vectors lie on a body-centred cubic lattice, the best covering of space by a lattice, with one point
+    per step_rad^3 as in a cubic lattice of this step. Covering radius c = 0.704 step_rad (cubic: 0.866): every rotation
+    by at most radius_rad - c is within c of one of them, every one by at most radius_rad within 2 c (exp brings
+    rotation vectors nowhere further apart).
+
+    Args:
+        step_rad: rad, cube root of the volume per rotation.
+        radius_rad: rad, 0 .. pi, the largest angle.
+        dtype: of the result.
+        device: of the result.
+
+    Returns:
+        (M, 3, 3), the unit rotation first, then by angle; with each rotation also its inverse.
+
+    Raises:
+        SettingsError: the step is not above 0, or the radius not in 0 .. pi.
+
+    Source: Conway and Sloane, Sphere Packings, Lattices and Groups, ch. 2 (covering radius sqrt(5)/4 of the edge).
+    """
+    if not step_rad > 0:
+        raise SettingsError(refusal("step_rad", expected="above 0", got=f"{step_rad}", do="give the step in rad"))
+    if not 0 <= radius_rad <= math.pi:
+        do = "give the radius in rad, or take lattman_grid for all rotations"
+        raise SettingsError(refusal("radius_rad", expected="0 .. pi", got=f"{radius_rad}", do=do))
+    unit = HALF_EDGE * step_rad
+    reach = radius_rad / unit * (1 + 1e-9)  # a shell that lies on the rim by geometry is not lost to the last bits
+    line = torch.arange(-math.floor(reach), math.floor(reach) + 1)
+    places = torch.cartesian_prod(line, line, line)
+    norm2 = places.square().sum(1)
+    inside = (norm2 <= reach**2) & (places % 2 == places[:, :1] % 2).all(1)
+    # whole numbers: ties in angle are exact, and the stable sort keeps them in the order of the places
+    order = norm2[inside].argsort(stable=True)
+    return exp(places[inside][order].to(torch.float64) * unit).to(dtype=dtype, device=device)

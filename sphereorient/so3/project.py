@@ -1,0 +1,44 @@
+"""Matrices that are nearly rotations."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sphereorient.errors import check_tail
+
+
+def nearest_rotation(M: Tensor) -> Tensor:
+    """Return the rotation nearest to a matrix, by the sum of squared differences.
+
+    Args:
+        M: (..., 3, 3), any matrix, any unit.
+
+    Returns:
+        (..., 3, 3), orthogonal, determinant +1; NaN where M has a NaN or infinity. Where several rotations are equally
+        near (rank below 2, or a reflection with its two smallest singular values equal) one of them comes, with
+        gradient 0 in the directions that are undecided. First derivatives only.
+
+    Raises:
+        ShapeError: the last axes are not (3, 3).
+
+    Source: Kabsch 1976, the paper's R_kabsch; derivative of the polar factor, textbook.
+    """
+    check_tail("M", M, 3, 3)
+    finite = M.isfinite().all(-1).all(-1)[..., None, None]
+    eye = torch.eye(3, dtype=M.dtype, device=M.device)
+    M = torch.where(finite, M, eye)
+    U, S, Vh = torch.linalg.svd(M.detach())
+    # The determinant's sign goes to the smallest singular value and its direction.
+    sign = torch.linalg.det(U @ Vh).sign()[..., None]
+    signs = torch.cat([torch.ones_like(S[..., :2]), sign], -1)
+    S, Vh = S * signs, signs[..., None] * Vh
+    R = U @ Vh
+    # U and V have no derivative where singular values are equal, as they are for every rotation; their product has,
+    # with only sums of singular values in the denominator: dR = U X V^T, X = antisymmetric part of U^T dM V / sums.
+    sums = S[..., :, None] + S[..., None, :]
+    decided = sums > 8 * torch.finfo(M.dtype).eps * S[..., :1, None]
+    turned = U.mT @ M @ Vh.mT
+    X = torch.where(decided, (turned - turned.mT) / torch.where(decided, sums, torch.ones_like(sums)), 0)
+    step = U @ X @ Vh
+    return torch.where(finite, R + (step - step.detach()), torch.full_like(R, torch.nan))

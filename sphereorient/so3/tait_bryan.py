@@ -1,0 +1,124 @@
+"""The paper's angles: theta = (theta_x, theta_y, theta_z), R = Rx(theta_x) Ry(theta_y) Rz(theta_z)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from sphereorient.errors import check_tail
+
+
+def from_tait_bryan(theta: Tensor) -> Tensor:
+    """Return the rotation of a triplet of Tait-Bryan angles.
+
+    Args:
+        theta: (..., 3), theta_x, theta_y, theta_z, rad.
+
+    Returns:
+        (..., 3, 3), Rx(theta_x) Ry(theta_y) Rz(theta_z): with the paper R_lab_body, that is body -> lab.
+
+    Raises:
+        ShapeError: the last axis is not 3.
+
+    Source: the paper's R(theta). In words (ERRATA E9): turns about the fixed z, then the fixed y, then the fixed x;
+        or about the body's x, then its new y, then its new z.
+    """
+    check_tail("theta", theta, 3)
+    (sx, sy, sz), (cx, cy, cz) = theta.sin().unbind(-1), theta.cos().unbind(-1)
+    rows = [
+        *(cy * cz, -cy * sz, sy),
+        *(cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy),
+        *(sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy),
+    ]
+    return torch.stack(rows, -1).reshape(*theta.shape[:-1], 3, 3)
+
+
+def to_tait_bryan(R: Tensor) -> Tensor:
+    """Return the triplet of Tait-Bryan angles of a rotation, the one with theta_y in -pi/2 .. pi/2.
+
+    Args:
+        R: (..., 3, 3), rotations, not checked.
+
+    Returns:
+        (..., 3), theta_x, theta_y, theta_z, rad. At cos(theta_y) = 0 (below four roundings) only theta_x + theta_z
+        or theta_x - theta_z is defined: theta_z is set to 0, and its gradient.
+
+    Raises:
+        ShapeError: the last axes are not (3, 3).
+
+    Source: ERRATA E1. theta_y and theta_x come from other elements than there, equal for a rotation, because asin
+        loses half the digits near theta_y = ± pi/2, and -R23, R33 lose all.
+    """
+    check_tail("R", R, 3, 3)
+    cos_y = torch.linalg.vector_norm(R[..., 0, :2], dim=-1)
+    defined = cos_y > 4 * torch.finfo(R.dtype).eps
+    zero, one = torch.zeros_like(cos_y), torch.ones_like(cos_y)
+    theta_z = torch.atan2(torch.where(defined, -R[..., 0, 1], zero), torch.where(defined, R[..., 0, 0], one))
+    # R Rz^T = Rx Ry, whose second column (0, cos theta_x, sin theta_x) does not shrink with cos theta_y.
+    column = R[..., 1:, 0] * theta_z.sin()[..., None] + R[..., 1:, 1] * theta_z.cos()[..., None]
+    theta_x = torch.atan2(column[..., 1], column[..., 0])
+    return torch.stack([theta_x, torch.atan2(R[..., 0, 2], cos_y), theta_z], -1)
+
+
+def second_triplet(theta: Tensor) -> Tensor:
+    """Return the other triplet of Tait-Bryan angles of the same rotation.
+
+    Args:
+        theta: (..., 3), theta_x, theta_y, theta_z, rad.
+
+    Returns:
+        (..., 3), theta_x + pi, ± pi - theta_y with the sign of theta_y, theta_z + pi, rad, not wrapped.
+
+    Raises:
+        ShapeError: the last axis is not 3.
+
+    Source: the paper's second triplet with sign(0) = 1, ERRATA E2.
+    """
+    check_tail("theta", theta, 3)
+    x, y, z = theta.unbind(-1)
+    half_turn = torch.where(y < 0, torch.full_like(y, -math.pi), torch.full_like(y, math.pi))
+    return torch.stack([x + math.pi, half_turn - y, z + math.pi], -1)
+
+
+def rate_matrix_lab(theta: Tensor) -> Tensor:
+    """Return H with H dtheta/dt = omega_lab.
+
+    Args:
+        theta: (..., 3), theta_x, theta_y, theta_z of R_lab_body, rad.
+
+    Returns:
+        (..., 3, 3), no unit; determinant cos(theta_y).
+
+    Raises:
+        ShapeError: the last axis is not 3.
+
+    Source: the paper's H, which it takes for the body's (ERRATA E3).
+    """
+    check_tail("theta", theta, 3)
+    x, y, _ = theta.unbind(-1)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    sx, cx, sy, cy = x.sin(), x.cos(), y.sin(), y.cos()
+    return torch.stack([one, zero, sy, zero, cx, -sx * cy, zero, sx, cx * cy], -1).reshape(*theta.shape[:-1], 3, 3)
+
+
+def rate_matrix_body(theta: Tensor) -> Tensor:
+    """Return the matrix that takes dtheta/dt to omega_body.
+
+    Args:
+        theta: (..., 3), theta_x, theta_y, theta_z of R_lab_body, rad.
+
+    Returns:
+        (..., 3, 3), R^T `rate_matrix_lab`, no unit; determinant cos(theta_y).
+
+    Raises:
+        ShapeError: the last axis is not 3.
+
+    Source: ERRATA E3.
+    """
+    check_tail("theta", theta, 3)
+    _, y, z = theta.unbind(-1)
+    zero, one = torch.zeros_like(y), torch.ones_like(y)
+    sy, cy, sz, cz = y.sin(), y.cos(), z.sin(), z.cos()
+    return torch.stack([cy * cz, sz, zero, -cy * sz, cz, zero, sy, zero, one], -1).reshape(*theta.shape[:-1], 3, 3)

@@ -1,0 +1,182 @@
+"""cameras.yaml: there and back, and every fault in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from camera_examples import f64, pinhole, tsai, whole_picture
+from conftest import SHARED, assert_close
+
+from sphereorient.cameras import PinholeCamera, TsaiCamera, load_cameras, save_cameras
+from sphereorient.errors import CameraError, OutputError
+
+TSAI = """
+schema: sphereorient-cameras/1
+cameras:
+  cam1:
+    model: tsai
+    image_size: [650, 480]
+    f: 45.0
+    pixel_pitch: [0.02, 0.02]
+    sx: 1.0
+    centre: [324.5, 239.5]
+    kappa1: 2.2e-4
+    R: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    T: [0.0, 0.0, 520.0]
+"""
+PINHOLE = """
+schema: sphereorient-cameras/1
+cameras:
+  cam1: {model: pinhole, image_size: [384, 288], vfov_deg: 45.0, R: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], T: [0, 0, 0]}
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "cameras.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_cameras_come_back_to_the_last_bit(tmp_path):
+    cameras = {"left": tsai(1e-5 / 3), "right": pinhole(f_px=f64(700.0 / 3))}
+    path = tmp_path / "cameras.yaml"
+    save_cameras(path, cameras, comment="two lines\nof comment")
+    back = load_cameras(path)
+    assert list(back) == ["left", "right"]
+    assert isinstance(back["left"], TsaiCamera)
+    assert isinstance(back["right"], PinholeCamera)
+    uv_px = whole_picture()
+    for name, camera in cameras.items():
+        assert back[name].image_size == camera.image_size
+        assert torch.equal(back[name].R_cam_lab, camera.R_cam_lab)
+        assert torch.equal(back[name].rays(uv_px).direction_lab, camera.rays(uv_px).direction_lab)
+    assert path.read_text().startswith("# two lines\n# of comment\nschema: sphereorient-cameras/1\n")
+    assert [file.name for file in tmp_path.iterdir()] == ["cameras.yaml"]
+
+
+def test_small_numbers_are_written_so_that_yaml_reads_numbers(tmp_path):
+    save_cameras(tmp_path / "cameras.yaml", {"cam1": tsai(1e-5)})
+    assert yaml.safe_load((tmp_path / "cameras.yaml").read_text())["cameras"]["cam1"]["kappa1"] == 1e-5
+    assert yaml.safe_load("1e-5") == "1e-5"  # the trap: without a point PyYAML reads text
+
+
+def test_numbers_that_yaml_takes_for_text_are_still_read(tmp_path):
+    camera = load_cameras(written(tmp_path, TSAI.replace("2.2e-4", "22e-5")))["cam1"]
+    assert camera.kappa1.item() == 22e-5
+
+
+def test_a_tensor_that_requires_gradients_can_be_saved(tmp_path):
+    save_cameras(tmp_path / "cameras.yaml", {"cam1": tsai(kappa1=f64(1e-4).requires_grad_())})
+    assert load_cameras(tmp_path / "cameras.yaml")["cam1"].kappa1.item() == 1e-4
+
+
+def test_the_fields_of_the_file_mean_what_the_design_says(tmp_path):
+    camera = load_cameras(written(tmp_path, TSAI.replace("sx: 1.0", "sx: 1.5")))["cam1"]
+    assert camera.image_size == (650, 480)
+    # 52 mm aside at 520 mm: x_u = 4.5 mm = x_d (1 + 2.2e-4 x_d^2), u = 1.5 x_d / 0.02 + 324.5
+    uv_px = camera.project(f64((52.0, 0.0, 0.0)))
+    r_d = (uv_px[0].item() - 324.5) * 0.02 / 1.5
+    assert r_d * (1 + 2.2e-4 * r_d**2) == pytest.approx(4.5, abs=1e-12)
+    assert uv_px[1].item() == 239.5
+
+
+def test_a_pinhole_takes_the_middle_of_the_picture_unless_told_otherwise(tmp_path):
+    camera = load_cameras(written(tmp_path, PINHOLE))["cam1"]
+    assert_close(camera.project(f64((0.0, 0.0, 1.0))), f64((191.5, 143.5)))
+    assert camera.f_px.item() == pytest.approx(347.6467, abs=1e-4)
+    told = written(tmp_path, PINHOLE.replace("vfov_deg: 45.0", "f_px: 300.0, centre: [192.0, 144.0]"))
+    assert_close(load_cameras(told)["cam1"].project(f64((1.0, 0.0, 1.0))), f64((492.0, 144.0)))
+
+
+@pytest.mark.parametrize("extra", ["covariance: {parameters: [f], matrix: [[0.1]]}", "port: null"])
+def test_keys_that_a_calibration_adds_are_accepted(tmp_path, extra):
+    assert "cam1" in load_cameras(written(tmp_path, TSAI + f"    {extra}\n"))
+
+
+FAULTS = {
+    "unknown key": (TSAI.replace("kappa1", "kapa1"), r"cam1: expected one of .*got 'kapa1'; write 'kappa1' instead\."),
+    "unknown top key": (TSAI + "camera: 3\n", "got 'camera'; write 'cameras' instead"),
+    "unknown model": (TSAI.replace("tsai", "tsay"), "model: expected one of tsai, pinhole, got 'tsay'; write 'tsai'"),
+    "model of a later version": (TSAI.replace("tsai", "telecentric"), "expected one of tsai, pinhole, got 'telecentr"),
+    "model as a list": (TSAI.replace("tsai", "[tsai]"), "model: expected one of tsai, pinhole"),
+    "no model": (TSAI.replace("    model: tsai\n", ""), "cam1, model: expected one of tsai, pinhole, got none"),
+    "port": (TSAI + "    port: {normal: [0, -1, 0], offset: 120.0}\n", "cam1, port: expected a camera without a port"),
+    "missing key": (TSAI.replace("    f: 45.0\n", ""), "cam1, f: expected a value, got none; add the key"),
+    "text for a number": (TSAI.replace("45.0", "wide"), "cam1, f: expected a valid number.* got 'wide'"),
+    "not a number": (TSAI.replace("45.0", ".nan"), "cam1, f_mm: expected finite numbers"),
+    "negative": (TSAI.replace("45.0", "-45.0"), "cam1, f_mm: expected above zero, got -45.0"),
+    "no rotation": (
+        TSAI.replace("[0, 0, 1]]", "[0, 0, 1.1]]"),
+        r"cam1, R_cam_lab: .*\|R R\^T - I\| = 0.21, det = 1.1;",
+    ),
+    "mirror": (TSAI.replace("[0, 0, 1]]", "[0, 0, -1]]"), r"cam1, R_cam_lab: .*det = -1;"),
+    "two rows": (TSAI.replace(", [0, 0, 1]]", "]"), r"cam1, R\.2: expected a value, got none"),
+    "one size": (TSAI.replace("[650, 480]", "[650]"), r"cam1, image_size\.1: expected a value"),
+    "size of zero": (TSAI.replace("[650, 480]", "[650, 0]"), "cam1, image_size: expected two whole numbers above zero"),
+    "folded": (TSAI.replace("2.2e-4", "-2.2e-1"), "cam1, kappa1: expected above .* folds over"),
+    "schema": (TSAI.replace("cameras/1", "cameras/2"), "schema: expected sphereorient-cameras/1, got 'sphereorient-ca"),
+    "no schema": (TSAI.replace("schema: sphereorient-cameras/1", ""), "expected sphereorient-cameras/1, got none"),
+    "no cameras": ("schema: sphereorient-cameras/1\ncameras: {}\n", "expected named cameras"),
+    "camera of text": (
+        "schema: sphereorient-cameras/1\ncameras: {cam1: tsai}\n",
+        "expected the keys of a camera",
+    ),
+    "both foci": (PINHOLE.replace("vfov_deg: 45.0", "vfov_deg: 45.0, f_px: 3.0"), "exactly one, got both"),
+    "no focus": (PINHOLE.replace("vfov_deg: 45.0, ", ""), "cam1, vfov_deg, f_px: expected exactly one, got none"),
+    "wide": (PINHOLE.replace("45.0", "181"), "cam1, vfov_deg: expected an angle between 0 and 180, got 181"),
+    "a list": ("- 1\n- 2\n", r"expected keys and values, got \[1, 2\]"),
+    "empty": ("", "got an empty file"),
+    "no yaml": ("a: [1, 2\nb: }", "expected YAML, got '.*' in line"),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), FAULTS.values(), ids=FAULTS)
+def test_every_fault_is_one_line_that_names_the_file(tmp_path, text, message):
+    path = written(tmp_path, text)
+    with pytest.raises(CameraError, match=message) as refused:
+        load_cameras(path)
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_missing_file_a_folder_and_bytes_are_refused(tmp_path):
+    with pytest.raises(CameraError, match="got no such file"):
+        load_cameras(tmp_path / "none.yaml")
+    with pytest.raises(CameraError, match="got a folder"):
+        load_cameras(tmp_path)
+    (tmp_path / "cameras.yaml").write_bytes(b"\xff\xfe\x00\xd8")
+    with pytest.raises(CameraError, match=r"no text|expected YAML"):
+        load_cameras(tmp_path / "cameras.yaml")
+
+
+def test_a_folder_that_is_not_there_is_refused_on_writing(tmp_path):
+    with pytest.raises(OutputError, match="expected a file that can be written"):
+        save_cameras(tmp_path / "none" / "cameras.yaml", {"cam1": tsai()})
+
+
+def test_an_old_file_survives_a_camera_that_cannot_be_written(tmp_path):
+    path = tmp_path / "cameras.yaml"
+    save_cameras(path, {"cam1": tsai()})
+    before = path.read_bytes()
+    with pytest.raises(CameraError, match="register the model"):
+        save_cameras(path, {"cam1": object()})
+    assert path.read_bytes() == before
+
+
+@pytest.mark.shared
+def test_exact_cameras_project_the_true_positions_onto_the_true_pixels():
+    h5py = pytest.importorskip("h5py")
+    cameras = load_cameras(SHARED / "experiment" / "cameras.yaml")
+    with h5py.File(SHARED / "experiment" / "truth.h5") as truth:
+        position = torch.from_numpy(truth["position"][:])
+        for name, camera in cameras.items():
+            assert_close(camera.project(position), torch.from_numpy(truth[name]["centre_px"][:]), atol=1e-6)
+
+
+@pytest.mark.shared
+def test_cameras_behind_a_port_are_refused_and_not_read_without_it():
+    with pytest.raises(CameraError, match="port"):
+        load_cameras(SHARED / "tank" / "cameras.yaml")
