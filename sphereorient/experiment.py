@@ -38,6 +38,7 @@ class Experiment:
     texture_path: Path | None = None  # None: to be learnt
     fixed: bool = False  # whether the ball does not move
     mask_paths: dict[str, Path] = field(default_factory=dict)  # black where something that does not move hides the ball
+    background_paths: dict[str, Path] = field(default_factory=dict)  # the scene without the ball
     start: dict[str, int] = field(default_factory=dict)  # frame of each movie that is the experiment's frame 0
     frames: tuple[int, int] | None = None  # first, last + 1 of the experiment; None: all
     flow: dict[str, float] = field(default_factory=dict)  # SI
@@ -76,6 +77,7 @@ class ExperimentKeys(BaseModel):
     exposure: Positive | None = None
     sphere: SphereKeys
     masks: dict[str, str] = Field(default_factory=dict)
+    backgrounds: dict[str, str] = Field(default_factory=dict)
     cameras: str
     movies: dict[str, str] = Field(min_length=1, max_length=MAX_CAMERAS)
     start: dict[str, FrameNumber] = Field(default_factory=dict)
@@ -115,6 +117,7 @@ def load_experiment(path: Path | str) -> Experiment:
         texture_path=None if keys.sphere.texture is None else path.parent / keys.sphere.texture,
         fixed=keys.sphere.fixed,
         mask_paths={name: path.parent / mask for name, mask in keys.masks.items()},
+        background_paths={name: path.parent / picture for name, picture in keys.backgrounds.items()},
         start={name: keys.start.get(name, 0) for name in keys.movies},
         frames=keys.frames,
         flow=keys.flow.model_dump(exclude_none=True),
@@ -144,6 +147,7 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
         sphere["fixed"] = True
     optional: dict[str, Any] = {
         "masks": {name: relative(path) for name, path in experiment.mask_paths.items()},
+        "backgrounds": {name: relative(path) for name, path in experiment.background_paths.items()},
         "start": {name: number for name, number in experiment.start.items() if number},
         "frames": None if experiment.frames is None else list(experiment.frames),
         "flow": dict(experiment.flow),
@@ -235,7 +239,7 @@ def _refuse_times(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def _check_names(path: Path, keys: ExperimentKeys) -> None:
-    for key, named in (("masks", keys.masks), ("start", keys.start)):
+    for key, named in (("masks", keys.masks), ("backgrounds", keys.backgrounds), ("start", keys.start)):
         for name in named:
             if name not in keys.movies:
                 raise ExperimentError(refuse_unknown(name, keys.movies, f"{path}, {key}"))

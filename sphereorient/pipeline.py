@@ -145,10 +145,12 @@ def locate_sphere(
     stage = f"{reel.name}: locate"
     progress(stage, 0, len(reel.frames))
     spread = locate.spread_frames(reel.frames, settings.locate.background_frames)
-    background = locate.measure_background(reel.movie, spread)
     diameter_px = settings.locate.diameter_px or locate.expected_diameter_px(
         reel.name, cameras, experiment.diameter_mm
     )
+    empty_path = experiment.background_paths.get(reel.name)
+    empty = None if empty_path is None else locate.load_background(empty_path, reel.movie.frame_shape)
+    background = locate.learn_background(reel.movie, spread, diameter_px, settings.locate, empty)
     found = []
     for done, picture in enumerate(reel.pictures(), 1):
         found.append(locate.find_ball(picture, background, diameter_px, settings.locate))

@@ -1,9 +1,10 @@
 """Where is it: background, blob, outline, gaps."""
 
-from sphereorient.locate.background import Background, measure_background, spread_frames
+from sphereorient.locate.background import Background, load_background, spread_frames
 from sphereorient.locate.expected import expected_diameter_px, size_of
 from sphereorient.locate.find import find_ball, sightings_of
 from sphereorient.locate.gaps import repair
+from sphereorient.locate.learn import learn_background
 from sphereorient.locate.position import Positions, find_positions
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import Sightings
@@ -16,7 +17,8 @@ __all__ = [
     "expected_diameter_px",
     "find_ball",
     "find_positions",
-    "measure_background",
+    "learn_background",
+    "load_background",
     "repair",
     "sightings_of",
     "size_of",

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, refusal
-from sphereorient.movies import Movie
 
 # A pixel's scatter is read off at this share of its frames, and divided by what that is for Gaussian noise in standard
 # deviations. About a background taken from the movie: things that turn and glitter move a pixel in more frames than
@@ -24,7 +23,7 @@ GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Background:
-    """Mean picture and noise of one movie; made by `measure_background`, read by blob and outline."""
+    """Mean picture and noise of one movie; made by `learn_background`, read by blob and outline."""
 
     mean: NDArray[np.float32]  # (H, W), grey levels
     noise: NDArray[np.float32]  # (H, W), robust standard deviation of each pixel about the mean, grey levels
@@ -71,16 +70,13 @@ def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.floa
     return np.asarray(picture, np.float32)
 
 
-def measure_background(
-    movie: Movie, frames: Sequence[int], empty: NDArray[np.float32] | None = None
-) -> Background:
+def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None = None) -> Background:
     """Average frames of a movie and measure how much each pixel scatters without the ball.
 
     Turning, glittering things scatter in every frame and the passing ball only in some: a quantile tells them apart.
 
     Args:
-        movie: the movie.
-        frames: numbers of the frames, in the movie's own counting; all are held in memory at once.
+        pictures: (n, H, W), evenly spread frames, uint8 or uint16.
         empty: (H, W), the scene without the ball, where there is such a picture: for short movies, or a ball that
             hardly moves; only the noise is then measured.
 
@@ -89,19 +85,54 @@ def measure_background(
         paint differs from a dark wall; the mean here leaves out the frames in which a pixel was covered (more than
         four robust sigmas from its median), and so sees the rim where the plain mean is blind (paper section III A).
     """
-    pictures = movie.sample(frames)
-    full_scale = float(np.iinfo(movie.dtype).max)
-    rounding = full_scale / 255 / 12**0.5  # scatters by this much also where all frames are equal
-    share, sigmas = (MEASURED_SHARE, MEASURED_SIGMAS) if empty is None else (GIVEN_SHARE, GIVEN_SIGMAS)
-    mean = np.empty(movie.frame_shape, np.float32)
-    noise = np.empty_like(mean)
-    for row in range(0, len(mean), 16):  # by strips: a float copy of all frames would be four times the frames
+    full_scale = float(np.iinfo(pictures.dtype).max)
+    shape = pictures.shape[1:]
+    mean, noise = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    for row in range(0, shape[0], 16):  # by strips: a float copy of all frames would be four times the frames
         these = np.s_[row : row + 16]
-        strip = pictures[:, these].astype(np.float32)
-        middle = np.median(strip, axis=0) if empty is None else empty[these]
-        scatter = np.abs(strip - middle)
-        sigma = np.maximum(np.quantile(scatter, share, axis=0) / sigmas, rounding)
-        usual = scatter <= 4 * sigma
-        mean[these] = middle if empty is not None else np.where(usual, strip, 0).sum(0) / usual.sum(0)
-        noise[these] = sigma
+        given = None if empty is None else empty[these]
+        mean[these], noise[these] = _statistics(pictures[:, these].astype(np.float32), given, full_scale)
     return Background(mean=mean, noise=noise, full_scale=full_scale)
+
+
+def without_ball(background: Background, pictures: NDArray[Any], covered: NDArray[np.bool_]) -> Background:
+    """Measure a background again where the ball was found, from the frames in which it was elsewhere.
+
+    Args:
+        background: as measured from all frames.
+        pictures: (n, H, W), the same frames.
+        covered: (n, H, W) bool, the pixels of the ball and its rim in each frame.
+
+    Returns:
+        The background; a pixel that is free in fewer than four frames keeps its values.
+    """
+    free = len(pictures) - covered.sum(axis=0)
+    again = (free < len(pictures)) & (free >= 4)
+    values = pictures[:, again].astype(np.float32)
+    values[covered[:, again]] = np.nan
+    mean, noise = background.mean.copy(), background.noise.copy()
+    mean[again], noise[again] = _statistics(values, None, background.full_scale)
+    return Background(mean=mean, noise=noise, full_scale=background.full_scale)
+
+
+def _statistics(
+    values: NDArray[np.float32], given: NDArray[np.float32] | None, full_scale: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Clipped mean, or the given one, and robust sigma over the first axis; NaN does not count."""
+    rounding = full_scale / 255 / 12**0.5  # scatters by this much also where all frames are equal
+    share, sigmas = (MEASURED_SHARE, MEASURED_SIGMAS) if given is None else (GIVEN_SHARE, GIVEN_SIGMAS)
+    middle = _nan_quantile(values, 0.5) if given is None else given
+    scatter = np.abs(values - middle)
+    sigma = np.maximum(_nan_quantile(scatter, share) / sigmas, rounding)
+    if given is not None:
+        return given, sigma
+    usual = scatter <= 4 * sigma
+    return np.where(usual, values, 0).sum(0) / usual.sum(0), sigma
+
+
+def _nan_quantile(values: NDArray[np.float32], share: float) -> NDArray[np.float32]:
+    """Quantile over the first axis without NaN, nearest rank; numpy's own is a Python loop over the pixels."""
+    ordered = np.sort(values, axis=0)  # NaN last
+    count = np.isfinite(values).sum(axis=0)
+    rank = np.clip(np.rint(share * (count - 1)), 0, None).astype(np.int64)
+    return np.asarray(np.take_along_axis(ordered, rank[None], axis=0)[0])

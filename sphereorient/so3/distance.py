@@ -50,5 +50,5 @@ def geodesic_distance(A: Tensor, B: Tensor) -> Tensor:
     D = B - A
     # A^T A is symmetric, so A^T B and A^T (B - A) have the same vee: with rows a, d it is half the sum of d × a.
     # The difference keeps its digits where A and B are close; the product A^T B would not.
-    sine = torch.linalg.vector_norm(torch.linalg.cross(D, A).sum(-2), dim=-1) / 2
+    sine = torch.linalg.vector_norm(torch.linalg.cross(D, A.expand_as(D)).sum(-2), dim=-1) / 2
     return torch.atan2(sine, 1 - D.square().sum((-2, -1)) / 4)

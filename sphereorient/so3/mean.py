@@ -20,8 +20,8 @@ def weighted_mean(R: Tensor, weights: Tensor) -> Tensor:
 
     Args:
         R: (..., K, 3, 3), rotations, not checked.
-        weights: (..., K), not negative, of any sum above 0; broadcasts against the K rotations. A rotation that is NaN
-            does not count where its weight is 0.
+        weights: (..., K), not negative, of any sum above 0; leading axes broadcast against those of R. A rotation that
+            is NaN does not count where its weight is 0.
 
     Returns:
         (..., 3, 3), frames of R; NaN where all weights are 0. Where the rotations are so far apart that several means
@@ -29,11 +29,12 @@ def weighted_mean(R: Tensor, weights: Tensor) -> Tensor:
         half circles between them, divided by the weights.
 
     Raises:
-        ShapeError: the last axes of R are not (3, 3).
+        ShapeError: the last axes of R are not (K, 3, 3).
 
     Source: Hartley et al. 2013, Rotation averaging, algorithm 1.
     """
-    check_tail("R", R, 3, 3)
+    check_tail("R", R, *weights.shape[-1:], 3, 3)
+    weights = weights.to(R)
     share = (weights / weights.sum(-1, keepdim=True))[..., None]
     missing = (share == 0)[..., None] & R.isnan()
     R = torch.where(missing, torch.eye(3, dtype=R.dtype, device=R.device), R)

@@ -1,0 +1,60 @@
+"""Background and ball depend on each other: two rounds settle both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.locate.background import Background, measure_background, without_ball
+from sphereorient.locate.find import find_ball
+from sphereorient.locate.settings import LocateSettings
+from sphereorient.movies import Movie
+
+RIM = 1.15  # of the radius: the ball's halo and shadow belong to it
+
+
+def learn_background(
+    movie: Movie,
+    frames: Sequence[int],
+    diameter_px: float,
+    settings: LocateSettings,
+    empty: NDArray[np.float32] | None = None,
+) -> Background:
+    """Learn what a movie shows without the ball.
+
+    The mean of evenly spread frames first; then the ball is looked for in them, and the pixels that it covers are
+    measured again from the frames in which it is elsewhere. A ball that stays long in one region would otherwise
+    become part of the background there.
+
+    Args:
+        movie: the movie.
+        frames: numbers of the frames, in the movie's own counting; all are held in memory at once.
+        diameter_px: expected diameter of the ball.
+        settings: of the room.
+        empty: (H, W), the scene without the ball, where there is such a picture; one round then is enough.
+    """
+    pictures = movie.sample(frames)
+    background = measure_background(pictures, empty)
+    if empty is not None:
+        return background
+    return without_ball(background, pictures, _covered(pictures, background, diameter_px, settings))
+
+
+def _covered(
+    pictures: NDArray[Any], background: Background, diameter_px: float, settings: LocateSettings
+) -> NDArray[np.bool_]:
+    """Pixels of the ball in each of (n, H, W) frames; none where it was not found."""
+    covered = np.zeros(pictures.shape, bool)
+    for picture, mask in zip(pictures, covered, strict=True):
+        outline, _ = find_ball(picture, background, diameter_px, settings)
+        if outline is None:
+            continue
+        reach = RIM * outline.radius_px + 1
+        left, top = max(0, int(outline.u_px - reach)), max(0, int(outline.v_px - reach))
+        window = mask[top : int(outline.v_px + reach) + 2, left : int(outline.u_px + reach) + 2]
+        row, column = np.ogrid[: window.shape[0], : window.shape[1]]
+        window[...] = (row + top - outline.v_px) ** 2 + (column + left - outline.u_px) ** 2 <= reach**2
+    return covered

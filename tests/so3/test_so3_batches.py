@@ -1,0 +1,80 @@
+"""The batch law, one driver over all functions: a batch is the stack of its singles, in the dtype that came."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from conftest import assert_close
+
+from sphereorient import so3
+
+
+def vectors(batch, dtype, rng):
+    return (torch.randn(*batch, 3, generator=rng, dtype=dtype),)
+
+
+def rotations(batch, dtype, rng):
+    return (so3.random_rotations(batch, generator=rng, dtype=dtype),)
+
+
+def pairs(batch, dtype, rng):
+    return rotations(batch, dtype, rng) + rotations(batch, dtype, rng)
+
+
+def weighted(batch, dtype, rng):
+    return *rotations((*batch, 3), dtype, rng), torch.rand(*batch, 3, generator=rng, dtype=dtype)
+
+
+def angles(batch, dtype, rng):
+    return (torch.rand(batch, generator=rng, dtype=dtype),)
+
+
+def steps(theta_y):
+    return torch.stack(so3.lattman_steps(theta_y, 0.1), -1)
+
+
+CASES = {
+    so3.exp: (vectors, (3, 3)),
+    so3.hat: (vectors, (3, 3)),
+    so3.from_tait_bryan: (vectors, (3, 3)),
+    so3.second_triplet: (vectors, (3,)),
+    so3.rate_matrix_lab: (vectors, (3, 3)),
+    so3.rate_matrix_body: (vectors, (3, 3)),
+    so3.to_lattman: (vectors, (3,)),
+    so3.from_lattman: (vectors, (3,)),
+    so3.log: (rotations, (3,)),
+    so3.vee: (rotations, (3,)),
+    so3.angle: (rotations, ()),
+    so3.to_tait_bryan: (rotations, (3,)),
+    so3.nearest_rotation: (rotations, (3, 3)),
+    so3.geodesic_distance: (pairs, ()),
+    so3.weighted_mean: (weighted, (3, 3)),
+    steps: (angles, (2,)),
+}
+
+
+@pytest.mark.parametrize("function", CASES, ids=lambda f: f.__name__)
+def test_a_batch_is_the_stack_of_its_singles(function, batch, dtype, rng, tolerance):
+    make, tail = CASES[function]
+    inputs = make(batch, dtype, rng)
+    before = [x.clone() for x in inputs]
+    found = function(*inputs)
+    assert found.shape == (*batch, *tail)
+    assert found.dtype == dtype
+    assert all(torch.equal(x, old) for x, old in zip(inputs, before, strict=True))
+    for index in torch.cartesian_prod(*map(torch.arange, batch)).reshape(-1, len(batch)).tolist() if batch else [[]]:
+        single = function(*(x[tuple(index)] for x in inputs))
+        assert_close(found[tuple(index)], single, atol=tolerance)
+
+
+@pytest.mark.parametrize("function", CASES, ids=lambda f: f.__name__)
+def test_a_batch_of_no_elements_passes_gradients(function, dtype, rng):
+    inputs = [x.requires_grad_() for x in CASES[function][0]((0,), dtype, rng)]
+    function(*inputs).sum().backward()
+    assert all(x.grad.shape == x.shape for x in inputs)
+
+
+def test_every_public_name_is_there():
+    assert all(callable(getattr(so3, name)) for name in so3.__all__)
+    grids = {so3.lattman_grid, so3.local_grid, so3.random_rotations, so3.lattman_steps}  # no tensor in, or two out
+    assert {getattr(so3, name) for name in so3.__all__} - grids == set(CASES) - {steps}
