@@ -1,4 +1,4 @@
-"""Background and ball depend on each other: two rounds settle both."""
+"""Background and ball depend on each other: a few rounds settle both."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from sphereorient.locate.find import find_ball
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.movies import Movie
 
+ROUNDS = 4  # at most; each finds the ball in more frames, most movies need two
 RIM = 1.15  # of the radius: the ball's halo and shadow belong to it
 
 
@@ -31,16 +32,24 @@ def learn_background(
 
     Args:
         movie: the movie.
-        frames: numbers of the frames, in the movie's own counting; all are held in memory at once.
+        frames: numbers of evenly spread frames, in the movie's own counting; all are held in memory at once.
         diameter_px: expected diameter of the ball.
         settings: of the room.
-        empty: (H, W), the scene without the ball, where there is such a picture; one round then is enough.
+        empty: (H, W), the scene without the ball, where there is such a picture; nothing then is left to learn.
     """
     pictures = movie.sample(frames)
     background = measure_background(pictures, empty)
     if empty is not None:
         return background
-    return without_ball(background, pictures, _covered(pictures, background, diameter_px, settings))
+    first, before = background, 0
+    for _ in range(ROUNDS):
+        covered = _covered(pictures, background, diameter_px, settings)
+        background = without_ball(first, pictures, covered)
+        found = int(covered.any(axis=(1, 2)).sum())
+        if found <= before:  # nothing new to learn
+            break
+        before = found
+    return background
 
 
 def _covered(

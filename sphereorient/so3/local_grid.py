@@ -49,7 +49,7 @@ def local_grid(
     line = torch.arange(-math.floor(reach), math.floor(reach) + 1)
     places = torch.cartesian_prod(line, line, line)
     norm2 = places.square().sum(1)
-    inside = (norm2 <= reach**2) & (places % 2 == places[:, :1] % 2).all(1)
+    inside = (norm2 <= math.floor(reach**2)) & (places % 2 == places[:, :1] % 2).all(1)
     # whole numbers: ties in angle are exact, and the stable sort keeps them in the order of the places
     order = norm2[inside].argsort(stable=True)
     return exp(places[inside][order].to(torch.float64) * unit).to(dtype=dtype, device=device)

@@ -74,21 +74,22 @@ class RandomMotion:
 
 
 def random_motion(
-    velocity_rms: float, omega_rms: float, correlation_time: float, volume_mm: float, seed: int
+    velocity_rms: float, velocity_time: float, omega_rms: float, omega_time: float, volume_mm: float, seed: int
 ) -> RandomMotion:
     """Draw a smooth motion.
 
     Args:
         velocity_rms: m/s per component; less where the path would leave the volume.
+        velocity_time: correlation time of the velocity, s.
         omega_rms: rad/s per component of omega_lab.
-        correlation_time: s, of both.
+        omega_time: correlation time of omega_lab, s.
         volume_mm: the path stays within this distance of the origin: where its rms radius is above half of it, path
             and velocity are scaled down.
         seed: same seed, same motion.
     """
     rng = torch.Generator().manual_seed(seed)
-    path = _random_waves(velocity_rms * 1000, correlation_time, rng)
-    omega = _random_waves(omega_rms, correlation_time, rng)
+    path = _random_waves(velocity_rms * 1000, velocity_time, rng)
+    omega = _random_waves(omega_rms, omega_time, rng)
     reach = float((path.amplitude / path.rate[:, None]).square().sum().div(2).sqrt())  # rms distance from the middle
     squeeze = min(1.0, 0.5 * volume_mm / max(reach, 1e-9))
     R_start = so3.random_rotations(1, generator=rng, dtype=torch.float64)[0]

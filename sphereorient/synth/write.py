@@ -58,7 +58,8 @@ def write_experiment(folder: Path, settings: SynthSettings, progress: Callable[[
         progress: called with the number of frames rendered since the last call.
 
     Returns:
-        Path of experiment.yaml. Beside it: cam1.mkv, cam2.mkv, texture.png, cameras.yaml, truth.h5.
+        Path of experiment.yaml. Beside it: cam1.mkv, cam2.mkv, pictures of the scene without the
+        sphere, texture.png, cameras.yaml, truth.h5.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -74,18 +75,30 @@ def write_experiment(folder: Path, settings: SynthSettings, progress: Callable[[
     cameras = default_cameras(settings)
     time_s = torch.arange(settings.frames, dtype=torch.float64) / settings.frame_rate
     motion = random_motion(
-        settings.velocity_rms, settings.omega_rms, settings.correlation_time, settings.volume_mm, settings.seed
+        settings.velocity_rms,
+        settings.velocity_time,
+        settings.omega_rms,
+        settings.omega_time,
+        settings.volume_mm,
+        settings.seed,
     )
     for index, (name, camera) in enumerate(cameras.items()):
         frames = _frames(settings, torch.from_numpy(grey / np.float32(255)), camera, motion, index, progress)
         write_ffv1(folder / f"{name}.mkv", frames, settings.frame_rate)
-    if not cv2.imwrite(str(folder / "texture.png"), grey):
-        raise OutputError(refusal(f"{folder}/texture.png", expected="a writable file", got="a refusal", do="check the disk"))
+        # As a careful lab does: a picture of the scene without the ball, before it is let in.
+        empty = np.full(camera.image_size[::-1], round(settings.background), np.uint8)
+        _write_picture(folder / f"empty_{name}.png", empty)
+    _write_picture(folder / "texture.png", grey)
     save_cameras(folder / "cameras.yaml", cameras, comment="exact cameras; X_cam = R X_lab + T, mm")
     _write_truth(folder / "truth.h5", motion.at(time_s), cameras)
     path = folder / "experiment.yaml"
     path.write_text(yaml.safe_dump(_experiment(settings, cameras), sort_keys=False), encoding="utf-8")
     return path
+
+
+def _write_picture(path: Path, grey: NDArray[np.uint8]) -> None:
+    if not cv2.imwrite(str(path), grey):
+        raise OutputError(refusal(str(path), expected="a writable file", got="a refusal", do="check the disk"))
 
 
 def _frames(
@@ -139,5 +152,6 @@ def _experiment(settings: SynthSettings, cameras: Mapping[str, Camera]) -> dict[
         "exposure": settings.exposure,
         "sphere": {"diameter": settings.diameter_mm, "texture": "texture.png"},
         "cameras": "cameras.yaml",
+        "backgrounds": {name: f"empty_{name}.png" for name in cameras},
         "movies": {name: f"{name}.mkv" for name in cameras},
     }
