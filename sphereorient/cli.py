@@ -57,15 +57,15 @@ def track(
 ) -> None:
     """Track the sphere of an experiment: position and orientation of every frame."""
     _check_writable(out)
-    from sphereorient.pipeline import silent, track_movies
+    from sphereorient.pipeline import track_movies
     from sphereorient.settings import load_settings
 
     chosen = load_settings(settings, set_ or [])
     command = " ".join(["sphereorient", *sys.argv[1:]])
     names = None if cameras is None else [name.strip() for name in cameras.split(",") if name.strip()]
-    with _bar(quiet) as advance:
+    with progress_bar(quiet) as advance:
         result = track_movies(
-            experiment, method=method, settings=chosen, cameras=names, progress=advance or silent, command=command
+            experiment, method=method, settings=chosen, cameras=names, progress=advance, command=command
         )
     result.save(out)
     if not quiet:
@@ -86,14 +86,13 @@ def synth(
 
     chosen = load_synth_settings(settings, set_ or [])
     total = 2 * chosen.frames
-    with _bar(quiet) as advance:
+    with progress_bar(quiet) as advance:
         done = 0
 
         def rendered(count: int) -> None:
             nonlocal done
             done += count
-            if advance is not None:
-                advance("render", done, total)
+            advance("render", done, total)
 
         path = write_experiment(out, chosen, rendered)
     if not quiet:
@@ -144,19 +143,21 @@ Advance = Callable[[str, int, int], None]
 
 
 @contextmanager
-def _bar(quiet: bool) -> Iterator[Advance | None]:
-    """Show one line of progress a stage: share done, frames per second, time left."""
+def progress_bar(quiet: bool = False) -> Iterator[Advance]:
+    """Show one line of progress a stage, with frames per second and time left; nothing where `quiet`."""
     if quiet:
-        yield None
+        yield lambda stage, done, total: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns: list[Any] = [
-        TextColumn("{task.description:16}"),
+        TextColumn("{task.description:13}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
+        TextColumn("{task.fields[rate]:>14}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
         TimeRemainingColumn(),
     ]
     with Progress(*columns, console=Console(stderr=True)) as bar:
@@ -165,9 +166,9 @@ def _bar(quiet: bool) -> Iterator[Advance | None]:
         def advance(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=total, rate="")
-            task = bar.tasks[bar.task_ids.index(tasks[stage])]
-            rate = done / task.elapsed if done and task.elapsed else 0.0
-            bar.update(tasks[stage], completed=done, rate=f"{rate:6.1f} frames/s" if rate else "")
+            elapsed = bar.tasks[bar.task_ids.index(tasks[stage])].elapsed
+            rate = f"{done / elapsed:.1f} frames/s" if done and elapsed else ""
+            bar.update(tasks[stage], completed=done, rate=rate)
 
         yield advance
 

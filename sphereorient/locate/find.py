@@ -46,18 +46,18 @@ def find_ball(
         if best is not None and best.coverage >= max(settings.coverage_min, 0.5):
             break
     if best is None or best.coverage < settings.coverage_min:
-        return None, _why_not(difference, background, blobs[:1], settings)
+        return None, _why_not(difference, diameter_px, background, blobs, settings)
     reason = _why_unreadable(frame, difference, background, best, settings)
     return (best, Reason.OK) if reason is Reason.OK else (None, reason)
 
 
 def _why_not(
-    difference: NDArray[np.float32], background: Background, blobs: list[Blob], settings: LocateSettings
+    difference: NDArray[np.float32], diameter_px: float, background: Background, blobs: list[Blob], settings: LocateSettings
 ) -> Reason:
     if not blobs or blobs[0].merit <= 0:
         return Reason.NOT_FOUND
-    u, v = int(blobs[0].u_px), int(blobs[0].v_px)
-    contrast = np.percentile(difference[max(0, v - 8) : v + 9, max(0, u - 8) : u + 9], 90)
+    u, v, half = int(blobs[0].u_px), int(blobs[0].v_px), int(0.5 * diameter_px)
+    contrast = np.percentile(difference[max(0, v - half) : v + half + 1, max(0, u - half) : u + half + 1], 90)
     return Reason.DARK if contrast < settings.contrast_min * background.full_scale / 255 else Reason.OUTLINE
 
 
