@@ -1,6 +1,6 @@
 """Track the bundled excerpt, compare it with its exact truth, and draw what came out.
 
-    scripts/demo.py [--out out/demo]
+scripts/demo.py [--out out/demo]
 """
 
 from __future__ import annotations

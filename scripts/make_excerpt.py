@@ -78,7 +78,8 @@ def write_card(source: Path, out: Path, first: int, last: int) -> None:
         "licence": "MIT, as the project",
         "made_by": "scripts/make_excerpt.py",
         "source_sha256": {
-            name: hashlib.sha256((source / name).read_bytes()).hexdigest() for name in ("cam1.mkv", "cam2.mkv", "truth.h5")
+            name: hashlib.sha256((source / name).read_bytes()).hexdigest()
+            for name in ("cam1.mkv", "cam2.mkv", "truth.h5")
         },
         "sha256": {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files},
     }

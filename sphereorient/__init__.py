@@ -1,3 +1,32 @@
 """Six-dimensional motion of a painted sphere from high-speed movies."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sphereorient.experiment import Experiment, load_experiment
+    from sphereorient.pipeline import track_movies
+    from sphereorient.settings import Settings, load_settings
+    from sphereorient.trajectory import Trajectory
+
 __version__ = "0.1.0"
+__all__ = ["Experiment", "Settings", "Trajectory", "load_experiment", "load_settings", "track_movies"]
+
+_HOMES = {
+    "Experiment": "experiment",
+    "Settings": "settings",
+    "Trajectory": "trajectory",
+    "load_experiment": "experiment",
+    "load_settings": "settings",
+    "track_movies": "pipeline",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import on first use: torch takes a second, and `sphereorient --help` has no use for it."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

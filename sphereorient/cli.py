@@ -134,7 +134,9 @@ def _check_writable(out: Path) -> None:
     folder = out.parent
     do = "choose another --out"
     if not folder.is_dir():
-        raise OutputError(refusal(f"--out {out}", expected=f"an existing folder {folder}", got="none", do="make it first"))
+        raise OutputError(
+            refusal(f"--out {out}", expected=f"an existing folder {folder}", got="none", do="make it first")
+        )
     if not os.access(folder, os.W_OK):
         raise OutputError(refusal(f"--out {out}", expected="a writable folder", got=f"{folder}, which is not", do=do))
 
@@ -149,7 +151,14 @@ def progress_bar(quiet: bool = False) -> Iterator[Advance]:
         yield lambda stage, done, total: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     columns: list[Any] = [
         TextColumn("{task.description:13}"),

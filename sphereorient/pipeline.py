@@ -5,10 +5,10 @@ movies -> locate -> orient -> assemble -> motion -> Trajectory
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,11 +32,7 @@ from sphereorient.trajectory import CameraTrack, Reason, Trajectory
 CHUNK = 64  # frames held at once; a result does not depend on it
 
 
-class Progress(Protocol):
-    """Told how far a stage is; the command line draws a bar."""
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        """`done` of `total` frames of a stage are finished."""
+Progress = Callable[[str, int, int], None]  # (stage, frames done, frames in all); the command line draws a bar
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -96,7 +92,9 @@ def track_movies(
     try:
         frames = frame_numbers(experiment, movies)
         reels = [
-            Reel(name=n, camera=experiment.cameras[n], movie=movies[n], frames=range(*movie_span(experiment, n, frames)))
+            Reel(
+                name=n, camera=experiment.cameras[n], movie=movies[n], frames=range(*movie_span(experiment, n, frames))
+            )
             for n in names
         ]
         clock = torch.from_numpy(time_s(experiment, frames))
@@ -145,9 +143,7 @@ def locate_sphere(
     stage = f"{reel.name}: locate"
     progress(stage, 0, len(reel.frames))
     spread = locate.spread_frames(reel.frames, settings.locate.background_frames)
-    diameter_px = settings.locate.diameter_px or locate.expected_diameter_px(
-        reel.name, cameras, experiment.diameter_mm
-    )
+    diameter_px = settings.locate.diameter_px or locate.expected_diameter_px(reel.name, cameras, experiment.diameter_mm)
     empty_path = experiment.background_paths.get(reel.name)
     empty = None if empty_path is None else locate.load_background(empty_path, reel.movie.frame_shape)
     background = locate.learn_background(reel.movie, spread, diameter_px, settings.locate, empty)
@@ -270,5 +266,7 @@ def _chosen(experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:
     unknown = [name for name in wanted if name not in known]
     if unknown or not wanted:
         got = ", ".join(unknown) or "none"
-        raise ExperimentError(refusal("cameras", expected=" or ".join(known), got=got, do="name cameras of the experiment"))
+        raise ExperimentError(
+            refusal("cameras", expected=" or ".join(known), got=got, do="name cameras of the experiment")
+        )
     return [name for name in known if name in wanted]

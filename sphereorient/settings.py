@@ -74,7 +74,9 @@ def _read(path: Path) -> dict[str, Any]:
         return {}
     if not isinstance(tree, dict):
         raise SettingsError(
-            refusal(f"settings {path}", expected="keys and values", got=type(tree).__name__, do="see configs/paper.yaml")
+            refusal(
+                f"settings {path}", expected="keys and values", got=type(tree).__name__, do="see configs/paper.yaml"
+            )
         )
     return tree
 
@@ -85,7 +87,9 @@ def _override(tree: dict[str, Any], text: str, depth: int) -> None:
     *rooms, leaf = key.strip().split(".")
     if not equals or len(rooms) != depth - 1:
         expected = "room.key=value" if depth == 2 else "key=value"
-        raise SettingsError(refusal(f"--set {text}", expected=expected, got=repr(text), do="give one key and its value"))
+        raise SettingsError(
+            refusal(f"--set {text}", expected=expected, got=repr(text), do="give one key and its value")
+        )
     for room in rooms:
         branch = tree.setdefault(room, {})
         tree = branch if isinstance(branch, dict) else {}

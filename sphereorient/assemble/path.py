@@ -33,9 +33,7 @@ class Path:
         return self.choice >= 0
 
 
-def assemble_paths(
-    candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings
-) -> dict[str, Path]:
+def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings) -> dict[str, Path]:
     """Choose one candidate a frame for each camera so that the whole movie's cost is least; all cameras in one batch.
 
     Args:

@@ -39,7 +39,7 @@ def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
     chunk = max(1, PAIRS_AT_ONCE // width**2)
     parts = [
         so3.geodesic_distance(a[:, :, None], b[:, None])
-        for a, b in zip(before.split(chunk), after.split(chunk), strict=True)
+        for a, b in zip(torch.split(before, chunk), torch.split(after, chunk), strict=True)
     ]
     distance = torch.cat(parts).reshape(*batch, max(steps - 1, 0), width, width)
     doubt = 2 - score[..., :-1, :, None] - score[..., 1:, None, :]
@@ -92,7 +92,9 @@ def _forward(edge_cost: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         best = torch.where(begins, torch.zeros_like(best), best)
         total = torch.where(empty, total, torch.where(here, best, torch.inf))
         origins.append(torch.where(empty, stay, origin))
-    return total, torch.stack(origins, dim=-2) if origins else mask.new_zeros((*total.shape[:-1], 0, width), dtype=torch.int64)
+    return total, torch.stack(origins, dim=-2) if origins else mask.new_zeros(
+        (*total.shape[:-1], 0, width), dtype=torch.int64
+    )
 
 
 def _backward(last: Tensor, origin: Tensor, mask: Tensor) -> Tensor:

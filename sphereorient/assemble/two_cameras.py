@@ -170,9 +170,7 @@ def _nearest(R: Tensor, graph: Candidates, frames: Tensor, limit: float, quality
     near, which = distance.min(-1)
     present = near <= limit
     score = torch.where(present, score_all[frames, which], torch.nan)
-    return _Track(
-        R=torch.where(present[:, None, None], R_all[frames, which], torch.nan), score=score, present=present
-    )
+    return _Track(R=torch.where(present[:, None, None], R_all[frames, which], torch.nan), score=score, present=present)
 
 
 def _roughness(track: _Track, frames: Tensor) -> float:

@@ -44,7 +44,8 @@ def _percentiles(values: Floats) -> Floats:
 
 
 def _angle_deg(A: Floats, B: Floats) -> Floats:
-    return np.rad2deg(so3.geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy())
+    distance = so3.geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy()
+    return np.asarray(np.rad2deg(distance), np.float64)
 
 
 def score_track(track: Trajectory, truth_path: str | Path) -> Score:
@@ -78,8 +79,8 @@ def score_track(track: Trajectory, truth_path: str | Path) -> Score:
         measured, true = getattr(track, key), truth[key][row]
         have = np.isfinite(measured).all(axis=1)
         coverage[key] = float(have.mean())
-        error = np.square(measured - true)[have].sum(1).mean() if have.any() else np.nan
-        relative[key] = float(np.sqrt(error / np.square(true[have]).sum(1).mean())) if have.any() else np.nan
+        wrong, whole = (np.square(x[have]).sum() for x in (measured - true, true))
+        relative[key] = float(np.sqrt(wrong / whole)) if have.any() else np.nan
     R_true = truth["orientation"][row]
     return Score(
         frames=len(track),

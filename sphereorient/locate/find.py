@@ -52,7 +52,11 @@ def find_ball(
 
 
 def _why_not(
-    difference: NDArray[np.float32], diameter_px: float, background: Background, blobs: list[Blob], settings: LocateSettings
+    difference: NDArray[np.float32],
+    diameter_px: float,
+    background: Background,
+    blobs: list[Blob],
+    settings: LocateSettings,
 ) -> Reason:
     if not blobs or blobs[0].merit <= 0:
         return Reason.NOT_FOUND

@@ -76,7 +76,8 @@ def _support(circles: NDArray[np.float64], edges: _Edges, tolerance: float) -> N
     beyond = radial & (offset >= tolerance) & (offset < 0.25 * circles[:, 2:3])
     row = np.arange(len(circles))[:, None] * DIRECTIONS + direction
     counted = [
-        np.bincount(row[which], minlength=len(circles) * DIRECTIONS).reshape(-1, DIRECTIONS) > 0 for which in (on, beyond)
+        np.bincount(row[which], minlength=len(circles) * DIRECTIONS).reshape(-1, DIRECTIONS) > 0
+        for which in (on, beyond)
     ]
     return np.asarray(counted[0].sum(1) - 0.5 * counted[1].sum(1), np.float64)
 
@@ -190,7 +191,9 @@ def _fit_circle(
     rms = float(np.sqrt((residual[used] ** 2).mean()))
     angle = np.arctan2(outward[used, 1], outward[used, 0])
     coverage = len(np.unique(np.floor((angle + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int))) / DIRECTIONS
-    return Outline(u_px=float(circle[0]), v_px=float(circle[1]), radius_px=float(circle[2]), rms_px=rms, coverage=coverage)
+    return Outline(
+        u_px=float(circle[0]), v_px=float(circle[1]), radius_px=float(circle[2]), rms_px=rms, coverage=coverage
+    )
 
 
 def _stabilised(window: NDArray[np.float32], noise: float, blur_px: float) -> NDArray[np.float32]:

@@ -11,7 +11,9 @@ class LocateSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     background_frames: int = Field(
-        100, ge=1, description="evenly spread frames whose mean is the background; more smear a passing sphere out better"
+        100,
+        ge=1,
+        description="evenly spread frames whose mean is the background; more smear a passing sphere out better",
     )
     reduction: int = Field(
         2, ge=1, le=8, description="blobs are looked for on frames reduced by this whole factor; 2 is fastest per frame"
@@ -24,7 +26,9 @@ class LocateSettings(BaseModel):
     )
     blob_candidates: int = Field(4, ge=1, description="round blobs whose variance and roundness are compared")
     noise_factor: float = Field(
-        5.0, gt=0, description="a pixel belongs to the ball above this many standard deviations of the background's noise"
+        5.0,
+        gt=0,
+        description="a pixel belongs to the ball above this many standard deviations of the background's noise",
     )
     contrast_min: float = Field(
         8.0, gt=0, description="faintest ball: 90th percentile of the difference inside it, in 255ths of full scale"

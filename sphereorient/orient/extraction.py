@@ -90,7 +90,12 @@ def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Te
     """
     if disks.shape[-2:] != inside.shape:
         raise ShapeError(
-            refusal("disks", expected=f"(F, {', '.join(map(str, inside.shape))})", got=str(tuple(disks.shape)), do="crop anew")
+            refusal(
+                "disks",
+                expected=f"(F, {', '.join(map(str, inside.shape))})",
+                got=str(tuple(disks.shape)),
+                do="crop anew",
+            )
         )
     grey = stretch_contrast(disks, inside, settings.black_share, settings.white_share)
     one_hot = _one_hot(grey, inside)

@@ -13,7 +13,9 @@ class OrientSettings(BaseModel):
     size_px: int | None = Field(
         None, ge=16, description="side of the disk's picture, px; null takes the movie's median diameter (real size)"
     )
-    black_share: float = Field(0.30, gt=0, lt=1, description="at least this share of the disk becomes black; the paper's b")
+    black_share: float = Field(
+        0.30, gt=0, lt=1, description="at least this share of the disk becomes black; the paper's b"
+    )
     white_share: float = Field(0.30, gt=0, lt=1, description="at least this share becomes white; the paper's w")
     regions: tuple[float, float] = Field(
         (0.5, 0.3),
@@ -21,19 +23,29 @@ class OrientSettings(BaseModel):
         "patches are as large as the second",
     )
     region_contrast_min: float = Field(
-        0.3, ge=0, le=1, description="a region whose two classes differ less (0..1) shows one paint: the global one decides"
+        0.3,
+        ge=0,
+        le=1,
+        description="a region whose two classes differ less (0..1) shows one paint: the global one decides",
     )
     disk_share: float = Field(
         0.96, gt=0.5, le=1, description="pixels within this share of the radius are compared; the rim is blurred"
     )
     coarse_step_deg: float = Field(12.0, ge=4, le=30, description="step of the coarse Lattman grid; the paper's 12")
-    score_margin: float = Field(0.1, gt=0, lt=0.5, description="possible orientations: T above the best less this; the paper's 0.1")
-    group_deg: float = Field(30.0, gt=0, lt=180, description="orientations closer than this are one group; the paper: 30 to 45")
+    score_margin: float = Field(
+        0.1, gt=0, lt=0.5, description="possible orientations: T above the best less this; the paper's 0.1"
+    )
+    group_deg: float = Field(
+        30.0, gt=0, lt=180, description="orientations closer than this are one group; the paper: 30 to 45"
+    )
     groups_max: int = Field(
         40, ge=1, description="a frame with more groups is a runaway: noise fits everywhere, paint in a few places"
     )
     fine_step_deg: float = Field(3.0, gt=0.5, le=12, description="step of the fine grid; the paper's 3")
     fine_radius_deg: float = Field(
-        12.0, gt=0, le=45, description="reach of the fine grid about a group's best: covers the coarse cell (10.4 at 12)"
+        12.0,
+        gt=0,
+        le=45,
+        description="reach of the fine grid about a group's best: covers the coarse cell (10.4 at 12)",
     )
     score_min: float = Field(0.5, ge=0, le=1, description="candidates of lower T are no candidates; the paper's 0.5")

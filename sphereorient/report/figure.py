@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.errors import ExperimentError, refusal
 from sphereorient.evaluate import Score
 from sphereorient.experiment import Experiment, movie_span, open_movies
 from sphereorient.sphere import SphereRenderer, load_texture, orthographic_view, reduced_texture
@@ -21,6 +22,7 @@ from sphereorient.trajectory import Trajectory
 
 # Okabe and Ito's colours: told apart by colour-blind readers, and in grey print.
 AXIS_COLOURS = ("#D55E00", "#009E73", "#0072B2")
+BRIGHT_COLOURS = ("#FF8C3B", "#2BE0A8", "#63C3FF")  # the same hues on dark pictures
 TRUTH_COLOUR = "#444444"
 CROP_PX = 96
 
@@ -34,9 +36,9 @@ def demo_figure(track: Trajectory, experiment: Experiment, path: Path, score: Sc
         path: of the PNG or PDF to write.
         score: errors against the truth, where it is known.
     """
-    figure = Figure(figsize=(12, 10), layout="constrained")
+    figure = Figure(figsize=(12, 9.5), layout="constrained")
     FigureCanvasAgg(figure)
-    top, bottom = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
+    top, bottom = np.ravel(figure.subfigures(2, 1, height_ratios=[0.75, 1.15], squeeze=False))
     _frames_part(top, track, experiment)
     _curves_part(bottom, track, score)
     figure.savefig(path, dpi=110)
@@ -44,25 +46,27 @@ def demo_figure(track: Trajectory, experiment: Experiment, path: Path, score: Sc
 
 def _frames_part(part: Any, track: Trajectory, experiment: Experiment) -> None:
     """Per camera two rows: the crop with outline and body axes, and the sphere re-rendered at the measured attitude."""
-    assert experiment.texture_path is not None  # a track cannot come from an experiment without one
-    chosen = _spread_valid(track, 6)
+    if experiment.texture_path is None:
+        do = "draw the track of an experiment with a texture"
+        raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
     names = list(track.cameras)
-    axes = part.subplots(2 * len(names), len(chosen), squeeze=False)
+    chosen = _spread_valid(track, 8 // len(names))
     movies = open_movies(experiment, names)
     texture = load_texture(experiment.texture_path)
     first = round(track.time[0] * track.frame_rate)
-    for row, name in enumerate(names):
+    for beside, name in zip(part.subfigures(1, len(names), squeeze=False)[0], names, strict=True):
+        axes = beside.subplots(2, len(chosen), squeeze=False)
         shift = movie_span(experiment, name, range(first, first + len(track)))[0]
         pictures = movies[name].sample([shift + k for k in chosen])
         for column, (k, picture) in enumerate(zip(chosen, pictures, strict=True)):
-            _draw_sighting(axes[2 * row, column], picture, track, experiment.cameras[name], name, k)
-            _draw_render(axes[2 * row + 1, column], texture, track, experiment.cameras[name], name, k)
-        axes[2 * row, 0].set_ylabel(f"{name}\nfilmed")
-        axes[2 * row + 1, 0].set_ylabel(f"{name}\nre-rendered")
+            _draw_sighting(axes[0, column], picture, track, experiment.cameras[name], name, k)
+            _draw_render(axes[1, column], texture, track, experiment.cameras[name], name, k)
+            axes[0, column].set_title(f"{1e3 * track.time[k]:.1f} ms", fontsize=9)
+        axes[0, 0].set_ylabel("filmed")
+        axes[1, 0].set_ylabel("re-rendered")
+        beside.suptitle(name, fontsize=11)
         movies[name].close()
-    for column, k in enumerate(chosen):
-        axes[0, column].set_title(f"t = {1e3 * track.time[k]:.1f} ms", fontsize=9)
-    part.suptitle("Body axes x, y, z (solid: towards the camera) and outline, as measured", fontsize=10)
+    part.supxlabel("outline and body axes as measured; solid: towards the camera, dotted: away", fontsize=9)
 
 
 def _spread_valid(track: Trajectory, count: int) -> list[int]:
@@ -72,9 +76,7 @@ def _spread_valid(track: Trajectory, count: int) -> list[int]:
     return [int(valid[int(i)]) for i in np.linspace(0, len(valid) - 1, min(count, len(valid)))]
 
 
-def _draw_sighting(
-    axes: Any, picture: NDArray[Any], track: Trajectory, camera: Camera, name: str, k: int
-) -> None:
+def _draw_sighting(axes: Any, picture: NDArray[Any], track: Trajectory, camera: Camera, name: str, k: int) -> None:
     seen = track.cameras[name]
     u, v = seen.centre_px[k]
     radius = seen.radius_px[k]
@@ -83,10 +85,11 @@ def _draw_sighting(
     angle = np.linspace(0, 2 * np.pi, 100)
     axes.plot(u + radius * np.cos(angle), v + radius * np.sin(angle), color="#F0E442", linewidth=1)
     R_cam_body = camera.R_cam_lab.numpy() @ track.orientation[k]
-    for label, colour, tip in zip("xyz", AXIS_COLOURS, R_cam_body.T, strict=True):
+    for label, colour, tip in zip("xyz", BRIGHT_COLOURS, R_cam_body.T, strict=True):
         style = "-" if tip[2] < 0 else ":"
-        axes.plot([u, u + radius * tip[0]], [v, v + radius * tip[1]], style, color=colour, linewidth=1.6)
-        axes.text(u + 1.12 * radius * tip[0], v + 1.12 * radius * tip[1], label, color=colour, fontsize=8)
+        axes.plot([u, u + radius * tip[0]], [v, v + radius * tip[1]], style, color=colour, linewidth=2)
+        at = (u + 1.14 * radius * tip[0], v + 1.14 * radius * tip[1])
+        axes.text(*at, label, color=colour, fontsize=9, fontweight="bold", ha="center", va="center")
     axes.set(xlim=(u - reach, u + reach), ylim=(v + reach, v - reach))
     _bare(axes)
 

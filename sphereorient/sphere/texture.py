@@ -35,7 +35,9 @@ def load_texture(path: Path) -> Tensor:
     picture = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if picture is None:
         raise TextureError(
-            refusal(name, expected="a PNG, TIFF or JPEG picture", got="a file that does not decode", do="export it again")
+            refusal(
+                name, expected="a PNG, TIFF or JPEG picture", got="a file that does not decode", do="export it again"
+            )
         )
     height, width = picture.shape
     if width != 2 * height or height < 8:

@@ -49,7 +49,9 @@ def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
     }
 
 
-def write_experiment(folder: Path, settings: SynthSettings, progress: Callable[[int], None] = lambda done: None) -> Path:
+def write_experiment(
+    folder: Path, settings: SynthSettings, progress: Callable[[int], None] = lambda done: None
+) -> Path:
     """Render a two-camera experiment with exact truth.
 
     Args:
