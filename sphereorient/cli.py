@@ -216,3 +216,7 @@ def _usage_error(error: Exception) -> int:
         raise error
     show()
     return int(getattr(error, "exit_code", EXIT_REFUSED))
+
+
+if __name__ == "__main__":
+    main()

@@ -84,10 +84,8 @@ def track_movies(
         experiment = load_experiment(FilePath(experiment))
     settings = settings or Settings()
     names = _chosen(experiment, cameras)
-    if experiment.texture_path is None:
-        do = "give sphere.texture; learning it from the movie is not part of this version"
-        raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
-    texture = load_texture(experiment.texture_path)
+    texture = load_texture(_texture_path(experiment))
+    _refuse_unsupported(experiment, names)
     movies = open_movies(experiment, names)
     try:
         frames = frame_numbers(experiment, movies)
@@ -117,6 +115,7 @@ def _paper(
     """Section III of the paper, step by step."""
     cameras = {reel.name: reel.camera for reel in reels}
     sightings = {reel.name: locate_sphere(reel, cameras, experiment, settings, progress) for reel in reels}
+    locate.check_seen(sightings)
     positions = locate.find_positions(sightings, cameras, experiment.diameter_mm)
     candidates = {
         reel.name: propose_orientations(reel, sightings[reel.name], texture, settings, progress) for reel in reels
@@ -162,6 +161,8 @@ def propose_orientations(
     stage = f"{reel.name}: orient"
     total = len(reel.frames)
     progress(stage, 0, total)
+    if not sightings.placed.any():
+        return in_the_lab(Proposals.none(sightings.reason), reel.camera, sightings.centre_px)
     proposer: Proposer = TemplateSearch(texture, locate.size_of(sightings, settings.orient.size_px), settings.orient)
     proposals = [Proposals.none(sightings.reason[:0])]
     waiting: list[NDArray[np.float32]] = []
@@ -257,6 +258,26 @@ def _trajectory(
         flags=(fused.flags | positions.flags).numpy().astype(np.uint32),
         cameras=dict(tracks),
     )
+
+
+def _texture_path(experiment: Experiment) -> FilePath:
+    if experiment.texture_path is None:
+        do = "give sphere.texture; learning it from the movie is not part of this version"
+        raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
+    return experiment.texture_path
+
+
+def _refuse_unsupported(experiment: Experiment, names: Sequence[str]) -> None:
+    """Refuse what the file may say and this version would ignore: a wrong result is worse than none."""
+    if any(name in experiment.mask_paths for name in names):
+        do = "remove masks: and see how far the method gets without them"
+        raise ExperimentError(
+            refusal(f"{experiment.path}, masks", expected="none with method paper", got="masks", do=do)
+        )
+    if experiment.fixed and not all(name in experiment.background_paths for name in names):
+        do = "give backgrounds: pictures of the scene without the ball; a ball at rest is part of the movie's own"
+        got = "a fixed ball without them"
+        raise ExperimentError(refusal(f"{experiment.path}", expected="backgrounds of all cameras", got=got, do=do))
 
 
 def _chosen(experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:

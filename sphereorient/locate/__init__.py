@@ -1,7 +1,7 @@
 """Where is it: background, blob, outline, gaps."""
 
 from sphereorient.locate.background import Background, load_background, spread_frames
-from sphereorient.locate.expected import expected_diameter_px, size_of
+from sphereorient.locate.expected import check_seen, expected_diameter_px, size_of
 from sphereorient.locate.find import find_ball, sightings_of
 from sphereorient.locate.gaps import repair
 from sphereorient.locate.learn import learn_background
@@ -14,6 +14,7 @@ __all__ = [
     "LocateSettings",
     "Positions",
     "Sightings",
+    "check_seen",
     "expected_diameter_px",
     "find_ball",
     "find_positions",

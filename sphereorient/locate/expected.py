@@ -43,17 +43,26 @@ def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: 
     return diameter_px
 
 
+def check_seen(sightings: Mapping[str, Sightings]) -> None:
+    """Refuse an experiment in which no camera found the sphere in any frame.
+
+    Raises:
+        ExperimentError: with the reasons that the frames gave.
+    """
+    if any(bool(seen.placed.any()) for seen in sightings.values()):
+        return
+    reasons = ", ".join(sorted({str(why) for seen in sightings.values() for why in seen.reason}))
+    do = "check sphere.diameter and the cameras, or set locate.diameter_px"
+    raise ExperimentError(refusal("movies", expected="the sphere in some frame", got=f"none ({reasons})", do=do))
+
+
 def size_of(sightings: Sightings, size_px: int | None) -> int:
     """Return the side of the disks' pictures: as set, or the movie's median diameter, whole px.
 
-    Raises:
-        ExperimentError: the sphere was found in no frame.
+    Args:
+        sightings: of one camera, with at least one frame in which it has the sphere.
+        size_px: the setting, or None.
     """
     if size_px is not None:
         return size_px
-    radius = sightings.radius_px[sightings.placed]
-    if not len(radius):
-        reasons = ", ".join(sorted({str(why) for why in sightings.reason}))
-        do = "check sphere.diameter, the cameras, or set locate.diameter_px"
-        raise ExperimentError(refusal("movie", expected="a sphere in some frame", got=f"none ({reasons})", do=do))
-    return max(16, round(2 * float(radius.median())))
+    return max(16, round(2 * float(sightings.radius_px[sightings.placed].median())))

@@ -1,0 +1,291 @@
+"""The whole method on the bundled excerpt, through the command line as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import yaml
+from conftest import REPO
+
+from sphereorient.evaluate import score_track
+from sphereorient.movies import open_movie, write_ffv1
+from sphereorient.pipeline import track_movies
+from sphereorient.settings import load_settings
+from sphereorient.trajectory import Flag, Trajectory
+
+EXCERPT = REPO / "synthetic_data" / "excerpt"
+
+
+def sphereorient(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "sphereorient.cli", *map(str, arguments)], capture_output=True, text=True, timeout=300
+    )
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    out = tmp_path_factory.mktemp("excerpt") / "track.h5"
+    return out, sphereorient("track", EXCERPT / "experiment.yaml", "--out", out)
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """The excerpt in a folder of its own, to be broken."""
+    shutil.copytree(EXCERPT, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def test_the_excerpt_meets_the_bars_of_the_paper_method(tracked):
+    out, run = tracked
+    assert run.returncode == 0, run.stderr
+    score = score_track(Trajectory.load(out), EXCERPT / "truth.h5")
+    assert score.valid.sum() == 40
+    p50, p95, p99, largest = score.percentiles_deg()
+    assert p50 <= 1.5
+    assert p95 <= 3.0
+    assert p99 <= 5.0
+    assert largest < 10
+    p50, p95, _, _ = score.percentiles_mm()
+    assert p50 <= 0.10
+    assert p95 <= 0.30
+    assert score.relative_rms["omega_lab"] <= 0.2
+    assert score.relative_rms["omega_body"] <= 0.2
+    assert score.relative_rms["velocity"] <= 0.05
+
+
+def test_the_summary_says_what_is_valid_and_what_each_camera_lost(tracked):
+    _, run = tracked
+    assert "40 of 40 frames valid" in run.stdout
+    assert "cam1: frames lost: none" in run.stdout
+    assert "frames/s" in run.stderr
+
+
+def test_the_file_has_every_dataset_with_units_and_its_provenance(tracked):
+    out, _ = tracked
+    with h5py.File(out) as file:
+        assert file.attrs["schema"] == "sphereorient-track/1"
+        assert file.attrs["method"] == "paper"
+        assert yaml.safe_load(file.attrs["settings"])["orient"]["fine_step_deg"] == 3.0
+        provenance = json.loads(file.attrs["provenance"])
+        assert len(provenance["sha256"]["cam1.mkv"]) == 64
+        assert np.allclose(file["time"][()], np.arange(40) / 600)
+        assert np.isnan(file["position_smooth"][()]).all()  # not measured by this method: nothing is invented
+        for name in ("position", "orientation", "omega_lab", "cameras/cam1/centre_px", "cameras/cam2/candidates/score"):
+            assert "units" in file[name].attrs, name
+
+
+def test_the_python_call_gives_the_same_bytes_as_the_command(tracked):
+    out, _ = tracked
+    again = track_movies(EXCERPT / "experiment.yaml")
+    first = Trajectory.load(out)
+    for name in ("position", "orientation", "omega_lab", "segment", "flags"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+    for name, camera in first.cameras.items():
+        np.testing.assert_array_equal(again.cameras[name].candidate_orientation, camera.candidate_orientation)
+
+
+def test_one_camera_alone_tracks_the_orientation_and_says_so(tmp_path):
+    out = tmp_path / "one.h5"
+    run = sphereorient("track", EXCERPT / "experiment.yaml", "--out", out, "--cameras", "cam2", "--quiet")
+    assert run.returncode == 0, run.stderr
+    assert run.stdout == ""
+    track = Trajectory.load(out)
+    score = score_track(track, EXCERPT / "truth.h5")
+    assert score.percentiles_deg()[0] <= 2.0
+    assert list(track.cameras) == ["cam2"]
+    assert (track.flags & int(Flag.ONE_CAMERA)).all()
+    assert np.isnan(track.orientation_cov).all()  # nothing to measure it by
+
+
+def test_a_part_of_the_frames_keeps_the_experiments_clock(copy):
+    experiment = copy / "experiment.yaml"
+    experiment.write_text(experiment.read_text() + "frames: [10, 22]\n")
+    track = track_movies(experiment)
+    assert np.allclose(track.time, np.arange(10, 22) / 600)
+    assert score_track(track, EXCERPT / "truth.h5").percentiles_deg()[3] < 5
+
+
+def test_swapped_cameras_do_not_pass_for_a_measurement(copy):
+    """A wrong input must not give a confident wrong output: the rays then miss each other by centimetres."""
+    text = (copy / "experiment.yaml").read_text()
+    (copy / "experiment.yaml").write_text(
+        text.replace("cam1: cam1.mkv, cam2: cam2.mkv", "cam1: cam2.mkv, cam2: cam1.mkv")
+    )
+    track = track_movies(copy / "experiment.yaml")
+    assert score_track(track, EXCERPT / "truth.h5").percentiles_mm()[0] > 5
+
+
+def test_a_mirrored_movie_scores_worse_than_the_right_one(copy, tracked):
+    """Chirality: the mirror image of a painted sphere is another sphere."""
+    for name in ("cam1", "cam2"):
+        with open_movie(EXCERPT / f"{name}.mkv") as movie:
+            write_ffv1(copy / f"{name}.mkv", (frame[:, ::-1] for frame in movie.frames(0, 8)), 600.0)
+    experiment = copy / "experiment.yaml"
+    experiment.write_text(experiment.read_text().replace("backgrounds", "frames: [0, 8]\nbackgrounds"))
+    for name in ("cam1", "cam2"):
+        empty = cv2.imread(str(copy / f"empty_{name}.png"), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(copy / f"empty_{name}.png"), empty[:, ::-1])
+    mirrored = track_movies(experiment)
+    right = Trajectory.load(tracked[0])
+    for name in ("cam1", "cam2"):
+        # Either nothing fits (runaway), or what fits best fits visibly worse.
+        best = np.nan_to_num(mirrored.cameras[name].score, nan=0.0).max()
+        assert best < np.nanmin(right.cameras[name].score) - 0.05
+
+
+def _missing(folder: Path) -> None:
+    (folder / "cam1.mkv").unlink()
+
+
+def _unreadable(folder: Path) -> None:
+    (folder / "cam1.mkv").write_bytes(bytes(range(256)) * 20)
+
+
+def _empty(folder: Path) -> None:
+    np.save(folder / "none.npy", np.zeros((0, 650, 650), np.uint8))
+    _replace(folder / "experiment.yaml", "cam1: cam1.mkv", "cam1: none.npy")
+
+
+def _texture(folder: Path) -> None:
+    texture = cv2.imread(str(folder / "texture.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(folder / "texture.png"), texture[:-10])
+
+
+def _other_size(folder: Path) -> None:
+    _replace(folder / "cameras.yaml", "- 650", "- 640")
+
+
+def _other_length(folder: Path) -> None:
+    (folder / "experiment.yaml").write_text((folder / "experiment.yaml").read_text() + "start: {cam1: 3}\n")
+
+
+def _not_a_number(folder: Path) -> None:
+    _replace(folder / "cameras.yaml", "f: 45.0", "f: .nan")
+
+
+def _no_rotation(folder: Path) -> None:
+    _replace(folder / "cameras.yaml", "0.998022948172868", "0.9")
+
+
+def _unknown_key(folder: Path) -> None:
+    _replace(folder / "experiment.yaml", "frame_rate", "framerate")
+
+
+def _masks(folder: Path) -> None:
+    (folder / "experiment.yaml").write_text((folder / "experiment.yaml").read_text() + "masks: {cam1: m.png}\n")
+
+
+def _fixed(folder: Path) -> None:
+    text = (folder / "experiment.yaml").read_text().splitlines()
+    text = [line for line in text if not line.startswith("backgrounds")]
+    (folder / "experiment.yaml").write_text("\n".join(text).replace("{diameter: 18.0", "{fixed: true, diameter: 18.0"))
+
+
+def _no_ball(folder: Path) -> None:
+    frames = np.random.default_rng(0).integers(10, 14, (12, 650, 650)).astype(np.uint8)
+    for name in ("cam1", "cam2"):
+        np.save(folder / f"{name}.npy", frames)
+        _replace(folder / "experiment.yaml", f"{name}.mkv", f"{name}.npy")
+    lines = (folder / "experiment.yaml").read_text().splitlines()
+    (folder / "experiment.yaml").write_text("\n".join(line for line in lines if not line.startswith("backgrounds")))
+
+
+def _replace(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (_missing, ["cam1.mkv", "no such file"]),
+        (_unreadable, ["cam1.mkv", "readable movie"]),
+        (_empty, ["none.npy"]),
+        (_texture, ["texture.png", "twice as wide as high", "2048 x 1014"]),
+        (_other_size, ["640 x 640", "650 x 650"]),
+        (_other_length, ["37 (cam1)", "40 (cam2)", "frames: [0, 37]"]),
+        (_not_a_number, ["cameras.yaml", "cam1", "nan"]),
+        (_no_rotation, ["cameras.yaml", "cam1", "rotation"]),
+        (_unknown_key, ["framerate", "frame_rate"]),
+        (_masks, ["masks"]),
+        (_fixed, ["backgrounds"]),
+        (_no_ball, ["sphere in some frame", "not_found"]),
+    ],
+    ids=lambda value: value.__name__.strip("_") if callable(value) else "",
+)
+def test_bad_input_is_one_clear_line_and_leaves_no_file(copy, spoil, words):
+    spoil(copy)
+    out = copy / "track.h5"
+    run = sphereorient("track", copy / "experiment.yaml", "--out", out, "--quiet")
+    assert run.returncode == 2
+    lines = run.stderr.strip().splitlines()
+    assert len(lines) == 1, run.stderr
+    assert lines[0].startswith("sphereorient: ")
+    for word in words:
+        assert word in lines[0]
+    assert not list(copy.glob("*track*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--out", "nowhere/track.h5"], "nowhere"),
+        (["--out", "track.h5", "--set", "orient.fine_stp_deg=2"], "orient.fine_step_deg"),
+        (["--out", "track.h5", "--set", "orient.fine_step_deg=wide"], "wide"),
+        (["--out", "track.h5", "--method", "guess"], "paper"),
+        (["--out", "track.h5", "--cameras", "cam7"], "cam1 or cam2"),
+        (["--out", "track.h5", "--settings", "none.yaml"], "none.yaml"),
+    ],
+)
+def test_bad_arguments_are_one_clear_line(arguments, word, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = sphereorient("track", EXCERPT / "experiment.yaml", "--quiet", *arguments)
+    assert run.returncode == 2
+    assert len(run.stderr.strip().splitlines()) == 1
+    assert word in run.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path):
+    run = sphereorient("track", EXCERPT / "experiment.yaml", "--out", "/proc/track.h5", "--quiet")
+    assert run.returncode == 2
+    assert "/proc" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+def test_ctrl_c_leaves_one_line_and_no_file(tmp_path):
+    out = tmp_path / "track.h5"
+    command = [sys.executable, "-m", "sphereorient.cli", "track", EXCERPT / "experiment.yaml", "--out", out, "--quiet"]
+
+    # A shell's background jobs, and so perhaps this test, ignore Ctrl-C: the child is started as in the foreground.
+    def in_foreground() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=in_foreground)
+    time.sleep(3.0)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted" in stderr
+    assert "Traceback" not in stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_settings_are_kept_in_the_track(copy):
+    _replace(copy / "experiment.yaml", "backgrounds", "frames: [0, 6]\nbackgrounds")
+    settings = load_settings(None, ["orient.fine_step_deg=4", "orient.coarse_step_deg=15"])
+    track = track_movies(copy / "experiment.yaml", settings=settings)
+    kept = yaml.safe_load(track.settings)
+    assert kept["orient"]["fine_step_deg"] == 4.0
+    assert kept["orient"]["coarse_step_deg"] == 15.0
