@@ -196,17 +196,18 @@ def main() -> None:
     """Run the command line; errors that a user can mend become one line and a non-zero exit code."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(EXIT_INTERRUPTED))
     try:
-        app(standalone_mode=False)
+        # Without its standalone mode the parser hands exit codes back, that of Ctrl-C among them.
+        code = app(standalone_mode=False) or 0
     except SphereOrientError as error:
         typer.echo(f"sphereorient: {error}", err=True)
-        sys.exit(EXIT_REFUSED)
+        code = EXIT_REFUSED
     except (KeyboardInterrupt, typer.Abort):
-        typer.echo("sphereorient: interrupted; nothing was written.", err=True)
-        sys.exit(EXIT_INTERRUPTED)
-    except typer.Exit as exit_:
-        sys.exit(exit_.exit_code)
+        code = EXIT_INTERRUPTED
     except Exception as error:
-        sys.exit(_usage_error(error))
+        code = _usage_error(error)
+    if code == EXIT_INTERRUPTED:
+        typer.echo("sphereorient: interrupted; nothing was written.", err=True)
+    sys.exit(code)
 
 
 def _usage_error(error: Exception) -> int:
