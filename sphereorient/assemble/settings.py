@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class AssembleSettings(BaseModel):
-    """How candidates of single frames become one history (paper sections III D and E)."""
+    """How candidates of single frames become one history (the paper's assembly and its two cameras)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -18,7 +18,9 @@ class AssembleSettings(BaseModel):
         41, ge=5, description="frames over which xi's usual size is taken (moving median): a few turns of the velocity"
     )
     spike_factor: float = Field(
-        6.0, gt=1, description="a spike is this many times the usual xi; the grid's own steps reach about 3 times"
+        6.0,
+        gt=1,
+        description="a spike is this many robust deviations (1.48 MAD) above xi's moving median; noise stays below",
     )
     spike_min_deg: float = Field(
         15.0,

@@ -11,7 +11,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import ShapeError, check_tail, refusal
 
-PAIRS_AT_ONCE = 1 << 20  # candidate pairs whose 3 x 3 products are held at once, 75 MB
+PAIRS_AT_ONCE = 1 << 16  # candidate pairs whose 3 x 3 products are held at once, 5 MB
 
 Reduction = Callable[[Tensor], tuple[Tensor, Tensor]]  # totals (..., from, to) -> total and origin of each `to`
 
@@ -116,12 +116,12 @@ def sweep(edge_cost: Tensor, mask: Tensor, reduce: Reduction) -> tuple[Tensor, T
     visited = mask.any(-1)
     edges = torch.where(_usable(mask, visited), edge_cost, torch.inf)
     first = visited & (visited.cumsum(-1) == 1)
-    nothing = torch.where(mask, 0.0, torch.inf).to(edge_cost.dtype)
+    start = torch.where(mask, 0.0, torch.inf).to(edge_cost.dtype)
     stay = torch.arange(width, device=mask.device)
-    total, origins = nothing[..., 0, :], []
+    total, origins = start[..., 0, :], []
     for k in range(mask.shape[-2] - 1):  # a recursion: each step needs the one before
         best, origin = reduce(total[..., :, None] + edges[..., k, :, :])
-        best = torch.where(first[..., k + 1, None], nothing[..., k + 1, :], best)
+        best = torch.where(first[..., k + 1, None], start[..., k + 1, :], best)
         total = torch.where(visited[..., k + 1, None], best, total)
         origins.append(torch.where(visited[..., k + 1, None], origin, stay))
     none = mask.new_zeros((*total.shape[:-1], 0, width), dtype=torch.int64)
@@ -147,7 +147,7 @@ def _walk_back(end: Tensor, origin: Tensor) -> Tensor:
 def _cost_along(edge_cost: Tensor, held: Tensor, visited: Tensor) -> Tensor:
     """Sum of the edges of a path, (...): the minimum's subgradient is 1 on these edges and 0 elsewhere."""
     width = edge_cost.shape[-1]
-    linked = visited[..., 1:] & visited.cummax(-1).values[..., :-1]
+    linked = visited[..., 1:] & (visited.cumsum(-1) > 0)[..., :-1]
     flat = held[..., :-1] * width + held[..., 1:]
     along = edge_cost.flatten(-2).gather(-1, flat[..., None])[..., 0]
     return torch.where(linked, along, 0.0).sum(-1)

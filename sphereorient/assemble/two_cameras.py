@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble.path import Path, links
+from sphereorient.assemble.path import Path, graph_of, links
+from sphereorient.assemble.repair import Track, repair
 from sphereorient.assemble.segments import find_spikes, moving, number_segments
 from sphereorient.assemble.settings import AssembleSettings
+from sphereorient.errors import ExperimentError, ShapeError, refusal
 from sphereorient.orient import Candidates
 from sphereorient.trajectory import Flag
 
 CHI2_3_MEDIAN = 2.366  # median of a sum of three squared standard normals
+LINKS_MIN = 3  # in the window; fewer give no variance worth the name
+VARIANCE_RANGE = 10.0  # a quiet stretch of xi is no proof of a perfect camera
+CAMERAS_RATIO_MAX = 100.0  # of typical variances: a track whose xi never changes is not infinitely good
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,16 +32,10 @@ class Fused:
     disagreement_rad: Tensor  # (N,), distance of the two cameras' orientations after repair; NaN with one
     segment: Tensor  # (N,) int64, -1 outside any
     spike: Tensor  # (N,) bool
-    flags: Tensor  # (N,) int64
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Track:
-    """One camera's orientations while they are repaired."""
-
-    R: Tensor  # (N, 3, 3)
-    score: Tensor  # (N,)
-    present: Tensor  # (N,) bool
+    flags: Tensor  # (N,) int64, bits of trajectory.Flag
+    weight: Mapping[str, Tensor]  # (N,) of each camera, its share in the mean: their sum is 1, or 0 where none has one
+    repaired: Mapping[str, Tensor]  # (N,) bool of each camera
+    R_lab_body_of: Mapping[str, Tensor]  # (N, 3, 3) of each camera after the repair, NaN where it has none
 
 
 def fuse(
@@ -46,8 +44,8 @@ def fuse(
     """Join the cameras' paths, both in the lab frame, into one.
 
     Stretches in which they are more than `repair_deg` apart are repaired; then each frame is the mean of both,
-    weighted with the inverse moving variance of xi. The variances are relative; their common scale comes from how far
-    the cameras are apart over the whole movie.
+    weighted with the inverse moving variance of xi. These variances are relative; their common scale comes from how
+    far the cameras are apart over the whole movie, and with one camera there is none.
 
     Args:
         paths: of one or two cameras, N frames.
@@ -56,125 +54,124 @@ def fuse(
         settings: of the room.
 
     Returns:
-        The fused track. Frames of one camera only carry its orientation and `ONE_CAMERA`.
+        The fused track. A frame that one camera only saw carries its orientation and `ONE_CAMERA`; so does every
+        frame of an experiment with one camera. Frames of a repair that was a guess carry `AMBIGUOUS`.
 
-    Source: paper section III E; ERRATA A7 (which camera is right) and A8 (what the weights measure).
+    Raises:
+        ExperimentError: no camera, or more than two.
+        ShapeError: paths, candidates and times are not of the same cameras and frames.
+
+    Source: the paper's two cameras; ERRATA A7 (which camera is right) and A8 (what the weights measure: xi's variance
+        holds the motion's too, so that a sphere that turns unevenly draws the weights towards equal ones).
     """
+    _check(paths, candidates, time_s)
     names = list(paths)
-    tracks = [_Track(R=p.R_lab_body.clone(), score=p.score.clone(), present=p.present.clone()) for p in paths.values()]
-    flags = torch.zeros(len(time_s), dtype=torch.int64)
+    tracks = [Track(R_lab_body=path.R_lab_body, score=path.score) for path in paths.values()]
+    present = torch.stack([track.present for track in tracks])
+    repaired, ambiguous = torch.zeros_like(present), torch.zeros_like(present[0])
     if len(tracks) == 2:
-        graphs = (candidates[names[0]], candidates[names[1]])
-        tracks, flags = _repair((tracks[0], tracks[1]), graphs, settings)
-    variance = [_moving_variance(links(t.R, t.score, time_s)[0], settings.weight_window_frames) for t in tracks]
-    R, sigma, apart = _mean(tracks, variance)
-    present = torch.stack([t.present for t in tracks])
-    flags = flags | torch.where(present.sum(0) == 1, int(Flag.ONE_CAMERA), 0)
-    score = torch.stack([torch.where(t.present, t.score, 0.0) for t in tracks]).sum(0) / present.sum(0)
+        first, second = (graph_of(candidates[name], settings.quality_min) for name in names)
+        mended = repair((tracks[0], tracks[1]), (first, second), settings)
+        tracks, repaired, ambiguous = list(mended.tracks), mended.repaired, mended.ambiguous
+    present = torch.stack([track.present for track in tracks])
+    variance = relative_variance([links(t.R_lab_body, t.score, time_s)[0] for t in tracks], settings)
+    share = _shares(variance, present)
+    R = _mean(tracks, share)
+    apart = _apart(tracks)
+    score = torch.stack([track.score for track in tracks]).nanmean(0)
     xi, turn = links(R, score, time_s)
     spike = find_spikes(xi, turn, settings)
+    alone = present.sum(0) == 1 if len(tracks) == 2 else torch.ones_like(present[0])
+    bits = {
+        Flag.ONE_CAMERA: alone,
+        Flag.REPAIRED_FROM_OTHER_CAMERA: repaired.any(0),
+        Flag.AMBIGUOUS: ambiguous,
+        Flag.SPIKE: spike,
+    }
     return Fused(
         R_lab_body=R,
-        sigma_rad=sigma,
+        sigma_rad=_sigma(variance, share, apart),
         disagreement_rad=apart,
         segment=number_segments(present.any(0), spike, settings.gap_frames_max),
         spike=spike,
-        flags=flags | torch.where(spike, int(Flag.SPIKE), 0),
+        flags=torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0),
+        weight=dict(zip(names, share, strict=True)),
+        repaired=dict(zip(names, repaired, strict=True)),
+        R_lab_body_of={name: track.R_lab_body for name, track in zip(names, tracks, strict=True)},
     )
 
 
-def _moving_variance(xi: Tensor, window: int) -> Tensor:
-    """Variance of xi about each frame, (N,); the movie's own where too few links are near; never 0."""
-    windows = moving(xi, window)
-    count = torch.isfinite(windows).sum(-1)
-    mean = windows.nanmean(-1, keepdim=True)
-    variance = (windows - mean).square().nansum(-1) / (count - 1).clamp_min(1)
-    typical = variance[count >= 3].median() if (count >= 3).any() else torch.ones((), dtype=xi.dtype)
-    typical = typical if typical > 0 else torch.ones_like(typical)
-    # Within a factor of ten of the typical one: a quiet stretch of xi is no proof of a perfect camera.
-    return torch.where(count >= 3, variance.clamp(0.1 * typical, 10 * typical), typical)
+def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tensor:
+    """Return the moving variance of each camera's xi, (K, N), above 0 everywhere; only their ratios mean something.
 
+    It is kept within a factor of `VARIANCE_RANGE` of what is typical (the median) for the camera, which is taken
+    where fewer than `LINKS_MIN` links are near.
 
-def _mean(tracks: list[_Track], variance: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Weighted mean, sigma per axis, and the cameras' distance."""
-    if len(tracks) == 1:
-        unknown = torch.full_like(tracks[0].score, torch.nan)
-        return tracks[0].R, unknown, unknown
-    a, b = tracks
-    both = a.present & b.present
-    eye = torch.eye(3, dtype=a.R.dtype)
-    safe_a, safe_b = (torch.where(both[:, None, None], t.R, eye) for t in tracks)
-    weight = torch.stack([1 / variance[0], 1 / variance[1]], dim=-1)
-    mean = so3.weighted_mean(torch.stack([safe_a, safe_b], dim=-3), weight)
-    R = torch.where(both[:, None, None], mean, torch.where(a.present[:, None, None], a.R, b.R))
-    apart = torch.where(both, so3.geodesic_distance(safe_a, safe_b), torch.nan)
-    # E d^2 = 3 (s_a^2 + s_b^2) for independent errors per axis; the median is blind to what repair left wrong.
-    scale = (apart.square() / (variance[0] + variance[1])).nanmedian() / CHI2_3_MEDIAN
-    fused = 1 / weight.sum(-1)
-    relative = torch.where(both, fused, torch.where(a.present, variance[0], variance[1]))
-    sigma = torch.where(a.present | b.present, (scale * relative).sqrt(), torch.nan)
-    return R, sigma, apart
-
-
-def _repair(
-    tracks: tuple[_Track, _Track], graphs: tuple[Candidates, Candidates], settings: AssembleSettings
-) -> tuple[list[_Track], Tensor]:
-    """Repair each stretch in which the cameras contradict each other, the better supported one leading.
-
-    Nothing tells beforehand which camera is right (A7). Each in turn is supposed to be: the other then takes, in
-    every frame, its candidate nearest to that orientation, if there is one within `repair_deg`. The supposition under
-    which both pictures are explained better, by mean T, holds; where they are equal, the steadier one, and the frames
-    are ambiguous.
+    Args:
+        xi: (N,) of each camera, rad/s, NaN where no link enters the frame.
+        settings: the window.
     """
-    limit = math.radians(settings.repair_deg)
-    a, b = tracks
-    both = a.present & b.present
-    flags = torch.zeros(len(both), dtype=torch.int64)
-    apart = torch.where(both, so3.geodesic_distance(a.R, b.R), 0.0)
-    for frames in _stretches(apart > limit):
-        # (leader, follower): either way round.
-        options = [
-            (leader, _nearest(tracks[leader].R[frames], graphs[1 - leader], frames, limit, settings.quality_min))
-            for leader in (0, 1)
-        ]
-        merit = [
-            float((tracks[leader].score[frames] + follower.score.nan_to_num(0.0)).mean() / 2)
-            for leader, follower in options
-        ]
-        close = abs(merit[0] - merit[1]) < settings.repair_margin
-        if close:
-            rough = [_roughness(tracks[leader], frames) for leader, _ in options]
-            winner = int(rough[1] < rough[0])
-        else:
-            winner = int(merit[1] > merit[0])
-        _, follower = options[winner]
-        loser = tracks[1 - winner]
-        loser.R[frames], loser.score[frames], loser.present[frames] = follower.R, follower.score, follower.present
-        flags[frames] |= torch.where(follower.present, int(Flag.REPAIRED_FROM_OTHER_CAMERA), 0)
-        flags[frames] |= int(Flag.AMBIGUOUS) if close else 0
-    return list(tracks), flags
+    windows = [moving(each, settings.weight_window_frames) for each in xi]
+    count = torch.stack([torch.isfinite(window).sum(-1) for window in windows])
+    squares = torch.stack([(window - window.nanmean(-1, keepdim=True)).square().nansum(-1) for window in windows])
+    variance = torch.where(count >= LINKS_MIN, squares / (count - 1).clamp_min(1), torch.nan)
+    typical = variance.nanmedian(-1, keepdim=True).values if variance.shape[1] else variance.new_ones(len(xi), 1)
+    largest = typical.nan_to_num(0.0).max()
+    # A camera without links, or all of them perfectly still: nothing speaks for one or the other.
+    typical = torch.where(typical.isnan() | (largest == 0), torch.where(largest > 0, largest, 1.0), typical)
+    typical = typical.clamp_min(typical.max() / CAMERAS_RATIO_MAX)
+    within = torch.minimum(torch.maximum(variance, typical / VARIANCE_RANGE), typical * VARIANCE_RANGE)
+    return torch.where(variance.isnan(), typical, within)
 
 
-def _stretches(wrong: Tensor) -> list[Tensor]:
-    """Runs of consecutive True, as frame numbers."""
-    frame = torch.nonzero(wrong)[:, 0]
-    cuts = torch.nonzero(frame.diff() > 1)[:, 0] + 1
-    return [part for part in torch.tensor_split(frame, cuts) if len(part)]
+def _shares(variance: Tensor, present: Tensor) -> Tensor:
+    """Inverse variances of the cameras that have an orientation, (K, N), scaled to the sum 1; 0 where none has."""
+    weight = torch.where(present, 1 / variance, 0.0)
+    total = weight.sum(0)
+    return weight / torch.where(total > 0, total, 1.0)
 
 
-def _nearest(R: Tensor, graph: Candidates, frames: Tensor, limit: float, quality_min: float) -> _Track:
-    """A camera's candidates nearest to given orientations; absent where none is within the limit."""
-    R_all, score_all, mask = graph.padded()
-    distance = so3.geodesic_distance(R[:, None], R_all[frames])
-    distance = torch.where(mask[frames] & (score_all[frames] >= quality_min), distance, torch.inf)
-    near, which = distance.min(-1)
-    present = near <= limit
-    score = torch.where(present, score_all[frames, which], torch.nan)
-    return _Track(R=torch.where(present[:, None, None], R_all[frames, which], torch.nan), score=score, present=present)
+def _mean(tracks: Sequence[Track], share: Tensor) -> Tensor:
+    """Weighted mean of the cameras, (N, 3, 3); exactly the one camera's where there is one; NaN where none."""
+    present = torch.stack([track.present for track in tracks])[..., None, None]
+    R = torch.stack([track.R_lab_body for track in tracks])
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    several = present.sum(0) > 1
+    mean = so3.weighted_mean(
+        torch.where(several, R, eye).movedim(0, -3), torch.where(several[..., 0, 0], share, 1.0).movedim(0, -1)
+    )
+    alone = torch.where(present, R, 0.0).sum(0)
+    return torch.where(several, mean, torch.where(present.any(0), alone, torch.nan))
 
 
-def _roughness(track: _Track, frames: Tensor) -> float:
-    """Largest turn per frame of a track over a stretch and its two neighbours, rad."""
-    first, last = max(int(frames[0]) - 1, 0), min(int(frames[-1]) + 2, len(track.score))
-    R = track.R[first:last][track.present[first:last]]
-    return float(so3.geodesic_distance(R[:-1], R[1:]).max()) if len(R) > 1 else 0.0
+def _apart(tracks: Sequence[Track]) -> Tensor:
+    """Distance of the two cameras' orientations, (N,), rad; NaN where fewer than two have one."""
+    if len(tracks) == 1:
+        return torch.full_like(tracks[0].score, torch.nan)
+    first, second = tracks
+    apart = so3.geodesic_distance(first.R_lab_body, second.R_lab_body)
+    return torch.where(first.present & second.present, apart, torch.nan)
+
+
+def _sigma(variance: Tensor, share: Tensor, apart: Tensor) -> Tensor:
+    """Standard deviation per axis of the mean, (N,), rad.
+
+    Errors with the variances s^2 variance_i per axis make d^2 / (s^2 (variance_1 + variance_2)) the sum of three
+    squared standard normals. Its median gives s^2, blind to the few frames that the repair left wrong.
+    """
+    scale = (apart.square() / variance.sum(0)).nanmedian() / CHI2_3_MEDIAN if len(apart) else apart.sum()
+    relative = (share.square() * variance).sum(0)
+    return torch.where(share.sum(0) > 0, (scale * relative).sqrt(), torch.nan)
+
+
+def _check(paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor) -> None:
+    """Refuse what is not one or two cameras of the same frames."""
+    if not 1 <= len(paths) <= 2:
+        do = "name one or two cameras"
+        raise ExperimentError(refusal("paths", expected="one or two cameras", got=str(len(paths)), do=do))
+    for name, path in paths.items():
+        frames = len(candidates[name]) if name in candidates else 0
+        if not len(path.choice) == frames == len(time_s):
+            expected, got = f"{len(time_s)} frames", f"{len(path.choice)} in the path, {frames} in the candidates"
+            do = "pass what assemble_paths was given and gave"
+            raise ShapeError(refusal(f"camera {name!r}", expected=expected, got=got, do=do))

@@ -24,7 +24,7 @@ SEEDS = range(6)
 def random_graph(
     shape: tuple[int, ...], width: int, seed: int, *, ties: bool = False, dtype: torch.dtype = torch.float64
 ) -> tuple[Tensor, Tensor]:
-    """Edge costs and mask with holes at the start, in the middle and at the end; whole numbers where ties are wanted."""
+    """Edge costs and mask with holes anywhere, the ends too; whole numbers where ties are wanted."""
     rng = torch.Generator().manual_seed(seed)
     *batch, steps = shape
     edges = torch.rand(*batch, max(steps - 1, 0), width, width, generator=rng, dtype=torch.float64) + 0.1
@@ -41,9 +41,7 @@ def visited(mask: Tensor) -> list[int]:
 
 def cost_of(edges: Tensor, steps: list[int], places: tuple[int, ...]) -> float:
     """Cost of one path: the edges that enter a step come from the step visited last."""
-    return sum(
-        float(edges[step - 1, a, b]) for step, a, b in zip(steps[1:], places[:-1], places[1:], strict=True)
-    )
+    return sum(float(edges[step - 1, a, b]) for step, a, b in zip(steps[1:], places[:-1], places[1:], strict=True))
 
 
 def all_paths(edges: Tensor, mask: Tensor) -> dict[tuple[int, ...], float]:

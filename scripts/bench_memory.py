@@ -1,0 +1,70 @@
+"""Peak memory and time of `sphereorient track` for a movie and for the same movie played to and fro.
+
+    scripts/bench_memory.py EXPERIMENT.yaml [--times 1 5]
+
+The movies are written as .npy into a temporary folder, each frame there `times` times: memory that grows with the
+movie's length shows. Prints one line a length; the whole process is measured, start-up included.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sphereorient.experiment import Experiment, load_experiment, open_movies, write_experiment
+
+
+def lengthened(experiment: Experiment, times: int, folder: Path) -> Path:
+    """Write the experiment with its movies played to and fro `times` times."""
+    paths = {}
+    for name, movie in open_movies(experiment).items():
+        count = len(movie)
+        paths[name] = folder / f"{name}.npy"
+        out = np.lib.format.open_memmap(paths[name], "w+", movie.dtype, (times * count, *movie.frame_shape))
+        for k, frame in enumerate(movie.frames()):
+            for turn in range(times):
+                out[turn * count + (k if turn % 2 == 0 else count - 1 - k)] = frame
+        out.flush()
+    return write_experiment(replace(experiment, path=folder / "experiment.yaml", movie_paths=paths))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("experiment", type=Path)
+    parser.add_argument("--times", type=int, nargs="+", default=[1, 5])
+    arguments = parser.parse_args()
+    experiment = load_experiment(arguments.experiment)
+    for times in arguments.times:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            path = lengthened(experiment, times, folder)
+            begin = time.perf_counter()
+            command = [sys.executable, "-m", "sphereorient.cli", "track", path, "--out", folder / "track.h5", "-q"]
+            process = subprocess.Popen(command)
+            # wait4 tells the peak of this one child; getrusage(RUSAGE_CHILDREN) would tell the largest of all so far.
+            _, status, usage = resource_of(process)
+            frames = np.load(folder / f"{next(iter(experiment.movie_paths))}.npy", mmap_mode="r").shape[0]
+            seconds = time.perf_counter() - begin
+            print(
+                f"{frames:6d} frames: exit {status}, peak {usage.ru_maxrss / 1024:.0f} MiB, {seconds:.0f} s wall, "
+                f"{usage.ru_utime + usage.ru_stime:.0f} s CPU"
+            )
+
+
+def resource_of(process: subprocess.Popen[bytes]) -> tuple[int, int, resource.struct_rusage]:
+    """Wait for a process; its id, exit status and use of resources."""
+    import os
+
+    return os.wait4(process.pid, 0)
+
+
+if __name__ == "__main__":
+    main()
