@@ -1,14 +1,15 @@
-"""Peak memory and time of `sphereorient track` for a movie and for the same movie played to and fro.
+"""Peak memory and time of `sphereorient track` for a movie and for the same movie played several times in a row.
 
     scripts/bench_memory.py EXPERIMENT.yaml [--times 1 5]
 
-The movies are written as .npy into a temporary folder, each frame there `times` times: memory that grows with the
+The movies are written as .npy into a temporary folder, each `times` times in a row: memory that grows with the
 movie's length shows. Prints one line a length; the whole process is measured, start-up included.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import resource
 import subprocess
 import sys
@@ -23,16 +24,21 @@ from sphereorient.experiment import Experiment, load_experiment, open_movies, wr
 
 
 def lengthened(experiment: Experiment, times: int, folder: Path) -> Path:
-    """Write the experiment with its movies played to and fro `times` times."""
+    """Write the experiment with its movies played `times` times in a row."""
     paths = {}
     for name, movie in open_movies(experiment).items():
-        count = len(movie)
         paths[name] = folder / f"{name}.npy"
-        out = np.lib.format.open_memmap(paths[name], "w+", movie.dtype, (times * count, *movie.frame_shape))
-        for k, frame in enumerate(movie.frames()):
-            for turn in range(times):
-                out[turn * count + (k if turn % 2 == 0 else count - 1 - k)] = frame
-        out.flush()
+        header = {
+            "descr": np.lib.format.dtype_to_descr(movie.dtype),
+            "fortran_order": False,
+            "shape": (times * len(movie), *movie.frame_shape),
+        }
+        # Written piece by piece: a child's peak counts from what its parent held, and a map of the file would be held.
+        with paths[name].open("wb") as file:
+            np.lib.format.write_array_header_2_0(file, header)
+            for _ in range(times):
+                for frame in movie.frames():
+                    file.write(frame.tobytes())
     return write_experiment(replace(experiment, path=folder / "experiment.yaml", movie_paths=paths))
 
 
@@ -61,8 +67,6 @@ def main() -> None:
 
 def resource_of(process: subprocess.Popen[bytes]) -> tuple[int, int, resource.struct_rusage]:
     """Wait for a process; its id, exit status and use of resources."""
-    import os
-
     return os.wait4(process.pid, 0)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
 import sys
 from collections.abc import Sequence
@@ -36,6 +37,7 @@ def sha256(path: Path) -> str:
 def provenance(experiment: Experiment, cameras: Sequence[str], command: str) -> dict[str, Any]:
     """Return what the track's attribute `provenance` holds, all of it fit for JSON."""
     inputs = [experiment.path, experiment.cameras_path, *(experiment.movie_paths[name] for name in cameras)]
+    inputs += [experiment.background_paths[name] for name in cameras if name in experiment.background_paths]
     if experiment.texture_path is not None:
         inputs.append(experiment.texture_path)
     return {
@@ -43,5 +45,6 @@ def provenance(experiment: Experiment, cameras: Sequence[str], command: str) -> 
         "command": command,
         "platform": f"{platform.system()} {platform.machine()}, {sys.implementation.name}",
         "versions": versions(),
-        "sha256": {path.name: sha256(path) for path in inputs},
+        # By their place beside experiment.yaml: two cameras' movies in two folders often share a name.
+        "sha256": {Path(os.path.relpath(path, experiment.folder)).as_posix(): sha256(path) for path in inputs},
     }

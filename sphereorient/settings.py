@@ -104,6 +104,8 @@ def _override(tree: dict[str, Any], text: str, depth: int) -> None:
 def _explain(error: ValidationError, source: str, model: type[BaseModel]) -> str:
     """Word pydantic's first complaint in one line."""
     first = error.errors()[0]
+    if isinstance(refused := first.get("ctx", {}).get("error"), SettingsError):  # a room has worded it already
+        return f"{source}, {refused}"
     parts = [str(part) for part in first["loc"]]
     key = ".".join(parts)
     if first["type"] == "extra_forbidden":

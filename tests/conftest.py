@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Two workers with two threads each wait for each other's cores; the commands that tests start inherit this.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch

@@ -100,10 +100,7 @@ def _cheapest(graphs: Mapping[str, Graph], time_s: Tensor) -> list[Tensor]:
         for part in range(3)
     )
     time = pad_sequence([time_s[frames] for frames in visited], batch_first=True)
-    # Padding goes on after the movie, a second a step: the division stays finite, and the mask keeps it out.
-    place = torch.arange(steps, device=time.device)
-    real = place < torch.tensor([len(frames) for frames in visited], device=time.device)[:, None]
-    time = torch.where(real, time, time_s[-1] + 1 + place)
+    # Behind a movie's end stand zeros, times too: the mask keeps these edges out, whatever their costs.
     choice = shortest_path(edge_costs(R, score, time), mask).choice
     return [row[: len(frames)] for row, frames in zip(choice, visited, strict=True)]
 

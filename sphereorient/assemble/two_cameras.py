@@ -74,7 +74,9 @@ def fuse(
         mended = repair((tracks[0], tracks[1]), (first, second), settings)
         tracks, repaired, ambiguous = list(mended.tracks), mended.repaired, mended.ambiguous
     present = torch.stack([track.present for track in tracks])
-    variance = relative_variance([links(t.R_lab_body, t.score, time_s)[0] for t in tracks], settings)
+    linked = [links(track.R_lab_body, track.score, time_s) for track in tracks]
+    variance = relative_variance([xi for xi, _ in linked], settings)
+    calm = torch.stack([_calm(xi, turn, settings) for xi, turn in linked]).all(0)
     share = _shares(variance, present)
     R = _mean(tracks, share)
     apart = _apart(tracks)
@@ -90,7 +92,7 @@ def fuse(
     }
     return Fused(
         R_lab_body=R,
-        sigma_rad=_sigma(variance, share, apart),
+        sigma_rad=_sigma(variance, share, apart, calm),
         disagreement_rad=apart,
         segment=number_segments(present.any(0), spike, settings.gap_frames_max),
         spike=spike,
@@ -124,6 +126,12 @@ def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tenso
     return torch.where(variance.isnan(), typical, within)
 
 
+def _calm(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
+    """Frames without a spike in the window of their variance, (N,) bool."""
+    spike = find_spikes(xi, turn, settings)
+    return moving(spike.to(xi), settings.weight_window_frames).nansum(-1) == 0
+
+
 def _shares(variance: Tensor, present: Tensor) -> Tensor:
     """Inverse variances of the cameras that have an orientation, (K, N), scaled to the sum 1; 0 where none has."""
     weight = torch.where(present, 1 / variance, 0.0)
@@ -153,13 +161,18 @@ def _apart(tracks: Sequence[Track]) -> Tensor:
     return torch.where(first.present & second.present, apart, torch.nan)
 
 
-def _sigma(variance: Tensor, share: Tensor, apart: Tensor) -> Tensor:
+def _sigma(variance: Tensor, share: Tensor, apart: Tensor, calm: Tensor) -> Tensor:
     """Standard deviation per axis of the mean, (N,), rad.
 
     Errors with the variances s^2 variance_i per axis make d^2 / (s^2 (variance_1 + variance_2)) the sum of three
-    squared standard normals. Its median gives s^2, blind to the few frames that the repair left wrong.
+    squared standard normals. Its median gives s^2, blind to the few frames that the repair left wrong. Frames near a
+    spike are left out where there are others: it raises the variance of all frames about it, not their d.
     """
-    scale = (apart.square() / variance.sum(0)).nanmedian() / CHI2_3_MEDIAN if len(apart) else apart.sum()
+    if not len(apart):
+        return apart
+    ratio = apart.square() / variance.sum(0)
+    quiet = torch.where(calm, ratio, torch.nan)
+    scale = (quiet if torch.isfinite(quiet).any() else ratio).nanmedian() / CHI2_3_MEDIAN
     relative = (share.square() * variance).sum(0)
     return torch.where(share.sum(0) > 0, (scale * relative).sqrt(), torch.nan)
 

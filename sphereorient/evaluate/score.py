@@ -15,6 +15,7 @@ from sphereorient.errors import TrackError, refusal
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+RATES = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,6 +49,19 @@ def _angle_deg(A: Floats, B: Floats) -> Floats:
     return np.asarray(np.rad2deg(distance), np.float64)
 
 
+def _read_truth(path: str | Path) -> dict[str, Floats]:
+    """Read the datasets of truth.h5 that a track is compared with."""
+    name, do = f"truth {path}", "pass the truth.h5 of a synthetic experiment"
+    try:
+        with h5py.File(path) as file:
+            return {key: np.asarray(file[key][()]) for key in ("time", "position", "orientation", *RATES)}
+    except OSError as error:
+        raise TrackError(refusal(name, expected="an HDF5 file", got=" ".join(str(error).split()), do=do)) from None
+    except KeyError as error:
+        got = " ".join(str(error.args[0]).split())
+        raise TrackError(refusal(name, expected="time, position, orientation and rates", got=got, do=do)) from None
+
+
 def score_track(track: Trajectory, truth_path: str | Path) -> Score:
     """Compare a track with the exact truth.
 
@@ -61,21 +75,16 @@ def score_track(track: Trajectory, truth_path: str | Path) -> Score:
     Raises:
         TrackError: no truth file, or times that do not fit.
     """
-    name = f"truth {truth_path}"
-    try:
-        with h5py.File(truth_path) as file:
-            truth = {key: np.asarray(file[key][()]) for key in file if isinstance(file[key], h5py.Dataset)}
-    except OSError as error:
-        raise TrackError(refusal(name, expected="an HDF5 file", got=str(error), do="pass truth.h5")) from None
+    truth = _read_truth(truth_path)
     step = float(np.median(np.diff(truth["time"])))
     row = np.rint((track.time - truth["time"][0]) / step).astype(int)
     known = (row >= 0) & (row < len(truth["time"]))
     if not known.all() or np.abs(track.time - truth["time"][row]).max() > step / 2:
         got = f"{track.time[0]:.6g} .. {track.time[-1]:.6g} s"
+        name = f"truth {truth_path}"
         raise TrackError(refusal(name, expected="times of the track", got=got, do="pass the truth of this experiment"))
-    rates = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
     relative, coverage = {}, {}
-    for key in rates:
+    for key in RATES:
         measured, true = getattr(track, key), truth[key][row]
         have = np.isfinite(measured).all(axis=1)
         coverage[key] = float(have.mean())

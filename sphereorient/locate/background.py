@@ -27,7 +27,7 @@ class Background:
 
     mean: NDArray[np.float32]  # (H, W), grey levels
     noise: NDArray[np.float32]  # (H, W), robust standard deviation of each pixel about the mean, grey levels
-    full_scale: float  # grey level of a saturated pixel, 255 for 8 bit
+    full_scale: float  # grey level of a saturated pixel, 255 for 8 bit, 1023 for 10
 
     @cached_property
     def typical_noise(self) -> float:
@@ -85,7 +85,7 @@ def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None
         paint differs from a dark wall; the mean here leaves out the frames in which a pixel was covered (more than
         four robust sigmas from its median), and so sees the rim where the plain mean is blind (paper section III A).
     """
-    full_scale = float(np.iinfo(pictures.dtype).max)
+    full_scale = _full_scale(pictures)
     shape = pictures.shape[1:]
     mean, noise = np.empty(shape, np.float32), np.empty(shape, np.float32)
     for row in range(0, shape[0], 16):  # by strips: a float copy of all frames would be four times the frames
@@ -97,6 +97,14 @@ def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None
         quiet = np.abs(pictures[:, ::8, ::8].astype(np.float32) - empty[::8, ::8])
         noise = np.maximum(noise, np.median(_nan_quantile(quiet, MEASURED_SHARE)) / MEASURED_SIGMAS)
     return Background(mean=mean, noise=noise, full_scale=full_scale)
+
+
+def _full_scale(pictures: NDArray[Any]) -> float:
+    """Grey level of a saturated pixel. Cameras of 10 to 14 bits fill 16-bit numbers from below, and no file says so."""
+    if pictures.dtype.itemsize == 1:
+        return 255.0
+    brightest = int(pictures.max(initial=0))
+    return float(next(2**bits - 1 for bits in (10, 12, 14, 16) if brightest < 2**bits))
 
 
 def without_ball(background: Background, pictures: NDArray[Any], covered: NDArray[np.bool_]) -> Background:

@@ -84,9 +84,8 @@ def _judge(small: NDArray[np.float32], u: float, v: float, radius: float) -> tup
         reach = int(np.ceil(1.5 * radius))
         top, left = max(0, int(v) - reach), max(0, int(u) - reach)
         window = small[top : int(v) + reach + 1, left : int(u) + reach + 1]
-        rows, columns = np.indices(window.shape, dtype=np.float32)
-        rows += top
-        columns += left
+        grid = np.indices(window.shape, dtype=np.float32)
+        rows, columns = grid[0] + top, grid[1] + left
         inside = (rows - v) ** 2 + (columns - u) ** 2 <= (1.1 * radius) ** 2
         weight = (window > 0) & inside
         total, count = int(np.count_nonzero(window)), int(np.count_nonzero(weight))

@@ -14,6 +14,7 @@ from sphereorient.locate.settings import LocateSettings
 DIRECTIONS = 72  # bins of 5 degrees in which the support of a circle is counted
 BEYOND = 1.0  # weight of a rim place beyond a circle against one on it
 NOISE_FLOOR = 2.0  # below so many sigmas the root is linear: noise is not magnified
+NOISE_STEEPNESS = 0.28  # times the root of the noise: stabilised noise falls as steeply in one place of ten thousand
 PROFILES = 180  # radial profiles of the sub-pixel fit; more only repeat the same pixels
 
 
@@ -113,7 +114,7 @@ def _radial_edges(
     The outermost and not the steepest: inside, paint against paint falls as steeply as the rim and often steeper.
 
     Returns:
-        Unit directions (n, 2), signed distances from the circle (n,), px, and steepness (n,) where there is such a fall.
+        Where there is such a fall: unit directions (n, 2), signed distances from the circle (n,), px, steepness (n,).
     """
     step = 0.5
     offset = np.arange(-reach[0], reach[1] + step / 2, step)
@@ -127,7 +128,7 @@ def _radial_edges(
         cv2.INTER_CUBIC,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    fall = cv2.blur(profile[:, :-2] - profile[:, 2:], (3, 1)) / (2 * step)
+    fall = np.asarray(cv2.blur(profile[:, :-2] - profile[:, 2:], (3, 1)) / (2 * step), np.float32)
     # A maximum within 1 px to both sides: the blurred rim's own tail ripples with the interpolation.
     peak = (fall >= cv2.dilate(fall, np.ones((1, 5), np.uint8))) & (fall > steepness)
     peak[:, [0, -1]] = False
@@ -190,14 +191,15 @@ def _fit_circle(
     used = weight > 0
     rms = float(np.sqrt((residual[used] ** 2).mean()))
     angle = np.arctan2(outward[used, 1], outward[used, 0])
-    coverage = len(np.unique(np.floor((angle + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int))) / DIRECTIONS
+    direction = ((angle + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
+    coverage = len(np.unique(direction)) / DIRECTIONS
     return Outline(
         u_px=float(circle[0]), v_px=float(circle[1]), radius_px=float(circle[2]), rms_px=rms, coverage=coverage
     )
 
 
 def _stabilised(window: NDArray[np.float32], noise: float, blur_px: float) -> NDArray[np.float32]:
-    """Blur, and take the root, as for shot noise: a dim rim then counts beside a bright one, noise equally everywhere."""
+    """Blur, and take the root, as for shot noise: a dim rim counts beside a bright one, noise equally everywhere."""
     blurred = cv2.GaussianBlur(window, (0, 0), blur_px)
     out: NDArray[np.float32] = np.sqrt(blurred + noise) - np.float32(np.sqrt(noise))
     return out
@@ -235,13 +237,15 @@ def fit_outline(
     window = _stabilised(window, NOISE_FLOOR * noise, settings.edge_blur_px)
     contrast = float(np.percentile(window, 90))
     # A step blurred by sigma is contrast / (sigma sqrt(2 pi)) steep.
-    steepness = settings.edge_fraction * contrast / (settings.edge_blur_px * 2.5)
+    # Where nothing is bright, noise alone would make up a circle.
+    floor = NOISE_STEEPNESS * noise**0.5
+    steepness = max(settings.edge_fraction * contrast / (settings.edge_blur_px * 2.5), floor)
     edges = _edge_points(window, steepness)
     sizes = tuple(0.5 * diameter_px * (1 + sign * settings.diameter_tolerance) for sign in (-1, 1))
     circle = _best_circle(edges, (sizes[0], sizes[1]), settings.edge_tolerance_px)
     if circle is None:
         return None
-    fit = _fit_circle(window, circle, settings.edge_tolerance_px, 0.5 * steepness)
+    fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor))
     if fit is None or not sizes[0] < fit.radius_px < sizes[1]:
         return None
     return Outline(

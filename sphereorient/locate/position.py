@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.cameras import Camera, Rays, triangulate
+from sphereorient.errors import ExperimentError, refusal
 from sphereorient.locate.sightings import Sightings
 from sphereorient.trajectory import Flag
 
@@ -44,9 +45,15 @@ def find_positions(
         Positions. Where one camera alone has the outline, the distance comes from its radius, is far less sure, and
         the frame carries `ONE_CAMERA`.
 
+    Raises:
+        ExperimentError: two cameras, and the diameter is unknown: radii and mm would stand side by side.
+
     Source: paper section III A (triangulation). The sigma of one camera's centre, per axis, is the rms of its
     outline; the rays carry it into space.
     """
+    if diameter_mm is None and len(sightings) > 1:
+        do = "give the diameter, or track with one camera"
+        raise ExperimentError(refusal("sphere.diameter", expected="a number of mm", got="null, two cameras", do=do))
     radius_mm = 1.0 if diameter_mm is None else diameter_mm / 2
     views = [_view(seen, cameras[name], radius_mm) for name, seen in sightings.items()]
     placed = torch.stack([seen.placed for seen in sightings.values()])

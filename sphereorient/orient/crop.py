@@ -16,7 +16,8 @@ def crop_disk(
 
     Args:
         frame: (H, W), grey levels; beyond its border the nearest pixel is repeated.
-        u_px, v_px: centre of the disk.
+        u_px: centre of the disk, column, px.
+        v_px: centre of the disk, row, px.
         radius_px: its radius; becomes half the picture.
         size_px: side of the picture, px.
 
@@ -25,9 +26,9 @@ def crop_disk(
     """
     offset = disk_offsets(size_px).numpy() * radius_px
     # The window first: a map over the whole frame would convert all of it to float.
-    reach = int(np.ceil(radius_px)) + 2
-    left, top = max(0, int(u_px) - reach), max(0, int(v_px) - reach)
-    window = frame[top : int(v_px) + reach + 2, left : int(u_px) + reach + 2].astype(np.float32)
+    left, right = _span(u_px, radius_px, frame.shape[1])
+    top, bottom = _span(v_px, radius_px, frame.shape[0])
+    window = frame[top:bottom, left:right].astype(np.float32)
     return np.asarray(
         cv2.remap(
             window,
@@ -37,3 +38,10 @@ def crop_disk(
             borderMode=cv2.BORDER_REPLICATE,
         )
     )
+
+
+def _span(centre_px: float, radius_px: float, length: int) -> tuple[int, int]:
+    """First and last + 1 of the columns or rows that a disk's pixels lie between; at least the one nearest to it."""
+    reach = int(np.ceil(radius_px)) + 2
+    first = min(max(int(centre_px) - reach, 0), length - 1)
+    return first, max(int(centre_px) + reach + 2, first + 1)

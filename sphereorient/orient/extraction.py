@@ -18,10 +18,12 @@ def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_sh
     Args:
         disks: (..., S, S), grey levels.
         inside: (S, S) bool, pixels of the disk.
-        black_share, white_share: least shares of its pixels at 0 and at 1; the paper's b and w.
+        black_share: least share of the disk's pixels at 0; the paper's b.
+        white_share: least share of the disk's pixels at 1; the paper's w.
 
     Returns:
-        (..., S, S) in 0 .. 1, 0.5 outside the disk and in a disk of one grey.
+        (..., S, S) in 0 .. 1, 0.5 outside the disk and in a disk of one grey. Where one grey fills so much that no
+        stretch gives both shares, darkest to brightest become 0 .. 1.
 
     Source: paper section III B; ERRATA A2 for what the forced shares cost.
     """
@@ -30,6 +32,9 @@ def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_sh
     count = ordered.shape[-1]
     low = ordered[..., min(int(black_share * count), count - 1), None]
     high = ordered[..., max(count - 1 - int(white_share * count), 0), None]
+    # More than all but the forced shares of one grey (dots on saturated white): stretch over what there is.
+    plateau = high <= low
+    low, high = torch.where(plateau, ordered[..., :1], low), torch.where(plateau, ordered[..., -1:], high)
     flat = high <= low
     stretched = ((values - low) / torch.where(flat, torch.ones_like(high), high - low)).clamp(0.0, 1.0)
     out = disks.new_full(disks.shape, 0.5)

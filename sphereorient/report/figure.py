@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,6 @@ from sphereorient.trajectory import Trajectory
 AXIS_COLOURS = ("#D55E00", "#009E73", "#0072B2")
 BRIGHT_COLOURS = ("#FF8C3B", "#2BE0A8", "#63C3FF")  # the same hues on dark pictures
 TRUTH_COLOUR = "#444444"
-CROP_PX = 96
 
 
 def demo_figure(track: Trajectory, experiment: Experiment, path: Path, score: Score | None = None) -> None:
@@ -51,21 +51,23 @@ def _frames_part(part: Any, track: Trajectory, experiment: Experiment) -> None:
         raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
     names = list(track.cameras)
     chosen = _spread_valid(track, 8 // len(names))
-    movies = open_movies(experiment, names)
     texture = load_texture(experiment.texture_path)
     first = round(track.time[0] * track.frame_rate)
+    pictures = {}
+    with ExitStack() as opened:
+        for name, movie in open_movies(experiment, names).items():
+            opened.enter_context(movie)
+            shift = movie_span(experiment, name, range(first, first + len(track)))[0]
+            pictures[name] = movie.sample([shift + k for k in chosen])
     for beside, name in zip(part.subfigures(1, len(names), squeeze=False)[0], names, strict=True):
         axes = beside.subplots(2, len(chosen), squeeze=False)
-        shift = movie_span(experiment, name, range(first, first + len(track)))[0]
-        pictures = movies[name].sample([shift + k for k in chosen])
-        for column, (k, picture) in enumerate(zip(chosen, pictures, strict=True)):
+        for column, (k, picture) in enumerate(zip(chosen, pictures[name], strict=True)):
             _draw_sighting(axes[0, column], picture, track, experiment.cameras[name], name, k)
             _draw_render(axes[1, column], texture, track, experiment.cameras[name], name, k)
             axes[0, column].set_title(f"{1e3 * track.time[k]:.1f} ms", fontsize=9)
         axes[0, 0].set_ylabel("filmed")
         axes[1, 0].set_ylabel("re-rendered")
         beside.suptitle(name, fontsize=11)
-        movies[name].close()
     part.supxlabel("outline and body axes as measured; solid: towards the camera, dotted: away", fontsize=9)
 
 
@@ -80,18 +82,22 @@ def _draw_sighting(axes: Any, picture: NDArray[Any], track: Trajectory, camera: 
     seen = track.cameras[name]
     u, v = seen.centre_px[k]
     radius = seen.radius_px[k]
-    reach = 1.25 * radius if np.isfinite(radius) else CROP_PX / 2
     axes.imshow(picture, cmap="gray", vmin=0, vmax=np.percentile(picture, 99.8), interpolation="nearest")
+    _bare(axes)
+    if not np.isfinite(radius):  # this camera does not have the sphere: the whole picture shows why
+        return
+    reach = 1.25 * radius
+    axes.set(xlim=(u - reach, u + reach), ylim=(v + reach, v - reach))
     angle = np.linspace(0, 2 * np.pi, 100)
     axes.plot(u + radius * np.cos(angle), v + radius * np.sin(angle), color="#F0E442", linewidth=1)
     R_cam_body = camera.R_cam_lab.numpy() @ track.orientation[k]
+    if not np.isfinite(R_cam_body).all():
+        return
     for label, colour, tip in zip("xyz", BRIGHT_COLOURS, R_cam_body.T, strict=True):
         style = "-" if tip[2] < 0 else ":"
         axes.plot([u, u + radius * tip[0]], [v, v + radius * tip[1]], style, color=colour, linewidth=2)
         at = (u + 1.14 * radius * tip[0], v + 1.14 * radius * tip[1])
         axes.text(*at, label, color=colour, fontsize=9, fontweight="bold", ha="center", va="center")
-    axes.set(xlim=(u - reach, u + reach), ylim=(v + reach, v - reach))
-    _bare(axes)
 
 
 def _draw_render(axes: Any, texture: torch.Tensor, track: Trajectory, camera: Camera, name: str, k: int) -> None:

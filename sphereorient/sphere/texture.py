@@ -14,6 +14,8 @@ from torch.nn import functional as F
 
 from sphereorient.errors import ShapeError, TextureError, check_tail, refusal
 
+WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}  # grey level of white paint by type of picture
+
 
 def load_texture(path: Path) -> Tensor:
     """Read an equirectangular grey map of the paint.
@@ -32,7 +34,9 @@ def load_texture(path: Path) -> Tensor:
         raise TextureError(
             refusal(name, expected="a picture file", got="no such file", do="correct sphere.texture in the experiment")
         )
-    picture = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    content = np.fromfile(path, dtype=np.uint8)
+    # OpenCV throws at an empty file where it returns None for any other that does not decode.
+    picture = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if len(content) else None
     if picture is None:
         raise TextureError(
             refusal(
@@ -49,13 +53,14 @@ def load_texture(path: Path) -> Tensor:
                 do="export the whole sphere, longitude -180..180 across and latitude 90..-90 down",
             )
         )
-    if picture.dtype not in (np.uint8, np.uint16):
+    white = WHITE.get(picture.dtype)
+    if white is None:
         raise TextureError(refusal(name, expected="8 or 16 bit grey", got=str(picture.dtype), do="export it as 8 bit"))
     if int(picture.min()) == int(picture.max()):
         raise TextureError(
             refusal(name, expected="a pattern of paint", got="one single grey", do="check that the map was saved")
         )
-    return torch.from_numpy(picture.astype(np.float32) / np.iinfo(picture.dtype).max)
+    return torch.from_numpy(picture.astype(np.float32) / white)
 
 
 def reduced_texture(texture: Tensor, diameter_px: float) -> Tensor:
@@ -86,10 +91,11 @@ def texture_coordinates(direction_body: Tensor) -> tuple[Tensor, Tensor]:
     """
     check_tail("direction_body", direction_body, 3)
     x, y, z = direction_body.unbind(-1)
-    # At the poles longitude is undefined and its gradient infinite; a direction nudged off the axis has both finite.
+    # At the poles longitude is undefined and its gradient infinite; a direction nudged off the axis has a longitude,
+    # and without the gradients of x and y it has none of 1 / nudge, which would drown those of all other directions.
     nudge = torch.finfo(direction_body.dtype).eps
     polar = (x.abs() < nudge) & (y.abs() < nudge)
-    x = torch.where(polar, x.detach() + nudge, x)
+    x, y = torch.where(polar, x.detach() + nudge, x), torch.where(polar, y.detach(), y)
     return torch.atan2(y, x), torch.atan2(z, torch.sqrt(x * x + y * y))
 
 

@@ -51,14 +51,14 @@ def _random_waves(rms: float, correlation_time: float, rng: torch.Generator, cou
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RandomMotion:
-    """A smooth motion that can be asked at any instants from 0 on; made by `random_motion`."""
+    """A smooth motion that can be asked at any instants; made by `random_motion`."""
 
     path: _Waves  # velocity, mm/s; its integral is the path
     omega: _Waves  # omega_lab, rad/s
     R_start: Tensor  # (3, 3), R_lab_body at time 0
 
     def at(self, time_s: Tensor) -> Motion6D:
-        """Evaluate at (N,) increasing instants, s, float64.
+        """Evaluate at (N,) instants, s, float64, each near the one before; the first may lie before time 0.
 
         R by a fourth-order Magnus integration of omega_lab, exact to better than 1e-9 rad per frame.
         """

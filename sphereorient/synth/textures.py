@@ -18,7 +18,7 @@ def map_directions(height: int) -> Tensor:
 
 def _random_directions(count: int, rng: torch.Generator) -> Tensor:
     draw = torch.randn(count, 3, generator=rng, dtype=torch.float64)
-    return draw / draw.norm(dim=-1, keepdim=True)
+    return torch.nn.functional.normalize(draw, dim=-1)
 
 
 def blobs(height: int, rng: torch.Generator) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,10 @@ def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
     """Two Tsai cameras at right angles: cam1 looks along lab +y, cam2 along lab -z; slight distortion."""
     focal_mm = settings.diameter_px * PIXEL_PITCH_MM * settings.distance_mm / settings.diameter_mm
     width, height = settings.image_size
+
+    def f64(value: Any) -> Tensor:
+        return torch.tensor(value, dtype=torch.float64)
+
     looks = {
         "cam1": [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
         "cam2": [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]],
@@ -37,13 +40,13 @@ def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
     return {
         name: TsaiCamera(
             image_size=(width, height),
-            f_mm=focal_mm,
-            pixel_pitch_mm=(PIXEL_PITCH_MM, PIXEL_PITCH_MM),
-            sx=1.0,
-            centre_px=((width - 1) / 2, (height - 1) / 2),
-            kappa1=kappa1,
-            R_cam_lab=R,
-            T_cam_lab_mm=[0.0, 0.0, settings.distance_mm],
+            f_mm=f64(focal_mm),
+            pixel_pitch_mm=f64((PIXEL_PITCH_MM, PIXEL_PITCH_MM)),
+            sx=f64(1.0),
+            centre_px=f64(((width - 1) / 2, (height - 1) / 2)),
+            kappa1=f64(kappa1),
+            R_cam_lab=f64(R),
+            T_cam_lab_mm=f64((0.0, 0.0, settings.distance_mm)),
         )
         for (name, R), kappa1 in zip(looks.items(), (2e-4, -1.5e-4), strict=True)
     }
@@ -115,7 +118,7 @@ def _frames(
     count = settings.exposure_samples
     within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
     time_s = torch.arange(settings.frames, dtype=torch.float64) / settings.frame_rate
-    now = motion.at((time_s[:, None] + within).reshape(-1).clamp_min(0))
+    now = motion.at((time_s[:, None] + within).reshape(-1))
     scene = make_scene(texture, settings)
     rng = np.random.default_rng([settings.seed, index])
     for k in range(settings.frames):
@@ -143,15 +146,17 @@ def _write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> 
     with h5py.File(aside, "w") as file:
         for key, value in data.items():
             file.create_dataset(key, data=value.numpy())
-    os.replace(aside, path)
+    aside.replace(path)
 
 
 def _experiment(settings: SynthSettings, cameras: Mapping[str, Camera]) -> dict[str, Any]:
+    # A momentary exposure is written as none: the experiment's key is a duration above 0.
+    exposure = {"exposure": settings.exposure} if settings.exposure > 0 else {}
     return {
         "schema": "sphereorient-experiment/1",
         "name": settings.name,
         "frame_rate": settings.frame_rate,
-        "exposure": settings.exposure,
+        **exposure,
         "sphere": {"diameter": settings.diameter_mm, "texture": "texture.png"},
         "cameras": "cameras.yaml",
         "backgrounds": {name: f"empty_{name}.png" for name in cameras},

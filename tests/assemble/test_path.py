@@ -21,10 +21,7 @@ def among_false_ones(R, rng, *, false_ones: int = 3, better_in: tuple[int, ...] 
     """The truth with T = 0.9 among random orientations of T = 0.6, in some frames of 0.97."""
     wrong = so3.random_rotations((len(R), false_ones), generator=rng)
     return candidates_of(
-        [
-            [(R[k], 0.9), *((each, 0.97 if k in better_in else 0.6) for each in wrong[k])]
-            for k in range(len(R))
-        ]
+        [[(R[k], 0.9), *((each, 0.97 if k in better_in else 0.6) for each in wrong[k])] for k in range(len(R))]
     )
 
 
@@ -90,10 +87,7 @@ def test_cameras_in_one_batch_give_what_each_gives_alone(rng):
     R = turning(40)
     full = among_false_ones(R, rng, better_in=(3, 4))
     holes = candidates_of(
-        [
-            [] if k in (0, 5, 6, 20) else [(R[k], 0.8), (turned_deg(R[k], 0.0, 50.0 + k, 0.0), 0.85)]
-            for k in range(40)
-        ]
+        [[] if k in (0, 5, 6, 20) else [(R[k], 0.8), (turned_deg(R[k], 0.0, 50.0 + k, 0.0), 0.85)] for k in range(40)]
     )
     cameras = {"cam1": full, "cam2": holes, "blind": single(R, without=range(40))}
     together = assemble_paths(cameras, times(40), SETTINGS)
@@ -148,5 +142,5 @@ def test_a_camera_of_another_length_is_refused():
 def test_a_path_of_unequal_parts_is_refused():
     path = assemble_path(single(turning(5)), times(5), SETTINGS)
     parts = {name: getattr(path, name) for name in Path.__dataclass_fields__}
-    with pytest.raises(ShapeError, match="Path.xi"):
+    with pytest.raises(ShapeError, match=r"Path\.xi"):
         Path(**parts | {"xi": path.xi[:-1]})

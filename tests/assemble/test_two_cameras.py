@@ -10,7 +10,7 @@ from assemble_examples import candidates_of, noisy, single, times, turned_deg, t
 from conftest import assert_close
 
 from sphereorient import so3
-from sphereorient.assemble import AssembleSettings, Fused, assemble_paths, fuse
+from sphereorient.assemble import AssembleSettings, Fused, assemble_path, assemble_paths, fuse
 from sphereorient.errors import ExperimentError, ShapeError
 from sphereorient.trajectory import Flag
 
@@ -27,42 +27,315 @@ def has(track: Fused, flag: Flag) -> list[int]:
     return torch.nonzero((track.flags & int(flag)) > 0).flatten().tolist()
 
 
-def deceived(R, *, truth_too: bool, true_score: float = 0.85, false_score: float = 0.9):
-    """A camera that in the stretch follows a false candidate standing still, with the true one beside it or not."""
-    still = turned_deg(R[25], 0.0, 0.0, 110.0)
-    frames = [[(R[k], 0.9)] for k in range(len(R))]
-    for k in STRETCH:
-        frames[k] = [(still, false_score)] + [(R[k], true_score)] * truth_too
+def false_track(R):
+    """A candidate that turns as the truth does, 110 degrees beside it."""
+    return turned_deg(R, 0.0, 0.0, 110.0)
+
+
+def sees(R, *, false_in=(), false_score: float = 0.9, true_in=None, true_score: float = 0.85, nothing_in=()):
+    """A camera's candidates: the false one in some frames, and the truth in all of them or in some."""
+    false = false_track(R)
+    frames = []
+    for k in range(len(R)):
+        frame = [(false[k], false_score)] if k in false_in else []
+        if k not in false_in or true_in is None or k in true_in:
+            frame.append((R[k], true_score))
+        frames.append([] if k in nothing_in else frame)
     return candidates_of(frames)
 
 
-def in_order(wrong_first: bool, wrong, right):
-    return {"cam1": wrong, "cam2": right} if wrong_first else {"cam1": right, "cam2": wrong}
+def contradiction(first, second, settings: AssembleSettings = SETTINGS, *, deceived=("cam1",), frames=STRETCH) -> Fused:
+    """Fuse two cameras of which some follow their best candidate, which in the stretch is false."""
+    cameras = {"cam1": first, "cam2": second}
+    time = times(len(first))
+    paths = assemble_paths(cameras, time, settings)
+    for name in deceived:
+        R, score, mask = cameras[name].padded()
+        best = candidates_of([[(R[k, 0], float(score[k, 0]))] if mask[k, 0] else [] for k in range(len(R))])
+        paths[name] = assemble_path(best, time, settings)
+    return fuse(paths, cameras, time, settings)
 
 
-@pytest.fixture(params=[True, False], ids=["first_wrong", "second_wrong"])
-def wrong_first(request: pytest.FixtureRequest) -> bool:
+@pytest.fixture(params=["cam1", "cam2"])
+def wrong(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-def test_a_camera_deceived_for_a_stretch_is_repaired_from_the_other(wrong_first):
+def as_pair(wrong: str, deceived, right):
+    return (deceived, right) if wrong == "cam1" else (right, deceived)
+
+
+def test_a_camera_deceived_for_a_stretch_is_repaired_from_the_other(wrong):
     R = turning(60)
-    # a motionless false candidate wins over the truth in the path (A6) only if the way there is short: give it T near 1
-    wrong = deceived(R, truth_too=True, true_score=0.7, false_score=0.999)
-    cameras = in_order(wrong_first, wrong, single(R, 0.95))
-    name = "cam1" if wrong_first else "cam2"
-    other = "cam2" if wrong_first else "cam1"
-    paths = assemble_paths(cameras, times(60), SETTINGS)
-    deceived_in = torch.nonzero(so3.geodesic_distance(paths[name].R_lab_body, R) > 0.5).flatten().tolist()
-    if not deceived_in:
-        pytest.fail("the example does not deceive the path")
-    track = fused(cameras)
+    track = contradiction(*as_pair(wrong, sees(R, false_in=STRETCH), sees(R)), deceived=[wrong])
+    right = {"cam1": "cam2", "cam2": "cam1"}[wrong]
     assert_close(track.R_lab_body, R, 1e-9)
-    assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == deceived_in
-    assert torch.nonzero(track.repaired[name]).flatten().tolist() == deceived_in
-    assert not track.repaired[other].any()
-    assert_close(track.R_lab_body_of[name], R)
+    assert_close(track.R_lab_body_of[wrong], R)
+    assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == list(STRETCH)
+    assert torch.nonzero(track.repaired[wrong]).flatten().tolist() == list(STRETCH)
+    assert not track.repaired[right].any()
     assert has(track, Flag.AMBIGUOUS) == []
     assert has(track, Flag.ONE_CAMERA) == []
-    assert not track.spike.any()
+    assert has(track, Flag.SPIKE) == []
     assert (track.segment == 0).all()
+    assert (track.disagreement_rad < 1e-6).all()
+
+
+def test_the_deceived_camera_loses_although_its_false_candidate_scores_higher(wrong):
+    R = turning(60)
+    pair = as_pair(wrong, sees(R, false_in=STRETCH, false_score=0.99), sees(R, true_score=0.7))
+    assert_close(contradiction(*pair, deceived=[wrong]).R_lab_body, R, 1e-9)
+
+
+def test_the_nearest_candidate_within_the_limit_is_taken_and_not_the_best(wrong):
+    R = turning(60)
+    deceived = candidates_of(
+        [
+            [(false_track(R)[k], 0.9), (turned_deg(R[k], 20.0, 0.0, 0.0), 0.85), (turned_deg(R[k], 2.0, 0.0, 0.0), 0.6)]
+            if k in STRETCH
+            else [(R[k], 0.9)]
+            for k in range(60)
+        ]
+    )
+    track = contradiction(*as_pair(wrong, deceived, sees(R)), deceived=[wrong])
+    taken = so3.geodesic_distance(track.R_lab_body_of[wrong], R)[list(STRETCH)]
+    assert_close(taken, torch.full_like(taken, math.radians(2.0)), 1e-9)
+
+
+def test_candidates_below_the_least_quality_are_not_taken_in_a_repair(wrong):
+    R = turning(60)
+    deceived = candidates_of(
+        [[(false_track(R)[k], 0.9), (R[k], 0.49)] if k in STRETCH else [(R[k], 0.9)] for k in range(60)]
+    )
+    track = contradiction(*as_pair(wrong, deceived, sees(R)), deceived=[wrong])
+    assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == []
+
+
+def test_where_the_loser_has_no_candidate_the_winner_stands_alone(wrong):
+    R = turning(60)
+    deceived = sees(R, false_in=STRETCH, true_in=range(20, 26))
+    track = contradiction(*as_pair(wrong, deceived, sees(R)), deceived=[wrong])
+    assert_close(track.R_lab_body, R, 1e-9)
+    assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == list(range(20, 26))
+    assert has(track, Flag.ONE_CAMERA) == list(range(26, 30))
+    assert track.R_lab_body_of[wrong][26:30].isnan().all()
+    assert track.disagreement_rad[26:30].isnan().all()
+    assert has(track, Flag.AMBIGUOUS) == []
+
+
+def test_where_neither_has_a_candidate_near_the_other_the_steadier_one_stands_alone_and_the_guess_is_marked(wrong):
+    R = turning(60)
+    deceived = sees(R, false_in=STRETCH, true_in=(), false_score=0.98)  # its T does not help it
+    track = contradiction(*as_pair(wrong, deceived, sees(R)), deceived=[wrong])
+    assert_close(track.R_lab_body, R, 1e-9)
+    assert has(track, Flag.AMBIGUOUS) == list(STRETCH)
+    assert has(track, Flag.ONE_CAMERA) == list(STRETCH)
+    assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == []
+
+
+def test_two_explanations_of_equal_quality_are_decided_by_continuity_and_marked(wrong):
+    R = turning(60)
+    false = false_track(R)
+    # both cameras have both candidates with the same T: each explains the other's
+    either = candidates_of([[(false[k], 0.8), (R[k], 0.8)] if k in STRETCH else [(R[k], 0.8)] for k in range(60)])
+    track = contradiction(*as_pair(wrong, either, either), deceived=[wrong])
+    assert_close(track.R_lab_body, R, 1e-9)
+    assert has(track, Flag.AMBIGUOUS) == list(STRETCH)
+    assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == list(STRETCH)
+    assert torch.nonzero(track.repaired[wrong]).flatten().tolist() == list(STRETCH)
+
+
+def test_a_larger_margin_makes_more_of_the_repairs_a_guess():
+    R = turning(60)
+    first, second = sees(R, false_in=STRETCH), sees(R)
+    assert has(contradiction(first, second), Flag.AMBIGUOUS) == []
+    loose = AssembleSettings(repair_margin=0.9)
+    assert has(contradiction(first, second, loose), Flag.AMBIGUOUS) == list(STRETCH)
+
+
+def test_stretches_with_different_culprits_are_decided_each_by_itself():
+    R = turning(90)
+    first, second = sees(R, false_in=range(20, 25)), sees(R, false_in=range(60, 70))
+    track = contradiction(first, second, deceived=["cam1", "cam2"])
+    assert_close(track.R_lab_body, R, 1e-9)
+    assert torch.nonzero(track.repaired["cam1"]).flatten().tolist() == list(range(20, 25))
+    assert torch.nonzero(track.repaired["cam2"]).flatten().tolist() == list(range(60, 70))
+
+
+def test_a_frame_that_one_camera_missed_does_not_split_a_stretch():
+    R = turning(60)
+    # left of the hole alone the false candidate would win: there the other camera has it too, and scores it higher
+    false = false_track(R)
+    first = candidates_of([[(false[k], 0.9), (R[k], 0.8)] if k in STRETCH else [(R[k], 0.9)] for k in range(60)])
+    second = candidates_of(
+        [[] if k == 22 else [(R[k], 0.9)] + ([(false[k], 0.85)] if k in (20, 21) else []) for k in range(60)]
+    )
+    track = contradiction(first, second)
+    assert torch.nonzero(track.repaired["cam1"]).flatten().tolist() == [k for k in STRETCH if k != 22]
+    assert not track.repaired["cam2"].any()
+
+
+@pytest.mark.parametrize(("apart_deg", "repaired"), [(29.0, False), (31.0, True)])
+def test_cameras_are_repaired_from_thirty_degrees_on(apart_deg, repaired):
+    R = turning(60)
+    beside = turned_deg(R, apart_deg, 0.0, 0.0)
+    first = candidates_of([[(beside[k], 0.9), (R[k], 0.85)] if k in STRETCH else [(R[k], 0.9)] for k in range(60)])
+    track = contradiction(first, single(R))
+    assert bool(track.repaired["cam1"].any()) is repaired
+    if not repaired:
+        assert_close(track.disagreement_rad[20], torch.tensor(math.radians(29.0), dtype=torch.float64), 1e-9)
+
+
+def test_the_noisier_camera_gets_less_weight(rng, wrong):
+    R = turning(600)
+    steady, rough = single(noisy(R, 0.003, rng)), single(noisy(R, 0.03, rng))
+    track = fused(dict(zip(("cam1", "cam2"), as_pair(wrong, rough, steady), strict=True)))
+    right = {"cam1": "cam2", "cam2": "cam1"}[wrong]
+    assert (track.weight[wrong] < track.weight[right]).double().mean() > 0.99
+    assert_close(track.weight[wrong] + track.weight[right], torch.ones(600, dtype=torch.float64))
+    error = {name: so3.geodesic_distance(track.R_lab_body_of[name], R).mean() for name in (wrong, right)}
+    assert so3.geodesic_distance(track.R_lab_body, R).mean() < 0.3 * error[wrong]
+
+
+def test_weights_follow_a_camera_that_becomes_noisy_for_a_while(rng):
+    R = turning(600)
+    sigma = torch.full((600,), 0.01)
+    sigma[200:400] = 0.04
+    track = fused({"cam1": single(noisy(R, sigma, rng)), "cam2": single(noisy(R, 0.02, rng))})
+    assert track.weight["cam1"][:180].mean() > 0.6
+    assert track.weight["cam1"][220:380].mean() < 0.4
+
+
+@pytest.mark.parametrize(("first", "second"), [(0.02, 0.02), (0.02, 0.04), (0.06, 0.03)])
+def test_sigma_is_the_error_per_axis_of_the_mean(rng, first, second):
+    R = turning(4000, 0.3)
+    track = fused({"cam1": single(noisy(R, first, rng)), "cam2": single(noisy(R, second, rng))})
+    true_error = so3.log(track.R_lab_body @ R.mT).square().mean().sqrt()
+    claimed = track.sigma_rad.square().mean().sqrt()
+    assert abs(float(claimed / true_error) - 1) < 0.15
+    best_possible = 1 / math.sqrt(1 / first**2 + 1 / second**2)
+    assert abs(float(true_error) / best_possible - 1) < 0.15
+
+
+def test_sigma_of_good_frames_does_not_notice_the_frames_that_stayed_wrong(rng):
+    R = turning(4000, 0.3)
+    left, right = noisy(R, 0.02, rng), noisy(R, 0.02, rng)
+    wrong = torch.arange(20, 4000, 50)
+    left[wrong] = turned_deg(left[wrong], 0.0, 28.0, 0.0)  # under the limit of the repair
+    track = fused({"cam1": single(left), "cam2": single(right)})
+    far = torch.arange(4000).sub(20).remainder(50).sub(25).abs() < 10  # no wrong frame in the window
+    true_error = so3.log(track.R_lab_body @ R.mT)[far].square().mean().sqrt()
+    assert abs(float(track.sigma_rad[far].square().mean().sqrt() / true_error) - 1) < 0.15
+    # and the wrong frames, about which xi varies much, have lost weight
+    assert (track.weight["cam1"][wrong] < 0.2).all()
+
+
+def test_the_mean_lies_between_the_cameras_divided_by_the_weights(rng):
+    R = turning(100)
+    track = fused({"cam1": single(noisy(R, 0.01, rng)), "cam2": single(noisy(R, 0.03, rng))})
+    to_first = so3.geodesic_distance(track.R_lab_body, track.R_lab_body_of["cam1"])
+    to_second = so3.geodesic_distance(track.R_lab_body, track.R_lab_body_of["cam2"])
+    assert_close(to_first, track.disagreement_rad * track.weight["cam2"], 1e-9)
+    assert_close(to_second, track.disagreement_rad * track.weight["cam1"], 1e-9)
+
+
+def test_a_frame_that_one_camera_saw_carries_exactly_its_orientation(rng):
+    R = turning(100)
+    first, second = single(noisy(R, 0.01, rng), without=range(40, 50)), single(noisy(R, 0.01, rng), without=[45, 80])
+    track = fused({"cam1": first, "cam2": second})
+    assert has(track, Flag.ONE_CAMERA) == [*range(40, 45), *range(46, 50), 80]
+    assert torch.equal(track.R_lab_body[41], track.R_lab_body_of["cam2"][41])
+    assert torch.equal(track.R_lab_body[80], track.R_lab_body_of["cam1"][80])
+    assert float(track.weight["cam1"][41]) == 0.0
+    assert float(track.weight["cam2"][41]) == 1.0
+    assert track.R_lab_body[45].isnan().all()
+    assert math.isnan(track.sigma_rad[45])
+    assert float(track.weight["cam1"][45] + track.weight["cam2"][45]) == 0.0
+    assert float(track.sigma_rad[41]) > float(track.sigma_rad[:40].min())
+    assert (track.segment == 0).all()  # a hole of one frame
+
+
+def test_one_camera_alone_is_the_fused_track():
+    R = turning(30)
+    R[12] = turned_deg(R[12], 0.0, 60.0, 0.0)
+    cameras = {"cam1": single(R, without=[3])}
+    path = assemble_paths(cameras, times(30), SETTINGS)["cam1"]
+    track = fused(cameras)
+    assert_close(track.R_lab_body, path.R_lab_body)
+    assert torch.equal(track.segment, path.segment)
+    assert torch.equal(track.spike, path.spike)
+    assert has(track, Flag.SPIKE) == [12, 13]
+    assert has(track, Flag.ONE_CAMERA) == list(range(30))
+    assert track.sigma_rad.isnan().all()
+    assert track.disagreement_rad.isnan().all()
+
+
+def test_two_cameras_that_never_saw_the_sphere_together_have_no_sigma():
+    R = turning(40)
+    track = fused({"cam1": single(R, without=range(20, 40)), "cam2": single(R, without=range(20))})
+    assert_close(track.R_lab_body, R)
+    assert track.sigma_rad.isnan().all()
+
+
+def test_a_camera_that_saw_nothing_leaves_the_other_alone():
+    R = turning(20)
+    track = fused({"cam1": single(R), "cam2": single(R, without=range(20))})
+    assert_close(track.R_lab_body, R)
+    assert has(track, Flag.ONE_CAMERA) == list(range(20))
+
+
+def test_motionless_identical_tracks_have_equal_finite_weights():
+    R = turning(1).expand(30, 3, 3)
+    track = fused({"cam1": single(R), "cam2": single(R)})
+    assert_close(track.weight["cam1"], torch.full((30,), 0.5, dtype=torch.float64))
+    assert_close(track.R_lab_body, R)
+
+
+def test_a_track_without_any_scatter_does_not_get_all_the_weight(rng):
+    R = turning(1).expand(60, 3, 3)
+    track = fused({"cam1": single(R), "cam2": single(noisy(R, 0.01, rng))})
+    assert (track.weight["cam2"] > 0).all()
+    assert (track.weight["cam1"] > 0.5).all()
+    assert torch.isfinite(track.R_lab_body).all()
+
+
+@pytest.mark.parametrize("names", [("cam1",), ("cam1", "cam2")])
+def test_a_movie_without_frames_is_data(names):
+    track = fused({name: candidates_of([]) for name in names})
+    assert track.R_lab_body.shape == (0, 3, 3)
+    assert track.sigma_rad.shape == track.flags.shape == track.segment.shape == (0,)
+
+
+def test_the_order_of_the_cameras_does_not_matter(rng):
+    R = turning(60)
+    cameras = {"a": single(noisy(R, 0.01, rng)), "b": single(noisy(R, 0.02, rng))}
+    forth, back = fused(cameras), fused(dict(reversed(cameras.items())))
+    assert_close(forth.R_lab_body, back.R_lab_body)
+    assert_close(forth.sigma_rad, back.sigma_rad)
+    assert_close(forth.weight["a"], back.weight["a"])
+
+
+def test_paths_are_left_as_they_were():
+    R = turning(60)
+    cameras = {"cam1": sees(R, false_in=STRETCH), "cam2": sees(R)}
+    paths = assemble_paths(cameras, times(60), SETTINGS)
+    before = {name: (path.R_lab_body.clone(), path.score.clone()) for name, path in paths.items()}
+    fuse(paths, cameras, times(60), SETTINGS)
+    for name, (orientation, score) in before.items():
+        assert_close(paths[name].R_lab_body, orientation)
+        assert_close(paths[name].score, score)
+
+
+def test_no_camera_and_three_are_refused():
+    cameras = {name: single(turning(5)) for name in ("a", "b", "c")}
+    for some in ({}, cameras):
+        paths = assemble_paths(some, times(5), SETTINGS)
+        with pytest.raises(ExperimentError, match="paths: expected one or two cameras, got"):
+            fuse(paths, some, times(5), SETTINGS)
+
+
+def test_candidates_of_another_camera_are_refused():
+    cameras = {"a": single(turning(5))}
+    paths = assemble_paths(cameras, times(5), SETTINGS)
+    with pytest.raises(ShapeError, match="camera 'a': expected 5 frames, got 5 in the path, 0 in the candidates"):
+        fuse(paths, {"b": cameras["a"]}, times(5), SETTINGS)
