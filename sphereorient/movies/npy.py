@@ -27,8 +27,8 @@ class NpyMovie:
             expected, got = "an array (N, H, W) of uint8 or uint16, not empty", f"{array.shape} of {array.dtype}"
             do = "save grey frames along the first axis"
             raise MovieError(refusal(str(path), expected=expected, got=got, do=do))
-        self._count, *size = array.shape
-        self.frame_shape: tuple[int, int] = (size[0], size[1])
+        self._count = int(array.shape[0])
+        self.frame_shape: tuple[int, int] = (int(array.shape[1]), int(array.shape[2]))
         self.dtype: np.dtype[Any] = array.dtype.newbyteorder("=")
 
     def _map(self) -> Grey:
