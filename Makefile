@@ -2,6 +2,8 @@
 # TORCH_INDEX: on a machine without a GPU, give pip the address of torch's CPU builds here to avoid the CUDA packages.
 PYTHON ?= python3
 TORCH_INDEX ?=
+# Threads that wait for a core must not burn it: see cli.main.
+export OMP_WAIT_POLICY ?= PASSIVE
 VENV := .venv
 BIN := $(VENV)/bin
 INDEX := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)

@@ -74,7 +74,8 @@ def _why_unreadable(
 ) -> Reason:
     """Tell a ball that is too dark or too bright to read; OK otherwise."""
     half = int(0.7 * outline.radius_px)  # the square inside the disk
-    u, v = round(outline.u_px), round(outline.v_px)
+    height, width = frame.shape
+    u, v = min(max(round(outline.u_px), 0), width - 1), min(max(round(outline.v_px), 0), height - 1)
     inside = np.s_[max(0, v - half) : v + half + 1, max(0, u - half) : u + half + 1]
     if np.percentile(difference[inside], 90) < settings.contrast_min * background.full_scale / 255:
         return Reason.DARK
