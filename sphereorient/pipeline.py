@@ -123,7 +123,7 @@ def _paper(
     paths = assemble.assemble_paths(candidates, clock, settings.assemble)
     fused = assemble.fuse(paths, candidates, clock, settings.assemble)
     moved = motion.measure_motion(
-        positions.position_lab_mm,
+        positions.for_motion(),
         fused.R_lab_body,
         fused.segment,
         experiment.frame_rate_hz,

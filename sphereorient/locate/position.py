@@ -25,6 +25,15 @@ class Positions:
     gap_mm: Tensor  # (N,), distance of the two rays, NaN with one
     flags: Tensor  # (N,) int64
 
+    def for_motion(self) -> Tensor:
+        """Positions fit for derivatives, (N, 3), mm: all, or where some come from two rays, only those.
+
+        A distance from the size is a hundred times less sure than one from two rays: a change between the two would
+        pass for a velocity.
+        """
+        two_rays = torch.isfinite(self.gap_mm)
+        return torch.where(two_rays[:, None] | ~two_rays.any(), self.position_lab_mm, torch.nan)
+
     @property
     def measured(self) -> Tensor:
         """Frames whose position comes from outlines measured in them, (N,) bool."""

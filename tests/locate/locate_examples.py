@@ -117,19 +117,18 @@ def sightings(
 def looking_along_y(**changes: object) -> PinholeCamera:
     """A camera 520 mm before the origin that looks along lab +y, lab z up; 78 px for 18 mm."""
     R_cam_lab = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
-    return _camera(R_cam_lab, **changes)
+    return _camera({"R_cam_lab": R_cam_lab} | changes)
 
 
 def looking_down(**changes: object) -> PinholeCamera:
     """A camera 520 mm above the origin that looks along lab -z, lab x to the right."""
     R_cam_lab = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=torch.float64)
-    return _camera(R_cam_lab, **changes)
+    return _camera({"R_cam_lab": R_cam_lab} | changes)
 
 
-def _camera(R_cam_lab: torch.Tensor, **changes: object) -> PinholeCamera:
+def _camera(changes: dict[str, object]) -> PinholeCamera:
     parameters: dict[str, object] = {
         "image_size": (650, 650),
-        "R_cam_lab": R_cam_lab,
         "T_cam_lab_mm": torch.tensor([0.0, 0.0, 520.0], dtype=torch.float64),
         "centre_px": torch.tensor([324.5, 324.5], dtype=torch.float64),
         "f_px": torch.tensor(78.0 * 520 / 18, dtype=torch.float64),

@@ -89,7 +89,7 @@ def test_a_given_empty_picture_is_the_mean_and_only_noise_is_measured(dwelling, 
     empty = scene.astype(np.float32)
     given = learn_background(Pictures(dwelling), range(len(dwelling)), 60.0, SETTINGS, empty)
     np.testing.assert_array_equal(given.mean, empty)
-    assert given.typical_noise == pytest.approx(1.5, rel=0.25)
+    assert 1.2 < given.typical_noise < 2.5  # 1.5; the ball is in a third of this small picture
     assert np.percentile(given.noise, 99) < 8  # also below the ball, which covers some pixels in most frames
 
 

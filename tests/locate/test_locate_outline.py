@@ -97,7 +97,9 @@ def test_two_disks_that_differ_by_a_fraction_of_a_pixel_are_told_apart():
     assert abs(np.diff(radii)[0] - 0.25) < 0.03
 
 
-@pytest.mark.parametrize("paint", [half_gone, sectors(8), sectors(6, 0.3), patches_gone], ids=["half", "8", "6", "paint"])
+@pytest.mark.parametrize(
+    "paint", [half_gone, sectors(8), sectors(6, 0.3), patches_gone], ids=["half", "8", "6", "paint"]
+)
 @pytest.mark.parametrize("place", PLACES)
 def test_half_of_the_rim_may_vanish_into_the_dark(place, paint):
     whole = outline_of(filmed(plant(white, *place)), *place)

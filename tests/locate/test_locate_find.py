@@ -1,0 +1,158 @@
+"""Finding the ball in one frame: the outline, or the one reason why there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from locate_examples import BACK, DIAMETER, SETTINGS, blobs, distance_px, even_background, filmed, plant, white
+
+from sphereorient.errors import ShapeError
+from sphereorient.locate import LocateSettings, Sightings, find_ball, sightings_of
+from sphereorient.locate.outline import Outline
+from sphereorient.trajectory import Reason
+
+WIDE = (240, 320)
+
+
+def even(level: float):
+    return lambda x, y: np.full_like(x, level)
+
+
+def burnt_out(share: float):
+    """Saturated in the middle, on this share of the radius."""
+    return lambda x, y: np.where(x**2 + y**2 < share**2, np.float32(400), np.float32(150))
+
+
+def find(picture, seed=0, settings=SETTINGS, **background):
+    frame = filmed(picture, seed)
+    return find_ball(frame, even_background(frame.shape, **background), DIAMETER, settings)
+
+
+def streaks(grey, rows, columns):
+    for row, column, slope in ((40, 240, 0.1), (200, 230, -0.3), (215, 60, 0.0)):
+        streak = (np.abs(columns - column) < 50) & (np.abs(rows - row - slope * (columns - column)) < 4)
+        grey = np.where(streak, np.float32(250), grey)
+    return grey
+
+
+@pytest.mark.parametrize("place", [(110.3, 95.6), (200.8, 140.1), (60.0, 180.4)])
+def test_a_ball_among_glitter_is_found(place):
+    outline, reason = find(plant(blobs, *place, shape=WIDE, also=streaks))
+    assert reason is Reason.OK
+    assert distance_px(outline, place) < 0.15
+
+
+def test_a_dark_ball_before_a_bright_wall_is_found():
+    outline, reason = find(plant(even(20), 110.0, 95.0, shape=WIDE, back=120.0), back=120.0)
+    assert reason is Reason.OK
+    assert distance_px(outline, (110.0, 95.0)) < 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_empty_picture_says_not_found(seed):
+    assert find(np.full(WIDE, BACK, np.float32), seed) == (None, Reason.NOT_FOUND)
+
+
+@pytest.mark.parametrize("radius", [12, 15, 20, 58, 70])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_disk_of_another_size_is_refused(radius, seed):
+    """A lone bubble too: noise around it must not make up a ball."""
+    outline, reason = find(plant(white, 150.0, 120.0, radius, shape=WIDE), seed)
+    assert outline is None
+    assert reason in (Reason.OUTLINE, Reason.DARK)
+
+
+def test_a_bright_thing_of_another_shape_says_outline():
+    def triangle(grey, rows, columns):
+        inside = (rows > 90) & (rows - 120 < 40 - 1.6 * np.abs(columns - 150))
+        return np.where(inside, np.float32(200), np.float32(BACK))
+
+    assert find(plant(white, 150.0, 120.0, shape=WIDE, also=triangle)) == (None, Reason.OUTLINE)
+
+
+@pytest.mark.parametrize("above", [4, 5])
+def test_a_ball_hardly_brighter_than_the_scene_says_dark(above):
+    assert find(plant(even(BACK + above), 150.0, 120.0, shape=WIDE), noise=0.7) == (None, Reason.DARK)
+
+
+def test_a_ball_just_bright_enough_is_found():
+    outline, reason = find(plant(even(BACK + 10), 150.0, 120.0, shape=WIDE), noise=0.7)
+    assert reason is Reason.OK
+    assert distance_px(outline, (150.0, 120.0)) < 0.3
+
+
+@pytest.mark.parametrize("share", [1.0, 0.7])
+def test_a_ball_mostly_saturated_says_saturated(share):
+    assert find(plant(burnt_out(share), 150.0, 120.0, shape=WIDE)) == (None, Reason.SATURATED)
+
+
+def test_a_reflection_on_the_ball_is_not_too_much_light():
+    outline, reason = find(plant(burnt_out(0.3), 150.0, 120.0, shape=WIDE))
+    assert reason is Reason.OK
+    assert distance_px(outline, (150.0, 120.0)) < 0.1
+
+
+@pytest.mark.parametrize("scale", [4, 16, 257])
+def test_pictures_of_more_bits_are_found_alike(scale):
+    """Contrast and saturation count in shares of full scale."""
+    frame = filmed(plant(blobs, 150.0, 120.0, shape=WIDE)).astype(np.uint16) * scale
+    eight = even_background(WIDE)
+    background = type(eight)(mean=eight.mean * scale, noise=eight.noise * scale, full_scale=255.0 * scale)
+    outline, reason = find_ball(frame, background, DIAMETER, SETTINGS)
+    again, _ = find_ball((frame // scale).astype(np.uint8), eight, DIAMETER, SETTINGS)
+    assert reason is Reason.OK
+    assert distance_px(outline, (again.u_px, again.v_px)) < 0.02
+
+
+def test_a_ball_that_is_nearly_out_of_the_picture_is_no_fault():
+    """Its centre is outside: there is no square inside the disk to look at."""
+    settings = LocateSettings(coverage_min=0.05)
+    for u in (-32.0, -25.0, -12.0):
+        outline, reason = find(plant(white, u, 120.0, shape=WIDE), settings=settings)
+        assert (outline is None) == (reason is not Reason.OK)
+
+
+def test_the_share_of_directions_that_is_asked_for_counts():
+    def quarter(x, y):
+        return np.where((x > 0) & (y > 0), np.float32(170), np.float32(BACK))
+
+    picture = plant(quarter, 150.0, 120.0, shape=WIDE)
+    assert find(picture, settings=LocateSettings(coverage_min=0.35))[1] is Reason.OUTLINE
+    outline, reason = find(picture, settings=LocateSettings(coverage_min=0.2))
+    assert reason is Reason.OK
+    assert distance_px(outline, (150.0, 120.0)) < 0.5
+
+
+def test_what_was_found_becomes_one_row_a_frame():
+    outline = Outline(u_px=10.5, v_px=20.25, radius_px=39.0, rms_px=0.2, coverage=0.9)
+    seen = sightings_of(iter([(outline, Reason.OK), (None, Reason.DARK)]))
+    assert len(seen) == 2
+    assert seen.centre_px.tolist()[0] == [10.5, 20.25]
+    assert (seen.radius_px[0], seen.outline_rms_px[0], seen.coverage[0]) == (39.0, 0.2, 0.9)
+    assert seen.placed.tolist() == [True, False]
+    assert seen.centre_px[1].isnan().all()
+    assert seen.reason == (Reason.OK, Reason.DARK)
+    assert seen.flags.tolist() == [0, 0]
+
+
+def test_no_frames_are_no_rows():
+    seen = sightings_of([])
+    assert len(seen) == 0
+    assert seen.centre_px.shape == (0, 2)
+    assert seen.placed.shape == (0,)
+
+
+@pytest.mark.parametrize("part", ["centre_px", "radius_px", "outline_rms_px", "coverage", "flags", "reason"])
+def test_sightings_of_unequal_lengths_are_refused(part):
+    parts = {
+        "centre_px": torch.zeros(3, 2, dtype=torch.float64),
+        "radius_px": torch.zeros(3, dtype=torch.float64),
+        "outline_rms_px": torch.zeros(3, dtype=torch.float64),
+        "coverage": torch.zeros(3, dtype=torch.float64),
+        "flags": torch.zeros(3, dtype=torch.int64),
+        "reason": (Reason.OK,) * 3,
+    }
+    assert len(Sightings(**parts)) == 3
+    with pytest.raises(ShapeError, match="one row a frame"):
+        Sightings(**(parts | {part: parts[part][:2]}))
