@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import h5py
@@ -56,17 +55,25 @@ def true_track(experiment: Experiment, names: tuple[str, ...], first: int = 0, l
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Keep figures, drawn in coarse dots, instead of writing them."""
-    kept: list[Figure] = []
+def kept(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Keep figures instead of writing them."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    return figures
 
-    def keep(figure: Figure, *_: object, **__: object) -> None:
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Keep figures, drawn in coarse dots: some faults show only then."""
+    figures: list[Figure] = []
+
+    def draw(figure: Figure, *_: object, **__: object) -> None:
         figure.set_dpi(20)
         figure.canvas.draw()
-        kept.append(figure)
+        figures.append(figure)
 
-    monkeypatch.setattr(Figure, "savefig", keep)
-    return kept
+    monkeypatch.setattr(Figure, "savefig", draw)
+    return figures
 
 
 @pytest.mark.parametrize(
@@ -84,17 +91,17 @@ def test_the_figure_is_a_picture_of_sensible_size(experiment, tmp_path, names, s
 
 
 @pytest.mark.parametrize(("names", "scored"), [(("cam1",), True), (("cam1", "cam2"), False)], ids=["one", "two"])
-def test_without_a_truth_the_last_panel_shows_the_cameras(experiment, tmp_path, drawn, names, scored):
+def test_without_a_truth_the_last_panel_shows_the_cameras(experiment, tmp_path, kept, names, scored):
     track = true_track(experiment, names)
     demo_figure(track, experiment, tmp_path / "figure.png", score_track(track, TRUTH) if scored else None)
-    label = drawn[0].subfigs[1].axes[3].get_ylabel()
+    label = kept[0].subfigs[1].axes[3].get_ylabel()
     assert ("error" in label) == scored
 
 
-def test_the_rerendered_sphere_looks_like_the_filmed_one(experiment, tmp_path, drawn):
+def test_the_rerendered_sphere_looks_like_the_filmed_one(experiment, tmp_path, kept):
     """True orientations must give the filmed paint, in the same place and neither mirrored nor turned."""
     demo_figure(true_track(experiment, ("cam1", "cam2")), experiment, tmp_path / "figure.png")
-    [top, _] = drawn[0].subfigs
+    [top, _] = kept[0].subfigs
     assert len(top.subfigs) == 2
     for beside in top.subfigs:
         filmed, rendered = np.array(beside.axes).reshape(2, -1)
@@ -124,24 +131,24 @@ def likeness(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a[inside], b[inside])[0, 1])
 
 
-def test_a_part_of_the_frames_shows_these_frames(experiment, tmp_path, drawn):
+def test_a_part_of_the_frames_shows_these_frames(experiment, tmp_path, kept):
     """The clock does not restart: frame 12 of the movie belongs to the first row of such a track."""
     whole, part = true_track(experiment, ("cam1",)), true_track(experiment, ("cam1",), 12, 30)
     for track in (whole, part):
         demo_figure(track, experiment, tmp_path / "figure.png")
-    first = [figure.subfigs[0].subfigs[0].axes[0].images[0].get_array() for figure in drawn]
+    first = [figure.subfigs[0].subfigs[0].axes[0].images[0].get_array() for figure in kept]
     with_number_12 = replace(whole, valid=np.arange(40) == 12)
     demo_figure(with_number_12, experiment, tmp_path / "figure.png")
-    again = drawn[2].subfigs[0].subfigs[0].axes[0].images[0].get_array()
+    again = kept[2].subfigs[0].subfigs[0].axes[0].images[0].get_array()
     np.testing.assert_array_equal(first[1], again)
     assert not np.array_equal(first[0], again)
 
 
-def test_the_curves_are_the_tracks(experiment, tmp_path, drawn):
+def test_the_curves_are_the_tracks(experiment, tmp_path, kept):
     track = true_track(experiment, ("cam1", "cam2"))
     score = score_track(track, TRUTH)
     demo_figure(track, experiment, tmp_path / "figure.png", score)
-    position, angles, omega, errors = drawn[0].subfigs[1].axes
+    position, angles, omega, errors = kept[0].subfigs[1].axes
     for axis in range(3):
         np.testing.assert_array_equal(position.lines[axis].get_ydata(), track.position[:, axis])
         np.testing.assert_array_equal(omega.lines[axis].get_ydata(), track.omega_lab[:, axis])
@@ -150,13 +157,13 @@ def test_the_curves_are_the_tracks(experiment, tmp_path, drawn):
     np.testing.assert_array_equal(errors.lines[2].get_ydata(), score.orientation_deg)
 
 
-def test_no_line_crosses_the_panel_where_an_angle_wraps(experiment, tmp_path, drawn):
+def test_no_line_crosses_the_panel_where_an_angle_wraps(experiment, tmp_path, kept):
     track = true_track(experiment, ("cam1",))
     spin = np.deg2rad(np.arange(40) * 20.0)
     cos, sin, zero, one = np.cos(spin), np.sin(spin), np.zeros(40), np.ones(40)
     Rz = np.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], axis=1).reshape(40, 3, 3)
     demo_figure(replace(track, orientation=Rz), experiment, tmp_path / "figure.png")
-    theta_z = drawn[0].subfigs[1].axes[1].lines[2].get_ydata()
+    theta_z = kept[0].subfigs[1].axes[1].lines[2].get_ydata()
     assert np.nanmax(np.abs(np.diff(theta_z))) < 21
     assert np.isnan(theta_z).sum() == 2  # 780 degrees: twice across the end of the scale
 

@@ -1,0 +1,72 @@
+"""Write docs/parameters.md and the files in configs/ from the settings' own descriptions.
+
+    scripts/make_parameters.py [--check]
+
+With --check nothing is written; the exit code is 1 where a file is not what the settings say.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from sphereorient.settings import Settings, settings_yaml, synth_settings_yaml
+from sphereorient.synth import SynthSettings
+
+REPO = Path(__file__).resolve().parents[1]
+HEAD = """\
+# Parameters
+
+All settings of `--method paper`, with the paper's numbers as defaults; where the paper gives none, the description says
+why this one. A file with any of them goes in by `--settings FILE` (`configs/paper.yaml` has them all), a single one by
+`--set room.key=value`. The track's attribute `settings` keeps what was used. Made by `scripts/make_parameters.py`.
+"""
+
+
+def table(model: type[BaseModel]) -> list[str]:
+    """One row a key."""
+    rows = ["| key | default | what |", "|---|---|---|"]
+    for key, field in model.model_fields.items():
+        default = list(field.default) if isinstance(field.default, tuple) else field.default
+        rows.append(f"| `{key}` | {'null' if default is None else default} | {field.description} |")
+    return rows
+
+
+def parameters() -> str:
+    """The page docs/parameters.md."""
+    lines = [HEAD]
+    for room, field in Settings.model_fields.items():
+        model = field.annotation
+        assert isinstance(model, type)
+        lines += [f"## {room}: {field.description}", "", (model.__doc__ or "").strip(), "", *table(model), ""]
+    lines += ["## synth", "", "Of `sphereorient synth`: `--settings configs/synth.yaml`, `--set key=value`.", ""]
+    return "\n".join([*lines, *table(SynthSettings), ""])
+
+
+def pages() -> dict[Path, str]:
+    """Every file that this script writes, with its text."""
+    return {
+        REPO / "docs" / "parameters.md": parameters(),
+        REPO / "configs" / "paper.yaml": settings_yaml(),
+        REPO / "configs" / "synth.yaml": synth_settings_yaml(),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true")
+    check = parser.parse_args().check
+    stale = [path for path, text in pages().items() if not path.is_file() or path.read_text(encoding="utf-8") != text]
+    for path in stale:
+        if check:
+            print(f"stale: {path.relative_to(REPO)}")
+        else:
+            path.write_text(pages()[path], encoding="utf-8")
+    sys.exit(1 if check and stale else 0)
+
+
+if __name__ == "__main__":
+    main()
