@@ -1,0 +1,199 @@
+"""A whole experiment on disk: what was written is what is read, and it is true."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pydantic
+import pytest
+import torch
+from conftest import assert_close
+
+from sphereorient.cameras import TsaiCamera
+from sphereorient.errors import OutputError
+from sphereorient.experiment import load_experiment, open_movies
+from sphereorient.sphere import load_texture
+from sphereorient.synth import SynthSettings, write_experiment
+from sphereorient.synth.write import default_cameras
+
+FRAMES = 6
+# Light paint on dark ground, so that the whole disk stands out.
+SETTINGS = SynthSettings(
+    name="tiny",
+    frames=FRAMES,
+    image_size=(160, 140),
+    diameter_px=40.0,
+    volume_mm=12.0,
+    black=110.0,
+    white=180.0,
+    ambient=0.9,
+    background=10.0,
+    velocity_rms=0.4,
+    seed=2,
+)
+TRUTH = {
+    "time": (FRAMES,),
+    "position": (FRAMES, 3),
+    "orientation": (FRAMES, 3, 3),
+    "velocity": (FRAMES, 3),
+    "acceleration": (FRAMES, 3),
+    "omega_lab": (FRAMES, 3),
+    "omega_body": (FRAMES, 3),
+    "alpha_lab": (FRAMES, 3),
+    "alpha_body": (FRAMES, 3),
+    "cam1/centre_px": (FRAMES, 2),
+    "cam2/centre_px": (FRAMES, 2),
+}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_experiment(tmp_path_factory.mktemp("synth") / "new" / "folder", SETTINGS)
+
+
+def truth_of(path: Path) -> dict[str, torch.Tensor]:
+    with h5py.File(path.parent / "truth.h5") as file:
+        return {name: torch.from_numpy(file[name][()]) for name in TRUTH}
+
+
+def frames_of(path: Path) -> dict[str, np.ndarray]:
+    return {
+        name: np.stack([movie.frame(k) for k in range(len(movie))])
+        for name, movie in open_movies(load_experiment(path)).items()
+    }
+
+
+def test_it_is_an_experiment_that_loads(written):
+    experiment = load_experiment(written)
+    assert experiment.name == "tiny"
+    assert experiment.frame_rate_hz == 600.0
+    assert experiment.exposure_s == 0.0004
+    assert experiment.diameter_mm == 18.0
+    assert list(experiment.cameras) == ["cam1", "cam2"]
+    assert {path.name for path in written.parent.iterdir()} == {
+        "experiment.yaml",
+        "cameras.yaml",
+        "texture.png",
+        "truth.h5",
+        *("cam1.mkv", "cam2.mkv", "empty_cam1.png", "empty_cam2.png"),
+    }
+    assert experiment.texture_path is not None
+    assert load_texture(experiment.texture_path).shape == (512, 1024)
+
+
+def test_movies_have_their_size_and_number_of_frames(written):
+    for frames in frames_of(written).values():
+        assert frames.shape == (FRAMES, 140, 160)
+        assert frames.dtype == np.uint8
+        assert all(not np.array_equal(frames[k], frames[k + 1]) for k in range(FRAMES - 1))
+
+
+def test_the_cameras_file_holds_the_cameras_that_rendered(written):
+    read = load_experiment(written).cameras
+    for name, camera in default_cameras(SETTINGS).items():
+        other = read[name]
+        assert isinstance(camera, TsaiCamera)
+        assert isinstance(other, TsaiCamera)
+        for part in ("f_mm", "pixel_pitch_mm", "sx", "kappa1", "centre_px", "R_cam_lab", "T_cam_lab_mm"):
+            assert torch.equal(getattr(other, part), getattr(camera, part))
+
+
+def test_the_truth_has_every_dataset_in_its_shape(written):
+    with h5py.File(written.parent / "truth.h5") as file:
+        names: list[str] = []
+        file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+        assert {name: file[name].shape for name in names} == TRUTH
+        assert all(file[name].dtype == np.float64 for name in names)
+    truth = truth_of(written)
+    assert_close(truth["time"], torch.arange(FRAMES, dtype=torch.float64) / 600)
+    assert all(torch.isfinite(value).all() for value in truth.values())
+
+
+def test_body_components_are_R_transposed_times_lab_components(written):
+    truth = truth_of(written)
+    for quantity in ("omega", "alpha"):
+        assert_close(
+            torch.einsum("nij,nj->ni", truth["orientation"], truth[f"{quantity}_body"]), truth[f"{quantity}_lab"]
+        )
+        assert (truth[f"{quantity}_body"] - truth[f"{quantity}_lab"]).norm(dim=-1).min() > 0.1
+
+
+def test_centres_are_the_projections_of_the_positions(written):
+    truth = truth_of(written)
+    for name, camera in load_experiment(written).cameras.items():
+        assert_close(truth[f"{name}/centre_px"], camera.project(truth["position"]), atol=1e-9)
+
+
+def test_in_each_picture_the_disk_lies_at_its_true_centre(written):
+    truth = truth_of(written)
+    v, u = np.mgrid[:140, :160]
+    for name, frames in frames_of(written).items():
+        for frame, centre in zip(frames, truth[f"{name}/centre_px"], strict=True):
+            disk = frame > 60
+            assert disk.sum() == pytest.approx(np.pi * 20**2, rel=0.15)
+            seen = torch.tensor([u[disk].mean(), v[disk].mean()])
+            assert (seen - centre).norm() < 0.4
+        # It moves by more than that, and so a frame too early or too late would be seen.
+    assert (truth["cam1/centre_px"][-1] - truth["cam1/centre_px"][0]).norm() > 2
+
+
+def test_the_pictures_of_the_empty_scene_are_its_background(written):
+    experiment = load_experiment(written)
+    for name in experiment.cameras:
+        import cv2
+
+        empty = cv2.imread(str(experiment.background_paths[name]), cv2.IMREAD_UNCHANGED)
+        assert empty.shape == (140, 160)
+        assert (empty == 10).all()
+
+
+def test_the_same_seed_gives_the_same_movies_and_truth_and_another_others(written, tmp_path):
+    again = write_experiment(tmp_path / "again", SETTINGS)
+    other = write_experiment(tmp_path / "other", SETTINGS.model_copy(update={"seed": 3}))
+    for name, frames in frames_of(written).items():
+        assert np.array_equal(frames_of(again)[name], frames)
+        assert not np.array_equal(frames_of(other)[name], frames)
+    for name, value in truth_of(written).items():
+        assert torch.equal(truth_of(again)[name], value)
+    assert not torch.equal(truth_of(other)["orientation"], truth_of(written)["orientation"])
+
+
+def test_progress_counts_the_frames_of_both_cameras_and_old_files_are_replaced(tmp_path):
+    steps: list[int] = []
+    few = SETTINGS.model_copy(update={"frames": 2, "image_size": (64, 60)})
+    for _ in range(2):
+        steps.clear()
+        path = write_experiment(tmp_path, few, steps.append)
+        assert sum(steps) == 4
+    assert {len(frames) for frames in frames_of(path).values()} == {2}
+
+
+def test_a_momentary_exposure_gives_an_experiment_that_loads(tmp_path):
+    few = SETTINGS.model_copy(update={"frames": 2, "image_size": (64, 60), "exposure": 0.0})
+    assert load_experiment(write_experiment(tmp_path, few)).exposure_s is None
+
+
+def test_the_exposure_lies_about_the_frames_time_also_in_frame_0(tmp_path):
+    # 8 ms of exposure smear the disk to both sides alike: its middle stays at the truth.
+    long = SETTINGS.model_copy(update={"frames": 2, "exposure": 0.008, "exposure_samples": 9, "velocity_rms": 1.0})
+    path = write_experiment(tmp_path, long.model_copy(update={"volume_mm": 30.0, "image_size": (300, 300)}))
+    centre = truth_of(path)["cam1/centre_px"][0]
+    frame = frames_of(path)["cam1"][0].astype(float) - 10
+    weight = np.clip(frame, 8, None) - 8
+    v, u = np.mgrid[: frame.shape[0], : frame.shape[1]]
+    seen = torch.tensor([(u * weight).sum() / weight.sum(), (v * weight).sum() / weight.sum()])
+    assert (seen - centre).norm() < 1.0
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError, match="expected a folder that can be made"):
+        write_experiment(tmp_path / "file" / "folder", SETTINGS)
+
+
+@pytest.mark.parametrize("wrong", [{"frames": 1}, {"white": 300.0}, {"texture": "stripes"}, {"whit": 3}], ids=str)
+def test_impossible_and_unknown_settings_are_refused(wrong):
+    with pytest.raises(pydantic.ValidationError):
+        SynthSettings(**wrong)
