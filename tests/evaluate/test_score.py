@@ -132,6 +132,17 @@ def test_percentiles_are_over_the_valid_frames(truth):
     np.testing.assert_array_equal(score.valid, valid)
 
 
+def test_percentiles_are_the_median_two_tails_and_the_worst(truth):
+    """Errors of 0 .. 39: the q-th percentile is 39 q / 100."""
+    track = perfect(truth)
+    degrees, shift = np.linspace(0, 39, 40), np.linspace(0, 3.9, 40)
+    position = track.position + shift[:, None] * np.array([0.6, 0.0, -0.8])
+    spread = replace(track, orientation=turned(track.orientation, degrees, (1, 1, 0)), position=position)
+    score = score_track(spread, TRUTH)
+    np.testing.assert_allclose(score.percentiles_deg(), [19.5, 37.05, 38.61, 39.0], rtol=1e-6)
+    np.testing.assert_allclose(score.percentiles_mm(), [1.95, 3.705, 3.861, 3.9], rtol=1e-6)
+
+
 def test_a_frame_without_a_position_is_not_valid_whatever_the_track_says(truth):
     track = perfect(truth)
     position = track.position.copy()

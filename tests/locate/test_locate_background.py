@@ -117,6 +117,17 @@ def test_the_noise_about_a_given_picture_is_its_sigma(sigma):
     assert np.median(measured) == pytest.approx(sigma, rel=0.1)
 
 
+def test_a_pixel_noisier_than_most_keeps_its_own_noise_about_a_given_picture():
+    """The floor is what most pixels do; a flickering third lies above it."""
+    frames = noisy(1001, 20.0, level=2000.0)
+    away = frames.astype(np.float32) - 16 * 2000.0
+    away[:, :, 20:] *= 4
+    flickering = np.clip(np.rint(16 * 2000.0 + away), 0, 65535).astype(np.uint16)
+    measured = measure_background(flickering, np.full(frames.shape[1:], 16 * 2000.0, np.float32)).noise / 16
+    assert np.median(measured[:, 20:]) == pytest.approx(80.0, rel=0.1)
+    assert np.median(measured[:, :20]) == pytest.approx(20.0, rel=0.15)
+
+
 def test_frames_that_are_all_equal_scatter_by_their_rounding():
     frames = np.full((5, 20, 20), 40, np.uint8)
     measured = measure_background(frames)

@@ -114,6 +114,9 @@ def test_the_rerendered_sphere_looks_like_the_filmed_one(experiment, tmp_path, k
             crop = cut(above.images[0].get_array(), centre, radius, template.shape[0])
             right = likeness(crop, template)
             assert right > 0.75
+            assert below.images[0].get_extent()[2:] == [len(template) / 2, -len(template) / 2]  # row 0 on top,
+            assert below.get_ylim()[1] < 0 < below.get_ylim()[0]  # where the axes have what is up
+            assert above.get_ylim()[1] < above.get_ylim()[0]
             assert right > likeness(crop, template[:, ::-1]) + 0.2
             assert right > likeness(crop, template.T) + 0.2
 
