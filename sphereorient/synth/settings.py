@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class SynthSettings(BaseModel):
@@ -35,3 +35,9 @@ class SynthSettings(BaseModel):
     shot_noise: float = Field(0.3, ge=0, description="grey levels per root of grey level")
     blur_px: float = Field(0.55, ge=0, description="Gaussian blur of the optics, px")
     seed: int = Field(0, ge=0, description="same seed, same bytes")
+
+    @model_validator(mode="after")
+    def _exposed_within_a_frame(self) -> Self:
+        if self.exposure * self.frame_rate > 1:
+            raise ValueError(f"exposure is above 1 / frame_rate, {1 / self.frame_rate:.4g} s")
+        return self

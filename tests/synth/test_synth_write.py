@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pydantic
@@ -30,7 +31,8 @@ SETTINGS = SynthSettings(
     white=180.0,
     ambient=0.9,
     background=10.0,
-    velocity_rms=0.4,
+    velocity_rms=1.5,
+    velocity_time=0.03,
     seed=2,
 )
 TRUTH = {
@@ -59,10 +61,11 @@ def truth_of(path: Path) -> dict[str, torch.Tensor]:
 
 
 def frames_of(path: Path) -> dict[str, np.ndarray]:
-    return {
-        name: np.stack([movie.frame(k) for k in range(len(movie))])
-        for name, movie in open_movies(load_experiment(path)).items()
-    }
+    movies = open_movies(load_experiment(path))
+    frames = {name: np.stack(list(movie.frames())) for name, movie in movies.items()}
+    for movie in movies.values():
+        movie.close()
+    return frames
 
 
 def test_it_is_an_experiment_that_loads(written):
@@ -142,8 +145,6 @@ def test_in_each_picture_the_disk_lies_at_its_true_centre(written):
 def test_the_pictures_of_the_empty_scene_are_its_background(written):
     experiment = load_experiment(written)
     for name in experiment.cameras:
-        import cv2
-
         empty = cv2.imread(str(experiment.background_paths[name]), cv2.IMREAD_UNCHANGED)
         assert empty.shape == (140, 160)
         assert (empty == 10).all()
@@ -177,8 +178,9 @@ def test_a_momentary_exposure_gives_an_experiment_that_loads(tmp_path):
 
 def test_the_exposure_lies_about_the_frames_time_also_in_frame_0(tmp_path):
     # 8 ms of exposure smear the disk to both sides alike: its middle stays at the truth.
-    long = SETTINGS.model_copy(update={"frames": 2, "exposure": 0.008, "exposure_samples": 9, "velocity_rms": 1.0})
-    path = write_experiment(tmp_path, long.model_copy(update={"volume_mm": 30.0, "image_size": (300, 300)}))
+    slow = {"frames": 2, "frame_rate": 100.0, "exposure": 0.008, "exposure_samples": 9}
+    fast = {"velocity_rms": 1.0, "velocity_time": 0.12, "volume_mm": 30.0, "image_size": (300, 300)}
+    path = write_experiment(tmp_path, SETTINGS.model_copy(update=slow | fast))
     centre = truth_of(path)["cam1/centre_px"][0]
     frame = frames_of(path)["cam1"][0].astype(float) - 10
     weight = np.clip(frame, 8, None) - 8
@@ -193,7 +195,9 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
         write_experiment(tmp_path / "file" / "folder", SETTINGS)
 
 
-@pytest.mark.parametrize("wrong", [{"frames": 1}, {"white": 300.0}, {"texture": "stripes"}, {"whit": 3}], ids=str)
+@pytest.mark.parametrize(
+    "wrong", [{"frames": 1}, {"white": 300.0}, {"texture": "stripes"}, {"whit": 3}, {"exposure": 0.01}], ids=str
+)
 def test_impossible_and_unknown_settings_are_refused(wrong):
     with pytest.raises(pydantic.ValidationError):
         SynthSettings(**wrong)
