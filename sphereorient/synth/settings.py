@@ -6,6 +6,8 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from sphereorient.errors import SettingsError, refusal
+
 
 class SynthSettings(BaseModel):
     """A synthetic experiment: motion, light, cameras and noise."""
@@ -38,6 +40,8 @@ class SynthSettings(BaseModel):
 
     @model_validator(mode="after")
     def _exposed_within_a_frame(self) -> Self:
-        if self.exposure * self.frame_rate > 1:
-            raise ValueError(f"exposure is above 1 / frame_rate, {1 / self.frame_rate:.4g} s")
+        longest = 1 / self.frame_rate
+        if self.exposure > longest:
+            expected, got = f"at most 1 / frame_rate, {longest:.4g} s", f"{self.exposure:g}"
+            raise SettingsError(refusal("exposure", expected=expected, got=got, do="write it in seconds"))
         return self

@@ -274,13 +274,23 @@ def test_ctrl_c_leaves_one_line_and_no_file(tmp_path):
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=in_foreground)
-    time.sleep(3.0)
+    _wait_until_it_works(process.pid)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "interrupted" in stderr
     assert "Traceback" not in stderr
     assert not list(tmp_path.iterdir())
+
+
+def _wait_until_it_works(pid: int) -> None:
+    """Wait until torch is loaded, which is after the command began and well before it ends."""
+    maps = Path(f"/proc/{pid}/maps")
+    for _ in range(600):
+        if maps.exists() and "libtorch" in maps.read_text():
+            break
+        time.sleep(0.1)
+    time.sleep(1.0)
 
 
 def test_settings_are_kept_in_the_track(copy):
