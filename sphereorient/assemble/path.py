@@ -137,7 +137,8 @@ def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Te
     frame = torch.nonzero(torch.isfinite(score))[:, 0]
     xi = torch.full_like(score, torch.nan)
     turn = torch.full_like(score, torch.nan)
-    R, T, time = R_lab_body[frame], score[frame], time_s[frame].to(score)
+    R, T = R_lab_body[frame], score[frame]
+    dt = time_s[frame].diff().to(score)  # in this order: single precision does not tell apart late times
     turn[frame[1:]] = so3.geodesic_distance(R[:-1], R[1:])
-    xi[frame[1:]] = turn[frame[1:]] * (2 - T[:-1] - T[1:]) / time.diff()
+    xi[frame[1:]] = turn[frame[1:]] * (2 - T[:-1] - T[1:]) / dt
     return xi, turn

@@ -33,7 +33,8 @@ def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
         time_s: (..., N), increasing.
 
     Returns:
-        (..., N - 1, C, C), d(A, B) (2 - T_A - T_B) / dt, rad/s; row: from, column: to.
+        (..., N - 1, C, C), d(A, B) (2 - T_A - T_B) / dt, rad/s; row: from, column: to; dtype of
+        the rotations, whatever that of the times.
 
     Raises:
         ShapeError: the inputs are not of the same steps and candidates.
@@ -54,7 +55,7 @@ def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
     ]
     distance = torch.cat(parts).reshape(*batch, max(steps - 1, 0), width, width)
     doubt = 2 - score[..., : max(steps - 1, 0), :, None] - score[..., 1:, None, :]
-    return distance * doubt / time_s.diff()[..., None, None]
+    return distance * doubt / time_s.diff().to(distance)[..., None, None]
 
 
 def shortest_path(edge_cost: Tensor, mask: Tensor) -> ShortestPath:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from sphereorient import so3
 from sphereorient.assemble import AssembleSettings, Path, assemble_path, assemble_paths
 from sphereorient.errors import ShapeError
 from sphereorient.orient import Candidates
+from sphereorient.trajectory import Reason
 
 SETTINGS = AssembleSettings()
 
@@ -41,6 +43,71 @@ def test_the_best_score_frame_by_frame_would_be_wrong_there(rng):
     assert float(so3.geodesic_distance(best, R)[7]) > 0.1
 
 
+def draw(rng: torch.Generator, low: float, high: float) -> float:
+    return low + (high - low) * float(torch.rand((), generator=rng))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_degrees_a_frame_are_found_among_three_to_six_false_candidates(seed):
+    rng = torch.Generator().manual_seed(seed)
+    R = turning(300, 2.0)
+    empty = {0, 1, 298, 299, *torch.randint(300, (20,), generator=rng).tolist()}
+    frames, truth = [], []
+    for k in range(300):
+        wrong = so3.random_rotations(int(torch.randint(3, 7, (), generator=rng)), generator=rng)
+        better = k % 10 == 5  # one of the false ones beats the truth
+        frame = [(each, 0.97 if better and not i else draw(rng, 0.5, 0.85)) for i, each in enumerate(wrong)]
+        truth.append(draw(rng, 0.85, 0.95))
+        frames.append([] if k in empty else [*frame, (R[k], truth[-1])])
+    path = assemble_path(candidates_of(frames), times(300), SETTINGS)
+    seen = torch.tensor([k not in empty for k in range(300)])
+    assert torch.equal(path.present, seen)
+    assert torch.equal(path.R_lab_body[seen], R[seen])
+    frame, T = torch.nonzero(seen).flatten(), torch.tensor(truth, dtype=torch.float64)[seen]
+    assert_close(path.score[seen], T)
+    dt = frame.diff().double() / RATE_HZ
+    expected = so3.geodesic_distance(R[frame[:-1]], R[frame[1:]]) * (2 - T[:-1] - T[1:]) / dt
+    assert_close(path.xi[frame[1:]], expected, 1e-9)
+    assert not path.spike.any()
+
+
+def test_of_equal_candidates_the_first_is_taken_each_time():
+    R = turning(30)
+    twins = candidates_of([[(R[k], 0.9), (R[k], 0.9), (R[k], 0.9)] for k in range(30)])
+    for _ in range(3):
+        assert assemble_path(twins, times(30), SETTINGS).choice.tolist() == [0] * 30
+
+
+def test_single_precision_chooses_the_same_and_keeps_its_links_late_in_a_movie(rng):
+    full = among_false_ones(turning(40), rng, better_in=(7,))
+    single_precision = replace(full, R_lab_body=full.R_lab_body.float(), score=full.score.float())
+    late = times(40) + 20_000.0  # s; steps of 1/600 s are lost in single precision there
+    expected, path = (assemble_path(each, late, SETTINGS) for each in (full, single_precision))
+    assert torch.equal(path.choice, expected.choice)
+    assert path.xi.dtype == path.R_lab_body.dtype == torch.float32
+    assert_close(path.xi, expected.xi.float(), 1e-4)
+    assert late.float().diff().min() == 0.0  # the reading that rounds the times first
+
+
+@pytest.mark.slow
+def test_a_movie_of_fifteen_thousand_frames_with_ten_candidates_each_is_found(rng):
+    frames, width = 15_000, 10
+    R = turning(frames, 2.0)
+    wrong = so3.random_rotations((frames, width - 1), generator=rng)
+    # Row 4 of each frame is the truth; the scores fall with the row.
+    every = torch.cat([wrong[:, :4], R[:, None], wrong[:, 4:]], dim=1)
+    score = torch.linspace(0.95, 0.5, width, dtype=torch.float64).repeat(frames)
+    candidates = Candidates(
+        offset=torch.arange(frames + 1) * width,
+        R_lab_body=every.flatten(0, 1),
+        score=score,
+        reason=(Reason.OK,) * frames,
+    )
+    path = assemble_path(candidates, times(frames), SETTINGS)
+    assert path.choice.unique().tolist() == [4]
+    assert_close(path.R_lab_body, R)
+
+
 def test_frames_without_candidates_are_skipped_and_the_link_over_them_takes_its_time():
     R = turning(30)
     path = assemble_path(single(R, without=(0, 10, 11, 29)), times(30), SETTINGS)
@@ -52,6 +119,22 @@ def test_frames_without_candidates_are_skipped_and_the_link_over_them_takes_its_
     assert abs(float(path.xi[12] - over)) > 1.0  # the reading that counts the hole as one frame
     assert math.isnan(path.xi[1])  # the first frame seen: no link enters it
     assert path.segment.tolist() == [-1, *[0] * 28, -1]
+
+
+@pytest.mark.parametrize("by", ["hole", "uneven_times"])
+def test_the_longer_of_two_links_is_given_the_larger_turn(by):
+    """Both ways turn by 30 degrees in all; the better scored one turns by most of it in the short link."""
+    still = torch.eye(3, dtype=torch.float64)
+    early, late = turned_deg(still, 25.0, 0.0, 0.0), turned_deg(still, 5.0, 0.0, 0.0)
+    frames = [[(still, 0.9)], [(early, 0.905), (late, 0.9)], [(turned_deg(still, 30.0, 0.0, 0.0), 0.9)]]
+    time = times(3)
+    if by == "hole":
+        frames, time = [*frames[:2], [], [], [], frames[2]], times(6)
+    else:
+        time[2] = time[1] + 4 / RATE_HZ
+    assert assemble_path(candidates_of(frames), time, SETTINGS).choice[1] == 1
+    evenly = candidates_of([frames[0], frames[1], frames[-1]])
+    assert assemble_path(evenly, times(3), SETTINGS).choice[1] == 0  # the reading that counts links, not time
 
 
 def test_xi_stands_at_the_frame_that_the_link_enters():

@@ -6,8 +6,10 @@ import math
 
 import pytest
 import torch
-from assemble_examples import single, times, turned_deg, turning
+from assemble_examples import noisy, single, times, turned_deg, turning
+from conftest import assert_close
 
+from sphereorient import so3
 from sphereorient.assemble import AssembleSettings, assemble_path
 from sphereorient.assemble.segments import find_spikes, moving, number_segments
 
@@ -42,6 +44,42 @@ def test_a_steady_turn_has_no_spike_however_fast():
 def test_the_first_steps_after_a_standstill_are_no_spikes():
     R = torch.cat([turning(1).expand(30, 3, 3), turning(31, 3.0)[1:]])
     assert not assemble_path(single(R), times(60), SETTINGS).spike.any()
+
+
+def seen_on_a_grid(seed: int, deg_per_frame: float, wrong: slice = slice(0, 0)):
+    """500 frames whose orientations are wrong by 1 degree rms, with the scatter of T that goes with it."""
+    rng = torch.Generator().manual_seed(seed)
+    R = noisy(turning(500, deg_per_frame), math.radians(1.0) / math.sqrt(3), rng)
+    R[wrong] = turned_deg(R[wrong], 0.0, 70.0, 0.0)
+    score = (0.9 + 0.02 * (2 * torch.rand(500, generator=rng) - 1)).tolist()
+    return single(R, dict(enumerate(score)))
+
+
+# Fast: every turn is above the least one, so only the size of xi tells noise from a spike.
+@pytest.mark.parametrize("deg_per_frame", [2.0, 18.0], ids=["usual", "fast"])
+@pytest.mark.parametrize("seed", range(4))
+def test_ordinary_motion_seen_on_a_grid_has_no_spike(seed, deg_per_frame):
+    path = assemble_path(seen_on_a_grid(seed, deg_per_frame), times(500), SETTINGS)
+    assert not path.spike.any()
+    assert (path.segment == 0).all()
+
+
+@pytest.mark.parametrize("deg_per_frame", [2.0, 18.0], ids=["usual", "fast"])
+@pytest.mark.parametrize("length", [1, 6, 30])
+def test_a_wrong_stretch_in_noise_has_a_spike_on_entering_and_one_on_leaving(length, deg_per_frame):
+    wrong = slice(200, 200 + length)
+    path = assemble_path(seen_on_a_grid(0, deg_per_frame, wrong), times(500), SETTINGS)
+    assert torch.nonzero(path.spike).flatten().tolist() == [200, 200 + length]
+    assert path.segment.tolist() == [0] * 200 + [1] * length + [2] * (300 - length)
+
+
+@pytest.mark.parametrize("small_deg", [1.0, 14.0])
+def test_a_small_move_after_a_standstill_is_no_spike_and_a_large_one_is(small_deg):
+    R = turning(1).expand(60, 3, 3).clone()
+    R[30:] = turned_deg(R[30:], small_deg, 0.0, 0.0)
+    assert not assemble_path(single(R), times(60), SETTINGS).spike.any()
+    R[30:] = turned_deg(R[30:], 20.0, 0.0, 0.0)
+    assert torch.nonzero(assemble_path(single(R), times(60), SETTINGS).spike).flatten().tolist() == [30]
 
 
 def test_spikes_are_measured_against_what_is_usual_about_them_and_not_in_the_whole_movie():
@@ -81,6 +119,30 @@ def test_holes_of_under_five_frames_are_bridged_and_longer_ones_are_not():
     present[5:9], present[15:20], present[28:] = False, False, False
     segment = number_segments(present, torch.zeros_like(present), SETTINGS.gap_frames_max)
     assert segment.tolist() == [0] * 15 + [-1] * 5 + [1] * 8 + [-1] * 2
+
+
+@pytest.mark.parametrize(("hole", "bridged"), [(1, True), (4, True), (5, False), (12, False)])
+def test_a_path_over_a_hole_is_one_segment_where_the_hole_is_short(hole, bridged):
+    R = turning(60, 2.0)
+    path = assemble_path(single(R, without=range(20, 20 + hole)), times(60), SETTINGS)
+    inside, behind = (0, 0) if bridged else (-1, 1)
+    assert path.segment.tolist() == [0] * 20 + [inside] * hole + [behind] * (40 - hole)
+    assert not path.spike.any()
+    assert_close(path.xi[20 + hole], so3.geodesic_distance(R[19], R[20 + hole]) * 0.2 * 600.0 / (hole + 1), 1e-9)
+
+
+@pytest.mark.parametrize(("longest", "segments"), [(0, 3), (1, 2), (2, 1)])
+def test_the_longest_hole_inside_a_segment_is_a_setting(longest, segments):
+    without = (20, 40, 41)
+    settings = AssembleSettings(gap_frames_max=longest)
+    path = assemble_path(single(turning(60), without=without), times(60), settings)
+    assert int(path.segment.max()) + 1 == segments
+    assert (path.segment[[20]] == -1).all() == (longest < 1)
+
+
+def test_holes_at_the_ends_of_a_movie_belong_to_no_segment():
+    path = assemble_path(single(turning(30), without=(0, 1, 29)), times(30), SETTINGS)
+    assert path.segment.tolist() == [-1] * 2 + [0] * 27 + [-1]
 
 
 def test_a_spike_over_a_hole_leaves_the_hole_outside():

@@ -167,6 +167,34 @@ def test_movies_of_different_length_and_different_holes_give_in_a_batch_what_the
         assert_close(together.cost[row], alone.cost)
 
 
+def test_steps_before_the_first_and_behind_the_last_candidate_do_not_count():
+    edges, _ = random_graph((9,), 3, 0)
+    mask = torch.ones(9, 3, dtype=torch.bool)
+    mask[:2], mask[7:] = False, False
+    path, middle = shortest_path(edges, mask), shortest_path(edges[2:6], mask[2:7])
+    assert path.choice.tolist() == [-1, -1, *middle.choice.tolist(), -1, -1]
+    assert_close(path.cost, middle.cost)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_single_precision_takes_the_same_path(seed):
+    edges, mask = random_graph((60,), 5, seed)
+    path, expected = shortest_path(edges.float(), mask), shortest_path(edges, mask)
+    assert torch.equal(path.choice, expected.choice)
+    assert path.cost.dtype == torch.float32
+    assert_close(path.cost, expected.cost.float(), 1e-4)  # a sum of about 40 edges
+
+
+@pytest.mark.parametrize("ties", [False, True], ids=["distinct", "ties"])
+def test_the_same_graph_gives_the_same_path_each_time(ties):
+    edges, mask = random_graph((2, 1, 3, 40), 5, 4, ties=ties)
+    first = shortest_path(edges, mask)
+    for _ in range(5):
+        again = shortest_path(edges.clone(), mask.clone())
+        assert torch.equal(again.choice, first.choice)
+        assert torch.equal(again.cost, first.cost)
+
+
 @pytest.mark.parametrize("poison", [torch.inf, torch.nan, -100.0], ids=str)
 def test_what_stands_on_edges_of_masked_candidates_does_not_matter(poison):
     edges, mask = random_graph((30,), 4, 1)
@@ -292,6 +320,35 @@ def test_edge_costs_have_finite_gradients_where_candidates_coincide():
     edge_costs(R, score, torch.arange(3.0, dtype=torch.float64)).sum().backward()
     assert torch.isfinite(R.grad).all()
     assert torch.isfinite(score.grad).all()
+
+
+def test_gradient_of_the_whole_movie_agrees_with_differences(rng):
+    turn = 0.3 * torch.randn(5, 3, 3, generator=rng, dtype=torch.float64)  # rotation vectors, 5 frames, 3 candidates
+    score = 0.5 + 0.4 * torch.rand(5, 3, generator=rng, dtype=torch.float64)
+    time = torch.tensor([0.0, 1.0, 1.5, 3.0, 4.0], dtype=torch.float64)
+    mask = torch.ones(5, 3, dtype=torch.bool)
+    mask[1, 0], mask[3, 2] = False, False
+
+    def cost(turn: Tensor, score: Tensor) -> Tensor:
+        return shortest_path(edge_costs(so3.exp(turn), score, time), mask).cost
+
+    assert torch.autograd.gradcheck(cost, (turn.requires_grad_(), score.requires_grad_()))
+
+
+def test_edge_costs_keep_single_precision_beside_times_in_double(rng):
+    R = so3.random_rotations((4, 3), generator=rng, dtype=torch.float32)
+    late = 20_000.0 + torch.arange(4, dtype=torch.float64) / 600  # s; lost in single precision
+    cost = edge_costs(R, torch.full((4, 3), 0.8), late)
+    assert cost.dtype == torch.float32
+    angle = so3.geodesic_distance(R[:-1, :, None], R[1:, None])
+    assert_close(cost, angle * 0.4 * 600, 1e-2)  # rad/s of some hundred; whole steps of dt would be half off
+
+
+def test_edge_costs_leave_their_inputs_as_they_were(rng):
+    inputs = (so3.random_rotations((4, 3), generator=rng), torch.full((4, 3), 0.8), torch.arange(4.0))
+    before = [each.clone() for each in inputs]
+    edge_costs(*inputs)
+    assert all(map(torch.equal, inputs, before))
 
 
 def test_edge_costs_refuse_scores_of_other_frames():

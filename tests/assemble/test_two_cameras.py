@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from assemble_examples import candidates_of, noisy, single, times, turned_deg, turning
 from conftest import assert_close
+from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.assemble import AssembleSettings, Fused, assemble_path, assemble_paths, fuse
@@ -132,6 +134,34 @@ def test_where_neither_has_a_candidate_near_the_other_the_steadier_one_stands_al
     assert has(track, Flag.AMBIGUOUS) == list(STRETCH)
     assert has(track, Flag.ONE_CAMERA) == list(STRETCH)
     assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == []
+
+
+def test_where_both_lack_the_truth_and_contradict_each_other_the_result_is_wrong_but_marked(wrong):
+    """Nothing can be right there: the steadier of two false tracks stands alone, as a guess and between spikes."""
+    R = turning(60)
+    rough = turned_deg(R, 0.0, 100.0, 0.0)
+    rough[21::2] = turned_deg(rough[21::2], 0.0, 40.0, 0.0)
+    rougher = candidates_of([[(rough[k], 0.9)] if k in STRETCH else [(R[k], 0.9)] for k in range(60)])
+    steadier = sees(R, false_in=STRETCH, true_in=())
+    track = contradiction(*as_pair(wrong, rougher, steadier), deceived=[])
+    outside = [k for k in range(60) if k not in STRETCH]
+    assert_close(track.R_lab_body[outside], R[outside], 1e-9)
+    assert_close(track.R_lab_body[list(STRETCH)], false_track(R)[list(STRETCH)], 1e-9)
+    assert has(track, Flag.AMBIGUOUS) == has(track, Flag.ONE_CAMERA) == list(STRETCH)
+    assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == []
+    assert has(track, Flag.SPIKE) == [20, 30]
+    assert track.R_lab_body_of[wrong][list(STRETCH)].isnan().all()
+
+
+def test_where_both_are_wrong_alike_only_the_spikes_tell():
+    """A known weakness: cameras that agree are believed."""
+    R = turning(60)
+    false = sees(R, false_in=STRETCH, true_in=())
+    track = fused({"cam1": false, "cam2": false})
+    assert_close(track.R_lab_body[25], false_track(R)[25], 1e-9)
+    assert int(track.flags[25]) == 0
+    assert has(track, Flag.SPIKE) == [20, 30]
+    assert track.segment.tolist() == [0] * 20 + [1] * 10 + [2] * 30
 
 
 def test_two_explanations_of_equal_quality_are_decided_by_continuity_and_marked(wrong):
@@ -339,15 +369,37 @@ def test_the_order_of_the_cameras_does_not_matter(rng):
     assert_close(forth.weight["a"], back.weight["a"])
 
 
-def test_paths_are_left_as_they_were():
+def tensors(record: object) -> dict[str, Tensor]:
+    return {name: value for name, value in vars(record).items() if isinstance(value, Tensor)}
+
+
+def test_paths_candidates_and_times_are_left_as_they_were():
     R = turning(60)
-    cameras = {"cam1": sees(R, false_in=STRETCH), "cam2": sees(R)}
-    paths = assemble_paths(cameras, times(60), SETTINGS)
-    before = {name: (path.R_lab_body.clone(), path.score.clone()) for name, path in paths.items()}
-    fuse(paths, cameras, times(60), SETTINGS)
-    for name, (orientation, score) in before.items():
-        assert_close(paths[name].R_lab_body, orientation)
-        assert_close(paths[name].score, score)
+    cameras = {"cam1": sees(R, false_in=STRETCH), "cam2": sees(R, nothing_in=(3, 4))}
+    paths, time = assemble_paths(cameras, times(60), SETTINGS), times(60)
+    best = candidates_of([[(false_track(R)[k] if k in STRETCH else R[k], 0.9)] for k in range(60)])
+    paths["cam1"] = assemble_path(best, time, SETTINGS)
+    records = [*paths.values(), *cameras.values()]
+    before = [{name: value.clone() for name, value in tensors(record).items()} for record in records]
+    track = fuse(paths, cameras, time, SETTINGS)
+    assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == list(STRETCH)  # there was something to write
+    for record, old in zip(records, before, strict=True):
+        for name, value in tensors(record).items():
+            assert_close(value, old[name])
+    assert torch.equal(time, times(60))
+
+
+def test_single_precision_gives_the_same_in_single_precision(rng):
+    R = turning(100)
+    cameras = {"cam1": single(noisy(R, 0.01, rng)), "cam2": single(noisy(R, 0.03, rng), without=[40])}
+    expected = fused(cameras)
+    track = fused({k: replace(c, R_lab_body=c.R_lab_body.float(), score=c.score.float()) for k, c in cameras.items()})
+    for name, value in tensors(track).items():
+        if value.is_floating_point():
+            assert value.dtype == torch.float32
+            assert_close(value, getattr(expected, name).float(), 1e-4)
+        else:
+            assert torch.equal(value, getattr(expected, name))
 
 
 def test_no_camera_and_three_are_refused():
