@@ -1,0 +1,135 @@
+"""Draw docs/conventions.png: the frames, the map and how a camera sees it, and where pixels lie.
+
+    scripts/figure_conventions.py [--out docs/conventions.png]
+
+The map is read and the sphere drawn by the package's own functions, so that the picture shows what the code does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.sphere import SphereRenderer, orthographic_view
+
+REPO = Path(__file__).resolve().parents[1]
+HEIGHT = 180  # rows of the map, one a degree
+COLOURS = ("#c0392b", "#2e8b57", "#2c5aa0")  # x, y, z of every frame
+R_CAM_LAB = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # looks along lab +y, lab z up
+R_LAB_BODY = so3.exp(torch.tensor([0.0, 0.0, -math.pi / 2]))  # body +x towards that camera
+
+
+def letter_map() -> Tensor:
+    """A map (H, 2 H), 0 .. 1: an F about its middle, which no mirrored picture shows, and lines every 30 degrees."""
+    grey = torch.full((HEIGHT, 2 * HEIGHT), 0.82)
+    grey[:, ::30] = grey[::30, :] = 0.62
+    grey[:, HEIGHT:] -= 0.12  # east of the middle a little darker
+    top, left = HEIGHT // 2 - 40, HEIGHT - 26
+    for rows, columns in (((0, 80), (0, 16)), ((0, 16), (0, 54)), ((32, 46), (0, 40))):
+        grey[top + rows[0] : top + rows[1], left + columns[0] : left + columns[1]] = 0.08
+    return grey
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=REPO / "docs" / "conventions.png")
+    out = parser.parse_args().out
+    figure = plt.figure(figsize=(9.6, 6.6), dpi=110, layout="constrained")
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
+    draw_frames(figure.add_subplot(grid[0, 0], projection="3d"))
+    draw_map(figure.add_subplot(grid[0, 1]))
+    draw_picture(figure.add_subplot(grid[1, 0]))
+    draw_pixels(figure.add_subplot(grid[1, 1]))
+    figure.savefig(out, metadata={"Software": None})
+
+
+def draw_frames(axes: Any) -> None:
+    """Lab, camera and body axes for the check of all signs."""
+    camera, sphere = np.array([0.0, -4.6, 0.0]), np.zeros(3)
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
+    ball = 0.8 * np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
+    axes.plot_surface(*ball, color="0.8", alpha=0.35, linewidth=0)
+    axes.plot(*np.stack([camera, sphere]).T, color="0.6", lw=1, ls=":")
+    triad(axes, np.array([1.9, -2.4, -1.2]), np.eye(3), "lab", 1.2)
+    triad(axes, camera, R_CAM_LAB.numpy().T, "cam", 1.2)  # columns of R_lab_cam: the camera's axes in the lab
+    triad(axes, sphere, R_LAB_BODY.numpy(), "body", 1.7)
+    axes.set(xlim=(-1.6, 2.9), ylim=(-4.8, 1.6), zlim=(-2.0, 1.8))
+    axes.set_box_aspect((4.5, 6.4, 3.8), zoom=1.35)
+    axes.view_init(elev=24, azim=-28)
+    axes.set_axis_off()
+    axes.set_title("frames: the camera looks along lab +y,\nR_lab_body = Rz(-90 degrees)", fontsize=10)
+    handles = [Line2D([], [], color=colour, lw=2, label=name) for colour, name in zip(COLOURS, "xyz", strict=True)]
+    axes.legend(handles=handles, loc="lower right", fontsize=8, frameon=False, ncols=3)
+
+
+def triad(axes: Any, origin: NDArray[Any], columns: NDArray[Any], name: str, length: float) -> None:
+    """Three arrows; `columns` are their directions in the lab."""
+    for axis, direction, colour in zip("xyz", columns.T, COLOURS, strict=True):
+        axes.quiver(*origin, *(length * direction), color=colour, lw=2, arrow_length_ratio=0.18)
+        axes.text(*(origin + 1.25 * length * direction), f"{name} {axis}", color=colour, fontsize=8, ha="center")
+
+
+def draw_map(axes: Any) -> None:
+    """The map, read as the world's maps are."""
+    axes.imshow(letter_map(), cmap="gray", vmin=0, vmax=1, extent=(-180, 180, -90, 90))
+    for longitude, down, text in ((0, 62, "body +x"), (90, 17, "body +y"), (-90, 17, "body -y")):
+        axes.plot(longitude, 0, "o", color="#d35400", ms=5)
+        axes.text(longitude, -down, text, color="#d35400", fontsize=9, ha="center", weight="bold")
+    axes.text(0, 76, "north: body +z", color="#d35400", fontsize=9, ha="center", weight="bold")
+    axes.set(xticks=range(-180, 181, 90), yticks=(-90, 0, 90))
+    axes.set_xlabel("longitude (degrees), column 0 is the left", fontsize=9)
+    axes.set_ylabel("latitude", fontsize=9)
+    axes.set_title("the map: north up, east to the right, W = 2H", fontsize=10)
+
+
+def draw_picture(axes: Any) -> None:
+    """What the camera of the first panel sees of that map."""
+    size = 240
+    view = orthographic_view(size)
+    picture = SphereRenderer(letter_map(), view)(R_CAM_LAB @ R_LAB_BODY).reshape(size, size)
+    seen = np.ma.masked_array(picture.numpy(), ~view.inside.numpy())
+    axes.imshow(seen, cmap="gray", vmin=0, vmax=1)
+    arrow = {"arrowprops": {"arrowstyle": "<-", "color": "black", "lw": 1.5}, "va": "center", "ha": "center"}
+    axes.annotate("u, cam x", (-28, -12), (62, -12), fontsize=9, **arrow)
+    axes.annotate("v, cam y", (-28, -12), (-28, 70), fontsize=9, rotation=90, **arrow)
+    axes.text(size + 12, size / 2, "east of the\nmap's middle", fontsize=9, va="center")
+    axes.text(size / 2, size + 14, "this camera's picture: the F is not mirrored", fontsize=10, ha="center", va="top")
+    axes.set(xlim=(-110, size + 130), ylim=(size + 34, -30))
+    axes.set_axis_off()
+
+
+def draw_pixels(axes: Any) -> None:
+    """A picture of 4 x 3 pixels: whole numbers are centres."""
+    width, height = 4, 3
+    for u in range(width):
+        for v in range(height):
+            axes.add_patch(Rectangle((u - 0.5, v - 0.5), 1, 1, fc="0.94" if (u + v) % 2 else "0.85", ec="0.5"))
+            axes.plot(u, v, "k.", ms=4)
+            axes.text(u, v + 0.24, f"({u}, {v})", ha="center", fontsize=8)
+    axes.set(xlim=(-0.8, 3.8), ylim=(2.8, -0.8), xticks=(-0.5, 0, 1, 2, 3, 3.5), yticks=(-0.5, 0, 1, 2, 2.5))
+    axes.xaxis.tick_top()
+    for each in (axes.xaxis, axes.yaxis):
+        each.set_major_formatter("{x:g}")
+    axes.tick_params(labelsize=8)
+    axes.set_aspect("equal")
+    axes.set_ylabel("v, row", fontsize=9)
+    axes.set_xlabel("pixels (u, v) of a 4 x 3 picture: it spans -0.5 .. 3.5 and -0.5 .. 2.5", fontsize=9)
+
+
+if __name__ == "__main__":
+    main()
