@@ -151,3 +151,15 @@ def test_axes_of_the_cube_stay_within_the_table():
     table = DirectionTable(random_texture("blobs", 1, 32), 16)
     axes = torch.eye(3)
     assert table.render(axes[None] * (1 + 5e-7), torch.cat([axes, -axes])).abs().eq(1).all()
+
+
+def test_a_cell_of_the_table_holds_the_paint_at_its_middle():
+    # The equator is a border between cells: with the middles' paint the table of a half-white sphere is exact, and
+    # that of its negative is its negative. With the corners' paint one of the two is off by a cell.
+    north = torch.zeros(32, 64)
+    north[:16] = 1.0
+    view = orthographic_view(60)
+    upright = f64([[0, 1, 0], [0, 0, -1], [-1, 0, 0]]).float()[None]
+    up = torch.where(view.normal_view[:, 1] < 0, 1, -1).to(torch.int8)
+    assert torch.equal(DirectionTable(north, 64).render(upright, view.normal_view)[0], up)
+    assert torch.equal(DirectionTable(1 - north, 64).render(upright, view.normal_view)[0], -up)
