@@ -8,6 +8,8 @@ With --check nothing is written; the exit code is 1 where a file is not what the
 from __future__ import annotations
 
 import argparse
+import inspect
+import re
 import sys
 from pathlib import Path
 
@@ -20,18 +22,24 @@ REPO = Path(__file__).resolve().parents[1]
 HEAD = """\
 # Parameters
 
-All settings of `--method paper`, with the paper's numbers as defaults; where the paper gives none, the description says
-why this one. A file with any of them goes in by `--settings FILE` (`configs/paper.yaml` has them all), a single one by
-`--set room.key=value`. The track's attribute `settings` keeps what was used. Made by `scripts/make_parameters.py`.
+All settings of `--method paper`. A default in **bold** is the paper's number; where the paper gives none, the
+description says why this one. A file with any of them goes in by `--settings FILE` (`configs/paper.yaml` has them all),
+a single one by `--set room.key=value`. The track's attribute `settings` keeps what was used. Made by
+`scripts/make_parameters.py`.
 """
 
+FROM_PAPER = re.compile(r"the paper(:|'s (b|w|\d))")  # "the paper's 12", "the paper: under 5", "the paper's b"
 
-def table(model: type[BaseModel]) -> list[str]:
-    """One row a key."""
+
+def table(model: type[BaseModel], of_method: bool = True) -> list[str]:
+    """One row a key; numbers that the description calls the paper's stand out where they are the method's."""
     rows = ["| key | default | what |", "|---|---|---|"]
     for key, field in model.model_fields.items():
         default = list(field.default) if isinstance(field.default, tuple) else field.default
-        rows.append(f"| `{key}` | {'null' if default is None else default} | {field.description} |")
+        shown = "null" if default is None else str(default)
+        if of_method and FROM_PAPER.search(field.description or ""):
+            shown = f"**{shown}**"
+        rows.append(f"| `{key}` | {shown} | {field.description} |")
     return rows
 
 
@@ -41,9 +49,9 @@ def parameters() -> str:
     for room, field in Settings.model_fields.items():
         model = field.annotation
         assert isinstance(model, type)
-        lines += [f"## {room}: {field.description}", "", (model.__doc__ or "").strip(), "", *table(model), ""]
+        lines += [f"## {room}: {field.description}", "", inspect.cleandoc(model.__doc__ or ""), "", *table(model), ""]
     lines += ["## synth", "", "Of `sphereorient synth`: `--settings configs/synth.yaml`, `--set key=value`.", ""]
-    return "\n".join([*lines, *table(SynthSettings), ""])
+    return "\n".join([*lines, *table(SynthSettings, of_method=False), ""])
 
 
 def pages() -> dict[Path, str]:

@@ -4,18 +4,33 @@ from __future__ import annotations
 
 import doctest
 import re
+import shutil
 import subprocess
 import sys
+from importlib import import_module
+from pathlib import Path
 
+import cv2
 import pytest
+import yaml
 from conftest import REPO
+
+from sphereorient.experiment import ExperimentKeys, load_experiment
+from sphereorient.trajectory import Flag, Reason, Trajectory
 
 DOCS = sorted([*REPO.glob("*.md"), *(REPO / "docs").glob("*.md")])
 
 
+def blocks(page: str, language: str) -> list[str]:
+    """Fenced blocks of a language in a page of docs/."""
+    text = (REPO / "docs" / page).read_text()
+    found = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return [block for kind, block in found if kind == language]
+
+
 def test_the_examples_of_the_conventions_run():
     failed, tried = doctest.testfile(str(REPO / "docs" / "conventions.md"), module_relative=False)
-    assert tried >= 20
+    assert tried >= 40
     assert failed == 0
 
 
@@ -23,11 +38,86 @@ def test_parameters_and_configs_are_those_of_the_code():
     subprocess.run([sys.executable, REPO / "scripts" / "make_parameters.py", "--check"], check=True)
 
 
+def test_the_figure_of_the_conventions_is_drawn_by_its_script(tmp_path):
+    out = tmp_path / "conventions.png"
+    subprocess.run([sys.executable, REPO / "scripts" / "figure_conventions.py", "--out", out], check=True)
+    drawn, committed = (cv2.imread(str(path)) for path in (out, REPO / "docs" / "conventions.png"))
+    assert drawn.shape == committed.shape
+    # Fonts and line ends differ between versions of matplotlib, the panels do not.
+    assert abs(drawn.astype(float) - committed).mean() < 10
+
+
 def test_every_test_that_the_paper_map_names_exists():
     named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", (REPO / "docs" / "paper-map.md").read_text())
-    assert len(named) > 25
+    assert len(named) > 40
     for path, test in named:
         assert f"def {test}(" in (REPO / path).read_text(), f"{path}::{test}"
+
+
+def test_every_function_that_the_paper_map_names_exists():
+    rows = re.findall(r"^\|[^|]*\|[^|]*\|([^|]*)\| `tests/", (REPO / "docs" / "paper-map.md").read_text(), re.MULTILINE)
+    named = [name for row in rows for name in re.findall(r"`(\w+)\.(\w+)`", row)]
+    assert len(named) > 30
+    for room, name in named:
+        assert hasattr(import_module(f"sphereorient.{room}"), name), f"{room}.{name}"
+
+
+def test_every_correction_has_a_row():
+    text = (REPO / "docs" / "paper-map.md").read_text()
+    used = {number for path in (REPO / "sphereorient").rglob("*.py") for number in erratas(path)}
+    assert len(used) > 10
+    for number in used:
+        assert f"\n| {number} | " in text, number
+
+
+def erratas(path: Path) -> list[str]:
+    """Numbers such as E5 that a file of the package names."""
+    return re.findall(r"\b([AE](?:10|[1-9]))\b", path.read_text())
+
+
+def test_the_keys_of_an_experiment_are_all_in_the_data_format():
+    text = (REPO / "docs" / "data-format.md").read_text()
+    example = yaml.safe_load(blocks("data-format.md", "yaml")[0])
+    assert example.pop("schema") == "sphereorient-experiment/1"
+    keys = ExperimentKeys.model_validate(example)
+    for key in [*type(keys).model_fields, *(f"sphere.{name}" for name in type(keys.sphere).model_fields)]:
+        assert f"`{key}`" in text or f"\n{key}:" in text, key
+
+
+def test_flags_reasons_and_datasets_are_all_in_the_data_format():
+    text = (REPO / "docs" / "data-format.md").read_text()
+    for flag in Flag:
+        assert re.search(rf"^\|[ \d,]*\b{flag.value}\b[ \d,]*\|", text, re.MULTILINE), flag
+    for reason in Reason:
+        assert f"`{reason}`" in text, reason
+    track = Trajectory.__dataclass_fields__
+    for name in (name for name in track if "column" in track[name].metadata and not name.endswith(("_sigma", "_cov"))):
+        assert f"`{name}`" in text, name
+
+
+def test_the_files_of_the_walkthrough_load(tmp_path):
+    experiment, cameras = blocks("walkthrough.md", "yaml")
+    (tmp_path / "cameras.yaml").write_text(cameras)
+    (tmp_path / "experiment.yaml").write_text(experiment)
+    assert list(load_experiment(tmp_path / "experiment.yaml").cameras) == ["cam1", "cam2"]
+
+
+@pytest.mark.slow  # renders and tracks 60 frames: a quarter of a minute
+def test_the_commands_and_the_python_of_the_walkthrough_run(tmp_path, monkeypatch):
+    # A copy of the project's folder, so that its own out/ stays as it is.
+    (tmp_path / ".venv").symlink_to(sys.prefix)
+    shutil.copytree(REPO / "scripts", tmp_path / "scripts")
+    (tmp_path / "out").mkdir()
+    lines = (line for block in blocks("walkthrough.md", "") for line in block.splitlines())
+    commands = [line for line in lines if line.startswith(".venv/bin/")]
+    assert len(commands) == 3
+    for command in commands:
+        subprocess.run(command.split(), cwd=tmp_path, check=True, capture_output=True)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for block in blocks("walkthrough.md", "python"):
+        exec(block, names)
+    assert (tmp_path / "out" / "try" / "track.csv").is_file()
 
 
 @pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)

@@ -1,4 +1,4 @@
-"""The rooms are a line: each imports only from those before it (docs/conventions.md, Rooms)."""
+"""The rooms are a line: each imports only from those before it (CONTRIBUTING.md, Rooms)."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ def imported(tree: ast.AST) -> list[str]:
     """Modules of the package that a file imports anywhere, `from sphereorient import so3` as sphereorient.so3."""
     names = []
     for node in ast.walk(tree):
+        assert not (isinstance(node, ast.ImportFrom) and node.level), "write imports from sphereorient in full"
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "sphereorient":
             bare = node.module == "sphereorient"
             names += [f"sphereorient.{alias.name}" if bare else node.module for alias in node.names]
