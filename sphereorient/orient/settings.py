@@ -49,3 +49,29 @@ class OrientSettings(BaseModel):
         description="reach of the fine grid about a group's best: covers the coarse cell (10.4 at 12)",
     )
     score_min: float = Field(0.5, ge=0, le=1, description="candidates of lower T are no candidates; the paper's 0.5")
+
+
+class RefineSettings(BaseModel):
+    """How poses are fitted to pictures (method precise)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    background_frames: int = Field(
+        48, ge=1, description="evenly spread frames whose mean is the background; half as many as paper: starts sooner"
+    )
+    study_frames: int = Field(
+        16, ge=1, description="evenly spread frames from which blur, light and noise of the pictures are learnt"
+    )
+    blur_px: float | None = Field(
+        None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null learns it"
+    )
+    reach: float = Field(
+        1.25, ge=1, description="largest disk expected over the one in the middle of the volume: ball near the camera"
+    )
+    candidates: int = Field(4, ge=1, description="proposals of each camera that are fitted where nothing is known")
+    block_frames: int = Field(
+        64, ge=2, description="frames between full searches; blocks begin at multiples of it and know nothing of others"
+    )
+    lanes: int = Field(
+        2, ge=1, description="blocks followed side by side; all of their frames are held in memory, 2 x 64 are 54 MB"
+    )

@@ -1,0 +1,182 @@
+"""The pose of a single frame of which nothing is known: outlines, search over all rotations, fits that narrow down."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.cameras import R_cam_view
+from sphereorient.locate import LocateSettings, find_ball, find_positions, sightings_of
+from sphereorient.locate.find import Found
+from sphereorient.orient.crop import crop_disk
+from sphereorient.orient.eye import Fitter, Picture
+from sphereorient.orient.proposer import Proposer
+from sphereorient.orient.refine import Fit
+from sphereorient.trajectory import Reason
+
+DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin
+PLACE_SHARE = 0.03  # of the radius: how far an outline's centre may be off, dark rims included
+GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance see different things
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Poses:
+    """Distinct poses that one frame's pictures allow, most likely first; made by orient, read by the tracker.
+
+    M poses, C cameras; M = 0 where there is none, and then `reason` says why.
+    """
+
+    position_lab_mm: Tensor  # (M, 3)
+    R_lab_body: Tensor  # (M, 3, 3)
+    covariance: Tensor  # (M, 6, 6), of delta (rad) and position (mm), lab
+    own_turn: Tensor  # (M, C, 3), rad, see Fit
+    own_covariance: Tensor  # (M, C, 3, 3)
+    deviation: Tensor  # (M, C)
+    score: Tensor  # (M, C)
+    nll: Tensor  # (M,)
+    use: Tensor  # (C,) bool, cameras whose pictures count
+    reason: tuple[Reason, ...]  # C
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.nll)
+
+
+POSE_PARTS = ("position_lab_mm", "R_lab_body", "covariance", "own_turn", "own_covariance", "deviation", "score", "nll")
+
+
+def poses_of(fit: Fit, chosen: Tensor, use: Tensor, reason: Sequence[Reason]) -> Poses:
+    """Return some rows of a fit as the poses of one frame."""
+    return Poses(**{name: getattr(fit, name)[chosen] for name in POSE_PARTS}, use=use, reason=tuple(reason))
+
+
+def no_pose(cameras: int, reason: Sequence[Reason]) -> Poses:
+    """Return a frame without any pose."""
+    tails = {"position_lab_mm": (3,), "R_lab_body": (3, 3), "covariance": (6, 6), "own_turn": (cameras, 3)}
+    tails |= {"own_covariance": (cameras, 3, 3), "deviation": (cameras,), "score": (cameras,), "nll": ()}
+    parts = {name: torch.zeros(0, *tail, dtype=torch.float64) for name, tail in tails.items()}
+    return Poses(**parts, use=torch.zeros(cameras, dtype=torch.bool), reason=tuple(reason))
+
+
+def cold_start(
+    fitter: Fitter,
+    proposers: Mapping[str, Proposer],
+    pictures: Sequence[Picture],
+    locating: LocateSettings,
+    *,
+    candidates: int,
+    finalists: int = 2,
+) -> Poses:
+    """Find all poses that the pictures of one instant allow.
+
+    Args:
+        fitter: with the C eyes.
+        proposers: of their names.
+        pictures: C frames.
+        locating: how outlines are found.
+        candidates: proposals of each camera that are fitted.
+        finalists: poses that are fitted to all detail.
+
+    Returns:
+        Poses, or none with the reasons.
+    """
+    found = [
+        find_ball(frame, eye.background, eye.diameter_px, locating)
+        for eye, frame in zip(fitter.eyes, pictures, strict=True)
+    ]
+    ask = partial(_poses, fitter, proposers, pictures, candidates=candidates, finalists=finalists)
+    use = [outline is not None for outline, _ in found]
+    if all(use) and len(use) > 1 and _apart_mm(fitter, found) > GAP_SHARE * fitter.radius_mm:
+        # The cameras see different things: believe the one whose picture is explained better.
+        alone = [ask(_only(found, k)) for k in range(len(found))]
+        return max(alone, key=lambda poses: float(poses.score[0, poses.use].max()) if len(poses) else -torch.inf)
+    return ask(found)
+
+
+def _only(found: Sequence[Found], kept: int) -> list[Found]:
+    return [one if k == kept else (None, Reason.OUTLINE) for k, one in enumerate(found)]
+
+
+def _apart_mm(fitter: Fitter, found: Sequence[Found]) -> float:
+    """Distance of the lines of sight to the outlines' centres."""
+    seen = {eye.name: sightings_of([one]) for eye, one in zip(fitter.eyes, found, strict=True)}
+    return float(find_positions(seen, {eye.name: eye.camera for eye in fitter.eyes}, 2 * fitter.radius_mm).gap_mm[0])
+
+
+def _poses(
+    fitter: Fitter,
+    proposers: Mapping[str, Proposer],
+    pictures: Sequence[Picture],
+    found: Sequence[Found],
+    *,
+    candidates: int,
+    finalists: int,
+) -> Poses:
+    """Search and fit, given the outlines."""
+    eyes, reason = fitter.eyes, [why for _, why in found]
+    use = torch.tensor([outline is not None for outline, _ in found])
+    if not use.any():
+        return no_pose(len(eyes), reason)
+    seen = {eye.name: sightings_of([one]) for eye, one in zip(eyes, found, strict=True)}
+    placed = find_positions(seen, {eye.name: eye.camera for eye in eyes}, 2 * fitter.radius_mm)
+    starts = [torch.zeros(0, 3, 3, dtype=torch.float64)]
+    for eye, frame, (outline, _) in zip(eyes, pictures, found, strict=True):
+        if outline is None:
+            continue
+        proposer = proposers[eye.name]
+        disk = crop_disk(frame, outline.u_px, outline.v_px, outline.radius_px, proposer.size_px)
+        proposals = proposer.propose(torch.from_numpy(disk)[None])
+        ray = eye.camera.rays(torch.tensor([outline.u_px, outline.v_px], dtype=torch.float64)).direction_lab
+        R_lab_view = eye.camera.R_cam_lab.mT @ R_cam_view(eye.camera.R_cam_lab @ ray)
+        starts.append(R_lab_view @ proposals.R_view_body[:candidates])
+    R = torch.cat(starts)
+    if not len(R):
+        return no_pose(len(eyes), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
+    slack = torch.nan_to_num(placed.covariance_mm2[0]) + (PLACE_SHARE * fitter.radius_mm) ** 2 * torch.eye(3).double()
+    return _narrow(fitter, pictures, placed.position_lab_mm, torch.linalg.inv(slack), R, use, reason, finalists)
+
+
+def _narrow(
+    fitter: Fitter,
+    pictures: Sequence[Picture],
+    place: Tensor,
+    precision: Tensor,
+    R: Tensor,
+    use: Tensor,
+    reason: Sequence[Reason],
+    finalists: int,
+) -> Poses:
+    """Fit all starts to coarse detail, and the best distinct ones to finer and finer."""
+    X = place.expand(len(R), 3)
+    optics = fitter.optics
+    for level, iterations, keep in (
+        (optics.coarse, 4, finalists + 1),
+        (optics.middle, 3, finalists),
+        (optics.fine, 3, finalists),
+    ):
+        held = None if level is optics.fine else precision.expand(len(R), 3, 3)
+        # All starts of a level look at the same pixels: those about the place the outlines give.
+        one = fitter.pixels([pictures], place, level)
+        pixels = one.where(torch.arange(len(one)).repeat(len(R)))
+        fit = fitter.fit(pixels, X, R, use.expand(len(R), -1), level, iterations, held)
+        chosen = distinct(fit.R_lab_body, fit.nll, keep)
+        X, R = fit.position_lab_mm[chosen], fit.R_lab_body[chosen]
+        place = X[:1]
+    return poses_of(fit, chosen, use, reason)
+
+
+def distinct(R: Tensor, nll: Tensor, count: int) -> Tensor:
+    """Return the indices of the most likely rotations (M, 3, 3) that are not near a likelier one, at most `count`."""
+    near = so3.geodesic_distance(R[:, None], R[None]) < DISTINCT_RAD
+    left = torch.isfinite(nll)
+    chosen: list[int] = []
+    for k in nll.argsort(stable=True).tolist():
+        if left[k] and len(chosen) < count:
+            chosen.append(k)
+            left = left & ~near[k]
+    return torch.tensor(chosen, dtype=torch.int64)

@@ -1,0 +1,103 @@
+"""How the painted sphere looks through real pixels, and how that changes with its pose: exact geometry, blurred."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sphereorient.orient.pixels import Pixels
+from sphereorient.sphere.paint_table import PaintTable
+
+SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself
+DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of the paint is infinite on the limb
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """The sphere in the pixels of L disks at one pose each; made by `sphere_view`, read by refine and light."""
+
+    paint: Tensor  # (L, P), blurred paint seen, 0 .. 1
+    coverage: Tensor  # (L, P), share of the pixel's blurred aperture that the sphere fills
+    across: Tensor  # (L, 2, P), place on the disk along the camera's x and y, radii
+    paint_by_rotation: Tensor  # (L, 3, P), derivative by delta in exp([delta]x) R, 1/rad
+    paint_by_position: Tensor  # (L, 3, P), derivative by the centre, lab, 1/mm
+    coverage_by_position: Tensor  # (L, 3, P), 1/mm
+
+
+def sphere_view(
+    pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, radius_mm: float, paint: PaintTable, blur_px: float
+) -> View:
+    """Look at the sphere through pixels whose aperture is a Gaussian.
+
+    A pixel near the limb sees the paint about the middle of that part of its aperture which the sphere covers, and
+    along the radius the sphere's curvature stretches the aperture over more paint: two look-ups, one standard deviation
+    to both sides of the mean of a Gaussian cut off at the limb, make both right, the table's own blur does the rest.
+
+    Args:
+        pixels: of L disks, float32.
+        position_lab_mm: (L, 3), centre of the sphere.
+        R_lab_body: (L, 3, 3).
+        radius_mm: of the sphere.
+        paint: blurred by `blur_px` as seen at the disk's middle.
+        blur_px: standard deviation of the aperture, px.
+
+    Returns:
+        The view. In its derivatives the spread of the two look-ups is held fixed.
+
+    Source: ERRATA A4 (the cap and the ellipse that a perspective camera sees); mean and variance of a cut-off
+    Gaussian, Johnson, Kotz and Balakrishnan 1994, section 13.10.
+    """
+    d = pixels.direction
+    R = R_lab_body.to(d.dtype)
+    # In double precision, once: half a metre less half a metre.
+    to_centre = (position_lab_mm[:, :, None] - pixels.origin.double()).to(d.dtype)
+    along = (to_centre * d).sum(1, keepdim=True)
+    aside = to_centre - along * d  # from the line of sight's nearest point to the centre
+    nearest = (aside * aside).sum(1).sqrt().clamp_min(1e-6 * radius_mm)
+    outward = aside / -nearest[:, None]  # unit, from the centre to the line of sight
+    q0 = nearest / radius_mm
+    distance = to_centre[..., 0].norm(dim=1, keepdim=True)
+    blur = blur_px * pixels.pitch_rad[:, None] * distance / radius_mm
+    # The Gaussian aperture, cut off at the limb: what share is left, where its middle lies, how wide it is.
+    edge = (1.0 - q0) / blur
+    coverage = torch.special.ndtr(edge)
+    density = torch.exp(-0.5 * edge * edge) * (1.0 / math.sqrt(2.0 * math.pi))
+    pull = density / coverage.clamp_min(1e-4)
+    variance = (1.0 - pull * (edge + pull)).clamp(SPREAD_MIN, 1.0)
+    q = (q0 - blur * pull).clamp(0.0, 1.0)
+    spread = blur * variance.sqrt() * q
+    # In body components, where the paint is: the derivatives are turned back once, at the end.
+    sight_b, outward_b = R.mT @ d, R.mT @ outward
+    body, radial = torch.zeros_like(q), torch.zeros_like(q)
+    turn_b, flat_b = torch.zeros_like(d), torch.zeros_like(d)
+    for side in (-1.0, 1.0):
+        qt = (q + side * spread).clamp(0.0, math.sqrt(1.0 - DEPTH_MIN**2))
+        depth = (1.0 - qt * qt).sqrt()
+        normal_b = qt[:, None] * outward_b - depth[:, None] * sight_b
+        value, slope = paint.look(normal_b)
+        body = body + value
+        turn_b = turn_b + _cross(slope, normal_b)
+        flat_b = flat_b + qt[:, None] * slope
+        # Moving the centre along -outward lets the look-up slide outwards over the sphere by `variance` of it.
+        radial = radial + (slope * outward_b).sum(1) + qt / depth * (slope * sight_b).sum(1)
+    by_sight, by_outward = (flat_b * sight_b).sum(1), (flat_b * outward_b).sum(1)
+    # Across the radius the look-up stays at its share of it, q / q0.
+    flat = R @ flat_b - by_sight[:, None] * d - by_outward[:, None] * outward
+    shift = flat * (-0.5 / nearest)[:, None] - (0.5 * radial * variance / radius_mm)[:, None] * outward
+    return View(
+        paint=0.5 * body,
+        coverage=coverage,
+        across=q[:, None] * (pixels.axes @ outward),
+        paint_by_rotation=0.5 * (R @ turn_b),
+        paint_by_position=shift,
+        coverage_by_position=(density / (blur * radius_mm))[:, None] * outward,
+    )
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Return a x b of (L, 3, P); torch's own is several times slower along a middle axis."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=1)

@@ -1,0 +1,152 @@
+"""The pixels of a ball in a frame, each with its own line of sight: what refinement compares with the model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient.cameras import Camera
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pixels:
+    """Pixels of L disks (one camera's view of one frame each) with P places each; made here, read by refine.
+
+    Grey levels and geometry are float32: a line of sight is right to 3e-5 mm half a metre away.
+    """
+
+    grey: Tensor  # (L, P), grey levels
+    behind: Tensor  # (L, P), grey levels of the scene without the ball
+    inside: Tensor  # (L, P) bool, places that lie in the picture and are not masked
+    direction: Tensor  # (L, 3, P), unit lines of sight, lab
+    origin: Tensor  # (L, 3, 1) or (L, 3, P), where they start, lab, mm
+    axes: Tensor  # (L, 2, 3), the camera's x and y in the lab
+    pitch_rad: Tensor  # (L,), angle between neighbouring pixels at the disk's middle
+    tile: Tensor  # (P,) int64, square tile of the disk that a place belongs to, for errors that neighbours share
+
+    def __len__(self) -> int:
+        """Return the number of disks."""
+        return len(self.grey)
+
+    def where(self, chosen: Tensor) -> Pixels:
+        """Return some of the disks, by mask (L,) or by index."""
+        names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+
+    def every(self, places: Tensor) -> Pixels:
+        """Return some of the places of all disks, by index (Q,)."""
+        names = ("grey", "behind", "inside", "direction")
+        parts = {name: getattr(self, name)[..., places] for name in names}
+        origin = self.origin if self.origin.shape[-1] == 1 else self.origin[..., places]
+        return replace(self, **parts, origin=origin, tile=self.tile[places])
+
+
+class LinesOfSight:
+    """The lines of sight of all pixels of a camera, once and for all frames.
+
+    Args:
+        camera: any model.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        width, height = camera.image_size
+        v, u = torch.meshgrid(
+            torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
+        )
+        rays = camera.rays(torch.stack([u, v], dim=-1))
+        self.direction = rays.direction_lab.float().movedim(-1, 0).contiguous()  # (3, H, W)
+        origin = rays.origin_lab_mm
+        self.one_origin = bool((origin == origin[0, 0]).all())
+        self.origin = origin.float().movedim(-1, 0)[:, :1, :1] if self.one_origin else origin.float().movedim(-1, 0)
+        self.axes = camera.R_cam_lab[:2].float()
+        self.size = width, height
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Stencil:
+    """Places of a disk about its middle pixel, in order of distance, at one step in pixels; made by `disk_stencil`."""
+
+    right: NDArray[np.int64]  # (P,), px
+    down: NDArray[np.int64]
+    tile: Tensor  # (P,) int64
+    reach: int  # px
+
+
+def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stencil:
+    """Return all places within a radius, `step_px` apart."""
+    reach = math.ceil(radius_px)
+    at = np.arange(-reach, reach + 1)
+    at = at[at % step_px == 0]
+    down, right = (grid.reshape(-1) for grid in np.meshgrid(at, at, indexing="ij"))
+    distance2 = right**2 + down**2
+    # Among equals in no order of place: every second one of a list row by row would be the disk's left half.
+    order = np.lexsort((np.random.default_rng(0).random(len(distance2)), distance2))
+    order = order[distance2[order] <= radius_px**2]
+    right, down = right[order], down[order]
+    across = 2 * reach // tile_px + 1
+    tile = (down + reach) // tile_px * across + (right + reach) // tile_px
+    _, tile = np.unique(tile, return_inverse=True)
+    return Stencil(right=right, down=down, tile=torch.from_numpy(tile), reach=reach)
+
+
+def cut_pixels(
+    frame: NDArray[np.generic],
+    background: NDArray[np.float32],
+    sight: LinesOfSight,
+    middle_px: tuple[float, float],
+    stencil: Stencil,
+    blur_px: float = 0.0,
+) -> Pixels:
+    """Take a disk's pixels out of a frame, as they are: no resampling, so the noise of neighbours stays independent.
+
+    Args:
+        frame: (H, W), grey levels.
+        background: (H, W), the scene without the ball.
+        sight: of the camera.
+        middle_px: (u, v), near the ball's centre.
+        stencil: of the places.
+        blur_px: standard deviation of a Gaussian laid over frame and background first; tames detail for coarse fits.
+
+    Returns:
+        One disk.
+    """
+    width, height = sight.size
+    u, v = round(middle_px[0]), round(middle_px[1])
+    columns, rows = u + stencil.right, v + stencil.down
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    columns, rows = columns.clip(0, width - 1), rows.clip(0, height - 1)
+    reach = stencil.reach + math.ceil(3 * blur_px)
+    left, top = min(max(u - reach, 0), width - 1), min(max(v - reach, 0), height - 1)
+    window = np.s_[top : max(v + reach + 1, top + 1), left : max(u + reach + 1, left + 1)]
+    grey, behind = frame[window].astype(np.float32), background[window]
+    if blur_px > 0:
+        grey, behind = (cv2.GaussianBlur(part, (0, 0), blur_px) for part in (grey, behind))
+    place = (rows - top).clip(0, grey.shape[0] - 1) * grey.shape[1] + (columns - left).clip(0, grey.shape[1] - 1)
+    at = torch.from_numpy(rows * width + columns)
+    flat = sight.direction.reshape(3, -1)
+    middle = min(max(v, 0), height - 2) * width + min(max(u, 0), width - 2)
+    pitch = (flat[:, middle + 1] - flat[:, middle]).norm(), (flat[:, middle + width] - flat[:, middle]).norm()
+    return Pixels(
+        grey=torch.from_numpy(grey.reshape(-1)[place])[None],
+        behind=torch.from_numpy(np.ascontiguousarray(behind).reshape(-1)[place])[None],
+        inside=torch.from_numpy(inside)[None],
+        direction=flat[:, at][None],
+        origin=(sight.origin.reshape(3, 1) if sight.one_origin else sight.origin.reshape(3, -1)[:, at])[None],
+        axes=sight.axes[None],
+        pitch_rad=(0.5 * (pitch[0] + pitch[1]))[None],
+        tile=stencil.tile,
+    )
+
+
+def stacked(parts: list[Pixels]) -> Pixels:
+    """Return the disks of all parts, which share one stencil, in one record."""
+    names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad")
+    widest = max(part.origin.shape[-1] for part in parts)
+    full = [replace(part, origin=part.origin.expand(-1, -1, widest)) for part in parts]
+    return replace(full[0], **{name: torch.cat([getattr(part, name) for part in full]) for name in names})

@@ -1,0 +1,301 @@
+"""Pose to hundredths of a degree: Gauss-Newton on rotation and place, all cameras at once, light solved inside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.orient.light import Light, light_basis, light_maps, light_sums, noise_curve, polynomials
+from sphereorient.orient.picture import View, sphere_view
+from sphereorient.orient.pixels import Pixels
+from sphereorient.sphere.paint_table import PaintTable
+
+TUKEY = 9.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
+NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shading:
+    """Orders of the polynomials by which a frame's light may differ from the learnt; made by settings."""
+
+    difference: int
+    black: int
+
+
+FIRST = Shading(difference=4, black=2)  # nothing is known of the light yet
+LATER = Shading(difference=2, black=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fit:
+    """B poses fitted to the pictures of C cameras; made by `refine`, read by the tracker."""
+
+    position_lab_mm: Tensor  # (B, 3) float64
+    R_lab_body: Tensor  # (B, 3, 3) float64
+    covariance: Tensor  # (B, 6, 6) float64, of delta (rad) and position (mm), lab
+    own_turn: Tensor  # (B, C, 3), rad: how each camera alone would turn the pose, its place held
+    own_covariance: Tensor  # (B, C, 3, 3), rad^2
+    deviation: Tensor  # (B, C), robust standard deviation of the residuals over the noise expected
+    score: Tensor  # (B, C), 1 less the share of the picture's variance that is left
+    nll: Tensor  # (B,), negative log-likelihood, errors that neighbours share counted once
+    step: Tensor  # (B, 6), the last one
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Residuals:
+    """The linear problem at one pose; L disks."""
+
+    design: Tensor  # (L, 6 + K, P), derivatives by pose and by the light's coefficients
+    residual: Tensor  # (L, P), grey levels
+    model: Tensor  # (L, P), grey levels
+    variance: Tensor  # (L, P), expected
+    weight: Tensor  # (L, P), robust and inside, 0 .. 1
+    deviation: Tensor  # (L,), robust standard deviation of the residuals over the noise expected
+
+
+def light_columns(view: View, light: Light, cameras: int, shading: Shading) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what the light's coefficients multiply, (L, K, P), and the learnt maps of difference and black (L, P)."""
+    spread = view.across.unflatten(0, (-1, cameras))
+    basis = light_basis(spread)
+    difference = (light.difference[:, None, :] @ basis)[..., 0, :].flatten(0, 1)
+    black = (light.black[:, None, :] @ basis)[..., 0, :].flatten(0, 1)
+    tints = polynomials(view.across, max(shading.difference, shading.black))
+    n_difference, n_black = ((order + 1) * (order + 2) // 2 for order in (shading.difference, shading.black))
+    lit = (view.coverage * (view.paint * difference + black))[:, None]
+    columns = torch.cat([lit * tints[:, :n_difference], view.coverage[:, None] * tints[:, :n_black]], dim=1)
+    return columns, difference, black
+
+
+def refine(
+    pixels: Pixels,
+    position_lab_mm: Tensor,
+    R_lab_body: Tensor,
+    use: Tensor,
+    *,
+    radius_mm: float,
+    paint: PaintTable,
+    blur_px: float,
+    light: Light,
+    shading: Shading = LATER,
+    iterations: int = 3,
+    place_precision: Tensor | None = None,
+) -> Fit:
+    """Fit poses to pictures: robust Gauss-Newton, the light's coefficients eliminated in every step.
+
+    Args:
+        pixels: of B * C disks, the cameras of a pose next to each other.
+        position_lab_mm: (B, 3), start.
+        R_lab_body: (B, 3, 3), start.
+        use: (B, C) bool, the cameras that see the ball; a pose without any stays where it is.
+        radius_mm: of the sphere.
+        paint: blurred by `blur_px`.
+        blur_px: standard deviation of optics, pixel and whatever was laid over the frame, px.
+        light: of the C cameras.
+        shading: how far a frame's light may differ from it.
+        iterations: steps, the same for all poses, so that none depends on its neighbours in the batch.
+        place_precision: (B, 3, 3), 1/mm^2: holds the place near its start while detail is coarse.
+
+    Returns:
+        The fit, its covariance that of the robust estimate with errors shared within tiles of the picture.
+
+    Source: variable projection, Golub and Pereyra 1973; covariance of an M-estimate from clustered scores, Liang and
+    Zeger 1986.
+    """
+    cameras = use.shape[1]
+    start, X, R = position_lab_mm.double(), position_lab_mm.double(), R_lab_body.double()
+    state: tuple[Tensor, Tensor] | None = None
+    for k in range(iterations + 1):
+        at = _residuals(pixels, X, R, state, radius_mm, paint, blur_px, light, cameras, shading)
+        state = at.model, at.weight
+        precision = at.weight / at.variance
+        weighted = at.design * precision[:, None]
+        normal = (weighted @ at.design.mT).double()
+        gradient = (weighted @ at.residual[..., None])[..., 0].double()
+        information, pull, mixed = _without_light(normal, gradient)
+        information, pull = (part.unflatten(0, (-1, cameras)) for part in (information, pull))
+        seen = use.to(information.dtype)
+        whole = (information * seen[..., None, None]).sum(1)
+        force = (pull * seen[..., None]).sum(1)
+        if place_precision is not None:
+            whole[:, 3:, 3:] += place_precision
+            force[:, 3:] -= (place_precision @ (X - start)[..., None])[..., 0]
+        step = _solved(whole, force)
+        if k == iterations:
+            break
+        step = _bounded(step, radius_mm)
+        R = so3.exp(step[:, :3]) @ R
+        X = X + step[:, 3:]
+    own = _solved(information[..., :3, :3], pull[..., :3])
+    shared = _shared_scores(at, precision, mixed, pixels.tile).unflatten(0, (-1, cameras))
+    bread = _inverse(whole)
+    own_bread = _inverse(information[..., :3, :3])
+    covariance = bread @ (shared * seen[..., None, None]).sum(1) @ bread
+    loss = _loss(at, pixels.inside).unflatten(0, (-1, cameras))
+    return Fit(
+        position_lab_mm=X,
+        R_lab_body=R,
+        covariance=covariance,
+        own_turn=own,
+        own_covariance=own_bread @ shared[..., :3, :3] @ own_bread,
+        deviation=at.deviation.double().unflatten(0, (-1, cameras)),
+        score=_score(at, pixels.inside).double().unflatten(0, (-1, cameras)),
+        nll=(loss * seen).sum(1),
+        step=step,
+    )
+
+
+def _residuals(
+    pixels: Pixels,
+    X: Tensor,
+    R: Tensor,
+    state: tuple[Tensor, Tensor] | None,
+    radius_mm: float,
+    paint: PaintTable,
+    blur_px: float,
+    light: Light,
+    cameras: int,
+    shading: Shading,
+) -> _Residuals:
+    """Linearise the pictures about a pose, the light's coefficients at their best."""
+    view = sphere_view(
+        pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), radius_mm, paint, blur_px
+    )
+    columns, difference, black = light_columns(view, light, cameras, shading)
+    beyond = (1.0 - view.coverage) * pixels.behind
+    noise = light.noise.repeat(len(X), 1)
+    # The first weights come from the picture itself, later ones from the model, which has no noise.
+    expected, weight = (pixels.grey, pixels.inside.to(columns.dtype)) if state is None else state
+    variance = _variance(expected, noise)
+    target = pixels.grey - beyond
+    weighted = columns * (weight / variance)[:, None]
+    coefficients = _solved(
+        (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double(), ridge=1e-7
+    ).to(columns.dtype)
+    painted = (coefficients[:, None] @ columns)[:, 0]
+    model, residual = painted + beyond, target - painted
+    variance = _variance(model, noise)
+    deviation = _deviation(residual, variance, pixels.inside)
+    variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
+    weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * pixels.inside
+    tints = polynomials(view.across, max(shading.difference, shading.black))
+    n = (shading.difference + 1) * (shading.difference + 2) // 2
+    gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
+    offset = (coefficients[:, None, n:] @ tints[:, : columns.shape[1] - n])[:, 0]
+    step, ground = difference * gain, black * gain + offset
+    by_paint = (view.coverage * step)[:, None]
+    over = (view.paint * step + ground - pixels.behind)[:, None]
+    by_pose = torch.cat(
+        [by_paint * view.paint_by_rotation, by_paint * view.paint_by_position + over * view.coverage_by_position], dim=1
+    )
+    design = torch.cat([by_pose, columns], dim=1)
+    return _Residuals(
+        design=design, residual=residual, model=model, variance=variance, weight=weight, deviation=deviation
+    )
+
+
+def _variance(grey: Tensor, noise: Tensor) -> Tensor:
+    """Noise expected at grey levels (L, P) by the curves (L, 3)."""
+    grey = grey.clamp_min(0.0)
+    return (noise[:, :1] + noise[:, 1:2] * grey + noise[:, 2:] * grey * grey).clamp_min(NOISE_MIN)
+
+
+def _deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
+    """Robust standard deviation of residuals over the noise expected, (L,); 1 where the noise explains them."""
+    # A quarter of the places tells as much: they are in order of distance from the middle.
+    residual, variance, inside = residual[:, ::4], variance[:, ::4], inside[:, ::4]
+    scaled = torch.where(inside, residual.abs() * variance.rsqrt(), torch.nan)
+    return 1.4826 * torch.nan_to_num(scaled.nanmedian(-1).values)
+
+
+def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Eliminate the light's coefficients: information (L, 6, 6), gradient (L, 6), what the pose takes from them."""
+    light = normal[:, 6:, 6:]
+    light = light + 1e-7 * torch.diag_embed(light.diagonal(dim1=-2, dim2=-1) + 1e-12)
+    mixed = torch.linalg.solve(light, normal[:, 6:, :6])
+    information = normal[:, :6, :6] - normal[:, :6, 6:] @ mixed
+    return information, gradient[:, :6] - (mixed.mT @ gradient[:, 6:, None])[..., 0], mixed
+
+
+def _solved(matrix: Tensor, right: Tensor, ridge: float = 1e-9) -> Tensor:
+    """Solve small symmetric systems; a direction that nothing determines gets no step."""
+    size = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(0)
+    floor = ridge * size + 1e-12
+    return torch.linalg.solve_ex(matrix + torch.diag_embed(floor), right[..., None]).result[..., 0]
+
+
+def _inverse(matrix: Tensor) -> Tensor:
+    size = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(0)
+    return torch.linalg.inv_ex(matrix + torch.diag_embed(1e-9 * size + 1e-12)).inverse
+
+
+def _bounded(step: Tensor, radius_mm: float) -> Tensor:
+    """Shorten steps over 0.1 rad or a tenth of a radius, pose by pose: beyond, the paint's slope says nothing."""
+    size = torch.maximum(step[:, :3].norm(dim=-1), step[:, 3:].norm(dim=-1) / radius_mm)
+    return step * (0.1 / size.clamp_min(0.1))[:, None]
+
+
+def _shared_scores(at: _Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:
+    """Sum over tiles of the outer products of their scores, (L, 6, 6): neighbours' errors are not independent."""
+    by_pose = at.design[:, :6] - mixed.mT.to(at.design.dtype) @ at.design[:, 6:]
+    score = by_pose * (precision * at.residual)[:, None]
+    tiles = score.new_zeros(*score.shape[:2], int(tile.max()) + 1 if len(tile) else 1)
+    tiles = tiles.index_add(2, tile, score).double()
+    return tiles @ tiles.mT
+
+
+def _loss(at: _Residuals, inside: Tensor) -> Tensor:
+    """Tukey's loss with its scale's own term (L,), natural units: what a wider scatter gains, it pays for."""
+    share = (at.residual.square() / (TUKEY**2 * at.variance)).clamp_max(1.0)
+    loss = (TUKEY**2 / 6.0) * (1.0 - (1.0 - share) ** 3) + at.deviation.clamp_min(1.0).log()[:, None]
+    return (loss * inside).sum(-1).double()
+
+
+def _score(at: _Residuals, inside: Tensor) -> Tensor:
+    """Share of the disk's variance that the model explains, (L,); every pixel counts, or what is wrong would not."""
+    share = inside / inside.sum(-1, keepdim=True).clamp_min(1)
+    grey = at.model + at.residual
+    spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
+    left = (share * at.residual.square()).sum(-1)
+    return 1.0 - left / spread.clamp_min(1e-9)
+
+
+def learn_light(
+    pixels: Pixels,
+    fit: Fit,
+    use: Tensor,
+    *,
+    radius_mm: float,
+    paint: PaintTable,
+    blur_px: float,
+    light: Light,
+    shading: Shading,
+) -> Light:
+    """Learn the light and the noise of a movie from fitted poses.
+
+    Args:
+        pixels: of B * C disks.
+        fit: of them.
+        use: (B, C) bool, disks to learn from.
+        radius_mm: as in `refine`, like the following ones.
+        paint: as there.
+        blur_px: as there.
+        light: with which the poses were fitted.
+        shading: with which the poses were fitted.
+    """
+    cameras = use.shape[1]
+    X, R = fit.position_lab_mm, fit.R_lab_body
+    at = _residuals(pixels, X, R, None, radius_mm, paint, blur_px, light, cameras, shading)
+    at = _residuals(pixels, X, R, (at.model, at.weight), radius_mm, paint, blur_px, light, cameras, shading)
+    view = sphere_view(
+        pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), radius_mm, paint, blur_px
+    )
+    normal, right = light_sums(view, pixels, at.weight / at.variance * use.reshape(-1, 1))
+    difference, black = light_maps(normal.unflatten(0, (-1, cameras)).sum(0), right.unflatten(0, (-1, cameras)).sum(0))
+    counted = pixels.inside & use.reshape(-1, 1)
+    noise = torch.stack(
+        [noise_curve(at.model[c::cameras], at.residual[c::cameras], counted[c::cameras]) for c in range(cameras)]
+    )
+    return Light(difference=difference, black=black, noise=noise, known=True)

@@ -1,0 +1,138 @@
+"""What a movie's pictures are like, learnt from a few of its frames before the others are measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sphereorient.errors import ExperimentError, refusal
+from sphereorient.locate import LocateSettings
+from sphereorient.orient.cold import Poses, cold_start
+from sphereorient.orient.eye import Eye, Fitter, Level, Optics, Picture
+from sphereorient.orient.light import Light
+from sphereorient.orient.pixels import Pixels
+from sphereorient.orient.proposer import Proposer
+from sphereorient.orient.refine import Fit, learn_light
+from sphereorient.orient.settings import RefineSettings
+from sphereorient.sphere.paint_table import PaintTable
+
+BLURS = tuple(0.4 * 1.25**k for k in range(8))  # px; what is tried where the blur is not given
+FIRST_BLUR = 0.7  # px: a pixel's own width and a good lens
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Study:
+    """Blur and light of the movies, and how well right and wrong poses explain them; made by `study`."""
+
+    fitter: Fitter
+    score_min: float  # between right and wrong poses
+    right_score: float  # typical of right poses
+
+
+def study(
+    eyes: Sequence[Eye],
+    pictures: Sequence[Sequence[Picture]],
+    base: PaintTable,
+    proposers: Mapping[str, Proposer],
+    radius_mm: float,
+    locating: LocateSettings,
+    settings: RefineSettings,
+) -> Study:
+    """Learn blur and light.
+
+    Args:
+        eyes: C of them.
+        pictures: n times C frames, spread over the movie.
+        base: finest table of the paint.
+        proposers: by name of eye.
+        radius_mm: of the sphere.
+        locating: how outlines are found.
+        settings: blur, if given.
+
+    Raises:
+        ExperimentError: no frame has a pose.
+    """
+    diameter_px = max(eye.diameter_px for eye in eyes)
+    blur_px = settings.blur_px or FIRST_BLUR
+    noise = torch.tensor([[eye.background.typical_noise**2, 0.02, 0.001] for eye in eyes])
+    light = Light.unknown(len(eyes), noise)
+    fitter = Fitter(
+        eyes=eyes,
+        radius_mm=radius_mm,
+        optics=Optics(base, blur_px, diameter_px, settings.reach),
+        light=light,
+    )
+    found = [
+        cold_start(fitter, proposers, frames, locating, candidates=settings.candidates, finalists=2)
+        for frames in pictures
+    ]
+    chosen = _clear(found)
+    if not chosen:
+        reasons = ", ".join(sorted({str(why) for poses in found for why in poses.reason}))
+        do = "check texture, cameras and sphere.diameter; `--method paper` says more"
+        raise ExperimentError(
+            refusal("movies", expected="frames that the map explains", got=f"none ({reasons})", do=do)
+        )
+    X = torch.cat([found[k].position_lab_mm[:1] for k in chosen])
+    R = torch.cat([found[k].R_lab_body[:1] for k in chosen])
+    use = torch.stack([found[k].use for k in chosen])
+    pixels = fitter.pixels([pictures[k] for k in chosen], X, fitter.optics.fine)
+    pixels = pixels.every(torch.arange(0, pixels.grey.shape[1], 2))
+    fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 3)
+    fitter, fit = _with_light(fitter, pixels, fit, use, 2)
+    if settings.blur_px is None:
+        blur_px = _best_blur(fitter, base, pixels, fit, use)
+        optics = Optics(base, blur_px, diameter_px, settings.reach)
+        fitter = Fitter(eyes=eyes, radius_mm=radius_mm, optics=optics, light=fitter.light)
+    fitter, fit = _with_light(fitter, pixels, fit, use, 2)
+    right = float(fit.score[use].median())
+    wrong = torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in chosen])
+    highest = float(wrong.quantile(0.9)) if len(wrong) else 0.0
+    return Study(fitter=fitter, score_min=0.5 * (right + min(highest, right)), right_score=right)
+
+
+def _clear(found: Sequence[Poses]) -> list[int]:
+    """Frames whose best pose explains the picture about as well as in the typical frame."""
+    best = torch.tensor([float(poses.score[0, poses.use].min()) if len(poses) else torch.nan for poses in found])
+    if torch.isnan(best).all():
+        return []
+    return [k for k, score in enumerate(best.tolist()) if score >= 1 - 3 * (1 - float(best.nanquantile(0.75)))]
+
+
+def _with_light(fitter: Fitter, pixels: Pixels, fit: Fit, use: Tensor, rounds: int) -> tuple[Fitter, Fit]:
+    """Learn the light and fit again, some times."""
+    fine = fitter.optics.fine
+    for _ in range(rounds):
+        light = learn_light(
+            pixels,
+            fit,
+            use,
+            radius_mm=fitter.radius_mm,
+            paint=fine.paint,
+            blur_px=fine.blur_px,
+            light=fitter.light,
+            shading=fitter.shading,
+        )
+        fitter = Fitter(eyes=fitter.eyes, radius_mm=fitter.radius_mm, optics=fitter.optics, light=light)
+        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 2)
+    return fitter, fit
+
+
+def _best_blur(fitter: Fitter, base: PaintTable, pixels: Pixels, fit: Fit, use: Tensor) -> float:
+    """Return the blur that leaves the least of the pictures unexplained, between the tried ones by a parabola."""
+    radius_px = max(eye.diameter_px for eye in fitter.eyes) / 2
+    left = []
+    for blur_px in BLURS:
+        paint = base.blurred(max(blur_px / radius_px, base.blur_rad))
+        level = Level(extra_px=0.0, blur_px=blur_px, stencil=fitter.optics.fine.stencil, paint=paint)
+        tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 1)
+        left.append(float((1.0 - tried.score)[use].median()))
+    k = min(range(len(left)), key=left.__getitem__)
+    if k in (0, len(left) - 1):
+        return BLURS[k]
+    bend = left[k - 1] - 2 * left[k] + left[k + 1]
+    shift = 0.5 * (left[k - 1] - left[k + 1]) / bend if bend > 0 else 0.0
+    return BLURS[k] * (BLURS[1] / BLURS[0]) ** shift
