@@ -1,4 +1,4 @@
-"""The paper's method on one page: the only place that knows the order.
+"""The methods on one page: the only place that knows the order.
 
 movies -> locate -> orient -> assemble -> motion -> Trajectory
 """
@@ -6,7 +6,10 @@ movies -> locate -> orient -> assemble -> motion -> Trajectory
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -15,19 +18,31 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient import assemble, locate, motion
-from sphereorient.assemble import Fused, Path
+from sphereorient import assemble, locate, motion, results
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment import Experiment, frame_numbers, load_experiment, movie_span, open_movies, time_s
-from sphereorient.locate import Positions, Sightings
-from sphereorient.motion import Motion
+from sphereorient.locate import Sightings
 from sphereorient.movies import Movie
-from sphereorient.orient import Candidates, Proposals, Proposer, TemplateSearch, crop_disk
+from sphereorient.orient import (
+    BlockTracker,
+    Candidates,
+    Eye,
+    LinesOfSight,
+    Poses,
+    Proposals,
+    Proposer,
+    Study,
+    TemplateSearch,
+    base_table,
+    crop_disk,
+    pose_table,
+    study,
+)
 from sphereorient.provenance import provenance
 from sphereorient.settings import DEFAULT_METHOD, METHODS, Settings, settings_yaml
 from sphereorient.sphere import load_texture
-from sphereorient.trajectory import CameraTrack, Reason, Trajectory
+from sphereorient.trajectory import Trajectory
 
 CHUNK = 64  # frames held at once; a result does not depend on it
 
@@ -96,7 +111,8 @@ def track_movies(
             for n in names
         ]
         clock = torch.from_numpy(time_s(experiment, frames))
-        track = _paper(experiment, reels, clock, texture, settings, progress)
+        compose = {"paper": _paper, "precise": _precise}[method]
+        track = compose(experiment, reels, frames, clock, texture, settings, progress)
         text = settings_yaml(settings)
         return replace(track, method=method, settings=text, provenance=provenance(experiment, names, command))
     finally:
@@ -107,6 +123,7 @@ def track_movies(
 def _paper(
     experiment: Experiment,
     reels: Sequence[Reel],
+    frames: range,
     clock: Tensor,
     texture: Tensor,
     settings: Settings,
@@ -131,8 +148,8 @@ def _paper(
         position_sigma_mm=positions.covariance_mm2.diagonal(dim1=-2, dim2=-1).sqrt(),
         orientation_sigma_rad=fused.sigma_rad,
     )
-    tracks = {name: _camera_track(sightings[name], candidates[name], paths[name]) for name in cameras}
-    return _trajectory(experiment, clock, positions, fused, moved, tracks)
+    tracks = {name: results.paper_camera(sightings[name], candidates[name], paths[name]) for name in cameras}
+    return results.paper_track(experiment, clock, positions, fused, moved, tracks)
 
 
 def locate_sphere(
@@ -199,65 +216,104 @@ def in_the_lab(proposals: Proposals, camera: Camera, centre_px: Tensor) -> Candi
     )
 
 
-def _camera_track(sightings: Sightings, candidates: Candidates, path: Path) -> CameraTrack:
-    """Collect what one camera saw."""
-    track = CameraTrack.empty(len(sightings))
-    lost = torch.isnan(path.score)
-    reason = [
-        Reason.LOW_SCORE if reason is Reason.OK and lost[k] else reason for k, reason in enumerate(candidates.reason)
-    ]
-    return replace(
-        track,
-        centre_px=sightings.centre_px.numpy(),
-        radius_px=sightings.radius_px.numpy(),
-        outline_rms_px=sightings.outline_rms_px.numpy(),
-        orientation=path.R_lab_body.numpy(),
-        score=path.score.numpy(),
-        xi=path.xi.numpy(),
-        reason=tuple(str(why) for why in reason),
-        candidate_offset=candidates.offset.numpy(),
-        candidate_orientation=candidates.R_lab_body.numpy(),
-        candidate_score=candidates.score.numpy(),
-    )
-
-
-def _trajectory(
+def _precise(
     experiment: Experiment,
+    reels: Sequence[Reel],
+    frames: range,
     clock: Tensor,
-    positions: Positions,
-    fused: Fused,
-    moved: Motion,
-    tracks: Mapping[str, CameraTrack],
+    texture: Tensor,
+    settings: Settings,
+    progress: Progress,
 ) -> Trajectory:
-    """Put everything into the noun that comes out."""
-    empty = Trajectory.empty(
-        clock.numpy(), cameras=tuple(tracks), frame_rate=experiment.frame_rate_hz, experiment=experiment.name
+    """One likelihood for all cameras: pose after pose refined, then the history, then its motion."""
+    eyes = [open_eye(reel, reels, experiment, settings, progress) for reel in reels]
+    proposers: dict[str, Proposer] = {eye.name: motion.GreySearch(texture, None) for eye in eyes}
+    learnt = study_movies(reels, eyes, texture, proposers, experiment, settings, progress)
+    tracker = BlockTracker(learnt, proposers, settings.locate, settings.refine)
+    table = pose_table(list(follow_sphere(reels, frames, tracker, progress)), len(eyes))
+    hypotheses = assemble.Hypotheses(
+        R_lab_body=table.R_lab_body, nll=table.nll, covariance_rad2=table.covariance[..., :3, :3], mask=table.mask
     )
-    oriented = torch.isfinite(fused.R_lab_body).all(-1).all(-1)
-    variance = fused.sigma_rad.square()[:, None, None] * torch.eye(3, dtype=torch.float64)
-    return replace(
-        empty,
-        valid=(oriented & positions.measured).numpy(),
-        position=positions.position_lab_mm.numpy(),
-        position_cov=positions.covariance_mm2.numpy(),
-        orientation=fused.R_lab_body.numpy(),
-        orientation_cov=variance.numpy(),
-        velocity=moved.velocity_m_s.numpy(),
-        velocity_sigma=moved.velocity_sigma_m_s.numpy(),
-        acceleration=moved.acceleration_m_s2.numpy(),
-        acceleration_sigma=moved.acceleration_sigma_m_s2.numpy(),
-        omega_lab=moved.omega_lab_rad_s.numpy(),
-        omega_lab_sigma=moved.omega_lab_sigma_rad_s.numpy(),
-        omega_body=moved.omega_body_rad_s.numpy(),
-        omega_body_sigma=moved.omega_body_sigma_rad_s.numpy(),
-        alpha_lab=moved.alpha_lab_rad_s2.numpy(),
-        alpha_lab_sigma=moved.alpha_lab_sigma_rad_s2.numpy(),
-        alpha_body=moved.alpha_body_rad_s2.numpy(),
-        alpha_body_sigma=moved.alpha_body_sigma_rad_s2.numpy(),
-        segment=fused.segment.numpy(),
-        flags=(fused.flags | positions.flags).numpy().astype(np.uint32),
-        cameras=dict(tracks),
+    chosen = assemble.physical_path(hypotheses, clock, settings.path)
+    picked = table.rows(chosen.choice)
+    smoothed = motion.smooth_motion(
+        clock,
+        picked["position_lab_mm"],
+        picked["covariance"][:, 3:, 3:],
+        picked["R_lab_body"],
+        picked["covariance"][:, :3, :3],
+        chosen.segment,
+        None,
     )
+    return results.precise_track(experiment, clock, table, chosen, smoothed, learnt)
+
+
+def open_eye(reel: Reel, reels: Sequence[Reel], experiment: Experiment, settings: Settings, progress: Progress) -> Eye:
+    """Learn one camera's empty scene."""
+    stage = f"{reel.name}: background"
+    progress(stage, 0, 1)
+    cameras = {each.name: each.camera for each in reels}
+    diameter_px = settings.locate.diameter_px or locate.expected_diameter_px(reel.name, cameras, experiment.diameter_mm)
+    empty_path = experiment.background_paths.get(reel.name)
+    empty = None if empty_path is None else locate.load_background(empty_path, reel.movie.frame_shape)
+    spread = locate.spread_frames(reel.frames, settings.refine.background_frames)
+    background = locate.learn_background(reel.movie, spread, diameter_px, settings.locate, empty)
+    progress(stage, 1, 1)
+    sight = LinesOfSight(reel.camera)
+    return Eye(name=reel.name, camera=reel.camera, background=background, diameter_px=diameter_px, sight=sight)
+
+
+def study_movies(
+    reels: Sequence[Reel],
+    eyes: Sequence[Eye],
+    texture: Tensor,
+    proposers: Mapping[str, Proposer],
+    experiment: Experiment,
+    settings: Settings,
+    progress: Progress,
+) -> Study:
+    """Learn blur and light from a few frames of all cameras."""
+    progress("study", 0, 1)
+    count = settings.refine.study_frames
+    pictures = [reel.movie.sample(locate.spread_frames(reel.frames, count)) for reel in reels]
+    learnt = study(
+        eyes,
+        list(zip(*pictures, strict=True)),
+        base_table(texture),
+        proposers,
+        _radius_mm(experiment),
+        settings.locate,
+        settings.refine,
+    )
+    progress("study", 1, 1)
+    return learnt
+
+
+def follow_sphere(reels: Sequence[Reel], frames: range, tracker: BlockTracker, progress: Progress) -> Iterator[Poses]:
+    """Yield the poses of every frame, while the frames of the blocks to come are being decoded."""
+    stage, done = "track", 0
+    progress(stage, 0, len(frames))
+    windows = tracker.windows(frames)
+    # The pool last: it waits for its readers, and only then may the iterators that they read from be closed.
+    with ExitStack() as open_iterators, ThreadPoolExecutor(len(reels)) as pool:
+        pictures = [open_iterators.enter_context(closing(reel.pictures())) for reel in reels]
+
+        def ahead(window: Sequence[int]) -> list[Future[list[NDArray[Any]]]]:
+            return [pool.submit(lambda movie=movie: list(islice(movie, sum(window)))) for movie in pictures]
+
+        coming = ahead(windows[0]) if windows else []
+        for k, window in enumerate(windows):
+            read = [movie.result() for movie in coming]
+            coming = ahead(windows[k + 1]) if k + 1 < len(windows) else []
+            for poses in tracker.track(read, window):
+                yield poses
+                done += 1
+            progress(stage, done, len(frames))
+
+
+def _radius_mm(experiment: Experiment) -> float:
+    """Radius of the sphere; 1 where lengths are in radii."""
+    return 1.0 if experiment.diameter_mm is None else experiment.diameter_mm / 2
 
 
 def _texture_path(experiment: Experiment) -> FilePath:

@@ -11,27 +11,29 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from sphereorient.assemble.settings import AssembleSettings
+from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.motion.settings import MotionSettings
-from sphereorient.orient.settings import OrientSettings
+from sphereorient.orient.settings import OrientSettings, RefineSettings
 from sphereorient.synth.settings import SynthSettings
 
 Model = TypeVar("Model", bound=BaseModel)
-METHODS = ("paper",)
-DEFAULT_METHOD = "paper"
+METHODS = ("precise", "paper")
+DEFAULT_METHOD = "precise"
 
 
 class Settings(BaseModel):
-    """All settings of the paper's method, one branch a room; the defaults are the paper's numbers."""
+    """All settings, one branch a stage; those of stages that a method does not have are not read by it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    locate: LocateSettings = Field(default_factory=LocateSettings, description="where is the sphere")
-    orient: OrientSettings = Field(default_factory=OrientSettings, description="where could it point")
-    assemble: AssembleSettings = Field(default_factory=AssembleSettings, description="which candidate is true")
-    motion: MotionSettings = Field(default_factory=MotionSettings, description="velocities and accelerations")
+    locate: LocateSettings = Field(default_factory=LocateSettings, description="where is the sphere (both methods)")
+    refine: RefineSettings = Field(default_factory=RefineSettings, description="poses to hundredths (precise)")
+    path: PathSettings = Field(default_factory=PathSettings, description="which candidate is true (precise)")
+    orient: OrientSettings = Field(default_factory=OrientSettings, description="where could it point (paper)")
+    assemble: AssembleSettings = Field(default_factory=AssembleSettings, description="which candidate is true (paper)")
+    motion: MotionSettings = Field(default_factory=MotionSettings, description="velocities, accelerations (paper)")
 
 
 def load_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> Settings:

@@ -15,13 +15,12 @@ import numpy as np
 from sphereorient.assemble.continuity import REST_SHARE, VARIANCE_MAX, Bools, Floats, Ints, Motion, turn_between, turned
 from sphereorient.assemble.settings import PathSettings
 
-BEAM_NATS = 25.0  # a break and a new beginning cost less: no true history stays further behind for long
+BEAM_NATS = 30.0  # a break and a new beginning cost less: no true history stays further behind for long
 STATES_MAX = 256
 STUCK_FRAMES = 3  # a stuck candidate may be away for this many frames, less one
 PIN_NATS = 6.0  # what following the motion must gain in every frame of a run that needs no search
 PIN_MARGIN = 3  # frames at either end of such a run that are searched all the same
 
-SAME_S = 1.0e-3  # frame intervals
 NEAR_WHOLE_TURN = 1.0  # rad; nearer, two orientations do not tell the axis of the turn between them
 
 NOT_YET, LOST = -1, -2  # in place of the frame of the last orientation
@@ -151,12 +150,9 @@ class _Search:
         hit, miss = self.hit[fresh], self.miss[fresh]
         every = np.arange(len(fresh))
         pair, single = np.flatnonzero(alive & (states.span > 0)), np.flatnonzero(alive & (states.span == 0))
-        goes_on, emission = hit + self.goes_on, self._emission(f, -np.inf)
-        onward = []
+        goes_on, onward = hit + self.goes_on, []
         if len(pair):
-            way, ratio = self._go_on(states.take(pair), pair, dt[pair], goes_on[pair], f)
-            onward.append(way)
-            emission = self._emission(f, ratio)
+            onward.append(self._go_on(states.take(pair), pair, dt[pair], goes_on[pair], f))
         if len(single):
             onward.append(self._second(states.take(single), single, dt[single], goes_on[single], f))
         visits = [self._begin(every, hit + np.where(alive, self.breaks, 0.0), f)]
@@ -164,7 +160,6 @@ class _Search:
         if f and self.first_pin[f - 1]:
             visits = visits[1:]
         step = _join(f, visits)
-        step.cost[:] += emission[step.states.row[step.target] - self.offset[f]]
         if self.first_pin[f] or (f and self.first_pin[f - 1]):
             return step
         return _join(f, [step, _stay(states, every[alive], miss[alive]), _lose(every[~alive], miss[~alive])])
@@ -178,16 +173,15 @@ class _Search:
         foretold = self.motion.predicted_variance(dt, span, states.before, here, 0.0)
         return dt, tracked & (dt <= self.hole_s) & ((states.span == 0) | (foretold <= VARIANCE_MAX))
 
-    def _emission(self, f: int, ratio: Floats | float) -> Floats:
-        """Cost of a frame's candidates by themselves: the pictures, and how easily a false one would stand there.
+    def _cost(self, rows: Ints | slice, log_ratio: Floats | float) -> Floats:
+        """Cost of candidates: the pictures, and how much more likely each is where it stands if right than if false.
 
         Args:
-            f: frame.
-            ratio: log ratio at which each follows any of the motions at hand.
+            rows: (...) of the candidates.
+            log_ratio: (...), of the density there by the motion to the uniform one. A false one may follow the same
+                motion, so it proves no more than that is rare: two tracks that are both smooth remain as they are.
         """
-        rows = slice(self.offset[f], self.offset[f + 1])
-        clutter = np.logaddexp(self.still[rows], math.log(self.follow) + ratio)
-        return clutter - self.movie.log_weight[rows]
+        return np.logaddexp(self.still[rows] - log_ratio, math.log(self.follow)) - self.movie.log_weight[rows]
 
     def _begin(self, source: Ints, cost: Floats, f: int) -> _Step:
         """Begin a motion at each candidate: it may point anywhere, so its ratio to the uniform density is 1."""
@@ -201,15 +195,12 @@ class _Search:
             states=states,
             source=np.repeat(source, len(rows)),
             target=np.tile(np.arange(len(rows)), len(source)),
-            cost=np.repeat(cost, len(rows)),
+            cost=(cost[:, None] + self._cost(rows, 0.0)).ravel(),
             best=rows[:0],
         )
 
-    def _go_on(self, states: _States, source: Ints, dt: Floats, cost: Floats, f: int) -> tuple[_Step, Floats]:
-        """Go on from states whose omega is known; the turn is the one nearest to what omega predicts.
-
-        Also returns the largest log ratio at which each candidate follows one of the latest of these motions, (C,).
-        """
+    def _go_on(self, states: _States, source: Ints, dt: Floats, cost: Floats, f: int) -> _Step:
+        """Go on from states whose omega is known; the turn is the one nearest to what omega predicts."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         R, R_before = self.movie.R_lab_body[rows], self.movie.R_lab_body[states.row]
         expected = states.omega * dt[:, None]
@@ -233,8 +224,7 @@ class _Search:
             ahead = expected[:, None] / np.maximum(length, 1e-300)
             longer = length + (off[..., None] * axis_off * ahead).sum(-1, keepdims=True)
             turn = np.where(whole[..., None], ahead * longer, turn)
-        ratio = self.motion.log_ratio(off, variance)
-        way = self._onward(
+        return self._onward(
             f,
             source=np.repeat(source, len(rows)),
             before=np.repeat(states.row, len(rows)),
@@ -242,12 +232,8 @@ class _Search:
             dt=np.repeat(dt, len(rows)),
             around=around.ravel(),
             turn=turn.reshape(-1, 3),
-            cost=(cost[:, None] - ratio).ravel(),
+            cost=(cost[:, None] + self._cost(rows, self.motion.log_ratio(off, variance))).ravel(),
         )
-        # Of the motions at hand only the latest: a track among false ones then gains the same in every frame, and the
-        # noise of two tracks does not decide between them.
-        begun = self.time[f] - dt - states.span
-        return way, ratio[begun >= begun.max() - SAME_S * self.motion.frame_s].max(0)
 
     def _second(self, states: _States, source: Ints, dt: Floats, cost: Floats, f: int) -> _Step:
         """Go on from where a motion began: slowly, or by any turn there is time for."""
@@ -270,7 +256,7 @@ class _Search:
             dt=dt[of_source],
             around=around[of_turn],
             turn=turn,
-            cost=cost[of_source] - ratio[of_source, of_row, of_turn],
+            cost=cost[of_source] + self._cost(rows[of_row], ratio[of_source, of_row, of_turn]),
         )
 
     def _onward(
@@ -337,8 +323,7 @@ class _Search:
         spread = self.motion.predicted_variance(dt[1:], dt[:-1], variance[:-2], variance[1:-1], variance[2:])
         row = self.offset[2:-1]
         ratio = self.motion.log_ratio(off, spread)
-        clutter = np.logaddexp(self.still[row], math.log(self.follow) + ratio)
-        cost[2:] = self.hit[1] + self.goes_on + clutter - self.movie.log_weight[row] - ratio
+        cost[2:] = self.hit[1] + self.goes_on + self._cost(row, ratio)
         follows = single[2:] & single[1:-1] & single[:-2] & close[1:] & close[:-1]
         follows &= ratio - self.still[row] >= PIN_NATS
         edge = np.diff(np.concatenate([[0], follows.astype(np.int64), [0]]))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-# The sweep over a movie is sequential, each step a hundred operations on few numbers: numpy's cost a quarter of torch's.
+# The sweep is sequential, each step a hundred operations on few numbers: numpy's cost a quarter of torch's.
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -52,7 +52,9 @@ class Motion:
         Args:
             dt_s: (...), step from the span's end to the predicted orientation.
             span_s: (...), time over which omega was measured.
-            before, here, after: (...), rad^2 per axis, of the span's ends and of the orientation compared.
+            before: (...), rad^2 per axis, of the span's first orientation.
+            here: (...), of its last.
+            after: (...), of the one compared with the prediction.
         """
         ratio = dt_s / span_s
         drift = self.acceleration_rad_s2 * (span_s + dt_s) / 2 * dt_s

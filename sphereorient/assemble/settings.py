@@ -56,7 +56,7 @@ class PathSettings(BaseModel):
     tail: float = Field(
         4.0,
         gt=2,
-        description="degrees of freedom of the Student-t of the change of omega; small: sudden changes are less unlikely",
+        description="degrees of freedom of the Student-t of omega's change; small: sudden changes are less unlikely",
     )
     miss_probability: float = Field(
         0.01, gt=0, lt=1, description="that no candidate of a frame is right although one was in the frame before"
@@ -71,7 +71,10 @@ class PathSettings(BaseModel):
         0.3, gt=0, lt=0.5, description="that a false candidate stands where one stood in a frame before (glare, dirt)"
     )
     follow_probability: float = Field(
-        0.05, gt=0, lt=0.5, description="that a false candidate moves on like the sphere (the twin of a symmetric map)"
+        2.0e-3,
+        gt=0,
+        lt=0.5,
+        description="that a false candidate moves on like the sphere (the twin of a symmetric map)",
     )
     evidence_doubt: float = Field(
         0.01, gt=0, lt=1, description="that the pictures say nothing on which of a frame's candidates is right"

@@ -1,18 +1,39 @@
-"""Where could it point: extraction, bank, search; the Proposer protocol."""
+"""Where could it point: extraction, bank, search, refinement; the Proposer protocol."""
 
+from sphereorient.orient.blocks import BlockTracker
 from sphereorient.orient.candidates import Candidates
+from sphereorient.orient.cold import Poses, cold_start
 from sphereorient.orient.crop import crop_disk
 from sphereorient.orient.extraction import extract_paint
+from sphereorient.orient.eye import Eye, Fitter, base_table
+from sphereorient.orient.gather import PoseTable, pose_table
+from sphereorient.orient.pixels import LinesOfSight
 from sphereorient.orient.proposer import Proposals, Proposer
+from sphereorient.orient.refine import Fit, refine
 from sphereorient.orient.search import TemplateSearch
-from sphereorient.orient.settings import OrientSettings
+from sphereorient.orient.settings import OrientSettings, RefineSettings
+from sphereorient.orient.study import Study, study
 
 __all__ = [
+    "BlockTracker",
     "Candidates",
+    "Eye",
+    "Fit",
+    "Fitter",
+    "LinesOfSight",
     "OrientSettings",
+    "PoseTable",
+    "Poses",
     "Proposals",
     "Proposer",
+    "RefineSettings",
+    "Study",
     "TemplateSearch",
+    "base_table",
+    "cold_start",
     "crop_disk",
     "extract_paint",
+    "pose_table",
+    "refine",
+    "study",
 ]

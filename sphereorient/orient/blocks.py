@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
@@ -26,6 +27,7 @@ class _Lane:
     """One block on its way: the last poses, in the order of their frames."""
 
     first: int
+    last: int  # + 1
     past: deque[tuple[int, Tensor, Tensor]] = field(default_factory=lambda: deque(maxlen=3))
 
     def predicted(self, frame: int) -> tuple[Tensor, Tensor] | None:
@@ -71,25 +73,37 @@ class BlockTracker:
         self.locating = locating
         self.settings = settings
 
-    def track(self, pictures: Sequence[Sequence[Picture]]) -> Iterator[Poses]:
-        """Follow at most `lanes` blocks side by side.
+    def windows(self, frames: range) -> list[list[int]]:
+        """Return the lengths of the blocks that are followed side by side, window by window.
 
         Args:
-            pictures: of each eye, the frames of these blocks in order; the first begins a block.
+            frames: the experiment's frame numbers; those that are multiples of the setting begin a block.
+        """
+        length = self.settings.block_frames
+        firsts = [frames.start, *range((frames.start // length + 1) * length, frames.stop, length)] if frames else []
+        lengths = [last - first for first, last in pairwise([*firsts, frames.stop])]
+        return [lengths[k : k + self.settings.lanes] for k in range(0, len(lengths), self.settings.lanes)]
+
+    def track(self, pictures: Sequence[Sequence[Picture]], window: Sequence[int]) -> Iterator[Poses]:
+        """Follow the blocks of one window.
+
+        Args:
+            pictures: of each eye, the frames of these blocks in order.
+            window: lengths of the blocks.
 
         Yields:
             The poses of each frame, in order.
         """
-        total, length = len(pictures[0]), self.settings.block_frames
-        lanes = [_Lane(first) for first in range(0, total, length)]
-        found: list[Poses | None] = [None] * total
-        for k in range(min(length, total)):
-            now = [lane for lane in lanes if lane.first + k < total]
+        firsts = list(accumulate([0, *window[:-1]]))
+        lanes = [_Lane(first, first + length) for first, length in zip(firsts, window, strict=True)]
+        found: dict[int, Poses] = {}
+        for k in range(max(window)):
+            now = [lane for lane in lanes if lane.first + k < lane.last]
             frames = {lane.first: [movie[lane.first + k] for movie in pictures] for lane in now}
             for lane, poses in zip(now, self._step(now, k, frames), strict=True):
                 lane.saw(lane.first + k, poses)
                 found[lane.first + k] = poses
-        yield from (poses for poses in found if poses is not None)
+        yield from (found[k] for k in range(sum(window)))
 
     def _step(self, lanes: Sequence[_Lane], k: int, frames: Mapping[int, Sequence[Picture]]) -> Iterator[Poses]:
         """Measure one frame of each lane: predicted where that holds, searched for where not."""

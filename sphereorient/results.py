@@ -1,0 +1,175 @@
+"""From the rooms' records to the noun that comes out, one function a method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sphereorient.assemble import Fused, Path
+from sphereorient.cameras import Camera
+from sphereorient.experiment import Experiment
+from sphereorient.locate import Positions, Sightings
+from sphereorient.motion import Motion
+from sphereorient.orient import Candidates, PoseTable, Study
+from sphereorient.so3 import exp
+from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
+
+
+def paper_camera(sightings: Sightings, candidates: Candidates, path: Path) -> CameraTrack:
+    """Collect what one camera saw."""
+    track = CameraTrack.empty(len(sightings))
+    lost = torch.isnan(path.score)
+    reason = [
+        Reason.LOW_SCORE if reason is Reason.OK and lost[k] else reason for k, reason in enumerate(candidates.reason)
+    ]
+    return replace(
+        track,
+        centre_px=sightings.centre_px.numpy(),
+        radius_px=sightings.radius_px.numpy(),
+        outline_rms_px=sightings.outline_rms_px.numpy(),
+        orientation=path.R_lab_body.numpy(),
+        score=path.score.numpy(),
+        xi=path.xi.numpy(),
+        reason=tuple(str(why) for why in reason),
+        candidate_offset=candidates.offset.numpy(),
+        candidate_orientation=candidates.R_lab_body.numpy(),
+        candidate_score=candidates.score.numpy(),
+    )
+
+
+def paper_track(
+    experiment: Experiment,
+    clock: Tensor,
+    positions: Positions,
+    fused: Fused,
+    moved: Motion,
+    tracks: Mapping[str, CameraTrack],
+) -> Trajectory:
+    """Put everything into the noun that comes out."""
+    empty = Trajectory.empty(
+        clock.numpy(), cameras=tuple(tracks), frame_rate=experiment.frame_rate_hz, experiment=experiment.name
+    )
+    oriented = torch.isfinite(fused.R_lab_body).all(-1).all(-1)
+    variance = fused.sigma_rad.square()[:, None, None] * torch.eye(3, dtype=torch.float64)
+    return replace(
+        empty,
+        valid=(oriented & positions.measured).numpy(),
+        position=positions.position_lab_mm.numpy(),
+        position_cov=positions.covariance_mm2.numpy(),
+        orientation=fused.R_lab_body.numpy(),
+        orientation_cov=variance.numpy(),
+        velocity=moved.velocity_m_s.numpy(),
+        velocity_sigma=moved.velocity_sigma_m_s.numpy(),
+        acceleration=moved.acceleration_m_s2.numpy(),
+        acceleration_sigma=moved.acceleration_sigma_m_s2.numpy(),
+        omega_lab=moved.omega_lab_rad_s.numpy(),
+        omega_lab_sigma=moved.omega_lab_sigma_rad_s.numpy(),
+        omega_body=moved.omega_body_rad_s.numpy(),
+        omega_body_sigma=moved.omega_body_sigma_rad_s.numpy(),
+        alpha_lab=moved.alpha_lab_rad_s2.numpy(),
+        alpha_lab_sigma=moved.alpha_lab_sigma_rad_s2.numpy(),
+        alpha_body=moved.alpha_body_rad_s2.numpy(),
+        alpha_body_sigma=moved.alpha_body_sigma_rad_s2.numpy(),
+        segment=fused.segment.numpy(),
+        flags=(fused.flags | positions.flags).numpy().astype(np.uint32),
+        cameras=dict(tracks),
+    )
+
+
+def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], learnt: Study) -> CameraTrack:
+    """Collect what one camera says at the poses chosen.
+
+    Args:
+        place: of the camera among those of the fit.
+        table: all poses.
+        picked: the parts of the chosen ones, see `PoseTable.rows`.
+        learnt: with the eyes.
+    """
+    eye = learnt.fitter.eyes[place]
+    frames, used = len(table), table.use[:, place]
+    position, R = picked["position_lab_mm"], picked["R_lab_body"]
+    centre_px = eye.camera.project(position)
+    counts = table.mask.sum(-1)
+    shown = used & torch.isfinite(position[:, 0])
+    where = shown[:, None, None]
+    reason = [
+        Reason.LOW_SCORE if why[place] is Reason.OK and not shown[k] else why[place]
+        for k, why in enumerate(table.reason)
+    ]
+    return replace(
+        CameraTrack.empty(frames),
+        centre_px=centre_px.numpy(),
+        radius_px=_radius_px(eye.camera, position, learnt.fitter.radius_mm).numpy(),
+        orientation=torch.where(where, exp(picked["own_turn"][:, place]) @ R, torch.nan).numpy(),
+        orientation_cov=torch.where(where, picked["own_covariance"][:, place], torch.nan).numpy(),
+        score=picked["score"][:, place].numpy(),
+        reason=tuple(str(why) for why in reason),
+        candidate_offset=torch.nn.functional.pad(counts.cumsum(0), (1, 0)).numpy(),
+        candidate_orientation=table.R_lab_body[table.mask].numpy(),
+        candidate_score=table.score[..., place][table.mask].numpy(),
+    )
+
+
+def _radius_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
+    """Half the width of the sphere's picture across the line to the camera's own right, (N,)."""
+    right = camera.R_cam_lab[0] * radius_mm
+    ends = camera.project(torch.stack([position_lab_mm - right, position_lab_mm + right]))
+    return (ends[1] - ends[0]).norm(dim=-1) / 2
+
+
+def precise_track(
+    experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Any, smoothed: Any, learnt: Study
+) -> Trajectory:
+    """Put everything into the noun that comes out."""
+    names = [eye.name for eye in learnt.fitter.eyes]
+    empty = Trajectory.empty(
+        clock.numpy(), cameras=tuple(names), frame_rate=experiment.frame_rate_hz, experiment=experiment.name
+    )
+    picked = table.rows(chosen.choice)
+    covariance = picked["covariance"]
+    flags = chosen.flags | _fit_flags(table, chosen, picked, learnt)
+    flags |= torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
+    return replace(
+        empty,
+        valid=(chosen.choice >= 0).numpy(),
+        position=picked["position_lab_mm"].numpy(),
+        position_cov=(covariance[:, 3:, 3:] * smoothed.position_scale**2).numpy(),
+        orientation=picked["R_lab_body"].numpy(),
+        orientation_cov=(covariance[:, :3, :3] * smoothed.orientation_scale**2).numpy(),
+        position_smooth=smoothed.position_lab_mm.numpy(),
+        position_smooth_cov=smoothed.position_cov_mm2.numpy(),
+        orientation_smooth=smoothed.R_lab_body.numpy(),
+        orientation_smooth_cov=smoothed.orientation_cov_rad2.numpy(),
+        velocity=smoothed.velocity_m_s.numpy(),
+        velocity_sigma=smoothed.velocity_sigma_m_s.numpy(),
+        acceleration=smoothed.acceleration_m_s2.numpy(),
+        acceleration_sigma=smoothed.acceleration_sigma_m_s2.numpy(),
+        omega_lab=smoothed.omega_lab_rad_s.numpy(),
+        omega_lab_sigma=smoothed.omega_lab_sigma_rad_s.numpy(),
+        omega_body=smoothed.omega_body_rad_s.numpy(),
+        omega_body_sigma=smoothed.omega_body_sigma_rad_s.numpy(),
+        alpha_lab=smoothed.alpha_lab_rad_s2.numpy(),
+        alpha_lab_sigma=smoothed.alpha_lab_sigma_rad_s2.numpy(),
+        alpha_body=smoothed.alpha_body_rad_s2.numpy(),
+        alpha_body_sigma=smoothed.alpha_body_sigma_rad_s2.numpy(),
+        segment=chosen.segment.numpy(),
+        flags=flags.numpy().astype(np.uint32),
+        confidence=chosen.probability.numpy(),
+        cameras={name: precise_camera(k, table, picked, learnt) for k, name in enumerate(names)},
+    )
+
+
+def _fit_flags(table: PoseTable, chosen: Any, picked: Mapping[str, Tensor], learnt: Study) -> Tensor:
+    """Frames that one camera alone measured, and fits that explain their picture badly, (N,) int64."""
+    found = chosen.choice >= 0
+    one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)
+    # Halfway from the least score of a right pose to the usual one.
+    poor = 0.5 * (learnt.score_min + learnt.right_score)
+    best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
+    doubtful = found & (best < poor)
+    return torch.where(one, int(Flag.ONE_CAMERA), 0) | torch.where(doubtful, int(Flag.DOUBTFUL_FIT), 0)
