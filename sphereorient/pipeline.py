@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import assemble, locate, motion, results
+from sphereorient.assemble import Hypotheses
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment import Experiment, frame_numbers, load_experiment, movie_span, open_movies, time_s
@@ -28,6 +29,7 @@ from sphereorient.orient import (
     BlockTracker,
     Candidates,
     Eye,
+    GreySearch,
     LinesOfSight,
     Poses,
     Proposals,
@@ -227,11 +229,11 @@ def _precise(
 ) -> Trajectory:
     """One likelihood for all cameras: pose after pose refined, then the history, then its motion."""
     eyes = [open_eye(reel, reels, experiment, settings, progress) for reel in reels]
-    proposers: dict[str, Proposer] = {eye.name: motion.GreySearch(texture, None) for eye in eyes}
+    proposers: dict[str, Proposer] = {eye.name: GreySearch(texture, settings.search) for eye in eyes}
     learnt = study_movies(reels, eyes, texture, proposers, experiment, settings, progress)
     tracker = BlockTracker(learnt, proposers, settings.locate, settings.refine)
     table = pose_table(list(follow_sphere(reels, frames, tracker, progress)), len(eyes))
-    hypotheses = assemble.Hypotheses(
+    hypotheses = Hypotheses(
         R_lab_body=table.R_lab_body, nll=table.nll, covariance_rad2=table.covariance[..., :3, :3], mask=table.mask
     )
     chosen = assemble.physical_path(hypotheses, clock, settings.path)

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.assemble import Fused, Path
-from sphereorient.cameras import Camera
+from sphereorient.assemble import Chosen, Fused, Path
 from sphereorient.experiment import Experiment
 from sphereorient.locate import Positions, Sightings
 from sphereorient.motion import Motion
@@ -104,7 +103,7 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
     return replace(
         CameraTrack.empty(frames),
         centre_px=centre_px.numpy(),
-        radius_px=_radius_px(eye.camera, position, learnt.fitter.radius_mm).numpy(),
+        radius_px=eye.radius_px(position, learnt.fitter.radius_mm).numpy(),
         orientation=torch.where(where, exp(picked["own_turn"][:, place]) @ R, torch.nan).numpy(),
         orientation_cov=torch.where(where, picked["own_covariance"][:, place], torch.nan).numpy(),
         score=picked["score"][:, place].numpy(),
@@ -115,15 +114,8 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
     )
 
 
-def _radius_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
-    """Half the width of the sphere's picture across the line to the camera's own right, (N,)."""
-    right = camera.R_cam_lab[0] * radius_mm
-    ends = camera.project(torch.stack([position_lab_mm - right, position_lab_mm + right]))
-    return (ends[1] - ends[0]).norm(dim=-1) / 2
-
-
 def precise_track(
-    experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Any, smoothed: Any, learnt: Study
+    experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Chosen, smoothed: Any, learnt: Study
 ) -> Trajectory:
     """Put everything into the noun that comes out."""
     names = [eye.name for eye in learnt.fitter.eyes]
@@ -164,7 +156,7 @@ def precise_track(
     )
 
 
-def _fit_flags(table: PoseTable, chosen: Any, picked: Mapping[str, Tensor], learnt: Study) -> Tensor:
+def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], learnt: Study) -> Tensor:
     """Frames that one camera alone measured, and fits that explain their picture badly, (N,) int64."""
     found = chosen.choice >= 0
     one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)

@@ -15,7 +15,7 @@ from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.motion.settings import MotionSettings
-from sphereorient.orient.settings import OrientSettings, RefineSettings
+from sphereorient.orient.settings import GreySearchSettings, OrientSettings, RefineSettings
 from sphereorient.synth.settings import SynthSettings
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -29,6 +29,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     locate: LocateSettings = Field(default_factory=LocateSettings, description="where is the sphere (both methods)")
+    search: GreySearchSettings = Field(default_factory=GreySearchSettings, description="where could it point (precise)")
     refine: RefineSettings = Field(default_factory=RefineSettings, description="poses to hundredths (precise)")
     path: PathSettings = Field(default_factory=PathSettings, description="which candidate is true (precise)")
     orient: OrientSettings = Field(default_factory=OrientSettings, description="where could it point (paper)")

@@ -60,8 +60,10 @@ def _start(movie: Movie, motion: Motion, settings: PathSettings) -> Motion:
     What the pictures' favourites do tells nothing here: they may stand still.
     """
     frames = len(movie.time_s)
-    firsts = {int(first) for first in np.linspace(0, max(frames - SAMPLE_FRAMES, 0), SAMPLES)}
-    parts = [movie.part(first, min(first + SAMPLE_FRAMES, frames)) for first in sorted(firsts)]
+    parts = [movie]
+    if frames > SAMPLES * SAMPLE_FRAMES:
+        firsts = np.linspace(0, frames - SAMPLE_FRAMES, SAMPLES).astype(np.int64).tolist()
+        parts = [movie.part(first, first + SAMPLE_FRAMES) for first in firsts]
     least, most = _bounds(movie, motion)
     trials = [
         replace(motion, acceleration_rad_s2=float(np.clip(math.radians(change) / motion.frame_s**2, least, most)))

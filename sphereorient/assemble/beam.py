@@ -14,6 +14,7 @@ import numpy as np
 
 from sphereorient.assemble.continuity import REST_SHARE, VARIANCE_MAX, Bools, Floats, Ints, Motion, turn_between, turned
 from sphereorient.assemble.settings import PathSettings
+from sphereorient.assemble.ways import NOT_YET, States, Step, join, lose, merge, soft_min, stay
 
 BEAM_NATS = 30.0  # a break and a new beginning cost less: no true history stays further behind for long
 STATES_MAX = 256
@@ -22,8 +23,6 @@ PIN_NATS = 6.0  # what following the motion must gain in every frame of a run th
 PIN_MARGIN = 3  # frames at either end of such a run that are searched all the same
 
 NEAR_WHOLE_TURN = 1.0  # rad; nearer, two orientations do not tell the axis of the turn between them
-
-NOT_YET, LOST = -1, -2  # in place of the frame of the last orientation
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,34 +64,6 @@ class Histories:
     evidence: float  # log of how much more probable the movie is with a motion in it than without
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _States:
-    """Ends of histories at one frame, S of them."""
-
-    frame: Ints  # of the last orientation; LOST or NOT_YET where there is none to go on from
-    row: Ints  # of the last orientation
-    omega: Floats  # (S, 3), rad/s, mean over the span
-    turn: Floats  # (S, 3), rad, over the span
-    span: Floats  # s, between the last two orientations; 0 where a motion begins
-    before: Floats  # rad^2 per axis, of the last but one
-
-    def take(self, which: Ints) -> _States:
-        """Some of the states."""
-        return _States(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Step:
-    """One frame of the sweep: its states and the edges that lead to them."""
-
-    frame: int
-    states: _States
-    source: Ints  # (E,), among the states of the step before
-    target: Ints  # (E,), among these
-    cost: Floats  # (E,)
-    best: Ints  # (S,), edge by which the cheapest history comes
-
-
 def search(movie: Movie, motion: Motion, settings: PathSettings) -> Histories:
     """Find the most probable history of a movie, and the share of each candidate in all of them.
 
@@ -112,8 +83,9 @@ class _Search:
     def __init__(self, movie: Movie, motion: Motion, settings: PathSettings) -> None:
         self.movie, self.motion = movie, motion
         self.time, self.offset = movie.time_s, movie.offset
-        self.follow = settings.follow_probability
-        self.still = still_ratio(movie, motion, settings)
+        stuck, follow = settings.stuck_probability, settings.follow_probability
+        self.log_anywhere, self.log_stuck, self.log_follow = np.log([1 - stuck - follow, stuck, follow])
+        self.still = still_log_ratio(movie, motion)
         self.hole_s = (settings.gap_frames_max + 1.5) * motion.frame_s  # half a frame for uneven times
         self.miss = -np.log([settings.miss_again_probability, settings.miss_probability])  # index: fresh
         self.hit = -np.log1p([-settings.miss_again_probability, -settings.miss_probability])
@@ -125,9 +97,9 @@ class _Search:
         nothing = np.zeros(1)
         start = np.full(1, NOT_YET, dtype=np.int64)
         vectors = np.zeros((1, 3))
-        states = _States(frame=start, row=start, omega=vectors, turn=vectors, span=nothing, before=nothing)
+        states = States(frame=start, row=start, omega=vectors, turn=vectors, span=nothing, before=nothing)
         least, total = np.zeros(1), np.zeros(1)
-        steps: list[_Step] = []
+        steps: list[Step] = []
         totals: list[Floats] = []
         f = 0
         while f < len(self.time):
@@ -143,7 +115,7 @@ class _Search:
             states, f = step.states, step.frame + 1
         return self._read(steps, totals, int(least.argmin()))
 
-    def _step(self, states: _States, least: Floats, f: int) -> _Step:
+    def _step(self, states: States, least: Floats, f: int) -> Step:
         """All ways on from some states to frame f: begin at a candidate, go on to one, or to none."""
         dt, alive = self._alive(states, f)
         fresh = (states.frame == f - 1).astype(np.int64)
@@ -156,15 +128,15 @@ class _Search:
         if len(single):
             onward.append(self._second(states.take(single), single, dt[single], goes_on[single], f))
         visits = [self._begin(every, hit + np.where(alive, self.breaks, 0.0), f)]
-        visits += [_merge(onward, least)] if onward else []
+        visits += [merge(onward, least)] if onward else []
         if f and self.first_pin[f - 1]:
             visits = visits[1:]
-        step = _join(f, visits)
+        step = join(f, visits)
         if self.first_pin[f] or (f and self.first_pin[f - 1]):
             return step
-        return _join(f, [step, _stay(states, every[alive], miss[alive]), _lose(every[~alive], miss[~alive])])
+        return join(f, [step, stay(states, every[alive], miss[alive]), lose(every[~alive], miss[~alive])])
 
-    def _alive(self, states: _States, f: int) -> tuple[Floats, Bools]:
+    def _alive(self, states: States, f: int) -> tuple[Floats, Bools]:
         """Time since the last orientation, and whether the motion can be followed so far: omega foretells the turn."""
         tracked = states.row >= 0
         dt = np.where(tracked, self.time[f] - self.time[states.frame], 0.0)
@@ -176,21 +148,26 @@ class _Search:
     def _cost(self, rows: Ints | slice, log_ratio: Floats | float) -> Floats:
         """Cost of candidates: the pictures, and how much more likely each is where it stands if right than if false.
 
+        A false candidate stands anywhere; or where one stood before; or it follows the motion as the right one does,
+        so that following proves no more than that is rare, and two tracks that are both smooth stay even. Standing
+        still is never the better explanation of what the motion explains: else noise would lose a sphere at rest.
+
         Args:
             rows: (...) of the candidates.
-            log_ratio: (...), of the density there by the motion to the uniform one. A false one may follow the same
-                motion, so it proves no more than that is rare: two tracks that are both smooth remain as they are.
+            log_ratio: (...), of the density there by the motion to the uniform one.
         """
-        return np.logaddexp(self.still[rows] - log_ratio, math.log(self.follow)) - self.movie.log_weight[rows]
+        stuck = self.log_stuck + np.minimum(self.still[rows], log_ratio)
+        false: Floats = np.logaddexp(np.logaddexp(self.log_anywhere, stuck), self.log_follow + log_ratio)
+        return false - log_ratio - self.movie.log_weight[rows]
 
-    def _begin(self, source: Ints, cost: Floats, f: int) -> _Step:
+    def _begin(self, source: Ints, cost: Floats, f: int) -> Step:
         """Begin a motion at each candidate: it may point anywhere, so its ratio to the uniform density is 1."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         nothing, vectors = np.zeros(len(rows)), np.zeros((len(rows), 3))
-        states = _States(
+        states = States(
             frame=np.full(len(rows), f), row=rows, omega=vectors, turn=vectors, span=nothing, before=nothing
         )
-        return _Step(
+        return Step(
             frame=f,
             states=states,
             source=np.repeat(source, len(rows)),
@@ -199,7 +176,7 @@ class _Search:
             best=rows[:0],
         )
 
-    def _go_on(self, states: _States, source: Ints, dt: Floats, cost: Floats, f: int) -> _Step:
+    def _go_on(self, states: States, source: Ints, dt: Floats, cost: Floats, f: int) -> Step:
         """Go on from states whose omega is known; the turn is the one nearest to what omega predicts."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         R, R_before = self.movie.R_lab_body[rows], self.movie.R_lab_body[states.row]
@@ -215,15 +192,16 @@ class _Search:
         angle, axis = turn_between(R_before[:, None], R)
         zones = self.motion.zones(dt)[:, None]
         around = np.rint(((expected[:, None] * axis).sum(-1) - angle) / (2 * math.pi)).astype(np.int64)
+        length = np.sqrt((expected**2).sum(-1))[:, None]
+        whole = (angle < NEAR_WHOLE_TURN) & (length > math.pi)
+        around = np.where(whole, np.rint(length / (2 * math.pi)).astype(np.int64), around)
         around = np.clip(around, -(zones // 2), (zones - 1) // 2)
         turn = (angle + 2 * math.pi * around)[..., None] * axis
-        whole = (around != 0) & (angle < NEAR_WHOLE_TURN)
         if whole.any():
             # The axis of the little that is missing or too much is not omega's: that is kept, the turn lengthened.
-            length = np.sqrt((expected**2).sum(-1))[:, None, None]
-            ahead = expected[:, None] / np.maximum(length, 1e-300)
-            longer = length + (off[..., None] * axis_off * ahead).sum(-1, keepdims=True)
-            turn = np.where(whole[..., None], ahead * longer, turn)
+            ahead = expected[:, None] / np.maximum(length, 1e-300)[..., None]
+            longer = length + (off[..., None] * axis_off * ahead).sum(-1)
+            turn = np.where(whole[..., None], ahead * longer[..., None], turn)
         return self._onward(
             f,
             source=np.repeat(source, len(rows)),
@@ -235,7 +213,7 @@ class _Search:
             cost=(cost[:, None] + self._cost(rows, self.motion.log_ratio(off, variance))).ravel(),
         )
 
-    def _second(self, states: _States, source: Ints, dt: Floats, cost: Floats, f: int) -> _Step:
+    def _second(self, states: States, source: Ints, dt: Floats, cost: Floats, f: int) -> Step:
         """Go on from where a motion began: slowly, or by any turn there is time for."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         angle, axis = turn_between(self.movie.R_lab_body[states.row][:, None], self.movie.R_lab_body[rows])
@@ -261,10 +239,10 @@ class _Search:
 
     def _onward(
         self, f: int, *, source: Ints, before: Ints, row: Ints, dt: Floats, around: Ints, turn: Floats, cost: Floats
-    ) -> _Step:
-        """Edges to states of two orientations, each to a state of its own; `_merge` finds the equal ones."""
+    ) -> Step:
+        """Edges to states of two orientations, each to a state of its own; `merge` finds the equal ones."""
         key = (before * (self.offset[f + 1] - self.offset[f]) + row - self.offset[f]) * (1 << 20) + around
-        states = _States(
+        states = States(
             frame=np.full(len(row), f),
             row=row,
             omega=turn / dt[:, None],
@@ -272,16 +250,16 @@ class _Search:
             span=dt,
             before=self.movie.variance[before],
         )
-        return _Step(frame=f, states=states, source=source, target=key, cost=cost, best=key[:0])
+        return Step(frame=f, states=states, source=source, target=key, cost=cost, best=key[:0])
 
-    def _arrive(self, step: _Step, least: Floats, total: Floats) -> tuple[_Step, Floats, Floats]:
+    def _arrive(self, step: Step, least: Floats, total: Floats) -> tuple[Step, Floats, Floats]:
         """Reduce the edges to the best and to the sum of each state; drop the states far behind."""
         size = len(step.states.row)
         arriving = least[step.source] + step.cost
         order = np.lexsort((arriving, step.target))
         first = order[np.searchsorted(step.target[order], np.arange(size))]
         new_least = arriving[first]
-        new_total = _soft_min(total[step.source] + step.cost, step.target, size)
+        new_total = soft_min(total[step.source] + step.cost, step.target, size)
         near = np.flatnonzero(new_least <= new_least.min() + BEAM_NATS)
         if len(near) > STATES_MAX:
             near = np.sort(near[np.argsort(new_least[near], kind="stable")[:STATES_MAX]])
@@ -289,7 +267,7 @@ class _Search:
         place[near] = np.arange(len(near))
         kept = place[step.target] >= 0
         renumbered = np.cumsum(kept) - 1
-        pruned = _Step(
+        pruned = Step(
             frame=step.frame,
             states=step.states.take(near),
             source=step.source[kept],
@@ -325,7 +303,7 @@ class _Search:
         ratio = self.motion.log_ratio(off, spread)
         cost[2:] = self.hit[1] + self.goes_on + self._cost(row, ratio)
         follows = single[2:] & single[1:-1] & single[:-2] & close[1:] & close[:-1]
-        follows &= ratio - self.still[row] >= PIN_NATS
+        follows &= ratio - np.maximum(self.still[row] + self.log_stuck, 0.0) >= PIN_NATS
         edge = np.diff(np.concatenate([[0], follows.astype(np.int64), [0]]))
         for begin, end in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) + 1, strict=True):
             # Frames begin .. end, both included: the first to follow is begin + 2.
@@ -334,11 +312,11 @@ class _Search:
                 last[begin + PIN_MARGIN + 1] = end - PIN_MARGIN
         return cost, turn, first, last
 
-    def _jump(self, step: _Step, last: int) -> tuple[_Step, float]:
+    def _jump(self, step: Step, last: int) -> tuple[Step, float]:
         """Go through a pinned run, from its second frame to its last."""
         span = self.time[last] - self.time[last - 1]
         row = int(self.offset[last])
-        states = _States(
+        states = States(
             frame=np.array([last]),
             row=np.array([row]),
             omega=self.chain_turn[None, last] / span,
@@ -348,14 +326,14 @@ class _Search:
         )
         cost = float(self.chain_cost[step.frame + 1 : last + 1].sum())
         none = np.zeros(1, dtype=np.int64)
-        return _Step(frame=last, states=states, source=none, target=none, cost=np.array([cost]), best=none), cost
+        return Step(frame=last, states=states, source=none, target=none, cost=np.array([cost]), best=none), cost
 
-    def _read(self, steps: list[_Step], totals: list[Floats], end: int) -> Histories:
+    def _read(self, steps: list[Step], totals: list[Floats], end: int) -> Histories:
         """Walk back from the end: the best history, and the sums over all of them."""
         frames = len(self.time)
         row, begins, breaks = np.full(frames, -1), np.zeros(frames, dtype=np.bool_), np.zeros(frames, dtype=np.bool_)
         turn, posterior = np.full((frames, 3), np.nan), np.zeros(len(self.still))
-        everything = float(_soft_min(totals[-1], np.zeros(len(totals[-1]), dtype=np.int64), 1)[0])
+        everything = float(soft_min(totals[-1], np.zeros(len(totals[-1]), dtype=np.int64), 1)[0])
         ahead = np.zeros(len(totals[-1]))
         for place in range(len(steps) - 1, -1, -1):
             step, total = steps[place], totals[place]
@@ -371,84 +349,23 @@ class _Search:
             end = int(step.source[step.best[end]])
             if begins[f] and place:
                 breaks[f] = self._alive(steps[place - 1].states, f)[1][end]
-            ahead = _soft_min(step.cost + ahead[step.target], step.source, len(totals[place - 1]) if place else 1)
+            ahead = soft_min(step.cost + ahead[step.target], step.source, len(totals[place - 1]) if place else 1)
         return Histories(
             row=row, begins=begins, breaks=breaks, turn_rad=turn, posterior=posterior, evidence=-everything
         )
 
 
-def _merge(ways: list[_Step], least: Floats) -> _Step:
-    """Join edges that lead to the same two orientations by the same number of turns; the cheapest gives the state."""
-    source, key, cost = (np.concatenate([getattr(way, name) for way in ways]) for name in ("source", "target", "cost"))
-    order = np.argsort(least[source] + cost, kind="stable")  # so that the first of equal keys is the cheapest
-    _, first, target = np.unique(key[order], return_index=True, return_inverse=True)
-    return _Step(
-        frame=ways[0].frame,
-        states=_side_by_side(ways).take(order[first]),
-        source=source[order],
-        target=target,
-        cost=cost[order],
-        best=first[:0],
-    )
+def still_log_ratio(movie: Movie, motion: Motion) -> Floats:
+    """Return how likely each candidate is where it stands if one of the last frames' stays, log of ratio to uniform.
 
-
-def _side_by_side(ways: list[_Step]) -> _States:
-    """The states of several ways on."""
-    return _States(
-        **{name: np.concatenate([getattr(way.states, name) for way in ways]) for name in _States.__dataclass_fields__}
-    )
-
-
-def _stay(states: _States, alive: Ints, cost: Floats) -> _Step:
-    """No candidate is right: the motion waits."""
-    target = np.arange(len(alive))
-    return _Step(frame=-1, states=states.take(alive), source=alive, target=target, cost=cost, best=target[:0])
-
-
-def _lose(source: Ints, cost: Floats) -> _Step:
-    """No candidate is right, and nothing is left to go on from."""
-    size = min(len(source), 1)
-    lost, nothing, vectors = np.full(size, LOST), np.zeros(size), np.zeros((size, 3))
-    states = _States(frame=lost, row=np.full(size, -1), omega=vectors, turn=vectors, span=nothing, before=nothing)
-    target = np.zeros(len(source), dtype=np.int64)
-    return _Step(frame=-1, states=states, source=source, target=target, cost=cost, best=target[:0])
-
-
-def _join(frame: int, ways: list[_Step]) -> _Step:
-    """Put several ways on side by side."""
-    sizes = np.cumsum([0, *(len(way.states.row) for way in ways)])
-    return _Step(
-        frame=frame,
-        states=_side_by_side(ways),
-        source=np.concatenate([way.source for way in ways]),
-        target=np.concatenate([way.target + size for way, size in zip(ways, sizes[:-1], strict=True)]),
-        cost=np.concatenate([way.cost for way in ways]),
-        best=ways[0].best[:0],
-    )
-
-
-def _soft_min(values: Floats, group: Ints, size: int) -> Floats:
-    """Return -log sum exp(-values) of each group, (size,); inf where it is empty."""
-    low = np.full(size, np.inf)
-    np.minimum.at(low, group, values)
-    finite = np.isfinite(values)
-    share = np.bincount(group[finite], np.exp(low[group[finite]] - values[finite]), size)
-    return np.where(share > 0, low - np.log(np.maximum(share, 1e-300)), np.inf)
-
-
-def still_ratio(movie: Movie, motion: Motion, settings: PathSettings) -> Floats:
-    """Return how likely each candidate is where it stands if it is false and no motion, log of the ratio to uniform.
-
-    A false candidate stands anywhere, or where one stood before: glare and dirt stay. A motionless candidate thus
-    proves nothing by following a motion; one that turns does.
+    False candidates do: glare and dirt stay. A motionless candidate thus proves little by following a motion.
 
     Args:
         movie: candidates.
         motion: its acceleration says what is as good as still.
-        settings: shares of the false ones.
 
     Returns:
-        (M,), of each row.
+        (M,), of each row; -inf where there is no frame before.
     """
     best = np.full(len(movie.variance), -np.inf)
     for lag in range(1, min(STUCK_FRAMES, len(movie.time_s) - 1) + 1):
@@ -457,8 +374,7 @@ def still_ratio(movie: Movie, motion: Motion, settings: PathSettings) -> Floats:
         cosine = ((movie.R_lab_body[before] * movie.R_lab_body[after]).sum((-2, -1)) - 1) / 2
         variance = motion.rest_variance(dt, movie.variance[before], movie.variance[after])
         np.maximum.at(best, after, motion.log_ratio(np.arccos(np.clip(cosine, -1.0, 1.0)), variance))
-    anywhere = 1 - settings.stuck_probability - settings.follow_probability
-    return np.logaddexp(math.log(anywhere), math.log(settings.stuck_probability) + best)
+    return best
 
 
 def _row_pairs(offset: Ints, lag: int) -> tuple[Ints, Ints]:

@@ -91,7 +91,7 @@ def turn_between(R_from: Floats, R_to: Floats) -> tuple[Floats, Floats]:
 def turned(R: Floats, rotvec: Floats) -> Floats:
     """Return (..., 3, 3), orientations (..., 3, 3) after lab turns (..., 3), rad.
 
-    Source: Rodrigues' formula, as quaternion products would round alike.
+    Source: Rodrigues' formula.
     """
     angle = np.sqrt((rotvec**2).sum(-1))[..., None]
     axis = rotvec / np.maximum(angle, SMALL)
@@ -100,4 +100,5 @@ def turned(R: Floats, rotvec: Floats) -> Floats:
     a, b, c = R[..., 0, :], R[..., 1, :], R[..., 2, :]
     across = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], -2)
     cosine, sine = np.cos(angle)[..., None], np.sin(angle)[..., None]
-    return R * cosine + across * sine + axis[..., None] * along[..., None, :] * (1 - cosine)
+    result: Floats = R * cosine + across * sine + axis[..., None] * along[..., None, :] * (1 - cosine)
+    return result

@@ -140,7 +140,7 @@ def _chosen(
     begins, spike = _breaks(frames, len(mask), movie, histories, motion, settings)
     present = torch.isfinite(probability)
     recovered = torch.zeros_like(begins)
-    recovered[seen[1:]] = begins[seen[1:]] | (seen.diff() > 1)
+    recovered[seen[1:]] = (begins | spike)[seen[1:]] | (seen.diff() > 1)
     bits = {
         Flag.AMBIGUOUS: present & (probability < settings.probability_min),
         Flag.RECOVERED: recovered,

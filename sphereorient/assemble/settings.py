@@ -65,7 +65,7 @@ class PathSettings(BaseModel):
         0.5, gt=0, lt=1, description="that no candidate is right after a frame in which none was: misses come in bursts"
     )
     break_probability: float = Field(
-        1.0e-4, gt=0, lt=1, description="that the motion does not go on from one frame with an orientation to the next"
+        1.0e-5, gt=0, lt=1, description="that the motion does not go on from one frame with an orientation to the next"
     )
     stuck_probability: float = Field(
         0.3, gt=0, lt=0.5, description="that a false candidate stands where one stood in a frame before (glare, dirt)"

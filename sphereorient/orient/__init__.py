@@ -7,11 +7,12 @@ from sphereorient.orient.crop import crop_disk
 from sphereorient.orient.extraction import extract_paint
 from sphereorient.orient.eye import Eye, Fitter, base_table
 from sphereorient.orient.gather import PoseTable, pose_table
+from sphereorient.orient.grey_search import GreySearch
 from sphereorient.orient.pixels import LinesOfSight
 from sphereorient.orient.proposer import Proposals, Proposer
 from sphereorient.orient.refine import Fit, refine
 from sphereorient.orient.search import TemplateSearch
-from sphereorient.orient.settings import OrientSettings, RefineSettings
+from sphereorient.orient.settings import GreySearchSettings, OrientSettings, RefineSettings
 from sphereorient.orient.study import Study, study
 
 __all__ = [
@@ -20,6 +21,8 @@ __all__ = [
     "Eye",
     "Fit",
     "Fitter",
+    "GreySearch",
+    "GreySearchSettings",
     "LinesOfSight",
     "OrientSettings",
     "PoseTable",

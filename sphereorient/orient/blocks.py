@@ -15,11 +15,24 @@ from sphereorient.locate import LocateSettings
 from sphereorient.orient.cold import Poses, cold_start, poses_of
 from sphereorient.orient.eye import Fitter, Picture
 from sphereorient.orient.proposer import Proposer
+from sphereorient.orient.refine import Fit
 from sphereorient.orient.settings import RefineSettings
 from sphereorient.orient.study import Study
 from sphereorient.trajectory import Reason
 
-CLOSE_STEP_RAD = 0.02  # a fit whose last step is longer has not arrived
+ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
+NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
+ASTRAY_SHARE = 0.01  # of the radius: how far a place may be from where three frames say it is
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Expected:
+    """What a frame's predecessors say of it."""
+
+    position_lab_mm: Tensor  # (3,)
+    R_lab_body: Tensor  # (3, 3)
+    use: Tensor  # (C,) bool, cameras that saw the ball
+    place_precision: Tensor  # (3, 3), 1/mm^2
 
 
 @dataclass(eq=False)
@@ -28,23 +41,31 @@ class _Lane:
 
     first: int
     last: int  # + 1
-    past: deque[tuple[int, Tensor, Tensor]] = field(default_factory=lambda: deque(maxlen=3))
+    past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
 
-    def predicted(self, frame: int) -> tuple[Tensor, Tensor] | None:
-        """Pose expected in a frame: place and turn go on, the turn's change too where three frames tell it."""
-        if len(self.past) < 2 or self.past[-1][0] != frame - 1 or self.past[-2][0] != frame - 2:
+    def expected(self, frame: int, radius_mm: float) -> _Expected | None:
+        """Place and turn go on, their change too where three frames tell it."""
+        rows = [poses for number, poses in self.past if number >= frame - len(self.past)]
+        if len(rows) < 2 or [number for number, _ in self.past][-2:] != [frame - 2, frame - 1]:
             return None
-        (_, X1, R1), (_, X0, R0) = self.past[-1], self.past[-2]
+        *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
+        *_, R0, R1 = (poses.R_lab_body[0] for poses in rows)
         turn, move = so3.log(R1 @ R0.mT), X1 - X0
-        if len(self.past) == 3 and self.past[0][0] == frame - 3:
-            turn = 2 * turn - so3.log(R0 @ self.past[0][2].mT)
-            move = 2 * move - (X0 - self.past[0][1])
-        return X1 + move, so3.exp(turn) @ R1
+        if len(rows) == 3:
+            turn = 2 * turn - so3.log(R0 @ rows[0].R_lab_body[0].mT)
+            move = 2 * move - (X0 - rows[0].position_lab_mm[0])
+        astray = (ASTRAY_SHARE * radius_mm) ** 2 * torch.eye(3, dtype=torch.float64)
+        return _Expected(
+            position_lab_mm=X1 + move,
+            R_lab_body=so3.exp(turn) @ R1,
+            use=rows[-1].use | rows[-1].again,
+            place_precision=torch.linalg.inv(rows[-1].covariance[0, 3:, 3:] + astray),
+        )
 
     def saw(self, frame: int, poses: Poses) -> None:
-        """Remember the best pose of a frame, if it has one and only one that matters."""
-        if len(poses):
-            self.past.append((frame, poses.position_lab_mm[0], poses.R_lab_body[0]))
+        """Remember the best pose of a frame, if a picture bears it out."""
+        if len(poses) and bool(poses.use.any()):
+            self.past.append((frame, poses))
 
 
 class BlockTracker:
@@ -107,67 +128,67 @@ class BlockTracker:
 
     def _step(self, lanes: Sequence[_Lane], k: int, frames: Mapping[int, Sequence[Picture]]) -> Iterator[Poses]:
         """Measure one frame of each lane: predicted where that holds, searched for where not."""
-        expected = [lane.predicted(lane.first + k) for lane in lanes]
-        ahead = [n for n, pose in enumerate(expected) if pose is not None]
-        followed = dict(
-            zip(ahead, self._follow([expected[n] for n in ahead], [frames[lanes[n].first] for n in ahead]), strict=True)
-        )
-        for n, lane in enumerate(lanes):
-            poses = followed.get(n)
-            if poses is None:
-                poses = cold_start(
-                    self.fitter,
-                    self.proposers,
-                    frames[lane.first],
-                    self.locating,
-                    candidates=self.settings.candidates,
-                )
-                poses = self._believable(poses)
-            yield poses
+        expected = {lane.first: lane.expected(lane.first + k, self.fitter.radius_mm) for lane in lanes}
+        ahead = {first: pose for first, pose in expected.items() if pose is not None}
+        followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
+        for lane in lanes:
+            poses = followed.get(lane.first)
+            yield self._search(frames[lane.first]) if poses is None else poses
 
-    def _follow(
-        self, expected: Sequence[tuple[Tensor, Tensor]], frames: Sequence[Sequence[Picture]]
-    ) -> list[Poses | None]:
+    def _follow(self, expected: Sequence[_Expected], frames: Sequence[Sequence[Picture]]) -> list[Poses | None]:
         """Fit expected poses, all in one batch of fixed size; None where the pictures do not bear one out."""
         if not expected:
             return []
-        asked = len(expected)
-        filled = [*expected, *[expected[-1]] * (self.settings.lanes - asked)]
-        frames = [*frames, *[frames[-1]] * (self.settings.lanes - asked)]
-        X, R = (torch.stack(parts) for parts in zip(*filled, strict=True))
-        fitter, fine = self.fitter, self.fitter.optics.fine
-        use = torch.ones(len(X), len(fitter.eyes), dtype=torch.bool)
-        pixels = fitter.pixels(frames, X, fine)
+        asked, missing = len(expected), self.settings.lanes - len(expected)
+        expected, frames = [*expected, *[expected[-1]] * missing], [*frames, *[frames[-1]] * missing]
+        X, R, use, precision = (
+            torch.stack([getattr(one, name) for one in expected])
+            for name in ("position_lab_mm", "R_lab_body", "use", "place_precision")
+        )
+        # With all cameras the pictures tell the place; with one of two its distance is better known from before.
+        precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
+        fine = self.fitter.optics.fine
+        pixels = self.fitter.pixels(frames, X, fine)
         half = pixels.every(torch.arange(0, pixels.grey.shape[1], 2))
-        fit = fitter.fit(half, X, R, use, fine, 1)
-        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 1)
+        fit = self.fitter.fit(half, X, R, use, fine, 1, precision)
+        far = fit.step[:, :3].norm(dim=-1) > NEAR_RAD
+        if bool(far.any()):
+            more = self.fitter.fit(half, fit.position_lab_mm, fit.R_lab_body, use, fine, 2, precision)
+            fit = _chosen(far, more, fit)
+        fit = self.fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 1, precision)
         seen = fit.score >= self.score_min
-        if not bool(seen[:asked].all()):
-            again = fitter.fit(pixels, X, R, seen, fine, 2)
-            part = ~seen.all(1)
-            fit = replace(
-                fit,
-                **{
-                    name: torch.where(_tall(part, getattr(fit, name)), getattr(again, name), getattr(fit, name))
-                    for name in fit.__dataclass_fields__
-                },
-            )
-        arrived = (fit.step[:, :3].norm(dim=-1) < CLOSE_STEP_RAD) & seen.any(1)
-        reasons = [[Reason.OK if ok else Reason.LOW_SCORE for ok in row] for row in seen.tolist()]
-        return [poses_of(fit, torch.tensor([n]), seen[n], reasons[n]) if arrived[n] else None for n in range(asked)]
+        borne_out = (seen | ~use).all(1) & (fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD)
+        reasons = [[Reason.OK if ok else Reason.LOW_SCORE for ok in row] for row in use.tolist()]
+        return [
+            replace(poses_of(fit, torch.tensor([n]), use[n], reasons[n]), again=seen[n]) if borne_out[n] else None
+            for n in range(asked)
+        ]
 
-    def _believable(self, poses: Poses) -> Poses:
-        """Say which cameras' pictures the best pose explains; nothing is thrown away, the path decides."""
+    def _search(self, frames: Sequence[Picture]) -> Poses:
+        """Find the poses of a frame of which nothing is known, by those cameras whose pictures bear them out."""
+        count = self.settings.candidates
+        poses = cold_start(self.fitter, self.proposers, frames, self.locating, candidates=count)
         if not len(poses):
             return poses
-        use = poses.use & (poses.score[0] >= self.score_min)
+        seen = poses.use & (poses.score[0] >= self.score_min)
         reason = [
             Reason.LOW_SCORE if was and not now else why
-            for was, now, why in zip(poses.use.tolist(), use.tolist(), poses.reason, strict=True)
+            for was, now, why in zip(poses.use.tolist(), seen.tolist(), poses.reason, strict=True)
         ]
-        return replace(poses, use=use, reason=tuple(reason))
+        if bool((seen == poses.use).all()) or not bool(seen.any()):
+            # Nothing is thrown away where no camera is sure: the path decides.
+            return replace(poses, use=seen, reason=tuple(reason))
+        fine = self.fitter.optics.fine
+        X, R = poses.position_lab_mm, poses.R_lab_body
+        pixels = self.fitter.pixels([frames] * len(poses), X, fine)
+        fit = self.fitter.fit(pixels, X, R, seen.expand(len(poses), -1), fine, 4)
+        return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 
 
-def _tall(rows: Tensor, like: Tensor) -> Tensor:
-    """Stretch a mask (B,) over the trailing axes of another tensor."""
-    return rows.reshape(-1, *[1] * (like.ndim - 1))
+def _chosen(rows: Tensor, one: Fit, other: Fit) -> Fit:
+    """Return one fit where the mask (B,) holds and the other elsewhere."""
+    parts = {}
+    for name in one.__dataclass_fields__:
+        a, b = getattr(one, name), getattr(other, name)
+        parts[name] = torch.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+    return Fit(**parts)

@@ -40,6 +40,7 @@ class Poses:
     score: Tensor  # (M, C)
     nll: Tensor  # (M,)
     use: Tensor  # (C,) bool, cameras whose pictures count
+    again: Tensor  # (C,) bool, cameras whose pictures bear the pose out, counted or not: they count in the next frame
     reason: tuple[Reason, ...]  # C
 
     def __len__(self) -> int:
@@ -52,15 +53,16 @@ POSE_PARTS = ("position_lab_mm", "R_lab_body", "covariance", "own_turn", "own_co
 
 def poses_of(fit: Fit, chosen: Tensor, use: Tensor, reason: Sequence[Reason]) -> Poses:
     """Return some rows of a fit as the poses of one frame."""
-    return Poses(**{name: getattr(fit, name)[chosen] for name in POSE_PARTS}, use=use, reason=tuple(reason))
+    return Poses(**{name: getattr(fit, name)[chosen] for name in POSE_PARTS}, use=use, again=use, reason=tuple(reason))
 
 
 def no_pose(cameras: int, reason: Sequence[Reason]) -> Poses:
     """Return a frame without any pose."""
     tails = {"position_lab_mm": (3,), "R_lab_body": (3, 3), "covariance": (6, 6), "own_turn": (cameras, 3)}
     tails |= {"own_covariance": (cameras, 3, 3), "deviation": (cameras,), "score": (cameras,), "nll": ()}
+    none = torch.zeros(cameras, dtype=torch.bool)
     parts = {name: torch.zeros(0, *tail, dtype=torch.float64) for name, tail in tails.items()}
-    return Poses(**parts, use=torch.zeros(cameras, dtype=torch.bool), reason=tuple(reason))
+    return Poses(**parts, use=none, again=none, reason=tuple(reason))
 
 
 def cold_start(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -20,7 +21,8 @@ from sphereorient.sphere.paint_table import BASE_RAD, PaintTable, paint_table
 
 Picture = NDArray[np.generic]
 
-RIM = 1.06  # of the radius: pixels that the ball's blurred limb touches
+RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
+SIZES = 1.06  # ratio of neighbouring sizes of disks for which there is a stencil
 COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
 
 
@@ -34,6 +36,12 @@ class Eye:
     diameter_px: float  # of the ball in the middle of the volume
     sight: LinesOfSight
 
+    def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
+        """Half the width of the ball's picture at places (..., 3), along the camera's own right."""
+        right = self.camera.R_cam_lab[0] * radius_mm
+        ends = self.camera.project(torch.stack([position_lab_mm - right, position_lab_mm + right]))
+        return (ends[1] - ends[0]).norm(dim=-1) / 2
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Level:
@@ -41,8 +49,17 @@ class Level:
 
     extra_px: float
     blur_px: float
-    stencil: Stencil
     paint: PaintTable
+
+    def stencil(self, radius_px: float) -> Stencil:
+        """Return the places of a disk of some radius, from a small set of sizes."""
+        size = SIZES ** math.ceil(math.log(radius_px + RIM * self.blur_px) / math.log(SIZES))
+        return _stencil(size, max(1, round(self.extra_px)))
+
+
+@lru_cache(maxsize=64)
+def _stencil(radius_px: float, step_px: int) -> Stencil:
+    return disk_stencil(radius_px, step_px, tile_px=max(6, step_px))
 
 
 class Optics:
@@ -51,24 +68,21 @@ class Optics:
     Args:
         base: finest table of the paint.
         blur_px: of optics, pixel and exposure together, px.
-        diameter_px: largest typical diameter of the disk, px.
-        reach: largest disk expected over the typical one.
+        diameter_px: typical diameter of the disk, px.
     """
 
-    def __init__(self, base: PaintTable, blur_px: float, diameter_px: float, reach: float) -> None:
+    def __init__(self, base: PaintTable, blur_px: float, diameter_px: float) -> None:
         radius_px = diameter_px / 2
         self.blur_px = blur_px
         self.coarse, self.middle, self.fine = (
-            self._level(base, extra, radius_px, reach) for extra in (COARSE * radius_px, MIDDLE * radius_px, 0.0)
+            level_of(base, blur_px, extra, radius_px) for extra in (COARSE * radius_px, MIDDLE * radius_px, 0.0)
         )
 
-    def _level(self, base: PaintTable, extra_px: float, radius_px: float, reach: float) -> Level:
-        blur_px = math.hypot(self.blur_px, extra_px)
-        step = max(1, round(extra_px))
-        stencil = disk_stencil(RIM * radius_px * reach + 2 * blur_px, step, tile_px=max(6, step))
-        return Level(
-            extra_px=extra_px, blur_px=blur_px, stencil=stencil, paint=base.blurred(max(blur_px / radius_px, BASE_RAD))
-        )
+
+def level_of(base: PaintTable, blur_px: float, extra_px: float, radius_px: float) -> Level:
+    """Return the level at which `extra_px` of blur are laid over pictures of blur `blur_px`."""
+    whole = math.hypot(blur_px, extra_px)
+    return Level(extra_px=extra_px, blur_px=whole, paint=base.blurred(whole / radius_px))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,9 +108,11 @@ class Fitter:
             level: of detail.
         """
         middles = [torch.nan_to_num(eye.camera.project(position_lab_mm)).tolist() for eye in self.eyes]
+        largest = torch.stack([eye.radius_px(position_lab_mm, self.radius_mm) for eye in self.eyes]).nan_to_num().max()
+        stencil = level.stencil(min(float(largest), 0.5 * max(self.eyes[0].camera.image_size)))
         return stacked(
             [
-                cut_pixels(frame, eye.background.mean, eye.sight, tuple(middles[c][b]), level.stencil, level.extra_px)
+                cut_pixels(frame, eye.background.mean, eye.sight, tuple(middles[c][b]), stencil, level.extra_px)
                 for b, frames in enumerate(pictures)
                 for c, (eye, frame) in enumerate(zip(self.eyes, frames, strict=True))
             ]

@@ -41,12 +41,12 @@ class Light:
     """What makes a movie's pictures grey: light on the disk, noise, blur; one entry a camera; made by `learn_light`.
 
     A pixel of the ball shows paint * difference + black, each a map over the disk; its noise has the variance
-    noise[0] + noise[1] I + noise[2] I^2 (read-out; photons; paint's grain).
+    noise[0] + noise[1] I + noise[2] I^2 + noise[3] I^3 (read-out; photons; grain of all paint, of white paint alone).
     """
 
     difference: Tensor  # (C, K), white less black paint, grey levels
     black: Tensor  # (C, K)
-    noise: Tensor  # (C, 3), grey levels^2, grey levels, 1
+    noise: Tensor  # (C, 4), grey levels^2 .. 1 / grey level
     known: bool  # False: nothing learnt yet, difference is 1 everywhere and black 0
 
     @classmethod
@@ -82,7 +82,7 @@ def light_maps(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:
-    """Learn how noise grows with brightness, (3,): variance = a + b I + c I^2, none of them negative.
+    """Learn how noise grows with brightness, (4,): coefficients of its variance, none of them negative.
 
     Args:
         model: (N,) grey levels expected.
@@ -93,9 +93,9 @@ def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:
     order = model.argsort(stable=True)
     groups = [group for group in order.tensor_split(24) if len(group) >= 50]
     if len(groups) < 3:
-        return torch.tensor([float(residual.square().mean()) if len(residual) else 1.0, 0.0, 0.0])
+        return torch.tensor([float(residual.square().mean()) if len(residual) else 1.0, 0.0, 0.0, 0.0])
     at = torch.stack([model[group].mean() for group in groups])
     # Robust: the paint's borders leave residuals that are not noise.
     seen = torch.stack([(1.4826 * residual[group].abs().median()).square() for group in groups]).clamp_min(0.1)
-    design = torch.stack([torch.ones_like(at), at, at.square()], dim=-1) / seen[:, None]
+    design = torch.stack([at**power for power in range(4)], dim=-1) / seen[:, None]
     return torch.from_numpy(nnls(design.numpy(), np.ones(len(groups)))[0]).float()

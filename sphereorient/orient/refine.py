@@ -54,6 +54,7 @@ class _Residuals:
     variance: Tensor  # (L, P), expected
     weight: Tensor  # (L, P), robust and inside, 0 .. 1
     deviation: Tensor  # (L,), robust standard deviation of the residuals over the noise expected
+    coverage: Tensor  # (L, P), share of each pixel that is ball
 
 
 def light_columns(view: View, light: Light, cameras: int, shading: Shading) -> tuple[Tensor, Tensor, Tensor]:
@@ -80,7 +81,7 @@ def refine(
     blur_px: float,
     light: Light,
     shading: Shading = LATER,
-    iterations: int = 3,
+    iterations: int = 4,
     place_precision: Tensor | None = None,
 ) -> Fit:
     """Fit poses to pictures: robust Gauss-Newton, the light's coefficients eliminated in every step.
@@ -95,11 +96,12 @@ def refine(
         blur_px: standard deviation of optics, pixel and whatever was laid over the frame, px.
         light: of the C cameras.
         shading: how far a frame's light may differ from it.
-        iterations: steps, the same for all poses, so that none depends on its neighbours in the batch.
-        place_precision: (B, 3, 3), 1/mm^2: holds the place near its start while detail is coarse.
+        iterations: steps, at least 1, the same for all poses, so that none depends on its neighbours in the batch.
+        place_precision: (B, 3, 3), 1/mm^2: what is known of the place, `position_lab_mm`, beforehand.
 
     Returns:
-        The fit, its covariance that of the robust estimate with errors shared within tiles of the picture.
+        The fit, its covariance that of the robust estimate with errors shared within tiles of the picture. All but
+        the pose is as it was before the last step, which `step` holds: a fit that has arrived does not move any more.
 
     Source: variable projection, Golub and Pereyra 1973; covariance of an M-estimate from clustered scores, Liang and
     Zeger 1986.
@@ -107,7 +109,7 @@ def refine(
     cameras = use.shape[1]
     start, X, R = position_lab_mm.double(), position_lab_mm.double(), R_lab_body.double()
     state: tuple[Tensor, Tensor] | None = None
-    for k in range(iterations + 1):
+    for _ in range(iterations):
         at = _residuals(pixels, X, R, state, radius_mm, paint, blur_px, light, cameras, shading)
         state = at.model, at.weight
         precision = at.weight / at.variance
@@ -122,17 +124,21 @@ def refine(
         if place_precision is not None:
             whole[:, 3:, 3:] += place_precision
             force[:, 3:] -= (place_precision @ (X - start)[..., None])[..., 0]
-        step = _solved(whole, force)
-        if k == iterations:
-            break
-        step = _bounded(step, radius_mm)
+        step = _bounded(_solved(whole, force), radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
-    own = _solved(information[..., :3, :3], pull[..., :3])
+    # Where each camera would go from where the last step began, less that step.
+    own = _solved(
+        information[..., :3, :3], pull[..., :3] - (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
+    )
+    own = own - step[:, None, :3]
     shared = _shared_scores(at, precision, mixed, pixels.tile).unflatten(0, (-1, cameras))
+    meat = (shared * seen[..., None, None]).sum(1)
+    if place_precision is not None:  # what was known before has an error of its own
+        meat[:, 3:, 3:] += place_precision
     bread = _inverse(whole)
     own_bread = _inverse(information[..., :3, :3])
-    covariance = bread @ (shared * seen[..., None, None]).sum(1) @ bread
+    covariance = bread @ meat @ bread
     loss = _loss(at, pixels.inside).unflatten(0, (-1, cameras))
     return Fit(
         position_lab_mm=X,
@@ -166,20 +172,22 @@ def _residuals(
     columns, difference, black = light_columns(view, light, cameras, shading)
     beyond = (1.0 - view.coverage) * pixels.behind
     noise = light.noise.repeat(len(X), 1)
-    # The first weights come from the picture itself, later ones from the model, which has no noise.
-    expected, weight = (pixels.grey, pixels.inside.to(columns.dtype)) if state is None else state
-    variance = _variance(expected, noise)
     target = pixels.grey - beyond
-    weighted = columns * (weight / variance)[:, None]
-    coefficients = _solved(
-        (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double(), ridge=1e-7
-    ).to(columns.dtype)
-    painted = (coefficients[:, None] @ columns)[:, 0]
-    model, residual = painted + beyond, target - painted
-    variance = _variance(model, noise)
-    deviation = _deviation(residual, variance, pixels.inside)
-    variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
-    weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * pixels.inside
+    # The first weights come from the picture itself, which a bubble is part of: a second round does without it.
+    rounds = (pixels.grey, pixels.inside.to(columns.dtype)) if state is None else state
+    for _ in range(1 if state is not None else 2):
+        expected, weight = rounds
+        weighted = columns * (weight / _variance(expected, noise))[:, None]
+        coefficients = _solved(
+            (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double(), ridge=1e-7
+        ).to(columns.dtype)
+        painted = (coefficients[:, None] @ columns)[:, 0]
+        model, residual = painted + beyond, target - painted
+        variance = _variance(model, noise)
+        deviation = _deviation(residual, variance, pixels.inside)
+        variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
+        weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * pixels.inside
+        rounds = model, weight
     tints = polynomials(view.across, max(shading.difference, shading.black))
     n = (shading.difference + 1) * (shading.difference + 2) // 2
     gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
@@ -192,14 +200,21 @@ def _residuals(
     )
     design = torch.cat([by_pose, columns], dim=1)
     return _Residuals(
-        design=design, residual=residual, model=model, variance=variance, weight=weight, deviation=deviation
+        design=design,
+        residual=residual,
+        model=model,
+        variance=variance,
+        weight=weight,
+        deviation=deviation,
+        coverage=view.coverage,
     )
 
 
 def _variance(grey: Tensor, noise: Tensor) -> Tensor:
     """Noise expected at grey levels (L, P) by the curves (L, 3)."""
     grey = grey.clamp_min(0.0)
-    return (noise[:, :1] + noise[:, 1:2] * grey + noise[:, 2:] * grey * grey).clamp_min(NOISE_MIN)
+    a, b, c, d = noise.split(1, dim=-1)
+    return (a + grey * (b + grey * (c + grey * d))).clamp_min(NOISE_MIN)
 
 
 def _deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
@@ -254,11 +269,16 @@ def _loss(at: _Residuals, inside: Tensor) -> Tensor:
 
 
 def _score(at: _Residuals, inside: Tensor) -> Tensor:
-    """Share of the disk's variance that the model explains, (L,); every pixel counts, or what is wrong would not."""
-    share = inside / inside.sum(-1, keepdim=True).clamp_min(1)
+    """Share of the disk's variance that the model explains, (L,).
+
+    Every pixel of the ball counts: those that do not fit are what tells a wrong pose. A bubble counts as dark or
+    bright as paint is, however much brighter it shines.
+    """
+    share = at.coverage * inside
+    share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)
     grey = at.model + at.residual
     spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
-    left = (share * at.residual.square()).sum(-1)
+    left = (share * torch.minimum(at.residual.square(), 4.0 * spread[:, None])).sum(-1)
     return 1.0 - left / spread.clamp_min(1e-9)
 
 

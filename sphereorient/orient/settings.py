@@ -51,6 +51,41 @@ class OrientSettings(BaseModel):
     score_min: float = Field(0.5, ge=0, le=1, description="candidates of lower T are no candidates; the paper's 0.5")
 
 
+class GreySearchSettings(BaseModel):
+    """How orientations are searched for on grey values (method precise)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    size_px: int = Field(
+        40, ge=16, le=128, description="side of the disk's picture, px; 40 has 1,256 pixels, 24 twice the speed"
+    )
+    distance_radii: float | None = Field(
+        None, gt=1.5, description="of the camera from the ball, in its radii; null: so far that perspective is nothing"
+    )
+    step_deg: float = Field(
+        12.0, ge=6, le=30, description="step of the bank's Lattman grid; 12: no rotation is beyond 14.5 of a template"
+    )
+    detail: float = Field(
+        0.1, gt=0, lt=0.5, description="detail finer than this is blurred away in the bank, in radii (5.7 degrees)"
+    )
+    window: float = Field(
+        0.3, gt=0.1, lt=2, description="neighbourhood over which light is taken to be even, radii (standard deviation)"
+    )
+    floor: float = Field(
+        0.5, gt=0, description="a neighbourhood deviating less than this share of the disk's deviation is of one paint"
+    )
+    clip: float = Field(2.5, gt=1, description="evened grey values beyond this many deviations are reflections")
+    peak_deg: float = Field(20.0, gt=0, lt=90, description="the bank's peaks are at least this far apart")
+    peaks: int = Field(8, ge=1, le=32, description="best peaks from which a climb begins")
+    rough_steps: int = Field(3, ge=1, description="steps of each climb on coarse detail")
+    finalists: int = Field(4, ge=1, description="climbs that go on to the finest detail")
+    fine_steps: int = Field(2, ge=1, description="steps of these")
+    distinct_deg: float = Field(8.0, gt=0, lt=90, description="proposals nearer than this to a better one are the same")
+    score_min: float = Field(
+        0.5, ge=0, lt=1, description="proposals that explain less of the picture (0..1) are none; noise explains 0.3"
+    )
+
+
 class RefineSettings(BaseModel):
     """How poses are fitted to pictures (method precise)."""
 
@@ -65,13 +100,10 @@ class RefineSettings(BaseModel):
     blur_px: float | None = Field(
         None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null learns it"
     )
-    reach: float = Field(
-        1.25, ge=1, description="largest disk expected over the one in the middle of the volume: ball near the camera"
-    )
     candidates: int = Field(4, ge=1, description="proposals of each camera that are fitted where nothing is known")
     block_frames: int = Field(
         64, ge=2, description="frames between full searches; blocks begin at multiples of it and know nothing of others"
     )
     lanes: int = Field(
-        2, ge=1, description="blocks followed side by side; all of their frames are held in memory, 2 x 64 are 54 MB"
+        1, ge=1, description="blocks followed side by side, in one batch; more suit a GPU; their frames are all held"
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.locate import LocateSettings
 from sphereorient.orient.cold import Poses, cold_start
-from sphereorient.orient.eye import Eye, Fitter, Level, Optics, Picture
+from sphereorient.orient.eye import Eye, Fitter, Optics, Picture, level_of
 from sphereorient.orient.light import Light
 from sphereorient.orient.pixels import Pixels
 from sphereorient.orient.proposer import Proposer
@@ -57,12 +57,12 @@ def study(
     """
     diameter_px = max(eye.diameter_px for eye in eyes)
     blur_px = settings.blur_px or FIRST_BLUR
-    noise = torch.tensor([[eye.background.typical_noise**2, 0.02, 0.001] for eye in eyes])
+    noise = torch.tensor([[eye.background.typical_noise**2, 0.02, 0.001, 0.0] for eye in eyes])
     light = Light.unknown(len(eyes), noise)
     fitter = Fitter(
         eyes=eyes,
         radius_mm=radius_mm,
-        optics=Optics(base, blur_px, diameter_px, settings.reach),
+        optics=Optics(base, blur_px, diameter_px),
         light=light,
     )
     found = [
@@ -81,11 +81,11 @@ def study(
     use = torch.stack([found[k].use for k in chosen])
     pixels = fitter.pixels([pictures[k] for k in chosen], X, fitter.optics.fine)
     pixels = pixels.every(torch.arange(0, pixels.grey.shape[1], 2))
-    fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 3)
+    fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
     fitter, fit = _with_light(fitter, pixels, fit, use, 2)
     if settings.blur_px is None:
         blur_px = _best_blur(fitter, base, pixels, fit, use)
-        optics = Optics(base, blur_px, diameter_px, settings.reach)
+        optics = Optics(base, blur_px, diameter_px)
         fitter = Fitter(eyes=eyes, radius_mm=radius_mm, optics=optics, light=fitter.light)
     fitter, fit = _with_light(fitter, pixels, fit, use, 2)
     right = float(fit.score[use].median())
@@ -117,7 +117,7 @@ def _with_light(fitter: Fitter, pixels: Pixels, fit: Fit, use: Tensor, rounds: i
             shading=fitter.shading,
         )
         fitter = Fitter(eyes=fitter.eyes, radius_mm=fitter.radius_mm, optics=fitter.optics, light=light)
-        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 2)
+        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
     return fitter, fit
 
 
@@ -126,9 +126,8 @@ def _best_blur(fitter: Fitter, base: PaintTable, pixels: Pixels, fit: Fit, use: 
     radius_px = max(eye.diameter_px for eye in fitter.eyes) / 2
     left = []
     for blur_px in BLURS:
-        paint = base.blurred(max(blur_px / radius_px, base.blur_rad))
-        level = Level(extra_px=0.0, blur_px=blur_px, stencil=fitter.optics.fine.stencil, paint=paint)
-        tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 1)
+        level = level_of(base, blur_px, 0.0, radius_px)
+        tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 2)
         left.append(float((1.0 - tried.score)[use].median()))
     k = min(range(len(left)), key=left.__getitem__)
     if k in (0, len(left) - 1):

@@ -1,0 +1,151 @@
+"""The search on grey values: a bank of evened pictures over all rotations, distinct peaks, a climb from each."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from sphereorient import so3
+from sphereorient.errors import ShapeError, refusal
+from sphereorient.orient.climb import climb, climb_level, level_picture
+from sphereorient.orient.evening import Evening
+from sphereorient.orient.peaks import compact_groups, distinct_peaks
+from sphereorient.orient.proposer import Proposals
+from sphereorient.orient.settings import GreySearchSettings
+from sphereorient.sphere import orthographic_view, perspective_view
+from sphereorient.sphere.paint_table import PaintTable, paint_table
+from sphereorient.trajectory import Reason
+
+# Disks evened at once. Fixed and filled up with empty disks: the last bits of sums depend on how many there are, and so
+# a disk's answer would depend on how many others came with it. Products of whole numbers are exact, and may be of any.
+BATCH = 32
+PRODUCT = 128  # disks in one product, at most: the scores of more leave the cache
+GROUP = 8  # neighbouring templates whose best one stands for them in the selection
+LOOKED_AT = 32  # best groups among which peaks are sought: a broad peak spans several
+TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest detail
+DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
+FLAT = 1e-3  # contrast, as a share of the brightest pixel, below which a picture shows nothing
+
+
+class GreySearch:
+    """Searches all of SO(3) for the views of a map that look like a disk, under any smooth light.
+
+    The bank covers SO(3): every rotation is within (1/2 + 1/sqrt 2) step of a template's (`so3.lattman_grid`), and
+    detail finer than `detail` is taken out of templates and pictures, so that the nearest template still resembles.
+
+    Args:
+        texture: (H, 2 H), the map, 0 black .. 1 white.
+        settings: of the search.
+    """
+
+    def __init__(self, texture: Tensor, settings: GreySearchSettings) -> None:
+        self._settings = settings
+        size, distance = settings.size_px, settings.distance_radii
+        self._view = orthographic_view(size) if distance is None else perspective_view(size, distance)
+        self._evening = Evening(
+            size, detail=settings.detail, window=settings.window, floor=settings.floor, clip=settings.clip
+        )
+        pixel_rad = 2.0 / size
+        paint = paint_table(texture, min(pixel_rad, settings.detail), TABLE_SIDE)
+        self._rough = climb_level(self._view, paint, settings.detail, every=2)
+        self._fine = climb_level(self._view, paint, pixel_rad, every=1)
+        grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
+        # (GROUP, G): the members of a group lie one below the other, and their maximum is one of whole rows.
+        self._grid = grid[compact_groups(grid, GROUP).T]
+        self._bank = self._templates(paint)
+
+    @property
+    def size_px(self) -> int:
+        """Side of the disks, px."""
+        return self._settings.size_px
+
+    @property
+    def templates(self) -> Tensor:
+        """Rotations of the bank, (K, 3, 3) float32."""
+        return self._grid.flatten(0, 1)
+
+    def propose(self, disks: Tensor) -> Proposals:
+        """Propose the best orientations that a disk allows, at least `distinct_deg` apart.
+
+        Args:
+            disks: (F, S, S) float32, grey levels of any scale, the outline touching the borders.
+
+        Returns:
+            Proposals, best first. The score is the share of the disk's deviation from smooth light that the paint
+            explains, 0 .. 1 (the square of their correlation). A disk without contrast, or whose best score stays
+            below `score_min`, has none (`LOW_SCORE`).
+
+        Raises:
+            ShapeError: the disks are of another size.
+        """
+        if disks.shape[1:] != (self.size_px, self.size_px):
+            size = f"(F, {self.size_px}, {self.size_px})"
+            raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
+        parts = [Proposals.none(())]
+        for some in disks.split(PRODUCT):
+            place, peak, shown = self.search(some)
+            for disk, at, kept, seen in zip(some, place, peak, shown.tolist(), strict=True):
+                starts = self.templates[at[kept][: self._settings.peaks]]
+                parts.append(self._climbed(disk, starts) if seen else Proposals.none([Reason.LOW_SCORE]))
+        return Proposals.joined(parts)
+
+    def search(self, disks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Compare disks with the whole bank.
+
+        Args:
+            disks: (F, S, S) float32; the scores of all are held at once, 36 kB each.
+
+        Returns:
+            Places of the best templates of the best groups, (F, M) int64 in `templates`, best first; which of them
+            are peaks, (F, M) bool; and which disks show anything, (F,) bool.
+        """
+        filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
+        evened = [self._evening(batch) for batch in filled.split(BATCH)]
+        steps = torch.cat([_steps(even) for even, _ in evened])
+        scores = torch._int_mm(steps, self._bank.T).unflatten(1, self._grid.shape[:2])
+        apart = math.radians(self._settings.peak_deg)
+        found = [distinct_peaks(batch, self._grid, apart, LOOKED_AT) for batch in scores.split(BATCH)]
+        place, peak = (torch.cat(part)[: len(disks)] for part in zip(*found, strict=True))
+        contrast = torch.cat([part for _, part in evened])[: len(disks)]
+        return place, peak, contrast > FLAT * disks.abs().amax((1, 2))
+
+    def _templates(self, paint: PaintTable) -> Tensor:
+        """Evened views of all rotations, (K, P) int8."""
+        normal = self._view.normal_view.T.contiguous()
+        chunks = self.templates.split(BATCH)
+        return torch.cat([_steps(self._evening(self._view.picture(paint.look(R.mT @ normal)[0]))[0]) for R in chunks])
+
+    def _climbed(self, disk: Tensor, starts: Tensor) -> Proposals:
+        """Climb from the peaks of one disk: its proposals, best first."""
+        settings = self._settings
+        R, score = climb(self._rough, level_picture(self._rough, disk), starts, settings.rough_steps)
+        R = R[self._distinct(R, score)[: settings.finalists]]
+        R, score = climb(self._fine, level_picture(self._fine, disk), R, settings.fine_steps)
+        chosen = self._distinct(R, score)
+        chosen = chosen[score[chosen] >= settings.score_min]
+        if not len(chosen):
+            return Proposals.none([Reason.LOW_SCORE])
+        # The float32 products back to rotations of float64.
+        return Proposals(
+            offset=torch.tensor([0, len(chosen)]),
+            R_view_body=so3.nearest_rotation(R[chosen].double()),
+            score=score[chosen].double(),
+            reason=(Reason.OK,),
+        )
+
+    def _distinct(self, R: Tensor, score: Tensor) -> Tensor:
+        """Indices of the rotations that are not near a better one, best first."""
+        order = score.argsort(descending=True, stable=True)
+        flat = R[order].flatten(1)
+        near = flat @ flat.T > 1 + 2 * math.cos(math.radians(self._settings.distinct_deg))
+        return order[~torch.tril(near, -1).any(1)]
+
+
+def _steps(even: Tensor) -> Tensor:
+    """Whole numbers -127 .. 127 in place of evened pictures, (B, P) int8, filled up to a multiple of 8 pixels."""
+    scale = 127.0 / DEVIATIONS * math.sqrt(even.shape[1])
+    # One scale for all templates: as all are of length 1, products of whole numbers rank them as they are.
+    return F.pad((even * scale).round().clamp(-127, 127), (0, -even.shape[1] % 8)).to(torch.int8)

@@ -1,0 +1,62 @@
+"""Movies of pooled candidates whose truth is known, for the path with physics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from assemble_examples import noisy, turned_deg
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.assemble import Chosen, Hypotheses
+
+SIGMA = 1.0e-3  # rad per axis, of every candidate
+
+
+def pooled(*tracks: Tensor, nll: Sequence[float] | Tensor | None = None, mask: Tensor | None = None) -> Hypotheses:
+    """Tracks (N, 3, 3) side by side; of equal likelihood where nothing else is said."""
+    R = torch.stack(tracks, 1)
+    shape = R.shape[:2]
+    given = torch.zeros(shape[1], dtype=torch.float64) if nll is None else torch.as_tensor(nll, dtype=torch.float64)
+    return Hypotheses(
+        R_lab_body=R,
+        nll=given.expand(shape),
+        covariance_rad2=(SIGMA**2 * torch.eye(3, dtype=torch.float64)).expand(*shape, 3, 3),
+        mask=torch.ones(shape, dtype=torch.bool) if mask is None else mask,
+    )
+
+
+def seen(R: Tensor, rng: torch.Generator) -> Tensor:
+    """R as the pictures give it."""
+    return noisy(R, SIGMA, rng)
+
+
+def without(R: Tensor, frames: Sequence[int] | range) -> Hypotheses:
+    """One candidate a frame, none in some."""
+    mask = torch.ones(len(R), 1, dtype=torch.bool)
+    mask[list(frames)] = False
+    return pooled(R, mask=mask)
+
+
+def standing(frames: int) -> Tensor:
+    """An orientation that does not change."""
+    start = torch.eye(3, dtype=torch.float64)
+    return turned_deg(start, 0.0, 0.0, 120.0).expand(frames, 3, 3)
+
+
+def wrong_frames(path: Chosen, R: Tensor) -> list[int]:
+    """Frames with an orientation more than 1 degree from the truth."""
+    apart = so3.geodesic_distance(path.R_lab_body, R)
+    return torch.nonzero(apart > math.radians(1.0)).flatten().tolist()
+
+
+def lost_frames(path: Chosen) -> list[int]:
+    """Frames without an orientation."""
+    return torch.nonzero(~path.present).flatten().tolist()
+
+
+def flagged(path: Chosen, flag: int) -> list[int]:
+    """Frames that carry a flag."""
+    return torch.nonzero(path.flags & int(flag)).flatten().tolist()
