@@ -245,7 +245,7 @@ def _precise(
         picked["R_lab_body"],
         picked["covariance"][:, :3, :3],
         chosen.segment,
-        None,
+        settings.smooth,
     )
     return results.precise_track(experiment, clock, table, chosen, smoothed, learnt)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 from sphereorient.assemble import Chosen, Fused, Path
 from sphereorient.experiment import Experiment
 from sphereorient.locate import Positions, Sightings
-from sphereorient.motion import Motion
+from sphereorient.motion import Motion, Smoothed
 from sphereorient.orient import Candidates, PoseTable, Study
 from sphereorient.so3 import exp
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
@@ -115,7 +114,7 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
 
 
 def precise_track(
-    experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Chosen, smoothed: Any, learnt: Study
+    experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Chosen, smoothed: Smoothed, learnt: Study
 ) -> Trajectory:
     """Put everything into the noun that comes out."""
     names = [eye.name for eye in learnt.fitter.eyes]

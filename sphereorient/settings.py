@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.locate.settings import LocateSettings
-from sphereorient.motion.settings import MotionSettings
+from sphereorient.motion.settings import MotionSettings, SmoothSettings
 from sphereorient.orient.settings import GreySearchSettings, OrientSettings, RefineSettings
 from sphereorient.synth.settings import SynthSettings
 
@@ -32,6 +32,7 @@ class Settings(BaseModel):
     search: GreySearchSettings = Field(default_factory=GreySearchSettings, description="where could it point (precise)")
     refine: RefineSettings = Field(default_factory=RefineSettings, description="poses to hundredths (precise)")
     path: PathSettings = Field(default_factory=PathSettings, description="which candidate is true (precise)")
+    smooth: SmoothSettings = Field(default_factory=SmoothSettings, description="motion from the track (precise)")
     orient: OrientSettings = Field(default_factory=OrientSettings, description="where could it point (paper)")
     assemble: AssembleSettings = Field(default_factory=AssembleSettings, description="which candidate is true (paper)")
     motion: MotionSettings = Field(default_factory=MotionSettings, description="velocities, accelerations (paper)")

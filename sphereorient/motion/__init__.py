@@ -4,16 +4,20 @@ from sphereorient.motion.angular_velocity import omega_from_orientations, to_bod
 from sphereorient.motion.derivative import gaussian_derivative, noise_gain
 from sphereorient.motion.kabsch import kabsch, omega_from_markers
 from sphereorient.motion.measure import Motion, measure_motion
-from sphereorient.motion.settings import MotionSettings
+from sphereorient.motion.settings import MotionSettings, SmoothSettings
+from sphereorient.motion.smooth import Smoothed, smooth_motion
 
 __all__ = [
     "Motion",
     "MotionSettings",
+    "SmoothSettings",
+    "Smoothed",
     "gaussian_derivative",
     "kabsch",
     "measure_motion",
     "noise_gain",
     "omega_from_markers",
     "omega_from_orientations",
+    "smooth_motion",
     "to_body",
 ]

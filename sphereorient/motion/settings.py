@@ -63,3 +63,16 @@ class MotionSettings(BaseModel):
             got, do = str(self.min_separations), "lower it or give more separations"
             raise SettingsError(refusal("motion.min_separations", expected=f"at most {len(m)}", got=got, do=do))
         return self
+
+
+class SmoothSettings(BaseModel):
+    """How the precise track becomes smooth motion."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    position_band_hz: float | None = Field(
+        None, gt=0, description="frequency up to which places are followed, Hz; null learns it from the track itself"
+    )
+    orientation_band_hz: float | None = Field(
+        None, gt=0, description="frequency up to which orientations are followed, Hz; null learns it likewise"
+    )

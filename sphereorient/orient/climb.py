@@ -17,7 +17,7 @@ from sphereorient.sphere.paint_table import PaintTable
 WHITE_ORDER, BLACK_ORDER = 2, 1  # of the light's polynomials over the disk: on the paint, and without it
 STEP_RAD = 0.14  # longest step: beyond it the paint's slope says nothing any more
 RIDGE = 1e-4  # of the diagonal: keeps the light solvable where the disk shows one paint
-GAIN_MIN = 0.1  # of the mean one: a place darker than that still turns the paint the right way
+GAIN_MIN = 0.1  # white less black paint, deviations: a place that is darker still turns the right way
 PIXEL = 0.5  # standard deviation of a pixel and its resampling, px
 
 
@@ -61,61 +61,67 @@ def climb_level(view: DiskView, paint: PaintTable, detail: float, every: int) ->
     )
 
 
-def level_picture(level: Level, disk: Tensor) -> Tensor:
-    """Return the level's pixels of a disk (S, S), in units of their deviation from the smoothest light, (P,)."""
-    seen = level.blur(disk[None])[0].reshape(-1)[level.place]
-    seen = seen - (seen * level.weight).sum() / level.weight.sum()
-    seen = seen / seen.abs().amax().clamp_min(1e-12)  # whatever the camera's units: single precision has few digits
-    smooth = _solved(level.white[None], seen, level.weight)[0] @ level.white
-    return seen / ((seen - smooth).square() * level.weight).sum().div(level.weight.sum()).sqrt().clamp_min(1e-12)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Target:
+    """What a level sees of one disk; made by `level_target`, read by `climb`."""
+
+    grey: Tensor  # (P,), in units of its deviation from the smoothest light
+    unexplained: Tensor  # (), cost where there is light only and no paint
 
 
-def climb(level: Level, picture: Tensor, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+def level_target(level: Level, disk: Tensor) -> Target:
+    """Return a level's pixels of a disk, (S, S) grey levels of any scale."""
+    grey = level.blur(disk[None])[0].reshape(-1)[level.place]
+    # Whatever the camera's units: single precision has few digits.
+    grey = grey - (grey * level.weight).sum() / level.weight.sum()
+    grey = grey / grey.abs().amax().clamp_min(1e-12)
+    rough = grey - (_solved(level.white[None], grey, level.weight) @ level.white)[0]
+    deviation = (rough.square() * level.weight).sum().div(level.weight.sum()).sqrt().clamp_min(1e-12)
+    return Target(grey=grey / deviation, unexplained=_cost(level, rough / deviation))
+
+
+def climb(level: Level, target: Target, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Turn orientations towards the best fit nearby.
 
     Args:
         level: of detail.
-        picture: (P,), of `level_picture`.
+        target: the disk at this level.
         R_view_body: (Q, 3, 3) float32, starts.
         steps: Gauss-Newton steps.
 
     Returns:
-        R_view_body (Q, 3, 3), and the score (Q,): the share of the picture's deviation from smooth light that paint
+        R_view_body (Q, 3, 3), and the score (Q,): the share of the disk's deviation from smooth light that paint
         explains, 1 at most, 0 and below where it explains nothing.
 
     Source: variable projection, Golub and Pereyra 1973; robust weights, Geman and McClure 1987.
     """
-    R = R_view_body
-    gain = torch.ones(len(R), 1)
-    weight = level.weight.expand(len(R), -1)
-    whites = len(level.white)
+    R, weight, whites = R_view_body, level.weight.expand(len(R_view_body), -1), len(level.white)
     for _ in range(steps):
         normal_body = R.mT @ level.normal
         value, slope = level.paint.look(normal_body)
         light = _light_columns(level, value)
+        found = _solved(light, target.grey, weight)
+        left = target.grey - (found[:, None] @ light)[:, 0]
+        weight = level.weight * _trust(left)
+        gain = (found[:, None, :whites] @ level.white)[:, 0].clamp_min(GAIN_MIN)
         # Turning the body by epsilon, R exp(epsilon), changes the paint by epsilon . (slope x normal).
-        columns = torch.cat([light, _cross(slope, normal_body) * gain[:, None]], dim=1)
-        found = _solved(columns, picture, weight)
-        mean_gain = found[:, :1].clamp_min(GAIN_MIN)
-        # The first step knows no map of the gain yet, and has its mean in the turn.
-        turn = found[:, -3:] / (mean_gain if gain.shape[1] == 1 else 1.0)
-        turn = turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0)
-        R = R @ so3.exp(turn)
-        gain = torch.maximum(found[:, :whites] @ level.white, GAIN_MIN * mean_gain)
-        weight = level.weight * _trust(picture - (found[:, None] @ columns)[:, 0])
-    return R, _score(level, picture, R, weight)
+        turned = _cross(slope, normal_body) * gain[:, None]
+        turn = _solved(torch.cat([light, turned], dim=1), left, weight)[:, -3:]
+        R = R @ so3.exp(turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0))
+    return R, _score(level, target, R, weight)
 
 
-def _score(level: Level, picture: Tensor, R: Tensor, weight: Tensor) -> Tensor:
+def _score(level: Level, target: Target, R: Tensor, weight: Tensor) -> Tensor:
     light = _light_columns(level, level.paint.look(R.mT @ level.normal)[0])
-    found = _solved(light, picture, weight)
-    left = picture - (found[:, None] @ light)[:, 0]
-    # Bounded as the weights are, so that a reflection costs every orientation the same.
-    cost = (left.square() * _trust(left).sqrt() * level.weight).sum(1)
-    smooth = picture - _solved(level.white[None], picture, level.weight)[0] @ level.white
-    worst = (smooth.square() * _trust(smooth).sqrt() * level.weight).sum()
+    found = _solved(light, target.grey, weight)
+    cost = _cost(level, target.grey - (found[:, None] @ light)[:, 0])
     # Paint that would have to be lit by less than nothing is the negative of a map.
-    return torch.where(found[:, 0] > 0, 1.0 - cost / worst.clamp_min(1e-12), -torch.ones_like(cost))
+    return torch.where(found[:, 0] > 0, 1.0 - cost / target.unexplained.clamp_min(1e-12), -1.0)
+
+
+def _cost(level: Level, residual: Tensor) -> Tensor:
+    """Sum over the pixels (..., P), bounded as the weights are: a reflection costs every orientation the same."""
+    return (residual.square() * _trust(residual).sqrt() * level.weight).sum(-1)
 
 
 def _light_columns(level: Level, value: Tensor) -> Tensor:
@@ -128,11 +134,11 @@ def _trust(residual: Tensor) -> Tensor:
     return (1.0 + residual.square()).square().reciprocal()
 
 
-def _solved(columns: Tensor, picture: Tensor, weight: Tensor) -> Tensor:
+def _solved(columns: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
     """Weighted least squares, (Q, C) float32, of columns (Q, C, P)."""
     weighted = columns * weight.expand(len(columns), -1)[:, None]
     normal = (weighted @ columns.mT).double()
-    right = (weighted @ picture[:, None]).double()
+    right = (weighted @ grey[..., None]).double()
     ridge = RIDGE * normal.diagonal(dim1=1, dim2=2).clamp_min(1e-9)
     return torch.linalg.solve(normal + torch.diag_embed(ridge), right)[..., 0].float()
 

@@ -10,9 +10,9 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError, refusal
-from sphereorient.orient.climb import climb, climb_level, level_picture
+from sphereorient.orient.climb import climb, climb_level, level_target
 from sphereorient.orient.evening import Evening
-from sphereorient.orient.peaks import compact_groups, distinct_peaks
+from sphereorient.orient.peaks import best_of_groups, compact_groups, distinct
 from sphereorient.orient.proposer import Proposals
 from sphereorient.orient.settings import GreySearchSettings
 from sphereorient.sphere import orthographic_view, perspective_view
@@ -104,11 +104,12 @@ class GreySearch:
         """
         filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
         evened = [self._evening(batch) for batch in filled.split(BATCH)]
-        steps = torch.cat([_steps(even) for even, _ in evened])
+        steps = torch.cat([_steps(even) for even, _ in evened])[: len(disks)]
         scores = torch._int_mm(steps, self._bank.T).unflatten(1, self._grid.shape[:2])
+        place = best_of_groups(scores, LOOKED_AT)
         apart = math.radians(self._settings.peak_deg)
-        found = [distinct_peaks(batch, self._grid, apart, LOOKED_AT) for batch in scores.split(BATCH)]
-        place, peak = (torch.cat(part)[: len(disks)] for part in zip(*found, strict=True))
+        looked_at = self.templates[F.pad(place, (0, 0, 0, -len(disks) % BATCH))].split(BATCH)
+        peak = torch.cat([distinct(R, apart) for R in looked_at])[: len(disks)]
         contrast = torch.cat([part for _, part in evened])[: len(disks)]
         return place, peak, contrast > FLAT * disks.abs().amax((1, 2))
 
@@ -121,9 +122,9 @@ class GreySearch:
     def _climbed(self, disk: Tensor, starts: Tensor) -> Proposals:
         """Climb from the peaks of one disk: its proposals, best first."""
         settings = self._settings
-        R, score = climb(self._rough, level_picture(self._rough, disk), starts, settings.rough_steps)
+        R, score = climb(self._rough, level_target(self._rough, disk), starts, settings.rough_steps)
         R = R[self._distinct(R, score)[: settings.finalists]]
-        R, score = climb(self._fine, level_picture(self._fine, disk), R, settings.fine_steps)
+        R, score = climb(self._fine, level_target(self._fine, disk), R, settings.fine_steps)
         chosen = self._distinct(R, score)
         chosen = chosen[score[chosen] >= settings.score_min]
         if not len(chosen):
@@ -139,9 +140,7 @@ class GreySearch:
     def _distinct(self, R: Tensor, score: Tensor) -> Tensor:
         """Indices of the rotations that are not near a better one, best first."""
         order = score.argsort(descending=True, stable=True)
-        flat = R[order].flatten(1)
-        near = flat @ flat.T > 1 + 2 * math.cos(math.radians(self._settings.distinct_deg))
-        return order[~torch.tril(near, -1).any(1)]
+        return order[distinct(R[order], math.radians(self._settings.distinct_deg))]
 
 
 def _steps(even: Tensor) -> Tensor:

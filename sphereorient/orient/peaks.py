@@ -1,4 +1,4 @@
-"""The best distinct rotations of a long list of scores, found without sorting it."""
+"""The tops of many scores over SO(3), found without sorting them."""
 
 from __future__ import annotations
 
@@ -36,22 +36,33 @@ def compact_groups(R: Tensor, size: int) -> Tensor:
     return torch.stack(halved(index))
 
 
-def distinct_peaks(scores: Tensor, R: Tensor, apart_rad: float, count: int) -> tuple[Tensor, Tensor]:
-    """Find rotations that no better one is near to, among the best of each group.
+def best_of_groups(scores: Tensor, count: int) -> Tensor:
+    """Find the best member of each of the best groups.
 
     Args:
         scores: (F, M, G), those of the M members of G groups.
-        R: (M, G, 3, 3), their rotations.
-        apart_rad: a rotation nearer than this to a better one is no peak of its own.
-        count: how many groups are looked at, the best ones.
+        count: of groups.
 
     Returns:
-        Places (F, count) int64 in the flattened members and groups, best first, and which of them are peaks, bool.
+        (F, count) int64, or of all groups where there are fewer: places in the flattened members and groups, best
+        first.
     """
     groups = scores.shape[2]
     group = scores.amax(1).topk(min(count, groups), dim=1).indices
     members = scores.gather(2, group[:, None].expand(-1, scores.shape[1], -1))
-    place = members.argmax(1) * groups + group
-    flat = R.reshape(-1, 9)[place]
-    near = flat @ flat.mT > 1 + 2 * math.cos(apart_rad)  # trace of A^T B
-    return place, ~torch.tril(near, -1).any(-1)
+    return members.argmax(1) * groups + group
+
+
+def distinct(R: Tensor, apart_rad: float) -> Tensor:
+    """Return which rotations of lists, best first, are not near a better one.
+
+    Args:
+        R: (..., M, 3, 3).
+        apart_rad: how near, rad.
+
+    Returns:
+        (..., M) bool; the first is always one. One that is near a better one is none even where that is none itself:
+        what remains are the tops.
+    """
+    flat = R.flatten(-2)
+    return ~torch.tril(flat @ flat.mT > 1 + 2 * math.cos(apart_rad), -1).any(-1)  # the product is the trace of A^T B

@@ -13,7 +13,7 @@ from sphereorient.orient.picture import View, sphere_view
 from sphereorient.orient.pixels import Pixels
 from sphereorient.sphere.paint_table import PaintTable
 
-TUKEY = 9.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
+TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 

@@ -77,12 +77,12 @@ class GreySearchSettings(BaseModel):
     clip: float = Field(2.5, gt=1, description="evened grey values beyond this many deviations are reflections")
     peak_deg: float = Field(20.0, gt=0, lt=90, description="the bank's peaks are at least this far apart")
     peaks: int = Field(8, ge=1, le=32, description="best peaks from which a climb begins")
-    rough_steps: int = Field(3, ge=1, description="steps of each climb on coarse detail")
+    rough_steps: int = Field(4, ge=1, description="steps of each climb on coarse detail")
     finalists: int = Field(4, ge=1, description="climbs that go on to the finest detail")
-    fine_steps: int = Field(2, ge=1, description="steps of these")
+    fine_steps: int = Field(3, ge=1, description="steps of these")
     distinct_deg: float = Field(8.0, gt=0, lt=90, description="proposals nearer than this to a better one are the same")
     score_min: float = Field(
-        0.5, ge=0, lt=1, description="proposals that explain less of the picture (0..1) are none; noise explains 0.3"
+        0.45, ge=0, lt=1, description="proposals that explain less of the picture (0..1) are none; smooth noise: 0.36"
     )
 
 
