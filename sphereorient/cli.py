@@ -47,7 +47,9 @@ def common(
 def track(
     experiment: ExperimentPath,
     out: Annotated[Path, typer.Option("--out", "-o", help="HDF5 file to write (schema sphereorient-track/1).")],
-    method: Annotated[str, typer.Option(help="paper: Zimmermann et al. 2011, corrected.")] = "paper",
+    method: Annotated[
+        str, typer.Option(help="precise: refined poses with covariances; paper: Zimmermann et al. 2011, corrected.")
+    ] = "precise",
     settings: Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set orient.fine_step_deg=2.")

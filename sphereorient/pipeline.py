@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path as FilePath
@@ -296,12 +295,11 @@ def follow_sphere(reels: Sequence[Reel], frames: range, tracker: BlockTracker, p
     stage, done = "track", 0
     progress(stage, 0, len(frames))
     windows = tracker.windows(frames)
-    # The pool last: it waits for its readers, and only then may the iterators that they read from be closed.
-    with ExitStack() as open_iterators, ThreadPoolExecutor(len(reels)) as pool:
-        pictures = [open_iterators.enter_context(closing(reel.pictures())) for reel in reels]
+    with ThreadPoolExecutor(len(reels)) as pool:
+        pictures = [reel.pictures() for reel in reels]
 
         def ahead(window: Sequence[int]) -> list[Future[list[NDArray[Any]]]]:
-            return [pool.submit(lambda movie=movie: list(islice(movie, sum(window)))) for movie in pictures]
+            return [pool.submit(_taken, movie, sum(window)) for movie in pictures]
 
         coming = ahead(windows[0]) if windows else []
         for k, window in enumerate(windows):
@@ -311,6 +309,11 @@ def follow_sphere(reels: Sequence[Reel], frames: range, tracker: BlockTracker, p
                 yield poses
                 done += 1
             progress(stage, done, len(frames))
+
+
+def _taken(pictures: Iterator[NDArray[Any]], count: int) -> list[NDArray[Any]]:
+    """Take the next pictures of a movie."""
+    return list(islice(pictures, count))
 
 
 def _radius_mm(experiment: Experiment) -> float:

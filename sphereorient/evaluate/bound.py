@@ -14,8 +14,10 @@ from sphereorient.sphere import reduced_texture, sample_texture
 from sphereorient.synth.aperture import aperture_matrix, fine_places
 
 STEP_PX = 0.1  # of central differences, as motion on the picture: their error is 0.5 % of the bound at 0.6 px of blur
-DETERMINED = 1e-6  # information below this share of the greatest is rounding: nothing is known of that direction
-SAMPLES = 1 << 21  # fine samples held at once, of all pictures together
+ROUNDING = 1e-6  # an unknown whose own information is below this share of the greatest moves nothing but last digits
+DETERMINED = 1e-3  # with each unknown's own information 1: differences of sampled pictures tell no less from nothing
+ATTITUDES = 16  # whose derivatives are held at once
+SAMPLES = 1 << 18  # fine samples drawn at once, of all pictures together: more leave the cache
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +102,7 @@ def cramer_rao_bound(
     )
     flat = R_view_body.reshape(-1, 3, 3)
     parts = [flat.new_zeros(0, 6, 6)]
-    for R in flat.split(disk.attitudes_at_once):
+    for R in flat.split(ATTITUDES):
         jacobian = disk.jacobian(R)
         parts.append(jacobian.mT @ jacobian / noise_share**2)
     return Bound(information=torch.cat(parts).reshape(*R_view_body.shape[:-2], 6, 6))
@@ -130,11 +132,6 @@ class DiskPicture:
         self.reached = right.square() + down.square() < (radius_px + 1.0) ** 2
         self.place = torch.stack([right[self.reached], down[self.reached]], dim=-1)
 
-    @property
-    def attitudes_at_once(self) -> int:
-        """How many attitudes to take the derivatives of in one go."""
-        return max(1, SAMPLES // (12 * self.reached.numel()))
-
     def __call__(self, R_view_body: Tensor, centre_px: Tensor, radius_px: Tensor) -> Tensor:
         """Draw the pictures.
 
@@ -160,27 +157,23 @@ class DiskPicture:
 
     def jacobian(self, R_view_body: Tensor) -> Tensor:
         """Derivatives of the pictures (K, S^2, 6), the disk in the middle; order of the unknowns as in `Bound`."""
-        scale = self.unknowns_per_px(R_view_body)
-        step = STEP_PX * torch.diag(scale)
-        step = torch.cat([step, -step])  # (12, 6)
-        R = so3.exp(step[:, :3]) @ R_view_body[:, None]
         count = len(R_view_body)
-        pictures = self(
-            R.flatten(0, 1), step[:, 3:5].repeat(count, 1), self.radius_px + step[:, 5].repeat(count)
-        ).reshape(count, 2, 6, -1)
-        return ((pictures[:, 0] - pictures[:, 1]) / (2 * STEP_PX * scale[:, None])).mT
-
-    def unknowns_per_px(self, like: Tensor) -> Tensor:
-        """How much of each unknown moves the picture by about a pixel, (6,)."""
-        return like.new_tensor([1 / self.radius_px] * 3 + [1.0] * 3)
+        step = STEP_PX * R_view_body.new_tensor([1 / self.radius_px] * 3 + [1.0] * 3)
+        both = torch.cat([torch.diag(step), -torch.diag(step)])  # (12, 6)
+        R = (so3.exp(both[:, :3]) @ R_view_body[:, None]).flatten(0, 1)
+        centre_px, radius_px = both[:, 3:5].repeat(count, 1), self.radius_px + both[:, 5].repeat(count)
+        at_once = max(1, SAMPLES // len(self.place))
+        parts = zip(R.split(at_once), centre_px.split(at_once), radius_px.split(at_once), strict=True)
+        pictures = torch.cat([self(*part) for part in parts]).reshape(count, 2, 6, -1)
+        return ((pictures[:, 0] - pictures[:, 1]) / (2 * step[:, None])).mT
 
 
 def _inverse(information: Tensor) -> Tensor:
     """Invert information (..., K, K); unknowns that it leaves open get an infinite variance."""
-    # In units in which each unknown's own information is 1: rad and px cannot be compared.
+    # In units in which each unknown's own information is 1, as far as it has any: rad and px cannot be compared.
     own = information.diagonal(dim1=-2, dim2=-1).clamp_min(0)
     greatest = own.amax(-1, keepdim=True).clamp_min(torch.finfo(own.dtype).tiny)
-    unit = torch.where(own > DETERMINED * greatest, own, greatest).rsqrt()
+    unit = torch.where(own > ROUNDING * greatest, own, greatest).rsqrt()
     value, axis = torch.linalg.eigh(information * unit[..., None] * unit[..., None, :])
     open_ = value < DETERMINED
     weight = torch.where(open_, 0.0, 1.0 / torch.where(open_, 1.0, value))

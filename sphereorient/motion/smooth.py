@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from sphereorient.motion.turning import AXES, STATES, Moving, Turning, skew
 
 Floats = NDArray[np.float64]
 Segment = Moving | Turning
+S = TypeVar("S", Moving, Turning)
 
 LEARN_FRAMES = 400  # frames of the longest segment from which the noise is learnt
 ROUNDS = 2  # of learning, weighing outliers, and learning again
@@ -109,7 +111,7 @@ class _Noise:
     scale: float  # true errors of the measurements over their sigmas
 
 
-def _learnt(tracks: Sequence[Segment], band_hz: float | None, frame_s: float) -> _Noise:
+def _learnt(tracks: Sequence[S], band_hz: float | None, frame_s: float) -> _Noise:
     """Learn band and scale from the longest segment."""
     tracks = [track for track in tracks if track.measured.sum() > 2 * LEAST_FRAMES]
     if not tracks:
@@ -133,7 +135,7 @@ def _likeliest_band(track: Segment, noise: _Noise, looseness: Floats) -> float:
     """Return the band, rad per frame, under which the measurements surprise least."""
     found = minimize_scalar(
         lambda log_band: _surprise(track, replace(noise, band=float(np.exp(log_band))), looseness)[0],
-        bounds=np.log(2 * np.pi * np.array(BANDS)),
+        bounds=(float(np.log(2 * np.pi * BANDS[0])), float(np.log(2 * np.pi * BANDS[1]))),
         method="bounded",
         options={"xatol": 0.03},
     )
@@ -155,7 +157,7 @@ def _chain(track: Segment, noise: _Noise, looseness: Floats) -> Chain:
     return track.timed(noise.band).chain(noise.variance * noise.band, looseness)
 
 
-def _fitted(track: Segment, noise: _Noise, looseness: Floats) -> tuple[Segment, Solution]:
+def _fitted(track: S, noise: _Noise, looseness: Floats) -> tuple[S, Solution]:
     """Gauss and Newton from the present states, in the track's own unit of time."""
     for _ in range(STEPS if isinstance(track, Turning) else 1):
         solution = solve(_chain(track, noise, looseness))
@@ -164,7 +166,7 @@ def _fitted(track: Segment, noise: _Noise, looseness: Floats) -> tuple[Segment, 
     return track, replace(solution, covariance=solution.covariance * unit[:, None] * unit)
 
 
-def _settled(track: Segment, noise: _Noise) -> tuple[Segment, Floats]:
+def _settled(track: S, noise: _Noise) -> tuple[S, Floats]:
     """Return a segment's states and their covariances (N, D, D), measurements far off held back."""
     looseness = np.ones(len(track.time))
     track = track.start()

@@ -32,7 +32,8 @@ def left_jacobian(v: Floats) -> Floats:
     first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
     second = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
     K = skew(v)
-    return np.eye(3) + first * K + second * K @ K
+    J: Floats = np.eye(3) + first * K + second * K @ K
+    return J
 
 
 def _mean_variance(covariance: Floats, measured: NDArray[np.bool_]) -> Floats:
@@ -49,8 +50,11 @@ def _tied(step: Floats, density: float) -> tuple[Floats, Floats]:
     """Transitions of the whole state and their noise, (M, D, D)."""
     transition, noise = wiener_noise(step, STATES)
     eye = np.eye(AXES)
-    blocks = [np.kron(part, eye).reshape(-1, STATES * AXES, STATES * AXES) for part in (transition, density * noise)]
-    return blocks[0], blocks[1]
+    size = STATES * AXES
+    tied: list[Floats] = [
+        np.asarray(np.kron(part, eye)).reshape(-1, size, size) for part in (transition, density * noise)
+    ]
+    return tied[0], tied[1]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,7 +74,7 @@ class Moving:
     @property
     def measured(self) -> NDArray[np.bool_]:
         """(N,), frames with a measurement."""
-        return np.isfinite(self.value).all(1) & np.isfinite(self.covariance).all((1, 2))
+        return np.asarray(np.isfinite(self.value).all(1) & np.isfinite(self.covariance).all((1, 2)))
 
     @property
     def variance(self) -> Floats:
@@ -146,7 +150,7 @@ class Turning:
     @property
     def measured(self) -> NDArray[np.bool_]:
         """(N,), frames with a measurement."""
-        return np.isfinite(self.value).all((1, 2)) & np.isfinite(self.covariance).all((1, 2))
+        return np.asarray(np.isfinite(self.value).all((1, 2)) & np.isfinite(self.covariance).all((1, 2)))
 
     @property
     def variance(self) -> Floats:

@@ -131,7 +131,7 @@ def _light_columns(level: Level, value: Tensor) -> Tensor:
 
 def _trust(residual: Tensor) -> Tensor:
     """Weight of a pixel, 1 .. 0, by its residual in deviations of the picture."""
-    return (1.0 + residual.square()).square().reciprocal()
+    return 1.0 / (1.0 + residual.square()).square()
 
 
 def _solved(columns: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
@@ -140,7 +140,8 @@ def _solved(columns: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
     normal = (weighted @ columns.mT).double()
     right = (weighted @ grey[..., None]).double()
     ridge = RIDGE * normal.diagonal(dim1=1, dim2=2).clamp_min(1e-9)
-    return torch.linalg.solve(normal + torch.diag_embed(ridge), right)[..., 0].float()
+    solution: Tensor = torch.linalg.solve(normal + torch.diag_embed(ridge), right)
+    return solution[..., 0].float()
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

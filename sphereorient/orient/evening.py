@@ -13,7 +13,8 @@ RIM_WEIGHT_MIN = 0.02  # of the outermost pixels in the comparison
 
 def rim_share(size_px: int) -> Tensor:
     """Return how far the pixels of a disk's picture may be trusted not to show what is beside the ball, (S, S)."""
-    return ((1 - disk_offsets(size_px).norm(dim=-1)) / RIM).clamp(0, 1).float()
+    from_limb: Tensor = 1 - disk_offsets(size_px).norm(dim=-1)
+    return (from_limb / RIM).clamp(0, 1).float()
 
 
 class Blur:
@@ -59,15 +60,15 @@ class Evening:
         self._root_weight = (depth * self._share.clamp_min(RIM_WEIGHT_MIN)).reshape(-1)[self._inside]
 
     def __call__(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """Return evened pictures, (B, P) of length 1, and the contrast (B,): deviation in the picture's own units."""
+        """Return evened pictures, (B, P) of length 1, and their contrast (B,): deviation over deviation plus mean."""
         seen = self._detail(pictures)
         share, total = self._share, self._share.sum()
-        # In deviations of the whole disk: the numbers below have no unit.
-        seen = seen - (seen * share).sum((1, 2), keepdim=True) / total
-        contrast = ((seen.square() * share).sum((1, 2), keepdim=True) / total).sqrt()
-        seen = seen / contrast.clamp_min(1e-12)
+        mean = (seen * share).sum((1, 2), keepdim=True) / total
+        seen = seen - mean
+        deviation = ((seen.square() * share).sum((1, 2), keepdim=True) / total).sqrt()
+        seen = seen / deviation.clamp_min(1e-12)  # the numbers below have no unit
         local = seen - self._window(seen)
         even = (local * (self._window(local.square()) + self._floor2).rsqrt()).clamp(-self._clip, self._clip)
         even = even.flatten(1)[:, self._inside] * self._root_weight
         even = even - (even @ self._root_weight / self._root_weight.square().sum())[:, None] * self._root_weight
-        return even / even.norm(dim=1, keepdim=True).clamp_min(1e-12), contrast[:, 0, 0]
+        return even / even.norm(dim=1, keepdim=True).clamp_min(1e-12), (deviation / (deviation + mean.abs()).clamp_min(1e-12))[:, 0, 0]

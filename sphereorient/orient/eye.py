@@ -40,7 +40,8 @@ class Eye:
         """Half the width of the ball's picture at places (..., 3), along the camera's own right."""
         right = self.camera.R_cam_lab[0] * radius_mm
         ends = self.camera.project(torch.stack([position_lab_mm - right, position_lab_mm + right]))
-        return (ends[1] - ends[0]).norm(dim=-1) / 2
+        width: Tensor = (ends[1] - ends[0]).norm(dim=-1)
+        return width / 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -27,7 +27,7 @@ GROUP = 8  # neighbouring templates whose best one stands for them in the select
 LOOKED_AT = 32  # best groups among which peaks are sought: a broad peak spans several
 TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest detail
 DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
-FLAT = 1e-3  # contrast, as a share of the brightest pixel, below which a picture shows nothing
+FLAT = 1e-3  # contrast below which a picture shows nothing
 
 
 class GreySearch:
@@ -85,7 +85,7 @@ class GreySearch:
             size = f"(F, {self.size_px}, {self.size_px})"
             raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
         parts = [Proposals.none(())]
-        for some in disks.split(PRODUCT):
+        for some in torch.split(disks, PRODUCT):
             place, peak, shown = self.search(some)
             for disk, at, kept, seen in zip(some, place, peak, shown.tolist(), strict=True):
                 starts = self.templates[at[kept][: self._settings.peaks]]
@@ -103,20 +103,20 @@ class GreySearch:
             are peaks, (F, M) bool; and which disks show anything, (F,) bool.
         """
         filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
-        evened = [self._evening(batch) for batch in filled.split(BATCH)]
+        evened = [self._evening(batch) for batch in torch.split(filled, BATCH)]
         steps = torch.cat([_steps(even) for even, _ in evened])[: len(disks)]
-        scores = torch._int_mm(steps, self._bank.T).unflatten(1, self._grid.shape[:2])
-        place = best_of_groups(scores, LOOKED_AT)
+        scores = torch._int_mm(steps, self._bank.T)
+        place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
         apart = math.radians(self._settings.peak_deg)
-        looked_at = self.templates[F.pad(place, (0, 0, 0, -len(disks) % BATCH))].split(BATCH)
-        peak = torch.cat([distinct(R, apart) for R in looked_at])[: len(disks)]
+        looked_at = self.templates[F.pad(place, (0, 0, 0, -len(disks) % BATCH))]
+        peak = torch.cat([distinct(R, apart) for R in torch.split(looked_at, BATCH)])[: len(disks)]
         contrast = torch.cat([part for _, part in evened])[: len(disks)]
-        return place, peak, contrast > FLAT * disks.abs().amax((1, 2))
+        return place, peak, contrast > FLAT
 
     def _templates(self, paint: PaintTable) -> Tensor:
         """Evened views of all rotations, (K, P) int8."""
         normal = self._view.normal_view.T.contiguous()
-        chunks = self.templates.split(BATCH)
+        chunks = torch.split(self.templates, BATCH)
         return torch.cat([_steps(self._evening(self._view.picture(paint.look(R.mT @ normal)[0]))[0]) for R in chunks])
 
     def _climbed(self, disk: Tensor, starts: Tensor) -> Proposals:

@@ -78,7 +78,8 @@ def light_maps(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     # The basis is nearly dependent (x^2 + y^2 + depth^2 = 1): a ridge of 1e-5 picks the smallest coefficients.
     ridge = 1e-5 * normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9)
     solution = torch.linalg.solve(normal + torch.diag_embed(ridge), right).float()
-    return solution.unflatten(-1, (2, -1)).unbind(-2)
+    difference, black = solution.chunk(2, dim=-1)
+    return difference, black
 
 
 def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:

@@ -126,7 +126,8 @@ def cut_pixels(
     window = np.s_[top : max(v + reach + 1, top + 1), left : max(u + reach + 1, left + 1)]
     grey, behind = frame[window].astype(np.float32), background[window]
     if blur_px > 0:
-        grey, behind = (cv2.GaussianBlur(part, (0, 0), blur_px) for part in (grey, behind))
+        grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), blur_px), np.float32)
+        behind = np.asarray(cv2.GaussianBlur(behind, (0, 0), blur_px), np.float32)
     place = (rows - top).clip(0, grey.shape[0] - 1) * grey.shape[1] + (columns - left).clip(0, grey.shape[1] - 1)
     at = torch.from_numpy(rows * width + columns)
     flat = sight.direction.reshape(3, -1)

@@ -59,7 +59,7 @@ class _Residuals:
 
 def light_columns(view: View, light: Light, cameras: int, shading: Shading) -> tuple[Tensor, Tensor, Tensor]:
     """Return what the light's coefficients multiply, (L, K, P), and the learnt maps of difference and black (L, P)."""
-    spread = view.across.unflatten(0, (-1, cameras))
+    spread = _by_pose(view.across, cameras)
     basis = light_basis(spread)
     difference = (light.difference[:, None, :] @ basis)[..., 0, :].flatten(0, 1)
     black = (light.black[:, None, :] @ basis)[..., 0, :].flatten(0, 1)
@@ -117,7 +117,7 @@ def refine(
         normal = (weighted @ at.design.mT).double()
         gradient = (weighted @ at.residual[..., None])[..., 0].double()
         information, pull, mixed = _without_light(normal, gradient)
-        information, pull = (part.unflatten(0, (-1, cameras)) for part in (information, pull))
+        information, pull = (_by_pose(part, cameras) for part in (information, pull))
         seen = use.to(information.dtype)
         whole = (information * seen[..., None, None]).sum(1)
         force = (pull * seen[..., None]).sum(1)
@@ -132,22 +132,22 @@ def refine(
         information[..., :3, :3], pull[..., :3] - (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
     )
     own = own - step[:, None, :3]
-    shared = _shared_scores(at, precision, mixed, pixels.tile).unflatten(0, (-1, cameras))
+    shared = _by_pose(_shared_scores(at, precision, mixed, pixels.tile), cameras)
     meat = (shared * seen[..., None, None]).sum(1)
     if place_precision is not None:  # what was known before has an error of its own
         meat[:, 3:, 3:] += place_precision
     bread = _inverse(whole)
     own_bread = _inverse(information[..., :3, :3])
     covariance = bread @ meat @ bread
-    loss = _loss(at, pixels.inside).unflatten(0, (-1, cameras))
+    loss = _by_pose(_loss(at, pixels.inside), cameras)
     return Fit(
         position_lab_mm=X,
         R_lab_body=R,
         covariance=covariance,
         own_turn=own,
         own_covariance=own_bread @ shared[..., :3, :3] @ own_bread,
-        deviation=at.deviation.double().unflatten(0, (-1, cameras)),
-        score=_score(at, pixels.inside).double().unflatten(0, (-1, cameras)),
+        deviation=_by_pose(at.deviation.double(), cameras),
+        score=_by_pose(_score(at, pixels.inside).double(), cameras),
         nll=(loss * seen).sum(1),
         step=step,
     )
@@ -210,11 +210,17 @@ def _residuals(
     )
 
 
+def _by_pose(disks: Tensor, cameras: int) -> Tensor:
+    """Return (B * C, ...) as (B, C, ...)."""
+    return disks.reshape(-1, cameras, *disks.shape[1:])
+
+
 def _variance(grey: Tensor, noise: Tensor) -> Tensor:
     """Noise expected at grey levels (L, P) by the curves (L, 3)."""
     grey = grey.clamp_min(0.0)
-    a, b, c, d = noise.split(1, dim=-1)
-    return (a + grey * (b + grey * (c + grey * d))).clamp_min(NOISE_MIN)
+    a, b, c, d = noise[..., None].unbind(1)
+    variance: Tensor = a + grey * (b + grey * (c + grey * d))
+    return variance.clamp_min(NOISE_MIN)
 
 
 def _deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
@@ -238,12 +244,14 @@ def _solved(matrix: Tensor, right: Tensor, ridge: float = 1e-9) -> Tensor:
     """Solve small symmetric systems; a direction that nothing determines gets no step."""
     size = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(0)
     floor = ridge * size + 1e-12
-    return torch.linalg.solve_ex(matrix + torch.diag_embed(floor), right[..., None]).result[..., 0]
+    solution: Tensor = torch.linalg.solve_ex(matrix + torch.diag_embed(floor), right[..., None]).result
+    return solution[..., 0]
 
 
 def _inverse(matrix: Tensor) -> Tensor:
     size = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(0)
-    return torch.linalg.inv_ex(matrix + torch.diag_embed(1e-9 * size + 1e-12)).inverse
+    inverse: Tensor = torch.linalg.inv_ex(matrix + torch.diag_embed(1e-9 * size + 1e-12)).inverse
+    return inverse
 
 
 def _bounded(step: Tensor, radius_mm: float) -> Tensor:
@@ -313,7 +321,7 @@ def learn_light(
         pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), radius_mm, paint, blur_px
     )
     normal, right = light_sums(view, pixels, at.weight / at.variance * use.reshape(-1, 1))
-    difference, black = light_maps(normal.unflatten(0, (-1, cameras)).sum(0), right.unflatten(0, (-1, cameras)).sum(0))
+    difference, black = light_maps(_by_pose(normal, cameras).sum(0), _by_pose(right, cameras).sum(0))
     counted = pixels.inside & use.reshape(-1, 1)
     noise = torch.stack(
         [noise_curve(at.model[c::cameras], at.residual[c::cameras], counted[c::cameras]) for c in range(cameras)]

@@ -134,4 +134,4 @@ def _best_blur(fitter: Fitter, base: PaintTable, pixels: Pixels, fit: Fit, use: 
         return BLURS[k]
     bend = left[k - 1] - 2 * left[k] + left[k + 1]
     shift = 0.5 * (left[k - 1] - left[k + 1]) / bend if bend > 0 else 0.0
-    return BLURS[k] * (BLURS[1] / BLURS[0]) ** shift
+    return float(BLURS[k] * (BLURS[1] / BLURS[0]) ** shift)

@@ -31,7 +31,7 @@ def octahedral_directions(side: int) -> Tensor:
     z = 1.0 - x.abs() - y.abs()
     folded_x, folded_y = (1.0 - y.abs()) * torch.sign(x), (1.0 - x.abs()) * torch.sign(y)
     direction = torch.stack([torch.where(z < 0, folded_x, x), torch.where(z < 0, folded_y, y), z], dim=-1)
-    return (direction / direction.norm(dim=-1, keepdim=True)).reshape(-1, 3)
+    return torch.nn.functional.normalize(direction, dim=-1).reshape(-1, 3)
 
 
 def octahedral_cells(x: Tensor, y: Tensor, z: Tensor, side: int) -> Tensor:
@@ -47,7 +47,8 @@ def octahedral_cells(x: Tensor, y: Tensor, z: Tensor, side: int) -> Tensor:
     )
     column = (u + half).to(torch.int32).clamp_(0, side - 1)
     row = (v + half).to(torch.int32).clamp_(0, side - 1)
-    return row * side + column
+    cell: Tensor = row * side + column
+    return cell
 
 
 class PaintTable:
@@ -94,7 +95,7 @@ class PaintTable:
         target = min(blur_rad, 1.6 * self.blur_rad)
         added = math.sqrt(target**2 - self.blur_rad**2)
         parts = [torch.zeros(0, 4)]
-        for centre in octahedral_directions(self.side).split(CHUNK):
+        for centre in torch.split(octahedral_directions(self.side), CHUNK):
             value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
             for share, _, at in _disk_nodes(centre, added, THREE):
                 v, g = self.look(at.T[None])
@@ -114,7 +115,7 @@ def paint_table(texture: Tensor, blur_rad: float, side: int = 512) -> PaintTable
     finest = min(blur_rad, BASE_RAD)
     reduced = reduced_texture(texture.float(), 2.0 / finest)  # pixels as wide as the blur: the rule sees no steps
     parts = [torch.zeros(0, 4)]
-    for centre in octahedral_directions(side).split(CHUNK):
+    for centre in torch.split(octahedral_directions(side), CHUNK):
         value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
         for share, offset, at in _disk_nodes(centre, finest, FIVE):
             v = sample_texture(reduced, at)
