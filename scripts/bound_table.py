@@ -4,7 +4,7 @@
 
 One picture, noise 5 % of the black-white step, optics sigma 0.55 px, background as dark as the black paint. Each
 figure is the root of the mean variance over several seeds of paint and random attitudes. Prints Markdown: orientation,
-degrees, in brackets with centre and radius known; after the slash the ratio to the specification. 60 s on one core.
+degrees, in brackets with centre and radius known; after the slash the ratio to the specification. 35 s of one core.
 
 Paint with twice the border has 0.7 times the bound, so the specification's figures hold for paint as fine as its own:
 blobs with as much border as the experiment's map, 34 dots spread evenly, and polygons of whose number nothing is known
@@ -29,7 +29,7 @@ from sphereorient.sphere import load_texture
 from sphereorient.synth import random_texture
 from sphereorient.synth.textures import map_directions
 
-SEEDS = 6
+SEEDS = 5
 HEIGHT = 512  # of the maps
 # Specified: diameter, then orientation and orientation with known place for each kind, centre for blobs.
 SPECIFIED = {

@@ -22,10 +22,10 @@ REPO = Path(__file__).resolve().parents[1]
 HEAD = """\
 # Parameters
 
-All settings of `--method paper`. A default in **bold** is the paper's number; where the paper gives none, the
-description says why this one. A file with any of them goes in by `--settings FILE` (`configs/paper.yaml` has them all),
-a single one by `--set room.key=value`. The track's attribute `settings` keeps what was used. Made by
-`scripts/make_parameters.py`.
+All settings; each branch says which method reads it. A default in **bold** is the paper's number; where the paper
+gives none, the description says why this one. A file with any of them goes in by `--settings FILE`
+(`configs/default.yaml` has them all), a single one by `--set room.key=value`. The track's attribute `settings` keeps
+what was used. Made by `scripts/make_parameters.py`.
 """
 
 FROM_PAPER = re.compile(r"the paper(:|'s (b|w|\d))")  # "the paper's 12", "the paper: under 5", "the paper's b"
@@ -58,7 +58,7 @@ def pages() -> dict[Path, str]:
     """Every file that this script writes, with its text."""
     return {
         REPO / "docs" / "parameters.md": parameters(),
-        REPO / "configs" / "paper.yaml": settings_yaml(),
+        REPO / "configs" / "default.yaml": settings_yaml(),
         REPO / "configs" / "synth.yaml": synth_settings_yaml(),
     }
 

@@ -79,7 +79,7 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise SettingsError(
             refusal(
-                f"settings {path}", expected="keys and values", got=type(tree).__name__, do="see configs/paper.yaml"
+                f"settings {path}", expected="keys and values", got=type(tree).__name__, do="see configs/default.yaml"
             )
         )
     return tree

@@ -27,7 +27,7 @@ from sphereorient.settings import (
 )
 from sphereorient.synth.settings import SynthSettings
 
-ROOMS = ["locate", "orient", "assemble", "motion"]
+ROOMS = ["locate", "search", "refine", "path", "smooth", "orient", "assemble", "motion"]
 CHANGES = [
     "locate.diameter_px=78.5",
     "locate.gap_frames_max=0",
@@ -208,7 +208,8 @@ def test_the_file_names_and_explains_every_setting():
         model = Settings.model_fields[room].annotation
         assert tree[room].keys() == model.model_fields.keys()
         for key, field in model.model_fields.items():
-            before = lines[next(k for k, line in enumerate(lines) if line.startswith(f"{key}:")) - 1]
+            first = next(k for k, line in enumerate(lines) if line.startswith(f"{room}:"))
+            before = lines[next(k for k, line in enumerate(lines) if k > first and line.startswith(f"{key}:")) - 1]
             assert before.startswith("# ")
             assert before.removeprefix("# ").split()[-1] == field.description.split()[-1]
     assert max(map(len, text.splitlines())) <= 120

@@ -71,4 +71,6 @@ class Evening:
         even = (local * (self._window(local.square()) + self._floor2).rsqrt()).clamp(-self._clip, self._clip)
         even = even.flatten(1)[:, self._inside] * self._root_weight
         even = even - (even @ self._root_weight / self._root_weight.square().sum())[:, None] * self._root_weight
-        return even / even.norm(dim=1, keepdim=True).clamp_min(1e-12), (deviation / (deviation + mean.abs()).clamp_min(1e-12))[:, 0, 0]
+        return even / even.norm(dim=1, keepdim=True).clamp_min(1e-12), (
+            deviation / (deviation + mean.abs()).clamp_min(1e-12)
+        )[:, 0, 0]

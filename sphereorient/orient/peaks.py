@@ -23,7 +23,7 @@ def compact_groups(R: Tensor, size: int) -> Tensor:
     """
     flat = R.flatten(1)
     groups = math.ceil(len(R) / size)
-    index = torch.cat([torch.arange(len(R)), torch.arange(groups * size - len(R))])
+    index = torch.arange(groups * size) % len(R)
 
     def halved(members: Tensor) -> list[Tensor]:
         if len(members) <= size:

@@ -18,6 +18,7 @@ from sphereorient.orient.proposer import Proposer
 from sphereorient.orient.refine import Fit, learn_light
 from sphereorient.orient.settings import RefineSettings
 from sphereorient.sphere.paint_table import PaintTable
+from sphereorient.trajectory import Reason
 
 BLURS = tuple(0.4 * 1.25**k for k in range(8))  # px; what is tried where the blur is not given
 FIRST_BLUR = 0.7  # px: a pixel's own width and a good lens
@@ -71,11 +72,7 @@ def study(
     ]
     chosen = _clear(found)
     if not chosen:
-        reasons = ", ".join(sorted({str(why) for poses in found for why in poses.reason}))
-        do = "check texture, cameras and sphere.diameter; `--method paper` says more"
-        raise ExperimentError(
-            refusal("movies", expected="frames that the map explains", got=f"none ({reasons})", do=do)
-        )
+        raise _nothing(found)
     X = torch.cat([found[k].position_lab_mm[:1] for k in chosen])
     R = torch.cat([found[k].R_lab_body[:1] for k in chosen])
     use = torch.stack([found[k].use for k in chosen])
@@ -92,6 +89,17 @@ def study(
     wrong = torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in chosen])
     highest = float(wrong.quantile(0.9)) if len(wrong) else 0.0
     return Study(fitter=fitter, score_min=0.5 * (right + min(highest, right)), right_score=right)
+
+
+def _nothing(found: Sequence[Poses]) -> ExperimentError:
+    """Say what was missing in all frames: the ball, or a pose of the map that looks like it."""
+    reasons = {str(why) for poses in found for why in poses.reason}
+    got = f"none ({', '.join(sorted(reasons))})"
+    if Reason.LOW_SCORE in reasons:
+        expected, do = "frames that the map explains", "check sphere.texture, and the cameras: are they swapped?"
+    else:
+        expected, do = "the sphere in some frame", "check sphere.diameter and the cameras, or set locate.diameter_px"
+    return ExperimentError(refusal("movies", expected=expected, got=got, do=do))
 
 
 def _clear(found: Sequence[Poses]) -> list[int]:

@@ -1,4 +1,4 @@
-"""The whole method on the bundled excerpt, through the command line as a user runs it."""
+"""The paper's method on the bundled excerpt, through the command line as a user runs it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def sphereorient(*arguments: object) -> subprocess.CompletedProcess[str]:
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
     out = tmp_path_factory.mktemp("excerpt") / "track.h5"
-    return out, sphereorient("track", EXCERPT / "experiment.yaml", "--out", out)
+    return out, sphereorient("track", EXCERPT / "experiment.yaml", "--method", "paper", "--out", out)
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_the_file_has_every_dataset_with_units_and_its_provenance(tracked):
 
 def test_the_python_call_gives_the_same_bytes_as_the_command(tracked):
     out, _ = tracked
-    again = track_movies(EXCERPT / "experiment.yaml")
+    again = track_movies(EXCERPT / "experiment.yaml", method="paper")
     first = Trajectory.load(out)
     for name in ("position", "orientation", "omega_lab", "segment", "flags"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
@@ -96,7 +96,9 @@ def test_the_python_call_gives_the_same_bytes_as_the_command(tracked):
 
 def test_one_camera_alone_tracks_the_orientation_and_says_so(tmp_path):
     out = tmp_path / "one.h5"
-    run = sphereorient("track", EXCERPT / "experiment.yaml", "--out", out, "--cameras", "cam2", "--quiet")
+    run = sphereorient(
+        "track", EXCERPT / "experiment.yaml", "--method", "paper", "--out", out, "--cameras", "cam2", "--quiet"
+    )
     assert run.returncode == 0, run.stderr
     assert run.stdout == ""
     track = Trajectory.load(out)
@@ -110,7 +112,7 @@ def test_one_camera_alone_tracks_the_orientation_and_says_so(tmp_path):
 def test_a_part_of_the_frames_keeps_the_experiments_clock(copy):
     experiment = copy / "experiment.yaml"
     experiment.write_text(experiment.read_text() + "frames: [10, 22]\n")
-    track = track_movies(experiment)
+    track = track_movies(experiment, method="paper")
     assert np.allclose(track.time, np.arange(10, 22) / 600)
     assert score_track(track, EXCERPT / "truth.h5").percentiles_deg()[3] < 5
 
@@ -122,7 +124,7 @@ def test_swapped_cameras_do_not_pass_for_a_measurement(copy):
         aside = first.rename(copy / "aside")
         second.rename(first)
         aside.rename(second)
-    track = track_movies(copy / "experiment.yaml")
+    track = track_movies(copy / "experiment.yaml", method="paper")
     assert score_track(track, EXCERPT / "truth.h5").percentiles_mm()[0] > 5
 
 
@@ -136,7 +138,7 @@ def test_a_mirrored_movie_scores_worse_than_the_right_one(copy, tracked):
     for name in ("cam1", "cam2"):
         empty = cv2.imread(str(copy / f"empty_{name}.png"), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(copy / f"empty_{name}.png"), empty[:, ::-1])
-    mirrored = track_movies(experiment)
+    mirrored = track_movies(experiment, method="paper")
     right = Trajectory.load(tracked[0])
     for name in ("cam1", "cam2"):
         # Either nothing fits (runaway), or what fits best fits visibly worse.
