@@ -227,8 +227,10 @@ def _precise(
     progress: Progress,
 ) -> Trajectory:
     """One likelihood for all cameras: pose after pose refined, then the history, then its motion."""
-    eyes = [open_eye(reel, reels, experiment, settings, progress) for reel in reels]
-    proposers: dict[str, Proposer] = {eye.name: GreySearch(texture, settings.search) for eye in eyes}
+    with ThreadPoolExecutor(len(reels)) as pool:
+        eyes = list(pool.map(lambda reel: open_eye(reel, reels, experiment, settings, progress), reels))
+    search = GreySearch(texture, settings.search)
+    proposers: dict[str, Proposer] = {eye.name: search for eye in eyes}
     learnt = study_movies(reels, eyes, texture, proposers, experiment, settings, progress)
     tracker = BlockTracker(learnt, proposers, settings.locate, settings.refine)
     table = pose_table(list(follow_sphere(reels, frames, tracker, progress)), len(eyes))
@@ -280,7 +282,7 @@ def study_movies(
     learnt = study(
         eyes,
         list(zip(*pictures, strict=True)),
-        base_table(texture),
+        base_table(texture, max(eye.diameter_px for eye in eyes)),
         proposers,
         _radius_mm(experiment),
         settings.locate,

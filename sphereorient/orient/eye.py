@@ -23,6 +23,7 @@ Picture = NDArray[np.generic]
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
 SIZES = 1.06  # ratio of neighbouring sizes of disks for which there is a stencil
+FINEST_PX = 0.4  # least blur of any picture, px: a pixel alone has 0.29
 COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
 
 
@@ -75,9 +76,10 @@ class Optics:
     def __init__(self, base: PaintTable, blur_px: float, diameter_px: float) -> None:
         radius_px = diameter_px / 2
         self.blur_px = blur_px
-        self.coarse, self.middle, self.fine = (
-            level_of(base, blur_px, extra, radius_px) for extra in (COARSE * radius_px, MIDDLE * radius_px, 0.0)
-        )
+        # Each from the one before: the wider the blur, the smaller the table that it is made from.
+        self.fine = level_of(base, blur_px, 0.0, radius_px)
+        self.middle = level_of(self.fine.paint, blur_px, MIDDLE * radius_px, radius_px)
+        self.coarse = level_of(self.middle.paint, blur_px, COARSE * radius_px, radius_px)
 
 
 def level_of(base: PaintTable, blur_px: float, extra_px: float, radius_px: float) -> Level:
@@ -145,6 +147,6 @@ class Fitter:
         )
 
 
-def base_table(texture: Tensor) -> PaintTable:
-    """Return the finest table of a map, from which all others are blurred."""
-    return paint_table(texture, BASE_RAD)
+def base_table(texture: Tensor, diameter_px: float) -> PaintTable:
+    """Return the finest table of a map that disks of some diameter can tell, from which all others are blurred."""
+    return paint_table(texture, max(BASE_RAD, FINEST_PX * 2 / diameter_px))

@@ -92,7 +92,7 @@ class RefineSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     background_frames: int = Field(
-        48, ge=1, description="evenly spread frames whose mean is the background; half as many as paper: starts sooner"
+        32, ge=1, description="evenly spread frames whose mean is the background; fewer than paper's: starts sooner"
     )
     study_frames: int = Field(
         16, ge=1, description="evenly spread frames from which blur, light and noise of the pictures are learnt"

@@ -11,7 +11,7 @@ from torch import Tensor
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.locate import LocateSettings
 from sphereorient.orient.cold import Poses, cold_start
-from sphereorient.orient.eye import Eye, Fitter, Optics, Picture, level_of
+from sphereorient.orient.eye import FINEST_PX, Eye, Fitter, Optics, Picture, level_of
 from sphereorient.orient.light import Light
 from sphereorient.orient.pixels import Pixels
 from sphereorient.orient.proposer import Proposer
@@ -20,8 +20,8 @@ from sphereorient.orient.settings import RefineSettings
 from sphereorient.sphere.paint_table import PaintTable
 from sphereorient.trajectory import Reason
 
-BLURS = tuple(0.4 * 1.25**k for k in range(8))  # px; what is tried where the blur is not given
-FIRST_BLUR = 0.7  # px: a pixel's own width and a good lens
+BLURS = tuple(FINEST_PX * 1.25**k for k in range(8))  # px; what is tried where the blur is not given
+FIRST_BLUR = 0.625  # px: a pixel's own width and a good lens
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,13 +132,24 @@ def _with_light(fitter: Fitter, pixels: Pixels, fit: Fit, use: Tensor, rounds: i
 def _best_blur(fitter: Fitter, base: PaintTable, pixels: Pixels, fit: Fit, use: Tensor) -> float:
     """Return the blur that leaves the least of the pictures unexplained, between the tried ones by a parabola."""
     radius_px = max(eye.diameter_px for eye in fitter.eyes) / 2
-    left = []
-    for blur_px in BLURS:
-        level = level_of(base, blur_px, 0.0, radius_px)
-        tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 2)
-        left.append(float((1.0 - tried.score)[use].median()))
-    k = min(range(len(left)), key=left.__getitem__)
-    if k in (0, len(left) - 1):
+    left: dict[int, float] = {}
+
+    def unexplained(k: int) -> float:
+        if k not in left:
+            level = level_of(base, BLURS[k], 0.0, radius_px)
+            tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 2)
+            left[k] = float((1.0 - tried.score)[use].median())
+        return left[k]
+
+    # Downhill from the first guess: each table of the paint costs a tenth of a second.
+    k = min(range(len(BLURS)), key=lambda k: abs(BLURS[k] - fitter.optics.blur_px))
+    while True:
+        near = [n for n in (k - 1, k, k + 1) if 0 <= n < len(BLURS)]
+        best = min(near, key=unexplained)
+        if best == k:
+            break
+        k = best
+    if k in (0, len(BLURS) - 1):
         return BLURS[k]
     bend = left[k - 1] - 2 * left[k] + left[k + 1]
     shift = 0.5 * (left[k - 1] - left[k + 1]) / bend if bend > 0 else 0.0

@@ -18,6 +18,8 @@ FIVE = (
 THREE = ((-math.sqrt(3.0), 0.0, math.sqrt(3.0)), (1 / 6, 2 / 3, 1 / 6))
 BASE_RAD = 0.008  # blur of the finest table: below half a pixel of any disk that is resolved to 160 px
 CHUNK = 1 << 16  # directions looked up at once while a table is made
+SIDE = 512  # cells along each axis of the finest table: 0.4 degrees, 4 MB
+CELLS_A_BLUR = 3.0  # cells that a blur's standard deviation is wide at least, in tables coarser than the finest
 
 
 def octahedral_directions(side: int) -> Tensor:
@@ -94,8 +96,10 @@ class PaintTable:
         # Nine points are exact for what is smooth over the added width: go there in steps of 1.6 at most.
         target = min(blur_rad, 1.6 * self.blur_rad)
         added = math.sqrt(target**2 - self.blur_rad**2)
+        # A cell is 2.2 / side wide; what is blurred more needs fewer of them.
+        side = min(self.side, 1 << math.ceil(math.log2(2.2 * CELLS_A_BLUR / target)))
         parts = [torch.zeros(0, 4)]
-        for centre in torch.split(octahedral_directions(self.side), CHUNK):
+        for centre in torch.split(octahedral_directions(side), CHUNK):
             value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
             for share, _, at in _disk_nodes(centre, added, THREE):
                 v, g = self.look(at.T[None])
@@ -104,13 +108,13 @@ class PaintTable:
         return PaintTable(torch.cat(parts), target).blurred(blur_rad)
 
 
-def paint_table(texture: Tensor, blur_rad: float, side: int = 512) -> PaintTable:
+def paint_table(texture: Tensor, blur_rad: float, side: int = SIDE) -> PaintTable:
     """Make the table of a map.
 
     Args:
         texture: (H, 2 H), the map, 0 black .. 1 white.
         blur_rad: standard deviation of the Gaussian on the sphere, rad.
-        side: cells along each axis; 512 is 0.4 degrees, 4 MB.
+        side: cells along each axis.
     """
     finest = min(blur_rad, BASE_RAD)
     reduced = reduced_texture(texture.float(), 2.0 / finest)  # pixels as wide as the blur: the rule sees no steps
