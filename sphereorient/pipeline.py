@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path as FilePath
@@ -113,12 +114,24 @@ def track_movies(
         ]
         clock = torch.from_numpy(time_s(experiment, frames))
         compose = {"paper": _paper, "precise": _precise}[method]
-        track = compose(experiment, reels, frames, clock, texture, settings, progress)
+        with one_thread():
+            track = compose(experiment, reels, frames, clock, texture, settings, progress)
         text = settings_yaml(settings)
         return replace(track, method=method, settings=text, provenance=provenance(experiment, names, command))
     finally:
         for movie in movies.values():
             movie.close()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep torch to one thread for a while: its tensors here are small, and idle threads that spin starve decoding."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _paper(

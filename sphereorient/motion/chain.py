@@ -34,7 +34,7 @@ class Solution:
 
     state: Floats  # (N, D)
     covariance: Floats  # (N, D, D), of each state by itself
-    surprise: Floats  # (N,), squared distance of each measurement from what those before it predict, in sigmas
+    innovation: Floats  # (N, 3), what each measurement adds to those before it, whitened
     log_determinant: Floats  # (N,), of that prediction's covariance; both NaN where nothing is measured
 
 
@@ -46,7 +46,7 @@ def solve(chain: Chain) -> Solution:
     count, size = len(chain.measured), len(chain.start_variance)
     states, covariances = np.empty((count, size)), np.empty((count, size, size))
     ahead, ahead_covariances = np.empty_like(states), np.empty_like(covariances)
-    surprise, log_determinant = np.full(count, np.nan), np.full(count, np.nan)
+    innovation, log_determinant = np.full((count, MEASURED), np.nan), np.full(count, np.nan)
     x, P = np.zeros(size), np.diag(chain.start_variance)
     eye = np.eye(size)
     # A recursion: each state needs the one before.
@@ -66,15 +66,16 @@ def solve(chain: Chain) -> Solution:
             left = eye.copy()
             left[:, :MEASURED] -= gain
             P = left @ P @ left.T + gain @ R @ gain.T
-            surprise[k] = miss @ inverse @ miss
-            log_determinant[k] = np.log(np.linalg.det(S))
+            root = np.linalg.cholesky(S)
+            innovation[k] = np.linalg.solve(root, miss)
+            log_determinant[k] = 2.0 * np.log(np.diag(root)).sum()
         states[k], covariances[k] = x, P
     for k in range(count - 2, -1, -1):
         gain = np.linalg.solve(ahead_covariances[k + 1], chain.transition[k] @ covariances[k]).T
         states[k] = states[k] + gain @ (states[k + 1] - ahead[k + 1])
         P = covariances[k] + gain @ (covariances[k + 1] - ahead_covariances[k + 1]) @ gain.T
         covariances[k] = 0.5 * (P + P.T)
-    return Solution(state=states, covariance=covariances, surprise=surprise, log_determinant=log_determinant)
+    return Solution(state=states, covariance=covariances, innovation=innovation, log_determinant=log_determinant)
 
 
 def wiener_noise(step: Floats, order: int) -> tuple[Floats, Floats]:

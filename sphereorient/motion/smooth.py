@@ -99,7 +99,9 @@ def smooth_motion(
     measured = np.isfinite(X).all(1) & np.isfinite(R).all((1, 2))
     extrapolated = torch.from_numpy((numbers >= 0) & ~measured)
     tensors = {name: torch.from_numpy(value) for name, value in out.items()}
-    return Smoothed(**tensors, extrapolated=extrapolated, position_scale=moving.scale, orientation_scale=turning.scale)
+    return Smoothed(
+        **tensors, extrapolated=extrapolated, position_scale=moving.whole_scale, orientation_scale=turning.whole_scale
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +110,13 @@ class _Noise:
 
     band: float  # rad per frame up to which the motion is followed
     variance: float  # of the measurements for which that holds, before `scale`
-    scale: float  # true errors of the measurements over their sigmas
+    scale: float  # errors of the measurements, as they surprise, over their sigmas
+    kinship: float = 1.0  # true errors over those, see `_kinship`
+
+    @property
+    def whole_scale(self) -> float:
+        """True errors of the measurements over their sigmas."""
+        return self.scale * self.kinship
 
 
 def _learnt(tracks: Sequence[S], band_hz: float | None, frame_s: float) -> _Noise:
@@ -128,7 +136,20 @@ def _learnt(tracks: Sequence[S], band_hz: float | None, frame_s: float) -> _Nois
         track, _ = _fitted(track, noise, looseness)
         noise = replace(noise, scale=_surprise(track, noise, looseness)[1])
         looseness = np.maximum(1.0, np.nan_to_num(track.misfit()) / (FAR * noise.scale**2))
-    return noise
+    return replace(noise, kinship=_kinship(track, noise, looseness))
+
+
+def _kinship(track: Segment, noise: _Noise, looseness: Floats) -> float:
+    """Return by how much errors exceed those of independent ones that surprise as much.
+
+    Neighbouring frames look alike, and so do their errors: a part of them passes for motion. It shows in the
+    innovations, which would be white otherwise; a mean of errors with this correlation is so much worse.
+    """
+    innovation = solve(_chain(track, noise, looseness)).innovation[track.measured][STATES:]
+    size = float((innovation**2).sum())
+    correlation = float((innovation[1:] * innovation[:-1]).sum()) / size if size > 0 else 0.0
+    correlation = min(max(correlation, 0.0), 0.8)
+    return float(np.sqrt((1 + correlation) / (1 - correlation)))
 
 
 def _likeliest_band(track: Segment, noise: _Noise, looseness: Floats) -> float:
@@ -146,7 +167,7 @@ def _surprise(track: Segment, noise: _Noise, looseness: Floats) -> tuple[float, 
     """Return the negative log-likelihood of a band, the scale at its best, and that scale."""
     solution = solve(_chain(track, noise, looseness))
     told = np.flatnonzero(track.measured)[STATES:]  # the first few only say where the motion begins
-    surprise, log_determinant = solution.surprise[told], solution.log_determinant[told]
+    surprise, log_determinant = (solution.innovation[told] ** 2).sum(1), solution.log_determinant[told]
     freedom = AXES * len(told)
     scale2 = max(float(surprise.sum()) / freedom, 1e-12)
     return 0.5 * (freedom * float(np.log(scale2)) + float(log_determinant.sum())), float(np.sqrt(scale2))
@@ -173,7 +194,7 @@ def _settled(track: S, noise: _Noise) -> tuple[S, Floats]:
     for _ in range(ROUNDS):
         track, solution = _fitted(track, noise, looseness)
         looseness = np.maximum(1.0, np.nan_to_num(track.misfit()) / (FAR * noise.scale**2))
-    return track, solution.covariance * noise.scale**2
+    return track, solution.covariance * noise.whole_scale**2
 
 
 def _blank(frames: int) -> dict[str, Floats]:

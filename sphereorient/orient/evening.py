@@ -1,4 +1,4 @@
-"""Pictures of the ball freed of light: what neighbouring places differ by, in units of how much they differ there."""
+"""Pictures of the ball freed of light: by how much each place differs from its neighbourhood."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Blur:
 
 
 class Evening:
-    """Makes pictures under any smooth light comparable: local mean taken off, divided by the local deviation.
+    """Makes pictures under any smooth light comparable: the local mean taken off, what sticks out cut off.
 
     The same is done to templates and to pictures, so that both lose the same; all sizes in radii of the disk.
 
@@ -45,32 +45,28 @@ class Evening:
         size_px: side S of the pictures, px; the disk fills them.
         detail: standard deviation of the Gaussian laid over a picture first; what is finer does not count.
         window: standard deviation of the neighbourhood.
-        floor: deviation, as a share of the whole disk's, below which a neighbourhood counts as of one paint.
-        clip: values beyond this many deviations are cut off: reflections.
+        clip: differences from the local mean beyond this many deviations of the disk are cut off: reflections, and
+            the contrast of well lit places over dim ones.
     """
 
-    def __init__(self, size_px: int, *, detail: float, window: float, floor: float, clip: float) -> None:
+    def __init__(self, size_px: int, *, detail: float, window: float, clip: float) -> None:
         radius = disk_offsets(size_px).norm(dim=-1)
         self._inside = torch.nonzero((radius < 1).reshape(-1))[:, 0]
-        self._share = rim_share(size_px)
+        self._share = rim_share(size_px) / rim_share(size_px).sum()
         self._detail, self._window = Blur(size_px, detail), Blur(size_px, window)
-        self._floor2, self._clip = floor**2, clip
+        self._clip = clip
         # Near the limb a small error of the outline turns far: pixels count by their foreshortening.
         depth = (1 - radius.square()).clamp_min(0).sqrt().float()
-        self._root_weight = (depth * self._share.clamp_min(RIM_WEIGHT_MIN)).reshape(-1)[self._inside]
+        self._root_weight = (depth * rim_share(size_px).clamp_min(RIM_WEIGHT_MIN)).reshape(-1)[self._inside]
+        self._unit = self._root_weight / self._root_weight.norm()
 
-    def __call__(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """Return evened pictures, (B, P) of length 1, and their contrast (B,): deviation over deviation plus mean."""
+    def __call__(self, pictures: Tensor) -> Tensor:
+        """Return evened pictures (B, S, S) as vectors (B, P) of length 1; a picture of one grey gives rounding."""
         seen = self._detail(pictures)
-        share, total = self._share, self._share.sum()
-        mean = (seen * share).sum((1, 2), keepdim=True) / total
-        seen = seen - mean
-        deviation = ((seen.square() * share).sum((1, 2), keepdim=True) / total).sqrt()
-        seen = seen / deviation.clamp_min(1e-12)  # the numbers below have no unit
-        local = seen - self._window(seen)
-        even = (local * (self._window(local.square()) + self._floor2).rsqrt()).clamp(-self._clip, self._clip)
-        even = even.flatten(1)[:, self._inside] * self._root_weight
-        even = even - (even @ self._root_weight / self._root_weight.square().sum())[:, None] * self._root_weight
-        return even / even.norm(dim=1, keepdim=True).clamp_min(1e-12), (
-            deviation / (deviation + mean.abs()).clamp_min(1e-12)
-        )[:, 0, 0]
+        mean = (seen * self._share).sum((1, 2), keepdim=True)
+        deviation = ((seen - mean).square() * self._share).sum((1, 2), keepdim=True).sqrt()
+        local = (seen - self._window(seen)) / deviation.clamp_min(1e-12)  # no unit from here on
+        even = local.clamp(-self._clip, self._clip).flatten(1)[:, self._inside] * self._root_weight
+        even = even - (even @ self._unit)[:, None] * self._unit
+        length: Tensor = even.norm(dim=1, keepdim=True)
+        return even / length.clamp_min(1e-12)

@@ -26,8 +26,7 @@ PRODUCT = 128  # disks in one product, at most: the scores of more leave the cac
 GROUP = 8  # neighbouring templates whose best one stands for them in the selection
 LOOKED_AT = 32  # best groups among which peaks are sought: a broad peak spans several
 TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest detail
-DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
-FLAT = 1e-3  # contrast below which a picture shows nothing
+DEVIATIONS = 5.0  # value of a pixel, in root mean squares of its picture, that becomes 127
 
 
 class GreySearch:
@@ -45,9 +44,7 @@ class GreySearch:
         self._settings = settings
         size, distance = settings.size_px, settings.distance_radii
         self._view = orthographic_view(size) if distance is None else perspective_view(size, distance)
-        self._evening = Evening(
-            size, detail=settings.detail, window=settings.window, floor=settings.floor, clip=settings.clip
-        )
+        self._evening = Evening(size, detail=settings.detail, window=settings.window, clip=settings.clip)
         pixel_rad = 2.0 / size
         paint = paint_table(texture, min(pixel_rad, settings.detail), TABLE_SIDE)
         self._rough = climb_level(self._view, paint, settings.detail, every=2)
@@ -75,8 +72,8 @@ class GreySearch:
 
         Returns:
             Proposals, best first. The score is the share of the disk's deviation from smooth light that the paint
-            explains, 0 .. 1 (the square of their correlation). A disk without contrast, or whose best score stays
-            below `score_min`, has none (`LOW_SCORE`).
+            explains, 0 .. 1 (the square of their correlation). A disk whose best score stays below `score_min` has
+            none (`LOW_SCORE`).
 
         Raises:
             ShapeError: the disks are of another size.
@@ -86,38 +83,34 @@ class GreySearch:
             raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
         parts = [Proposals.none(())]
         for some in torch.split(disks, PRODUCT):
-            place, peak, shown = self.search(some)
-            for disk, at, kept, seen in zip(some, place, peak, shown.tolist(), strict=True):
-                starts = self.templates[at[kept][: self._settings.peaks]]
-                parts.append(self._climbed(disk, starts) if seen else Proposals.none([Reason.LOW_SCORE]))
+            for disk, place, peak in zip(some, *self.search(some), strict=True):
+                parts.append(self._climbed(disk, self.templates[place[peak][: self._settings.peaks]]))
         return Proposals.joined(parts)
 
-    def search(self, disks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
         """Compare disks with the whole bank.
 
         Args:
             disks: (F, S, S) float32; the scores of all are held at once, 36 kB each.
 
         Returns:
-            Places of the best templates of the best groups, (F, M) int64 in `templates`, best first; which of them
-            are peaks, (F, M) bool; and which disks show anything, (F,) bool.
+            Places of the best templates of the best groups, (F, M) int64 in `templates`, best first; and which of
+            them are peaks, (F, M) bool.
         """
         filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
-        evened = [self._evening(batch) for batch in torch.split(filled, BATCH)]
-        steps = torch.cat([_steps(even) for even, _ in evened])[: len(disks)]
+        steps = torch.cat([_steps(self._evening(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
         scores = torch._int_mm(steps, self._bank.T)
         place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
         apart = math.radians(self._settings.peak_deg)
         looked_at = self.templates[F.pad(place, (0, 0, 0, -len(disks) % BATCH))]
         peak = torch.cat([distinct(R, apart) for R in torch.split(looked_at, BATCH)])[: len(disks)]
-        contrast = torch.cat([part for _, part in evened])[: len(disks)]
-        return place, peak, contrast > FLAT
+        return place, peak
 
     def _templates(self, paint: PaintTable) -> Tensor:
         """Evened views of all rotations, (K, P) int8."""
         normal = self._view.normal_view.T.contiguous()
         chunks = torch.split(self.templates, BATCH)
-        return torch.cat([_steps(self._evening(self._view.picture(paint.look(R.mT @ normal)[0]))[0]) for R in chunks])
+        return torch.cat([_steps(self._evening(self._view.picture(paint.look(R.mT @ normal)[0]))) for R in chunks])
 
     def _climbed(self, disk: Tensor, starts: Tensor) -> Proposals:
         """Climb from the peaks of one disk: its proposals, best first."""

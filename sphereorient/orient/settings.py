@@ -71,10 +71,12 @@ class GreySearchSettings(BaseModel):
     window: float = Field(
         0.3, gt=0.1, lt=2, description="neighbourhood over which light is taken to be even, radii (standard deviation)"
     )
-    floor: float = Field(
-        0.5, gt=0, description="a neighbourhood deviating less than this share of the disk's deviation is of one paint"
+    clip: float = Field(
+        0.6,
+        gt=0.1,
+        description="differences from the neighbourhood beyond this many deviations of the disk are cut off: "
+        "reflections, places lit better than others",
     )
-    clip: float = Field(2.5, gt=1, description="evened grey values beyond this many deviations are reflections")
     peak_deg: float = Field(20.0, gt=0, lt=90, description="the bank's peaks are at least this far apart")
     peaks: int = Field(8, ge=1, le=32, description="best peaks from which a climb begins")
     rough_steps: int = Field(4, ge=1, description="steps of each climb on coarse detail")
