@@ -146,7 +146,9 @@ def refined(texture: Tensor, seen: CleanSet, start: Poses) -> Poses:
     fitter = Fitter(
         eyes=[eye],
         radius_mm=seen.diameter_mm / 2,
-        optics=Optics(base_table(texture, seen.diameter_px), math.hypot(seen.optics.sigma_px, math.sqrt(1 / 12)), seen.diameter_px),
+        optics=Optics(
+            base_table(texture, seen.diameter_px), math.hypot(seen.optics.sigma_px, math.sqrt(1 / 12)), seen.diameter_px
+        ),
         light=Light.unknown(1, torch.tensor([[noise**2, 0.0, 0.0, 0.0]])),
     )
     pose = fitted(fitter, seen, start, coarse=True)

@@ -16,6 +16,7 @@ from sphereorient.synth.aperture import aperture_matrix, fine_places
 STEP_PX = 0.1  # of central differences, as motion on the picture: their error is 0.5 % of the bound at 0.6 px of blur
 ROUNDING = 1e-6  # an unknown whose own information is below this share of the greatest moves nothing but last digits
 DETERMINED = 1e-3  # with each unknown's own information 1: differences of sampled pictures tell no less from nothing
+OPEN_SHARE = 1e-3  # an unknown is open if this share of it lies along open directions
 ATTITUDES = 16  # whose derivatives are held at once
 SAMPLES = 1 << 18  # fine samples drawn at once, of all pictures together: more leave the cache
 
@@ -43,7 +44,7 @@ class Bound:
     @property
     def orientation_known_place_rms_rad(self) -> Tensor:
         """(...), the same with centre and radius known."""
-        return _root_trace(_inverse(self.information[..., :3, :3]))
+        return _root_trace(_inverse(self.information, 3))
 
     @property
     def centre_rms_px(self) -> Tensor:
@@ -79,8 +80,7 @@ def cramer_rao_bound(
             proportional to it.
         optics_sigma_px: standard deviation of the optics' blur, px; the pixel comes on top.
         background: grey behind the disk, 0 as the black paint, 1 as the white.
-        supersampling: fine samples per pixel and axis; 6 is right to 2 % from 40 px up, 12 from 20 px up
-            (scripts/bound_table.py).
+        supersampling: fine samples per pixel and axis; 6 is right to 3 % from 20 px up, 4 from 40 px up.
 
     Raises:
         ShapeError: attitudes that are not 3 x 3, or a map that is not 2:1.
@@ -102,7 +102,7 @@ def cramer_rao_bound(
     )
     flat = R_view_body.reshape(-1, 3, 3)
     parts = [flat.new_zeros(0, 6, 6)]
-    for R in flat.split(ATTITUDES):
+    for R in torch.split(flat, ATTITUDES):
         jacobian = disk.jacobian(R)
         parts.append(jacobian.mT @ jacobian / noise_share**2)
     return Bound(information=torch.cat(parts).reshape(*R_view_body.shape[:-2], 6, 6))
@@ -125,8 +125,8 @@ class DiskPicture:
         self.texture, self.radius_px, self.background = texture, radius_px, background
         self.supersampling = supersampling
         self.size_px = 2 * math.ceil(radius_px + 4 * optics_sigma_px + 1)
-        self.aperture = aperture_matrix(self.size_px, supersampling, optics_sigma_px, texture.dtype)
-        at = fine_places(self.size_px, supersampling, texture.dtype) - 0.5 * (self.size_px - 1)
+        self.aperture = aperture_matrix(self.size_px, supersampling, optics_sigma_px).to(texture)
+        at = fine_places(self.size_px, supersampling).to(texture) - 0.5 * (self.size_px - 1)
         down, right = torch.meshgrid(at, at, indexing="ij")
         # Only samples that the disk reaches while its centre and radius move by up to half a pixel.
         self.reached = right.square() + down.square() < (radius_px + 1.0) ** 2
@@ -163,24 +163,25 @@ class DiskPicture:
         R = (so3.exp(both[:, :3]) @ R_view_body[:, None]).flatten(0, 1)
         centre_px, radius_px = both[:, 3:5].repeat(count, 1), self.radius_px + both[:, 5].repeat(count)
         at_once = max(1, SAMPLES // len(self.place))
-        parts = zip(R.split(at_once), centre_px.split(at_once), radius_px.split(at_once), strict=True)
-        pictures = torch.cat([self(*part) for part in parts]).reshape(count, 2, 6, -1)
+        parts = zip(*(torch.split(each, at_once) for each in (R, centre_px, radius_px)), strict=True)
+        pictures = torch.cat([self(*part) for part in parts]).reshape(count, 2, 6, self.size_px**2)
         return ((pictures[:, 0] - pictures[:, 1]) / (2 * step[:, None])).mT
 
 
-def _inverse(information: Tensor) -> Tensor:
-    """Invert information (..., K, K); unknowns that it leaves open get an infinite variance."""
-    # In units in which each unknown's own information is 1, as far as it has any: rad and px cannot be compared.
+def _inverse(information: Tensor, count: int = 6) -> Tensor:
+    """Invert information (..., 6, 6) of the first `count` unknowns, the others known; what is open gets infinity."""
     own = information.diagonal(dim1=-2, dim2=-1).clamp_min(0)
+    # What is rounding shows beside the outline's information, not among unknowns that may all be open.
     greatest = own.amax(-1, keepdim=True).clamp_min(torch.finfo(own.dtype).tiny)
+    own, information = own[..., :count], information[..., :count, :count]
+    # In units in which each unknown's own information is 1, as far as it has any: rad and px cannot be compared.
     unit = torch.where(own > ROUNDING * greatest, own, greatest).rsqrt()
     value, axis = torch.linalg.eigh(information * unit[..., None] * unit[..., None, :])
     open_ = value < DETERMINED
     weight = torch.where(open_, 0.0, 1.0 / torch.where(open_, 1.0, value))
     covariance = (axis * weight[..., None, :]) @ axis.mT * unit[..., None] * unit[..., None, :]
-    lost = (axis.square() * open_[..., None, :]).sum(-1) > 1e-3
-    apart = lost[..., None] | lost[..., None, :]
-    covariance = torch.where(apart, 0.0, covariance)
+    lost = (axis.square() * open_[..., None, :]).sum(-1) > OPEN_SHARE
+    covariance = torch.where(lost[..., None] | lost[..., None, :], 0.0, covariance)
     return covariance + torch.diag_embed(torch.where(lost, torch.inf, 0.0))
 
 

@@ -49,17 +49,19 @@ class _Lane:
         if len(rows) < 2 or [number for number, _ in self.past][-2:] != [frame - 2, frame - 1]:
             return None
         *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
+        *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
         *_, R0, R1 = (poses.R_lab_body[0] for poses in rows)
-        turn, move = so3.log(R1 @ R0.mT), X1 - X0
+        turn, move, spread = so3.log(R1 @ R0.mT), X1 - X0, 4 * C1 + C0
         if len(rows) == 3:
             turn = 2 * turn - so3.log(R0 @ rows[0].R_lab_body[0].mT)
             move = 2 * move - (X0 - rows[0].position_lab_mm[0])
+            spread = 9 * C1 + 9 * C0 + rows[0].covariance[0, 3:, 3:]
         astray = (ASTRAY_SHARE * radius_mm) ** 2 * torch.eye(3, dtype=torch.float64)
         return _Expected(
             position_lab_mm=X1 + move,
             R_lab_body=so3.exp(turn) @ R1,
-            use=rows[-1].use | rows[-1].again,
-            place_precision=torch.linalg.inv(rows[-1].covariance[0, 3:, 3:] + astray),
+            use=rows[-1].use,
+            place_precision=torch.linalg.inv(spread + astray),
         )
 
     def saw(self, frame: int, poses: Poses) -> None:
@@ -156,13 +158,21 @@ class BlockTracker:
             more = self.fitter.fit(half, fit.position_lab_mm, fit.R_lab_body, use, fine, 2, precision)
             fit = _chosen(far, more, fit)
         fit = self.fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 1, precision)
-        seen = fit.score >= self.score_min
-        borne_out = (seen | ~use).all(1) & (fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD)
+        if not bool(use.all()):
+            # A camera that was blind may see again: that shows at the pose which all of them give together.
+            every = torch.ones_like(use)
+            both = self.fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, every, fine, 3)
+            back = ~use.all(1) & self._borne_out(both, every)
+            fit, use = _chosen(back, both, fit), use | back[:, None]
+        borne_out = self._borne_out(fit, use)
         reasons = [[Reason.OK if ok else Reason.LOW_SCORE for ok in row] for row in use.tolist()]
         return [
-            replace(poses_of(fit, torch.tensor([n]), use[n], reasons[n]), again=seen[n]) if borne_out[n] else None
-            for n in range(asked)
+            poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if borne_out[n] else None for n in range(asked)
         ]
+
+    def _borne_out(self, fit: Fit, use: Tensor) -> Tensor:
+        """Poses that have arrived and that all pictures in use explain well, (B,) bool."""
+        return ((fit.score >= self.score_min) | ~use).all(1) & (fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD)
 
     def _search(self, frames: Sequence[Picture]) -> Poses:
         """Find the poses of a frame of which nothing is known, by those cameras whose pictures bear them out."""

@@ -107,8 +107,14 @@ def climb(level: Level, target: Target, R_view_body: Tensor, steps: int) -> tupl
         # Turning the body by epsilon, R exp(epsilon), changes the paint by epsilon . (slope x normal).
         turned = _cross(slope, normal_body) * gain[:, None]
         turn = _solved(torch.cat([light, turned], dim=1), left, weight)[:, -3:]
-        R = R @ so3.exp(turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0))
+        R = R @ _rotation(turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0))
     return R, _score(level, target, R, weight)
+
+
+def _rotation(turn: Tensor) -> Tensor:
+    """Return rotations (Q, 3, 3) by Cayley's formula: as `so3.exp` but for terms of third order, much faster."""
+    H = so3.hat(turn)
+    return torch.eye(3) + (H + 0.5 * H @ H) / (1.0 + 0.25 * turn.square().sum(-1))[:, None, None]
 
 
 def _score(level: Level, target: Target, R: Tensor, weight: Tensor) -> Tensor:

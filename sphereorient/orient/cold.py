@@ -40,7 +40,6 @@ class Poses:
     score: Tensor  # (M, C)
     nll: Tensor  # (M,)
     use: Tensor  # (C,) bool, cameras whose pictures count
-    again: Tensor  # (C,) bool, cameras whose pictures bear the pose out, counted or not: they count in the next frame
     reason: tuple[Reason, ...]  # C
 
     def __len__(self) -> int:
@@ -53,7 +52,7 @@ POSE_PARTS = ("position_lab_mm", "R_lab_body", "covariance", "own_turn", "own_co
 
 def poses_of(fit: Fit, chosen: Tensor, use: Tensor, reason: Sequence[Reason]) -> Poses:
     """Return some rows of a fit as the poses of one frame."""
-    return Poses(**{name: getattr(fit, name)[chosen] for name in POSE_PARTS}, use=use, again=use, reason=tuple(reason))
+    return Poses(**{name: getattr(fit, name)[chosen] for name in POSE_PARTS}, use=use, reason=tuple(reason))
 
 
 def no_pose(cameras: int, reason: Sequence[Reason]) -> Poses:
@@ -62,7 +61,7 @@ def no_pose(cameras: int, reason: Sequence[Reason]) -> Poses:
     tails |= {"own_covariance": (cameras, 3, 3), "deviation": (cameras,), "score": (cameras,), "nll": ()}
     none = torch.zeros(cameras, dtype=torch.bool)
     parts = {name: torch.zeros(0, *tail, dtype=torch.float64) for name, tail in tails.items()}
-    return Poses(**parts, use=none, again=none, reason=tuple(reason))
+    return Poses(**parts, use=none, reason=tuple(reason))
 
 
 def cold_start(
@@ -156,14 +155,18 @@ def _narrow(
     """Fit all starts to coarse detail, and the best distinct ones to finer and finer."""
     X = place.expand(len(R), 3)
     optics = fitter.optics
-    for level, iterations, keep in (
-        (optics.coarse, 4, finalists + 1),
-        (optics.middle, 3, finalists),
-        (optics.fine, 3, finalists),
-    ):
+    # (level, every which pixel, iterations, poses kept): what is coarse needs few pixels, and the last look all.
+    steps = (
+        (optics.coarse, 1, 4, finalists + 1),
+        (optics.middle, 3, 3, finalists),
+        (optics.fine, 2, 2, finalists),
+        (optics.fine, 1, 2, finalists),
+    )
+    for level, every, iterations, keep in steps:
         held = None if level is optics.fine else precision.expand(len(R), 3, 3)
         # All starts of a level look at the same pixels: those about the place the outlines give.
         one = fitter.pixels([pictures], place, level)
+        one = one.every(torch.arange(0, one.grey.shape[1], every))
         pixels = one.where(torch.arange(len(one)).repeat(len(R)))
         fit = fitter.fit(pixels, X, R, use.expand(len(R), -1), level, iterations, held)
         chosen = distinct(fit.R_lab_body, fit.nll, keep)

@@ -68,5 +68,4 @@ class Evening:
         local = (seen - self._window(seen)) / deviation.clamp_min(1e-12)  # no unit from here on
         even = local.clamp(-self._clip, self._clip).flatten(1)[:, self._inside] * self._root_weight
         even = even - (even @ self._unit)[:, None] * self._unit
-        length: Tensor = even.norm(dim=1, keepdim=True)
-        return even / length.clamp_min(1e-12)
+        return torch.nn.functional.normalize(even, dim=1)

@@ -39,10 +39,13 @@ class Eye:
 
     def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
         """Half the width of the ball's picture at places (..., 3), along the camera's own right."""
+        return self.disk_px(position_lab_mm, radius_mm)[1]
+
+    def disk_px(self, position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
+        """Return where balls at places (..., 3) appear: (u, v) of their centres (..., 2), and radii (...), px."""
         right = self.camera.R_cam_lab[0] * radius_mm
-        ends = self.camera.project(torch.stack([position_lab_mm - right, position_lab_mm + right]))
-        width: Tensor = (ends[1] - ends[0]).norm(dim=-1)
-        return width / 2
+        centre, rim = self.camera.project(torch.stack([position_lab_mm, position_lab_mm + right]))
+        return centre, (rim - centre).norm(dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,9 +113,10 @@ class Fitter:
             position_lab_mm: (B, 3), where the ball is, to a few pixels.
             level: of detail.
         """
-        middles = [torch.nan_to_num(eye.camera.project(position_lab_mm)).tolist() for eye in self.eyes]
-        largest = torch.stack([eye.radius_px(position_lab_mm, self.radius_mm) for eye in self.eyes]).nan_to_num().max()
-        stencil = level.stencil(min(float(largest), 0.5 * max(self.eyes[0].camera.image_size)))
+        disks = [eye.disk_px(position_lab_mm, self.radius_mm) for eye in self.eyes]
+        middles = [torch.nan_to_num(centre).tolist() for centre, _ in disks]
+        largest = max(float(radius.nan_to_num().max()) for _, radius in disks)
+        stencil = level.stencil(min(largest, 0.5 * max(self.eyes[0].camera.image_size)))
         return stacked(
             [
                 cut_pixels(frame, eye.background.mean, eye.sight, tuple(middles[c][b]), stencil, level.extra_px)

@@ -26,7 +26,7 @@ PRODUCT = 128  # disks in one product, at most: the scores of more leave the cac
 GROUP = 8  # neighbouring templates whose best one stands for them in the selection
 LOOKED_AT = 32  # best groups among which peaks are sought: a broad peak spans several
 TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest detail
-DEVIATIONS = 5.0  # value of a pixel, in root mean squares of its picture, that becomes 127
+DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
 
 
 class GreySearch:

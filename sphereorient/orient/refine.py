@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.orient.light import Light, light_basis, light_maps, light_sums, noise_curve, polynomials
+from sphereorient.orient.light import Light, light_maps, light_sums, noise_curve, polynomials
 from sphereorient.orient.picture import View, sphere_view
 from sphereorient.orient.pixels import Pixels
 from sphereorient.sphere.paint_table import PaintTable
@@ -57,12 +57,9 @@ class _Residuals:
     coverage: Tensor  # (L, P), share of each pixel that is ball
 
 
-def light_columns(view: View, light: Light, cameras: int, shading: Shading) -> tuple[Tensor, Tensor, Tensor]:
+def light_columns(view: View, light: Light, shading: Shading) -> tuple[Tensor, Tensor, Tensor]:
     """Return what the light's coefficients multiply, (L, K, P), and the learnt maps of difference and black (L, P)."""
-    spread = _by_pose(view.across, cameras)
-    basis = light_basis(spread)
-    difference = (light.difference[:, None, :] @ basis)[..., 0, :].flatten(0, 1)
-    black = (light.black[:, None, :] @ basis)[..., 0, :].flatten(0, 1)
+    difference, black = light.at(view.across)
     tints = polynomials(view.across, max(shading.difference, shading.black))
     n_difference, n_black = ((order + 1) * (order + 2) // 2 for order in (shading.difference, shading.black))
     lit = (view.coverage * (view.paint * difference + black))[:, None]
@@ -169,7 +166,7 @@ def _residuals(
     view = sphere_view(
         pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), radius_mm, paint, blur_px
     )
-    columns, difference, black = light_columns(view, light, cameras, shading)
+    columns, difference, black = light_columns(view, light, shading)
     beyond = (1.0 - view.coverage) * pixels.behind
     noise = light.noise.repeat(len(X), 1)
     target = pixels.grey - beyond

@@ -6,22 +6,21 @@ import torch
 from torch import Tensor
 
 
-def fine_places(size_px: int, supersampling: int, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return the middles of the fine samples along one axis of a picture, (size supersampling,) px.
+def fine_places(size_px: int, supersampling: int) -> Tensor:
+    """Return the middles of the fine samples along one axis of a picture, (size supersampling,) float64, px.
 
     Whole numbers are pixel centres: the first pixel spans -0.5 .. 0.5.
     """
-    return (torch.arange(size_px * supersampling, dtype=dtype) + 0.5) / supersampling - 0.5
+    return (torch.arange(size_px * supersampling, dtype=torch.float64) + 0.5) / supersampling - 0.5
 
 
-def aperture_matrix(size_px: int, supersampling: int, sigma_px: float, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return the weights of the fine samples in each pixel, (S, S supersampling); picture = A fine A^T.
+def aperture_matrix(size_px: int, supersampling: int, sigma_px: float) -> Tensor:
+    """Return the weights of the fine samples in each pixel, (S, S supersampling) float64; picture = A fine A^T.
 
     Args:
         size_px: S, side of the picture, px.
         supersampling: fine samples per pixel and axis.
         sigma_px: standard deviation of the optics' Gaussian, px; 0 leaves the pixel's own square.
-        dtype: of the result.
 
     Returns:
         Rows that sum to 1, but for those near the border, whose aperture reaches beyond the picture.
@@ -35,4 +34,5 @@ def aperture_matrix(size_px: int, supersampling: int, sigma_px: float, dtype: to
         weight = ndtr((offset + 0.5) / sigma_px) - ndtr((offset - 0.5) / sigma_px)
     else:
         weight = (offset.abs() < 0.5).double()
-    return (weight / supersampling).to(dtype)
+    rows: Tensor = weight / supersampling
+    return rows

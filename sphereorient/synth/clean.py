@@ -135,7 +135,7 @@ def render_clean(
     aperture = aperture_matrix(size, supersampling, optics.sigma_px)
     texture = reduced_texture(texture, supersampling * 2 * reach_px).double()
     pictures = torch.full((len(middle_px), height, width), optics.black, dtype=torch.float32)
-    for rows in torch.arange(len(middle_px)).split(RENDERED_AT_ONCE):
+    for rows in torch.split(torch.arange(len(middle_px)), RENDERED_AT_ONCE):
         fine = torch.zeros(len(rows), *reached.shape, dtype=torch.float64)
         fine[:, reached] = _fine_picture(
             texture,
@@ -172,7 +172,8 @@ def _fine_picture(
     beside = camera.rays(uv_px[:, :1] + uv_px.new_tensor([1.0 / supersampling, 0.0])).direction_lab
     fine_mm = (beside - rays.direction_lab[:, :1]).norm(dim=-1) * to_centre.norm(dim=-1)
     share = ((radius_mm - aside_mm) / fine_mm + 0.5).clamp(0, 1)
-    return share * sample_texture(texture, normal @ R_lab_body)
+    seen: Tensor = share * sample_texture(texture, normal @ R_lab_body.mT)
+    return seen
 
 
 def _reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> float:
@@ -180,4 +181,4 @@ def _reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> floa
     middle_px = camera.project(position_lab_mm)
     across = 1.04 * radius_mm * camera.R_cam_lab[:2]
     rim_px = camera.project(position_lab_mm[:, None] + torch.cat([across, -across]))
-    return float((rim_px - middle_px[:, None]).norm(dim=-1).max()) if len(middle_px) else 0.0
+    return float((rim_px - middle_px[:, None]).norm(dim=-1).max()) if len(middle_px) else 1.0

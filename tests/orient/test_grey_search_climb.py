@@ -12,7 +12,7 @@ from grey_examples import KINDS, SIZE
 from orient_examples import attitudes, texture_of
 
 from sphereorient import so3
-from sphereorient.orient.climb import Level, climb, climb_level, level_target
+from sphereorient.orient.climb import Level, _rotation, climb, climb_level, level_target
 from sphereorient.orient.evening import Blur, Evening, rim_share
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.paint_table import PaintTable, paint_table
@@ -68,6 +68,13 @@ def test_each_axis_is_turned_the_right_way():
     starts = so3.exp(math.radians(2.0) * torch.cat([axes, -axes])) @ R
     found, _ = climb(level, target, starts.float(), 1)
     assert so3.geodesic_distance(found.double(), R).rad2deg().max() < 0.7
+
+
+def test_the_steps_rotation_is_one_and_that_of_exp_to_third_order():
+    turn = 0.14 * torch.nn.functional.normalize(torch.randn(30, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    R = _rotation(turn)
+    assert_close(R @ R.mT, torch.eye(3).expand(30, 3, 3), atol=1e-6)
+    assert so3.geodesic_distance(R, so3.exp(turn)).max() < 0.14**3 / 12 + 1e-6
 
 
 def test_half_the_pixels_arrive_too():

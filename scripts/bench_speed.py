@@ -1,0 +1,238 @@
+"""Where the time goes: each stage of the precise method, against the paper's literal method and against its floor.
+
+    scripts/bench_speed.py EXPERIMENT_FOLDER [--frames 240]
+
+CPU seconds of one thread for the stages, best of the repetitions, and wall seconds of the whole command in a fresh
+process. Other programs on the machine only ever make them longer: compare within one run. Prints Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+
+from sphereorient import locate, so3
+from sphereorient.experiment import Experiment, frame_numbers, load_experiment, movie_span, open_movies
+from sphereorient.orient import (
+    BlockTracker,
+    Eye,
+    GreySearch,
+    LinesOfSight,
+    Study,
+    base_table,
+    cold_start,
+    crop_disk,
+    extract_paint,
+    study,
+)
+from sphereorient.settings import Settings
+from sphereorient.sphere import SphereRenderer, load_texture, orthographic_view, reduced_texture
+
+FOLLOWED = 48  # frames over which one prediction after the other is timed
+TOLD = """
+import json, sys, time
+begun = time.perf_counter()
+from sphereorient.pipeline import track_movies
+told = []
+track = track_movies(sys.argv[1], progress=lambda *what: told.append((*what, time.perf_counter() - begun)))
+print(json.dumps({"told": told, "end": time.perf_counter() - begun, "cpu": time.process_time()}))
+"""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bench:
+    """What the stages work on: the first frames of an experiment, and all that is learnt before."""
+
+    experiment: Experiment
+    eyes: list[Eye]
+    pictures: list[list[np.ndarray]]  # per eye
+    search: GreySearch
+    learnt: Study
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--frames", type=int, default=240)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    print("| what | figure |\n|---|---|")
+    bench = prepared(arguments.folder)
+    predicted_s = stages(bench)
+    literal(bench, predicted_s)
+    with tempfile.TemporaryDirectory() as folder:
+        whole("FFV1", arguments.folder / "experiment.yaml", len(bench.eyes))
+        whole(".npy", as_npy(arguments.folder, Path(folder), arguments.frames), len(bench.eyes))
+
+
+def say(what: str, figure: str) -> None:
+    print(f"| {what} | {figure} |", flush=True)
+
+
+def cpu_s(work: Callable[[], object], repetitions: int = 5) -> float:
+    """Least CPU seconds of some calls."""
+    spent = []
+    for _ in range(repetitions):
+        begin = time.process_time()
+        work()
+        spent.append(time.process_time() - begin)
+    return min(spent)
+
+
+def prepared(folder: Path) -> Bench:
+    """Learn what the stages need, as the pipeline does."""
+    experiment, settings = load_experiment(folder / "experiment.yaml"), Settings()
+    names = list(experiment.cameras)
+    movies = open_movies(experiment, names)
+    frames = frame_numbers(experiment, movies)
+    eyes, pictures, sampled = [], [], []
+    for name in names:
+        span = range(*movie_span(experiment, name, frames))
+        diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
+        spread = locate.spread_frames(span, settings.refine.background_frames)
+        background = locate.learn_background(movies[name], spread, diameter_px, settings.locate)
+        camera = experiment.cameras[name]
+        eyes.append(
+            Eye(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
+        )
+        pictures.append(list(movies[name].frames(span.start, span.start + FOLLOWED)))
+        sampled.append(movies[name].sample(locate.spread_frames(span, settings.refine.study_frames)))
+        movie = movies[name]
+        decoding = cpu_s(lambda movie=movie, span=span: list(movie.frames(span.start, span.start + 20)), 3) / 20
+        say(f"decoding {name}, CPU ms a frame (floor of a movie)", f"{1e3 * decoding:.2f}")
+    texture = load_texture(experiment.texture_path)
+    search = GreySearch(texture, settings.search)
+    say("search bank, CPU s", f"{cpu_s(lambda: GreySearch(texture, settings.search), 2):.2f}")
+    base = base_table(texture, max(eye.diameter_px for eye in eyes))
+    proposers = {eye.name: search for eye in eyes}
+    begin = time.process_time()
+    learnt = study(
+        eyes,
+        list(zip(*sampled, strict=True)),
+        base,
+        proposers,
+        experiment.diameter_mm / 2,
+        settings.locate,
+        settings.refine,
+    )
+    say("study (light, blur, noise), CPU s", f"{time.process_time() - begin:.2f}")
+    return Bench(experiment=experiment, eyes=eyes, pictures=pictures, search=search, learnt=learnt)
+
+
+def stages(bench: Bench) -> float:
+    """Time single frames: found from nothing, and predicted; return CPU s of a predicted one and camera."""
+    settings, cameras = Settings(), len(bench.eyes)
+    proposers = {eye.name: bench.search for eye in bench.eyes}
+    frames = [movie[0] for movie in bench.pictures]
+    for eye, frame in zip(bench.eyes, frames, strict=True):
+        seen = cpu_s(
+            lambda eye=eye, frame=frame: locate.find_ball(frame, eye.background, eye.diameter_px, settings.locate)
+        )
+        say(f"outline in a full frame, {eye.name}, CPU ms", f"{1e3 * seen:.1f}")
+    outline, _ = locate.find_ball(frames[0], bench.eyes[0].background, bench.eyes[0].diameter_px, settings.locate)
+    assert outline is not None
+
+    def first_pose() -> object:
+        disk = crop_disk(frames[0], outline.u_px, outline.v_px, outline.radius_px, bench.search.size_px)
+        return bench.search.propose(torch.from_numpy(disk)[None])
+
+    say("first pose of a disk without history (crop, search, climb), CPU ms; bar 20", f"{1e3 * cpu_s(first_pose):.1f}")
+    found = cpu_s(
+        lambda: cold_start(
+            bench.learnt.fitter, proposers, frames, settings.locate, candidates=settings.refine.candidates
+        )
+    )
+    say("frame without history, outlines to covariances, CPU ms a camera", f"{1e3 * found / cameras:.1f}")
+    tracker = BlockTracker(bench.learnt, proposers, settings.locate, settings.refine)
+    short = cpu_s(lambda: list(tracker.track([movie[:2] for movie in bench.pictures], [2])), 3)
+    long = cpu_s(lambda: list(tracker.track(bench.pictures, [FOLLOWED])), 3)
+    each = (long - short) / (FOLLOWED - 2) / cameras
+    say("predicted frame, decoded already, with covariance, CPU ms a camera; bar 3.7", f"{1e3 * each:.2f}")
+    say("refinement, camera-frames per CPU second (two cores: twice); bar 300", f"{1 / each:.0f}")
+    return each
+
+
+def literal(bench: Bench, predicted_s: float) -> None:
+    """Time the paper's literal search: 12 then 3 degrees, every template rendered at full size."""
+    settings = Settings().orient
+    eye, frame = bench.eyes[0], bench.pictures[0][0]
+    outline, _ = locate.find_ball(frame, eye.background, eye.diameter_px, Settings().locate)
+    assert outline is not None
+    size_px = round(2 * outline.radius_px)
+    view = orthographic_view(size_px)
+    texture = reduced_texture(load_texture(bench.experiment.texture_path), size_px)
+    renderer = SphereRenderer(texture, view)
+    disk = torch.from_numpy(crop_disk(frame, outline.u_px, outline.v_px, outline.radius_px, size_px))[None]
+    signs = extract_paint(disk, view.inside, settings)[0][view.inside]
+    coarse = so3.lattman_grid(math.radians(12.0)).float()
+    fine = so3.local_grid(math.radians(3.0), math.radians(12.0)).float()
+
+    def quality(R: torch.Tensor) -> torch.Tensor:
+        parts = [torch.sign(renderer.disk(part) - 0.5) @ signs / len(signs) for part in torch.split(R, 64)]
+        return 0.5 + 0.5 * torch.cat(parts)
+
+    def once() -> None:
+        first = quality(coarse)
+        keep = coarse[first > first.max() - 0.1]
+        groups: list[torch.Tensor] = []
+        for R in keep:
+            if all(so3.geodesic_distance(R, other) > math.radians(30) for other in groups):
+                groups.append(R)
+        for R in groups:
+            quality(R @ fine)
+
+    paper = cpu_s(once, 1)
+    proposers = {each.name: bench.search for each in bench.eyes}
+    frames = [movie[0] for movie in bench.pictures]
+    ours = cpu_s(lambda: cold_start(bench.learnt.fitter, proposers, frames, Settings().locate, candidates=4)) / len(
+        bench.eyes
+    )
+    say("the paper's literal search, full-size renderings, CPU s a camera and frame", f"{paper:.1f}")
+    say("ratio to a frame without history, outline and refinement included", f"{paper / ours:.0f}")
+    block = Settings().refine.block_frames
+    mean = (2 * ours + (block - 2) * predicted_s) / block
+    say(f"ratio to the mean frame of a block of {block}, refinement included; bar 100", f"{paper / mean:.0f}")
+
+
+def as_npy(folder: Path, out: Path, count: int) -> Path:
+    """Write an experiment's movies as .npy, forwards and backwards until there are `count` frames."""
+    entry = yaml.safe_load((folder / "experiment.yaml").read_text())
+    experiment = load_experiment(folder / "experiment.yaml")
+    movies = open_movies(experiment, list(experiment.cameras))
+    for name, movie in movies.items():
+        frames = np.stack(list(movie.frames(0, len(movie))))
+        there_and_back = np.concatenate([frames, frames[::-1]])
+        np.save(out / f"{name}.npy", there_and_back[np.arange(count) % len(there_and_back)])
+    entry["movies"] = {name: str(out / f"{name}.npy") for name in movies}
+    entry["cameras"] = str((folder / "cameras.yaml").resolve())
+    entry["sphere"]["texture"] = str(experiment.texture_path.resolve())
+    (out / "experiment.yaml").write_text(yaml.safe_dump(entry))
+    return out / "experiment.yaml"
+
+
+def whole(kind: str, experiment: Path, cameras: int) -> None:
+    """Time the whole command in a fresh process."""
+    run = subprocess.run([sys.executable, "-c", TOLD, str(experiment)], capture_output=True, text=True, check=True)
+    result = json.loads(run.stdout)
+    tracked = [(done, total, at) for stage, done, total, at in result["told"] if stage == "track"]
+    begin, (_, total, _) = tracked[0][2], tracked[0]
+    say(f"{kind}: start-up to tracking, wall s; bar 5", f"{begin:.1f}")
+    rate = cameras * total / (result["end"] - begin)
+    say(f"{kind}: camera-frames per wall second, start-up apart; bars 120 (FFV1), 250 (.npy)", f"{rate:.0f}")
+    say(f"{kind}: CPU s in all, {total} frames of {cameras} cameras", f"{result['cpu']:.1f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""How often a single frame, of which nothing is known, gets the right orientation: found, fitted, within 1 degree.
+
+    scripts/cold_start.py [EXPERIMENT_FOLDER ...] [--frames 200]
+
+First frames of the project's own renderer, three paints, 5 % noise, random attitudes and places; then every frame of
+the experiments given, which hold experiment.yaml and truth.h5. Each camera alone, light and blur learnt as in a track.
+Prints Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from torch import Tensor
+
+from sphereorient import locate, so3
+from sphereorient.cameras import Camera
+from sphereorient.experiment import frame_numbers, load_experiment, movie_span, open_movies
+from sphereorient.locate import Background
+from sphereorient.orient import Eye, GreySearch, LinesOfSight, base_table, cold_start, study
+from sphereorient.settings import Settings
+from sphereorient.sphere import load_texture
+from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
+from sphereorient.synth.write import default_cameras
+
+RIGHT_DEG = 1.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folders", type=Path, nargs="*")
+    parser.add_argument("--frames", type=int, default=200, help="rendered frames of each paint")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    print("| frames | right within 1 degree | median, degrees | wrong |\n|---|---|---|---|")
+    for seed, paint in enumerate(("blobs", "patches", "dots"), 1):
+        rendered(paint, seed, arguments.frames)
+    for folder in arguments.folders:
+        measured(folder)
+
+
+def report(name: str, errors: list[float]) -> None:
+    """One row; a frame without any pose counts as wrong."""
+    right = sum(error <= RIGHT_DEG for error in errors)
+    median = float(np.median(errors))
+    share = 100 * right / len(errors)
+    print(f"| {name} | {right} of {len(errors)} ({share:.1f} %) | {median:.3f} | {len(errors) - right} |", flush=True)
+
+
+def errors_deg(
+    eye: Eye, texture: Tensor, radius_mm: float, frames: list[np.ndarray], R_lab_body: Tensor
+) -> list[float]:
+    """Find each frame by itself; infinite where nothing is found."""
+    settings = Settings()
+    search = {eye.name: GreySearch(texture, settings.search)}
+    spread = locate.spread_frames(range(len(frames)), settings.refine.study_frames)
+    base = base_table(texture, eye.diameter_px)
+    learnt = study([eye], [[frames[k]] for k in spread], base, search, radius_mm, settings.locate, settings.refine)
+    errors = []
+    for frame, R in zip(frames, R_lab_body, strict=True):
+        poses = cold_start(learnt.fitter, search, [frame], settings.locate, candidates=settings.refine.candidates)
+        error = float(so3.geodesic_distance(poses.R_lab_body[0], R)) if len(poses) else math.inf
+        errors.append(math.degrees(error))
+    return errors
+
+
+def rendered(paint: str, seed: int, count: int) -> None:
+    """Frames of the project's own renderer."""
+    settings = SynthSettings(read_noise=0.05 * SynthSettings().white, shot_noise=0.0)
+    camera = next(iter(default_cameras(settings).values()))
+    texture = random_texture(paint, seed)
+    scene = make_scene(texture, settings)
+    rng = np.random.default_rng(seed)
+    generator = torch.Generator().manual_seed(seed)
+    R_lab_body = so3.random_rotations((count,), generator=generator, dtype=torch.float64)
+    place = 10.0 * (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5)
+    frames = [render_frame(scene, camera, place[k : k + 1], R_lab_body[k : k + 1], rng) for k in range(count)]
+    eye = rendered_eye(camera, settings)
+    report(f"{paint}, rendered", errors_deg(eye, texture, settings.diameter_mm / 2, frames, R_lab_body))
+
+
+def rendered_eye(camera: Camera, settings: SynthSettings) -> Eye:
+    """The camera before its even background, which is known."""
+    width, height = camera.image_size
+    even = np.full((height, width), settings.background, np.float32)
+    background = Background(mean=even, noise=np.full_like(even, settings.read_noise), full_scale=255.0)
+    return Eye(
+        name="cam1", camera=camera, background=background, diameter_px=settings.diameter_px, sight=LinesOfSight(camera)
+    )
+
+
+def measured(folder: Path) -> None:
+    """Every frame of an experiment, each camera by itself."""
+    experiment, settings = load_experiment(folder / "experiment.yaml"), Settings()
+    movies = open_movies(experiment, list(experiment.cameras))
+    numbers = frame_numbers(experiment, movies)
+    with h5py.File(folder / "truth.h5") as file:
+        R_lab_body = torch.from_numpy(file["orientation"][()])[numbers.start : numbers.stop]
+    for name, camera in experiment.cameras.items():
+        span = range(*movie_span(experiment, name, numbers))
+        diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
+        spread = locate.spread_frames(span, settings.refine.background_frames)
+        background = locate.learn_background(movies[name], spread, diameter_px, settings.locate)
+        eye = Eye(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
+        frames = list(movies[name].frames(span.start, span.stop))
+        texture = load_texture(experiment.texture_path)
+        report(f"{folder.name}, {name}", errors_deg(eye, texture, experiment.diameter_mm / 2, frames, R_lab_body))
+
+
+if __name__ == "__main__":
+    main()
