@@ -7,8 +7,9 @@ figure is the root of the mean variance over several seeds of paint and random a
 degrees, in brackets with centre and radius known; after the slash the ratio to the specification. 35 s of one core.
 
 Paint with twice the border has 0.7 times the bound, so the specification's figures hold for paint as fine as its own:
-blobs with as much border as the experiment's map, 34 dots spread evenly, and polygons of whose number nothing is known
-(100 are taken). The paints of `sphereorient.synth` are coarser and follow at the end.
+blobs with as much border as the experiment's map, 34 dots spread evenly, and polygons of whose number nothing is known:
+100 were taken because 60, as synth has them, give figures 1.1 to 1.2 times as large. The paints of
+`sphereorient.synth` are coarser and follow at the end.
 """
 
 from __future__ import annotations

@@ -38,8 +38,9 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print("| frames | right within 1 degree | median, degrees | wrong |\n|---|---|---|---|")
-    for seed, paint in enumerate(("blobs", "patches", "dots"), 1):
-        rendered(paint, seed, arguments.frames)
+    for light, ambient in (("even light", 1.0), ("lamps, one side dark", SynthSettings().ambient)):
+        for seed, paint in enumerate(("blobs", "patches", "dots"), 1):
+            rendered(paint, seed, arguments.frames, light, ambient)
     for folder in arguments.folders:
         measured(folder)
 
@@ -69,9 +70,9 @@ def errors_deg(
     return errors
 
 
-def rendered(paint: str, seed: int, count: int) -> None:
+def rendered(paint: str, seed: int, count: int, light: str, ambient: float) -> None:
     """Frames of the project's own renderer."""
-    settings = SynthSettings(read_noise=0.05 * SynthSettings().white, shot_noise=0.0)
+    settings = SynthSettings(read_noise=0.05 * SynthSettings().white, shot_noise=0.0, ambient=ambient)
     camera = next(iter(default_cameras(settings).values()))
     texture = random_texture(paint, seed)
     scene = make_scene(texture, settings)
@@ -81,7 +82,7 @@ def rendered(paint: str, seed: int, count: int) -> None:
     place = 10.0 * (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5)
     frames = [render_frame(scene, camera, place[k : k + 1], R_lab_body[k : k + 1], rng) for k in range(count)]
     eye = rendered_eye(camera, settings)
-    report(f"{paint}, rendered", errors_deg(eye, texture, settings.diameter_mm / 2, frames, R_lab_body))
+    report(f"{paint}, {light}", errors_deg(eye, texture, settings.diameter_mm / 2, frames, R_lab_body))
 
 
 def rendered_eye(camera: Camera, settings: SynthSettings) -> Eye:

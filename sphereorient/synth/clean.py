@@ -172,7 +172,7 @@ def _fine_picture(
     beside = camera.rays(uv_px[:, :1] + uv_px.new_tensor([1.0 / supersampling, 0.0])).direction_lab
     fine_mm = (beside - rays.direction_lab[:, :1]).norm(dim=-1) * to_centre.norm(dim=-1)
     share = ((radius_mm - aside_mm) / fine_mm + 0.5).clamp(0, 1)
-    seen: Tensor = share * sample_texture(texture, normal @ R_lab_body.mT)
+    seen: Tensor = share * sample_texture(texture, normal @ R_lab_body)
     return seen
 
 
