@@ -64,7 +64,14 @@ def errors_deg(
     learnt = study([eye], [[frames[k]] for k in spread], base, search, radius_mm, settings.locate, settings.refine)
     errors = []
     for frame, R in zip(frames, R_lab_body, strict=True):
-        poses = cold_start(learnt.fitter, search, [frame], settings.locate, candidates=settings.refine.candidates)
+        poses = cold_start(
+            learnt.fitter,
+            search,
+            [frame],
+            settings.locate,
+            candidates=settings.refine.candidates,
+            score_min=learnt.score_min,
+        )
         error = float(so3.geodesic_distance(poses.R_lab_body[0], R)) if len(poses) else math.inf
         errors.append(math.degrees(error))
     return errors

@@ -166,9 +166,7 @@ class BlockTracker:
             fit, use = _chosen(back, both, fit), use | back[:, None]
         borne_out = self._borne_out(fit, use)
         reasons = [[Reason.OK if ok else Reason.LOW_SCORE for ok in row] for row in use.tolist()]
-        return [
-            poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if borne_out[n] else None for n in range(asked)
-        ]
+        return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if borne_out[n] else None for n in range(asked)]
 
     def _borne_out(self, fit: Fit, use: Tensor) -> Tensor:
         """Poses that have arrived and that all pictures in use explain well, (B,) bool."""
@@ -177,7 +175,9 @@ class BlockTracker:
     def _search(self, frames: Sequence[Picture]) -> Poses:
         """Find the poses of a frame of which nothing is known, by those cameras whose pictures bear them out."""
         count = self.settings.candidates
-        poses = cold_start(self.fitter, self.proposers, frames, self.locating, candidates=count)
+        poses = cold_start(
+            self.fitter, self.proposers, frames, self.locating, candidates=count, score_min=self.score_min
+        )
         if not len(poses):
             return poses
         seen = poses.use & (poses.score[0] >= self.score_min)

@@ -21,6 +21,7 @@ from sphereorient.trajectory import Reason
 
 DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin
 PLACE_SHARE = 0.03  # of the radius: how far an outline's centre may be off, dark rims included
+NARROWER = (0.15, 0.06)  # deviations from the usual diameter with which outlines are looked for again
 GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance see different things
 
 
@@ -72,6 +73,7 @@ def cold_start(
     *,
     candidates: int,
     finalists: int = 2,
+    score_min: float = 0.0,
 ) -> Poses:
     """Find all poses that the pictures of one instant allow.
 
@@ -82,10 +84,34 @@ def cold_start(
         locating: how outlines are found.
         candidates: proposals of each camera that are fitted.
         finalists: poses that are fitted to all detail.
+        score_min: where no picture is explained this well, outlines are looked for again, nearer to the usual size:
+            black paint that hides half of a rim leaves arcs that a smaller circle fits as well.
 
     Returns:
         Poses, or none with the reasons.
     """
+    poses = _with_outlines(fitter, proposers, pictures, locating, candidates, finalists)
+    for tolerance in NARROWER:
+        if _best_score(poses) >= score_min:
+            break
+        narrower = locating.model_copy(update={"diameter_tolerance": min(tolerance, locating.diameter_tolerance)})
+        again = _with_outlines(fitter, proposers, pictures, narrower, candidates, finalists)
+        poses = max(poses, again, key=_best_score)
+    return poses
+
+
+def _best_score(poses: Poses) -> float:
+    return float(poses.score[0, poses.use].max()) if len(poses) else -1.0
+
+
+def _with_outlines(
+    fitter: Fitter,
+    proposers: Mapping[str, Proposer],
+    pictures: Sequence[Picture],
+    locating: LocateSettings,
+    candidates: int,
+    finalists: int,
+) -> Poses:
     found = [
         find_ball(frame, eye.background, eye.diameter_px, locating)
         for eye, frame in zip(fitter.eyes, pictures, strict=True)
@@ -94,8 +120,7 @@ def cold_start(
     use = [outline is not None for outline, _ in found]
     if all(use) and len(use) > 1 and _apart_mm(fitter, found) > GAP_SHARE * fitter.radius_mm:
         # The cameras see different things: believe the one whose picture is explained better.
-        alone = [ask(_only(found, k)) for k in range(len(found))]
-        return max(alone, key=lambda poses: float(poses.score[0, poses.use].max()) if len(poses) else -torch.inf)
+        return max((ask(_only(found, k)) for k in range(len(found))), key=_best_score)
     return ask(found)
 
 
