@@ -32,6 +32,7 @@ class _Expected:
     position_lab_mm: Tensor  # (3,)
     R_lab_body: Tensor  # (3, 3)
     use: Tensor  # (C,) bool, cameras that saw the ball
+    reason: tuple[Reason, ...]  # C, why the others did not
     place_precision: Tensor  # (3, 3), 1/mm^2
 
 
@@ -54,13 +55,16 @@ class _Lane:
         turn, move, spread = so3.log(R1 @ R0.mT), X1 - X0, 4 * C1 + C0
         if len(rows) == 3:
             turn = 2 * turn - so3.log(R0 @ rows[0].R_lab_body[0].mT)
-            move = 2 * move - (X0 - rows[0].position_lab_mm[0])
-            spread = 9 * C1 + 9 * C0 + rows[0].covariance[0, 3:, 3:]
+            further = 9 * C1 + 9 * C0 + rows[0].covariance[0, 3:, 3:]
+            # Not so the distances that one camera tells: they scatter by more than the ball is accelerated.
+            if float(further.diagonal().sum()) < (ASTRAY_SHARE * radius_mm) ** 2:
+                move, spread = 2 * move - (X0 - rows[0].position_lab_mm[0]), further
         astray = (ASTRAY_SHARE * radius_mm) ** 2 * torch.eye(3, dtype=torch.float64)
         return _Expected(
             position_lab_mm=X1 + move,
             R_lab_body=so3.exp(turn) @ R1,
             use=rows[-1].use,
+            reason=tuple(Reason.LOW_SCORE if why is Reason.OK else why for why in rows[-1].reason),
             place_precision=torch.linalg.inv(spread + astray),
         )
 
@@ -147,30 +151,63 @@ class BlockTracker:
             torch.stack([getattr(one, name) for one in expected])
             for name in ("position_lab_mm", "R_lab_body", "use", "place_precision")
         )
+        fit = self._fitted(frames, X, R, use, precision)
+        good = self._borne_out(fit, use)
+        if not bool(good.all()):
+            # One picture without the ball spoils what all say together: each camera by itself, the best one counts.
+            best = torch.where(good, torch.inf, -torch.inf)
+            for camera in range(use.shape[1]):
+                only = torch.zeros_like(use)
+                only[:, camera] = True
+                alone = self._fitted(frames, X, R, only, precision)
+                better = self._borne_out(alone, only) & (alone.score[:, camera] > best)
+                fit, use = _chosen(better, alone, fit), torch.where(better[:, None], only, use)
+                best = torch.where(better, alone.score[:, camera], best)
+            good = best > -torch.inf
+        if not bool(use.all()):
+            # A camera that was blind may see again: that shows at the pose which all of them give together.
+            every = torch.ones_like(use)
+            both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, every, precision)
+            back = good & ~use.all(1) & self._borne_out(both, every)
+            fit, use = _chosen(back, both, fit), use | back[:, None]
+        reasons = [
+            [Reason.OK if ok else why for ok, why in zip(row, one.reason, strict=True)]
+            for row, one in zip(use.tolist(), expected, strict=True)
+        ]
+        return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if good[n] else None for n in range(asked)]
+
+    def _fitted(self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor) -> Fit:
+        """Fit poses that are about right: to half the pixels, longer where that moves them, and then to all."""
         # With all cameras the pictures tell the place; with one of two its distance is better known from before.
         precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
         fine = self.fitter.optics.fine
         pixels = self.fitter.pixels(frames, X, fine)
         half = pixels.every(torch.arange(0, pixels.grey.shape[1], 2))
         fit = self.fitter.fit(half, X, R, use, fine, 1, precision)
-        far = fit.step[:, :3].norm(dim=-1) > NEAR_RAD
+        far = self._far(fit, use)
         if bool(far.any()):
             more = self.fitter.fit(half, fit.position_lab_mm, fit.R_lab_body, use, fine, 2, precision)
             fit = _chosen(far, more, fit)
+            pixels = self.fitter.pixels(frames, torch.where(far[:, None], fit.position_lab_mm, X), fine)
         fit = self.fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 1, precision)
-        if not bool(use.all()):
-            # A camera that was blind may see again: that shows at the pose which all of them give together.
-            every = torch.ones_like(use)
-            both = self.fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, every, fine, 3)
-            back = ~use.all(1) & self._borne_out(both, every)
-            fit, use = _chosen(back, both, fit), use | back[:, None]
-        borne_out = self._borne_out(fit, use)
-        reasons = [[Reason.OK if ok else Reason.LOW_SCORE for ok in row] for row in use.tolist()]
-        return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if borne_out[n] else None for n in range(asked)]
+        far = self._far(fit, use)
+        if bool(far.any()):
+            more = self.fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3, precision)
+            fit = _chosen(far, more, fit)
+        return fit
+
+    def _far(self, fit: Fit, use: Tensor) -> Tensor:
+        """Fits whose last step was so long that another one is wanted, (B,) bool."""
+        turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
+        # One camera's distances scatter; what shows in its picture shows in the turn as well.
+        far: Tensor = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * self.fitter.radius_mm))
+        return far
 
     def _borne_out(self, fit: Fit, use: Tensor) -> Tensor:
         """Poses that have arrived and that all pictures in use explain well, (B,) bool."""
-        return ((fit.score >= self.score_min) | ~use).all(1) & (fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD)
+        explained = (fit.score >= self.score_min) | ~use
+        good: Tensor = explained.all(1) & (fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD)
+        return good
 
     def _search(self, frames: Sequence[Picture]) -> Poses:
         """Find the poses of a frame of which nothing is known, by those cameras whose pictures bear them out."""

@@ -12,6 +12,7 @@ from sphereorient.orient.pixels import Pixels
 from sphereorient.sphere.paint_table import PaintTable
 
 SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself
+RIM_NODES = 4  # look-ups along the radius where the limb is near: there the paint is squeezed together
 DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of the paint is infinite on the limb
 
 
@@ -35,6 +36,7 @@ def sphere_view(
     A pixel near the limb sees the paint about the middle of that part of its aperture which the sphere covers, and
     along the radius the sphere's curvature stretches the aperture over more paint: two look-ups, one standard deviation
     to both sides of the mean of a Gaussian cut off at the limb, make both right, the table's own blur does the rest.
+    Near the limb there are four, at the quantiles of what is left of the Gaussian.
 
     Args:
         pixels: of L disks, float32.
@@ -45,7 +47,7 @@ def sphere_view(
         blur_px: standard deviation of the aperture, px.
 
     Returns:
-        The view. In its derivatives the spread of the two look-ups is held fixed.
+        The view. In its derivatives the spread of the look-ups is held fixed.
 
     Source: ERRATA A4 (the cap and the ellipse that a perspective camera sees); mean and variance of a cut-off
     Gaussian, Johnson, Kotz and Balakrishnan 1994, section 13.10.
@@ -66,35 +68,84 @@ def sphere_view(
     coverage = torch.special.ndtr(edge)
     density = torch.exp(-0.5 * edge * edge) * (1.0 / math.sqrt(2.0 * math.pi))
     pull = density / coverage.clamp_min(1e-4)
-    variance = (1.0 - pull * (edge + pull)).clamp(SPREAD_MIN, 1.0)
     q = (q0 - blur * pull).clamp(0.0, 1.0)
-    spread = blur * variance.sqrt() * q
+    inner = pixels.inner
+    variance = (1.0 - pull * (edge + pull)).clamp(SPREAD_MIN, 1.0)[:, :inner]
+    spread = blur * variance.sqrt() * q[:, :inner]
+    nodes = [(q[:, :inner] + side * spread, variance) for side in (-1.0, 1.0)]
+    parts = [_looked(nodes, d[..., :inner], outward[..., :inner], nearest[:, :inner], R, paint, radius_mm)]
+    if inner < d.shape[-1]:
+        outer = slice(inner, None)
+        nodes = _rim_nodes(q0[:, outer], blur, edge[:, outer], coverage[:, outer], density[:, outer], q[:, outer])
+        parts.append(_looked(nodes, d[..., outer], outward[..., outer], nearest[:, outer], R, paint, radius_mm))
+    body, turn, shift = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
+    return View(
+        paint=body,
+        coverage=coverage,
+        across=q[:, None] * (pixels.axes @ outward),
+        paint_by_rotation=turn,
+        paint_by_position=shift,
+        coverage_by_position=(density / (blur * radius_mm))[:, None] * outward,
+    )
+
+
+def _rim_nodes(
+    q0: Tensor, blur: Tensor, edge: Tensor, coverage: Tensor, density: Tensor, middle: Tensor
+) -> list[tuple[Tensor, Tensor]]:
+    """Return look-ups of equal weight along the radius where the limb is near, and how each moves with the pixel.
+
+    They are quantiles of the cut-off Gaussian, drawn towards its middle by what the table's own blur adds.
+    """
+    nodes = []
+    for k in range(RIM_NODES):
+        share = (k + 0.5) / RIM_NODES
+        z = torch.special.ndtri((share * coverage).clamp(1e-6, 1 - 1e-6))
+        # Of the aperture's middle, the limb holds back the more of a node the nearer it is.
+        moves = 1.0 - share * density / (torch.exp(-0.5 * z * z) * (1.0 / math.sqrt(2.0 * math.pi)))
+        nodes.append((middle + middle * (q0 + blur * z - middle), moves.clamp(0.0, 1.0)))
+    return nodes
+
+
+def _looked(
+    nodes: list[tuple[Tensor, Tensor]],
+    d: Tensor,
+    outward: Tensor,
+    nearest: Tensor,
+    R: Tensor,
+    paint: PaintTable,
+    radius_mm: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean paint of some look-ups (L, P) and its derivatives by rotation and place (L, 3, P).
+
+    Args:
+        nodes: distance of each look-up from the disk's middle, radii, and by how much it moves with the pixel.
+        d: (L, 3, P), lines of sight.
+        outward: (L, 3, P), unit, from the centre to them.
+        nearest: (L, P), their distance, mm.
+        R: (L, 3, 3).
+        paint: table.
+        radius_mm: of the sphere.
+    """
     # In body components, where the paint is: the derivatives are turned back once, at the end.
     sight_b, outward_b = R.mT @ d, R.mT @ outward
-    body, radial = torch.zeros_like(q), torch.zeros_like(q)
+    body, radial = torch.zeros_like(nearest), torch.zeros_like(nearest)
     turn_b, flat_b = torch.zeros_like(d), torch.zeros_like(d)
-    for side in (-1.0, 1.0):
-        qt = (q + side * spread).clamp(0.0, math.sqrt(1.0 - DEPTH_MIN**2))
+    for at, moves in nodes:
+        qt = at.clamp(0.0, math.sqrt(1.0 - DEPTH_MIN**2))
         depth = (1.0 - qt * qt).sqrt()
         normal_b = qt[:, None] * outward_b - depth[:, None] * sight_b
         value, slope = paint.look(normal_b)
         body = body + value
         turn_b = turn_b + _cross(slope, normal_b)
         flat_b = flat_b + qt[:, None] * slope
-        # Moving the centre along -outward lets the look-up slide outwards over the sphere by `variance` of it.
-        radial = radial + (slope * outward_b).sum(1) + qt / depth * (slope * sight_b).sum(1)
+        # Moving the centre along -outward lets the look-up slide outwards over the sphere.
+        radial = radial + moves * ((slope * outward_b).sum(1) + qt / depth * (slope * sight_b).sum(1))
     by_sight, by_outward = (flat_b * sight_b).sum(1), (flat_b * outward_b).sum(1)
-    # Across the radius the look-up stays at its share of it, q / q0.
+    # Across the radius a look-up stays at its share of it, q / q0.
     flat = R @ flat_b - by_sight[:, None] * d - by_outward[:, None] * outward
-    shift = flat * (-0.5 / nearest)[:, None] - (0.5 * radial * variance / radius_mm)[:, None] * outward
-    return View(
-        paint=0.5 * body,
-        coverage=coverage,
-        across=q[:, None] * (pixels.axes @ outward),
-        paint_by_rotation=0.5 * (R @ turn_b),
-        paint_by_position=shift,
-        coverage_by_position=(density / (blur * radius_mm))[:, None] * outward,
-    )
+    weight = 1.0 / len(nodes)
+    shift = flat * (-weight / nearest)[:, None] - (weight * radial / radius_mm)[:, None] * outward
+    return weight * body, weight * (R @ turn_b), shift
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera
 
+INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pixels:
@@ -29,6 +31,7 @@ class Pixels:
     axes: Tensor  # (L, 2, 3), the camera's x and y in the lab
     pitch_rad: Tensor  # (L,), angle between neighbouring pixels at the disk's middle
     tile: Tensor  # (P,) int64, square tile of the disk that a place belongs to, for errors that neighbours share
+    inner: int = 0  # so many first places are well within the limb
 
     def __len__(self) -> int:
         """Return the number of disks."""
@@ -44,7 +47,8 @@ class Pixels:
         names = ("grey", "behind", "inside", "direction")
         parts = {name: getattr(self, name)[..., places] for name in names}
         origin = self.origin if self.origin.shape[-1] == 1 else self.origin[..., places]
-        return replace(self, **parts, origin=origin, tile=self.tile[places])
+        inner = int((places < self.inner).sum())
+        return replace(self, **parts, origin=origin, tile=self.tile[places], inner=inner)
 
 
 class LinesOfSight:
@@ -76,6 +80,7 @@ class Stencil:
     down: NDArray[np.int64]
     tile: Tensor  # (P,) int64
     reach: int  # px
+    inner: int  # so many first places are well within the limb
 
 
 def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stencil:
@@ -92,7 +97,8 @@ def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stenci
     across = 2 * reach // tile_px + 1
     tile = (down + reach) // tile_px * across + (right + reach) // tile_px
     _, tile = np.unique(tile, return_inverse=True)
-    return Stencil(right=right, down=down, tile=torch.from_numpy(tile), reach=reach)
+    inner = int((right**2 + down**2 < (INNER * radius_px) ** 2).sum())
+    return Stencil(right=right, down=down, tile=torch.from_numpy(tile), reach=reach, inner=inner)
 
 
 def cut_pixels(
@@ -142,6 +148,7 @@ def cut_pixels(
         axes=sight.axes[None],
         pitch_rad=(0.5 * (pitch[0] + pitch[1]))[None],
         tile=stencil.tile,
+        inner=stencil.inner,
     )
 
 
