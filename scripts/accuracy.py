@@ -1,6 +1,6 @@
-"""Measure what docs/accuracy.md states: errors of the paper's method against exact truth.
+"""Measure what docs/accuracy.md states: errors of a method against exact truth.
 
-    scripts/accuracy.py EXPERIMENT_FOLDER [EXPERIMENT_FOLDER ...] [--no-synth]
+    scripts/accuracy.py EXPERIMENT_FOLDER [EXPERIMENT_FOLDER ...] [--method precise] [--no-synth]
 
 Each folder holds experiment.yaml and truth.h5. Tracks it with all cameras and with each alone; then three synthetic
 movies of other paints (seeded). Prints one Markdown table.
@@ -19,6 +19,7 @@ import numpy as np
 from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.pipeline import track_movies
+from sphereorient.settings import DEFAULT_METHOD
 from sphereorient.synth import SynthSettings, write_experiment
 
 COLUMNS = (
@@ -29,6 +30,7 @@ COLUMNS = (
     "> 10°",
     "position p50 / p95 (mm)",
     "omega lab / body",
+    "alpha lab",
     "velocity",
     "s",
 )
@@ -37,24 +39,25 @@ COLUMNS = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", type=Path, nargs="*")
+    parser.add_argument("--method", default=DEFAULT_METHOD)
     parser.add_argument("--no-synth", action="store_true")
     arguments = parser.parse_args()
     print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
     for folder in arguments.folders:
         names = list(load_experiment(folder / "experiment.yaml").cameras)
         for cameras in [names] + ([[name] for name in names] if len(names) > 1 else []):
-            print(row(folder, f"{folder.name}, {' + '.join(cameras)}", cameras), flush=True)
+            print(row(folder, f"{folder.name}, {' + '.join(cameras)}", cameras, arguments.method), flush=True)
     if not arguments.no_synth:
         for seed, texture in enumerate(("blobs", "patches", "dots"), 1):
             with tempfile.TemporaryDirectory() as name:
                 write_experiment(Path(name), SynthSettings.model_validate({"texture": texture, "seed": seed}))
-                print(row(Path(name), f"synthetic, {texture}", ("cam1", "cam2")), flush=True)
+                print(row(Path(name), f"synthetic, {texture}", ("cam1", "cam2"), arguments.method), flush=True)
 
 
-def row(folder: Path, label: str, cameras: Sequence[str]) -> str:
+def row(folder: Path, label: str, cameras: Sequence[str], method: str) -> str:
     """Track one movie and word its errors as a row of the table."""
     begin = time.perf_counter()
-    track = track_movies(folder / "experiment.yaml", cameras=cameras)
+    track = track_movies(folder / "experiment.yaml", method=method, cameras=cameras)
     seconds = time.perf_counter() - begin
     score = score_track(track, folder / "truth.h5")
     error = score.orientation_deg[score.valid]
@@ -62,11 +65,12 @@ def row(folder: Path, label: str, cameras: Sequence[str]) -> str:
     cells = [
         label,
         f"{score.valid.sum()} of {score.frames}",
-        " / ".join(f"{value:.2f}" for value in score.percentiles_deg()),
-        f"{np.sqrt(np.mean(error**2)):.2f}",
+        " / ".join(f"{value:.3f}" for value in score.percentiles_deg()),
+        f"{np.sqrt(np.mean(error**2)):.3f}",
         str(int((error > 10).sum())),
-        f"{position[0]:.3f} / {position[1]:.3f}" if len(cameras) == 2 else "from the radius",
+        f"{position[0]:.4f} / {position[1]:.4f}" if len(cameras) == 2 else "from the radius",
         f"{_share(score, 'omega_lab')} / {_share(score, 'omega_body')}",
+        f"{_share(score, 'alpha_lab')}",
         _share(score, "velocity") if len(cameras) == 2 else "",
         f"{seconds:.0f}",
     ]
@@ -74,7 +78,7 @@ def row(folder: Path, label: str, cameras: Sequence[str]) -> str:
 
 
 def _share(score: Score, key: str) -> str:
-    return f"{score.relative_rms[key]:.3f} ({100 * score.coverage[key]:.0f} %)"
+    return f"{score.relative_rms[key]:.4f} ({100 * score.coverage[key]:.0f} %)"
 
 
 if __name__ == "__main__":

@@ -41,13 +41,13 @@ def error_table(score: Score) -> Table:
     title = f"Errors against the exact truth, {score.valid.sum()} of {score.frames} frames valid"
     table = Table("quantity", "median", "95 %", "largest", title=title)
     p50, p95, _, largest = score.percentiles_deg()
-    table.add_row("orientation (degrees)", f"{p50:.2f}", f"{p95:.2f}", f"{largest:.2f}")
+    table.add_row("orientation (degrees)", f"{p50:.3f}", f"{p95:.3f}", f"{largest:.3f}")
     p50, p95, _, largest = score.percentiles_mm()
-    table.add_row("position (mm)", f"{p50:.3f}", f"{p95:.3f}", f"{largest:.3f}")
+    table.add_row("position (mm)", f"{p50:.4f}", f"{p95:.4f}", f"{largest:.4f}")
     table.add_section()
     table.add_row("quantity", "rms error / rms", "frames", "", style="bold")
     for key in ("velocity", "omega_lab", "omega_body"):
-        table.add_row(key, f"{100 * score.relative_rms[key]:.1f} %", f"{100 * score.coverage[key]:.0f} %", "")
+        table.add_row(key, f"{100 * score.relative_rms[key]:.2f} %", f"{100 * score.coverage[key]:.0f} %", "")
     return table
 
 

@@ -1,0 +1,87 @@
+"""From how far the fit finds home: share of starts that arrive, by the angle they are off and the width of detail.
+
+    scripts/basin.py [--experiment FOLDER] [--every 2]
+
+Starts are the truth turned about random axes, on frames of the bundled excerpt (or of a folder with experiment.yaml
+and truth.h5), both cameras; each is fitted at one width of detail and then, as in a cold start, at the finer ones. It
+has arrived if it ends within half a degree. Beside it the covering angle of the search bank's grid. Prints Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+import h5py
+import torch
+
+from sphereorient import locate, so3
+from sphereorient.experiment import frame_numbers, load_experiment, movie_span, open_movies
+from sphereorient.orient import Eye, GreySearch, LinesOfSight, base_table, study
+from sphereorient.settings import Settings
+from sphereorient.sphere import load_texture
+
+REPO = Path(__file__).resolve().parents[1]
+ANGLES_DEG = (1, 2, 4, 6, 8, 10, 14, 20)
+ARRIVED_DEG = 0.5
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--experiment", type=Path, default=REPO / "synthetic_data" / "excerpt")
+    parser.add_argument("--every", type=int, default=2, help="use each so many-th frame")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    experiment, settings = load_experiment(arguments.experiment / "experiment.yaml"), Settings()
+    movies = open_movies(experiment, list(experiment.cameras))
+    numbers = frame_numbers(experiment, movies)
+    with h5py.File(arguments.experiment / "truth.h5") as file:
+        X, R = (
+            torch.from_numpy(file[key][()])[numbers.start : numbers.stop : arguments.every]
+            for key in ("position", "orientation")
+        )
+    eyes, pictures = [], []
+    for name, camera in experiment.cameras.items():
+        span = range(*movie_span(experiment, name, numbers))
+        diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
+        path = experiment.background_paths.get(name)
+        empty = None if path is None else locate.load_background(path, movies[name].frame_shape)
+        spread = locate.spread_frames(span, settings.refine.background_frames)
+        background = locate.learn_background(movies[name], spread, diameter_px, settings.locate, empty)
+        eyes.append(
+            Eye(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
+        )
+        pictures.append(list(movies[name].frames(span.start, span.stop))[:: arguments.every])
+    texture = load_texture(experiment.texture_path)
+    proposers = {eye.name: GreySearch(texture, settings.search) for eye in eyes}
+    frames = list(zip(*pictures, strict=True))
+    base = base_table(texture, max(eye.diameter_px for eye in eyes))
+    fitter = study(
+        eyes, frames[:16], base, proposers, experiment.diameter_mm / 2, settings.locate, settings.refine
+    ).fitter
+    use = torch.ones(len(frames), len(eyes), dtype=torch.bool)
+    optics = fitter.optics
+    levels = {"coarse": (optics.coarse, 8), "middle": (optics.middle, 8), "fine": (optics.fine, 8)}
+    pixels = {name: fitter.pixels(frames, X, level) for name, (level, _) in levels.items()}
+    generator = torch.Generator().manual_seed(0)
+    print("| detail | " + " | ".join(f"{angle}°" for angle in ANGLES_DEG) + " |\n|" + "---|" * (len(ANGLES_DEG) + 1))
+    for first in range(3):
+        cells = []
+        for angle in ANGLES_DEG:
+            axis = torch.nn.functional.normalize(torch.randn(len(R), 3, generator=generator, dtype=R.dtype), dim=-1)
+            at, place = so3.exp(math.radians(angle) * axis) @ R, X
+            for name in list(levels)[first:]:
+                fit = fitter.fit(pixels[name], place, at, use, *levels[name])
+                at, place = fit.R_lab_body, fit.position_lab_mm
+            arrived = so3.geodesic_distance(at, R) < math.radians(ARRIVED_DEG)
+            cells.append(f"{100 * float(arrived.double().mean()):.0f} %")
+        name = list(levels)[first]
+        print(f"| {name}, blur {levels[name][0].blur_px:.2f} px | " + " | ".join(cells) + " |", flush=True)
+    print(
+        f"\nGrid of {settings.search.step_deg:g} degrees: no rotation is beyond 14.5 degrees of a template (test_grey_search)."
+    )
+
+
+if __name__ == "__main__":
+    main()
