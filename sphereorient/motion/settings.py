@@ -76,3 +76,30 @@ class SmoothSettings(BaseModel):
     orientation_band_hz: float | None = Field(
         None, gt=0, description="frequency up to which orientations are followed, Hz; null learns it likewise"
     )
+    learn_frames: int = Field(
+        600,
+        ge=20,
+        description="frames from which band and noise are learnt, longest segments first; more only cost time",
+    )
+    least_frames: int = Field(
+        10, ge=5, description="measured frames in all below which nothing can be learnt and nothing is smoothed"
+    )
+    least_scale: float = Field(
+        0.5, gt=0, description="least factor on the given sigmas of the measurements that is believed"
+    )
+    most_scale: float = Field(
+        4.0, gt=0, description="largest factor on the given sigmas of the measurements that is believed"
+    )
+    slow_share: float = Field(
+        0.25,
+        ge=0,
+        lt=1,
+        description="share of the measurements' error variance that lasts over many frames; no smoother can tell it "
+        "from motion, so it is added to the smoothed covariances; about 0.3 on path-traced movies, 0 for white noise",
+    )
+    outlier_sigma: float = Field(
+        6.0, gt=0, description="a measurement farther from what all others say is left out, sigmas (of three axes)"
+    )
+    outlier_share: float = Field(
+        0.1, ge=0, le=0.5, description="largest share of a segment's measurements that may be left out"
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -40,12 +41,13 @@ class Pixels:
     def where(self, chosen: Tensor) -> Pixels:
         """Return some of the disks, by mask (L,) or by index."""
         names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+        parts: dict[str, Any] = {name: getattr(self, name)[chosen] for name in names}
+        return replace(self, **parts)
 
     def every(self, places: Tensor) -> Pixels:
         """Return some of the places of all disks, by index (Q,)."""
         names = ("grey", "behind", "inside", "direction")
-        parts = {name: getattr(self, name)[..., places] for name in names}
+        parts: dict[str, Any] = {name: getattr(self, name)[..., places] for name in names}
         origin = self.origin if self.origin.shape[-1] == 1 else self.origin[..., places]
         inner = int((places < self.inner).sum())
         return replace(self, **parts, origin=origin, tile=self.tile[places], inner=inner)
@@ -157,4 +159,5 @@ def stacked(parts: list[Pixels]) -> Pixels:
     names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad")
     widest = max(part.origin.shape[-1] for part in parts)
     full = [replace(part, origin=part.origin.expand(-1, -1, widest)) for part in parts]
-    return replace(full[0], **{name: torch.cat([getattr(part, name) for part in full]) for name in names})
+    whole: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in full]) for name in names}
+    return replace(full[0], **whole)

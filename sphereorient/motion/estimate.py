@@ -1,0 +1,175 @@
+"""One kind of track, places or orientations: learning, outliers, and the states of every segment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.motion.kalman import States, run_filter, smooth
+from sphereorient.motion.learn import Learnt, learn
+from sphereorient.motion.path import DELTA, MEAN, SIZE, Path
+from sphereorient.motion.settings import SmoothSettings
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+ITERATIONS = 8  # of Gauss and Newton at most between two rejections; two or three do
+SETTLED = 0.03  # of a measurement's sigma: convergence is quadratic, so the step after such a one is nothing
+PIECE = 200  # instants of the pieces that are learnt from, many times the memory of the motion
+FEWEST = 5  # measurements of a piece that is learnt from
+NEAR = 5  # frames over which a wrong measurement makes others look wrong
+ROUNDS = 3  # of learning
+JUDGEMENTS = 12  # of a segment's measurements; wrong ones near each other are found one after the other
+AGAIN = 0.5  # of the limit, below which a measurement is believed again; less than 1, lest it goes to and fro
+FAR_MOVED = 100.0  # sigmas; a reference that moved farther was no good place to learn at
+VALUE, SPEED, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)  # in `Estimate.covariance`
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Estimate:
+    """One segment's smooth motion at its M instants; made by `estimate`. NaN where there is none."""
+
+    value: Floats  # (M, 3) or (M, 3, 3)
+    rate: Floats  # (M, 3), per frame
+    change: Floats  # (M, 3), per frame^2
+    covariance: Floats  # (M, 9, 9), of value, rate, change
+    rejected: Bools  # (M,), measurements that were not believed
+
+
+def estimate(paths: Sequence[Path], band: float | None, settings: SmoothSettings) -> tuple[list[Estimate], float]:
+    """Learn from all segments of one kind, then smooth each by itself.
+
+    Args:
+        paths: one a segment.
+        band: cycles per frame, None learns it.
+        settings: limits.
+
+    Returns:
+        The estimates, and the true errors of the measurements over their sigmas, slow ones included.
+    """
+    pieces = _pieces(paths, settings.learn_frames)
+    measured = sum(int(path.used.sum()) for path in pieces)
+    if measured < settings.least_frames:
+        return [_alone(path) for path in paths], 1.0
+    learnt = _learnt(pieces, band, settings)
+    whole = learnt.scale / np.sqrt(1 - settings.slow_share)
+    return [_smoothed(path, learnt, settings) for path in paths], float(whole)
+
+
+def _pieces(paths: Sequence[Path], most: int) -> list[Path]:
+    """Return pieces of the paths to learn from, spread evenly over all where there are too many."""
+    starts = [(path, k) for path in paths for k in range(0, len(path.time), PIECE)]
+    total = sum(len(path.time) for path in paths)
+    if total > most:
+        count = max(1, round(len(starts) * most / total))
+        starts = [starts[k] for k in np.linspace(0, len(starts) - 1, count).round().astype(int)]
+    pieces = [_cut(path, slice(k, k + PIECE)) for path, k in starts]
+    return [piece for piece in pieces if piece.used.sum() >= FEWEST]
+
+
+def _cut(path: Path, part: slice) -> Path:
+    """Return a part of a path."""
+    by_instant = ("time", "covariance", "seen", "used", "rate", "value", "reference")
+    return replace(path, **{name: getattr(path, name)[part] for name in by_instant})
+
+
+def _learnt(pieces: Sequence[Path], band: float | None, settings: SmoothSettings) -> Learnt:
+    """Learn, look for wrong measurements, and learn again without them."""
+    scales = settings.least_scale, settings.most_scale
+    learnt = learn(pieces, scales, band)
+    for _ in range(ROUNDS):
+        settled = [_settled(piece, learnt, settings) for piece in pieces]
+        moved = any(farthest > FAR_MOVED for _, _, farthest in settled)
+        judged = any((new.used != old.used).any() for (new, _, _), old in zip(settled, pieces, strict=True))
+        pieces = [new for new, _, _ in settled]
+        if not (moved or judged):
+            break
+        learnt = learn(pieces, scales, band, before=learnt)
+    return learnt
+
+
+def _settled(path: Path, learnt: Learnt, settings: SmoothSettings) -> tuple[Path, States, float]:
+    """Return the path about its own smooth states, its measurements judged, and how far it moved, in sigmas."""
+    scale, limit = learnt.scale, settings.outlier_sigma**2
+    path = replace(path, covariance=path.covariance * scale**2)
+    farthest, tries, judgements = 0.0, 0, 0
+    while True:
+        chain = path.chain(learnt.prior)
+        states = smooth(chain, run_filter(chain), _wanted(learnt.prior.pole))
+        path = path.moved(states.state, learnt.prior)
+        step = float(np.abs(states.state[:, DELTA]).max()) / path.sigma
+        farthest, tries = max(farthest, step), tries + 1
+        if step > SETTLED and tries < ITERATIONS:
+            continue
+        used = _judged(path, states, limit, settings.outlier_share)
+        if judgements == JUDGEMENTS or (used == path.used).all():
+            return replace(path, covariance=path.covariance / scale**2), states, farthest
+        path, tries, judgements = replace(path, used=used), 0, judgements + 1
+
+
+def _judged(path: Path, states: States, limit: float, share: float) -> Bools:
+    """Return which measurements are believed: the most surprising ones no more, unsurprising ones again."""
+    out = path.seen & ~path.used
+    used = path.used.copy()
+    if out.any():
+        off = path.away()[out]
+        whole = path.covariance[out] + states.covariance[out][:, VALUE, VALUE]
+        surprise = np.einsum("ni,nij,nj->n", off, np.linalg.inv(whole), off)
+        used[out] = surprise < AGAIN * limit
+    wrong = _stand_out(states.surprise, limit)
+    if (path.seen & ~(used & ~wrong)).sum() <= share * path.seen.sum():
+        used &= ~wrong
+    return used
+
+
+def _stand_out(surprise: Floats, limit: float) -> Bools:
+    """Say which frames are farther off than the limit and than all near them, which are judged again without them."""
+    wrong = surprise > limit
+    for k in range(1, min(NEAR, len(surprise) - 1) + 1):
+        wrong[k:] &= surprise[k:] >= surprise[:-k]
+        wrong[:-k] &= surprise[:-k] > surprise[k:]
+    return wrong
+
+
+def _wanted(pole: float) -> Floats:
+    """Return the rows that take value, rate and its change from a state."""
+    eye = np.eye(3)
+    wanted = np.zeros((9, SIZE))
+    wanted[VALUE, DELTA] = eye
+    wanted[SPEED, MEAN] = wanted[SPEED, 6:9] = eye
+    wanted[CHANGE, 9:12] = pole * eye
+    return wanted
+
+
+def _smoothed(path: Path, learnt: Learnt, settings: SmoothSettings) -> Estimate:
+    """Return a segment's estimate; one measurement has no rate, two have no change of it."""
+    count = int(path.used.sum())
+    if count < 2:
+        return _alone(path)
+    settled, states, _ = _settled(path, learnt, settings)
+    rate, change = settled.mean + settled.rate[:, 0], settled.rate[:, 1] * settled.pole
+    covariance = states.covariance.copy()
+    # slow errors pass the smoother as motion does; what it learns about noise is the fast rest
+    slow = settings.slow_share / (1 - settings.slow_share) * learnt.scale**2
+    own = np.where(path.seen[:, None, None], path.covariance, path.sigma**2 * np.eye(3))
+    covariance[:, VALUE, VALUE] += slow * own
+    if count < 3:
+        change = np.full_like(change, np.nan)
+        covariance[:, CHANGE] = covariance[:, :, CHANGE] = np.nan
+    return Estimate(
+        value=settled.reference, rate=rate, change=change, covariance=covariance, rejected=settled.seen & ~settled.used
+    )
+
+
+def _alone(path: Path) -> Estimate:
+    """Return the measurements as they are, without derivatives."""
+    unknown = np.full((len(path.time), 3), np.nan)
+    covariance = np.full((len(path.time), 9, 9), np.nan)
+    covariance[path.seen, VALUE, VALUE] = path.covariance[path.seen]
+    value = np.full_like(path.value, np.nan)
+    value[path.seen] = path.value[path.seen]
+    none = np.zeros(len(path.time), dtype=bool)
+    return Estimate(value=value, rate=unknown, change=unknown, covariance=covariance, rejected=none)

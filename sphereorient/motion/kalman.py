@@ -1,0 +1,132 @@
+"""Kalman's filter and the smoother of Bryson and Frazier: linear in time, no inverse of a covariance of states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chain:
+    """A linear problem of N states of size D whose first three numbers are measured.
+
+    A step takes the first three numbers to `carried` times the whole state plus `drift`; what becomes of the others,
+    and the noise, depends only on the step's kind (its length), of which there are few.
+    """
+
+    carried: Floats  # (N - 1, 3, D)
+    drift: Floats  # (N - 1, 3)
+    kind: NDArray[np.int64]  # (N - 1,)
+    grown: Floats  # (kinds, D - 3, D - 3)
+    noise: Floats  # (kinds, D, D), covariance added in a step
+    start: Floats  # (D, D), covariance of the first state about zero
+    measured: Floats  # (N, 3); anything where not used
+    covariance: Floats  # (N, 3, 3), of the measurements
+    used: Bools  # (N,)
+
+    def transition(self, k: int, into: Floats) -> Floats:
+        """Write the transition from state k to the next into a (D, D) of zeros or of another step, and return it."""
+        into[:3] = self.carried[k]
+        into[3:, 3:] = self.grown[self.kind[k]]
+        return into
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Filtered:
+    """What the past says, frame by frame; made by `run_filter`."""
+
+    state: Floats  # (N, D), after the frame's own measurement
+    covariance: Floats  # (N, D, D)
+    gain: Floats  # (N, D, 3)
+    innovation: Floats  # (N, 3)
+    inverse: Floats  # (N, 3, 3), inverse covariance of the innovation
+    misfit: float  # sum of squared whitened innovations
+    log_determinant: float  # sum over the innovations' covariances
+
+
+def run_filter(chain: Chain) -> Filtered:
+    """Run Kalman's filter.
+
+    Source: Kalman 1960.
+    """
+    count, size = len(chain.measured), chain.start.shape[0]
+    x, P, F = np.zeros(size), chain.start, np.zeros((size, size))
+    states, covariances = np.empty((count, size)), np.empty((count, size, size))
+    gains, innovations, inverses = np.zeros((count, size, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for k in range(count):  # a recursion: each frame needs the one before
+        if k:
+            F = chain.transition(k - 1, F)
+            x = F @ x
+            x[:3] += chain.drift[k - 1]
+            P = F @ P @ F.T + chain.noise[chain.kind[k - 1]]
+        if chain.used[k]:
+            inverse = np.linalg.inv(P[:3, :3] + chain.covariance[k])
+            gain = P[:, :3] @ inverse
+            innovation = chain.measured[k] - x[:3]
+            x = x + gain @ innovation
+            P = P - gain @ P[:3]
+            P = 0.5 * (P + P.T)
+            gains[k], innovations[k], inverses[k] = gain, innovation, inverse
+        states[k], covariances[k] = x, P
+    seen = chain.used
+    return Filtered(
+        state=states,
+        covariance=covariances,
+        gain=gains,
+        innovation=innovations,
+        inverse=inverses,
+        misfit=float(np.einsum("ni,nij,nj->", innovations, inverses, innovations)),
+        log_determinant=-float(np.linalg.slogdet(inverses[seen])[1].sum()),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class States:
+    """What past and future say together; made by `smooth`."""
+
+    state: Floats  # (N, D)
+    covariance: Floats  # (N, K, K), of the wanted combinations of each state
+    surprise: Floats  # (N,), squared distance of a used measurement from what all others say, in sigmas; else 0
+
+
+def smooth(chain: Chain, filtered: Filtered, wanted: Floats) -> States:
+    """Run backwards over a filtered chain.
+
+    Args:
+        chain: the problem.
+        filtered: its forward pass.
+        wanted: (K, D), rows whose covariance is asked for.
+
+    Source: Bierman 1973 (modified Bryson-Frazier); the distance from what the others say: de Jong 1988.
+    """
+    count, size = filtered.state.shape
+    F = np.zeros((size, size))
+    pull, hold = np.zeros(size), np.zeros((size, size))  # gradient and curvature that the future exerts
+    state, surprise = filtered.state.copy(), np.zeros(count)
+    covariance = np.empty((count, len(wanted), len(wanted)))
+    for k in range(count - 1, -1, -1):
+        P = filtered.covariance[k]
+        state[k] -= P @ pull
+        half = wanted @ P
+        covariance[k] = half @ wanted.T - half @ hold @ half.T
+        if chain.used[k]:
+            K, inverse = filtered.gain[k], filtered.inverse[k]
+            held = hold @ K
+            whole = inverse @ filtered.innovation[k] + K.T @ pull
+            own = inverse + K.T @ held
+            surprise[k] = whole @ np.linalg.solve(own, whole)
+            pull[:3] -= whole
+            # C' hold C + H' S^-1 H with C = 1 - K H, written out: only three rows and columns change
+            hold[:3] -= held.T
+            hold[:, :3] -= held
+            hold[:3, :3] += own
+        if k:
+            F = chain.transition(k - 1, F)
+            pull, hold = F.T @ pull, F.T @ hold @ F
+            hold = 0.5 * (hold + hold.T)  # what the rounding leaves of asymmetry would grow
+    return States(state=state, covariance=covariance, surprise=surprise)

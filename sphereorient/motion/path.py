@@ -1,0 +1,348 @@
+"""Tracks as chains of small deviations from a reference: places on R^3, orientations on SO(3) whatever the turn.
+
+The state of an instant is 3 (2 + ORDER) numbers: the small deviation delta from the reference, the deviation of the
+constant rate from the reference's, and the random rate w, w' / pole, w'' / pole^2, ... itself. Time is in frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from sphereorient.motion.kalman import Chain
+from sphereorient.motion.matern import NODES, ORDER, STATIONARY, Prior, grown, grown_rate, integral, nodes
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+SIZE = 3 * (2 + ORDER)
+UNKNOWN = 100.0  # standard deviation of the start from its reference, in sigmas of a measurement: next to no pull
+VOTES = 5  # neighbouring turns of which the median is typical
+LEFT_OUT = 6  # frames in a row that the first guess may leave out
+DELTA, MEAN, RATE = slice(0, 3), slice(3, 6), slice(6, SIZE)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Path:
+    """One segment: what was measured, and the reference that the states are deviations from."""
+
+    time: Floats  # (N,), frames, increasing
+    covariance: Floats  # (N, 3, 3), of the measurements
+    seen: Bools  # (N,), measured
+    used: Bools  # (N,), measured and believed
+    unknown_rate: float  # standard deviation of the constant rate from the reference's, next to no pull
+    mean: Floats  # (3,), the reference's constant rate, value per frame
+    rate: Floats  # (N, ORDER, 3), the reference's w, w' / pole, ...
+    pole: float  # per frame, that `rate` is scaled by
+    value: Floats  # (N, 3) or (N, 3, 3), the measurements
+    reference: Floats  # like value
+
+    def away(self) -> Floats:
+        """Return the measurements as deviations from the reference, (N, 3); anything where unused."""
+        raise NotImplementedError
+
+    def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
+        """Return how the reference's steps differ from what its rate says.
+
+        Returns:
+            Rotations (N - 1, NODES + 1, 3, 3) that take a deviation from the nodes of a step, and from its begin, to
+            its end, and the reference's jumps (N - 1, 3) beyond its rate.
+        """
+        raise NotImplementedError
+
+    def moved(self, state: Floats, prior: Prior) -> Self:
+        """Return the path about the states (N, SIZE)."""
+        raise NotImplementedError
+
+    def rates(self) -> Floats:
+        """Return the rates between neighbouring measurements, (M, 3), per frame."""
+        raise NotImplementedError
+
+    @property
+    def sigma(self) -> float:
+        """Typical standard deviation of a measurement by axis."""
+        return float(np.sqrt(np.median(np.trace(self.covariance[self.seen], axis1=1, axis2=2)) / 3))
+
+    def scaled(self, prior: Prior) -> Floats:
+        """Return the reference's random rate (N, ORDER, 3) in the units of another pole."""
+        return self.rate * (self.pole / prior.pole) ** np.arange(ORDER)[:, None]
+
+    def chain(self, prior: Prior) -> Chain:
+        """Return the problem, linear about the reference.
+
+        Source: Barfoot 2017, State Estimation for Robotics, sections 7.2 and 7.3: perturbations from the left.
+        """
+        step = np.diff(self.time)
+        count = len(step)
+        lengths, kind = np.unique(np.round(step, 9), return_inverse=True)
+        carry, jump = self.jumps(prior)
+        at, weight = nodes(lengths)
+        by_rate = weight[..., None] * grown_rate(at * prior.pole)
+        turned = carry[:, :NODES].reshape(count, NODES, 9).mT
+        from_mean = (turned @ weight[kind][..., None]).reshape(count, 3, 3)
+        from_rate = (turned @ by_rate[kind]).reshape(count, 3, 3, ORDER).mT.reshape(count, 3, 3 * ORDER)
+        eye = np.eye(3)
+        grown_by = np.zeros((len(lengths), SIZE - 3, SIZE - 3))
+        grown_by[:, :3, :3], grown_by[:, 3:, 3:] = eye, _by_axis(grown(lengths * prior.pole))
+        keep = np.r_[0:3, 6:SIZE]
+        noise = np.zeros((len(lengths), SIZE, SIZE))
+        noise[:, keep[:, None], keep] = _by_axis(prior.step_noise(lengths))
+        start = np.zeros((SIZE, SIZE))
+        # weak beliefs about the reference, which follows the states: they damp a step and leave no bias when settled
+        start[DELTA, DELTA] = (UNKNOWN * self.sigma) ** 2 * eye
+        start[MEAN, MEAN] = (self.unknown_rate + self.sigma) ** 2 * eye
+        start[RATE, RATE] = prior.deviation**2 * np.kron(STATIONARY, eye)
+        return Chain(
+            carried=np.concatenate([carry[:, NODES], from_mean, from_rate], axis=2),
+            drift=-jump - (from_rate @ self.scaled(prior)[:-1].reshape(count, -1, 1))[..., 0],
+            kind=kind,
+            grown=grown_by,
+            noise=noise,
+            start=start,
+            measured=self.away(),
+            covariance=self.covariance,
+            used=self.used,
+        )
+
+
+def _by_axis(blocks: Floats) -> Floats:
+    """Return matrices (M, n, n) of one axis as those of three, (M, 3 n, 3 n)."""
+    count, size = blocks.shape[:2]
+    return np.asarray(np.einsum("mij,ab->miajb", blocks, np.eye(3)).reshape(count, 3 * size, 3 * size))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Places(Path):
+    """Places of one segment: value and reference (N, 3), mm, lab."""
+
+    @classmethod
+    def of(cls, time: Floats, value: Floats, covariance: Floats, seen: Bools) -> Self:
+        """Return the path about a first guess: the measurements themselves, gaps bridged evenly."""
+        frames = np.flatnonzero(seen)
+        if len(frames) > 1:
+            steps = np.diff(value[frames], axis=0)
+            velocity = _typical(time, time[frames], steps / np.diff(time[frames])[:, None])
+            gone = np.cumsum((velocity[1:] + velocity[:-1]) / 2 * np.diff(time)[:, None], axis=0)
+            still = value[frames] - np.concatenate([np.zeros((1, 3)), gone])[frames]
+            way = float(np.median(np.linalg.norm(steps, axis=1)))
+            frames = frames[_consistent(lambda lag: still[lag:] - still[:-lag], len(frames), way)]
+        trusted = np.isin(np.arange(len(time)), frames)
+        reference = np.stack([np.interp(time, time[frames], value[frames, axis]) for axis in range(3)], axis=1)
+        velocity = np.gradient(reference, time, axis=0) if len(time) > 1 else np.zeros_like(reference)
+        mean = velocity.mean(0)
+        rate = np.zeros((len(time), ORDER, 3))
+        rate[:, 0] = velocity - mean
+        return cls(
+            time=time,
+            covariance=covariance,
+            seen=seen,
+            used=trusted,
+            unknown_rate=2 * float(np.sqrt((rate[:, 0] ** 2).mean())),
+            mean=mean,
+            rate=rate,
+            pole=1.0,
+            value=value,
+            reference=reference,
+        )
+
+    def away(self) -> Floats:
+        """Return measurements minus reference."""
+        return np.where(self.seen[:, None], self.value - self.reference, 0.0)
+
+    def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
+        """Return no rotation, and what is left of the reference's steps."""
+        step = np.diff(self.time)
+        gone = (integral(step * prior.pole)[:, None] / prior.pole @ self.scaled(prior)[:-1])[:, 0]
+        carry = np.broadcast_to(np.eye(3), (len(step), NODES + 1, 3, 3))
+        return carry, np.diff(self.reference, axis=0) - step[:, None] * self.mean - gone
+
+    def rates(self) -> Floats:
+        """Return velocities between neighbouring measurements."""
+        seen = np.flatnonzero(self.used)
+        return np.diff(self.value[seen], axis=0) / np.diff(self.time[seen])[:, None]
+
+    def moved(self, state: Floats, prior: Prior) -> Self:
+        """Return the path about the states."""
+        return replace(
+            self,
+            reference=self.reference + state[:, DELTA],
+            mean=self.mean + state[0, MEAN],
+            rate=state[:, RATE].reshape(-1, ORDER, 3),
+            pole=prior.pole,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Turns(Path):
+    """Orientations of one segment: value and reference R_lab_body (N, 3, 3), deviations delta in lab components."""
+
+    @classmethod
+    def of(cls, time: Floats, value: Floats, covariance: Floats, seen: Bools) -> Self:
+        """Return the path about a first guess: the measurements that follow from each other, gaps bridged."""
+        reference, omega, trusted = _first_guess(time, value, seen)
+        mean = omega.mean(0)
+        rate = np.zeros((len(time), ORDER, 3))
+        rate[:, 0] = omega - mean
+        return cls(
+            time=time,
+            covariance=covariance,
+            seen=seen,
+            used=trusted,
+            unknown_rate=2 * float(np.sqrt((rate[:, 0] ** 2).mean())),
+            mean=mean,
+            rate=rate,
+            pole=1.0,
+            value=value,
+            reference=reference,
+        )
+
+    def away(self) -> Floats:
+        """Return the turns from reference to measurement."""
+        value = np.where(self.seen[:, None, None], self.value, self.reference)
+        return turn(self.reference, value)
+
+    def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
+        """Return the reference's own turns, exact for any angle, and what they leave of its steps."""
+        step = np.diff(self.time)
+        rate = self.scaled(prior)[:-1]
+        at, _ = nodes(step)
+        to_end = np.concatenate([step[:, None] - at, step[:, None]], axis=1)
+        pole = prior.pole
+        over_step = integral(step * pole)[:, None]
+        gone = np.concatenate([over_step - integral(at * pole), over_step], axis=1) / pole
+        angle = to_end[..., None] * self.mean + gone @ rate
+        carry = exp(angle)
+        whole = propagated(self.mean, rate, pole, step)
+        carry[:, NODES] = whole
+        return carry, turn(whole @ self.reference[:-1], self.reference[1:])
+
+    def rates(self) -> Floats:
+        """Return angular velocities between neighbouring measurements."""
+        seen = np.flatnonzero(self.used)
+        return turn(self.value[seen[:-1]], self.value[seen[1:]]) / np.diff(self.time[seen])[:, None]
+
+    def moved(self, state: Floats, prior: Prior) -> Self:
+        """Return the path about the states."""
+        return replace(
+            self,
+            reference=exp(state[:, DELTA]) @ self.reference,
+            mean=self.mean + state[0, MEAN],
+            rate=state[:, RATE].reshape(-1, ORDER, 3),
+            pole=prior.pole,
+        )
+
+
+def exp(rotvec: Floats) -> Floats:
+    """Return rotations (..., 3, 3) by rotation vectors (..., 3), rad."""
+    matrices = Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_matrix()
+    return np.asarray(matrices, dtype=np.float64).reshape(*rotvec.shape, 3)
+
+
+def turn(begin: Floats, end: Floats) -> Floats:
+    """Return the rotation vectors (M, 3) in lab components that lead from orientations (M, 3, 3) to others."""
+    if len(begin) == 0:
+        return np.zeros((0, 3))
+    return np.asarray(Rotation.from_matrix(end @ begin.swapaxes(-1, -2)).as_rotvec(), dtype=np.float64)
+
+
+def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int = 3) -> Floats:
+    """Return the turns (M, 3, 3) over steps (M,) by omega_lab = mean + w(t), w by its state (M, ORDER, 3) at the begin.
+
+    Source: Magnus expansion of fourth order at the two Gauss nodes (Iserles and Norsett 1999).
+    """
+    h = step[:, None] / parts
+    begin = h * np.arange(parts)
+    early, late = (mean + grown_rate((begin + h * (0.5 + side * np.sqrt(3) / 6)) * pole) @ rate for side in (-1, 1))
+    turns = exp(h[..., None] * (early + late) / 2 - np.sqrt(3) / 12 * h[..., None] ** 2 * np.cross(early, late))
+    whole = turns[:, 0]
+    for k in range(1, parts):
+        whole = turns[:, k] @ whole
+    return whole
+
+
+def _first_guess(time: Floats, R: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
+    """Return orientations (N, 3, 3) at all instants, omega_lab (N, 3), rad per frame, and the frames they lead through.
+
+    Over a gap, where more than half a turn may have passed, omega goes on smoothly from before to behind it; of the
+    turns that fit, the one nearest to that is meant.
+    """
+    frames = np.flatnonzero(seen)
+    if len(frames) < 2:
+        return np.broadcast_to(R[frames[0]], R.shape).copy(), np.zeros((len(time), 3)), seen
+    steps = turn(R[frames[:-1]], R[frames[1:]])
+    omega = _typical(time, time[frames], steps / np.diff(time[frames])[:, None])
+    gone = np.concatenate([np.eye(3)[None], exp((omega[1:] + omega[:-1]) / 2 * np.diff(time)[:, None])])
+    for k in range(1, len(time)):  # a product in order; it need not stay exact, it is compared over short spans only
+        gone[k] = gone[k] @ gone[k - 1]
+    still = gone[frames].mT @ R[frames]  # constant where the turning is typical
+    way = float(np.median(np.linalg.norm(steps, axis=1)))
+    trusted = frames[_consistent(lambda lag: turn(still[:-lag], still[lag:]), len(frames), way)]
+    # what omega alone leaves between two trusted frames is spread evenly over the time between them
+    at = np.interp(np.arange(len(time)), trusted, np.arange(len(trusted)))
+    left = np.minimum(at.astype(int), max(len(trusted) - 2, 0))
+    share = np.clip(at - left, 0.0, 1.0)
+    right = np.minimum(left + 1, len(trusted) - 1)
+    ahead = gone @ gone[trusted[left]].mT @ R[trusted[left]]
+    missed = turn(gone[trusted[right]] @ gone[trusted[left]].mT @ R[trusted[left]], R[trusted[right]])
+    carried = gone @ gone[trusted[right]].mT @ exp(missed)  # the correction grows in the frame that turns along
+    along = turn(ahead, carried @ gone[trusted[right]] @ gone[trusted[left]].mT @ R[trusted[left]])
+    reference = exp(share[:, None] * along) @ ahead
+    reference[trusted] = R[trusted]
+    return reference, omega, np.isin(np.arange(len(time)), trusted)
+
+
+def _typical(time: Floats, seen_time: Floats, rates: Floats) -> Floats:
+    """Return rates (N, 3) at all instants by those between neighbours, two wrong ones in five outvoted."""
+    step = np.diff(seen_time)
+    near = np.flatnonzero(step <= 1.5 * np.median(step))
+    rates, middle = rates[near], ((seen_time[:-1] + seen_time[1:]) / 2)[near]
+    if len(near) < VOTES:
+        return np.broadcast_to(np.median(rates, axis=0), (len(time), 3)).copy()
+    slope = np.median(_around(np.diff(rates, axis=0) / np.diff(middle)[:, None], 2 * VOTES - 2), axis=1)
+    slope = np.stack([slope[0], *(slope[1:] + slope[:-1]) / 2, slope[-1]])
+    away = _around(middle[:, None], VOTES) - middle[:, None, None]
+    voted = np.median(_around(rates, VOTES) - slope[:, None] * away, axis=1)
+    return np.asarray(PchipInterpolator(middle, voted)(time.clip(middle[0], middle[-1])), dtype=np.float64)
+
+
+def _around(x: Floats, width: int) -> Floats:
+    """Return the neighbours (n, width, d) of every row (n, d), those of the ends all on one side."""
+    width = min(width, len(x))
+    first = (np.arange(len(x)) - width // 2).clip(0, len(x) - width)
+    return np.asarray(x[first[:, None] + np.arange(width)])
+
+
+def _consistent(kink: Callable[[int], Floats], count: int, way: float) -> NDArray[np.int64]:
+    """Return the longest chain of frames that follow from each other, frames left out at a price.
+
+    Args:
+        kink: gives for a lag what the typical rate leaves of the way from each frame to the one so much later,
+            (count - lag, 3).
+        count: of frames.
+        way: typical length of a step; what is typical is itself known to a few hundredths only.
+
+    Source: dynamic programming over the frame before; kinks are measured by the median kink of the track.
+    """
+    reach = min(LEFT_OUT + 1, count - 1)
+    kinks = [np.linalg.norm(kink(lag), axis=1) / lag for lag in range(1, reach + 1)]
+    typical = max(float(np.median(kinks[0])), 0.03 * way, 1e-9)
+    links = [np.minimum((size / (8 * typical)) ** 2, 25.0) for size in kinks]
+    price, before = np.full(count, np.inf), np.full(count, -1)
+    for k in range(count):
+        price[k] = 4.0 * k if k <= LEFT_OUT else np.inf
+        for lag in range(1, min(reach, k) + 1):
+            total = price[k - lag] + links[lag - 1][k - lag] + 4.0 * (lag - 1)
+            if total < price[k]:
+                price[k], before[k] = total, k - lag
+    tail = min(LEFT_OUT + 1, count)
+    last = count - tail + int(np.argmin(price[-tail:] + 4.0 * np.arange(tail - 1, -1, -1)))
+    chain = [last]
+    while before[chain[-1]] >= 0:
+        chain.append(int(before[chain[-1]]))
+    return np.array(chain[::-1])

@@ -1,0 +1,367 @@
+"""The smoother on planted motion: figures, honest sigmas, gaps, ends, fast turns, wrong frames, laws."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import h5py
+import pytest
+import torch
+from conftest import SHARED, assert_close
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.errors import ShapeError
+from sphereorient.motion import Smoothed, SmoothSettings, smooth_motion
+from sphereorient.synth.motion import Motion6D, random_motion
+
+RATE = 600.0
+WHITE = SmoothSettings(slow_share=0.0)
+POSITION_MM, ORIENTATION_RAD = 0.01, math.radians(0.036)
+
+
+def clock(frames: int) -> Tensor:
+    return torch.arange(frames, dtype=torch.float64) / RATE
+
+
+def planted(omega_rms: float = 10.5, time_s: Tensor | None = None, seed: int = 3) -> Motion6D:
+    return random_motion(0.26, 0.12, omega_rms, 0.03, 45.0, seed).at(clock(200) if time_s is None else time_s)
+
+
+def measured(truth: Motion6D, rng: torch.Generator, factor: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Return positions and orientations with white noise."""
+    noise = factor * torch.randn(2, len(truth.time_s), 3, generator=rng, dtype=torch.float64)
+    R = so3.exp(ORIENTATION_RAD * noise[1]) @ truth.R_lab_body
+    return truth.position_lab_mm + POSITION_MM * noise[0], R
+
+
+def smoothed(
+    truth: Motion6D, position: Tensor, R: Tensor, segment: Tensor | None = None, settings: SmoothSettings = WHITE
+) -> Smoothed:
+    frames = len(truth.time_s)
+    unit = torch.eye(3, dtype=torch.float64).expand(frames, 3, 3)
+    segment = torch.zeros(frames, dtype=torch.long) if segment is None else segment
+    covariances = POSITION_MM**2 * unit, ORIENTATION_RAD**2 * unit
+    return smooth_motion(truth.time_s, position, covariances[0], R, covariances[1], segment, settings)
+
+
+def rel_rms(got: Tensor, true: Tensor) -> float:
+    return float((got - true).norm() / true.norm())
+
+
+def over_sigma(error: Tensor, covariance: Tensor) -> float:
+    root = torch.linalg.cholesky(covariance)
+    return float(torch.linalg.solve(root, error[..., None]).square().mean().sqrt())
+
+
+def turn_off(truth: Motion6D, result: Smoothed) -> Tensor:
+    return so3.log(truth.R_lab_body @ result.R_lab_body.mT)
+
+
+def errors(truth: Motion6D, result: Smoothed) -> dict[str, tuple[Tensor, Tensor]]:
+    """Return every derivative's error and sigma."""
+    to_body = truth.R_lab_body.mT
+    body = {
+        "omega": (to_body @ truth.omega_lab_rad_s[..., None])[..., 0],
+        "alpha": (to_body @ truth.alpha_lab_rad_s2[..., None])[..., 0],
+    }
+    return {
+        "velocity": (result.velocity_m_s - truth.velocity_m_s, result.velocity_sigma_m_s),
+        "acceleration": (result.acceleration_m_s2 - truth.acceleration_m_s2, result.acceleration_sigma_m_s2),
+        "omega_lab": (result.omega_lab_rad_s - truth.omega_lab_rad_s, result.omega_lab_sigma_rad_s),
+        "omega_body": (result.omega_body_rad_s - body["omega"], result.omega_body_sigma_rad_s),
+        "alpha_lab": (result.alpha_lab_rad_s2 - truth.alpha_lab_rad_s2, result.alpha_lab_sigma_rad_s2),
+        "alpha_body": (result.alpha_body_rad_s2 - body["alpha"], result.alpha_body_sigma_rad_s2),
+    }
+
+
+# oracle: planted truth
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("noise_deg", "limits"), [(0.036, (0.009, 0.085, 0.033)), (0.025, (0.007, 0.068, 0.024))], ids=str
+)
+def test_the_motion_of_the_experiment_is_recovered_as_a_plain_gaussian_process_does(
+    noise_deg: float, limits: tuple[float, float, float], rng: torch.Generator
+) -> None:
+    with h5py.File(SHARED / "experiment" / "truth.h5") as file:
+        read = {name: torch.from_numpy(file[name][()]) for name in file if isinstance(file[name], h5py.Dataset)}
+    truth = Motion6D(
+        time_s=read["time"],
+        position_lab_mm=read["position"],
+        velocity_m_s=read["velocity"],
+        acceleration_m_s2=read["acceleration"],
+        R_lab_body=read["orientation"],
+        omega_lab_rad_s=read["omega_lab"],
+        alpha_lab_rad_s2=read["alpha_lab"],
+    )
+    position, _ = measured(truth, rng)
+    noise = math.radians(noise_deg) * torch.randn(len(position), 3, generator=rng, dtype=torch.float64)
+    # the claimed sigma is that of 0.036 degrees throughout: the factor on it is learnt
+    result = smoothed(truth, position, so3.exp(noise) @ truth.R_lab_body)
+    assert rel_rms(result.omega_lab_rad_s, truth.omega_lab_rad_s) < limits[0]
+    assert rel_rms(result.alpha_lab_rad_s2, truth.alpha_lab_rad_s2) < limits[1]
+    assert math.degrees(turn_off(truth, result).norm(dim=-1).median()) < limits[2]
+    assert rel_rms(result.velocity_m_s, truth.velocity_m_s) < 0.0029
+    assert rel_rms(result.acceleration_m_s2, truth.acceleration_m_s2) < 0.036
+    assert result.orientation_scale == pytest.approx(noise_deg / 0.036, rel=0.12)
+    assert result.position_scale == pytest.approx(1.0, rel=0.12)
+    for name, (error, sigma) in errors(truth, result).items():
+        assert 0.7 < (error / sigma).square().mean().sqrt() < 1.4, name
+
+
+@pytest.mark.parametrize("omega_rms", [10.5, 145.0, 292.0], ids=["2 deg", "22 deg", "45 deg a frame"])
+def test_every_sigma_is_honest_whatever_the_turn_between_frames(omega_rms: float, rng: torch.Generator) -> None:
+    truth = planted(omega_rms)
+    result = smoothed(truth, *measured(truth, rng))
+    assert 0.7 < over_sigma(turn_off(truth, result), result.orientation_cov_rad2) < 1.4
+    assert 0.7 < over_sigma(truth.position_lab_mm - result.position_lab_mm, result.position_cov_mm2) < 1.4
+    for name, (error, sigma) in errors(truth, result).items():
+        assert 0.7 < (error / sigma).square().mean().sqrt() < 1.4, name
+    assert turn_off(truth, result).norm(dim=-1).max() < 3 * ORIENTATION_RAD
+    assert not result.extrapolated.any()
+    assert not result.rejected.any()
+
+
+def test_a_factor_on_the_sigmas_is_learnt(rng: torch.Generator) -> None:
+    truth = planted()
+    result = smoothed(truth, *measured(truth, rng, factor=1.4))
+    assert result.position_scale == pytest.approx(1.4, rel=0.1)
+    assert result.orientation_scale == pytest.approx(1.4, rel=0.1)
+
+
+def test_slow_errors_are_covered_by_the_share_that_is_set_aside_for_them(rng: torch.Generator) -> None:
+    truth, share = planted(), 0.3
+    position, R = measured(truth, rng, factor=math.sqrt(1 - share))
+    slow = torch.randn(len(position), 3, generator=rng, dtype=torch.float64)
+    for k in range(1, len(slow)):
+        slow[k] = 0.9 * slow[k - 1] + math.sqrt(1 - 0.81) * slow[k]
+    position = position + math.sqrt(share) * POSITION_MM * slow
+    settings = SmoothSettings(slow_share=share)
+    found = [smoothed(truth, position, R, settings=s) for s in (settings, WHITE)]
+    honest, bold = (over_sigma(truth.position_lab_mm - x.position_lab_mm, x.position_cov_mm2) for x in found)
+    assert 0.6 < honest < 1.4  # somewhat timid: the learnt factor holds part of the slow errors already
+    assert bold > 1.4
+    assert torch.equal(found[0].position_lab_mm, found[1].position_lab_mm)
+
+
+# gaps, ends, uneven times
+
+
+@pytest.mark.parametrize(("omega_rms", "lost"), [(10.5, (60, 80)), (22.0, (60, 72)), (292.0, (60, 72))], ids=str)
+def test_a_gap_is_bridged_with_sigmas_that_say_how_well(
+    omega_rms: float, lost: tuple[int, int], rng: torch.Generator
+) -> None:
+    truth = planted(omega_rms)
+    position, R = measured(truth, rng)
+    position[lost[0] : lost[1]], R[lost[0] : lost[1]] = torch.nan, torch.nan
+    result = smoothed(truth, position, R)
+    assert result.extrapolated.nonzero().flatten().tolist() == list(range(*lost))
+    off = turn_off(truth, result)
+    assert off.isfinite().all()
+    middle, sigma = (lost[0] + lost[1]) // 2, result.orientation_cov_rad2.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert sigma[middle].norm() > 1.2 * sigma[20].norm()
+    assert ((off / sigma)[lost[0] : lost[1]].abs() < 4).all()
+    assert rel_rms(result.omega_lab_rad_s, truth.omega_lab_rad_s) < 0.03
+
+
+def test_both_ends_have_values_and_their_own_larger_sigma(rng: torch.Generator) -> None:
+    truth = planted()
+    result = smoothed(truth, *measured(truth, rng))
+    for error, sigma in errors(truth, result).values():
+        for end, inner in ((0, 20), (-1, -20)):
+            assert (sigma[end] > 1.5 * sigma[inner]).all()
+            assert ((error / sigma)[end].abs() < 4).all()
+
+
+def test_a_third_of_the_frames_may_be_missing_even_at_45_degrees_a_frame(rng: torch.Generator) -> None:
+    truth = planted(292.0)
+    position, R = measured(truth, rng)
+    lost = torch.rand(len(R), generator=rng) < 0.3
+    position[lost], R[lost] = torch.nan, torch.nan
+    result = smoothed(truth, position, R)
+    assert turn_off(truth, result).norm(dim=-1).max() < 6 * ORIENTATION_RAD
+    assert torch.equal(result.extrapolated, lost)
+
+
+def test_positions_and_orientations_may_be_missing_in_different_frames(rng: torch.Generator) -> None:
+    truth = planted()
+    position, R = measured(truth, rng)
+    whole = smoothed(truth, position, R)
+    position[50] = torch.nan
+    result = smoothed(truth, position, R)
+    assert result.extrapolated.nonzero().flatten().tolist() == [50]
+    assert_close(result.omega_lab_rad_s, whole.omega_lab_rad_s)
+    assert result.velocity_m_s.isfinite().all()
+
+
+def test_times_may_be_uneven_and_jump(rng: torch.Generator) -> None:
+    time_s = (torch.rand(220, generator=rng, dtype=torch.float64).sort().values * 220 + torch.arange(220) * 0.2) / RATE
+    time_s = torch.cat([time_s[:100], time_s[100:] + 15 / RATE])
+    truth = planted(time_s=time_s)
+    result = smoothed(truth, *measured(truth, rng))
+    assert rel_rms(result.omega_lab_rad_s, truth.omega_lab_rad_s) < 0.006
+    assert rel_rms(result.velocity_m_s, truth.velocity_m_s) < 0.004
+    assert 0.7 < over_sigma(turn_off(truth, result), result.orientation_cov_rad2) < 1.4
+
+
+# wrong frames
+
+
+@pytest.mark.parametrize("omega_rms", [10.5, 292.0], ids=["2 deg", "45 deg a frame"])
+@pytest.mark.parametrize("wrong", [[70], [0, 3, 90, 91, 199], [50, 51, 52]], ids=str)
+def test_wrong_frames_bend_nothing(omega_rms: float, wrong: list[int], rng: torch.Generator) -> None:
+    truth = planted(omega_rms)
+    position, R = measured(truth, rng)
+    away = torch.tensor([0.0, 5.0, 0.0], dtype=torch.float64)
+    position[wrong] += away
+    R[wrong] = so3.exp(torch.tensor([2.0, 1.0, 0.0], dtype=torch.float64)) @ R[wrong]
+    result = smoothed(truth, position, R)
+    assert result.rejected.nonzero().flatten().tolist() == wrong
+    assert not result.extrapolated.any()
+    sigma = result.orientation_cov_rad2.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert ((turn_off(truth, result) / sigma).abs() < 4.5).all()
+    assert ((truth.position_lab_mm - result.position_lab_mm).norm(dim=-1) < 0.1).all()
+
+
+def test_a_frame_that_is_off_by_ten_sigmas_is_found_and_one_by_two_is_kept(rng: torch.Generator) -> None:
+    truth = planted()
+    position, R = measured(truth, rng)
+    for k, sigmas in ((60, 10.0), (120, 2.0)):
+        R[k] = so3.exp(torch.tensor([sigmas * ORIENTATION_RAD, 0, 0], dtype=torch.float64)) @ truth.R_lab_body[k]
+    assert smoothed(truth, position, R).rejected.nonzero().flatten().tolist() == [60]
+
+
+# convention and laws
+
+
+def test_constant_velocity_and_spin_come_out_exactly() -> None:
+    t = clock(60)
+    velocity = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+    omega = torch.tensor([100.0, 250.0, -50.0], dtype=torch.float64)  # 27 degrees a frame
+    R = so3.exp(t[:, None] * omega) @ so3.exp(torch.tensor([0.3, 0.2, 0.1], dtype=torch.float64))
+    truth = replace(planted(time_s=t), position_lab_mm=1000 * velocity * t[:, None], R_lab_body=R)
+    result = smoothed(truth, truth.position_lab_mm, R)
+    assert_close(result.velocity_m_s, velocity.expand(60, 3), atol=1e-9)
+    assert_close(result.acceleration_m_s2, torch.zeros(60, 3, dtype=torch.float64), atol=1e-6)
+    assert_close(result.omega_lab_rad_s, omega.expand(60, 3), atol=1e-7)
+    assert_close(result.alpha_lab_rad_s2, torch.zeros(60, 3, dtype=torch.float64), atol=1e-4)
+    assert_close(result.R_lab_body, R, atol=1e-9)
+    body = R[0].mT @ omega  # the axis of a constant spin is fixed in the body too
+    assert_close(result.omega_body_rad_s, body.expand(60, 3), atol=1e-7)
+    assert (body - omega).norm() > 50  # the wrong frame would not pass
+
+
+def test_a_turned_lab_turns_the_result(rng: torch.Generator) -> None:
+    truth = planted(60.0, clock(80))
+    position, R = measured(truth, rng)
+    turn = so3.exp(torch.tensor([1.0, -0.5, 2.0], dtype=torch.float64))
+    settings = SmoothSettings(position_band_hz=40.0, orientation_band_hz=60.0)
+    one = smoothed(truth, position, R, settings=settings)
+    other = smoothed(truth, position @ turn.mT, turn @ R, settings=settings)
+    assert_close(other.velocity_m_s, one.velocity_m_s @ turn.mT, atol=1e-9)
+    assert_close(other.R_lab_body, turn @ one.R_lab_body, atol=1e-9)
+    assert_close(other.alpha_lab_rad_s2, one.alpha_lab_rad_s2 @ turn.mT, atol=1e-3)  # of some thousands
+    assert_close(other.alpha_body_rad_s2, one.alpha_body_rad_s2, atol=1e-3)
+    assert_close(other.orientation_cov_rad2, turn @ one.orientation_cov_rad2 @ turn.mT, atol=1e-10)
+
+
+def test_time_backwards_turns_rates_around(rng: torch.Generator) -> None:
+    truth = planted(time_s=clock(80))
+    position, R = measured(truth, rng)
+    settings = SmoothSettings(position_band_hz=40.0, orientation_band_hz=60.0)
+    one = smoothed(truth, position, R, settings=settings)
+    other = smoothed(truth, position.flip(0), R.flip(0), settings=settings)
+    assert_close(other.velocity_m_s.flip(0), -one.velocity_m_s, atol=1e-6)
+    assert_close(other.omega_lab_rad_s.flip(0), -one.omega_lab_rad_s, atol=2e-3)
+    assert_close(other.acceleration_m_s2.flip(0), one.acceleration_m_s2, atol=1e-4)
+
+
+def test_segments_know_nothing_of_each_other(rng: torch.Generator) -> None:
+    truth = planted()
+    position, R = measured(truth, rng)
+    segment = torch.zeros(len(R), dtype=torch.long)
+    segment[90:], segment[85:90] = 7, -1
+    settings = SmoothSettings(position_band_hz=40.0, orientation_band_hz=60.0)
+    one = smoothed(truth, position, R, segment, settings)
+    position[90:] += 30.0
+    R[90:] = R[90:] @ so3.exp(torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64))
+    other = smoothed(truth, position, R, segment, settings)
+    for entry in fields(Smoothed):
+        values = getattr(one, entry.name)
+        if isinstance(values, Tensor) and values.is_floating_point():
+            assert values[85:90].isnan().all(), entry.name
+            assert values[:85].isfinite().all(), entry.name
+            # the factor on the sigmas is learnt from all segments, the motion of each from itself
+            torch.testing.assert_close(getattr(other, entry.name)[:85], values[:85], rtol=1e-6, atol=1e-9)
+
+
+def test_a_narrower_band_follows_less() -> None:
+    truth = planted()
+    narrow, wide = (
+        smoothed(
+            truth, truth.position_lab_mm, truth.R_lab_body, settings=SmoothSettings(orientation_band_hz=band)
+        ).alpha_lab_rad_s2
+        for band in (5.0, 100.0)
+    )
+    assert rel_rms(wide, truth.alpha_lab_rad_s2) < 0.05
+    assert rel_rms(narrow, truth.alpha_lab_rad_s2) > 0.3
+
+
+@pytest.mark.parametrize(("frames", "rates", "changes"), [(1, False, False), (2, True, False), (3, True, True)])
+def test_short_segments_have_what_they_determine(frames: int, rates: bool, changes: bool, rng: torch.Generator) -> None:
+    truth = planted()
+    segment = torch.zeros(len(truth.time_s), dtype=torch.long)
+    segment[100:], segment[100 : 100 + frames] = -1, 1
+    result = smoothed(truth, *measured(truth, rng), segment)
+    few = slice(100, 100 + frames)
+    assert result.position_lab_mm[few].isfinite().all()
+    assert result.R_lab_body[few].isfinite().all()
+    assert result.orientation_cov_rad2[few].isfinite().all()
+    for x in (result.velocity_m_s, result.omega_lab_rad_s, result.omega_body_sigma_rad_s):
+        assert bool(x[few].isfinite().all()) == rates
+        assert bool(x[few].isnan().all()) != rates
+    for x in (result.acceleration_m_s2, result.alpha_lab_rad_s2, result.alpha_body_sigma_rad_s2):
+        assert bool(x[few].isnan().all()) != changes
+
+
+@pytest.mark.parametrize("frames", [0, 1, 4])
+def test_too_few_frames_to_learn_from_come_back_as_they_are(frames: int, rng: torch.Generator) -> None:
+    truth = planted(time_s=clock(4))
+    position, R = measured(truth, rng)
+    truth = Motion6D(**{entry.name: getattr(truth, entry.name)[:frames] for entry in fields(Motion6D)})
+    result = smoothed(truth, position[:frames], R[:frames])
+    assert_close(result.position_lab_mm, position[:frames])
+    assert_close(result.R_lab_body, R[:frames])
+    assert result.velocity_m_s.isnan().all()
+    assert result.position_scale == result.orientation_scale == 1.0
+
+
+def test_the_same_input_gives_the_same_bytes_and_is_left_alone(rng: torch.Generator) -> None:
+    truth = planted(time_s=clock(60))
+    position, R = measured(truth, rng)
+    copies = position.clone(), R.clone()
+    first, second = smoothed(truth, position, R), smoothed(truth, position, R)
+    for entry in fields(Smoothed):
+        one, other = getattr(first, entry.name), getattr(second, entry.name)
+        assert torch.equal(one, other) if isinstance(one, Tensor) else one == other, entry.name
+    assert torch.equal(position, copies[0])
+    assert torch.equal(R, copies[1])
+
+
+# refusals
+
+
+def test_unequal_numbers_of_frames_and_times_that_stand_still_are_refused(rng: torch.Generator) -> None:
+    truth = planted(time_s=clock(20))
+    position, R = measured(truth, rng)
+    with pytest.raises(ShapeError, match="same frames"):
+        smoothed(truth, position[:-1], R)
+    with pytest.raises(ShapeError, match="increase"):
+        smoothed(replace(truth, time_s=torch.zeros(20, dtype=torch.float64)), position, R)
+
+
+def test_every_setting_is_described() -> None:
+    assert all(entry.description for entry in SmoothSettings.model_fields.values())
