@@ -78,9 +78,7 @@ def main() -> None:
             cells.append(f"{100 * float(arrived.double().mean()):.0f} %")
         name = list(levels)[first]
         print(f"| {name}, blur {levels[name][0].blur_px:.2f} px | " + " | ".join(cells) + " |", flush=True)
-    print(
-        f"\nGrid of {settings.search.step_deg:g} degrees: no rotation is beyond 14.5 degrees of a template (test_grey_search)."
-    )
+    print(f"\nSearch bank of {settings.search.step_deg:g} degrees; at 12 no rotation is beyond 14.5 of a template.")
 
 
 if __name__ == "__main__":
