@@ -72,12 +72,14 @@ def sphere_view(
     inner = pixels.inner
     variance = (1.0 - pull * (edge + pull)).clamp(SPREAD_MIN, 1.0)[:, :inner]
     spread = blur * variance.sqrt() * q[:, :inner]
-    nodes = [(q[:, :inner] + side * spread, variance) for side in (-1.0, 1.0)]
-    parts = [_looked(nodes, d[..., :inner], outward[..., :inner], nearest[:, :inner], R, paint, radius_mm)]
+    at = torch.stack([q[:, :inner] - spread, q[:, :inner] + spread], dim=1)
+    parts = [
+        _looked(at, variance[:, None], d[..., :inner], outward[..., :inner], nearest[:, :inner], R, paint, radius_mm)
+    ]
     if inner < d.shape[-1]:
         outer = slice(inner, None)
-        nodes = _rim_nodes(q0[:, outer], blur, edge[:, outer], coverage[:, outer], density[:, outer], q[:, outer])
-        parts.append(_looked(nodes, d[..., outer], outward[..., outer], nearest[:, outer], R, paint, radius_mm))
+        at, moves = _rim_nodes(q0[:, outer], blur, coverage[:, outer], density[:, outer], q[:, outer])
+        parts.append(_looked(at, moves, d[..., outer], outward[..., outer], nearest[:, outer], R, paint, radius_mm))
     body, turn, shift = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
     return View(
         paint=body,
@@ -89,25 +91,22 @@ def sphere_view(
     )
 
 
-def _rim_nodes(
-    q0: Tensor, blur: Tensor, edge: Tensor, coverage: Tensor, density: Tensor, middle: Tensor
-) -> list[tuple[Tensor, Tensor]]:
-    """Return look-ups of equal weight along the radius where the limb is near, and how each moves with the pixel.
+def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
+    """Return look-ups along the radius where the limb is near, and how each moves with the pixel, (L, n, P) each.
 
     They are quantiles of the cut-off Gaussian, drawn towards its middle by what the table's own blur adds.
     """
-    nodes = []
-    for k in range(RIM_NODES):
-        share = (k + 0.5) / RIM_NODES
-        z = torch.special.ndtri((share * coverage).clamp(1e-6, 1 - 1e-6))
-        # Of the aperture's middle, the limb holds back the more of a node the nearer it is.
-        moves = 1.0 - share * density / (torch.exp(-0.5 * z * z) * (1.0 / math.sqrt(2.0 * math.pi)))
-        nodes.append((middle + middle * (q0 + blur * z - middle), moves.clamp(0.0, 1.0)))
-    return nodes
+    share = ((torch.arange(RIM_NODES, dtype=q0.dtype, device=q0.device) + 0.5) / RIM_NODES)[:, None]
+    z = torch.special.ndtri((share * coverage[:, None]).clamp(1e-6, 1 - 1e-6))
+    # The limb holds back the more of a node the nearer to it the node is.
+    moves = 1.0 - share * density[:, None] / (torch.exp(-0.5 * z * z) * (1.0 / math.sqrt(2.0 * math.pi)))
+    middle = middle[:, None]
+    return middle + middle * (q0[:, None] + blur[:, None] * z - middle), moves.clamp(0.0, 1.0)
 
 
 def _looked(
-    nodes: list[tuple[Tensor, Tensor]],
+    at: Tensor,
+    moves: Tensor,
     d: Tensor,
     outward: Tensor,
     nearest: Tensor,
@@ -118,7 +117,8 @@ def _looked(
     """Return the mean paint of some look-ups (L, P) and its derivatives by rotation and place (L, 3, P).
 
     Args:
-        nodes: distance of each look-up from the disk's middle, radii, and by how much it moves with the pixel.
+        at: (L, n, P), distance of each look-up from the disk's middle, radii.
+        moves: (L, n, P) or (L, 1, P), by how much it moves with the pixel.
         d: (L, 3, P), lines of sight.
         outward: (L, 3, P), unit, from the centre to them.
         nearest: (L, P), their distance, mm.
@@ -127,28 +127,24 @@ def _looked(
         radius_mm: of the sphere.
     """
     # In body components, where the paint is: the derivatives are turned back once, at the end.
-    sight_b, outward_b = R.mT @ d, R.mT @ outward
-    body, radial = torch.zeros_like(nearest), torch.zeros_like(nearest)
-    turn_b, flat_b = torch.zeros_like(d), torch.zeros_like(d)
-    for at, moves in nodes:
-        qt = at.clamp(0.0, math.sqrt(1.0 - DEPTH_MIN**2))
-        depth = (1.0 - qt * qt).sqrt()
-        normal_b = qt[:, None] * outward_b - depth[:, None] * sight_b
-        value, slope = paint.look(normal_b)
-        body = body + value
-        turn_b = turn_b + _cross(slope, normal_b)
-        flat_b = flat_b + qt[:, None] * slope
-        # Moving the centre along -outward lets the look-up slide outwards over the sphere.
-        radial = radial + moves * ((slope * outward_b).sum(1) + qt / depth * (slope * sight_b).sum(1))
-    by_sight, by_outward = (flat_b * sight_b).sum(1), (flat_b * outward_b).sum(1)
+    sight_b, outward_b = (R.mT @ d)[:, :, None], (R.mT @ outward)[:, :, None]
+    qt = at.clamp(0.0, math.sqrt(1.0 - DEPTH_MIN**2))
+    depth = (1.0 - qt * qt).sqrt()
+    normal_b = qt[:, None] * outward_b - depth[:, None] * sight_b
+    value, slope = paint.look(normal_b.flatten(2))
+    value, slope = value.reshape(qt.shape), slope.reshape(normal_b.shape)
+    # Moving the centre along -outward lets the look-up slide outwards over the sphere.
+    slide = (slope * outward_b).sum(1) + qt / depth * (slope * sight_b).sum(1)
+    radial = (moves * slide).mean(1)
+    flat_b = (qt[:, None] * slope).mean(2)
+    by_sight, by_outward = (flat_b * sight_b[:, :, 0]).sum(1), (flat_b * outward_b[:, :, 0]).sum(1)
     # Across the radius a look-up stays at its share of it, q / q0.
     flat = R @ flat_b - by_sight[:, None] * d - by_outward[:, None] * outward
-    weight = 1.0 / len(nodes)
-    shift = flat * (-weight / nearest)[:, None] - (weight * radial / radius_mm)[:, None] * outward
-    return weight * body, weight * (R @ turn_b), shift
+    shift = flat * (-1.0 / nearest)[:, None] - (radial / radius_mm)[:, None] * outward
+    return value.mean(1), R @ _cross(slope, normal_b).mean(2), shift
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """Return a x b of (L, 3, P); torch's own is several times slower along a middle axis."""
+    """Return a x b of (L, 3, ...); torch's own is several times slower along a middle axis."""
     (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=1)
