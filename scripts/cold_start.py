@@ -70,7 +70,7 @@ def errors_deg(
             [frame],
             settings.locate,
             candidates=settings.refine.candidates,
-            score_min=learnt.score_min,
+            score_min=learnt.clear_score,
         )
         error = float(so3.geodesic_distance(poses.R_lab_body[0], R)) if len(poses) else math.inf
         errors.append(math.degrees(error))

@@ -44,6 +44,7 @@ from sphereorient.orient import (
 from sphereorient.provenance import provenance
 from sphereorient.settings import DEFAULT_METHOD, METHODS, Settings, settings_yaml
 from sphereorient.sphere import load_texture
+from sphereorient.sphere.paint_table import PaintTable
 from sphereorient.trajectory import Trajectory
 
 CHUNK = 64  # frames held at once; a result does not depend on it
@@ -173,7 +174,7 @@ def locate_sphere(
     stage = f"{reel.name}: locate"
     progress(stage, 0, len(reel.frames))
     spread = locate.spread_frames(reel.frames, settings.locate.background_frames)
-    diameter_px = settings.locate.diameter_px or locate.expected_diameter_px(reel.name, cameras, experiment.diameter_mm)
+    diameter_px = _diameter_px(reel.name, cameras, experiment, settings)
     empty_path = experiment.background_paths.get(reel.name)
     empty = None if empty_path is None else locate.load_background(empty_path, reel.movie.frame_shape)
     background = locate.learn_background(reel.movie, spread, diameter_px, settings.locate, empty)
@@ -240,11 +241,15 @@ def _precise(
     progress: Progress,
 ) -> Trajectory:
     """One likelihood for all cameras: pose after pose refined, then the history, then its motion."""
-    with ThreadPoolExecutor(len(reels)) as pool:
-        eyes = list(pool.map(lambda reel: open_eye(reel, reels, experiment, settings, progress), reels))
-    search = GreySearch(texture, settings.search)
-    proposers: dict[str, Proposer] = {eye.name: search for eye in eyes}
-    learnt = study_movies(reels, eyes, texture, proposers, experiment, settings, progress)
+    cameras = {reel.name: reel.camera for reel in reels}
+    diameters = {name: _diameter_px(name, cameras, experiment, settings) for name in cameras}
+    with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products leave the interpreter free
+        opening = [pool.submit(open_eye, reel, diameters[reel.name], experiment, settings, progress) for reel in reels]
+        base = pool.submit(base_table, texture, max(diameters.values()))
+        search = pool.submit(GreySearch, texture, settings.search)
+        eyes = [eye.result() for eye in opening]
+        proposers: dict[str, Proposer] = {eye.name: search.result() for eye in eyes}
+        learnt = study_movies(reels, eyes, base.result(), proposers, experiment, settings, progress)
     tracker = BlockTracker(learnt, proposers, settings.locate, settings.refine)
     table = pose_table(list(follow_sphere(reels, frames, tracker, progress)), len(eyes))
     hypotheses = Hypotheses(
@@ -264,12 +269,10 @@ def _precise(
     return results.precise_track(experiment, clock, table, chosen, smoothed, learnt)
 
 
-def open_eye(reel: Reel, reels: Sequence[Reel], experiment: Experiment, settings: Settings, progress: Progress) -> Eye:
+def open_eye(reel: Reel, diameter_px: float, experiment: Experiment, settings: Settings, progress: Progress) -> Eye:
     """Learn one camera's empty scene."""
     stage = f"{reel.name}: background"
     progress(stage, 0, 1)
-    cameras = {each.name: each.camera for each in reels}
-    diameter_px = settings.locate.diameter_px or locate.expected_diameter_px(reel.name, cameras, experiment.diameter_mm)
     empty_path = experiment.background_paths.get(reel.name)
     empty = None if empty_path is None else locate.load_background(empty_path, reel.movie.frame_shape)
     spread = locate.spread_frames(reel.frames, settings.refine.background_frames)
@@ -282,7 +285,7 @@ def open_eye(reel: Reel, reels: Sequence[Reel], experiment: Experiment, settings
 def study_movies(
     reels: Sequence[Reel],
     eyes: Sequence[Eye],
-    texture: Tensor,
+    base: PaintTable,
     proposers: Mapping[str, Proposer],
     experiment: Experiment,
     settings: Settings,
@@ -295,7 +298,7 @@ def study_movies(
     learnt = study(
         eyes,
         list(zip(*pictures, strict=True)),
-        base_table(texture, max(eye.diameter_px for eye in eyes)),
+        base,
         proposers,
         _radius_mm(experiment),
         settings.locate,
@@ -329,6 +332,11 @@ def follow_sphere(reels: Sequence[Reel], frames: range, tracker: BlockTracker, p
 def _taken(pictures: Iterator[NDArray[Any]], count: int) -> list[NDArray[Any]]:
     """Take the next pictures of a movie."""
     return list(islice(pictures, count))
+
+
+def _diameter_px(name: str, cameras: Mapping[str, Camera], experiment: Experiment, settings: Settings) -> float:
+    """Expected diameter of the sphere's picture."""
+    return settings.locate.diameter_px or locate.expected_diameter_px(name, cameras, experiment.diameter_mm)
 
 
 def _radius_mm(experiment: Experiment) -> float:

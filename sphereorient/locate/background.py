@@ -19,6 +19,7 @@ from sphereorient.errors import ExperimentError, refusal
 # of the movie, a tenth of the frames shows the scene.
 MEASURED_SHARE, MEASURED_SIGMAS = 0.8, 1.2816
 GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
+FEW = 10  # frames; the share above means nothing in fewer, and all pixels are taken to be alike
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,7 +96,10 @@ def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None
     if empty is not None:
         # A low quantile of whole grey levels is often 0: no pixel is quieter than most of them are in most frames.
         quiet = np.abs(pictures[:, ::8, ::8].astype(np.float32) - empty[::8, ::8])
-        noise = np.maximum(noise, np.median(_nan_quantile(quiet, MEASURED_SHARE)) / MEASURED_SIGMAS)
+        if len(pictures) >= FEW:
+            noise = np.maximum(noise, np.median(_nan_quantile(quiet, MEASURED_SHARE)) / MEASURED_SIGMAS)
+        else:  # the ball itself would pass for a glittering thing wherever it is
+            noise = np.full(shape, max(1.4826 * np.median(quiet), _rounding(full_scale)), np.float32)
     return Background(mean=mean, noise=noise, full_scale=full_scale)
 
 
@@ -127,11 +131,16 @@ def without_ball(background: Background, pictures: NDArray[Any], covered: NDArra
     return Background(mean=mean, noise=noise, full_scale=background.full_scale)
 
 
+def _rounding(full_scale: float) -> float:
+    """Scatter of a pixel, grey levels, where all frames are equal."""
+    return float(full_scale / 255 / 12**0.5)
+
+
 def _statistics(
     values: NDArray[np.float32], given: NDArray[np.float32] | None, full_scale: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Clipped mean, or the given one, and robust sigma over the first axis; NaN does not count."""
-    rounding = full_scale / 255 / 12**0.5  # scatters by this much also where all frames are equal
+    rounding = _rounding(full_scale)
     share, sigmas = (MEASURED_SHARE, MEASURED_SIGMAS) if given is None else (GIVEN_SHARE, GIVEN_SIGMAS)
     middle = _nan_quantile(values, 0.5) if given is None else given
     scatter = np.abs(values - middle)

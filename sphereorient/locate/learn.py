@@ -46,7 +46,7 @@ def learn_background(
         covered = _covered(pictures, background, diameter_px, settings)
         background = without_ball(first, pictures, covered)
         found = int(covered.any(axis=(1, 2)).sum())
-        if found <= before:  # nothing new to learn
+        if found <= before or found == len(pictures):  # nothing new to learn
             break
         before = found
     return background

@@ -99,10 +99,14 @@ class _View:
 def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
     rays = camera.rays(seen.centre_px)
     rim = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=seen.centre_px.dtype)
-    limb = camera.rays(seen.centre_px[:, None] + rim * seen.radius_px[:, None, None]).direction_lab
+    limb = camera.rays(seen.centre_px[:, None] + rim * seen.radius_px[:, None, None])
     # sin of the angle between the centre's ray and the limb's: the cross product is exact for small angles.
-    sine = torch.linalg.cross(limb, rays.direction_lab[:, None].expand_as(limb)).norm(dim=-1).mean(1)
-    distance = radius_mm / sine
+    away = torch.linalg.cross(rays.direction_lab[:, None].expand_as(limb.direction_lab), limb.direction_lab)
+    sine = away.norm(dim=-1).mean(1)
+    distance = radius_mm / sine  # from where the rays would meet
+    # Behind a wall they begin that far from each other already, over the angle: so much of the distance is not theirs.
+    begun = torch.linalg.cross(rays.origin_lab_mm[:, None] - limb.origin_lab_mm, limb.direction_lab)
+    before = (begun * away).sum(-1).mean(1) / sine.square()
     per_px = distance * sine / seen.radius_px  # mm in space per px, at the sphere
     sigma = seen.outline_rms_px * per_px
     outer = rays.direction_lab[:, :, None] * rays.direction_lab[:, None, :]
@@ -110,7 +114,7 @@ def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
     sigma_along = distance * seen.outline_rms_px / seen.radius_px
     return _View(
         rays=rays,
-        from_size_mm=rays.origin_lab_mm + distance[:, None] * rays.direction_lab,
+        from_size_mm=rays.origin_lab_mm + (distance - before)[:, None] * rays.direction_lab,
         across=(eye - outer) / sigma[:, None, None].square(),
         along=outer / sigma_along[:, None, None].square(),
     )

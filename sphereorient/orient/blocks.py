@@ -22,6 +22,8 @@ from sphereorient.trajectory import Reason
 
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
 NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
+FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
+MOVE_SHARE = 0.3  # of the radius: how far the ball may have moved where nothing is known of its motion
 ASTRAY_SHARE = 0.01  # of the radius: how far a place may be from where three frames say it is
 
 
@@ -34,6 +36,7 @@ class _Expected:
     use: Tensor  # (C,) bool, cameras that saw the ball
     reason: tuple[Reason, ...]  # C, why the others did not
     place_precision: Tensor  # (3, 3), 1/mm^2
+    rough: bool = False  # from one predecessor alone: nothing is known of the motion
 
 
 @dataclass(eq=False)
@@ -47,8 +50,12 @@ class _Lane:
     def expected(self, frame: int, radius_mm: float) -> _Expected | None:
         """Place and turn go on, their change too where three frames tell it."""
         rows = [poses for number, poses in self.past if number >= frame - len(self.past)]
-        if len(rows) < 2 or [number for number, _ in self.past][-2:] != [frame - 2, frame - 1]:
+        numbers = [number for number, _ in self.past]
+        if not rows or numbers[-1] != frame - 1:
             return None
+        reason = tuple(Reason.LOW_SCORE if why is Reason.OK else why for why in rows[-1].reason)
+        if len(rows) < 2 or numbers[-2] != frame - 2:
+            return self._beside(rows[-1], reason, radius_mm)
         *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
         *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
         *_, R0, R1 = (poses.R_lab_body[0] for poses in rows)
@@ -64,8 +71,20 @@ class _Lane:
             position_lab_mm=X1 + move,
             R_lab_body=so3.exp(turn) @ R1,
             use=rows[-1].use,
-            reason=tuple(Reason.LOW_SCORE if why is Reason.OK else why for why in rows[-1].reason),
+            reason=reason,
             place_precision=torch.linalg.inv(spread + astray),
+        )
+
+    def _beside(self, last: Poses, reason: tuple[Reason, ...], radius_mm: float) -> _Expected:
+        """Near the last pose, the motion being unknown."""
+        spread = last.covariance[0, 3:, 3:] + (MOVE_SHARE * radius_mm) ** 2 * torch.eye(3, dtype=torch.float64)
+        return _Expected(
+            position_lab_mm=last.position_lab_mm[0],
+            R_lab_body=last.R_lab_body[0],
+            use=last.use,
+            reason=reason,
+            place_precision=torch.linalg.inv(spread),
+            rough=True,
         )
 
     def saw(self, frame: int, poses: Poses) -> None:
@@ -96,6 +115,7 @@ class BlockTracker:
     ) -> None:
         self.fitter: Fitter = learnt.fitter
         self.score_min = learnt.score_min
+        self.clear_score = learnt.clear_score
         self.proposers = proposers
         self.locating = locating
         self.settings = settings
@@ -151,9 +171,12 @@ class BlockTracker:
             torch.stack([getattr(one, name) for one in expected])
             for name in ("position_lab_mm", "R_lab_body", "use", "place_precision")
         )
+        if any(one.rough for one in expected):
+            X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
         fit = self._fitted(frames, X, R, use, precision)
         good = self._borne_out(fit, use)
-        if not bool(good.all()):
+        within = self.fitter.largest_px(X) <= self.fitter.widest_px  # others are searched for, frame by frame
+        if not bool((good | ~within).all()):
             # One picture without the ball spoils what all say together: each camera by itself, the best one counts.
             best = torch.where(good, torch.inf, -torch.inf)
             for camera in range(use.shape[1]):
@@ -174,21 +197,39 @@ class BlockTracker:
             [Reason.OK if ok else why for ok, why in zip(row, one.reason, strict=True)]
             for row, one in zip(use.tolist(), expected, strict=True)
         ]
+        good = good & within
         return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if good[n] else None for n in range(asked)]
 
+    def _approached(
+        self,
+        frames: Sequence[Sequence[Picture]],
+        X: Tensor,
+        R: Tensor,
+        use: Tensor,
+        precision: Tensor,
+        rough: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Bring rough poses (B,) bool within reach of the finest detail, through coarser ones."""
+        for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
+            pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px)
+            fit = self.fitter.fit(pixels.thinned(every), X, R, use, level, iterations, precision)
+            X = torch.where(rough[:, None], fit.position_lab_mm, X)
+            R = torch.where(rough[:, None, None], fit.R_lab_body, R)
+        return X, R
+
     def _fitted(self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor) -> Fit:
-        """Fit poses that are about right: to half the pixels, longer where that moves them, and then to all."""
+        """Fit poses that are about right: to some of the pixels, longer where that moves them, and then to all."""
         # With all cameras the pictures tell the place; with one of two its distance is better known from before.
         precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
-        fine = self.fitter.optics.fine
-        pixels = self.fitter.pixels(frames, X, fine)
-        half = pixels.every(torch.arange(0, pixels.grey.shape[1], 2))
-        fit = self.fitter.fit(half, X, R, use, fine, 1, precision)
+        fine, widest = self.fitter.optics.fine, self.fitter.widest_px
+        pixels = self.fitter.pixels(frames, X, fine, widest)
+        some = pixels.thinned(FIRST_EVERY)
+        fit = self.fitter.fit(some, X, R, use, fine, 1, precision)
         far = self._far(fit, use)
         if bool(far.any()):
-            more = self.fitter.fit(half, fit.position_lab_mm, fit.R_lab_body, use, fine, 2, precision)
+            more = self.fitter.fit(some, fit.position_lab_mm, fit.R_lab_body, use, fine, 2, precision)
             fit = _chosen(far, more, fit)
-            pixels = self.fitter.pixels(frames, torch.where(far[:, None], fit.position_lab_mm, X), fine)
+            pixels = self.fitter.pixels(frames, torch.where(far[:, None], fit.position_lab_mm, X), fine, widest)
         fit = self.fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 1, precision)
         far = self._far(fit, use)
         if bool(far.any()):
@@ -213,10 +254,12 @@ class BlockTracker:
         """Find the poses of a frame of which nothing is known, by those cameras whose pictures bear them out."""
         count = self.settings.candidates
         poses = cold_start(
-            self.fitter, self.proposers, frames, self.locating, candidates=count, score_min=self.score_min
+            self.fitter, self.proposers, frames, self.locating, candidates=count, score_min=self.clear_score
         )
         if not len(poses):
             return poses
+        if not bool(poses.use.all()):
+            poses = self._all_seeing(poses, frames)
         seen = poses.use & (poses.score[0] >= self.score_min)
         reason = [
             Reason.LOW_SCORE if was and not now else why
@@ -230,6 +273,19 @@ class BlockTracker:
         pixels = self.fitter.pixels([frames] * len(poses), X, fine)
         fit = self.fitter.fit(pixels, X, R, seen.expand(len(poses), -1), fine, 4)
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
+
+    def _all_seeing(self, poses: Poses, frames: Sequence[Picture]) -> Poses:
+        """Fit poses to all pictures, where that explains all: a disk without an outline may still be there."""
+        X, R, optics = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics
+        every = torch.ones_like(poses.use).expand(len(poses), -1)
+        for level, iterations in ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)):
+            pixels = self.fitter.pixels([frames] * len(poses), X, level)
+            fit = self.fitter.fit(pixels, X, R, every, level, iterations)
+            X, R = fit.position_lab_mm, fit.R_lab_body
+        order = fit.nll.argsort(stable=True)
+        if not bool(self._borne_out(fit, every)[order[0]]):
+            return poses
+        return poses_of(fit, order, torch.ones_like(poses.use), [Reason.OK] * len(poses.use))
 
 
 def _chosen(rows: Tensor, one: Fit, other: Fit) -> Fit:

@@ -21,6 +21,7 @@ from sphereorient.trajectory import Reason
 
 DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin
 PLACE_SHARE = 0.03  # of the radius: how far an outline's centre may be off, dark rims included
+DEPTH_SHARE = 0.08  # of the distance: how far off it may be where one outline's size alone tells it
 NARROWER = (0.15, 0.06)  # deviations from the usual diameter with which outlines are looked for again
 GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance see different things
 
@@ -164,6 +165,12 @@ def _poses(
     if not len(R):
         return no_pose(len(eyes), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
     slack = torch.nan_to_num(placed.covariance_mm2[0]) + (PLACE_SHARE * fitter.radius_mm) ** 2 * torch.eye(3).double()
+    if int(use.sum()) == 1:
+        # Arcs of a rim that is dark in part fit a smaller circle as well, and do not know it.
+        (seeing,) = (eye for eye, used in zip(eyes, use.tolist(), strict=True) if used)
+        sight = seeing.camera.rays(seeing.camera.project(placed.position_lab_mm))
+        along = placed.position_lab_mm[0] - sight.origin_lab_mm[0]
+        slack = slack + DEPTH_SHARE**2 * along[:, None] * along
     return _narrow(fitter, pictures, placed.position_lab_mm, torch.linalg.inv(slack), R, use, reason, finalists)
 
 
@@ -184,14 +191,13 @@ def _narrow(
     steps = (
         (optics.coarse, 1, 4, finalists + 1),
         (optics.middle, 3, 3, finalists),
-        (optics.fine, 2, 2, finalists),
-        (optics.fine, 1, 2, finalists),
+        (optics.fine, 4, 2, finalists),
+        (optics.fine, 1, 1, finalists),
     )
     for level, every, iterations, keep in steps:
         held = None if level is optics.fine else precision.expand(len(R), 3, 3)
         # All starts of a level look at the same pixels: those about the place the outlines give.
-        one = fitter.pixels([pictures], place, level)
-        one = one.every(torch.arange(0, one.grey.shape[1], every))
+        one = fitter.pixels([pictures], place, level).thinned(every)
         pixels = one.where(torch.arange(len(one)).repeat(len(R)))
         fit = fitter.fit(pixels, X, R, use.expand(len(R), -1), level, iterations, held)
         chosen = distinct(fit.R_lab_body, fit.nll, keep)

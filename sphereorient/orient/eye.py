@@ -38,14 +38,11 @@ class Eye:
     sight: LinesOfSight
 
     def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
-        """Half the width of the ball's picture at places (..., 3), along the camera's own right."""
-        return self.disk_px(position_lab_mm, radius_mm)[1]
-
-    def disk_px(self, position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
-        """Return where balls at places (..., 3) appear: (u, v) of their centres (..., 2), and radii (...), px."""
+        """Half the width (...), px, of the ball's picture at places (..., 3), along the camera's own right."""
         right = self.camera.R_cam_lab[0] * radius_mm
         centre, rim = self.camera.project(torch.stack([position_lab_mm, position_lab_mm + right]))
-        return centre, (rim - centre).norm(dim=-1)
+        radius_px: Tensor = (rim - centre).norm(dim=-1)
+        return radius_px
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,24 +96,37 @@ class Fitter:
     radius_mm: float
     optics: Optics
     light: Light
+    widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
 
     @property
     def shading(self) -> Shading:
         """Orders of each frame's own light: high while nothing is learnt."""
         return LATER if self.light.known else FIRST
 
-    def pixels(self, pictures: Sequence[Sequence[Picture]], position_lab_mm: Tensor, level: Level) -> Pixels:
+    def largest_px(self, position_lab_mm: Tensor) -> Tensor:
+        """Radius (B,), px, of the largest disk that a ball at places (B, 3) shows in any picture."""
+        radii = torch.stack([eye.radius_px(position_lab_mm, self.radius_mm) for eye in self.eyes])
+        return radii.nan_to_num().amax(0)
+
+    def pixels(
+        self,
+        pictures: Sequence[Sequence[Picture]],
+        position_lab_mm: Tensor,
+        level: Level,
+        radius_px: float | None = None,
+    ) -> Pixels:
         """Cut the disks of B poses out of the pictures of C eyes.
 
         Args:
             pictures: B times C frames.
             position_lab_mm: (B, 3), where the ball is, to a few pixels.
             level: of detail.
+            radius_px: of the disks; None: that of the largest one, on which the others' last bits then depend.
         """
-        disks = [eye.disk_px(position_lab_mm, self.radius_mm) for eye in self.eyes]
-        middles = [torch.nan_to_num(centre).tolist() for centre, _ in disks]
-        largest = max(float(radius.nan_to_num().max()) for _, radius in disks)
-        stencil = level.stencil(min(largest, 0.5 * max(self.eyes[0].camera.image_size)))
+        middles = [torch.nan_to_num(eye.camera.project(position_lab_mm)).tolist() for eye in self.eyes]
+        if radius_px is None:
+            radius_px = float(self.largest_px(position_lab_mm).max())
+        stencil = level.stencil(min(radius_px, 0.5 * max(self.eyes[0].camera.image_size)))
         return stacked(
             [
                 cut_pixels(frame, eye.background.mean, eye.sight, tuple(middles[c][b]), stencil, level.extra_px)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera
 
+VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
 INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
 
 
@@ -44,13 +45,23 @@ class Pixels:
         parts: dict[str, Any] = {name: getattr(self, name)[chosen] for name in names}
         return replace(self, **parts)
 
-    def every(self, places: Tensor) -> Pixels:
-        """Return some of the places of all disks, by index (Q,)."""
+    def thinned(self, step: int) -> Pixels:
+        """Return every so-many-th place of all disks."""
+        places = torch.arange(0, whole_vectors(self.grey.shape[1] // step) * step, step)
         names = ("grey", "behind", "inside", "direction")
         parts: dict[str, Any] = {name: getattr(self, name)[..., places] for name in names}
         origin = self.origin if self.origin.shape[-1] == 1 else self.origin[..., places]
         inner = int((places < self.inner).sum())
         return replace(self, **parts, origin=origin, tile=self.tile[places], inner=inner)
+
+
+def whole_vectors(count: int) -> int:
+    """Return the largest number up to `count` that fills the processor's vectors: the rest is computed otherwise.
+
+    What is left over at the end of a batch goes through other code whose last bits differ, and a disk's numbers would
+    depend on whether it is the last one.
+    """
+    return max(count // VECTOR, 1) * VECTOR
 
 
 class LinesOfSight:
@@ -94,7 +105,7 @@ def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stenci
     distance2 = right**2 + down**2
     # Among equals in no order of place: every second one of a list row by row would be the disk's left half.
     order = np.lexsort((np.random.default_rng(0).random(len(distance2)), distance2))
-    order = order[distance2[order] <= radius_px**2]
+    order = order[: whole_vectors(int((distance2 <= radius_px**2).sum()))]
     right, down = right[order], down[order]
     across = 2 * reach // tile_px + 1
     tile = (down + reach) // tile_px * across + (right + reach) // tile_px

@@ -105,6 +105,8 @@ def refine(
     """
     cameras = use.shape[1]
     start, X, R = position_lab_mm.double(), position_lab_mm.double(), R_lab_body.double()
+    origin = _by_pose(pixels.origin[..., 0].double(), cameras)
+    seen = use.to(X.dtype)
     state: tuple[Tensor, Tensor] | None = None
     for _ in range(iterations):
         at = _residuals(pixels, X, R, state, radius_mm, paint, blur_px, light, cameras, shading)
@@ -115,13 +117,12 @@ def refine(
         gradient = (weighted @ at.residual[..., None])[..., 0].double()
         information, pull, mixed = _without_light(normal, gradient)
         information, pull = (_by_pose(part, cameras) for part in (information, pull))
-        seen = use.to(information.dtype)
         whole = (information * seen[..., None, None]).sum(1)
         force = (pull * seen[..., None]).sum(1)
         if place_precision is not None:
             whole[:, 3:, 3:] += place_precision
             force[:, 3:] -= (place_precision @ (X - start)[..., None])[..., 0]
-        step = _bounded(_solved(whole, force), radius_mm)
+        step = _bounded(_solved(whole, force), X[:, None] - origin, seen, radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
     # Where each camera would go from where the last step began, less that step.
@@ -251,9 +252,23 @@ def _inverse(matrix: Tensor) -> Tensor:
     return inverse
 
 
-def _bounded(step: Tensor, radius_mm: float) -> Tensor:
-    """Shorten steps over 0.1 rad or a tenth of a radius, pose by pose: beyond, the paint's slope says nothing."""
-    size = torch.maximum(step[:, :3].norm(dim=-1), step[:, 3:].norm(dim=-1) / radius_mm)
+def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) -> Tensor:
+    """Shorten steps that change a picture by over 0.1 radii, pose by pose: beyond, the slopes say nothing.
+
+    Along a line of sight the picture only grows: there a step may be as long as its share of the distance allows.
+
+    Args:
+        step: (B, 6), rad and mm.
+        to_centre: (B, C, 3), from where each camera looks to the sphere, mm.
+        seen: (B, C), 1 for the cameras in use.
+        radius_mm: of the sphere.
+    """
+    distance = to_centre.norm(dim=-1, keepdim=True).clamp_min(radius_mm)
+    move, sight = step[:, None, 3:], to_centre / distance
+    along = (move * sight).sum(-1, keepdim=True)
+    across = (move - along * sight).norm(dim=-1) / radius_mm
+    seen_change = torch.hypot(across, (along / distance)[..., 0]) * seen
+    size = torch.maximum(step[:, :3].norm(dim=-1), seen_change.amax(1))
     return step * (0.1 / size.clamp_min(0.1))[:, None]
 
 

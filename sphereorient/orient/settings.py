@@ -104,8 +104,8 @@ class RefineSettings(BaseModel):
     )
     candidates: int = Field(4, ge=1, description="proposals of each camera that are fitted where nothing is known")
     block_frames: int = Field(
-        64, ge=2, description="frames between full searches; blocks begin at multiples of it and know nothing of others"
+        32, ge=2, description="frames between full searches; blocks begin at multiples of it and know nothing of others"
     )
     lanes: int = Field(
-        1, ge=1, description="blocks followed side by side, in one batch; more suit a GPU; their frames are all held"
+        4, ge=1, description="blocks followed side by side, in one batch; more suit a GPU; their frames are all held"
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,6 +22,8 @@ from sphereorient.sphere.paint_table import PaintTable
 from sphereorient.trajectory import Reason
 
 BLURS = tuple(FINEST_PX * 1.25**k for k in range(8))  # px; what is tried where the blur is not given
+ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
+WIDER = 1.03  # how much larger than in the frames looked at a disk may be in others
 FIRST_BLUR = 0.625  # px: a pixel's own width and a good lens
 
 
@@ -31,6 +34,11 @@ class Study:
     fitter: Fitter
     score_min: float  # between right and wrong poses
     right_score: float  # typical of right poses
+
+    @property
+    def clear_score(self) -> float:
+        """Score of a pose that explains its pictures about as well as is typical."""
+        return max(self.score_min, _clear_of(self.right_score))
 
 
 def study(
@@ -66,10 +74,12 @@ def study(
         optics=Optics(base, blur_px, diameter_px),
         light=light,
     )
-    found = [
-        cold_start(fitter, proposers, frames, locating, candidates=settings.candidates, finalists=2)
-        for frames in pictures
-    ]
+
+    def search(frames: Sequence[Picture]) -> Poses:
+        return cold_start(fitter, proposers, frames, locating, candidates=settings.candidates, finalists=2)
+
+    with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
+        found = list(pool.map(search, pictures))
     chosen = _clear(found)
     if not chosen:
         raise _nothing(found)
@@ -77,7 +87,7 @@ def study(
     R = torch.cat([found[k].R_lab_body[:1] for k in chosen])
     use = torch.stack([found[k].use for k in chosen])
     pixels = fitter.pixels([pictures[k] for k in chosen], X, fitter.optics.fine)
-    pixels = pixels.every(torch.arange(0, pixels.grey.shape[1], 2))
+    pixels = pixels.thinned(max(1, round(pixels.grey.shape[1] / ENOUGH)))
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
     fitter, fit = _with_light(fitter, pixels, fit, use, 2)
     if settings.blur_px is None:
@@ -85,9 +95,11 @@ def study(
         optics = Optics(base, blur_px, diameter_px)
         fitter = Fitter(eyes=eyes, radius_mm=radius_mm, optics=optics, light=fitter.light)
     fitter, fit = _with_light(fitter, pixels, fit, use, 2)
+    widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
     wrong = torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in chosen])
     highest = float(wrong.quantile(0.9)) if len(wrong) else 0.0
+    fitter = replace(fitter, widest_px=widest)
     return Study(fitter=fitter, score_min=0.5 * (right + min(highest, right)), right_score=right)
 
 
@@ -107,7 +119,12 @@ def _clear(found: Sequence[Poses]) -> list[int]:
     best = torch.tensor([float(poses.score[0, poses.use].min()) if len(poses) else torch.nan for poses in found])
     if torch.isnan(best).all():
         return []
-    return [k for k, score in enumerate(best.tolist()) if score >= 1 - 3 * (1 - float(best.nanquantile(0.75)))]
+    return [k for k, score in enumerate(best.tolist()) if score >= _clear_of(float(best.nanquantile(0.75)))]
+
+
+def _clear_of(typical: float) -> float:
+    """Return the score that leaves three times as much unexplained as a typical one."""
+    return 1 - 3 * (1 - typical)
 
 
 def _with_light(fitter: Fitter, pixels: Pixels, fit: Fit, use: Tensor, rounds: int) -> tuple[Fitter, Fit]:
