@@ -62,7 +62,7 @@ def sphere_view(
     outward = aside / -nearest[:, None]  # unit, from the centre to the line of sight
     q0 = nearest / radius_mm
     distance = to_centre[..., 0].norm(dim=1, keepdim=True)
-    blur = blur_px * pixels.pitch_rad[:, None] * distance / radius_mm
+    blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
     # The Gaussian aperture, cut off at the limb: what share is left, where its middle lies, how wide it is.
     edge = (1.0 - q0) / blur
     coverage = torch.special.ndtr(edge)

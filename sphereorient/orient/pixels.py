@@ -31,7 +31,8 @@ class Pixels:
     direction: Tensor  # (L, 3, P), unit lines of sight, lab
     origin: Tensor  # (L, 3, 1) or (L, 3, P), where they start, lab, mm
     axes: Tensor  # (L, 2, 3), the camera's x and y in the lab
-    pitch_rad: Tensor  # (L,), angle between neighbouring pixels at the disk's middle
+    pitch_rad: Tensor  # (L,), angle between neighbouring lines of sight at the disk's middle
+    pitch_mm: Tensor  # (L,), how far apart they start; 0 but behind a wall and in parallel light
     tile: Tensor  # (P,) int64, square tile of the disk that a place belongs to, for errors that neighbours share
     inner: int = 0  # so many first places are well within the limb
 
@@ -41,13 +42,14 @@ class Pixels:
 
     def where(self, chosen: Tensor) -> Pixels:
         """Return some of the disks, by mask (L,) or by index."""
-        names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad")
+        names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad", "pitch_mm")
         parts: dict[str, Any] = {name: getattr(self, name)[chosen] for name in names}
         return replace(self, **parts)
 
     def thinned(self, step: int) -> Pixels:
         """Return every so-many-th place of all disks."""
-        places = torch.arange(0, whole_vectors(self.grey.shape[1] // step) * step, step)
+        places = torch.arange(0, self.grey.shape[1], step)
+        places = places[: whole_vectors(len(places))]
         names = ("grey", "behind", "inside", "direction")
         parts: dict[str, Any] = {name: getattr(self, name)[..., places] for name in names}
         origin = self.origin if self.origin.shape[-1] == 1 else self.origin[..., places]
@@ -83,6 +85,16 @@ class LinesOfSight:
         self.origin = origin.float().movedim(-1, 0)[:, :1, :1] if self.one_origin else origin.float().movedim(-1, 0)
         self.axes = camera.R_cam_lab[:2].float()
         self.size = width, height
+
+    def pitch(self, u: int, v: int) -> tuple[Tensor, Tensor]:
+        """Return by how much the line of sight differs from the next ones, right and below: angle, start (mm)."""
+        d = self.direction
+        turned = 0.5 * ((d[:, v, u + 1] - d[:, v, u]).norm() + (d[:, v + 1, u] - d[:, v, u]).norm())
+        if self.one_origin:
+            return turned, torch.zeros(())
+        o, here = self.origin, d[:, v, u]
+        moved = [o[:, v, u + 1] - o[:, v, u], o[:, v + 1, u] - o[:, v, u]]
+        return turned, torch.stack([(step - (step @ here) * here).norm() for step in moved]).mean()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,8 +162,7 @@ def cut_pixels(
     place = (rows - top).clip(0, grey.shape[0] - 1) * grey.shape[1] + (columns - left).clip(0, grey.shape[1] - 1)
     at = torch.from_numpy(rows * width + columns)
     flat = sight.direction.reshape(3, -1)
-    middle = min(max(v, 0), height - 2) * width + min(max(u, 0), width - 2)
-    pitch = (flat[:, middle + 1] - flat[:, middle]).norm(), (flat[:, middle + width] - flat[:, middle]).norm()
+    pitch_rad, pitch_mm = sight.pitch(min(max(u, 0), width - 2), min(max(v, 0), height - 2))
     return Pixels(
         grey=torch.from_numpy(grey.reshape(-1)[place])[None],
         behind=torch.from_numpy(np.ascontiguousarray(behind).reshape(-1)[place])[None],
@@ -159,7 +170,8 @@ def cut_pixels(
         direction=flat[:, at][None],
         origin=(sight.origin.reshape(3, 1) if sight.one_origin else sight.origin.reshape(3, -1)[:, at])[None],
         axes=sight.axes[None],
-        pitch_rad=(0.5 * (pitch[0] + pitch[1]))[None],
+        pitch_rad=pitch_rad[None],
+        pitch_mm=pitch_mm[None],
         tile=stencil.tile,
         inner=stencil.inner,
     )
@@ -167,7 +179,7 @@ def cut_pixels(
 
 def stacked(parts: list[Pixels]) -> Pixels:
     """Return the disks of all parts, which share one stencil, in one record."""
-    names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad")
+    names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad", "pitch_mm")
     widest = max(part.origin.shape[-1] for part in parts)
     full = [replace(part, origin=part.origin.expand(-1, -1, widest)) for part in parts]
     whole: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in full]) for name in names}
