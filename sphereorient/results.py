@@ -89,11 +89,13 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
         learnt: with the eyes.
     """
     eye = learnt.fitter.eyes[place]
-    frames, used = len(table), table.use[:, place]
-    position, R = picked["position_lab_mm"], picked["R_lab_body"]
+    frames = len(table)
+    tells = torch.tensor([why[place] in (Reason.OK, Reason.CONTRADICTS) for why in table.reason], dtype=torch.bool)
+    position, R = picked["position_lab_mm"] + picked["own_move"][:, place], picked["R_lab_body"]
+    position = torch.where(tells[:, None], position, picked["position_lab_mm"])
     centre_px = eye.camera.project(position)
     counts = table.mask.sum(-1)
-    shown = used & torch.isfinite(position[:, 0])
+    shown = tells & torch.isfinite(position[:, 0])
     where = shown[:, None, None]
     reason = [
         Reason.LOW_SCORE if why[place] is Reason.OK and not shown[k] else why[place]

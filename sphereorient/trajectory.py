@@ -52,6 +52,7 @@ class Reason(StrEnum):
     RUNAWAY = "runaway"
     LOW_SCORE = "low_score"
     AMBIGUOUS = "ambiguous"
+    CONTRADICTS = "contradicts"  # sees the ball, but elsewhere than the other camera: the cameras do not fit together
     UNDECODABLE = "undecodable"
 
 

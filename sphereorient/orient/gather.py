@@ -25,6 +25,7 @@ class PoseTable:
     covariance: Tensor  # (N, M, 6, 6), of delta (rad) and position (mm), lab
     own_turn: Tensor  # (N, M, C, 3), rad
     own_covariance: Tensor  # (N, M, C, 3, 3)
+    own_move: Tensor  # (N, M, C, 3), mm
     deviation: Tensor  # (N, M, C)
     score: Tensor  # (N, M, C)
     nll: Tensor  # (N, M), above the frame's best
@@ -55,7 +56,8 @@ def pose_table(frames: Sequence[Poses], cameras: int) -> PoseTable:
     width = max([len(poses) for poses in frames] + [1])
     mask = torch.tensor([[k < len(poses) for k in range(width)] for poses in frames]).reshape(-1, width)
     tails = {"position_lab_mm": (3,), "R_lab_body": (3, 3), "covariance": (6, 6), "own_turn": (cameras, 3)}
-    tails |= {"own_covariance": (cameras, 3, 3), "deviation": (cameras,), "score": (cameras,), "nll": ()}
+    tails |= {"own_covariance": (cameras, 3, 3), "own_move": (cameras, 3), "deviation": (cameras,)}
+    tails |= {"score": (cameras,), "nll": ()}
     parts = {}
     for name in POSE_PARTS:
         whole = torch.zeros(len(frames), width, *tails[name], dtype=torch.float64)

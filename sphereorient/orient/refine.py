@@ -38,6 +38,7 @@ class Fit:
     covariance: Tensor  # (B, 6, 6) float64, of delta (rad) and position (mm), lab
     own_turn: Tensor  # (B, C, 3), rad: how each camera alone would turn the pose, its place held
     own_covariance: Tensor  # (B, C, 3, 3), rad^2
+    own_move: Tensor  # (B, C, 3), mm, lab: how each camera alone would move the sphere, distance by size included
     deviation: Tensor  # (B, C), robust standard deviation of the residuals over the noise expected
     score: Tensor  # (B, C), 1 less the share of the picture's variance that is left
     nll: Tensor  # (B,), negative log-likelihood, errors that neighbours share counted once
@@ -130,6 +131,7 @@ def refine(
         information[..., :3, :3], pull[..., :3] - (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
     )
     own = own - step[:, None, :3]
+    freed = _solved(information, pull) - step[:, None]
     shared = _by_pose(_shared_scores(at, precision, mixed, pixels.tile), cameras)
     meat = (shared * seen[..., None, None]).sum(1)
     if place_precision is not None:  # what was known before has an error of its own
@@ -143,6 +145,7 @@ def refine(
         R_lab_body=R,
         covariance=covariance,
         own_turn=own,
+        own_move=_bounded_alone(freed, X[:, None] - origin, radius_mm),
         own_covariance=own_bread @ shared[..., :3, :3] @ own_bread,
         deviation=_by_pose(at.deviation.double(), cameras),
         score=_by_pose(_score(at, pixels.inside).double(), cameras),
@@ -270,6 +273,14 @@ def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) ->
     seen_change = torch.hypot(across, (along / distance)[..., 0]) * seen
     size = torch.maximum(step[:, :3].norm(dim=-1), seen_change.amax(1))
     return step * (0.1 / size.clamp_min(0.1))[:, None]
+
+
+def _bounded_alone(freed: Tensor, to_centre: Tensor, radius_mm: float) -> Tensor:
+    """Return the moves (B, C, 3) of steps (B, C, 6) that each camera would take alone."""
+    count = freed.shape[0] * freed.shape[1]
+    alone = torch.ones(count, 1, dtype=freed.dtype, device=freed.device)
+    step = _bounded(freed.reshape(count, 6), to_centre.reshape(count, 1, 3), alone, radius_mm)
+    return step.reshape(freed.shape)[..., 3:]
 
 
 def _shared_scores(at: _Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:

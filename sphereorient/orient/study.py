@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.locate import LocateSettings
-from sphereorient.orient.cold import Poses, cold_start
+from sphereorient.orient.cold import Poses, cold_start, cold_start_apart
 from sphereorient.orient.eye import FINEST_PX, Eye, Fitter, Optics, Picture, level_of
 from sphereorient.orient.light import Light
 from sphereorient.orient.pixels import Pixels
@@ -22,6 +24,7 @@ from sphereorient.sphere.paint_table import PaintTable
 from sphereorient.trajectory import Reason
 
 BLURS = tuple(FINEST_PX * 1.25**k for k in range(8))  # px; what is tried where the blur is not given
+TRIED, APART = 4, 1.5  # frames; and by how much more cameras that do not fit together leave unexplained
 ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
 WIDER = 1.03  # how much larger than in the frames looked at a disk may be in others
 FIRST_BLUR = 0.625  # px: a pixel's own width and a good lens
@@ -75,18 +78,20 @@ def study(
         light=light,
     )
 
-    def search(frames: Sequence[Picture]) -> Poses:
-        return cold_start(fitter, proposers, frames, locating, candidates=settings.candidates, finalists=2)
+    def search(how: Callable[..., Poses]) -> list[Poses]:
+        ask = partial(how, fitter, proposers, locating=locating, candidates=settings.candidates)
+        with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
+            return list(pool.map(ask, pictures))
 
-    with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
-        found = list(pool.map(search, pictures))
+    found = search(cold_start)
+    together = _fit_together(fitter, pictures, found)
+    if not together:
+        found = search(cold_start_apart)
     chosen = _clear(found)
     if not chosen:
         raise _nothing(found)
-    X = torch.cat([found[k].position_lab_mm[:1] for k in chosen])
-    R = torch.cat([found[k].R_lab_body[:1] for k in chosen])
-    use = torch.stack([found[k].use for k in chosen])
-    pixels = fitter.pixels([pictures[k] for k in chosen], X, fitter.optics.fine)
+    frame, X, R, use = _seen_by_all(found, chosen) if together else _seen_by_each(found, chosen)
+    pixels = fitter.pixels([pictures[k] for k in frame], X, fitter.optics.fine)
     pixels = pixels.thinned(max(1, round(pixels.grey.shape[1] / ENOUGH)))
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
     fitter, fit = _with_light(fitter, pixels, fit, use, 2)
@@ -101,6 +106,54 @@ def study(
     highest = float(wrong.quantile(0.9)) if len(wrong) else 0.0
     fitter = replace(fitter, widest_px=widest)
     return Study(fitter=fitter, score_min=0.5 * (right + min(highest, right)), right_score=right)
+
+
+def _fit_together(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> bool:
+    """Tell from a few frames whether the cameras see one ball in one place: bumped ones each explain more alone."""
+    if len(fitter.eyes) == 1:
+        return True
+    whole = [k for k, poses in enumerate(found) if len(poses) and bool(poses.use.all())]
+    apart = sum(Reason.CONTRADICTS in poses.reason for poses in found)
+    if apart > len(whole):
+        return False
+    tried = sorted(whole, key=lambda k: -float(found[k].score[0].min()))[:TRIED]
+    if not tried:
+        return True
+    X, R = (torch.cat([getattr(found[k], name)[:1] for k in tried]) for name in ("position_lab_mm", "R_lab_body"))
+    gains = []
+    for camera in range(len(fitter.eyes)):
+        only = torch.zeros(len(tried), len(fitter.eyes), dtype=torch.bool)
+        only[:, camera] = True
+        X_own, R_own = X, R
+        for level, step in ((fitter.optics.middle, 3), (fitter.optics.fine, 4)):
+            pixels = fitter.pixels([pictures[k] for k in tried], X_own, level).thinned(step)
+            fit = fitter.fit(pixels, X_own, R_own, only, level, 3)
+            X_own, R_own = fit.position_lab_mm, fit.R_lab_body
+        joint = torch.cat([found[k].score[:1, camera] for k in tried])
+        gains.append((1 - joint) / (1 - fit.score[:, camera]).clamp_min(1e-6))
+    return float(torch.stack(gains).amax(0).median()) < APART
+
+
+def _seen_by_all(found: Sequence[Poses], chosen: Sequence[int]) -> tuple[list[int], Tensor, Tensor, Tensor]:
+    """Return frames, places, rotations and cameras in use of poses that all cameras tell."""
+    X = torch.cat([found[k].position_lab_mm[:1] for k in chosen])
+    R = torch.cat([found[k].R_lab_body[:1] for k in chosen])
+    return list(chosen), X, R, torch.stack([found[k].use for k in chosen])
+
+
+def _seen_by_each(found: Sequence[Poses], chosen: Sequence[int]) -> tuple[list[int], Tensor, Tensor, Tensor]:
+    """Return the same of poses that each camera tells for itself."""
+    rows = [
+        (k, camera)
+        for k in chosen
+        for camera, why in enumerate(found[k].reason)
+        if why in (Reason.OK, Reason.CONTRADICTS)
+    ]
+    X = torch.stack([found[k].position_lab_mm[0] + found[k].own_move[0, c] * (not found[k].use[c]) for k, c in rows])
+    turn = torch.stack([found[k].own_turn[0, c] * (not found[k].use[c]) for k, c in rows])
+    R = so3.exp(turn) @ torch.stack([found[k].R_lab_body[0] for k, _ in rows])
+    use = torch.nn.functional.one_hot(torch.tensor([c for _, c in rows]), found[0].use.shape[0]).bool()
+    return [k for k, _ in rows], X, R, use
 
 
 def _nothing(found: Sequence[Poses]) -> ExperimentError:
