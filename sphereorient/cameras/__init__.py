@@ -3,6 +3,7 @@
 from sphereorient.cameras.camera import Camera, Rays
 from sphereorient.cameras.files import load_cameras, save_cameras
 from sphereorient.cameras.pinhole import PinholeCamera
+from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.cameras.triangulate import triangulate
 from sphereorient.cameras.tsai import TsaiCamera
 from sphereorient.cameras.view import R_cam_view
@@ -10,6 +11,8 @@ from sphereorient.cameras.view import R_cam_view
 __all__ = [
     "Camera",
     "PinholeCamera",
+    "Port",
+    "PortCamera",
     "R_cam_view",
     "Rays",
     "TsaiCamera",

@@ -7,6 +7,8 @@ from typing import Protocol
 
 from torch import Tensor
 
+from sphereorient.cameras.covariance import ParameterCovariance
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rays:
@@ -35,11 +37,15 @@ class Camera(Protocol):
     def T_cam_lab_mm(self) -> Tensor:
         """(3,) float64: X_cam = R_cam_lab X_lab + T_cam_lab_mm."""
 
+    @property
+    def covariance(self) -> ParameterCovariance | None:
+        """How wrong the parameters may be, where a calibration has said so."""
+
     def project(self, x_lab_mm: Tensor) -> Tensor:
         """Return the pixels (..., 2) as (u, v), px, where lab points (..., 3), mm, appear; NaN behind the camera."""
 
     def rays(self, uv_px: Tensor) -> Rays:
-        """Return the lines of sight of pixels (..., 2)."""
+        """Return the lines of sight of pixels (..., 2); behind a wall they begin on its liquid side."""
 
     def undistort(self, uv_px: Tensor) -> Tensor:
         """Return where the same camera without lens distortion would show what pixels (..., 2) show, (..., 2) px."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from sphereorient.cameras.camera import Rays
 from sphereorient.cameras.checks import as_parameter, check_image_size, check_points, check_rotation
+from sphereorient.cameras.covariance import ParameterCovariance
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -23,6 +26,10 @@ class CentralCamera(ABC):
     R_cam_lab: Tensor  # (3, 3)
     T_cam_lab_mm: Tensor  # (3,), X_cam = R_cam_lab X_lab + T
     centre_px: Tensor  # (2,), pixel of the optical axis
+    covariance: ParameterCovariance | None = None  # as of a calibration
+
+    # Names in cameras.yaml -> field, and place in it; rotation and translation, which all have, are not among them.
+    PARAMETERS: ClassVar[Mapping[str, tuple[str, int | None]]]
 
     def __post_init__(self) -> None:
         """Refuse what is no camera."""
@@ -35,6 +42,11 @@ class CentralCamera(ABC):
 
     def _set_parameter(self, name: str, *shape: int) -> None:
         object.__setattr__(self, name, as_parameter(name, getattr(self, name), *shape))
+
+    @property
+    def centre_lab_mm(self) -> Tensor:
+        """(3,), lab, mm: the point that all rays leave from."""
+        return -(self.R_cam_lab.mT @ self.T_cam_lab_mm)
 
     @property
     @abstractmethod
@@ -88,6 +100,5 @@ class CentralCamera(ABC):
         slope = (self.undistort(uv_px) - self.centre_px.to(uv_px)) / self.focal_px.to(uv_px)
         direction_cam = torch.cat([slope, torch.ones_like(slope[..., :1])], dim=-1)
         direction_cam = direction_cam / direction_cam.norm(dim=-1, keepdim=True)
-        centre_lab_mm = -(self.R_cam_lab.mT @ self.T_cam_lab_mm).to(uv_px)
         direction_lab = direction_cam @ self.R_cam_lab.to(uv_px)  # rows: R_lab_cam applied to every direction
-        return Rays(origin_lab_mm=centre_lab_mm.expand_as(direction_lab), direction_lab=direction_lab)
+        return Rays(origin_lab_mm=self.centre_lab_mm.to(uv_px).expand_as(direction_lab), direction_lab=direction_lab)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from sphereorient.errors import CameraError, ShapeError, check_tail, refusal
 
 ROTATION_TOLERANCE = 1e-5  # of |R R^T - I|: moves a point at the rim of a 1000 px picture by less than 0.01 px
+RIM_STEPS = 33  # points per side of the picture where the distortion is tried; both corners are among them
 
 
 def as_parameter(name: str, value: Tensor | float | Sequence[float], *shape: int) -> Tensor:
@@ -65,6 +67,36 @@ def check_rotation(name: str, R: Tensor) -> None:
         expected = f"a rotation, |R R^T - I| below {ROTATION_TOLERANCE:g} and det 1"
         do = "write R_cam_lab row by row with at least 7 digits, x right, y down, z forward"
         raise CameraError(refusal(name, expected=expected, got=f"|R R^T - I| = {error:.2g}, det = {det:.6g}", do=do))
+
+
+class Distorting(Protocol):
+    """What `check_unfolded` asks of a camera."""
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the picture, px."""
+
+    def undistort(self, uv_px: Tensor) -> Tensor:
+        """Return NaN where the distortion cannot be undone."""
+
+
+def check_unfolded(name: str, camera: Distorting) -> None:
+    """Refuse a distortion that folds over inside the picture.
+
+    Raises:
+        CameraError: somewhere on the picture's rim the distortion cannot be undone. Inside the rim it then can.
+    """
+    width, height = camera.image_size
+    across = torch.linspace(-0.5, width - 0.5, RIM_STEPS, dtype=torch.float64)
+    down = torch.linspace(-0.5, height - 0.5, RIM_STEPS, dtype=torch.float64)
+    sides = [torch.stack([across, torch.full_like(across, v)], dim=-1) for v in (-0.5, height - 0.5)]
+    sides += [torch.stack([torch.full_like(down, u), down], dim=-1) for u in (-0.5, width - 0.5)]
+    rim_px = torch.cat(sides)
+    lost = torch.isnan(camera.undistort(rim_px).detach()).any(-1)
+    if bool(lost.any()):
+        u, v = rim_px[lost][0].tolist()
+        expected, got = "a distortion that can be undone in the whole picture", f"one that folds before ({u:g}, {v:g})"
+        raise CameraError(refusal(name, expected=expected, got=got, do="correct the camera or calibrate again"))
 
 
 def check_points(name: str, points: Tensor, size: int) -> None:

@@ -17,10 +17,11 @@ def load_cameras(path: Path | str) -> dict[str, Camera]:
     """Read all cameras of a file, in the file's order.
 
     Args:
-        path: a YAML file of schema sphereorient-cameras/1. A camera's `covariance` is accepted and not kept.
+        path: a YAML file of schema sphereorient-cameras/1. A camera with a `port` comes as PortCamera; its
+            `covariance` is the camera's attribute of that name.
 
     Raises:
-        CameraError: missing, not YAML, another schema, an unknown key or model, a port, or an impossible parameter.
+        CameraError: missing, not YAML, another schema, an unknown key or model, or an impossible parameter.
 
     Source: DESIGN section 2.
     """
@@ -37,7 +38,7 @@ def load_cameras(path: Path | str) -> dict[str, Camera]:
 
 
 def save_cameras(path: Path | str, cameras: Mapping[str, Camera], comment: str = "") -> None:
-    """Write cameras to a file that `load_cameras` reads back to the last bit.
+    """Write cameras to a file that `load_cameras` reads back to the last bit, ports and covariances among them.
 
     Args:
         path: the file; an old one is replaced at once.

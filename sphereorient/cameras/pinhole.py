@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,6 +20,12 @@ class PinholeCamera(CentralCamera):
     """Perspective without distortion and with square pixels (DESIGN section 2, `pinhole`)."""
 
     f_px: Tensor  # (), focal length, px
+
+    PARAMETERS: ClassVar[Mapping[str, tuple[str, int | None]]] = {
+        "f_px": ("f_px", None),
+        "centre_u": ("centre_px", 0),
+        "centre_v": ("centre_px", 1),
+    }
 
     def __post_init__(self) -> None:
         """Refuse what is no camera."""

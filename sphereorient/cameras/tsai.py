@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -25,6 +27,16 @@ class TsaiCamera(CentralCamera):
     pixel_pitch_mm: Tensor  # (2,)
     sx: Tensor  # (), horizontal scale
     kappa1: Tensor  # (), 1/mm^2; DESIGN's symbol
+
+    PARAMETERS: ClassVar[Mapping[str, tuple[str, int | None]]] = {
+        "f": ("f_mm", None),
+        "pixel_pitch_u": ("pixel_pitch_mm", 0),
+        "pixel_pitch_v": ("pixel_pitch_mm", 1),
+        "sx": ("sx", None),
+        "centre_u": ("centre_px", 0),
+        "centre_v": ("centre_px", 1),
+        "kappa1": ("kappa1", None),
+    }
 
     def __post_init__(self) -> None:
         """Refuse what is no camera, and a distortion that folds the picture."""

@@ -6,7 +6,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from sphereorient.cameras import PinholeCamera, TsaiCamera
+from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera
+from sphereorient.cameras.brown import BrownCamera
+from sphereorient.cameras.openptv_camera import OpenPTVCamera
+from sphereorient.cameras.telecentric import TelecentricCamera
 
 SIZE = (650, 480)
 ROTVEC = (0.3, -0.2, 0.5)
@@ -44,6 +47,66 @@ def pinhole(**changes: object) -> PinholeCamera:
         "f_px": f64(700.0),
     }
     return PinholeCamera(**(parameters | changes))
+
+
+def brown(**changes: object) -> BrownCamera:
+    parameters: dict[str, object] = {
+        "image_size": SIZE,
+        "R_cam_lab": turned(),
+        "T_cam_lab_mm": f64(T_MM),
+        "centre_px": f64((331.0, 228.5)),
+        "f_px": f64((700.0, 715.0)),
+        "k": f64((-0.21, 0.12, -0.03)),
+        "p": f64((2e-3, -1.5e-3)),
+    }
+    return BrownCamera(**(parameters | changes))
+
+
+def telecentric(**changes: object) -> TelecentricCamera:
+    parameters: dict[str, object] = {
+        "image_size": SIZE,
+        "R_cam_lab": turned(),
+        "T_cam_lab_mm": f64(T_MM),
+        "centre_px": f64((331.0, 228.5)),
+        "scale_mm_px": f64(0.23),
+    }
+    return TelecentricCamera(**(parameters | changes))
+
+
+def openptv(**changes: object) -> OpenPTVCamera:
+    parameters: dict[str, object] = {
+        "image_size": SIZE,
+        "R_cam_lab": turned(),
+        "T_cam_lab_mm": f64(T_MM),
+        "centre_px": f64((331.0, 228.5)),
+        "f_mm": f64(18.0),
+        "pixel_pitch_mm": f64((0.02, 0.021)),
+        "k": f64((-4e-4, 6e-7, 1e-9)),
+        "p": f64((1e-4, -2e-4)),
+        "scx": f64(1.003),
+        "she": f64(0.002),
+    }
+    return OpenPTVCamera(**(parameters | changes))
+
+
+MODELS = {"tsai": tsai, "pinhole": pinhole, "brown": brown, "telecentric": telecentric, "openptv": openptv}
+
+
+def port(**changes: object) -> Port:
+    """A wall 120 mm from the lab's origin, 6 degrees from square to the cameras above, in Plexiglas and sugar water."""
+    tilt = torch.from_numpy(Rotation.from_rotvec((0.1, -0.04, 0.0)).as_matrix())
+    parameters: dict[str, object] = {
+        "normal": -(tilt @ turned()[2]),
+        "offset_mm": 120.0,
+        "thickness_mm": 12.0,
+        "n_glass": 1.49,
+        "n_fluid": 1.36,
+    }
+    return Port(**(parameters | changes))
+
+
+def behind_port(camera: Camera, **changes: object) -> PortCamera:
+    return PortCamera(camera=camera, port=port(**changes))
 
 
 def level(kappa1: float) -> TsaiCamera:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
-from camera_examples import f64, pinhole, tsai, whole_picture
+from camera_examples import MODELS, behind_port, f64, pinhole, tsai, whole_picture
 from conftest import SHARED, assert_close
 
 from sphereorient.cameras import PinholeCamera, TsaiCamera, load_cameras, save_cameras
+from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.errors import CameraError, OutputError
 
 TSAI = """
@@ -32,6 +34,8 @@ schema: sphereorient-cameras/1
 cameras:
   cam1: {model: pinhole, image_size: [384, 288], vfov_deg: 45.0, R: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], T: [0, 0, 0]}
 """
+PORT = "    port: {normal: [0, 0, -1], offset: 120.0, thickness: 12.0, n_glass: 1.49, n_fluid: 1.36}\n"
+COVARIANCE = "    covariance: {parameters: [f, kappa1], matrix: [[0.1, 0.0], [0.0, 1.0e-8]]}\n"
 
 
 def written(folder: Path, text: str) -> Path:
@@ -99,11 +103,30 @@ def test_keys_that_a_calibration_adds_are_accepted(tmp_path, extra):
 FAULTS = {
     "unknown key": (TSAI.replace("kappa1", "kapa1"), r"cam1: expected one of .*got 'kapa1'; write 'kappa1' instead\."),
     "unknown top key": (TSAI + "camera: 3\n", "got 'camera'; write 'cameras' instead"),
-    "unknown model": (TSAI.replace("tsai", "tsay"), "model: expected one of tsai, pinhole, got 'tsay'; write 'tsai'"),
-    "model of a later version": (TSAI.replace("tsai", "telecentric"), "expected one of tsai, pinhole, got 'telecentr"),
+    "unknown model": (
+        TSAI.replace("tsai", "tsay"),
+        "model: expected one of tsai, pinhole, brown.*, got 'tsay'; write 'tsai'",
+    ),
+    "model of another": (TSAI.replace("tsai", "fisheye"), "expected one of tsai, pinhole, .*, got 'fisheye'"),
     "model as a list": (TSAI.replace("tsai", "[tsai]"), "model: expected one of tsai, pinhole"),
-    "no model": (TSAI.replace("    model: tsai\n", ""), "cam1, model: expected one of tsai, pinhole, got none"),
-    "port": (TSAI + "    port: {normal: [0, -1, 0], offset: 120.0}\n", "cam1, port: expected a camera without a port"),
+    "no model": (TSAI.replace("    model: tsai\n", ""), "cam1, model: expected one of tsai, pinhole, .* got none"),
+    "half a port": (TSAI + "    port: {normal: [0, 0, -1], offset: 120.0}\n", "cam1, port.thickness: expected a value"),
+    "unknown key of a port": (TSAI + PORT.replace("n_fluid", "n_liquid"), "cam1, port: .* write 'n_fluid' instead"),
+    "wall the wrong way round": (TSAI + PORT.replace("-1]", "1]"), "cam1, port: expected a camera before the wall, .*"),
+    "long normal": (TSAI + PORT.replace("-1]", "-2]"), "cam1, port, normal: expected a vector of length 1, got 2"),
+    "thin air": (TSAI + PORT.replace("1.36", "0.9"), "cam1, port, n_fluid: expected 1 or more, got 0.9"),
+    "wall of no thickness": (TSAI + PORT.replace("12.0", "-12.0"), "port, thickness_mm: expected 0 or more, got -12"),
+    "covariance of nothing": (TSAI + "    covariance: 3\n", "cam1, covariance: expected"),
+    "covariance of another": (TSAI + COVARIANCE.replace("kappa1", "kapa1"), "got 'kapa1'; write 'kappa1' instead"),
+    "covariance of a port without one": (TSAI + COVARIANCE.replace("kappa1", "port_offset"), "got 'port_offset'"),
+    "short covariance": (TSAI + COVARIANCE.replace("[0.1, 0.0]", "[0.1]"), r"rows of 2 numbers, got lengths \[1, 2\]"),
+    "lopsided covariance": (TSAI + COVARIANCE.replace("[0.1, 0.0]", "[0.1, 1.0e-5]"), "expected a symmetric matrix"),
+    "impossible covariance": (
+        TSAI + COVARIANCE.replace("0.0", "1.0"),
+        "covariance, matrix: expected no negative eigenvalue",
+    ),
+    "negative variance": (TSAI + COVARIANCE.replace("[0.1", "[-0.1"), "none below zero on the diagonal"),
+    "one name twice": (TSAI + COVARIANCE.replace("kappa1", "f"), "covariance, parameters: expected different names"),
     "missing key": (TSAI.replace("    f: 45.0\n", ""), "cam1, f: expected a value, got none; add the key"),
     "text for a number": (TSAI.replace("45.0", "wide"), "cam1, f: expected a valid number.* got 'wide'"),
     "not a number": (TSAI.replace("45.0", ".nan"), "cam1, f_mm: expected finite numbers"),
@@ -177,6 +200,52 @@ def test_exact_cameras_project_the_true_positions_onto_the_true_pixels():
 
 
 @pytest.mark.shared
-def test_cameras_behind_a_port_are_refused_and_not_read_without_it():
-    with pytest.raises(CameraError, match="port"):
-        load_cameras(SHARED / "tank" / "cameras.yaml")
+def test_exact_cameras_behind_walls_project_the_true_positions_onto_the_true_pixels():
+    h5py = pytest.importorskip("h5py")
+    cameras = load_cameras(SHARED / "tank" / "cameras.yaml")
+    with h5py.File(SHARED / "tank" / "truth.h5") as truth:
+        position = torch.from_numpy(truth["position"][:])
+        for name, camera in cameras.items():
+            centre_px = torch.from_numpy(truth[name]["centre_px"][:])
+            assert_close(camera.project(position), centre_px, atol=1e-6)
+            assert (camera.camera.project(position) - centre_px).norm(dim=-1).max() > 5  # without the wall
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+@pytest.mark.parametrize("wall", [False, True], ids=["air", "port"])
+def test_every_model_comes_back_to_the_last_bit(tmp_path, model, wall):
+    names = ("T_y", "rotation_x") + (("port_tilt_x",) if wall else ())
+    root = torch.linspace(0.1, 0.7, len(names) ** 2, dtype=torch.float64).reshape(len(names), -1)
+    camera = model()
+    camera = behind_port(camera, normal=f64((1.0, 2.0, 2.001)) / -3) if wall else camera
+    camera = replace(camera, covariance=ParameterCovariance(names=names, matrix=root @ root.mT / 3))
+    save_cameras(tmp_path / "cameras.yaml", {"cam1": camera})
+    back = load_cameras(tmp_path / "cameras.yaml")["cam1"]
+    assert type(back) is type(camera)
+    assert back.image_size == camera.image_size
+    assert torch.equal(back.rays(whole_picture()).direction_lab, camera.rays(whole_picture()).direction_lab)
+    assert torch.equal(back.rays(whole_picture()).origin_lab_mm, camera.rays(whole_picture()).origin_lab_mm)
+    assert back.covariance.names == names
+    assert torch.equal(back.covariance.matrix, camera.covariance.matrix)
+    save_cameras(tmp_path / "again.yaml", {"cam1": back})
+    assert (tmp_path / "again.yaml").read_bytes() == (tmp_path / "cameras.yaml").read_bytes()
+
+
+def test_the_covariance_of_a_file_is_found_on_the_camera(tmp_path):
+    camera = load_cameras(written(tmp_path, TSAI + COVARIANCE))["cam1"]
+    assert camera.covariance.names == ("f", "kappa1")
+    assert camera.covariance.sigmas == pytest.approx({"f": 0.1**0.5, "kappa1": 1e-4})
+    assert load_cameras(written(tmp_path, TSAI))["cam1"].covariance is None
+
+
+def test_brown_and_telecentric_read_the_keys_of_the_design(tmp_path):
+    head = "schema: sphereorient-cameras/1\ncameras:\n  cam1: {image_size: [384, 288], "
+    pose = "R: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], T: [0, 0, 10], "
+    keys = "model: brown, fx: 100.0, fy: 200.0, cx: 190.0, cy: 140.0, k: [0.5, 0.25, 0.125], p: [0.01, 0.02]}"
+    # X/Z = 0.1, Y/Z = 0.2: r^2 = 0.05, radial 1.025640625, tangential as OpenCV's manual has it
+    u = 190 + 100 * (0.1 * 1.025640625 + 2 * 0.01 * 0.02 + 0.02 * (0.05 + 2 * 0.01))
+    v = 140 + 200 * (0.2 * 1.025640625 + 0.01 * (0.05 + 2 * 0.04) + 2 * 0.02 * 0.02)
+    camera = load_cameras(written(tmp_path, head + pose + keys))["cam1"]
+    assert_close(camera.project(f64((1.0, 2.0, 0.0))), f64((u, v)), atol=1e-9)
+    camera = load_cameras(written(tmp_path, head + pose + "model: telecentric, scale: 0.5}"))["cam1"]
+    assert_close(camera.project(f64((1.0, 2.0, 77.0))), f64((191.5 + 2, 143.5 + 4)))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from camera_examples import ROTVEC, T_MM, f64, pinhole, tsai, whole_picture
+from camera_examples import ROTVEC, T_MM, brown, f64, openptv, pinhole, tsai, whole_picture
 from conftest import assert_close
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,7 +14,13 @@ from hypothesis import strategies as st
 from sphereorient.cameras import Camera, TsaiCamera
 from sphereorient.errors import ShapeError
 
-CAMERAS = {"tsai": tsai(), "tsai_barrel": tsai(-3e-4), "pinhole": pinhole()}
+CAMERAS = {
+    "tsai": tsai(),
+    "tsai_barrel": tsai(-3e-4),
+    "pinhole": pinhole(),
+    "brown": brown(),
+    "openptv": openptv(),
+}
 
 
 @pytest.fixture(params=CAMERAS.values(), ids=CAMERAS)

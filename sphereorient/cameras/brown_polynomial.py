@@ -1,0 +1,128 @@
+"""Brown's radial and tangential polynomial on the plane, and the way back."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+RADIAL_STEPS = 30  # of Newton held in a bracket; at a fold, where Newton stalls, halving alone leaves 1e-9
+PLANE_STEPS = 8  # of Newton, from the radial solution: what is left is as small as the tangential part
+
+
+def bent(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
+    """Return where the polynomial moves points.
+
+    Args:
+        xy: (..., 2), any unit, from the centre of the distortion.
+        k: (3,), radial k1, k2, k3, in the unit to the powers -2, -4, -6.
+        p: (2,), tangential p1, p2 in OpenCV's order, in the inverse unit.
+
+    Returns:
+        (..., 2), unit of `xy`; NaN, with gradient 0, at and beyond the fold.
+
+    Source: Brown 1966 as OpenCV writes it: x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2).
+    """
+    ahead = _before_fold(xy, k, p)
+    moved, _ = _bent(torch.where(ahead, xy, torch.zeros_like(xy)), k.to(xy), p.to(xy))
+    return torch.where(ahead, moved, torch.full_like(moved, torch.nan))
+
+
+def straightened(xy_bent: Tensor, k: Tensor, p: Tensor) -> Tensor:
+    """Return the points that `bent` takes to `xy_bent`.
+
+    Args:
+        xy_bent: (..., 2), any unit, from the centre of the distortion.
+        k: as for `bent`.
+        p: as for `bent`.
+
+    Returns:
+        (..., 2), unit of `xy_bent`; NaN, with gradient 0, where no point before the fold goes.
+    """
+    goal, kk, pp = xy_bent, k.to(xy_bent), p.to(xy_bent)
+    with torch.no_grad():
+        radius = goal.norm(dim=-1, keepdim=True)
+        safe = torch.where(radius > 0, radius, torch.ones_like(radius))
+        xy = goal * (_radius_before(radius, kk, math.sqrt(fold2(k))) / safe)
+        for _ in range(PLANE_STEPS):
+            xy = _newton(xy, goal, kk, pp)
+        missed = (_bent(xy, kk, pp)[0] - goal).norm(dim=-1, keepdim=True)
+        close = missed <= 1e4 * torch.finfo(goal.dtype).eps * radius  # rounding, times what a near fold magnifies
+        exists = close & _before_fold(xy, k, p)
+        xy = torch.where(exists, xy, torch.zeros_like(xy))
+    goal = torch.where(exists, goal, torch.zeros_like(goal))
+    # Two more steps carry the implicit derivative: one makes the first right, two also the second.
+    xy = _newton(_newton(xy, goal, kk, pp), goal, kk, pp)
+    return torch.where(exists, xy, torch.full_like(xy, torch.nan))
+
+
+def fold2(k: Tensor) -> float:
+    """Return the squared radius at which the radial polynomial turns back, infinite where it never does."""
+    k1, k2, k3 = k.detach().tolist()
+    # 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 = 0 in 1/s: the leading coefficient is then 1, whatever the others are.
+    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+    inverse = float(roots.real[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].max(initial=0.0))
+    return 1.0 / inverse if inverse > 1e-300 else math.inf
+
+
+def _bent(xy: Tensor, k: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    """Return moved points and the three different entries of the (symmetric) Jacobian: xx, xy, yy."""
+    x, y = xy.unbind(-1)
+    k1, k2, k3 = k.unbind()
+    p1, p2 = p.unbind()
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    rise = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # twice d radial / d r^2
+    moved = torch.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        dim=-1,
+    )
+    jacobian = torch.stack(
+        [
+            radial + rise * x * x + 2 * p1 * y + 6 * p2 * x,
+            rise * x * y + 2 * p1 * x + 2 * p2 * y,
+            radial + rise * y * y + 6 * p1 * y + 2 * p2 * x,
+        ],
+        dim=-1,
+    )
+    return moved, jacobian
+
+
+def _newton(xy: Tensor, goal: Tensor, k: Tensor, p: Tensor) -> Tensor:
+    moved, jacobian = _bent(xy, k, p)
+    dx, dy = (moved - goal).unbind(-1)
+    a, b, c = jacobian.unbind(-1)
+    step = torch.stack([c * dx - b * dy, a * dy - b * dx], dim=-1)
+    return xy - step / (a * c - b * b)[..., None]
+
+
+def _before_fold(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
+    with torch.no_grad():
+        a, b, c = _bent(xy, k.to(xy), p.to(xy))[1].unbind(-1)
+        return ((xy.square().sum(-1) < fold2(k)) & (a * c - b * b > 0))[..., None]
+
+
+def _radius_before(goal: Tensor, k: Tensor, fold: float) -> Tensor:
+    """Return the radius that the radial part alone takes to `goal`, at most `fold`."""
+    k1, k2, k3 = k.unbind()
+
+    def value_and_slope(r: Tensor) -> tuple[Tensor, Tensor]:
+        r2 = r * r
+        return r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) - goal, 1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3))
+
+    low, high = torch.zeros_like(goal), goal.clamp_max(fold)
+    for _ in range(10):  # until the root lies in the upper half of the bracket, or 1000 times away from the goal
+        half_is_beyond, is_below = value_and_slope(high / 2)[0] > 0, value_and_slope(high)[0] < 0
+        high = torch.where(is_below, 2 * high, torch.where(half_is_beyond, high / 2, high)).clamp_max(fold)
+    r = high
+    for _ in range(RADIAL_STEPS):
+        value, slope = value_and_slope(r)
+        low, high = torch.where(value < 0, r, low), torch.where(value < 0, high, r)
+        better = r - value / slope
+        r = torch.where((better >= low) & (better <= high), better, (low + high) / 2)
+    return r

@@ -1,0 +1,242 @@
+"""A flat wall between camera and liquid: Snell's law at both faces, in both directions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sphereorient.cameras.camera import Camera, Rays
+from sphereorient.cameras.central import CentralCamera
+from sphereorient.cameras.checks import as_parameter, check_points
+from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.errors import CameraError, refusal
+
+UNIT_TOLERANCE = 1e-3  # of |normal| - 1: three digits are enough to write a normal; its length is not used
+STEPS = 12  # of Newton's method, before those that carry derivatives; 11 suffice up to 89.9 degrees of incidence
+ROUNDS = 40  # of the iteration for cameras without one centre; one is exact for parallel rays
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Port:
+    """A flat transparent wall: air before it, liquid behind it. Numbers float64; they may require gradients."""
+
+    normal: Tensor  # (3,), lab, unit length to three digits, towards the camera
+    offset_mm: Tensor  # (), normal . X of the wall's liquid side, lab
+    thickness_mm: Tensor  # ()
+    n_glass: Tensor  # (), index of the wall, relative to the air's
+    n_fluid: Tensor  # (), index of the liquid, relative to the air's
+
+    def __post_init__(self) -> None:
+        """Refuse what is no wall."""
+        object.__setattr__(self, "normal", as_parameter("port, normal", self.normal, 3))
+        for name in ("offset_mm", "thickness_mm", "n_glass", "n_fluid"):
+            object.__setattr__(self, name, as_parameter(f"port, {name}", getattr(self, name)))
+        length = float(self.normal.detach().norm())
+        if abs(length - 1) > UNIT_TOLERANCE:
+            do = "write the wall's normal in lab axes, towards the camera"
+            raise CameraError(refusal("port, normal", expected="a vector of length 1", got=f"{length:.6g}", do=do))
+        _check_least("port, thickness_mm", self.thickness_mm, 0.0, "write the wall's thickness in mm")
+        for name in ("n_glass", "n_fluid"):
+            _check_least(f"port, {name}", getattr(self, name), 1.0, "write the index relative to the air's")
+
+    @property
+    def normal_lab(self) -> Tensor:
+        """(3,), the normal with length 1 to the last digit."""
+        length: Tensor = self.normal.norm()
+        return self.normal / length
+
+    @property
+    def air_side_mm(self) -> Tensor:
+        """(), normal . X of the wall's side towards the camera, lab."""
+        return self.offset_mm + self.thickness_mm
+
+    def refract(self, air: Rays) -> Rays:
+        """Return what becomes of rays in air when they pass the wall.
+
+        Args:
+            air: rays on the camera's side, lab; each is taken for a whole line.
+
+        Returns:
+            Rays in the liquid: origin (..., 3) on the wall's liquid side, mm, and direction (..., 3); NaN, with
+            gradient 0, for rays that do not go towards the wall.
+
+        Source: Snell's law: the direction's part along the wall is divided by the index (DESIGN section 2, Port).
+        """
+        d = air.direction_lab
+        normal = self.normal_lab.to(d)
+        n_glass, n_fluid = self.n_glass.to(d), self.n_fluid.to(d)
+        cosine = -(d @ normal)[..., None]
+        passes = cosine > 0
+        cosine = torch.where(passes, cosine, torch.ones_like(cosine))
+        along_wall = torch.where(passes, d, -normal) + cosine * normal  # its length is the sine in air
+        # n cos(angle inside) = sqrt(n^2 - sin^2): written so that n = 1 gives back the cosine itself.
+        in_glass = (n_glass.square() - 1 + cosine.square()).sqrt()
+        in_fluid = (n_fluid.square() - 1 + cosine.square()).sqrt()
+        height = (air.origin_lab_mm @ normal)[..., None] - self.air_side_mm.to(d)
+        outer = air.origin_lab_mm + height / cosine * torch.where(passes, d, -normal)
+        origin = outer + self.thickness_mm.to(d) * (along_wall / in_glass - normal)
+        direction = (along_wall - in_fluid * normal) / n_fluid
+        nan = torch.full_like(direction, torch.nan)
+        return Rays(origin_lab_mm=torch.where(passes, origin, nan), direction_lab=torch.where(passes, direction, nan))
+
+    def entry_point(self, x_lab_mm: Tensor, eye_lab_mm: Tensor) -> Tensor:
+        """Return where light from points in the liquid leaves the wall on its way to an eye in the air.
+
+        Args:
+            x_lab_mm: (..., 3), lab, mm, in the liquid.
+            eye_lab_mm: (3,), lab, mm, in the air.
+
+        Returns:
+            (..., 3), lab, mm, on the wall's air side; NaN, with gradient 0, for points that are not in the liquid.
+
+        Source: Snell's law in the plane of normal and point (textbook), solved for the share of the way along the wall.
+        """
+        normal = self.normal_lab.to(x_lab_mm)
+        eye = eye_lab_mm.to(x_lab_mm)
+        height = eye @ normal - self.air_side_mm.to(x_lab_mm)
+        depth = self.offset_mm.to(x_lab_mm) - x_lab_mm @ normal
+        inside = depth >= 0
+        way = torch.where(inside[..., None], x_lab_mm, eye) - eye
+        along_wall = way - (way @ normal)[..., None] * normal
+        share = self._share_in_air(along_wall.square().sum(-1), height, torch.where(inside, depth, height))
+        point = eye - height * normal + share[..., None] * along_wall
+        return torch.where(inside[..., None], point, torch.full_like(point, torch.nan))
+
+    def _share_in_air(self, across2: Tensor, height: Tensor, depth: Tensor) -> Tensor:
+        """Return which share of the way along the wall is made in air, in (0, 1].
+
+        With s the sine in air the way is height tan + thickness s / sqrt(n_g^2 - s^2) + depth s / sqrt(n_f^2 - s^2).
+        Divided by the whole way it is g(share) = 1 below, which needs no square root of the way and so has gradients
+        straight below the eye as well. g rises and is concave: Newton from the share of steep rays, which is too
+        small, climbs to the root without ever passing it.
+        """
+        layers = [(self.thickness_mm.to(depth), self.n_glass.to(depth)), (depth, self.n_fluid.to(depth))]
+
+        def newton(share: Tensor) -> Tensor:
+            value, slope = share - 1, torch.ones_like(share)
+            for thick, n in layers:
+                straight2 = (n * height).square()
+                root2 = straight2 + (n.square() - 1) * share.square() * across2
+                root = root2.sqrt()
+                value = value + thick * share / root
+                slope = slope + thick * straight2 / (root2 * root)
+            return share - value / slope
+
+        with torch.no_grad():
+            share = newton(torch.zeros_like(depth))  # steep rays: 1 / (1 + thickness / (n_g H) + depth / (n_f H))
+            for _ in range(STEPS):
+                share = newton(share)
+        # Two more steps carry the implicit derivative: one makes the first right, two also the second.
+        return newton(newton(share))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PortCamera:
+    """Any camera model behind a flat wall; its R, T and picture are those of the camera in air.
+
+    `undistort` and `distort` are the inner camera's: they mend the lens and leave the bend of the wall, which depends
+    on how far the point is.
+    """
+
+    camera: Camera  # as it would be in air
+    port: Port
+    covariance: ParameterCovariance | None = None  # of the camera's and the port's parameters together
+
+    def __post_init__(self) -> None:
+        """Refuse a camera that stands in its wall or looks away from it."""
+        if self.covariance is None:
+            object.__setattr__(self, "covariance", self.camera.covariance)
+        normal, wall = self.port.normal_lab.detach(), float(self.port.air_side_mm.detach())
+        if isinstance(self.camera, CentralCamera):
+            stands = float(self.camera.centre_lab_mm.detach() @ normal)
+            if stands <= wall:
+                expected = f"a camera before the wall, its centre beyond normal . X = {wall:.6g} mm"
+                do = "write the normal towards the camera, and offset and thickness in mm in the lab"
+                raise CameraError(refusal("port", expected=expected, got=f"{stands:.6g} mm", do=do))
+        if not bool((self.camera.R_cam_lab[2].detach() @ normal) < 0):
+            do = "write the normal towards the camera"
+            got = f"normal {[round(part, 6) for part in normal.tolist()]}, away from it"
+            raise CameraError(refusal("port", expected="a wall that the camera looks at", got=got, do=do))
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the picture, px."""
+        return self.camera.image_size
+
+    @property
+    def R_cam_lab(self) -> Tensor:
+        """(3, 3) float64, takes lab components to camera components."""
+        return self.camera.R_cam_lab
+
+    @property
+    def T_cam_lab_mm(self) -> Tensor:
+        """(3,) float64: X_cam = R_cam_lab X_lab + T_cam_lab_mm, straight through the wall."""
+        return self.camera.T_cam_lab_mm
+
+    def undistort(self, uv_px: Tensor) -> Tensor:
+        """Return where the camera in air, without lens distortion, would show what pixels (..., 2) show there."""
+        return self.camera.undistort(uv_px)
+
+    def distort(self, uv_px: Tensor) -> Tensor:
+        """Return the pixels (..., 2) that `undistort` takes to `uv_px`, px."""
+        return self.camera.distort(uv_px)
+
+    def rays(self, uv_px: Tensor) -> Rays:
+        """Return the lines of sight of pixels in the liquid.
+
+        Args:
+            uv_px: (..., 2) as (u, v), px.
+
+        Returns:
+            Rays with origin (..., 3) on the wall's liquid side, mm, and direction (..., 3), lab; NaN where the pixel
+            does not look at the wall.
+
+        Raises:
+            ShapeError: the last axis is not 2.
+        """
+        return self.port.refract(self.camera.rays(uv_px))
+
+    def project(self, x_lab_mm: Tensor) -> Tensor:
+        """Return where points in the liquid appear.
+
+        Args:
+            x_lab_mm: (..., 3), lab, mm.
+
+        Returns:
+            (..., 2) as (u, v), px, also outside the picture; NaN for points that are not in the liquid.
+
+        Raises:
+            ShapeError: the last axis is not 3.
+        """
+        check_points("x_lab_mm", x_lab_mm, 3)
+        if isinstance(self.camera, CentralCamera):
+            return self.camera.project(self.port.entry_point(x_lab_mm, self.camera.centre_lab_mm))
+        return self.camera.project(self._apparent_point(x_lab_mm))
+
+    def _apparent_point(self, x_lab_mm: Tensor) -> Tensor:
+        """Return points that a camera without one centre would see in air where it sees `x_lab_mm` in the liquid.
+
+        The apparent point moves along the wall by what its own ray misses the true point; what is missed shrinks by
+        1 - 1/n and more per round for rays that meet the wall steeply, and is 0 after the first for parallel rays.
+        """
+        normal = self.port.normal_lab.to(x_lab_mm)
+        inside = (x_lab_mm @ normal <= self.port.offset_mm.to(x_lab_mm))[..., None]
+        apparent = x_lab_mm
+        missed = torch.zeros_like(x_lab_mm)
+        for _ in range(ROUNDS):
+            ray = self.rays(self.camera.project(apparent))
+            to_go = ((x_lab_mm - ray.origin_lab_mm) @ normal) / (ray.direction_lab @ normal)
+            missed = x_lab_mm - ray.origin_lab_mm - to_go[..., None] * ray.direction_lab
+            apparent = apparent + missed
+        found = missed.norm(dim=-1, keepdim=True) < 1e3 * torch.finfo(missed.dtype).eps * (
+            1 + x_lab_mm.norm(dim=-1, keepdim=True)
+        )
+        return torch.where(inside & found, apparent, torch.full_like(apparent, torch.nan))
+
+
+def _check_least(name: str, value: Tensor, least: float, do: str) -> None:
+    number = float(value.detach())
+    if number < least:
+        raise CameraError(refusal(name, expected=f"{least:g} or more", got=f"{number:.6g}", do=do))

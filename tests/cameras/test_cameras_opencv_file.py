@@ -1,0 +1,127 @@
+"""OpenCV's files: read as OpenCV wrote them, written as it reads them, and every fault in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from camera_examples import ROTVEC, SIZE, T_MM, brown, f64, turned
+from conftest import assert_close
+
+from sphereorient.cameras.opencv_file import load_opencv, save_opencv
+from sphereorient.errors import CameraError, OutputError
+
+K = np.array([[700.0, 0, 331], [0, 715, 228.5], [0, 0, 1]])
+D = np.array([-0.21, 0.12, 2e-3, -1.5e-3, -0.03])
+
+
+def opencv_file(path: Path, **nodes: object) -> Path:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    whole = {"image_width": SIZE[0], "image_height": SIZE[1], "camera_matrix": K, "distortion_coefficients": D}
+    for key, value in (whole | nodes).items():
+        if value is not None:
+            storage.write(key, value)
+    storage.release()
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".yaml", ".xml", ".json"])
+def test_a_camera_comes_back_to_the_last_bit(tmp_path, suffix):
+    camera = brown(f_px=f64((2100.0, 2144.0)) / 3)
+    save_opencv(tmp_path / f"cam{suffix}", camera)
+    back = load_opencv(tmp_path / f"cam{suffix}")
+    assert back.image_size == camera.image_size
+    for name in ("f_px", "centre_px", "k", "p", "R_cam_lab", "T_cam_lab_mm"):
+        assert torch.equal(getattr(back, name), getattr(camera, name)), name
+
+
+def test_opencv_reads_what_is_written(tmp_path):
+    save_opencv(tmp_path / "cam.yml", brown())
+    storage = cv2.FileStorage(str(tmp_path / "cam.yml"), cv2.FILE_STORAGE_READ)
+    np.testing.assert_array_equal(storage.getNode("camera_matrix").mat(), K)
+    np.testing.assert_array_equal(storage.getNode("distortion_coefficients").mat()[:, 0], D)
+    assert storage.getNode("image_height").real() == 480
+
+
+@pytest.mark.parametrize(
+    "distortion", [D, D[:, None], D[None], np.append(D, np.zeros(3))], ids=["5", "5x1", "1x5", "8"]
+)
+@pytest.mark.parametrize(
+    "pose",
+    [
+        {"R": turned().numpy(), "T": np.array(T_MM)},
+        {"rvec": np.array(ROTVEC), "tvec": np.array(T_MM)[:, None]},
+    ],
+    ids=["matrix", "vector"],
+)
+def test_what_opencv_writes_is_read(tmp_path, distortion, pose):
+    camera = load_opencv(opencv_file(tmp_path / "cam.xml", distortion_coefficients=distortion, **pose))
+    x_lab_mm = np.array([[10.0, -20.0, 30.0], [-60.0, 5.0, 0.0]])
+    expected, _ = cv2.projectPoints(x_lab_mm, np.array(ROTVEC), np.array(T_MM), K, D)
+    assert_close(camera.project(torch.from_numpy(x_lab_mm)), torch.from_numpy(expected[:, 0]), atol=1e-9)
+
+
+def test_without_a_pose_the_lab_is_the_camera_and_four_coefficients_end_with_p2(tmp_path):
+    camera = load_opencv(opencv_file(tmp_path / "cam.yml", distortion_coefficients=D[:4]))
+    assert torch.equal(camera.R_cam_lab, torch.eye(3, dtype=torch.float64))
+    assert torch.equal(camera.T_cam_lab_mm, torch.zeros(3, dtype=torch.float64))
+    assert camera.k.tolist() == [-0.21, 0.12, 0.0]
+    assert camera.p.tolist() == [2e-3, -1.5e-3]
+
+
+def test_a_size_that_the_file_does_not_say_is_given(tmp_path):
+    path = opencv_file(tmp_path / "cam.yml", image_width=None, image_height=None)
+    assert load_opencv(path, image_size=SIZE).image_size == SIZE
+    with pytest.raises(CameraError, match="image_width, image_height: expected two whole numbers, got none; give"):
+        load_opencv(path)
+    with pytest.raises(CameraError, match=r"expected \(9, 9\), got \(650, 480\)"):
+        load_opencv(opencv_file(tmp_path / "cam.yml"), image_size=(9, 9))
+
+
+FAULTS = {
+    "no matrix": ({"camera_matrix": None}, "camera_matrix: expected an OpenCV matrix, got none"),
+    "number for a matrix": ({"camera_matrix": 3.0}, "camera_matrix: expected an OpenCV matrix, got none"),
+    "matrix of another shape": ({"camera_matrix": K[:2]}, r"camera_matrix: expected 3 x 3 numbers, got \(2, 3\)"),
+    "shear": ({"camera_matrix": K + np.eye(3, k=1)}, "camera_matrix: expected fx and fy on the diagonal"),
+    "stereo": ({"camera_matrix": None, "K1": K}, r"got a stereo pair \(K1, D1, \.\.\.\); split"),
+    "no distortion": (
+        {"distortion_coefficients": None},
+        "distortion_coefficients: expected an OpenCV matrix, got none",
+    ),
+    "three": ({"distortion_coefficients": D[:3]}, "expected 4, 5, 8, 12 or 14 numbers, got 3"),
+    "rational": ({"distortion_coefficients": np.append(D, [0, 0.1, 0])}, "expected k1, k2, p1, p2, k3 and nothing"),
+    "not a number": ({"T": np.array([0.0, np.nan, 0.0])}, "T_cam_lab_mm: expected finite numbers"),
+    "short T": ({"T": np.zeros(2)}, "T: expected 3 numbers"),
+    "odd R": ({"R": np.zeros((2, 2))}, "R: expected a matrix of 3 x 3 or a vector of 3"),
+    "no rotation": ({"R": 2 * np.eye(3)}, "R_cam_lab: expected a rotation"),
+    "fold": ({"distortion_coefficients": np.array([-1.5, 0, 0, 0, 0])}, "k, p: expected a distortion that can be"),
+}
+
+
+@pytest.mark.parametrize(("nodes", "message"), FAULTS.values(), ids=FAULTS)
+def test_every_fault_is_one_line_that_names_the_file(tmp_path, nodes, message):
+    path = opencv_file(tmp_path / "cam.yml", **nodes)
+    with pytest.raises(CameraError, match=message) as refused:
+        load_opencv(path)
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_files_that_are_not_opencvs_are_refused(tmp_path):
+    with pytest.raises(CameraError, match="got no such file"):
+        load_opencv(tmp_path / "none.yml")
+    with pytest.raises(CameraError, match="got a folder"):
+        load_opencv(tmp_path)
+    (tmp_path / "cam.yml").write_text("a: [1, 2\n}")
+    with pytest.raises(CameraError, match="expected a file of OpenCV's FileStorage, got another"):
+        load_opencv(tmp_path / "cam.yml")
+
+
+def test_a_place_that_cannot_be_written_is_refused(tmp_path):
+    with pytest.raises(OutputError, match="expected a file in a folder that exists"):
+        save_opencv(tmp_path / "none" / "cam.yml", brown())
+    with pytest.raises(OutputError, match=r"expected a name ending in \.yml, .*, got '\.txt'"):
+        save_opencv(tmp_path / "cam.txt", brown())
