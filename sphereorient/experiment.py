@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StrictBool
 
-from sphereorient.cameras import Camera, load_cameras
+from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
 from sphereorient.cameras.yaml_file import read_document, refuse_unknown, validated, write_document
 from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.movies import Movie, open_movie
@@ -42,6 +42,7 @@ class Experiment:
     start: dict[str, int] = field(default_factory=dict)  # frame of each movie that is the experiment's frame 0
     frames: tuple[int, int] | None = None  # first, last + 1 of the experiment; None: all
     flow: dict[str, float] = field(default_factory=dict)  # SI
+    camera_covariance: ParameterCovariance | None = None  # of the cameras' parameters, named camera.parameter
 
     @property
     def folder(self) -> Path:
@@ -105,12 +106,14 @@ def load_experiment(path: Path | str) -> Experiment:
     _check_names(path, keys)
     _check_numbers(path, keys)
     cameras_path = path.parent / keys.cameras
+    cameras = _cameras_of(cameras_path, keys.movies)
     return Experiment(
         name=path.stem if keys.name is None else keys.name,
         path=path,
         frame_rate_hz=keys.frame_rate,
         cameras_path=cameras_path,
-        cameras=_cameras_of(cameras_path, keys.movies),
+        cameras=cameras,
+        camera_covariance=load_covariance(cameras_path, cameras),
         movie_paths={name: path.parent / movie for name, movie in keys.movies.items()},
         exposure_s=keys.exposure,
         diameter_mm=keys.sphere.diameter,

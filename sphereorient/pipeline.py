@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sphereorient import assemble, locate, motion, results
 from sphereorient.assemble import Hypotheses
-from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.cameras import Camera, ParameterCovariance, R_cam_view
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment import Experiment, frame_numbers, load_experiment, movie_span, open_movies, time_s
 from sphereorient.locate import Sightings
@@ -117,6 +117,9 @@ def track_movies(
         compose = {"paper": _paper, "precise": _precise}[method]
         with one_thread():
             track = compose(experiment, reels, frames, clock, texture, settings, progress)
+            track = results.with_systematic_errors(
+                track, {n: experiment.cameras[n] for n in names}, _covariance(experiment, names), _radius_mm(experiment)
+            )
         text = settings_yaml(settings)
         return replace(track, method=method, settings=text, provenance=provenance(experiment, names, command))
     finally:
@@ -337,6 +340,12 @@ def _taken(pictures: Iterator[NDArray[Any]], count: int) -> list[NDArray[Any]]:
 def _diameter_px(name: str, cameras: Mapping[str, Camera], experiment: Experiment, settings: Settings) -> float:
     """Expected diameter of the sphere's picture."""
     return settings.locate.diameter_px or locate.expected_diameter_px(name, cameras, experiment.diameter_mm)
+
+
+def _covariance(experiment: Experiment, names: Sequence[str]) -> ParameterCovariance | None:
+    """Covariance of the parameters of some cameras."""
+    whole = experiment.camera_covariance
+    return None if whole is None else whole.of(names)
 
 
 def _radius_mm(experiment: Experiment) -> float:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sphereorient.assemble import Chosen, Fused, Path
+from sphereorient.cameras import Camera, ParameterCovariance
+from sphereorient.cameras.calibration import systematic_errors
 from sphereorient.experiment import Experiment
 from sphereorient.locate import Positions, Sightings
 from sphereorient.motion import Motion, Smoothed
@@ -166,3 +169,33 @@ def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], l
     best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
     doubtful = found & (best < poor)
     return torch.where(one, int(Flag.ONE_CAMERA), 0) | torch.where(doubtful, int(Flag.DOUBTFUL_FIT), 0)
+
+
+def with_systematic_errors(
+    track: Trajectory, cameras: Mapping[str, Camera], covariance: ParameterCovariance | None, radius_mm: float
+) -> Trajectory:
+    """Add what errors of the calibration do to the poses; nothing where the cameras' errors are not known.
+
+    Args:
+        track: with positions.
+        cameras: those that made it.
+        covariance: of their parameters, named camera.parameter.
+        radius_mm: of the sphere.
+    """
+    if covariance is None:
+        return track
+    position = torch.from_numpy(track.position)
+    place, turn = torch.from_numpy(track.position_cov * np.nan), torch.from_numpy(track.orientation_cov * np.nan)
+    saw = {name: np.array([why == Reason.OK for why in track.cameras[name].reason]) for name in cameras}
+    for some in _subsets(list(cameras)):
+        rows = torch.from_numpy(np.all([saw[name] == (name in some) for name in cameras], axis=0))
+        if bool(rows.any()):
+            left = systematic_errors({name: cameras[name] for name in some}, covariance, position[rows], radius_mm)
+            place[rows], turn[rows] = left.position_mm2, left.orientation_rad2
+    return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())
+
+
+def _subsets(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """Yield all choices of one name or more."""
+    for count in range(1, len(names) + 1):
+        yield from combinations(names, count)

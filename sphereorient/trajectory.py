@@ -66,6 +66,7 @@ class _Column:
     tail: tuple[int, ...] = ()
     dtype: str = "float64"
     fill: float = np.nan
+    since: str = ""  # the version that added it: files of older ones are read without it
     rows: str = "frames"  # or offsets (frames + 1), or candidates
 
 
@@ -141,6 +142,16 @@ class Trajectory:
     position_cov: Floats = _column("mm^2", "covariance of position", 3, 3)
     orientation: Floats = _column("1", "R_lab_body: columns are the body axes in the lab", 3, 3)
     orientation_cov: Floats = _column("rad^2", "covariance of delta, R_true = exp([delta]x) R, lab components", 3, 3)
+    position_systematic_cov: Floats = _column(
+        "mm^2",
+        "covariance of the error of position that the calibration leaves, shared by all frames",
+        3,
+        3,
+        since="0.2",
+    )
+    orientation_systematic_cov: Floats = _column(
+        "rad^2", "covariance of delta that the calibration leaves, shared by all frames", 3, 3, since="0.2"
+    )
     position_smooth: Floats = _column("mm", "the smoother's position, lab", 3)
     position_smooth_cov: Floats = _column("mm^2", "covariance of position_smooth", 3, 3)
     orientation_smooth: Floats = _column("1", "the smoother's R_lab_body", 3, 3)
@@ -351,7 +362,14 @@ def _dataset(group: h5py.Group, place: str) -> NDArray[Any]:
 
 def _values(group: h5py.Group, record: type[Any]) -> dict[str, Any]:
     """Return all datasets of a record by field name."""
-    return {name: _dataset(group, place).astype(c.dtype) for name, place, c in _paths(record)}
+    known = {
+        name: _dataset(group, place).astype(c.dtype)
+        for name, place, c in _paths(record)
+        if not c.since or place in group
+    }
+    if len(known) == len(list(_columns(record))):
+        return known
+    return _blank(record, len(next(iter(known.values())))) | known
 
 
 def _attribute(file: h5py.File, name: str) -> Any:

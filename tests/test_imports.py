@@ -11,7 +11,7 @@ from conftest import REPO
 
 ROOMS = (
     "errors so3 cameras movies sphere experiment trajectory locate orient assemble motion synth learn paint settings "
-    "provenance results pipeline jobs evaluate report cli"
+    "provenance results pipeline calibrate jobs evaluate report cli"
 )
 ORDER = ROOMS.split(" ")
 FILES = sorted((REPO / "sphereorient").rglob("*.py"))

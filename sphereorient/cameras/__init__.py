@@ -1,7 +1,8 @@
 """Cameras: one file per model; pictures of points, lines of sight, triangulation."""
 
 from sphereorient.cameras.camera import Camera, Rays
-from sphereorient.cameras.files import load_cameras, save_cameras
+from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.cameras.files import load_cameras, load_covariance, save_cameras
 from sphereorient.cameras.pinhole import PinholeCamera
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.cameras.triangulate import triangulate
@@ -10,6 +11,7 @@ from sphereorient.cameras.view import R_cam_view
 
 __all__ = [
     "Camera",
+    "ParameterCovariance",
     "PinholeCamera",
     "Port",
     "PortCamera",
@@ -17,6 +19,7 @@ __all__ = [
     "Rays",
     "TsaiCamera",
     "load_cameras",
+    "load_covariance",
     "save_cameras",
     "triangulate",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -38,6 +39,15 @@ class ParameterCovariance:
     def sigmas(self) -> dict[str, float]:
         """Standard deviation of each parameter, in its own unit."""
         return dict(zip(self.names, self.matrix.diagonal().sqrt().tolist(), strict=True))
+
+
+    def of(self, cameras: Iterable[str]) -> ParameterCovariance | None:
+        """Return the share of some cameras where names are such as cam1.f; None where nothing is known of them."""
+        wanted = set(cameras)
+        kept = [k for k, name in enumerate(self.names) if name.partition(".")[0] in wanted]
+        if not kept:
+            return None
+        return ParameterCovariance(names=tuple(self.names[k] for k in kept), matrix=self.matrix[kept][:, kept])
 
 
 def _check_covariance(matrix: Tensor) -> None:

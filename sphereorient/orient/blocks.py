@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -336,7 +337,7 @@ class BlockTracker:
         return poses_of(fit, order, torch.ones_like(poses.use), [Reason.OK] * len(poses.use))
 
 
-def _own_views(last: Poses) -> dict[str, Tensor]:
+def _own_views(last: Poses) -> dict[str, Any]:
     """Return how the cameras that contradicted saw the last frame."""
     apart = torch.tensor([why is Reason.CONTRADICTS for why in last.reason])
     return {"apart": apart, "own_turn": last.own_turn[0], "own_move": last.own_move[0]}

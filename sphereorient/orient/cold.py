@@ -50,8 +50,8 @@ class Poses:
         return len(self.nll)
 
 
-POSE_PARTS = ("position_lab_mm", "R_lab_body", "covariance", "own_turn", "own_covariance")
-POSE_PARTS += ("own_move", "deviation", "score", "nll")
+POSE_PARTS: tuple[str, ...] = ("position_lab_mm", "R_lab_body", "covariance", "own_turn", "own_covariance", "own_move")
+POSE_PARTS += ("deviation", "score", "nll")
 
 
 def poses_of(fit: Fit, chosen: Tensor, use: Tensor, reason: Sequence[Reason]) -> Poses:
