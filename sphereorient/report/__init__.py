@@ -1,5 +1,6 @@
-"""Pictures of tracks."""
+"""Pictures of tracks and calibrations."""
 
+from sphereorient.report.calibration import calibration_figure
 from sphereorient.report.figure import demo_figure
 
-__all__ = ["demo_figure"]
+__all__ = ["calibration_figure", "demo_figure"]

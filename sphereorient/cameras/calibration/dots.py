@@ -28,6 +28,9 @@ class DotSettings(BaseModel):
     largest_part: float = Field(
         0.2, gt=0, le=1, description="longest side of a dot, as part of the picture's shorter side"
     )
+    faintest: float = Field(
+        0.4, ge=0, lt=1, description="least contrast of a dot, as part of that of the strongest ones in the picture"
+    )
     worst_misfit: float = Field(
         0.12, gt=0, description="rms of the picture about the fitted dot, as part of its contrast; noise included"
     )
@@ -93,6 +96,9 @@ def find_dots(picture: NDArray[np.generic], *, dark: bool = True, settings: DotS
         inside = ((fit.uv_px - reach >= -0.5) & (fit.uv_px + reach <= [width - 0.5, height - 0.5])).all(axis=1)
         good = inside & (fit.misfit < settings.worst_misfit) & (fit.contrast > 0.1) & (moved < 0.5)
         good &= np.isfinite(fit.sigma_px) & (_area(fit.shape) >= settings.smallest_area_px)
+    if good.any():
+        # Grain of the noise can look like faint dots; the contrast of a plate's own dots is the same in any light.
+        good &= fit.contrast > settings.faintest * np.percentile(fit.contrast[good], 95)
     good &= _first_of_equals(fit.uv_px, fit.shape, good)
     dots = Dots(
         uv_px=fit.uv_px,

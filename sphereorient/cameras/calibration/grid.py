@@ -36,7 +36,9 @@ def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> Plat
     if lattice is None or len(lattice.index) < LEAST_DOTS:
         got = f"{len(dots)} dots" + ("" if lattice is None else f", {len(lattice.index)} of them in a lattice")
         do = "look at the picture: is the plate in it, sharp, and dark or bright as stated"
-        return nothing_seen(refusal(name, expected=f"a lattice of {LEAST_DOTS} dots or more", got=got, do=do))
+        return nothing_seen(
+            refusal(name, expected=f"a lattice of {LEAST_DOTS} dots or more, 3 x 3 of them whole", got=got, do=do)
+        )
     large, odd = _sizes(lattice, plate)
     if odd.mean() > 0.2:
         pitches = float(np.median(lattice.width))

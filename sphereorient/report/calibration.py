@@ -1,0 +1,85 @@
+"""The picture that comes with a calibration: points found and expected, what is left between them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from sphereorient.calibrate import Calibrated, PictureReport
+
+SHOWN = 3  # pictures of each camera
+FOUND, EXPECTED, OUTLIER = "#009E73", "#D55E00", "#CC79A7"  # Okabe and Ito's
+
+
+def calibration_figure(result: Calibrated, path: Path) -> None:
+    """Draw pictures with points found and expected, all residuals over the picture, and their histogram.
+
+    Args:
+        result: of `calibrate_cameras`; the pictures are opened again.
+        path: of the PNG or PDF to write.
+    """
+    names = list(result.cameras)
+    figure = Figure(figsize=(4.2 * (SHOWN + 2), 4.3 * len(names)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(names), SHOWN + 2, squeeze=False)
+    for row, name in zip(axes, names, strict=True):
+        used = [one for one in result.pictures if one.picture.camera == name and not one.reason]
+        chosen = [used[int(k)] for k in np.linspace(0, len(used) - 1, min(SHOWN, len(used))).round()]
+        for ax, one in zip(row, chosen, strict=False):
+            _draw_picture(ax, one)
+        for ax in row[len(chosen) : SHOWN]:
+            ax.set_axis_off()
+        row[0].set_ylabel(name, fontsize=12)
+        _draw_residuals(row[SHOWN], used, result.cameras[name].image_size)
+        _draw_histogram(row[SHOWN + 1], used, result.rms_px(name))
+    figure.savefig(path, dpi=110)
+
+
+def _draw_picture(ax: Any, one: PictureReport) -> None:
+    data = np.fromfile(one.picture.path, np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    ax.imshow(picture, cmap="gray")
+    found = one.view.uv_px
+    expected = found - one.residual_px
+    ax.plot(*expected.T, "+", ms=7, mew=0.9, color=EXPECTED, label="expected")
+    ax.plot(*found.T, "o", ms=4, mfc="none", mew=0.8, color=FOUND, label="found")
+    if not one.used.all():
+        ax.plot(*found[~one.used].T, "x", ms=8, color=OUTLIER, label="left out")
+    ax.set(xticks=[], yticks=[])
+    ax.set_title(f"pose {one.pose}: {len(found)} points, rms {one.rms_px:.3f} px", fontsize=9)
+    ax.legend(loc="lower right", fontsize=7, framealpha=0.8)
+
+
+def _draw_residuals(ax: Any, used: list[PictureReport], image_size: tuple[int, int]) -> None:
+    place, missed = _joined(used)
+    usual = float(np.sqrt((missed**2).sum(1).mean())) if len(missed) else 1.0
+    # The arrow of the usual length is a fortieth of the picture long.
+    times = image_size[0] / 40 / max(usual, 1e-9)
+    ax.quiver(
+        *place.T, *(times * missed.T), angles="xy", scale_units="xy", scale=1, width=0.002, color=EXPECTED, alpha=0.7
+    )
+    ax.set(xlim=(0, image_size[0]), ylim=(image_size[1], 0), aspect="equal", xlabel="u (px)", ylabel="v (px)")
+    ax.set_title(f"found less expected, {times:.0f} times", fontsize=9)
+
+
+def _draw_histogram(ax: Any, used: list[PictureReport], rms_px: float) -> None:
+    _, missed = _joined(used)
+    reach = 4 * rms_px / np.sqrt(2)
+    edges = np.linspace(-reach, reach, 41)
+    for part, colour, label in zip(missed.T, (FOUND, EXPECTED), ("u", "v"), strict=True):
+        ax.hist(part, edges, histtype="step", lw=1.5, color=colour, label=label)
+    ax.set(xlabel="found less expected (px)", ylabel="points")
+    ax.set_title(f"all pictures: rms {rms_px:.3f} px", fontsize=9)
+    ax.legend(fontsize=8)
+
+
+def _joined(used: list[PictureReport]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return places (n, 2) and residuals (n, 2) of all points in use."""
+    place = np.concatenate([np.zeros((0, 2)), *(one.view.uv_px[one.used] for one in used)])
+    return place, np.concatenate([np.zeros((0, 2)), *(one.residual_px[one.used] for one in used)])
