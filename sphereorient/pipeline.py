@@ -26,6 +26,7 @@ from sphereorient.experiment import Experiment, frame_numbers, load_experiment, 
 from sphereorient.locate import Sightings
 from sphereorient.movies import Movie
 from sphereorient.orient import (
+    ApartTracker,
     BlockTracker,
     Candidates,
     Eye,
@@ -253,7 +254,9 @@ def _precise(
         eyes = [eye.result() for eye in opening]
         proposers: dict[str, Proposer] = {eye.name: search.result() for eye in eyes}
         learnt = study_movies(reels, eyes, base.result(), proposers, experiment, settings, progress)
-    tracker = BlockTracker(learnt, proposers, settings.locate, settings.refine)
+    # Cameras that were bumped would pull one pose to and fro between them.
+    follower = BlockTracker if learnt.together else ApartTracker
+    tracker = follower(learnt, proposers, settings.locate, settings.refine)
     table = pose_table(list(follow_sphere(reels, frames, tracker, progress)), len(eyes))
     hypotheses = Hypotheses(
         R_lab_body=table.R_lab_body, nll=table.nll, covariance_rad2=table.covariance[..., :3, :3], mask=table.mask
@@ -311,7 +314,9 @@ def study_movies(
     return learnt
 
 
-def follow_sphere(reels: Sequence[Reel], frames: range, tracker: BlockTracker, progress: Progress) -> Iterator[Poses]:
+def follow_sphere(
+    reels: Sequence[Reel], frames: range, tracker: BlockTracker | ApartTracker, progress: Progress
+) -> Iterator[Poses]:
     """Yield the poses of every frame, while the frames of the blocks to come are being decoded."""
     stage, done = "track", 0
     progress(stage, 0, len(frames))

@@ -1,5 +1,6 @@
 """Where could it point: extraction, bank, search, refinement; the Proposer protocol."""
 
+from sphereorient.orient.apart import ApartTracker
 from sphereorient.orient.blocks import BlockTracker
 from sphereorient.orient.candidates import Candidates
 from sphereorient.orient.cold import Poses, cold_start
@@ -16,6 +17,7 @@ from sphereorient.orient.settings import GreySearchSettings, OrientSettings, Ref
 from sphereorient.orient.study import Study, study
 
 __all__ = [
+    "ApartTracker",
     "BlockTracker",
     "Candidates",
     "Eye",

@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,9 +36,6 @@ class _Expected:
     use: Tensor  # (C,) bool, cameras that saw the ball
     reason: tuple[Reason, ...]  # C, why the others did not
     place_precision: Tensor  # (3, 3), 1/mm^2
-    apart: Tensor  # (C,) bool, cameras that saw the ball elsewhere
-    own_turn: Tensor  # (C, 3), rad, how they saw it turned
-    own_move: Tensor  # (C, 3), mm, and where
     rough: bool = False  # from one predecessor alone: nothing is known of the motion
 
 
@@ -77,7 +73,6 @@ class _Lane:
             use=rows[-1].use,
             reason=reason,
             place_precision=torch.linalg.inv(spread + astray),
-            **_own_views(rows[-1]),
         )
 
     def _beside(self, last: Poses, reason: tuple[Reason, ...], radius_mm: float) -> _Expected:
@@ -89,7 +84,6 @@ class _Lane:
             use=last.use,
             reason=reason,
             place_precision=torch.linalg.inv(spread),
-            **_own_views(last),
             rough=True,
         )
 
@@ -180,74 +174,31 @@ class BlockTracker:
         if any(one.rough for one in expected):
             X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
         fit = self._fitted(frames, X, R, use, precision)
-        good, apart = self._borne_out(fit, use), torch.zeros_like(use)
+        good = self._borne_out(fit, use)
         within = self.fitter.largest_px(X) <= self.fitter.widest_px  # others are searched for, frame by frame
         if not bool((good | ~within).all()):
             # One picture without the ball spoils what all say together: each camera by itself, the best one counts.
-            fit, use, apart = self._each_alone(frames, X, R, use, precision, fit, good)
-            good = good | use.any(1)
+            best = torch.where(good, torch.inf, -torch.inf)
+            for camera in range(use.shape[1]):
+                only = torch.zeros_like(use)
+                only[:, camera] = True
+                alone = self._fitted(frames, X, R, only, precision)
+                better = self._borne_out(alone, only) & (alone.score[:, camera] > best)
+                fit, use = _chosen(better, alone, fit), torch.where(better[:, None], only, use)
+                best = torch.where(better, alone.score[:, camera], best)
+            good = best > -torch.inf
         if not bool(use.all()):
             # A camera that was blind may see again: that shows at the pose which all of them give together.
             every = torch.ones_like(use)
             both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, every, precision)
             back = good & ~use.all(1) & self._borne_out(both, every)
             fit, use = _chosen(back, both, fit), use | back[:, None]
-            elsewhere = torch.stack([one.apart for one in expected]) & ~use & ~apart & good[:, None]
-            fit, told = self._told_elsewhere(frames, expected, fit, elsewhere)
-            apart = apart | told
         reasons = [
-            [_reason(*told) for told in zip(used, elsewhere, one.reason, strict=True)]
-            for used, elsewhere, one in zip(use.tolist(), apart.tolist(), expected, strict=True)
+            [Reason.OK if ok else why for ok, why in zip(row, one.reason, strict=True)]
+            for row, one in zip(use.tolist(), expected, strict=True)
         ]
         good = good & within
         return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if good[n] else None for n in range(asked)]
-
-    def _each_alone(
-        self,
-        frames: Sequence[Sequence[Picture]],
-        X: Tensor,
-        R: Tensor,
-        use: Tensor,
-        precision: Tensor,
-        fit: Fit,
-        good: Tensor,
-    ) -> tuple[Fit, Tensor, Tensor]:
-        """Fit poses that are not good (B,) bool to single cameras: the best fit of each, what it uses, who contradicts.
-
-        A pose that no camera bears out uses none.
-        """
-        cameras = use.shape[1]
-        only = torch.eye(cameras, dtype=torch.bool)[:, None].expand(cameras, len(use), cameras)
-        alone = [self._fitted(frames, X, R, mask, precision) for mask in only]
-        scores = torch.stack([one.score[:, k] for k, one in enumerate(alone)], dim=1)
-        borne = torch.stack([self._borne_out(one, mask) for one, mask in zip(alone, only, strict=True)], dim=1)
-        best = torch.where(borne, scores, -torch.inf).argmax(1)
-        bad = ~good
-        for k, one in enumerate(alone):
-            fit = _chosen(bad & (best == k), one, fit)
-        picked = torch.nn.functional.one_hot(best, cameras).bool()
-        use = torch.where(bad[:, None], picked & borne, use)
-        apart = bad[:, None] & borne & ~picked
-        for k, one in enumerate(alone):
-            fit = _as_told(apart[:, k], k, one, fit)
-        return fit, use, apart
-
-    def _told_elsewhere(
-        self, frames: Sequence[Sequence[Picture]], expected: Sequence[_Expected], fit: Fit, asked: Tensor
-    ) -> tuple[Fit, Tensor]:
-        """Follow the ball in cameras that do not fit together with the others; (B, C) bool, which ones still see it."""
-        told = torch.zeros_like(asked)
-        for camera in range(asked.shape[1]):
-            if not bool(asked[:, camera].any()):
-                continue
-            X = fit.position_lab_mm + torch.stack([one.own_move[camera] for one in expected])
-            R = so3.exp(torch.stack([one.own_turn[camera] for one in expected])) @ fit.R_lab_body
-            only = torch.zeros_like(asked)
-            only[:, camera] = True
-            alone = self._fitted(frames, X, R, only, torch.zeros(len(X), 3, 3, dtype=torch.float64))
-            told[:, camera] = asked[:, camera] & self._borne_out(alone, only)
-            fit = _as_told(told[:, camera], camera, alone, fit)
-        return fit, told
 
     def _approached(
         self,
@@ -335,30 +286,6 @@ class BlockTracker:
         if not bool(self._borne_out(fit, every)[order[0]]):
             return poses
         return poses_of(fit, order, torch.ones_like(poses.use), [Reason.OK] * len(poses.use))
-
-
-def _own_views(last: Poses) -> dict[str, Any]:
-    """Return how the cameras that contradicted saw the last frame."""
-    apart = torch.tensor([why is Reason.CONTRADICTS for why in last.reason])
-    return {"apart": apart, "own_turn": last.own_turn[0], "own_move": last.own_move[0]}
-
-
-def _reason(used: bool, elsewhere: bool, otherwise: Reason) -> Reason:
-    if used:
-        return Reason.OK
-    return Reason.CONTRADICTS if elsewhere else otherwise
-
-
-def _as_told(rows: Tensor, camera: int, one: Fit, fit: Fit) -> Fit:
-    """Put what a camera's own fit says beside another fit, where the mask (B,) holds."""
-    parts = {"own_turn": so3.log(one.R_lab_body @ fit.R_lab_body.mT)}
-    parts["own_move"] = one.position_lab_mm - fit.position_lab_mm
-    parts |= {name: getattr(one, name)[:, camera] for name in ("own_covariance", "deviation", "score")}
-    told = {}
-    for name, value in parts.items():
-        told[name] = getattr(fit, name).clone()
-        told[name][rows, camera] = value[rows]
-    return replace(fit, **told)
 
 
 def _chosen(rows: Tensor, one: Fit, other: Fit) -> Fit:

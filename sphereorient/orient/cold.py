@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -38,7 +38,7 @@ class Poses:
     covariance: Tensor  # (M, 6, 6), of delta (rad) and position (mm), lab
     own_turn: Tensor  # (M, C, 3), rad, see Fit
     own_covariance: Tensor  # (M, C, 3, 3)
-    own_move: Tensor  # (M, C, 3), mm
+    own_move: Tensor  # (M, C, 3), mm, see Fit
     deviation: Tensor  # (M, C)
     score: Tensor  # (M, C)
     nll: Tensor  # (M,)
@@ -94,40 +94,18 @@ def cold_start(
     Returns:
         Poses, or none with the reasons.
     """
-    poses = _with_outlines(fitter, proposers, pictures, locating, candidates, finalists, score_min)
+    poses = _with_outlines(fitter, proposers, pictures, locating, candidates, finalists)
     for tolerance in NARROWER:
         if _best_score(poses) >= score_min:
             break
         narrower = locating.model_copy(update={"diameter_tolerance": min(tolerance, locating.diameter_tolerance)})
-        again = _with_outlines(fitter, proposers, pictures, narrower, candidates, finalists, score_min)
+        again = _with_outlines(fitter, proposers, pictures, narrower, candidates, finalists)
         poses = max(poses, again, key=_best_score)
     return poses
 
 
 def _best_score(poses: Poses) -> float:
     return float(poses.score[0, poses.use].max()) if len(poses) else -1.0
-
-
-def cold_start_apart(
-    fitter: Fitter,
-    proposers: Mapping[str, Proposer],
-    pictures: Sequence[Picture],
-    locating: LocateSettings,
-    *,
-    candidates: int,
-    finalists: int = 2,
-) -> Poses:
-    """Find what each camera sees by itself, where the cameras do not fit together; see `cold_start`."""
-    found = _outlines(fitter, pictures, locating)
-    ask = partial(_poses, fitter, proposers, pictures, candidates=candidates, finalists=finalists)
-    return told_apart([ask(_only(found, k)) for k in range(len(found))])
-
-
-def _outlines(fitter: Fitter, pictures: Sequence[Picture], locating: LocateSettings) -> list[Found]:
-    return [
-        find_ball(frame, eye.background, eye.diameter_px, locating)
-        for eye, frame in zip(fitter.eyes, pictures, strict=True)
-    ]
 
 
 def _with_outlines(
@@ -137,48 +115,17 @@ def _with_outlines(
     locating: LocateSettings,
     candidates: int,
     finalists: int,
-    score_min: float,
 ) -> Poses:
-    found = _outlines(fitter, pictures, locating)
+    found = [
+        find_ball(frame, eye.background, eye.diameter_px, locating)
+        for eye, frame in zip(fitter.eyes, pictures, strict=True)
+    ]
     ask = partial(_poses, fitter, proposers, pictures, candidates=candidates, finalists=finalists)
-    if len(found) == 1 or any(outline is None for outline, _ in found):
-        return ask(found)
-    if _apart_mm(fitter, found) <= GAP_SHARE * fitter.radius_mm:
-        poses = ask(found)
-        if len(poses) and float(poses.score[0].min()) >= score_min:
-            return poses
-    else:
-        poses = no_pose(len(found), [Reason.OUTLINE] * len(found))
-    # Do the cameras see different things? Then each explains its own picture.
-    alone = [ask(_only(found, k)) for k in range(len(found))]
-    if len(poses) and any(_best_score(one) < score_min for one in alone):
-        return poses
-    return told_apart(alone)
-
-
-def told_apart(alone: Sequence[Poses]) -> Poses:
-    """Return the poses of the camera that explains its picture best, the others' as what they say for themselves.
-
-    Args:
-        alone: C records, each of one camera by itself.
-    """
-    best = max(range(len(alone)), key=lambda k: _best_score(alone[k]))
-    poses = alone[best]
-    reason = list(poses.reason)
-    for k, other in enumerate(alone):
-        if k == best or not len(other) or not len(poses):
-            continue
-        turn = so3.log(other.R_lab_body[:1] @ poses.R_lab_body.mT)
-        move = other.position_lab_mm[:1] - poses.position_lab_mm
-        parts = {"own_turn": turn, "own_move": move}
-        parts |= {name: getattr(other, name)[:1, k] for name in ("own_covariance", "deviation", "score")}
-        told = {}
-        for name, value in parts.items():
-            told[name] = getattr(poses, name).clone()
-            told[name][:, k] = value
-        reason[k] = Reason.CONTRADICTS
-        poses = replace(poses, **told)
-    return replace(poses, reason=tuple(reason))
+    use = [outline is not None for outline, _ in found]
+    if all(use) and len(use) > 1 and _apart_mm(fitter, found) > GAP_SHARE * fitter.radius_mm:
+        # The cameras see different things: believe the one whose picture is explained better.
+        return max((ask(_only(found, k)) for k in range(len(found))), key=_best_score)
+    return ask(found)
 
 
 def _only(found: Sequence[Found], kept: int) -> list[Found]:

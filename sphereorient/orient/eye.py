@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -102,6 +102,10 @@ class Fitter:
     def shading(self) -> Shading:
         """Orders of each frame's own light: high while nothing is learnt."""
         return LATER if self.light.known else FIRST
+
+    def of(self, camera: int) -> Fitter:
+        """Return the fitter of one camera by itself."""
+        return replace(self, eyes=[self.eyes[camera]], light=self.light.of(camera))
 
     def largest_px(self, position_lab_mm: Tensor) -> Tensor:
         """Radius (B,), px, of the largest disk that a ball at places (B, 3) shows in any picture."""

@@ -71,6 +71,11 @@ class Light:
         found = self._map.index_select(0, cell.reshape(-1)).to(across.dtype)
         return found[:, 0].reshape(cell.shape), found[:, 1].reshape(cell.shape)
 
+    def of(self, camera: int) -> Light:
+        """Return the light of one camera."""
+        one = slice(camera, camera + 1)
+        return Light(difference=self.difference[one], black=self.black[one], noise=self.noise[one], known=self.known)
+
     @classmethod
     def unknown(cls, cameras: int, noise: Tensor) -> Light:
         """Return flat light, from which the first fits begin."""

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 
 import torch
 from torch import Tensor
 
-from sphereorient import so3
+from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.locate import LocateSettings
-from sphereorient.orient.cold import Poses, cold_start, cold_start_apart
+from sphereorient.orient.cold import Poses, cold_start
 from sphereorient.orient.eye import FINEST_PX, Eye, Fitter, Optics, Picture, level_of
 from sphereorient.orient.light import Light
 from sphereorient.orient.pixels import Pixels
@@ -24,7 +26,9 @@ from sphereorient.sphere.paint_table import PaintTable
 from sphereorient.trajectory import Reason
 
 BLURS = tuple(FINEST_PX * 1.25**k for k in range(8))  # px; what is tried where the blur is not given
-TRIED, APART = 4, 1.5  # frames; and by how much more cameras that do not fit together leave unexplained
+TRIED = 6  # frames
+APART_GAIN = 1.5  # cameras that leave so many times more unexplained together than alone are followed one by one
+APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
 ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
 WIDER = 1.03  # how much larger than in the frames looked at a disk may be in others
 FIRST_BLUR = 0.625  # px: a pixel's own width and a good lens
@@ -37,6 +41,11 @@ class Study:
     fitter: Fitter
     score_min: float  # between right and wrong poses
     right_score: float  # typical of right poses
+    together: bool = True  # whether the cameras see one ball in one place, as they do unless they were bumped
+
+    def of(self, camera: int) -> Study:
+        """Return what was learnt of one camera."""
+        return replace(self, fitter=self.fitter.of(camera))
 
     @property
     def clear_score(self) -> float:
@@ -78,19 +87,23 @@ def study(
         light=light,
     )
 
-    def search(how: Callable[..., Poses]) -> list[Poses]:
-        ask = partial(how, fitter, proposers, locating=locating, candidates=settings.candidates)
+    def search(seeing: Fitter, frames: Sequence[Sequence[Picture]]) -> list[Poses]:
+        ask = partial(cold_start, seeing, proposers, locating=locating, candidates=settings.candidates)
         with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
-            return list(pool.map(ask, pictures))
+            return list(pool.map(ask, frames))
 
-    found = search(cold_start)
-    together = _fit_together(fitter, pictures, found)
-    if not together:
-        found = search(cold_start_apart)
-    chosen = _clear(found)
-    if not chosen:
+    found = search(fitter, pictures)
+    if not _clear(found):
         raise _nothing(found)
-    frame, X, R, use = _seen_by_all(found, chosen) if together else _seen_by_each(found, chosen)
+    gain, gap_px = _apart(fitter, pictures, found)
+    if gain > APART_GAIN or gap_px > APART_PX:
+        # A pose between what the cameras see would teach a light that is nowhere.
+        each = [search(fitter.of(k), [[frames[k]] for frames in pictures]) for k in range(len(eyes))]
+        frame, X, R, use = _seen_by_each(each)
+        wrong = _wrong_scores([poses for of_camera in each for poses in of_camera])
+    else:
+        frame, X, R, use = _seen_by_all(found)
+        wrong = _wrong_scores(found)
     pixels = fitter.pixels([pictures[k] for k in frame], X, fitter.optics.fine)
     pixels = pixels.thinned(max(1, round(pixels.grey.shape[1] / ENOUGH)))
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
@@ -102,58 +115,70 @@ def study(
     fitter, fit = _with_light(fitter, pixels, fit, use, 2)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
-    wrong = torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in chosen])
     highest = float(wrong.quantile(0.9)) if len(wrong) else 0.0
     fitter = replace(fitter, widest_px=widest)
-    return Study(fitter=fitter, score_min=0.5 * (right + min(highest, right)), right_score=right)
+    score_min = 0.5 * (right + min(highest, right))
+    return Study(fitter=fitter, score_min=score_min, right_score=right, together=gain <= APART_GAIN)
 
 
-def _fit_together(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> bool:
-    """Tell from a few frames whether the cameras see one ball in one place: bumped ones each explain more alone."""
-    if len(fitter.eyes) == 1:
-        return True
+def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
+    """Tell from a few frames whether the cameras see one ball in one place, as they do unless they were bumped.
+
+    Returns:
+        By how much more is left unexplained with all cameras than by each alone, and by how many pixels the lines of
+        sight to what each sees alone miss each other; both in the worst quarter of the frames, for a bump may leave
+        the cameras in accord in one part of the volume.
+    """
+    cameras = len(fitter.eyes)
     whole = [k for k, poses in enumerate(found) if len(poses) and bool(poses.use.all())]
-    apart = sum(Reason.CONTRADICTS in poses.reason for poses in found)
-    if apart > len(whole):
-        return False
-    tried = sorted(whole, key=lambda k: -float(found[k].score[0].min()))[:TRIED]
-    if not tried:
-        return True
-    X, R = (torch.cat([getattr(found[k], name)[:1] for k in tried]) for name in ("position_lab_mm", "R_lab_body"))
-    gains = []
-    for camera in range(len(fitter.eyes)):
-        only = torch.zeros(len(tried), len(fitter.eyes), dtype=torch.bool)
+    if cameras == 1:
+        return 1.0, 0.0
+    if len(whole) < sum(len(poses) > 0 for poses in found) / 2:
+        return math.inf, math.inf  # outlines that miss each other already
+    if not whole:
+        return 1.0, 0.0
+    tried = [whole[int(k)] for k in torch.linspace(0, len(whole) - 1, min(TRIED, len(whole))).round()]
+    start = [torch.cat([getattr(found[k], name)[:1] for k in tried]) for name in ("position_lab_mm", "R_lab_body")]
+    gains, rays = [], []
+    for camera, eye in enumerate(fitter.eyes):
+        only = torch.zeros(len(tried), cameras, dtype=torch.bool)
         only[:, camera] = True
-        X_own, R_own = X, R
+        X, R = start
         for level, step in ((fitter.optics.middle, 3), (fitter.optics.fine, 4)):
-            pixels = fitter.pixels([pictures[k] for k in tried], X_own, level).thinned(step)
-            fit = fitter.fit(pixels, X_own, R_own, only, level, 3)
-            X_own, R_own = fit.position_lab_mm, fit.R_lab_body
+            pixels = fitter.pixels([pictures[k] for k in tried], X, level).thinned(step)
+            fit = fitter.fit(pixels, X, R, only, level, 3)
+            X, R = fit.position_lab_mm, fit.R_lab_body
         joint = torch.cat([found[k].score[:1, camera] for k in tried])
         gains.append((1 - joint) / (1 - fit.score[:, camera]).clamp_min(1e-6))
-    return float(torch.stack(gains).amax(0).median()) < APART
+        rays.append(eye.camera.rays(eye.camera.project(X)))
+    gap_mm = torch.stack([triangulate(one, other)[1] for one, other in combinations(rays, 2)]).amax(0)
+    px_mm = max(eye.diameter_px for eye in fitter.eyes) / (2 * fitter.radius_mm)
+    return float(torch.stack(gains).amax(0).quantile(0.75)), float(gap_mm.quantile(0.75) * px_mm)
 
 
-def _seen_by_all(found: Sequence[Poses], chosen: Sequence[int]) -> tuple[list[int], Tensor, Tensor, Tensor]:
-    """Return frames, places, rotations and cameras in use of poses that all cameras tell."""
+Rows = tuple[list[int], Tensor, Tensor, Tensor]  # frames, places (n, 3), rotations (n, 3, 3), cameras in use (n, C)
+
+
+def _seen_by_all(found: Sequence[Poses]) -> Rows:
+    """Return the clear poses that all cameras tell together."""
+    chosen = _clear(found)
     X = torch.cat([found[k].position_lab_mm[:1] for k in chosen])
     R = torch.cat([found[k].R_lab_body[:1] for k in chosen])
-    return list(chosen), X, R, torch.stack([found[k].use for k in chosen])
+    return chosen, X, R, torch.stack([found[k].use for k in chosen])
 
 
-def _seen_by_each(found: Sequence[Poses], chosen: Sequence[int]) -> tuple[list[int], Tensor, Tensor, Tensor]:
-    """Return the same of poses that each camera tells for itself."""
-    rows = [
-        (k, camera)
-        for k in chosen
-        for camera, why in enumerate(found[k].reason)
-        if why in (Reason.OK, Reason.CONTRADICTS)
-    ]
-    X = torch.stack([found[k].position_lab_mm[0] + found[k].own_move[0, c] * (not found[k].use[c]) for k, c in rows])
-    turn = torch.stack([found[k].own_turn[0, c] * (not found[k].use[c]) for k, c in rows])
-    R = so3.exp(turn) @ torch.stack([found[k].R_lab_body[0] for k, _ in rows])
-    use = torch.nn.functional.one_hot(torch.tensor([c for _, c in rows]), found[0].use.shape[0]).bool()
+def _seen_by_each(each: Sequence[Sequence[Poses]]) -> Rows:
+    """Return the clear poses that each camera tells for itself."""
+    rows = [(k, camera) for camera, found in enumerate(each) for k in _clear(found)]
+    X = torch.stack([each[camera][k].position_lab_mm[0] for k, camera in rows])
+    R = torch.stack([each[camera][k].R_lab_body[0] for k, camera in rows])
+    use = torch.nn.functional.one_hot(torch.tensor([camera for _, camera in rows]), len(each)).bool()
     return [k for k, _ in rows], X, R, use
+
+
+def _wrong_scores(found: Sequence[Poses]) -> Tensor:
+    """Return how well wrong poses explain clear frames."""
+    return torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in _clear(found)])
 
 
 def _nothing(found: Sequence[Poses]) -> ExperimentError:
