@@ -55,6 +55,7 @@ def track(
         list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set orient.fine_step_deg=2.")
     ] = None,
     cameras: Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")] = None,
+    device: Annotated[str, typer.Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
 ) -> None:
     """Track the sphere of an experiment: position and orientation of every frame."""
@@ -67,7 +68,13 @@ def track(
     names = None if cameras is None else [name.strip() for name in cameras.split(",") if name.strip()]
     with progress_bar(quiet) as advance:
         result = track_movies(
-            experiment, method=method, settings=chosen, cameras=names, progress=advance, command=command
+            experiment,
+            method=method,
+            settings=chosen,
+            cameras=names,
+            device=device,
+            progress=advance,
+            command=command,
         )
     result.save(out)
     if not quiet:

@@ -78,6 +78,7 @@ def track_movies(
     method: str = DEFAULT_METHOD,
     settings: Settings | None = None,
     cameras: Sequence[str] | None = None,
+    device: str = "cpu",
     progress: Progress = silent,
     command: str = "sphereorient.track_movies",
 ) -> Trajectory:
@@ -85,9 +86,11 @@ def track_movies(
 
     Args:
         experiment: as loaded, or the path of its experiment.yaml.
-        method: "paper", Zimmermann et al. 2011 with the corrections of docs/paper-map.md.
+        method: "precise", refined poses with covariances; "paper", Zimmermann et al. 2011 with the corrections of
+            docs/paper-map.md.
         settings: None: the method's defaults.
         cameras: names of those to use; None: all.
+        device: where fits are computed, as torch names it: cpu, cuda, cuda:1.
         progress: told how far each stage is.
         command: what the track's provenance names as its origin.
 
@@ -99,6 +102,7 @@ def track_movies(
     """
     if method not in METHODS:
         raise SettingsError(refusal("method", expected=" or ".join(METHODS), got=repr(method), do="name one of these"))
+    there = _device(device)
     if not isinstance(experiment, Experiment):
         experiment = load_experiment(FilePath(experiment))
     settings = settings or Settings()
@@ -117,7 +121,7 @@ def track_movies(
         clock = torch.from_numpy(time_s(experiment, frames))
         compose = {"paper": _paper, "precise": _precise}[method]
         with one_thread():
-            track = compose(experiment, reels, frames, clock, texture, settings, progress)
+            track = compose(experiment, reels, frames, clock, texture, settings, there, progress)
             track = results.with_systematic_errors(
                 track, {n: experiment.cameras[n] for n in names}, _covariance(experiment, names), _radius_mm(experiment)
             )
@@ -146,6 +150,7 @@ def _paper(
     clock: Tensor,
     texture: Tensor,
     settings: Settings,
+    device: torch.device,
     progress: Progress,
 ) -> Trajectory:
     """Section III of the paper, step by step."""
@@ -242,6 +247,7 @@ def _precise(
     clock: Tensor,
     texture: Tensor,
     settings: Settings,
+    device: torch.device,
     progress: Progress,
 ) -> Trajectory:
     """One likelihood for all cameras: pose after pose refined, then the history, then its motion."""
@@ -256,7 +262,7 @@ def _precise(
         learnt = study_movies(reels, eyes, base.result(), proposers, experiment, settings, progress)
     # Cameras that were bumped would pull one pose to and fro between them.
     follower = BlockTracker if learnt.together else ApartTracker
-    tracker = follower(learnt, proposers, settings.locate, settings.refine)
+    tracker = follower(learnt.on(device), proposers, settings.locate, settings.refine)
     table = pose_table(list(follow_sphere(reels, frames, tracker, progress)), len(eyes))
     hypotheses = Hypotheses(
         R_lab_body=table.R_lab_body, nll=table.nll, covariance_rad2=table.covariance[..., :3, :3], mask=table.mask
@@ -363,6 +369,17 @@ def _texture_path(experiment: Experiment) -> FilePath:
         do = "give sphere.texture; learning it from the movie is not part of this version"
         raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
     return experiment.texture_path
+
+
+def _device(name: str) -> torch.device:
+    """Return a device that is there."""
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        got, do = f"'{name}': {str(error).splitlines()[0]}", "name cpu, or install torch for your GPU"
+        raise SettingsError(refusal("device", expected="a device that torch can use", got=got, do=do)) from None
+    return device
 
 
 def _refuse_unsupported(experiment: Experiment, names: Sequence[str]) -> None:

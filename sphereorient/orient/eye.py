@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -23,6 +24,7 @@ Picture = NDArray[np.generic]
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
 SIZES = 1.06  # ratio of neighbouring sizes of disks for which there is a stencil
+CPU = torch.device("cpu")
 FINEST_PX = 0.4  # least blur of any picture, px: a pixel alone has 0.29
 COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
 
@@ -81,6 +83,14 @@ class Optics:
         self.middle = level_of(self.fine.paint, blur_px, MIDDLE * radius_px, radius_px)
         self.coarse = level_of(self.middle.paint, blur_px, COARSE * radius_px, radius_px)
 
+    def to(self, device: torch.device) -> Optics:
+        """Return the same with its tables on another device."""
+        moved = copy(self)
+        for name in ("fine", "middle", "coarse"):
+            level: Level = getattr(self, name)
+            setattr(moved, name, replace(level, paint=level.paint.to(device)))
+        return moved
+
 
 def level_of(base: PaintTable, blur_px: float, extra_px: float, radius_px: float) -> Level:
     """Return the level at which `extra_px` of blur are laid over pictures of blur `blur_px`."""
@@ -96,12 +106,17 @@ class Fitter:
     radius_mm: float
     optics: Optics
     light: Light
+    device: torch.device = CPU  # where the fits are computed; what goes in and comes out is on the CPU
     widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
 
     @property
     def shading(self) -> Shading:
         """Orders of each frame's own light: high while nothing is learnt."""
         return LATER if self.light.known else FIRST
+
+    def on(self, device: torch.device) -> Fitter:
+        """Return a fitter that computes on another device."""
+        return replace(self, optics=self.optics.to(device), light=self.light.to(device), device=device)
 
     def of(self, camera: int) -> Fitter:
         """Return the fitter of one camera by itself."""
@@ -150,19 +165,20 @@ class Fitter:
         place_precision: Tensor | None = None,
     ) -> Fit:
         """Refine B poses at one level; see `refine`."""
+        there = self.device
         return refine(
-            pixels,
-            position_lab_mm,
-            R_lab_body,
-            use,
+            pixels.to(there),
+            position_lab_mm.to(there),
+            R_lab_body.to(there),
+            use.to(there),
             radius_mm=self.radius_mm,
             paint=level.paint,
             blur_px=level.blur_px,
             light=self.light,
             shading=self.shading if level.extra_px == 0 else LATER,
             iterations=iterations,
-            place_precision=place_precision,
-        )
+            place_precision=None if place_precision is None else place_precision.to(there),
+        ).to(CPU)
 
 
 def base_table(texture: Tensor, diameter_px: float) -> PaintTable:

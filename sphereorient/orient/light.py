@@ -54,7 +54,7 @@ class Light:
     @cached_property
     def _map(self) -> Tensor:
         """Difference and black over the square about the disk, (C * S * S, 2): a look-up beats 25 functions."""
-        at = (torch.arange(MAP_SIDE, dtype=torch.float32) + 0.5) * (2.0 / MAP_SIDE) - 1.0
+        at = (torch.arange(MAP_SIDE, dtype=torch.float32, device=self.difference.device) + 0.5) * (2.0 / MAP_SIDE) - 1.0
         y, x = torch.meshgrid(at, at, indexing="ij")
         across = torch.stack([x, y]).reshape(2, -1)
         # Cells that the limb cuts take their value on the disk.
@@ -70,6 +70,12 @@ class Light:
         cell = (camera[:, None] * MAP_SIDE + row) * MAP_SIDE + column
         found = self._map.index_select(0, cell.reshape(-1)).to(across.dtype)
         return found[:, 0].reshape(cell.shape), found[:, 1].reshape(cell.shape)
+
+    def to(self, device: torch.device) -> Light:
+        """Return the same on another device."""
+        parts = (part.to(device) for part in (self.difference, self.black, self.noise))
+        difference, black, noise = parts
+        return Light(difference=difference, black=black, noise=noise, known=self.known)
 
     def of(self, camera: int) -> Light:
         """Return the light of one camera."""

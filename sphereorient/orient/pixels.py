@@ -46,6 +46,12 @@ class Pixels:
         parts: dict[str, Any] = {name: getattr(self, name)[chosen] for name in names}
         return replace(self, **parts)
 
+    def to(self, device: torch.device) -> Pixels:
+        """Return the same on another device."""
+        names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad", "pitch_mm", "tile")
+        parts: dict[str, Any] = {name: getattr(self, name).to(device) for name in names}
+        return replace(self, **parts)
+
     def thinned(self, step: int) -> Pixels:
         """Return every so-many-th place of all disks."""
         places = torch.arange(0, self.grey.shape[1], step)

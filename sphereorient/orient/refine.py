@@ -44,6 +44,10 @@ class Fit:
     nll: Tensor  # (B,), negative log-likelihood, errors that neighbours share counted once
     step: Tensor  # (B, 6), the last one
 
+    def to(self, device: torch.device) -> Fit:
+        """Return the same on another device."""
+        return Fit(**{name: getattr(self, name).to(device) for name in self.__dataclass_fields__})
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Residuals:

@@ -47,6 +47,10 @@ class Study:
         """Return what was learnt of one camera."""
         return replace(self, fitter=self.fitter.of(camera))
 
+    def on(self, device: torch.device) -> Study:
+        """Return the same with fits that are computed on another device."""
+        return replace(self, fitter=self.fitter.on(device))
+
     @property
     def clear_score(self) -> float:
         """Score of a pose that explains its pictures about as well as is typical."""

@@ -85,6 +85,10 @@ class PaintTable:
         value = found[..., 0] + slope[:, 0] * x + slope[:, 1] * y + slope[:, 2] * z
         return value, slope
 
+    def to(self, device: torch.device) -> PaintTable:
+        """Return the same on another device, to look up there; `blurred` works on the CPU."""
+        return PaintTable(self.rows.to(device), self.blur_rad)
+
     def blurred(self, blur_rad: float) -> PaintTable:
         """Return the table of a wider blur, made from this one; itself where the blur is not wider.
 
