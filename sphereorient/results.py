@@ -17,7 +17,7 @@ from sphereorient.experiment import Experiment
 from sphereorient.locate import Positions, Sightings
 from sphereorient.motion import Motion, Smoothed
 from sphereorient.orient import Candidates, PoseTable, Study
-from sphereorient.so3 import exp
+from sphereorient.so3 import exp, geodesic_distance
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 
@@ -128,6 +128,7 @@ def precise_track(
     )
     picked = table.rows(chosen.choice)
     covariance = picked["covariance"]
+    margin, angle = _margin(table, chosen.choice)
     flags = chosen.flags | _fit_flags(table, chosen, picked, learnt)
     flags |= torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
     return replace(
@@ -156,8 +157,23 @@ def precise_track(
         segment=chosen.segment.numpy(),
         flags=flags.numpy().astype(np.uint32),
         confidence=chosen.probability.numpy(),
+        margin=margin.numpy(),
+        margin_angle=angle.numpy(),
         cameras={name: precise_camera(k, table, picked, learnt) for k, name in enumerate(names)},
     )
+
+
+def _margin(table: PoseTable, choice: Tensor) -> tuple[Tensor, Tensor]:
+    """Return by how much the next distinct orientation is less likely, and its angle, (N,) each; NaN without one."""
+    frame, place = torch.arange(len(table)), choice.clamp_min(0)
+    others = table.mask.clone()
+    others[frame, place] = False
+    others &= (choice >= 0)[:, None]
+    nll = torch.where(others, table.nll, torch.inf)
+    best, which = nll.min(1)
+    there = torch.isfinite(best)
+    angle = geodesic_distance(table.R_lab_body[frame, which], table.R_lab_body[frame, place])
+    return torch.where(there, best - table.nll[frame, place], torch.nan), torch.where(there, angle, torch.nan)
 
 
 def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], learnt: Study) -> Tensor:

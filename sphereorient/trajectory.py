@@ -171,6 +171,10 @@ class Trajectory:
     segment: NDArray[np.int64] = _column("1", "number of the segment, -1 outside any", dtype="int64", fill=-1)
     flags: NDArray[np.uint32] = _column("1", "bit mask, named in the attribute bits", dtype="uint32", fill=0)
     confidence: Floats = _column("1", "probability of the chosen orientation among the candidates")
+    margin: Floats = _column(
+        "1", "negative log-likelihood of the next distinct orientation less that of the chosen one", since="0.2"
+    )
+    margin_angle: Floats = _column("rad", "angle between these two; NaN where no other one was looked for", since="0.2")
     cameras: Mapping[str, CameraTrack]
     frame_rate: float  # Hz
     method: str  # paper, precise

@@ -23,6 +23,13 @@ DESIGN_SHAPES: dict[str, tuple[int, ...]] = {"time": (), "valid": (), "segment":
 DESIGN_SHAPES |= dict.fromkeys(("position", "position_smooth"), (3,))
 DESIGN_SHAPES |= dict.fromkeys(("position_cov", "position_smooth_cov", "orientation", "orientation_cov"), (3, 3))
 DESIGN_SHAPES |= dict.fromkeys(("orientation_smooth", "orientation_smooth_cov"), (3, 3))
+# And what came later: docs/data-format.md.
+DESIGN_SHAPES |= {
+    "position_systematic_cov": (3, 3),
+    "orientation_systematic_cov": (3, 3),
+    "margin": (),
+    "margin_angle": (),
+}
 MOTIONS = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
 DESIGN_SHAPES |= {f"{name}{end}": (3,) for name in MOTIONS for end in ("", "_sigma")}
 DESIGN_CAMERA = {"centre_px", "radius_px", "outline_rms_px", "orientation", "orientation_cov", "score", "xi", "reason"}

@@ -40,7 +40,6 @@ class ParameterCovariance:
         """Standard deviation of each parameter, in its own unit."""
         return dict(zip(self.names, self.matrix.diagonal().sqrt().tolist(), strict=True))
 
-
     def of(self, cameras: Iterable[str]) -> ParameterCovariance | None:
         """Return the share of some cameras where names are such as cam1.f; None where nothing is known of them."""
         wanted = set(cameras)
