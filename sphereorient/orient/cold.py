@@ -17,6 +17,7 @@ from sphereorient.orient.crop import crop_disk
 from sphereorient.orient.eye import Fitter, Picture
 from sphereorient.orient.proposer import Proposer
 from sphereorient.orient.refine import Fit
+from sphereorient.orient.scan import scan_ball
 from sphereorient.trajectory import Reason
 
 DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin
@@ -100,6 +101,14 @@ def cold_start(
             break
         narrower = locating.model_copy(update={"diameter_tolerance": min(tolerance, locating.diameter_tolerance)})
         again = _with_outlines(fitter, proposers, pictures, narrower, candidates, finalists)
+        poses = max(poses, again, key=_best_score)
+    if _best_score(poses) < score_min:
+        # No rim that is right: the paint itself tells where the disk is.
+        scanned = [
+            scan_ball(frame, eye, proposers[eye.name], locating)
+            for eye, frame in zip(fitter.eyes, pictures, strict=True)
+        ]
+        again = _poses(fitter, proposers, pictures, scanned, candidates=candidates, finalists=finalists)
         poses = max(poses, again, key=_best_score)
     return poses
 
