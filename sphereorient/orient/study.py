@@ -29,6 +29,7 @@ BLURS = tuple(FINEST_PX * 1.25**k for k in range(8))  # px; what is tried where 
 TRIED = 6  # frames
 APART_GAIN = 1.5  # cameras that leave so many times more unexplained together than alone are followed one by one
 APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
+FAR_APART_PX = 1.5  # and by more than this, one pose for all cameras is none
 ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
 WIDER = 1.03  # how much larger than in the frames looked at a disk may be in others
 FIRST_BLUR = 0.625  # px: a pixel's own width and a good lens
@@ -121,8 +122,9 @@ def study(
     right = float(fit.score[use].median())
     highest = float(wrong.quantile(0.9)) if len(wrong) else 0.0
     fitter = replace(fitter, widest_px=widest)
+    together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
     score_min = 0.5 * (right + min(highest, right))
-    return Study(fitter=fitter, score_min=score_min, right_score=right, together=gain <= APART_GAIN)
+    return Study(fitter=fitter, score_min=score_min, right_score=right, together=together)
 
 
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
