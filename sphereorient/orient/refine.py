@@ -14,6 +14,7 @@ from sphereorient.orient.pixels import Pixels
 from sphereorient.sphere.paint_table import PaintTable
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
+EDGE_PX = 0.01  # by how much the model's limb may lie off in all directions alike: no blur is known any better
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 
@@ -142,7 +143,9 @@ def refine(
         meat[:, 3:, 3:] += place_precision
     bread = _inverse(whole)
     own_bread = _inverse(information[..., :3, :3])
-    covariance = bread @ meat @ bread
+    edge = _edge_errors(pixels, X[:, None] - origin, cameras, radius_mm) * seen[..., None]
+    lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
+    covariance = bread @ meat @ bread + lured.mT @ lured
     loss = _by_pose(_loss(at, pixels.inside), cameras)
     return Fit(
         position_lab_mm=X,
@@ -277,6 +280,14 @@ def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) ->
     seen_change = torch.hypot(across, (along / distance)[..., 0]) * seen
     size = torch.maximum(step[:, :3].norm(dim=-1), seen_change.amax(1))
     return step * (0.1 / size.clamp_min(0.1))[:, None]
+
+
+def _edge_errors(pixels: Pixels, to_centre: Tensor, cameras: int, radius_mm: float) -> Tensor:
+    """Return by how much (B, C, 3), mm, an edge that is EDGE_PX off moves the sphere along each line of sight."""
+    distance = to_centre.norm(dim=-1, keepdim=True)
+    px_mm = _by_pose(pixels.pitch_mm, cameras)[..., None] + _by_pose(pixels.pitch_rad, cameras)[..., None] * distance
+    off: Tensor = to_centre * (EDGE_PX * px_mm / radius_mm)
+    return off
 
 
 def _bounded_alone(freed: Tensor, to_centre: Tensor, radius_mm: float) -> Tensor:
