@@ -56,9 +56,8 @@ class Level:
     paint: PaintTable
 
     def stencil(self, radius_px: float) -> Stencil:
-        """Return the places of a disk of some radius, from a small set of sizes."""
-        size = SIZES ** math.ceil(math.log(radius_px + RIM * self.blur_px) / math.log(SIZES))
-        return _stencil(size, max(1, round(self.extra_px)))
+        """Return the places of a disk of some radius."""
+        return _stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)))
 
 
 @lru_cache(maxsize=64)
@@ -144,7 +143,8 @@ class Fitter:
         """
         middles = [torch.nan_to_num(eye.camera.project(position_lab_mm)).tolist() for eye in self.eyes]
         if radius_px is None:
-            radius_px = float(self.largest_px(position_lab_mm).max())
+            radius_px = max(1.0, float(self.largest_px(position_lab_mm).max()))
+            radius_px = SIZES ** math.ceil(math.log(radius_px) / math.log(SIZES))
         stencil = level.stencil(min(radius_px, 0.5 * max(self.eyes[0].camera.image_size)))
         return stacked(
             [

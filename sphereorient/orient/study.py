@@ -31,7 +31,7 @@ APART_GAIN = 1.5  # cameras that leave so many times more unexplained together t
 APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
 FAR_APART_PX = 1.5  # and by more than this, one pose for all cameras is none
 ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
-WIDER = 1.03  # how much larger than in the frames looked at a disk may be in others
+WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
 FIRST_BLUR = 0.625  # px: a pixel's own width and a good lens
 
 
