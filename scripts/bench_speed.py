@@ -156,7 +156,7 @@ def stages(bench: Bench) -> float:
     )
     say("frame without history, outlines to covariances, CPU ms a camera", f"{1e3 * found / cameras:.1f}")
     tracker = BlockTracker(bench.learnt, proposers, settings.locate, settings.refine)
-    # As many blocks side by side as the tracker follows: their first frames are searched for, the second ones approached.
+    # As many blocks side by side as the tracker follows: first frames are searched for, second ones approached.
     lanes = settings.refine.lanes
     begun, whole = [2] * lanes, [FOLLOWED // lanes] * lanes
     short = cpu_s(lambda: list(tracker.track([movie[: sum(begun)] for movie in bench.pictures], begun)), 3)

@@ -39,9 +39,7 @@ def main() -> None:
     torch.set_num_threads(1)
     experiment = load_experiment(arguments.folder / "experiment.yaml")
     exact = experiment.cameras
-    print(
-        "| case | relative rotation before (°) | after (°) | gap before, rms mm | after | exact cameras | after / exact |"
-    )
+    print("| case | relative rotation before (°) | after (°) | gap before, rms mm | after | exact cameras | ratio |")
     print("|---|---|---|---|---|---|---|")
     for case in range(arguments.cases):
         bumped = bump(exact, math.radians(arguments.turn), arguments.move, case)

@@ -121,6 +121,7 @@ def calibrate(
 ) -> None:
     """Find cameras from pictures of a plate, or repair bumped ones from a track of both."""
     _check_writable(out)
+    _check_other_yaml(out, source)
     command = " ".join(["sphereorient", *sys.argv[1:]])
     if refine_with is not None:
         _repair(source, refine_with, out, command, quiet)
@@ -132,8 +133,9 @@ def calibrate(
     with progress_bar(quiet) as advance:
         result = calibrate_cameras(source, advance)
     picture = out.with_suffix(".png")
-    calibration_figure(result, picture)
-    save_cameras(out, result.cameras, f"X_cam = R X_lab + T, mm; made by {command}", result.covariance)
+    with _put_aside(picture) as partial:
+        calibration_figure(result, partial)
+        save_cameras(out, result.cameras, f"X_cam = R X_lab + T, mm; made by {command}", result.covariance)
     if quiet:
         return
     from rich.console import Console
@@ -170,7 +172,7 @@ def check_cameras(
 ) -> None:
     """Tell by how much the lines of sight of the cameras miss each other at the sphere, over a movie."""
     from sphereorient.calibrate import check_cameras as checked
-    from sphereorient.calibrate.table import check_lines
+    from sphereorient.calibrate.table import check_lines, contradiction_lines
     from sphereorient.experiment import load_experiment
     from sphereorient.pipeline import track_movies
     from sphereorient.trajectory import Trajectory
@@ -185,7 +187,7 @@ def check_cameras(
         with progress_bar(quiet) as advance:
             result = track_movies(known, progress=advance)
     lines = check_lines(checked(known.cameras, result))
-    for line in lines or ["no frame in which two cameras see the sphere"]:
+    for line in [*(lines or ["no frame in which two cameras see the sphere"]), *contradiction_lines(result)]:
         typer.echo(line)
 
 
@@ -231,6 +233,26 @@ def _check_writable(out: Path) -> None:
         raise OutputError(refusal(f"--out {out}", expected="a writable folder", got=f"{folder}, which is not", do=do))
 
 
+def _check_other_yaml(out: Path, source: Path) -> None:
+    """Refuse to write cameras over what they are made of, or to a file whose picture would have its own name."""
+    do = "choose another --out, such as cameras.yaml"
+    if out.suffix not in (".yaml", ".yml"):
+        raise OutputError(refusal(f"--out {out}", expected="a name that ends in .yaml", got=f"'{out.name}'", do=do))
+    if out.resolve() == source.resolve():
+        raise OutputError(refusal(f"--out {out}", expected="another file than the input", got="the input", do=do))
+
+
+@contextmanager
+def _put_aside(path: Path) -> Iterator[Path]:
+    """Give a name to write under; what was written takes its place at the end, or vanishes where something failed."""
+    aside = path.with_name(f"{path.stem}.partial{path.suffix}")
+    try:
+        yield aside
+        aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
 Advance = Callable[[str, int, int], None]
 
 
@@ -273,13 +295,16 @@ def progress_bar(quiet: bool = False) -> Iterator[Advance]:
 
 
 def _print_summary(result: Trajectory, out: Path) -> None:
-    """Say what came out: frames valid, and for each camera what was lost and why."""
+    """Say what came out: frames valid, what each camera lost and why, what to do about cameras that moved."""
+    from sphereorient.calibrate.table import contradiction_lines
+
     summary = result.summary()
     typer.echo(f"{summary['valid']} of {summary['frames']} frames valid (position and orientation measured)")
     for name, lost in summary["lost"].items():
         text = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"
         typer.echo(f"  {name}: frames lost: {text}")
-    typer.echo(f"Wrote {out}")
+    for line in [*contradiction_lines(result), f"Wrote {out}"]:
+        typer.echo(line)
 
 
 def main() -> None:

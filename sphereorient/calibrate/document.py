@@ -15,14 +15,19 @@ from sphereorient.cameras import Port
 from sphereorient.cameras.calibration import plate_from_entry
 from sphereorient.cameras.calibration.entry import Target
 from sphereorient.cameras.entries import PortEntry
-from sphereorient.cameras.yaml_file import read_document, validated
+from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
+from sphereorient.cameras.yaml_file import read_document, refuse_unknown, validated
 from sphereorient.errors import CameraError, refusal
 
 SCHEMA = "sphereorient-calibration/1"
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: what four digits after the point leave
 Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Pixels = Annotated[int, Field(gt=0)]
 Triple = tuple[Number, Number, Number]
 Model = Literal["tsai", "pinhole", "brown"]
+# Points of tables are in the lab already: a plate that lies in the lab's own axes.
+IN_THE_LAB = {0: (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))}
 
 
 class SurveyedKeys(BaseModel):
@@ -38,8 +43,8 @@ class CalibrationKeys(BaseModel):
     """Keys of calibration.yaml (DESIGN section 2)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    image_size: tuple[int, int]
-    pixel_pitch: tuple[Number, Number]
+    image_size: tuple[Pixels, Pixels]
+    pixel_pitch: tuple[Positive, Positive]
     plate: Any = None
     surveyed: SurveyedKeys | None = None
     ports: dict[str, PortEntry] = {}
@@ -91,7 +96,7 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
     if bool(keys.pictures) == bool(keys.points):
         got, do = ("both" if keys.points else "neither"), "name pictures of a plate, or tables of points"
         raise CameraError(refusal(f"{path}, pictures, points", expected="one of them", got=got, do=do))
-    numbers = _pose_numbers(keys, path)
+    numbers = _pose_numbers(keys, path) if keys.pictures else (0,)
     pictures = _pictures(keys, path, numbers)
     if keys.pictures and keys.plate is None:
         do = "say what the plate is: type, columns, rows, pitch"
@@ -103,17 +108,30 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
         model=keys.model,
         plate=plate_from_entry(keys.plate, f"{path}, plate") if keys.pictures else None,
         poses=numbers,
-        surveyed=_surveyed(keys, path, numbers) if keys.pictures else {},
+        surveyed=_surveyed(keys, path, numbers) if keys.pictures else IN_THE_LAB,
         pictures=pictures,
         points={name: path.parent / file for name, file in keys.points.items()},
         ports={name: entry.port() for name, entry in keys.ports.items()},
         fit_ports=keys.fit_ports,
     )
-    for name in keys.ports:
-        if name not in document.cameras:
-            do = f"name one of {', '.join(document.cameras)}"
-            raise CameraError(refusal(f"{path}, ports", expected="a camera with pictures", got=f"'{name}'", do=do))
+    _check_ports(keys, path, document.cameras)
     return document
+
+
+def _check_ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> None:
+    for name in keys.ports:
+        if name not in cameras:
+            do = f"name one of {', '.join(cameras)}"
+            raise CameraError(refusal(f"{path}, ports", expected="a camera with pictures", got=f"'{name}'", do=do))
+    for name in keys.fit_ports:
+        if name not in (*PORT_NUMBERS, *PORT_TILT):
+            raise CameraError(refuse_unknown(name, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports"))
+    if keys.fit_ports and not keys.ports:
+        do = "say under `ports` where the walls are, as well as you know"
+        raise CameraError(refusal(f"{path}, fit_ports", expected="ports to fit", got="none", do=do))
+    if len(set(keys.fit_ports)) < len(keys.fit_ports):
+        got, do = ", ".join(keys.fit_ports), "name each once"
+        raise CameraError(refusal(f"{path}, fit_ports", expected="different names", got=got, do=do))
 
 
 def _pose_numbers(keys: CalibrationKeys, path: Path) -> tuple[int, ...]:
@@ -131,6 +149,9 @@ def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> tu
     pictures, seen = [], set()
     for k, entry in enumerate(keys.pictures):
         row = numbers.index(entry["pose"])
+        if len(entry) == 1:
+            do = "name a picture, such as cam1: cam1_00.png, or leave the entry out"
+            raise CameraError(refusal(f"{path}, pictures, {k}", expected="a picture", got="none", do=do))
         for name, file in entry.items():
             if name == "pose":
                 continue

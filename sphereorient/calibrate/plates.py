@@ -1,4 +1,4 @@
-"""Calibration from pictures of a plate, step by step: pictures -> points -> guess -> joint fit -> cameras."""
+"""Calibration step by step: pictures of a plate, or tables -> points -> guess -> joint fit -> cameras."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.calibrate.document import CalibrationDocument, Picture, load_calibration
+from sphereorient.calibrate.points import read_tables
 from sphereorient.cameras import Camera
 from sphereorient.cameras.calibration import PlateView, placed, see_plate
 from sphereorient.cameras.calibration.bundle import Fitted, adjust
-from sphereorient.cameras.calibration.guess import guess_rig
+from sphereorient.cameras.calibration.guess import guess_from_points, guess_rig
 from sphereorient.cameras.calibration.problem import Problem, Rig, fitted_parameters, gathered
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.errors import CameraError, refusal
 
 Progress = Callable[[str, int, int], None]
 CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tied where one reading fits this well
-LOOSE = {"f": 0.01, "T": 0.01, "centre": 0.02, "rotation": 0.01}  # of focal length, distance, picture's width; rad
+# Standard deviations of what counts as undetermined: of focal length, distance, picture's width; rad
+LOOSE = {"f": 0.01, "T": 0.01, "centre": 0.02, "rotation": 0.01}
+LOOSE_PORT = {"port_offset": 5.0, "port_thickness": 5.0, "port_n_glass": 0.1, "port_n_fluid": 0.05, "port_tilt": 0.05}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,27 +85,42 @@ def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: P
             leave a parameter undetermined.
     """
     document = calibration if isinstance(calibration, CalibrationDocument) else load_calibration(calibration)
-    views = see_pictures(document, progress)
+    views = read_tables(document) if document.points else see_pictures(document, progress)
     tied = {picture: view for picture, view in views.items() if view.state == "tied"}
     _check_seen(document, views, tied)
     progress("fit", 0, 1)
-    rig = guess_rig(
-        _by_camera(document, tied),
-        document.image_size,
-        document.pixel_pitch_mm,
-        document.surveyed,
-        document.ports,
-        len(document.poses),
-        document.model,
-    )
+    rig = _first_rig(document, tied)
+    tied = {picture: view for picture, view in tied.items() if _placed(rig, picture)}
     fitted = adjust(_problem(document, rig, tied))
-    found = tie_floating(document, fitted.rig, views)
+    found = {} if document.points else tie_floating(document, fitted.rig, views)
     if found:
-        tied = {picture: view for picture, view in (views | found).items() if view.state == "tied"}
+        tied |= found
         fitted = adjust(_problem(document, fitted.rig, tied))
     _check_determined(document, fitted)
     progress("fit", 1, 1)
     return _collected(document, views, tied, fitted)
+
+
+def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView]) -> Rig:
+    size, pitch, model = document.image_size, document.pixel_pitch_mm, document.model
+    if not document.points:
+        views = _by_camera(document, tied)
+        return guess_rig(views, size, pitch, document.surveyed, document.ports, len(document.poses), model)
+    cameras = {}
+    for picture, view in tied.items():
+        name = picture.camera
+        arrays = torch.from_numpy(view.points_plate_mm), torch.from_numpy(view.uv_px)
+        try:
+            cameras[name] = guess_from_points(*arrays, size, pitch, document.ports.get(name), model)
+        except CameraError as error:
+            raise CameraError(f"{picture.path}, {error}") from None
+    (R, T) = document.surveyed[0]
+    return Rig(cameras=cameras, R_lab_plate=R[None], T_lab_plate_mm=T[None])
+
+
+def _placed(rig: Rig, picture: Picture) -> bool:
+    """Tell whether the guess knows where the plate is: of a picture with a handful of points it does not."""
+    return bool(torch.isfinite(rig.T_lab_plate_mm[picture.row]).all())
 
 
 def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Picture, PlateView]:
@@ -182,7 +200,7 @@ def tie_floating(
     A view stays floating where its pose is not known, or no reading of it, or more than one, fits.
     """
     assert document.plate is not None
-    known = {picture.row for picture, view in views.items() if view.state == "tied"}
+    known = {picture.row for picture, view in views.items() if view.state == "tied" and _placed(rig, picture)}
     tied = {}
     for picture, view in views.items():
         if view.state != "floating" or picture.row not in known:
@@ -240,7 +258,10 @@ def _size_of(camera: Camera, parameter: str, document: CalibrationDocument) -> f
         inner: Any = getattr(camera, "camera", camera)
         value = inner.f_mm if parameter == "f" else inner.f_px
         return LOOSE["f"] * float(torch.as_tensor(value).max())
-    return float("inf")  # distortion and ports: the others tell
+    for name, size in LOOSE_PORT.items():
+        if parameter.startswith(name):
+            return size
+    return float("inf")  # distortion: the others tell
 
 
 def _collected(
@@ -262,7 +283,8 @@ def _collected(
             residual, used = fitted.residual_px[name][share].numpy(), fitted.used[name][share].numpy()
             report = (tied[picture], residual, used, "")
         else:
-            report = (view, np.zeros((0, 2)), np.zeros(0, bool), view.reason)
+            few = f"{picture.path.name}: {len(view)} points, too few to tell the pose"
+            report = (view, np.zeros((0, 2)), np.zeros(0, bool), view.reason or few)
         reports.append(_report(document, picture, *report))
     count = sum(len(_sigmas(camera)) for camera in fitted.rig.cameras.values())
     return Calibrated(

@@ -10,9 +10,12 @@ import torch
 from rich.table import Table
 
 from sphereorient.calibrate.plates import Calibrated
-from sphereorient.calibrate.sphere import CameraCheck
+from sphereorient.calibrate.sphere import TELLING, CameraCheck
 from sphereorient.cameras import Camera
 from sphereorient.cameras.calibration.self_calibration import MOVED, Repaired
+from sphereorient.trajectory import Reason, Trajectory
+
+CONTRARY_SHARE = 0.5  # of the frames of both cameras; a passing reflection spoils a few, a bumped camera nearly all
 
 
 def parameters_table(result: Calibrated) -> Table:
@@ -81,6 +84,21 @@ def check_lines(checks: Sequence[CameraCheck]) -> list[str]:
             f"(95 %); pictures by {miss:.3f} px, {miss95:.3f} px; {len(check.gap_mm)} frames"
         )
     return lines
+
+
+def contradiction_lines(track: Trajectory) -> list[str]:
+    """Return what to do where the cameras see the ball in different places for most of a movie; else nothing."""
+    reasons = [camera.reason for camera in track.cameras.values()]
+    seen = sum(all(why in TELLING for why in frame) for frame in zip(*reasons, strict=True))
+    contrary = sum(Reason.CONTRADICTS in frame for frame in zip(*reasons, strict=True))
+    if len(reasons) < 2 or contrary <= CONTRARY_SHARE * seen:
+        return []
+    return [
+        f"The cameras contradict each other in {contrary} of the {seen} frames in which both see the sphere: one has "
+        "moved since its calibration, or cameras.yaml is of another set-up.",
+        "Repair it: sphereorient calibrate CAMERAS.yaml --refine-with TRACK.h5 --out REPAIRED.yaml, name REPAIRED.yaml "
+        "in experiment.yaml, and track again. If that does not help, take new pictures of the plate.",
+    ]
 
 
 def _values(camera: Camera) -> dict[str, float]:

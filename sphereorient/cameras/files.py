@@ -11,6 +11,7 @@ import torch
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.entries import CovarianceEntry
+from sphereorient.cameras.parameters import parameter_names
 from sphereorient.cameras.registry import build_camera, describe_camera
 from sphereorient.cameras.yaml_file import read_document, refuse_unknown, validated, write_document
 from sphereorient.errors import CameraError, refusal
@@ -66,6 +67,11 @@ def load_covariance(path: Path | str, cameras: Mapping[str, Camera]) -> Paramete
         whole = validated(CovarianceEntry, entry, where, CameraError).covariance()
     except CameraError as error:
         raise CameraError(str(error) if str(error).startswith(where) else f"{path}, {error}") from None
+    for name in whole.names:
+        camera, _, parameter = name.partition(".")
+        if camera in cameras and parameter not in parameter_names(cameras[camera]):
+            known = [f"{camera}.{one}" for one in parameter_names(cameras[camera])]
+            raise CameraError(refuse_unknown(name, known, f"{where}, parameters"))
     return whole.of(cameras)
 
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from sphereorient.calibrate import Calibrated, PictureReport
@@ -21,7 +22,7 @@ def calibration_figure(result: Calibrated, path: Path) -> None:
     """Draw pictures with points found and expected, all residuals over the picture, and their histogram.
 
     Args:
-        result: of `calibrate_cameras`; the pictures are opened again.
+        result: of `calibrate_cameras`; the pictures are opened again; tables have none.
         path: of the PNG or PDF to write.
     """
     names = list(result.cameras)
@@ -44,7 +45,11 @@ def calibration_figure(result: Calibrated, path: Path) -> None:
 def _draw_picture(ax: Any, one: PictureReport) -> None:
     data = np.fromfile(one.picture.path, np.uint8)
     picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    ax.imshow(picture, cmap="gray")
+    if picture is not None:  # a table of points has none
+        ax.imshow(picture, cmap="gray")
+    else:
+        ax.set_aspect("equal")
+        ax.invert_yaxis()
     found = one.view.uv_px
     expected = found - one.residual_px
     ax.plot(*expected.T, "+", ms=7, mew=0.9, color=EXPECTED, label="expected")
@@ -70,11 +75,12 @@ def _draw_residuals(ax: Any, used: list[PictureReport], image_size: tuple[int, i
 
 def _draw_histogram(ax: Any, used: list[PictureReport], rms_px: float) -> None:
     _, missed = _joined(used)
-    reach = 4 * rms_px / np.sqrt(2)
+    reach = 4 * max(rms_px, 1e-6) / np.sqrt(2)
     edges = np.linspace(-reach, reach, 41)
     for part, colour, label in zip(missed.T, (FOUND, EXPECTED), ("u", "v"), strict=True):
         ax.hist(part, edges, histtype="step", lw=1.5, color=colour, label=label)
     ax.set(xlabel="found less expected (px)", ylabel="points")
+    ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.set_title(f"all pictures: rms {rms_px:.3f} px", fontsize=9)
     ax.legend(fontsize=8)
 

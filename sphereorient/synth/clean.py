@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras import Camera, PinholeCamera
+from sphereorient.cameras import Camera, PinholeCamera, Rays
 from sphereorient.errors import CameraError, refusal
 from sphereorient.sphere import reduced_texture, sample_texture, sphere_normals
 from sphereorient.synth.aperture import aperture_matrix, fine_places
+from sphereorient.synth.window import reach_px
 
 SUPERSAMPLING = 4  # rays per pixel and axis: with soft borders, the picture is right to a hundredth of the step
 RENDERED_AT_ONCE = 2  # more leave the cache
@@ -117,12 +118,12 @@ def render_clean(
         (N, H, W) float32, grey levels.
 
     Raises:
-        CameraError: a ball that is not wholly inside the picture.
+        CameraError: a ball that is not wholly inside the picture, or not wholly before the camera or in the liquid.
     """
     width, height = camera.image_size
     middle_px = camera.project(position_lab_mm)
-    reach_px = _reach_px(camera, position_lab_mm, diameter_mm / 2)
-    half = math.ceil(reach_px + 4 * optics.sigma_px) + 1
+    reach = reach_px(camera, position_lab_mm, diameter_mm / 2)
+    half = math.ceil(reach + 4 * optics.sigma_px) + 1
     size = 2 * half + 1
     corner = middle_px.round().long() - half  # (N, 2) as (left, top)
     if not ((corner >= 0) & (corner <= torch.tensor([width, height]) - size)).all():
@@ -130,10 +131,10 @@ def render_clean(
         raise CameraError(refusal("position_lab_mm", expected="a ball inside the picture", got="one beyond", do=do))
     at = fine_places(size, supersampling)
     down, right = torch.meshgrid(at, at, indexing="ij")
-    reached = (right - half).square() + (down - half).square() < (reach_px + 1.5) ** 2
+    reached = (right - half).square() + (down - half).square() < (reach + 1.5) ** 2
     place = torch.stack([right[reached], down[reached]], dim=-1)
     aperture = aperture_matrix(size, supersampling, optics.sigma_px)
-    texture = reduced_texture(texture, supersampling * 2 * reach_px).double()
+    texture = reduced_texture(texture, supersampling * 2 * reach).double()
     pictures = torch.full((len(middle_px), height, width), optics.black, dtype=torch.float32)
     for rows in torch.split(torch.arange(len(middle_px)), RENDERED_AT_ONCE):
         fine = torch.zeros(len(rows), *reached.shape, dtype=torch.float64)
@@ -166,19 +167,17 @@ def _fine_picture(
     rays = camera.rays(uv_px)
     centre = position_lab_mm[:, None]
     normal, _ = sphere_normals(rays.origin_lab_mm, rays.direction_lab, centre, radius_mm)
-    to_centre = centre - rays.origin_lab_mm
-    aside_mm = torch.linalg.cross(rays.direction_lab, to_centre).norm(dim=-1)
     # The limb as wide as a fine sample: a step would be right to a 32nd of a pixel only.
-    beside = camera.rays(uv_px[:, :1] + uv_px.new_tensor([1.0 / supersampling, 0.0])).direction_lab
-    fine_mm = (beside - rays.direction_lab[:, :1]).norm(dim=-1) * to_centre.norm(dim=-1)
-    share = ((radius_mm - aside_mm) / fine_mm + 0.5).clamp(0, 1)
+    middle_px = camera.project(position_lab_mm)[:, None]
+    beside = camera.rays(middle_px + uv_px.new_tensor([1.0 / supersampling, 0.0]))
+    fine_mm = _passes_mm(beside, centre)
+    share = ((radius_mm - _passes_mm(rays, centre)) / fine_mm + 0.5).clamp(0, 1)
     seen: Tensor = share * sample_texture(texture, normal @ R_lab_body)
     return seen
 
 
-def _reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> float:
-    """Greatest distance, px, of the ball's rim from the picture of its centre, with 4 % for the cap's bulge."""
-    middle_px = camera.project(position_lab_mm)
-    across = 1.04 * radius_mm * camera.R_cam_lab[:2]
-    rim_px = camera.project(position_lab_mm[:, None] + torch.cat([across, -across]))
-    return float((rim_px - middle_px[:, None]).norm(dim=-1).max()) if len(middle_px) else 1.0
+def _passes_mm(rays: Rays, centre_lab_mm: Tensor) -> Tensor:
+    """Return by how much rays (K, P) pass centres (K, 1, 3), mm."""
+    to_centre = centre_lab_mm - rays.origin_lab_mm
+    aside_mm: Tensor = torch.linalg.cross(rays.direction_lab, to_centre).norm(dim=-1)
+    return aside_mm

@@ -14,6 +14,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera
 from sphereorient.sphere import reduced_texture, sample_texture, sphere_normals
 from sphereorient.synth.settings import SynthSettings
+from sphereorient.synth.window import reach_px
 
 SUPERSAMPLING = 3  # rays per pixel and axis: the paint's edges and the limb then are right to a few per cent
 
@@ -49,6 +50,9 @@ def render_frame(
 
     Returns:
         (H, W) uint8.
+
+    Raises:
+        CameraError: a ball that is not wholly before the camera, or not wholly in the liquid.
     """
     settings = scene.settings
     width, height = camera.image_size
@@ -69,7 +73,7 @@ def _add_sphere(
     settings = scene.settings
     u, v = camera.project(position).tolist()
     height, width = picture.shape
-    reach = math.ceil(0.75 * settings.diameter_px * settings.distance_mm / max(_depth(camera, position), 1.0)) + 2
+    reach = math.ceil(reach_px(camera, position[None], settings.diameter_mm / 2)) + 2
     left, right = max(0, round(u) - reach), min(width, round(u) + reach + 1)
     top, bottom = max(0, round(v) - reach), min(height, round(v) + reach + 1)
     if left >= right or top >= bottom:
@@ -89,7 +93,3 @@ def _add_sphere(
     fine = torch.stack([torch.where(hit, grey, 0.0), hit.double()])
     mean = torch.nn.functional.avg_pool2d(fine[None], SUPERSAMPLING)[0].numpy().astype(np.float32)
     picture[top:bottom, left:right] += share * (mean[0] - mean[1] * settings.background)
-
-
-def _depth(camera: Camera, position: Tensor) -> float:
-    return float(camera.R_cam_lab[2] @ position + camera.T_cam_lab_mm[2])

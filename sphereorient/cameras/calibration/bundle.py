@@ -6,19 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from torch import Tensor
 
+from sphereorient.cameras.calibration.descent import robust_least_squares
 from sphereorient.cameras.calibration.problem import Problem, Rig
 from sphereorient.cameras.covariance import ParameterCovariance
 
 SOFT = 2.0  # sigmas beyond which a residual pulls less than by its square
 OUTLIER = 6.0  # robust standard deviations beyond which a point is left out
 ROUNDS = 3  # of fit, perspective bias and outliers
-EVALUATIONS = 60  # at most, a round
+STEPS = 60  # at most, a round
+TOLERANCE = (1e-5, 1e-8)  # relative gain of the cost at which a round ends: those whose weights change, and the last
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,9 +45,9 @@ def adjust(problem: Problem) -> Fitted:
     """
     used = {name: torch.ones(len(seen.pose), dtype=torch.bool) for name, seen in problem.seen.items()}
     change = torch.zeros(problem.size, dtype=torch.float64)
-    for _ in range(ROUNDS):
+    for k in range(ROUNDS):
         shifts = problem.shifts(problem.applied(change))
-        change = _solved(problem, change, shifts, _rows(used))
+        change = _solved(problem, change, shifts, _rows(used), TOLERANCE[k == ROUNDS - 1])
         residuals = problem.residuals(change, shifts)
         used = _inliers(problem, residuals)
     shifts = problem.shifts(problem.applied(change))
@@ -69,20 +68,15 @@ def adjust(problem: Problem) -> Fitted:
     )
 
 
-def _solved(problem: Problem, start: Tensor, shifts: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-    kept = rows.numpy()
-
-    def residuals(change: NDArray[Any]) -> NDArray[Any]:
-        # A camera that a trial step throws behind the plate sees nothing: far off, so that the step is not taken.
-        return np.asarray(torch.nan_to_num(problem.residuals(torch.from_numpy(change), shifts), 1e6).numpy()[kept])
-
-    def slopes(change: NDArray[Any]) -> NDArray[Any]:
-        return np.asarray(torch.nan_to_num(problem.slopes(torch.from_numpy(change))).numpy()[kept])
-
-    fit = least_squares(
-        residuals, start.numpy(), jac=slopes, x_scale="jac", loss="soft_l1", f_scale=SOFT, max_nfev=EVALUATIONS
+def _solved(problem: Problem, start: Tensor, shifts: Mapping[str, Tensor], rows: Tensor, gain: float) -> Tensor:
+    return robust_least_squares(
+        lambda change: problem.residuals(change, shifts)[rows],
+        lambda change: problem.slopes(change)[rows],
+        start,
+        soft=SOFT,
+        gain=gain,
+        steps=STEPS,
     )
-    return torch.from_numpy(fit.x)
 
 
 def _rows(used: Mapping[str, Tensor]) -> Tensor:
@@ -107,11 +101,12 @@ def _in_px(problem: Problem, residuals: Tensor) -> dict[str, Tensor]:
 
 def _inverse(information: Tensor) -> Tensor:
     """Invert an information matrix of parameters in different units; what nothing determines gets a huge variance."""
-    scale = information.diagonal().clamp_min(1e-300).rsqrt()
+    known = information.diagonal()
+    scale = torch.where(known > 0, known, torch.ones_like(known)).rsqrt()
     values, vectors = torch.linalg.eigh(scale[:, None] * information * scale)
     inverse: Tensor = (vectors / values.clamp_min(1e-14)) @ vectors.mT
     whole: Tensor = scale[:, None] * inverse * scale
-    return whole
+    return (whole + whole.mT) / 2
 
 
 def _with_covariances(problem: Problem, rig: Rig, covariance: Tensor) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.cameras.calibration.problem import Rig
+from sphereorient.cameras.calibration.tsai_method import calibrate_tsai
 from sphereorient.cameras.calibration.view import PlateView
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.pinhole import PinholeCamera
@@ -45,6 +46,9 @@ def guess_rig(
         poses: their number.
         model: tsai, pinhole or brown.
 
+    Returns:
+        Cameras without distortion, and poses; T of a pose that no picture with enough points shows is NaN.
+
     Raises:
         CameraError: too few pictures of a camera, or one that shares no pose with the others.
 
@@ -54,16 +58,59 @@ def guess_rig(
     placed, plate = _chained({name: relative for name, (_, _, relative) in lenses.items()}, surveyed)
     cameras: dict[str, Camera] = {}
     for name, (f_px, centre, _) in lenses.items():
-        R, T = placed[name]
-        if name in ports:
-            f_px, R, T = _before_the_wall(f_px, R, T, ports[name])
-        lens = _LENSES[model](image_size, R, T, f_px, torch.tensor(centre, dtype=torch.float64), pixel_pitch_mm)
-        cameras[name] = PortCamera(camera=lens, port=ports[name]) if name in ports else lens
+        cameras[name] = _camera(model, image_size, placed[name], f_px, centre, pixel_pitch_mm, ports.get(name))
     R_all = torch.eye(3, dtype=torch.float64).repeat(poses, 1, 1)
-    T_all = torch.zeros(poses, 3, dtype=torch.float64)
+    T_all = torch.full((poses, 3), torch.nan, dtype=torch.float64)
     for row, (R, T) in plate.items():
         R_all[row], T_all[row] = R, T
     return Rig(cameras=cameras, R_lab_plate=R_all, T_lab_plate_mm=T_all)
+
+
+def guess_from_points(
+    x_lab_mm: Tensor,
+    uv_px: Tensor,
+    image_size: tuple[int, int],
+    pixel_pitch_mm: tuple[float, float],
+    port: Port | None = None,
+    model: str = "tsai",
+) -> Camera:
+    """Return a camera to begin with, from points whose places in the lab are known.
+
+    Args:
+        x_lab_mm: (n, 3), lab.
+        uv_px: (n, 2), where the camera shows them.
+        image_size: W, H px.
+        pixel_pitch_mm: of the sensor.
+        port: the wall that the camera looks through.
+        model: tsai, pinhole or brown.
+
+    Raises:
+        CameraError: points that do not determine a camera.
+
+    Source: Tsai 1987.
+    """
+    start = calibrate_tsai(x_lab_mm, uv_px, image_size, pixel_pitch_mm)
+    centre = (float(start.centre_px[0]), float(start.centre_px[1]))
+    f_px = float(start.f_mm) / pixel_pitch_mm[1]
+    pose = start.R_cam_lab, start.T_cam_lab_mm
+    return _camera(model, image_size, pose, f_px, centre, pixel_pitch_mm, port)
+
+
+def _camera(
+    model: str,
+    image_size: tuple[int, int],
+    pose: Pose,
+    f_px: float,
+    centre: tuple[float, float],
+    pitch: tuple[float, float],
+    port: Port | None,
+) -> Camera:
+    """Return a camera without distortion, behind its wall if there is one, from what it would be without the wall."""
+    R, T = pose
+    if port is not None:
+        f_px, R, T = _before_the_wall(f_px, R, T, port)
+    lens = _LENSES[model](image_size, R, T, f_px, torch.tensor(centre, dtype=torch.float64), pitch)
+    return lens if port is None else PortCamera(camera=lens, port=port)
 
 
 def _tsai(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras.calibration.bias import disk_centre_shift
-from sphereorient.cameras.calibration.forward import slope_along
+from sphereorient.cameras.calibration.forward import slopes_along
 from sphereorient.cameras.calibration.view import PlateView
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, parameter_names, with_parameters
@@ -128,7 +128,7 @@ class Problem:
         return torch.cat(parts)
 
     def slopes(self, change: Tensor) -> Tensor:
-        """Return the derivatives of the residuals (2 n, size), by forward differentiation of the cameras themselves.
+        """Return the derivatives of the residuals (2 n, size), by differentiation of the cameras themselves.
 
         A point's picture depends on its own camera and its own pose: all poses are differentiated in one pass.
         """
@@ -141,17 +141,16 @@ class Problem:
         for name, seen in self.seen.items():
             n = len(seen.pose)
             block = out[begin : begin + 2 * n].view(n, 2, self.size)
-            weight = -1.0 / seen.sigma_px[:, None]
-            for k, unit in enumerate(torch.eye(len(self.names[name]), dtype=torch.float64)):
-                moved = slope_along(partial(self._by_share, name, poses), shares[name], unit)
-                block[:, :, offset + k] = weight * moved
+            weight = -1.0 / seen.sigma_px[:, None, None]
+            units = torch.eye(len(self.names[name]), dtype=torch.float64)
+            by_share = slopes_along(partial(self._by_share, name, poses), shares[name], units)
+            block[:, :, offset : offset + len(units)] = weight * by_share
             place = torch.tensor([column.get(int(row), -1) for row in seen.pose])
             moving = torch.nonzero(place >= 0)[:, 0]
+            units = torch.eye(POSE_PARTS, dtype=torch.float64)[:, None].expand(-1, len(poses), -1)
+            by_pose = weight * slopes_along(partial(self._expected, name, shares[name]), poses, units)
             for part in range(POSE_PARTS):
-                unit = torch.zeros_like(poses)
-                unit[:, part] = 1.0
-                slope = weight * slope_along(partial(self._expected, name, shares[name]), poses, unit)
-                block[moving, :, first_pose + POSE_PARTS * place[moving] + part] = slope[moving]
+                block[moving, :, first_pose + POSE_PARTS * place[moving] + part] = by_pose[moving, :, part]
             begin, offset = begin + 2 * n, offset + len(self.names[name])
         return out
 

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras.calibration.forward import slope_along
+from sphereorient.cameras.calibration.forward import slopes_along
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
@@ -152,7 +152,7 @@ class _Pair:
             return self._stacked(x, gap_mm, turn_rad, prior)
 
         x = torch.from_numpy(at)
-        return torch.stack([slope_along(stacked, x, unit) for unit in torch.eye(9, dtype=torch.float64)], -1).numpy()
+        return slopes_along(stacked, x, torch.eye(9, dtype=torch.float64)).numpy()
 
     def _stacked(self, at: Tensor, gap_mm: float, turn_rad: NDArray[Any], prior: NDArray[Any]) -> Tensor:
         shared = SHARED**0.5

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.calibration.forward import slope_along
+from sphereorient.cameras.calibration.forward import slopes_along
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.parameters import with_parameters
@@ -109,8 +109,8 @@ def _slopes(camera: Camera, names: list[str], places: Tensor, radius_mm: float) 
         return with_parameters(camera, names, delta).project(points)
 
     axes, units = torch.eye(3, dtype=torch.float64), torch.eye(len(names), dtype=torch.float64)
-    by_place = torch.stack([slope_along(shown, points, axis.expand_as(points)) for axis in axes], dim=-1)
-    by_parameter = torch.stack([slope_along(changed, torch.zeros_like(unit), unit) for unit in units], dim=-1)
+    by_place = slopes_along(shown, points, [axis.expand_as(points) for axis in axes])
+    by_parameter = slopes_along(changed, torch.zeros(len(names), dtype=torch.float64), units)
     # A turn delta moves a point of the surface by delta x arm; the limb it does not move at all.
     lever = torch.linalg.cross(axes.expand(*arms.shape[:2], 3, 3), arms[..., None, :].expand(*arms.shape[:2], 3, 3))
     by_turn = by_place @ lever.mT
