@@ -15,6 +15,10 @@ import pytest
 import yaml
 from conftest import REPO
 
+from sphereorient.cameras import load_cameras
+from sphereorient.cameras.entries import PortEntry
+from sphereorient.cameras.parameters import parameter_names
+from sphereorient.cameras.registry import MODELS
 from sphereorient.experiment import ExperimentKeys, load_experiment
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
@@ -28,10 +32,31 @@ def blocks(page: str, language: str) -> list[str]:
     return [block for kind, block in found if kind == language]
 
 
-def test_the_examples_of_the_conventions_run():
-    failed, tried = doctest.testfile(str(REPO / "docs" / "conventions.md"), module_relative=False)
+@pytest.mark.parametrize("page", ["conventions.md", "cameras.md"])
+def test_the_examples_of_a_page_run(page):
+    failed, tried = doctest.testfile(str(REPO / "docs" / page), module_relative=False)
     assert tried >= 40
     assert failed == 0
+
+
+def test_the_cameras_of_the_page_load_and_no_key_of_any_model_is_missing(tmp_path):
+    (tmp_path / "cameras.yaml").write_text(blocks("cameras.md", "yaml")[0])
+    cameras = load_cameras(tmp_path / "cameras.yaml")
+    assert {type(getattr(camera, "camera", camera)) for camera in cameras.values()} == {
+        model.kind for model in MODELS.values()
+    }
+    text = (REPO / "docs" / "cameras.md").read_text()
+    entries = [PortEntry, *(model.entry for model in MODELS.values())]
+    for key in {key for entry in entries for key in entry.model_fields}:
+        assert f"`{key}`" in text, key
+
+
+def test_every_parameter_of_every_camera_is_named_on_the_page(tmp_path):
+    (tmp_path / "cameras.yaml").write_text(blocks("cameras.md", "yaml")[0])
+    text = (REPO / "docs" / "cameras.md").read_text()
+    for camera in load_cameras(tmp_path / "cameras.yaml").values():
+        for name in parameter_names(camera):
+            assert f"`{name}`" in text, name
 
 
 def test_parameters_and_configs_are_those_of_the_code():
