@@ -64,7 +64,8 @@ def sphere_view(
     distance = to_centre[..., 0].norm(dim=1, keepdim=True)
     blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
     # The Gaussian aperture, cut off at the limb: what share is left, where its middle lies, how wide it is.
-    edge = (1.0 - q0) / blur
+    # Half of an aperture on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
+    edge = (1.0 - 0.5 * blur * blur - q0) / blur
     coverage = torch.special.ndtr(edge)
     density = torch.exp(-0.5 * edge * edge) * (1.0 / math.sqrt(2.0 * math.pi))
     pull = density / coverage.clamp_min(1e-4)

@@ -14,7 +14,7 @@ from sphereorient.orient.pixels import Pixels
 from sphereorient.sphere.paint_table import PaintTable
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
-EDGE_PX = 0.01  # by how much the model's limb may lie off in all directions alike: no blur is known any better
+EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 
@@ -42,7 +42,7 @@ class Fit:
     own_move: Tensor  # (B, C, 3), mm, lab: how each camera alone would move the sphere, distance by size included
     deviation: Tensor  # (B, C), robust standard deviation of the residuals over the noise expected
     score: Tensor  # (B, C), 1 less the share of the picture's variance that is left
-    nll: Tensor  # (B,), negative log-likelihood, errors that neighbours share counted once
+    nll: Tensor  # (B,), negative log-likelihood of all pixels, as if they were independent
     step: Tensor  # (B, 6), the last one
 
     def to(self, device: torch.device) -> Fit:
@@ -146,6 +146,8 @@ def refine(
     edge = _edge_errors(pixels, X[:, None] - origin, cameras, radius_mm) * seen[..., None]
     lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
     covariance = bread @ meat @ bread + lured.mT @ lured
+    told = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # no picture, no knowledge: the inverse of nothing is huge
+    covariance = torch.where(told[:, None, None], 0.5 * (covariance + covariance.mT), bread)
     loss = _by_pose(_loss(at, pixels.inside), cameras)
     return Fit(
         position_lab_mm=X,
@@ -224,7 +226,7 @@ def _by_pose(disks: Tensor, cameras: int) -> Tensor:
 
 
 def _variance(grey: Tensor, noise: Tensor) -> Tensor:
-    """Noise expected at grey levels (L, P) by the curves (L, 3)."""
+    """Noise expected at grey levels (L, P) by the curves (L, 4)."""
     grey = grey.clamp_min(0.0)
     a, b, c, d = noise[..., None].unbind(1)
     variance: Tensor = a + grey * (b + grey * (c + grey * d))
@@ -304,7 +306,10 @@ def _shared_scores(at: _Residuals, precision: Tensor, mixed: Tensor, tile: Tenso
     score = by_pose * (precision * at.residual)[:, None]
     tiles = score.new_zeros(*score.shape[:2], int(tile.max()) + 1 if len(tile) else 1)
     tiles = tiles.index_add(2, tile, score).double()
-    return tiles @ tiles.mT
+    count, fitted = tiles.shape[2], at.design.shape[1]
+    # Residuals of a fit are smaller than errors: the correction for few clusters (Cameron and Miller 2015, CR1).
+    few = count / max(count - fitted, 1)
+    return few * (tiles @ tiles.mT)
 
 
 def _loss(at: _Residuals, inside: Tensor) -> Tensor:
@@ -325,7 +330,9 @@ def _score(at: _Residuals, inside: Tensor) -> Tensor:
     grey = at.model + at.residual
     spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
     left = (share * torch.minimum(at.residual.square(), 4.0 * spread[:, None])).sum(-1)
-    return 1.0 - left / spread.clamp_min(1e-9)
+    explained = 1.0 - left / spread.clamp_min(1e-9)
+    # Where no pixel is ball, nothing is explained.
+    return torch.where(spread > 1e-6, explained, torch.zeros_like(explained))
 
 
 def learn_light(
