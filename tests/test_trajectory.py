@@ -290,3 +290,18 @@ def test_the_summary_counts_lost_frames_by_reason() -> None:
 def test_the_noun_does_not_bring_torch_along() -> None:
     look = "import sys, sphereorient.trajectory; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", look], check=False).returncode == 0
+
+
+def test_a_track_of_before_the_systematic_errors_is_read_without_them(tmp_path: Path) -> None:
+    track = full_trajectory()
+    path = tmp_path / "track.h5"
+    track.save(path)
+    names = ("position_systematic_cov", "orientation_systematic_cov")
+    with h5py.File(path, "a") as file:
+        for name in names:
+            del file[name]
+    old = Trajectory.load(path)
+    for name in names:
+        assert np.shape(getattr(old, name)) == (len(track), 3, 3)
+        assert np.isnan(getattr(old, name)).all()
+    np.testing.assert_array_equal(old.position_cov, track.position_cov)

@@ -25,6 +25,8 @@ BIAS_RAD = np.deg2rad(0.08)  # constant turn by which one camera alone may be of
 SHARED = 12  # frames that share one error of the centre: neighbours see the same light
 HELD_SHARE = 0.5  # of the prior: what is known no better afterwards was not determined
 FRAMES_MIN = 20
+OUTLIER = 5.0  # robust standard deviations beyond which a frame is left out
+ROUNDS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,32 +135,46 @@ class _Pair:
         return torch.from_numpy(at[:6].copy()), torch.from_numpy(spread[:6].copy()), free
 
     def _improved(self, at: NDArray[Any], prior: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        for _ in range(3):  # the scatter is measured at the solution
-            change = torch.from_numpy(at[:6])
-            gap, turn = self.gaps(change), self.turns(change) - torch.from_numpy(at[6:])
-            scatter = (max(_robust(gap), 1e-6), np.maximum([_robust(part) for part in turn.T], 1e-6), prior)
-            fit = least_squares(
-                self._residuals, at, jac=self._jacobian, x_scale="jac", loss="soft_l1", f_scale=3.0, args=scatter
-            )
-            at = fit.x
-        slopes = self._jacobian(at, *scatter)
+        scatter = self._scatter(at, prior)
+        for _ in range(ROUNDS):  # the scatter is measured at the solution
+            at = least_squares(self._residuals, at, jac=self._jacobian, x_scale="jac", args=(scatter,)).x
+            scatter = self._scatter(at, prior)
+        slopes = self._jacobian(at, scatter)
         return at, np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
 
-    def _residuals(self, at: NDArray[Any], gap_mm: float, turn_rad: NDArray[Any], prior: NDArray[Any]) -> NDArray[Any]:
-        return np.asarray(self._stacked(torch.from_numpy(at), gap_mm, turn_rad, prior).numpy())
+    def _scatter(self, at: NDArray[Any], prior: NDArray[Any]) -> _Scatter:
+        change = torch.from_numpy(at[:6])
+        told = torch.cat([self.gaps(change)[:, None], self.turns(change)], dim=-1)
+        away = told - told.median(dim=0).values
+        spread = (1.4826 * away.abs().median(dim=0).values).clamp_min(1e-6)
+        # A soft loss is not enough: the prior would be softened with it, and a few mirror images pull for ever.
+        kept = (away.abs() <= OUTLIER * spread).all(-1)
+        return _Scatter(gap_mm=float(spread[0]), turn_rad=spread[1:], kept=kept, prior=torch.from_numpy(prior))
 
-    def _jacobian(self, at: NDArray[Any], gap_mm: float, turn_rad: NDArray[Any], prior: NDArray[Any]) -> NDArray[Any]:
+    def _residuals(self, at: NDArray[Any], scatter: _Scatter) -> NDArray[Any]:
+        return np.asarray(self._stacked(torch.from_numpy(at), scatter).numpy())
+
+    def _jacobian(self, at: NDArray[Any], scatter: _Scatter) -> NDArray[Any]:
         def stacked(x: Tensor) -> Tensor:
-            return self._stacked(x, gap_mm, turn_rad, prior)
+            return self._stacked(x, scatter)
 
-        x = torch.from_numpy(at)
-        return slopes_along(stacked, x, torch.eye(9, dtype=torch.float64)).numpy()
+        return np.asarray(slopes_along(stacked, torch.from_numpy(at), torch.eye(9, dtype=torch.float64)).numpy())
 
-    def _stacked(self, at: Tensor, gap_mm: float, turn_rad: NDArray[Any], prior: NDArray[Any]) -> Tensor:
+    def _stacked(self, at: Tensor, scatter: _Scatter) -> Tensor:
         shared = SHARED**0.5
-        gap = self.gaps(at[:6]) / (gap_mm * shared)
-        turn = (self.turns(at[:6]) - at[6:]) / (torch.from_numpy(turn_rad) * shared)
-        return torch.cat([gap, turn.reshape(-1), at[:6] / torch.from_numpy(prior), at[6:] / BIAS_RAD])
+        gap = self.gaps(at[:6])[scatter.kept] / (scatter.gap_mm * shared)
+        turn = (self.turns(at[:6]) - at[6:])[scatter.kept] / (scatter.turn_rad * shared)
+        return torch.cat([gap, turn.reshape(-1), at[:6] / scatter.prior, at[6:] / BIAS_RAD])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Scatter:
+    """How far frames lie apart, and which are no outliers."""
+
+    gap_mm: float
+    turn_rad: Tensor  # (3,)
+    kept: Tensor  # (N,) bool
+    prior: Tensor  # (6,)
 
 
 def _R_lab_view(camera: Camera, uv_px: Tensor) -> Tensor:
@@ -169,10 +185,6 @@ def _R_lab_view(camera: Camera, uv_px: Tensor) -> Tensor:
     x = camera.rays(uv_px + step).direction_lab - camera.rays(uv_px - step).direction_lab
     x = torch.nn.functional.normalize(x - (x * z).sum(-1, keepdim=True) * z, dim=-1)
     return torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
-
-
-def _robust(values: Tensor) -> float:
-    return 1.4826 * float((values - values.median()).abs().median())
 
 
 def _rms(values: Tensor) -> float:

@@ -17,6 +17,7 @@ from sphereorient.cameras.view import R_cam_view
 CAP_RINGS = (0.35, 0.75)  # of the radius: where paint is looked at
 PER_RING = 6
 LIMB_POINTS = 12
+GRAZING_ROUNDS = 4  # each brings the grazed point nearer by the ball's radius over its distance
 DIRECT_FRAMES = 200  # at so many places the effect is computed; it is smooth, a quadratic in place tells it in between
 
 
@@ -99,7 +100,7 @@ def _slopes(camera: Camera, names: list[str], places: Tensor, radius_mm: float) 
     towards = torch.nn.functional.normalize(camera.rays(camera.project(places)).direction_lab, dim=-1)
     R_lab_view = camera.R_cam_lab.mT @ R_cam_view(towards @ camera.R_cam_lab.mT)
     paint, limb = (pattern @ R_lab_view.mT * radius_mm for pattern in (_cap(), _limb()))
-    arms = torch.cat([paint, limb], dim=1)
+    arms = torch.cat([paint, _grazed(camera, places, limb, radius_mm)], dim=1)
     points = places[:, None] + arms
 
     def shown(x: Tensor) -> Tensor:
@@ -123,6 +124,20 @@ def _slopes(camera: Camera, names: list[str], places: Tensor, radius_mm: float) 
         along = (outward[:, count:, :, None] * slopes[:, count:]).sum(2)  # of the limb only what goes outwards is seen
         parts.append(torch.cat([slopes[:, :count].flatten(1, 2), along], dim=1))
     return parts[0], parts[1]
+
+
+def _grazed(camera: Camera, places: Tensor, arms: Tensor, radius_mm: float) -> Tensor:
+    """Return arms (N, M, 3), lab, mm, to where lines of sight graze the ball: a little before its middle.
+
+    Only of these points the picture's way outwards is that of the limb, whatever else they do.
+    """
+    outward = torch.nn.functional.normalize(arms, dim=-1)
+    for _ in range(GRAZING_ROUNDS):
+        along = camera.rays(camera.project(places[:, None] + arms)).direction_lab
+        arms = radius_mm * torch.nn.functional.normalize(
+            outward - (outward * along).sum(-1, keepdim=True) * along, dim=-1
+        )
+    return arms
 
 
 def _cap() -> Tensor:
