@@ -15,9 +15,12 @@ import pytest
 import yaml
 from conftest import REPO
 
+from sphereorient.calibrate import load_calibration
+from sphereorient.calibrate.document import CalibrationKeys
 from sphereorient.cameras import load_cameras
+from sphereorient.cameras.calibration.entry import KEYS as PLATE_KEYS
 from sphereorient.cameras.entries import PortEntry
-from sphereorient.cameras.parameters import parameter_names
+from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT, parameter_names
 from sphereorient.cameras.registry import MODELS
 from sphereorient.experiment import ExperimentKeys, load_experiment
 from sphereorient.trajectory import Flag, Reason, Trajectory
@@ -57,6 +60,25 @@ def test_every_parameter_of_every_camera_is_named_on_the_page(tmp_path):
     for camera in load_cameras(tmp_path / "cameras.yaml").values():
         for name in parameter_names(camera):
             assert f"`{name}`" in text, name
+
+
+def test_the_calibration_file_of_the_page_loads_and_all_its_keys_are_there(tmp_path):
+    path = tmp_path / "calibration.yaml"
+    path.write_text(blocks("calibration.md", "yaml")[0])
+    assert load_calibration(path).cameras == ("cam1", "cam2")
+    text = (REPO / "docs" / "calibration.md").read_text()
+    plates = {key.rstrip("?") for _, keys in PLATE_KEYS.values() for key in keys}
+    for key in {*CalibrationKeys.model_fields, *plates, *PLATE_KEYS, *PORT_NUMBERS, *PORT_TILT}:
+        assert f"`{key}`" in text, key
+
+
+@pytest.mark.slow  # draws and finds 14 pictures
+def test_the_figure_of_the_calibration_is_drawn_by_its_script(tmp_path):
+    out = tmp_path / "calibration.png"
+    subprocess.run([sys.executable, REPO / "scripts" / "figure_calibration.py", "--out", out], check=True)
+    drawn, committed = (cv2.imread(str(path)) for path in (out, REPO / "docs" / "calibration.png"))
+    assert drawn.shape == committed.shape
+    assert abs(drawn.astype(float) - committed).mean() < 10
 
 
 def test_parameters_and_configs_are_those_of_the_code():

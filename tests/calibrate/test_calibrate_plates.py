@@ -163,6 +163,7 @@ def test_no_dots_found_is_said_with_the_first_reason(tmp_path):
     refused(path, r"cam2: expected pictures of the plate, got none of 5; the first: .*cam2_00.png")
 
 
+@pytest.mark.slow  # draws six pictures anew
 def test_no_fiducials_in_any_picture_of_a_camera_is_refused(tmp_path):
     path = write(tmp_path)
     for name in pictures():

@@ -125,6 +125,18 @@ def test_covariances_cover_the_errors_of_200_calibrations(rng):
     assert float(each.max()) < 1.15
 
 
+def test_the_residuals_tell_the_scale_of_the_covariance_not_the_sigmas_given(rng):
+    rig = planted(rng, count=4)
+    seen = views(rig, rng)
+    triple = {
+        name: {row: replace(one, sigma_px=3 * one.sigma_px) for row, one in rows.items()} for name, rows in seen.items()
+    }
+    one, other = (adjust(problem(rig, some)) for some in (seen, triple))
+    assert other.scale == pytest.approx(one.scale / 3, rel=0.02)
+    sigmas = [fitted.rig.cameras["cam1"].covariance.sigmas["f"] for fitted in (one, other)]
+    assert sigmas[1] == pytest.approx(sigmas[0], rel=0.05)
+
+
 def test_the_start_does_not_matter(rng):
     rig = planted(rng, count=5)
     seen = views(rig, rng)

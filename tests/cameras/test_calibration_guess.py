@@ -12,10 +12,12 @@ from calibration_examples import (
     planted,
     port,
     surveyed,
+    vector,
     view,
     views,
 )
 
+from sphereorient import so3
 from sphereorient.cameras import PinholeCamera, TsaiCamera
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.cameras.calibration.guess import guess_from_points, guess_rig
@@ -57,6 +59,17 @@ def test_a_guess_behind_a_wall_finds_focal_length_and_place_of_the_camera_in_air
     assert abs(float(found.camera.f_mm) / float(true.camera.f_mm) - 1) < 0.05
     apart = (found.camera.centre_lab_mm - true.camera.centre_lab_mm).norm()
     assert float(apart) < 0.05 * 520  # taken for a camera in the liquid it would stand a third farther away
+
+
+def test_a_camera_that_looks_aslant_through_its_wall_looks_more_aslant_in_air(rng):
+    """By Snell: 12 degrees in air are 8.8 in the liquid, which is what a camera without wall would be turned by."""
+    aslant = so3.exp(torch.deg2rad(vector(12.0, 0.0, 0.0)))
+    true = cameras(walls=True, turned_deg=0.0)["cam1"]
+    R = aslant @ true.camera.R_cam_lab
+    true = replace(true, camera=replace(true.camera, R_cam_lab=R, T_cam_lab_mm=vector(0.0, 108.0, 510.0)))
+    points = 30 * (2 * torch.rand(80, 3, generator=rng, dtype=torch.float64) - 1)
+    found = guess_from_points(points, true.project(points), SIZE, PITCH, port("cam1"))
+    assert float(torch.rad2deg(so3.geodesic_distance(found.R_cam_lab, R))) < 1.2
 
 
 def test_pixels_that_are_not_square_are_of_the_sensor(rng):
