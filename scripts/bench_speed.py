@@ -227,7 +227,7 @@ def as_npy(folder: Path, out: Path, count: int) -> Path:
 
 def whole(kind: str, experiment: Path, cameras: int) -> None:
     """Time the whole command in a fresh process."""
-    run = subprocess.run([sys.executable, "-c", TOLD, str(experiment)], capture_output=True, text=True, check=True)
+    run = subprocess.run([sys.executable, "-c", TOLD, str(experiment)], stdout=subprocess.PIPE, text=True, check=True)
     result = json.loads(run.stdout)
     tracked = [(done, total, at) for stage, done, total, at in result["told"] if stage == "track"]
     begin, (_, total, _) = tracked[0][2], tracked[0]
