@@ -27,7 +27,6 @@ from sphereorient.locate import Background
 from sphereorient.orient.eye import Eye, Fitter, Optics, base_table
 from sphereorient.orient.light import Light
 from sphereorient.orient.pixels import LinesOfSight
-from sphereorient.orient.refine import learn_light
 from sphereorient.sphere import load_texture
 from sphereorient.synth import random_texture
 from sphereorient.synth.clean import CleanSet, clean_set
@@ -176,17 +175,7 @@ def with_light(fitter: Fitter, seen: CleanSet, pose: Poses) -> Fitter:
     X, R, use = pose.position_lab_mm[first], pose.R_lab_body[first], torch.ones(len(first), 1, dtype=torch.bool)
     pixels = fitter.pixels([[seen.pictures[i].numpy()] for i in first.tolist()], X, fine)
     fit = fitter.fit(pixels, X, R, use, fine, 1)
-    light = learn_light(
-        pixels,
-        fit,
-        use,
-        radius_mm=fitter.radius_mm,
-        paint=fine.paint,
-        blur_px=fine.blur_px,
-        light=fitter.light,
-        shading=fitter.shading,
-    )
-    return Fitter(eyes=fitter.eyes, radius_mm=fitter.radius_mm, optics=fitter.optics, light=light)
+    return fitter.with_light_of(pixels, fit, use)
 
 
 if __name__ == "__main__":

@@ -182,11 +182,8 @@ def locate_sphere(
     """Find the sphere's outline in every frame of one camera, outliers replaced and short gaps filled."""
     stage = f"{reel.name}: locate"
     progress(stage, 0, len(reel.frames))
-    spread = locate.spread_frames(reel.frames, settings.locate.background_frames)
     diameter_px = _diameter_px(reel.name, cameras, experiment, settings)
-    empty_path = experiment.background_paths.get(reel.name)
-    empty = None if empty_path is None else locate.load_background(empty_path, reel.movie.frame_shape)
-    background = locate.learn_background(reel.movie, spread, diameter_px, settings.locate, empty)
+    background = empty_scene(reel, settings.locate.background_frames, diameter_px, experiment, settings)
     found = []
     for done, picture in enumerate(reel.pictures(), 1):
         found.append(locate.find_ball(picture, background, diameter_px, settings.locate))
@@ -281,14 +278,21 @@ def _precise(
     return results.precise_track(experiment, clock, table, chosen, smoothed, learnt)
 
 
+def empty_scene(
+    reel: Reel, count: int, diameter_px: float, experiment: Experiment, settings: Settings
+) -> locate.Background:
+    """Learn what one camera shows without the ball, from `count` frames or the experiment's own picture."""
+    path = experiment.background_paths.get(reel.name)
+    empty = None if path is None else locate.load_background(path, reel.movie.frame_shape)
+    spread = locate.spread_frames(reel.frames, count)
+    return locate.learn_background(reel.movie, spread, diameter_px, settings.locate, empty)
+
+
 def open_eye(reel: Reel, diameter_px: float, experiment: Experiment, settings: Settings, progress: Progress) -> Eye:
     """Learn one camera's empty scene."""
     stage = f"{reel.name}: background"
     progress(stage, 0, 1)
-    empty_path = experiment.background_paths.get(reel.name)
-    empty = None if empty_path is None else locate.load_background(empty_path, reel.movie.frame_shape)
-    spread = locate.spread_frames(reel.frames, settings.refine.background_frames)
-    background = locate.learn_background(reel.movie, spread, diameter_px, settings.locate, empty)
+    background = empty_scene(reel, settings.refine.background_frames, diameter_px, experiment, settings)
     progress(stage, 1, 1)
     sight = LinesOfSight(reel.camera)
     return Eye(name=reel.name, camera=reel.camera, background=background, diameter_px=diameter_px, sight=sight)

@@ -17,7 +17,7 @@ from sphereorient.cameras import Camera
 from sphereorient.locate import Background
 from sphereorient.orient.light import Light
 from sphereorient.orient.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
-from sphereorient.orient.refine import FIRST, LATER, Fit, Shading, refine
+from sphereorient.orient.refine import FIRST, LATER, Fit, Shading, learn_light, refine
 from sphereorient.sphere.paint_table import BASE_RAD, PaintTable, paint_table
 
 Picture = NDArray[np.generic]
@@ -112,6 +112,21 @@ class Fitter:
     def shading(self) -> Shading:
         """Orders of each frame's own light: high while nothing is learnt."""
         return LATER if self.light.known else FIRST
+
+    def with_light_of(self, pixels: Pixels, fit: Fit, use: Tensor) -> Fitter:
+        """Return a fitter that knows the light and the noise of fitted pictures; see `learn_light`."""
+        fine = self.optics.fine
+        light = learn_light(
+            pixels,
+            fit,
+            use,
+            radius_mm=self.radius_mm,
+            paint=fine.paint,
+            blur_px=fine.blur_px,
+            light=self.light,
+            shading=self.shading,
+        )
+        return replace(self, light=light)
 
     def on(self, device: torch.device) -> Fitter:
         """Return a fitter that computes on another device."""

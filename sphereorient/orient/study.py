@@ -20,7 +20,7 @@ from sphereorient.orient.eye import FINEST_PX, Eye, Fitter, Optics, Picture, lev
 from sphereorient.orient.light import Light
 from sphereorient.orient.pixels import Pixels
 from sphereorient.orient.proposer import Proposer
-from sphereorient.orient.refine import Fit, learn_light
+from sphereorient.orient.refine import Fit
 from sphereorient.orient.settings import RefineSettings
 from sphereorient.sphere.paint_table import PaintTable
 from sphereorient.trajectory import Reason
@@ -115,8 +115,7 @@ def study(
     fitter, fit = _with_light(fitter, pixels, fit, use, 2)
     if settings.blur_px is None:
         blur_px = _best_blur(fitter, base, pixels, fit, use)
-        optics = Optics(base, blur_px, diameter_px)
-        fitter = Fitter(eyes=eyes, radius_mm=radius_mm, optics=optics, light=fitter.light)
+        fitter = replace(fitter, optics=Optics(base, blur_px, diameter_px))
     fitter, fit = _with_light(fitter, pixels, fit, use, 2)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
@@ -213,20 +212,9 @@ def _clear_of(typical: float) -> float:
 
 def _with_light(fitter: Fitter, pixels: Pixels, fit: Fit, use: Tensor, rounds: int) -> tuple[Fitter, Fit]:
     """Learn the light and fit again, some times."""
-    fine = fitter.optics.fine
     for _ in range(rounds):
-        light = learn_light(
-            pixels,
-            fit,
-            use,
-            radius_mm=fitter.radius_mm,
-            paint=fine.paint,
-            blur_px=fine.blur_px,
-            light=fitter.light,
-            shading=fitter.shading,
-        )
-        fitter = Fitter(eyes=fitter.eyes, radius_mm=fitter.radius_mm, optics=fitter.optics, light=light)
-        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
+        fitter = fitter.with_light_of(pixels, fit, use)
+        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
     return fitter, fit
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from sphereorient.cameras.calibration.forward import slopes_along
+from sphereorient.cameras.calibration.slopes import slopes_along
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.checks import check_points
 from sphereorient.cameras.covariance import ParameterCovariance

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras.calibration.bias import disk_centre_shift
-from sphereorient.cameras.calibration.forward import slopes_along
+from sphereorient.cameras.calibration.slopes import slopes_along
 from sphereorient.cameras.calibration.view import PlateView
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, parameter_names, with_parameters

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras.calibration.forward import slopes_along
+from sphereorient.cameras.calibration.slopes import slopes_along
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.calibration.forward import slopes_along
+from sphereorient.cameras.calibration.slopes import slopes_along
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.parameters import with_parameters

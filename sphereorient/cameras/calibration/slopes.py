@@ -33,8 +33,3 @@ def slopes_along(function: Callable[[Tensor], Tensor], at: Tensor, directions: S
         return torch.zeros_like(value)[..., None].expand(*value.shape, len(directions))
     columns = [torch.autograd.grad(pulled, weight, direction, retain_graph=True)[0] for direction in directions]
     return torch.stack(columns, dim=-1) if columns else value.detach().new_zeros(*value.shape, 0)
-
-
-def slope_along(function: Callable[[Tensor], Tensor], at: Tensor, direction: Tensor) -> Tensor:
-    """Return the derivative of a function at a point along one direction, in the function's shape."""
-    return slopes_along(function, at, direction[None])[..., 0]
