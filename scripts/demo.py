@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from sphereorient.cli import progress_bar
+from sphereorient.cli.app import progress_bar
 from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.pipeline import track_movies

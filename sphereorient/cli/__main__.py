@@ -1,0 +1,3 @@
+from sphereorient.cli import main
+
+main()

@@ -1,0 +1,41 @@
+"""`sphereorient settings` and `info`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sphereorient.cli.app import app, check_writable
+
+
+@app.command()
+def settings(
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write; the screen without it.")] = None,
+) -> None:
+    """Write all settings of the method with their defaults, each one explained."""
+    from sphereorient.settings import settings_yaml
+
+    if out is None:
+        typer.echo(settings_yaml())
+        return
+    check_writable(out)
+    aside = out.with_name(out.name + ".partial")
+    aside.write_text(settings_yaml(), encoding="utf-8")
+    aside.replace(out)
+
+
+@app.command()
+def info() -> None:
+    """Print versions, threads and device."""
+    import torch
+
+    from sphereorient.provenance import versions
+
+    for package, number in versions().items():
+        typer.echo(f"{package:24} {number}")
+    typer.echo(f"{'threads':24} {torch.get_num_threads()} of {os.cpu_count()} cores")
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu (no GPU found)"
+    typer.echo(f"{'device':24} {device}")
