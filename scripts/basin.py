@@ -16,11 +16,11 @@ from pathlib import Path
 import h5py
 import torch
 
-from sphereorient import locate, so3
-from sphereorient.experiment import frame_numbers, load_experiment, movie_span, open_movies
-from sphereorient.orient import Eye, GreySearch, LinesOfSight, base_table, study
+from sphereorient import so3
+from sphereorient.orient import GreySearch, base_table, study
+from sphereorient.precise import open_eye
+from sphereorient.recording import open_recording, silent
 from sphereorient.settings import Settings
-from sphereorient.sphere import load_texture
 
 REPO = Path(__file__).resolve().parents[1]
 ANGLES_DEG = (1, 2, 4, 6, 8, 10, 14, 20)
@@ -33,33 +33,20 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=2, help="use each so many-th frame")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    experiment, settings = load_experiment(arguments.experiment / "experiment.yaml"), Settings()
-    movies = open_movies(experiment, list(experiment.cameras))
-    numbers = frame_numbers(experiment, movies)
+    settings, every = Settings(), arguments.every
+    with open_recording(arguments.experiment / "experiment.yaml") as recording:
+        numbers, texture, radius_mm = recording.frames, recording.texture, recording.radius_mm
+        eyes = [open_eye(recording, reel, settings, silent) for reel in recording.reels]
+        shots = [list(reel.shots(eye.background))[::every] for reel, eye in zip(recording.reels, eyes, strict=True)]
     with h5py.File(arguments.experiment / "truth.h5") as file:
         X, R = (
-            torch.from_numpy(file[key][()])[numbers.start : numbers.stop : arguments.every]
-            for key in ("position", "orientation")
+            torch.from_numpy(file[key][()])[numbers.start : numbers.stop : every] for key in ("position", "orientation")
         )
-    eyes, pictures = [], []
-    for name, camera in experiment.cameras.items():
-        span = range(*movie_span(experiment, name, numbers))
-        diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
-        path = experiment.background_paths.get(name)
-        empty = None if path is None else locate.load_background(path, movies[name].frame_shape)
-        spread = locate.spread_frames(span, settings.refine.background_frames)
-        background = locate.learn_background(movies[name], spread, diameter_px, settings.locate, empty)
-        eyes.append(
-            Eye(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
-        )
-        pictures.append(list(movies[name].frames(span.start, span.stop))[:: arguments.every])
-    texture = load_texture(experiment.texture_path)
     proposers = {eye.name: GreySearch(texture, settings.search) for eye in eyes}
-    frames = list(zip(*pictures, strict=True))
     base = base_table(texture, max(eye.diameter_px for eye in eyes))
-    fitter = study(
-        eyes, frames[:16], base, proposers, experiment.diameter_mm / 2, settings.locate, settings.refine
-    ).fitter
+    taken = list(zip(*shots, strict=True))
+    fitter = study(eyes, taken[:16], base, proposers, radius_mm, settings.locate, settings.refine).fitter
+    frames = [[shot.picture for shot in row] for row in taken]
     use = torch.ones(len(frames), len(eyes), dtype=torch.bool)
     optics = fitter.optics
     levels = {"coarse": (optics.coarse, 8), "middle": (optics.middle, 8), "fine": (optics.fine, 8)}

@@ -23,9 +23,10 @@ from torch import Tensor
 
 from sphereorient import locate, so3
 from sphereorient.cameras import Camera, R_cam_view
-from sphereorient.experiment import frame_numbers, load_experiment, movie_span, open_movies
 from sphereorient.orient import GreySearch, GreySearchSettings, crop_disk
-from sphereorient.sphere import load_texture, orthographic_view
+from sphereorient.recording import open_recording
+from sphereorient.settings import Settings
+from sphereorient.sphere import orthographic_view
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
 
@@ -93,29 +94,22 @@ def accuracy(attitudes: int) -> None:
 
 
 def on_experiment(folder: Path) -> None:
-    settings, locating = GreySearchSettings(), locate.LocateSettings()
-    experiment = load_experiment(folder / "experiment.yaml")
-    assert experiment.texture_path is not None
-    search = GreySearch(load_texture(experiment.texture_path), settings)
-    with h5py.File(folder / "truth.h5") as truth:
-        R_lab_body = torch.from_numpy(truth["orientation"][:])
-    movies = open_movies(experiment, list(experiment.movie_paths))
-    numbers = frame_numbers(experiment, movies)
-    for name, movie in movies.items():
-        camera = experiment.cameras[name]
-        span = range(*movie_span(experiment, name, numbers))
-        diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
-        spread = locate.spread_frames(span, locating.background_frames)
-        background = locate.learn_background(movie, spread, diameter_px, locating, None)
-        disks, R_view_body = [], []
-        for k, picture in zip(numbers, movie.frames(span.start, span.stop), strict=True):
-            outline, _ = locate.find_ball(picture, background, diameter_px, locating)
-            if outline is not None:
-                place = (outline.u_px, outline.v_px, outline.radius_px)
-                disks.append(torch.from_numpy(crop_disk(picture, *place, settings.size_px)))
-                R_view_body.append(R_lab_view(camera, *place[:2]).mT @ R_lab_body[k])
-        report(f"{folder.name}, {name}", search, torch.stack(disks), torch.stack(R_view_body))
-        movie.close()
+    settings, whole = GreySearchSettings(), Settings()
+    with open_recording(folder / "experiment.yaml") as recording:
+        search = GreySearch(recording.texture, settings)
+        with h5py.File(folder / "truth.h5") as truth:
+            R_lab_body = torch.from_numpy(truth["orientation"][:])
+        for reel in recording.reels:
+            background = recording.empty_scene(reel, whole.locate.background_frames, whole)
+            diameter_px = recording.diameter_px(reel.name, whole)
+            disks, R_view_body = [], []
+            for k, shot in zip(recording.frames, reel.shots(background), strict=True):
+                outline, _ = locate.find_ball(shot.picture, background, diameter_px, whole.locate)
+                if outline is not None:
+                    place = (outline.u_px, outline.v_px, outline.radius_px)
+                    disks.append(torch.from_numpy(crop_disk(shot.picture, *place, settings.size_px)))
+                    R_view_body.append(R_lab_view(reel.camera, *place[:2]).mT @ R_lab_body[k])
+            report(f"{folder.name}, {reel.name}", search, torch.stack(disks), torch.stack(R_view_body))
 
 
 def report(name: str, search: GreySearch, disks: Tensor, R_view_body: Tensor) -> None:

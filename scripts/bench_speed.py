@@ -24,12 +24,12 @@ import torch
 import yaml
 
 from sphereorient import locate, so3
-from sphereorient.experiment import Experiment, frame_numbers, load_experiment, movie_span, open_movies
+from sphereorient.experiment import Experiment, load_experiment, open_movies
+from sphereorient.locate import Shot
 from sphereorient.orient import (
     BlockTracker,
     Eye,
     GreySearch,
-    LinesOfSight,
     Study,
     base_table,
     cold_start,
@@ -37,6 +37,8 @@ from sphereorient.orient import (
     extract_paint,
     study,
 )
+from sphereorient.precise import open_eye, study_shots
+from sphereorient.recording import open_recording, silent
 from sphereorient.settings import Settings
 from sphereorient.sphere import SphereRenderer, load_texture, orthographic_view, reduced_texture
 
@@ -57,7 +59,8 @@ class Bench:
 
     experiment: Experiment
     eyes: list[Eye]
-    pictures: list[list[np.ndarray]]  # per eye
+    shots: list[list[Shot]]  # per eye
+    times: list[float]  # of the same frames, s
     search: GreySearch
     learnt: Study
 
@@ -93,49 +96,32 @@ def cpu_s(work: Callable[[], object], repetitions: int = 5) -> float:
 
 def prepared(folder: Path) -> Bench:
     """Learn what the stages need, as the pipeline does."""
-    experiment, settings = load_experiment(folder / "experiment.yaml"), Settings()
-    names = list(experiment.cameras)
-    movies = open_movies(experiment, names)
-    frames = frame_numbers(experiment, movies)
-    eyes, pictures, sampled = [], [], []
-    for name in names:
-        span = range(*movie_span(experiment, name, frames))
-        diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
-        spread = locate.spread_frames(span, settings.refine.background_frames)
-        background = locate.learn_background(movies[name], spread, diameter_px, settings.locate)
-        camera = experiment.cameras[name]
-        eyes.append(
-            Eye(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
-        )
-        pictures.append(list(movies[name].frames(span.start, span.start + FOLLOWED)))
-        sampled.append(movies[name].sample(locate.spread_frames(span, settings.refine.study_frames)))
-        movie = movies[name]
-        decoding = cpu_s(lambda movie=movie, span=span: list(movie.frames(span.start, span.start + 20)), 3) / 20
-        say(f"decoding {name}, CPU ms a frame (floor of a movie)", f"{1e3 * decoding:.2f}")
-    texture = load_texture(experiment.texture_path)
+    settings = Settings()
+    with open_recording(folder / "experiment.yaml") as recording:
+        eyes = [open_eye(recording, reel, settings, silent) for reel in recording.reels]
+        shots = [list(reel.shots(eye.background, 0, FOLLOWED)) for reel, eye in zip(recording.reels, eyes, strict=True)]
+        sampled = study_shots(recording, eyes, settings.refine.study_frames)
+        for reel in recording.reels:
+            decoding = cpu_s(lambda reel=reel: list(reel.pictures(0, 20)), 3) / 20
+            say(f"decoding {reel.name}, CPU ms a frame (floor of a movie)", f"{1e3 * decoding:.2f}")
+        texture, times = recording.texture, recording.timeline.time_s[:FOLLOWED].tolist()
+        experiment, radius_mm = recording.experiment, recording.radius_mm
     search = GreySearch(texture, settings.search)
     say("search bank, CPU s", f"{cpu_s(lambda: GreySearch(texture, settings.search), 2):.2f}")
     base = base_table(texture, max(eye.diameter_px for eye in eyes))
     proposers = {eye.name: search for eye in eyes}
     begin = time.process_time()
-    learnt = study(
-        eyes,
-        list(zip(*sampled, strict=True)),
-        base,
-        proposers,
-        experiment.diameter_mm / 2,
-        settings.locate,
-        settings.refine,
-    )
+    learnt = study(eyes, sampled, base, proposers, radius_mm, settings.locate, settings.refine)
     say("study (light, blur, noise), CPU s", f"{time.process_time() - begin:.2f}")
-    return Bench(experiment=experiment, eyes=eyes, pictures=pictures, search=search, learnt=learnt)
+    return Bench(experiment=experiment, eyes=eyes, shots=shots, times=times, search=search, learnt=learnt)
 
 
 def stages(bench: Bench) -> float:
     """Time single frames: found from nothing, and predicted; return CPU s of a block's mean frame, a camera."""
     settings, cameras = Settings(), len(bench.eyes)
     proposers = {eye.name: bench.search for eye in bench.eyes}
-    frames = [movie[0] for movie in bench.pictures]
+    first = [movie[0] for movie in bench.shots]
+    frames = [shot.picture for shot in first]
     for eye, frame in zip(bench.eyes, frames, strict=True):
         seen = cpu_s(
             lambda eye=eye, frame=frame: locate.find_ball(frame, eye.background, eye.diameter_px, settings.locate)
@@ -151,7 +137,7 @@ def stages(bench: Bench) -> float:
     say("first pose of a disk without history (crop, search, climb), CPU ms; bar 20", f"{1e3 * cpu_s(first_pose):.1f}")
     found = cpu_s(
         lambda: cold_start(
-            bench.learnt.fitter, proposers, frames, settings.locate, candidates=settings.refine.candidates
+            bench.learnt.fitter, proposers, first, settings.locate, candidates=settings.refine.candidates
         )
     )
     say("frame without history, outlines to covariances, CPU ms a camera", f"{1e3 * found / cameras:.1f}")
@@ -159,8 +145,8 @@ def stages(bench: Bench) -> float:
     # As many blocks side by side as the tracker follows: first frames are searched for, second ones approached.
     lanes = settings.refine.lanes
     begun, whole = [2] * lanes, [FOLLOWED // lanes] * lanes
-    short = cpu_s(lambda: list(tracker.track([movie[: sum(begun)] for movie in bench.pictures], begun)), 3)
-    long = cpu_s(lambda: list(tracker.track([movie[: sum(whole)] for movie in bench.pictures], whole)), 3)
+    short = cpu_s(lambda: list(tracker.track([movie[: sum(begun)] for movie in bench.shots], begun, bench.times)), 3)
+    long = cpu_s(lambda: list(tracker.track([movie[: sum(whole)] for movie in bench.shots], whole, bench.times)), 3)
     each = (long - short) / (sum(whole) - sum(begun)) / cameras
     say("predicted frame, decoded already, with covariance, CPU ms a camera; bar 3.7", f"{1e3 * each:.2f}")
     say("refinement, camera-frames per CPU second (two cores: twice); bar 300", f"{1 / each:.0f}")
@@ -171,7 +157,7 @@ def stages(bench: Bench) -> float:
 def literal(bench: Bench, mean_s: float) -> None:
     """Time the paper's literal search: 12 then 3 degrees, every template rendered at full size."""
     settings = Settings().orient
-    eye, frame = bench.eyes[0], bench.pictures[0][0]
+    eye, frame = bench.eyes[0], bench.shots[0][0].picture
     outline, _ = locate.find_ball(frame, eye.background, eye.diameter_px, Settings().locate)
     assert outline is not None
     size_px = round(2 * outline.radius_px)
@@ -199,7 +185,7 @@ def literal(bench: Bench, mean_s: float) -> None:
 
     paper = cpu_s(once, 1)
     proposers = {each.name: bench.search for each in bench.eyes}
-    frames = [movie[0] for movie in bench.pictures]
+    frames = [movie[0] for movie in bench.shots]
     ours = cpu_s(lambda: cold_start(bench.learnt.fitter, proposers, frames, Settings().locate, candidates=4)) / len(
         bench.eyes
     )

@@ -20,11 +20,11 @@ from torch import Tensor
 
 from sphereorient import locate, so3
 from sphereorient.cameras import Camera
-from sphereorient.experiment import frame_numbers, load_experiment, movie_span, open_movies
-from sphereorient.locate import Background
+from sphereorient.locate import Background, Shot
 from sphereorient.orient import Eye, GreySearch, LinesOfSight, base_table, cold_start, study
+from sphereorient.precise import open_eye
+from sphereorient.recording import open_recording, silent
 from sphereorient.settings import Settings
-from sphereorient.sphere import load_texture
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
 
@@ -61,13 +61,14 @@ def errors_deg(
     search = {eye.name: GreySearch(texture, settings.search)}
     spread = locate.spread_frames(range(len(frames)), settings.refine.study_frames)
     base = base_table(texture, eye.diameter_px)
-    learnt = study([eye], [[frames[k]] for k in spread], base, search, radius_mm, settings.locate, settings.refine)
+    shots = [[Shot(picture=frames[k])] for k in spread]
+    learnt = study([eye], shots, base, search, radius_mm, settings.locate, settings.refine)
     errors = []
     for frame, R in zip(frames, R_lab_body, strict=True):
         poses = cold_start(
             learnt.fitter,
             search,
-            [frame],
+            [Shot(picture=frame)],
             settings.locate,
             candidates=settings.refine.candidates,
             score_min=learnt.clear_score,
@@ -104,20 +105,16 @@ def rendered_eye(camera: Camera, settings: SynthSettings) -> Eye:
 
 def measured(folder: Path) -> None:
     """Every frame of an experiment, each camera by itself."""
-    experiment, settings = load_experiment(folder / "experiment.yaml"), Settings()
-    movies = open_movies(experiment, list(experiment.cameras))
-    numbers = frame_numbers(experiment, movies)
-    with h5py.File(folder / "truth.h5") as file:
-        R_lab_body = torch.from_numpy(file["orientation"][()])[numbers.start : numbers.stop]
-    for name, camera in experiment.cameras.items():
-        span = range(*movie_span(experiment, name, numbers))
-        diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
-        spread = locate.spread_frames(span, settings.refine.background_frames)
-        background = locate.learn_background(movies[name], spread, diameter_px, settings.locate)
-        eye = Eye(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
-        frames = list(movies[name].frames(span.start, span.stop))
-        texture = load_texture(experiment.texture_path)
-        report(f"{folder.name}, {name}", errors_deg(eye, texture, experiment.diameter_mm / 2, frames, R_lab_body))
+    settings = Settings()
+    with open_recording(folder / "experiment.yaml") as recording:
+        frames = recording.frames
+        with h5py.File(folder / "truth.h5") as file:
+            R_lab_body = torch.from_numpy(file["orientation"][()])[frames.start : frames.stop]
+        for reel in recording.reels:
+            eye = open_eye(recording, reel, settings, silent)
+            pictures = [picture for picture, _ in reel.pictures() if picture is not None]
+            errors = errors_deg(eye, recording.texture, recording.radius_mm, pictures, R_lab_body)
+            report(f"{folder.name}, {reel.name}", errors)
 
 
 if __name__ == "__main__":

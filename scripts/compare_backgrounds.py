@@ -31,7 +31,7 @@ def main() -> None:
             truth = file[f"{name}/centre_px"][()]
         diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
         spread = locate.spread_frames(range(len(movie)), settings.background_frames)
-        without = locate.learn_background(movie, spread, diameter_px, settings)
+        without = locate.learn_background(movie.sample(spread), diameter_px, settings)
         plain = replace(without, mean=movie.sample(spread).mean(axis=0, dtype=np.float32))
         for label, background in (("plain mean", plain), ("without the ball", without)):
             print(f"{name}, {label}: {errors(movie, background, diameter_px, settings, truth)}", flush=True)

@@ -1,4 +1,4 @@
-"""The noun that goes in: an experiment, its cameras, its movies, and which frame is when."""
+"""The noun that goes in: an experiment, its cameras and its movies; `timeline` tells which frame is when."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StrictBool
 
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
 from sphereorient.cameras.yaml_file import read_document, refuse_unknown, validated, write_document
 from sphereorient.errors import ExperimentError, MovieError, refusal
-from sphereorient.movies import Movie, open_movie
+from sphereorient.movies import Movie, flipped, open_movie
 
 SCHEMA = "sphereorient-experiment/1"
 MAX_CAMERAS = 2
+MOVIES_OWN = "movies"  # value of `times`
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 FrameNumber = Annotated[int, Field(ge=0)]
 
@@ -29,7 +28,7 @@ class Experiment:
 
     name: str
     path: Path  # of experiment.yaml
-    frame_rate_hz: float
+    frame_rate_hz: float  # NaN where times are given instead
     cameras_path: Path
     cameras: dict[str, Camera]  # of the movies, in their order
     movie_paths: dict[str, Path]
@@ -39,7 +38,10 @@ class Experiment:
     fixed: bool = False  # whether the ball does not move
     mask_paths: dict[str, Path] = field(default_factory=dict)  # black where something that does not move hides the ball
     background_paths: dict[str, Path] = field(default_factory=dict)  # the scene without the ball
+    times: str | None = None  # path of a table of times, or "movies": their own stamps; None: evenly spaced frames
     start: dict[str, int] = field(default_factory=dict)  # frame of each movie that is the experiment's frame 0
+    start_given: bool = False  # whether the file says so; with stamps each camera's clock then begins there
+    flip: dict[str, str] = field(default_factory=dict)  # movies seen through a mirror: see movies.flipped
     frames: tuple[int, int] | None = None  # first, last + 1 of the experiment; None: all
     flow: dict[str, float] = field(default_factory=dict)  # SI
     camera_covariance: ParameterCovariance | None = None  # of the cameras' parameters, named camera.parameter
@@ -74,7 +76,8 @@ class ExperimentKeys(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     name: str | None = None
-    frame_rate: Positive
+    frame_rate: Positive | None = None
+    times: str | None = None
     exposure: Positive | None = None
     sphere: SphereKeys
     masks: dict[str, str] = Field(default_factory=dict)
@@ -83,8 +86,8 @@ class ExperimentKeys(BaseModel):
     movies: dict[str, str] = Field(min_length=1, max_length=MAX_CAMERAS)
     start: dict[str, FrameNumber] = Field(default_factory=dict)
     frames: tuple[FrameNumber, FrameNumber] | None = None
+    flip: dict[str, Literal["none", "vertical", "horizontal", "both"]] = Field(default_factory=dict)
     flow: FlowKeys = FlowKeys()
-    times: Any = None  # known, so that it is refused as what it is and not as a mistyped key
 
 
 def load_experiment(path: Path | str) -> Experiment:
@@ -101,7 +104,6 @@ def load_experiment(path: Path | str) -> Experiment:
     """
     path = Path(path)
     document = read_document(path, SCHEMA, ExperimentError)
-    _refuse_times(path, document)
     keys = validated(ExperimentKeys, document, str(path), ExperimentError)
     _check_names(path, keys)
     _check_numbers(path, keys)
@@ -110,7 +112,7 @@ def load_experiment(path: Path | str) -> Experiment:
     return Experiment(
         name=path.stem if keys.name is None else keys.name,
         path=path,
-        frame_rate_hz=keys.frame_rate,
+        frame_rate_hz=float("nan") if keys.frame_rate is None else keys.frame_rate,
         cameras_path=cameras_path,
         cameras=cameras,
         camera_covariance=load_covariance(cameras_path, cameras),
@@ -121,7 +123,10 @@ def load_experiment(path: Path | str) -> Experiment:
         fixed=keys.sphere.fixed,
         mask_paths={name: path.parent / mask for name, mask in keys.masks.items()},
         background_paths={name: path.parent / picture for name, picture in keys.backgrounds.items()},
+        times=keys.times if keys.times in (None, MOVIES_OWN) else str(path.parent / str(keys.times)),
         start={name: keys.start.get(name, 0) for name in keys.movies},
+        start_given=bool(keys.start),
+        flip=dict(keys.flip),
         frames=keys.frames,
         flow=keys.flow.model_dump(exclude_none=True),
     )
@@ -153,11 +158,16 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
         "backgrounds": {name: relative(path) for name, path in experiment.background_paths.items()},
         "start": {name: number for name, number in experiment.start.items() if number},
         "frames": None if experiment.frames is None else list(experiment.frames),
+        "flip": dict(experiment.flip),
         "flow": dict(experiment.flow),
     }
+    if experiment.times is None:
+        clock: dict[str, Any] = {"frame_rate": float(experiment.frame_rate_hz)}
+    else:
+        clock = {"times": MOVIES_OWN if experiment.times == MOVIES_OWN else relative(Path(experiment.times))}
     document = {
         "name": experiment.name,
-        "frame_rate": float(experiment.frame_rate_hz),
+        **clock,
         **({} if experiment.exposure_s is None else {"exposure": float(experiment.exposure_s)}),
         "sphere": sphere,
         "cameras": relative(experiment.cameras_path),
@@ -169,7 +179,7 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
 
 
 def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> dict[str, Movie]:
-    """Open the movies of an experiment and check that they fit the cameras and each other.
+    """Open the movies of an experiment and check that they fit the cameras.
 
     Args:
         experiment: which movies.
@@ -180,8 +190,7 @@ def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> d
 
     Raises:
         ExperimentError: a name that the experiment does not have.
-        MovieError: a movie is missing or unreadable, of another size than its camera's picture, too short for
-            `frames`, or, without `frames`, of another length than the other one.
+        MovieError: a movie is missing or unreadable, or of another size than its camera's picture.
     """
     movies: dict[str, Movie] = {}
     try:
@@ -189,8 +198,8 @@ def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> d
             if name not in experiment.movie_paths:
                 raise ExperimentError(refuse_unknown(name, experiment.movie_paths, f"{experiment.path}, movies"))
             movies[name] = open_movie(experiment.movie_paths[name])
+            movies[name] = flipped(movies[name], experiment.flip.get(name, "none"))
             _check_size(experiment, name, movies[name])
-        _check_lengths(experiment, movies)
     except BaseException:
         for movie in movies.values():
             movie.close()
@@ -198,61 +207,39 @@ def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> d
     return movies
 
 
-def frame_numbers(experiment: Experiment, movies: Mapping[str, Movie]) -> range:
-    """Return the numbers of the experiment's frames: those of `frames`, or all that every movie has.
-
-    Args:
-        experiment: the experiment.
-        movies: its movies, as `open_movies` returns them.
-    """
-    if experiment.frames is not None:
-        return range(*experiment.frames)
-    return range(min(_available(experiment, movies).values(), default=0))
-
-
-def movie_span(experiment: Experiment, name: str, numbers: range) -> tuple[int, int]:
-    """Return first and last + 1 of a movie's own frames, for `Movie.frames`, that are these of the experiment.
-
-    Args:
-        experiment: the experiment.
-        name: of the camera.
-        numbers: consecutive frame numbers of the experiment, not empty.
-    """
-    start = experiment.start.get(name, 0)
-    return numbers.start + start, numbers.stop + start
-
-
-def time_s(experiment: Experiment, numbers: Sequence[int]) -> NDArray[np.float64]:
-    """Return the times of frames of the experiment, (N,), s: the middle of their exposures.
-
-    Args:
-        experiment: gives the frame rate.
-        numbers: of the experiment's frames; time does not restart where `frames` cuts.
-
-    Source: DESIGN section 2 (Time). The stamps of the movie file take no part: MKV rounds them to 1 ms.
-    """
-    return np.asarray(numbers, dtype=np.float64) / experiment.frame_rate_hz
-
-
-def _refuse_times(path: Path, document: Mapping[str, Any]) -> None:
-    if document.get("times") is not None:
-        do = "write frame_rate: in Hz"
-        got = "a table of times, which this version cannot use"
-        raise ExperimentError(refusal(f"{path}, times", expected="evenly spaced frames", got=got, do=do))
+def outside_paths(experiment: Experiment) -> list[Path]:
+    """Return the files that an experiment names outside of its own folder: told to whoever got it from others."""
+    named = [experiment.cameras_path, *experiment.movie_paths.values(), *experiment.mask_paths.values()]
+    named += experiment.background_paths.values()
+    if experiment.texture_path is not None:
+        named.append(experiment.texture_path)
+    if experiment.times not in (None, MOVIES_OWN):
+        named.append(Path(str(experiment.times)))
+    folder = Path(os.path.realpath(experiment.folder))
+    return [path for path in named if not Path(os.path.realpath(path)).is_relative_to(folder)]
 
 
 def _check_names(path: Path, keys: ExperimentKeys) -> None:
-    for key, named in (("masks", keys.masks), ("backgrounds", keys.backgrounds), ("start", keys.start)):
+    by_name: dict[str, Mapping[str, object]] = {
+        "masks": keys.masks,
+        "backgrounds": keys.backgrounds,
+        "start": keys.start,
+        "flip": keys.flip,
+    }
+    for key, named in by_name.items():
         for name in named:
             if name not in keys.movies:
                 raise ExperimentError(refuse_unknown(name, keys.movies, f"{path}, {key}"))
 
 
 def _check_numbers(path: Path, keys: ExperimentKeys) -> None:
+    if (keys.frame_rate is None) == (keys.times is None):
+        got, do = "neither" if keys.times is None else "both", "write frame_rate: in Hz, or times: with a file"
+        raise ExperimentError(refusal(str(path), expected="either frame_rate or times", got=got, do=do))
     if keys.frames is not None and keys.frames[0] >= keys.frames[1]:
         do = "write first and last + 1"
         raise ExperimentError(refusal(f"{path}, frames", expected="first below last", got=str(keys.frames), do=do))
-    if keys.exposure is not None and keys.exposure > 1 / keys.frame_rate:
+    if keys.exposure is not None and keys.frame_rate is not None and keys.exposure > 1 / keys.frame_rate:
         expected, do = f"at most the time between frames, {1 / keys.frame_rate:.4g} s", "write it in seconds"
         raise ExperimentError(refusal(f"{path}, exposure", expected=expected, got=f"{keys.exposure:g}", do=do))
 
@@ -272,23 +259,3 @@ def _check_size(experiment: Experiment, name: str, movie: Movie) -> None:
         got = f"{movie.frame_shape[1]} x {movie.frame_shape[0]}"
         do = "calibrate the camera with this movie's picture size"
         raise MovieError(refusal(str(movie.path), expected=expected, got=got, do=do))
-
-
-def _available(experiment: Experiment, movies: Mapping[str, Movie]) -> dict[str, int]:
-    """Return how many frames of the experiment each movie has, counted from the experiment's frame 0."""
-    return {name: len(movie) - experiment.start.get(name, 0) for name, movie in movies.items()}
-
-
-def _check_lengths(experiment: Experiment, movies: Mapping[str, Movie]) -> None:
-    available = _available(experiment, movies)
-    got = " and ".join(f"{count} ({name})" for name, count in available.items())
-    subject = f"{experiment.path}, movies"
-    if experiment.frames is not None:
-        if min(available.values()) < experiment.frames[1]:
-            expected, do = f"{experiment.frames[1]} frames as frames: says", "lower the end of frames:"
-            raise MovieError(refusal(subject, expected=expected, got=f"{got} after start", do=do))
-    elif min(available.values()) <= 0:
-        raise MovieError(refusal(subject, expected="frames after start", got=got, do="correct start:"))
-    elif len(set(available.values())) > 1:
-        do = f"check start:, then set frames: [0, {min(available.values())}]"
-        raise MovieError(refusal(subject, expected="equal frame counts", got=f"{got} after start", do=do))

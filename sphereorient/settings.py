@@ -12,6 +12,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
+from sphereorient.cameras.bounded_yaml import FAULTS, parse_yaml
+from sphereorient.cameras.yaml_file import read_yaml, short
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
@@ -67,13 +69,7 @@ def _load(model: type[Model], path: Path | None, overrides: Iterable[str]) -> Mo
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        got = " ".join(str(error).split())
-        raise SettingsError(
-            refusal(f"settings {path}", expected="a YAML file", got=got, do="write one with `sphereorient settings`")
-        ) from None
+    tree = read_yaml(path, SettingsError)
     if tree is None:
         return {}
     if not isinstance(tree, dict):
@@ -98,10 +94,10 @@ def _override(tree: dict[str, Any], text: str, depth: int) -> None:
         branch = tree.setdefault(room, {})
         tree = branch if isinstance(branch, dict) else {}
     try:
-        tree[leaf] = yaml.safe_load(value)
-    except yaml.YAMLError:
+        tree[leaf] = parse_yaml(value)
+    except FAULTS:
         raise SettingsError(
-            refusal(f"--set {text}", expected="a YAML value", got=repr(value), do="quote it for the shell")
+            refusal(f"--set {text}", expected="a YAML value", got=short(value), do="quote it for the shell")
         ) from None
 
 
@@ -118,7 +114,7 @@ def _explain(error: ValidationError, source: str, model: type[BaseModel]) -> str
         do = f"did you mean {'.'.join([*parts[:-1], near[0]])}" if near else f"use one of {', '.join(known)}"
         return refusal(f"{source}, {key}", expected="a known key", got="an unknown one", do=do)
     expected = first["msg"].replace("Input should be ", "")
-    return refusal(f"{source}, {key}", expected=expected, got=repr(first["input"]), do="correct the value")
+    return refusal(f"{source}, {key}", expected=expected, got=short(first["input"]), do="correct the value")
 
 
 def _known_keys(model: Any, parts: list[str]) -> list[str]:

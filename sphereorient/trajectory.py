@@ -8,7 +8,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import IntFlag, StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -54,6 +54,7 @@ class Reason(StrEnum):
     AMBIGUOUS = "ambiguous"
     CONTRADICTS = "contradicts"  # sees the ball, but elsewhere than the other camera: the cameras do not fit together
     UNDECODABLE = "undecodable"
+    MISSING = "missing"  # this camera has no picture of the frame
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,17 @@ class CameraTrack:
         candidates = int(self.candidate_offset[-1]) if np.size(self.candidate_offset) else 0
         frames = len(self.reason)
         _check_shapes(self, {"frames": frames, "offsets": frames + 1, "candidates": candidates})
+
+    def at(self, rows: NDArray[np.int64]) -> Self:
+        """Return some of the frames, in increasing order, with their candidates."""
+        counts = np.diff(self.candidate_offset)
+        kept = np.isin(np.repeat(np.arange(len(counts)), counts), rows)
+        parts = {}
+        for name, column in _columns(type(self)):
+            values = getattr(self, name)
+            parts[name] = values[kept] if column.rows == "candidates" else values[rows]
+        parts["candidate_offset"] = np.concatenate([[0], np.cumsum(counts[rows])])
+        return replace(self, **parts, reason=tuple(self.reason[k] for k in rows.tolist()))
 
     @classmethod
     def empty(cls, frames: int) -> Self:
@@ -285,6 +297,15 @@ class Trajectory:
                 return cls(**_read(file))
             except (ValueError, OSError) as error:  # ShapeError, unreadable JSON, a broken block
                 raise TrackError(f"{path}: {error}") from error
+
+    def at(self, rows: NDArray[np.int64]) -> Self:
+        """Return some of the frames, in increasing order.
+
+        Args:
+            rows: (n,), which.
+        """
+        parts = {name: getattr(self, name)[rows] for name, _ in _columns(type(self))}
+        return replace(self, **parts, cameras={name: camera.at(rows) for name, camera in self.cameras.items()})
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the trajectory as a table, one row a frame.

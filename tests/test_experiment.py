@@ -7,70 +7,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from conftest import SHARED
+from experiment_examples import FULL, HEIGHT, SHORT, WIDTH, make_folder, save_movie, written
 
-from sphereorient.cameras import PinholeCamera, save_cameras
 from sphereorient.errors import CameraError, ExperimentError, MovieError, OutputError
 from sphereorient.experiment import (
     Experiment,
-    frame_numbers,
     load_experiment,
-    movie_span,
     open_movies,
-    time_s,
+    outside_paths,
     write_experiment,
 )
-
-FULL = """
-schema: sphereorient-experiment/1
-name: mixer-3Hz
-frame_rate: 600.0
-exposure: 0.0004
-sphere: {diameter: 18.0, texture: texture.png}
-masks: {cam1: mask.png}
-cameras: cameras.yaml
-movies: {cam1: cam1.npy, cam2: films/cam2.npy}
-start: {cam2: 3}
-frames: [2, 10]
-flow: {viscosity: 8.0e-6, dissipation: 1.7}
-"""
-SHORT = """
-schema: sphereorient-experiment/1
-frame_rate: 30
-sphere: {diameter: null, fixed: true}
-cameras: cameras.yaml
-movies: {cam1: cam1.npy}
-"""
-BOTH = SHORT.replace("{cam1: cam1.npy}", "{cam1: cam1.npy, cam2: films/cam2.npy}")
-HEIGHT, WIDTH = 6, 8
-
-
-def camera() -> PinholeCamera:
-    zero = torch.zeros(3, dtype=torch.float64)
-    eye = torch.eye(3, dtype=torch.float64)
-    focal = torch.tensor(10.0, dtype=torch.float64)
-    return PinholeCamera(image_size=(WIDTH, HEIGHT), R_cam_lab=eye, T_cam_lab_mm=zero, centre_px=zero[:2], f_px=focal)
-
-
-def save_movie(path: Path, frames: int, shape: tuple[int, int] = (HEIGHT, WIDTH)) -> None:
-    path.parent.mkdir(exist_ok=True)
-    numbered = np.arange(frames, dtype=np.uint8)[:, None, None]
-    np.save(path, np.broadcast_to(numbered, (frames, *shape)).copy())
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    save_cameras(tmp_path / "cameras.yaml", {"cam1": camera(), "cam2": camera()})
-    save_movie(tmp_path / "cam1.npy", 12)
-    save_movie(tmp_path / "films" / "cam2.npy", 15)
-    return tmp_path
-
-
-def written(folder: Path, text: str) -> Path:
-    path = folder / "experiment.yaml"
-    path.write_text(text, encoding="utf-8")
-    return path
+    return make_folder(tmp_path)
 
 
 def test_every_key_arrives_with_its_unit_and_paths_are_relative_to_the_file(folder):
@@ -136,7 +88,6 @@ FAULTS = {
     "unknown key inside": (FULL.replace("diameter", "diametre"), "sphere: .*got 'diametre'; write 'diameter' instead"),
     "far from any key": (FULL + "zzz: 1\n", "got 'zzz'; remove it"),
     "flow key": (FULL.replace("viscosity", "viscosty"), "flow: .*write 'viscosity' instead"),
-    "no frame rate": (SHORT.replace("frame_rate: 30", ""), "frame_rate: expected a value, got none; add the key"),
     "no sphere": (SHORT.replace("sphere: {diameter: null, fixed: true}", ""), "sphere: expected a value"),
     "no diameter": (SHORT.replace("diameter: null, ", ""), r"sphere\.diameter: expected a value, got none"),
     "frame rate of zero": (SHORT.replace("30", "0"), "frame_rate: expected greater than 0, got 0"),
@@ -154,8 +105,10 @@ FAULTS = {
     "no movies": (SHORT.replace("{cam1: cam1.npy}", "{}"), "movies: .*at least 1"),
     "movies as a list": (SHORT.replace("{cam1: cam1.npy}", "[cam1.npy]"), "movies: expected a valid dictionary"),
     "fixed as a word": (SHORT.replace("true", "maybe"), r"sphere\.fixed: expected a valid boolean, got 'maybe'"),
-    "times": (SHORT + "times: times.csv\n", "times: .*this version cannot use; write frame_rate: in Hz"),
-    "times alone": (SHORT.replace("frame_rate: 30", "times: times.csv"), "times: expected evenly spaced frames"),
+    "times beside a rate": (SHORT + "times: times.csv\n", "expected either frame_rate or times, got both"),
+    "neither": (SHORT.replace("frame_rate: 30", "name: none"), "expected either frame_rate or times, got neither"),
+    "a flip that there is not": (SHORT + "flip: {cam1: upside}\n", "flip.cam1"),
+    "a flip of no camera": (SHORT + "flip: {cam7: both}\n", "got 'cam7'"),
     "schema": (
         SHORT.replace("experiment/1", "experiment/7"),
         "schema: expected sphereorient-experiment/1, got 'sphere",
@@ -193,51 +146,6 @@ def test_missing_cameras_are_a_camera_error(folder):
         load_experiment(written(folder, SHORT.replace("cameras.yaml", "other.yaml")))
 
 
-def test_the_experiments_frame_0_is_frame_start_of_each_movie(folder):
-    experiment = load_experiment(written(folder, FULL))
-    movies = open_movies(experiment)
-    numbers = frame_numbers(experiment, movies)
-    assert numbers == range(2, 10)
-    read = {name: [int(f[0, 0]) for f in movie.frames(*movie_span(experiment, name, numbers))]
-            for name, movie in movies.items()}  # fmt: skip
-    assert read == {"cam1": list(range(2, 10)), "cam2": list(range(5, 13))}
-
-
-def test_time_is_frame_number_over_frame_rate_and_does_not_restart_with_frames(folder):
-    experiment = load_experiment(written(folder, FULL))
-    time = time_s(experiment, frame_numbers(experiment, open_movies(experiment)))
-    assert time.dtype == np.float64
-    assert time.tolist() == [k / 600.0 for k in range(2, 10)]
-    assert time[0] != 0  # not counted from the first frame that is used
-    assert time[0] != 5 / 600.0  # nor by the second movie's own frames
-
-
-def test_all_frames_are_used_unless_frames_says_otherwise(folder):
-    experiment = load_experiment(written(folder, BOTH + "start: {cam2: 3}\n"))
-    assert frame_numbers(experiment, open_movies(experiment)) == range(12)
-
-
-def test_movies_of_different_lengths_are_refused_with_both_lengths_and_the_remedy(folder):
-    experiment = load_experiment(written(folder, BOTH))
-    with pytest.raises(MovieError, match=r"12 \(cam1\) and 15 \(cam2\).*set frames: \[0, 12\]"):
-        open_movies(experiment)
-    assert list(open_movies(experiment, ["cam2"])) == ["cam2"]  # one camera alone has nobody to differ from
-    cut = load_experiment(written(folder, BOTH + "frames: [0, 12]\n"))
-    assert frame_numbers(cut, open_movies(cut)) == range(12)
-
-
-def test_frames_beyond_the_shorter_movie_are_refused(folder):
-    experiment = load_experiment(written(folder, BOTH + "frames: [0, 13]\n"))
-    with pytest.raises(MovieError, match=r"expected 13 frames as frames: says, got 12 \(cam1\)"):
-        open_movies(experiment)
-
-
-def test_a_start_beyond_the_movie_is_refused(folder):
-    experiment = load_experiment(written(folder, SHORT + "start: {cam1: 12}\n"))
-    with pytest.raises(MovieError, match=r"expected frames after start, got 0 \(cam1\)"):
-        open_movies(experiment)
-
-
 def test_a_movie_of_another_size_than_its_camera_is_refused(folder):
     save_movie(folder / "cam1.npy", 12, (WIDTH, HEIGHT))  # rows and columns exchanged
     with pytest.raises(MovieError, match=f"expected {WIDTH} x {HEIGHT} px as camera cam1 .* got {HEIGHT} x {WIDTH}"):
@@ -259,5 +167,24 @@ def test_a_missing_movie_is_refused(folder):
 @pytest.mark.parametrize(("name", "count"), [("experiment", 240), ("fixed_ball", 250)])
 def test_the_shared_experiments_open(name, count):
     experiment = load_experiment(SHARED / name / "experiment.yaml")
-    assert frame_numbers(experiment, open_movies(experiment)) == range(count)
+    movies = open_movies(experiment)
+    assert {len(movie) for movie in movies.values()} == {count}
     assert experiment.fixed == (name == "fixed_ball")
+
+
+def test_files_outside_of_the_experiments_folder_are_told(folder, tmp_path_factory):
+    assert outside_paths(load_experiment(written(folder, FULL))) == []
+    other = tmp_path_factory.mktemp("other") / "texture.png"
+    (folder / "link.png").symlink_to(other)
+    for name in ("../texture.png", str(other), "link.png"):
+        experiment = load_experiment(written(folder, FULL.replace("texture.png", name)))
+        assert [path.name for path in outside_paths(experiment)] == [Path(name).name]
+
+
+def test_a_flipped_movie_is_read_flipped(folder):
+    picture = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(1, HEIGHT, WIDTH)
+    np.save(folder / "cam1.npy", picture)
+    flips = {"none": picture, "vertical": picture[:, ::-1], "horizontal": picture[:, :, ::-1]}
+    for how, expected in (flips | {"both": picture[:, ::-1, ::-1]}).items():
+        movies = open_movies(load_experiment(written(folder, SHORT + f"flip: {{cam1: {how}}}\n")))
+        np.testing.assert_array_equal(movies["cam1"].sample([0]), expected)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,15 +10,13 @@ from numpy.typing import NDArray
 from sphereorient.locate.background import Background, measure_background, without_ball
 from sphereorient.locate.find import find_ball
 from sphereorient.locate.settings import LocateSettings
-from sphereorient.movies import Movie
 
 ROUNDS = 4  # at most; each finds the ball in more frames, most movies need two
 RIM = 1.15  # of the radius: the ball's halo and shadow belong to it
 
 
 def learn_background(
-    movie: Movie,
-    frames: Sequence[int],
+    pictures: NDArray[Any],
     diameter_px: float,
     settings: LocateSettings,
     empty: NDArray[np.float32] | None = None,
@@ -31,13 +28,11 @@ def learn_background(
     become part of the background there.
 
     Args:
-        movie: the movie.
-        frames: numbers of evenly spread frames, in the movie's own counting; all are held in memory at once.
+        pictures: (n, H, W), evenly spread frames of one movie.
         diameter_px: expected diameter of the ball.
         settings: of the room.
         empty: (H, W), the scene without the ball, where there is such a picture; nothing then is left to learn.
     """
-    pictures = movie.sample(frames)
     background = measure_background(pictures, empty)
     if empty is not None:
         return background

@@ -39,24 +39,27 @@ class Estimate:
     rejected: Bools  # (M,), measurements that were not believed
 
 
-def estimate(paths: Sequence[Path], band: float | None, settings: SmoothSettings) -> tuple[list[Estimate], float]:
+def estimate(
+    paths: Sequence[Path], band: float | None, settings: SmoothSettings, known: Learnt | None = None
+) -> tuple[list[Estimate], float, Learnt | None]:
     """Learn from all segments of one kind, then smooth each by itself.
 
     Args:
         paths: one a segment.
         band: cycles per frame, None learns it.
         settings: limits.
+        known: what was learnt before, of this track or another one; None learns.
 
     Returns:
-        The estimates, and the true errors of the measurements over their sigmas, slow ones included.
+        The estimates, the true errors of the measurements over their sigmas, slow ones included, and what was learnt.
     """
-    pieces = _pieces(paths, settings.learn_frames)
-    measured = sum(int(path.used.sum()) for path in pieces)
-    if measured < settings.least_frames:
-        return [_alone(path) for path in paths], 1.0
-    learnt = _learnt(pieces, band, settings)
-    whole = learnt.scale / np.sqrt(1 - settings.slow_share)
-    return [_smoothed(path, learnt, settings) for path in paths], float(whole)
+    if known is None:
+        pieces = _pieces(paths, settings.learn_frames)
+        if sum(int(path.used.sum()) for path in pieces) < settings.least_frames:
+            return [_alone(path) for path in paths], 1.0, None
+        known = _learnt(pieces, band, settings)
+    whole = known.scale / np.sqrt(1 - settings.slow_share)
+    return [_smoothed(path, known, settings) for path in paths], float(whole), known
 
 
 def _pieces(paths: Sequence[Path], most: int) -> list[Path]:

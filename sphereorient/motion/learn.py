@@ -25,8 +25,22 @@ FIRST_TRIES = (0.15, 0.45, 1.2)  # poles per frame from the best of which the se
 class Learnt:
     """What a track says about itself; made by `learn`."""
 
-    prior: Prior
+    prior: Prior  # per frame
     scale: float  # true errors of the measurements over their sigmas
+
+    def at_rate(self, ratio: float) -> Learnt:
+        """Return the same motion in frames that last `ratio` times as long."""
+        prior = Prior(pole=self.prior.pole * ratio, deviation=self.prior.deviation * ratio)
+        return Learnt(prior=prior, scale=self.scale)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessNoise:
+    """What a track's smoothing learnt of its motion; made by `smooth_motion`, kept for other runs by the pipeline."""
+
+    place: Learnt | None  # None: too few frames to learn from
+    turn: Learnt | None
+    frame_s: float  # that `Learnt` counts in
 
 
 def learn(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, estimate
+from sphereorient.motion.learn import ProcessNoise
 from sphereorient.motion.path import Places, Turns
 from sphereorient.motion.settings import SmoothSettings
 
@@ -48,6 +49,7 @@ class Smoothed:
     rejected: Tensor  # (N,) bool, frames with a measurement too far off what all others say
     position_scale: float  # true errors of the measured positions over their sigmas: the learnt, and slow ones
     orientation_scale: float  # the same of the orientations
+    process: ProcessNoise  # what was learnt
 
 
 def smooth_motion(
@@ -58,6 +60,7 @@ def smooth_motion(
     orientation_cov_rad2: Tensor,
     segment: Tensor,
     settings: SmoothSettings,
+    known: ProcessNoise | None = None,
 ) -> Smoothed:
     """Smooth a track, segment by segment, and take its derivatives.
 
@@ -77,6 +80,7 @@ def smooth_motion(
         orientation_cov_rad2: (N, 3, 3), rad^2, of delta in R_true = exp([delta]x) R_lab_body, lab components.
         segment: (N,) int64, number of the segment, -1 outside any.
         settings: bands, limits.
+        known: the motion as another run learnt it; None learns it from this track.
 
     Returns:
         The motion, on the CPU.
@@ -103,8 +107,14 @@ def smooth_motion(
     unit = np.eye(3)
     places = [Places.of(at.time, at.spread(X, np.zeros(3)), at.spread(X_cov, unit), at.used) for at in in_places]
     turns = [Turns.of(at.time, at.spread(R, unit), at.spread(R_cov, unit), at.used) for at in in_turns]
-    moving, position_scale = estimate(places, _per_frame(settings.position_band_hz, frame_s), settings)
-    turning, orientation_scale = estimate(turns, _per_frame(settings.orientation_band_hz, frame_s), settings)
+    place, turn = (None, None) if known is None else (known.place, known.turn)
+    ratio = 1.0 if known is None else frame_s / known.frame_s
+    moving, position_scale, place = estimate(
+        places, _per_frame(settings.position_band_hz, frame_s), settings, place and place.at_rate(ratio)
+    )
+    turning, orientation_scale, turn = estimate(
+        turns, _per_frame(settings.orientation_band_hz, frame_s), settings, turn and turn.at_rate(ratio)
+    )
     out, rejected = _blank(len(t)), np.zeros(len(t), dtype=bool)
     for put, instants, estimates in ((_put_places, in_places, moving), (_put_turns, in_turns, turning)):
         for at, found in zip(instants, estimates, strict=True):
@@ -116,6 +126,7 @@ def smooth_motion(
         rejected=torch.from_numpy(rejected),
         position_scale=position_scale,
         orientation_scale=orientation_scale,
+        process=ProcessNoise(place=place, turn=turn, frame_s=frame_s),
     )
 
 
@@ -180,7 +191,7 @@ class _Instants:
 def _blank(frames: int) -> dict[str, Floats]:
     """Every tensor before anything is known."""
     square = ("position_cov_mm2", "orientation_cov_rad2", "R_lab_body")
-    other = ("extrapolated", "rejected", "position_scale", "orientation_scale")
+    other = ("extrapolated", "rejected", "position_scale", "orientation_scale", "process")
     names = [entry.name for entry in fields(Smoothed) if entry.name not in other]
     return {name: np.full((frames, 3, 3) if name in square else (frames, 3), np.nan) for name in names}
 

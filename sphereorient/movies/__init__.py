@@ -1,9 +1,9 @@
 """Movies: one reader interface, one file per format, exact grey values."""
 
-from sphereorient.movies.movie import Movie
-from sphereorient.movies.npy import NpyMovie
-from sphereorient.movies.open import open_movie
-from sphereorient.movies.video import VideoMovie
-from sphereorient.movies.write import write_ffv1
+from sphereorient.movies.flipped import flipped
+from sphereorient.movies.movie import Grey, Movie
+from sphereorient.movies.open import movie_files, open_movie
+from sphereorient.movies.readable import readable
+from sphereorient.movies.write import write_ffv1, write_movie
 
-__all__ = ["Movie", "NpyMovie", "VideoMovie", "open_movie", "write_ffv1"]
+__all__ = ["Grey", "Movie", "flipped", "movie_files", "open_movie", "readable", "write_ffv1", "write_movie"]

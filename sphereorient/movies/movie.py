@@ -16,7 +16,7 @@ Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
 
 
 class Movie(Protocol):
-    """A sequence of grey pictures. It knows nothing of time: time is frame number / frame rate of the experiment."""
+    """A sequence of grey pictures, with the times of the frames where the file holds exact ones."""
 
     @property
     def path(self) -> Path:
@@ -29,6 +29,14 @@ class Movie(Protocol):
     @property
     def dtype(self) -> np.dtype[Any]:
         """uint8, or uint16 where the file holds more than 8 bits; values are those of the file, not rescaled."""
+
+    @property
+    def times_s(self) -> NDArray[np.float64] | None:
+        """Time of each frame by the file's own stamps, (N,), s; None where it has none or rounds them (MKV, AVI)."""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user should know: that the file is cut off, that colour was made grey, that its codec loses."""
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -57,6 +65,23 @@ class Movie(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close the movie."""
+
+
+class HoldsNothing:
+    """What movies share that hold no file open between reads."""
+
+    def close(self) -> None:
+        """Do nothing: no file is held open."""
+
+    def __enter__(self) -> Self:
+        """Return the movie."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the movie."""
+        self.close()
 
 
 def check_range(path: Path, length: int, first: int, last: int | None) -> int:

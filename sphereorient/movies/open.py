@@ -41,3 +41,8 @@ def open_movie(path: Path | str) -> Movie:
         got, do = f"'{path.suffix}'", "convert it, lossless: ffmpeg -i MOVIE -c:v ffv1 -pix_fmt gray MOVIE.mkv"
         raise MovieError(refusal(str(path), expected=f"a movie of type {' '.join(READERS)}", got=got, do=do))
     return reader(path)
+
+
+def movie_files(path: Path | str) -> list[Path]:
+    """Return the files that a movie is made of, for fingerprints: one, or the pictures of a sequence."""
+    return [Path(path)]

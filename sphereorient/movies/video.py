@@ -5,27 +5,30 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import av
 import numpy as np
+from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
 from sphereorient.movies.grey import check_format, grey_dtype, grey_values
-from sphereorient.movies.movie import Grey, check_indices, check_range
+from sphereorient.movies.movie import Grey, HoldsNothing, check_indices, check_range
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
+from sphereorient.movies.stream import opened, stream_remarks, words
 
-THREADS = 2  # slices of one frame in parallel: 1.8 times faster for FFV1 on 2 cores, and errors keep their frame
+NOTHING = "none from the decoder"
 
 
-class VideoMovie:
+class VideoMovie(HoldsNothing):
     """A movie in a container with one video stream; no file stays open between calls."""
+
+    times_s: NDArray[np.float64] | None = None  # MKV rounds stamps to 1 ms, AVI has none: see Movie
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with self._container() as container:
-            frame = next((frame for _, frame in self._numbered(container, {})), None)
+        with opened(path) as container:
+            frame = _first_frame(container)
             if frame is None:
                 raise self._refusal("a movie with frames", "no frame", "record or export it again")
             check_format(str(path), frame.format)
@@ -37,10 +40,22 @@ class VideoMovie:
         """Return the number of frames, counted once, as packets without decoding them."""
         return self._index.count
 
+    @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user should know: see Movie."""
+        with opened(self.path) as container:
+            return (*self._read_error, *stream_remarks(container, self._format, len(self)))
+
     def frames(self, first: int = 0, last: int | None = None) -> Iterator[Grey]:
         """Yield frames first .. last - 1 in order, (H, W) each."""
         last = check_range(self.path, len(self), first, last)
         return self._wanted(list(range(first, last)))
+
+    def readable(self, first: int = 0, last: int | None = None) -> Iterator[Grey | None]:
+        """Yield frames first .. last - 1 in order, None for those that cannot be decoded."""
+        last = check_range(self.path, len(self), first, last)
+        for got in self._recovered(list(range(first, last))):
+            yield None if isinstance(got, MovieError) else got
 
     def sample(self, indices: Sequence[int]) -> Grey:
         """Return any frames in the order asked for, (n, H, W); only what leads to them is decoded."""
@@ -51,90 +66,60 @@ class VideoMovie:
             pictures[place] = picture
         return pictures[np.searchsorted(order, asked)] if asked else pictures
 
-    def close(self) -> None:
-        """Do nothing: every iteration opens the file for itself."""
-
-    def __enter__(self) -> Self:
-        """Return the movie."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the movie."""
-        self.close()
-
     def _refusal(self, expected: str, got: str, do: str, frame: int | None = None) -> MovieError:
         name = str(self.path) if frame is None else f"{self.path}, frame {frame}"
         return MovieError(refusal(name, expected=expected, got=got, do=do))
 
     @cached_property
-    def _index(self) -> PacketIndex:
-        with self._container() as container:
+    def _packets(self) -> tuple[PacketIndex, str]:
+        """The table of packets, and in words where reading it broke off."""
+        packets: list[Packet] = []
+        broken = ""
+        with opened(self.path) as container:
             try:
-                packets: list[Packet] = [
-                    (packet.pts, packet.dts, packet.is_keyframe)
-                    for packet in container.demux(container.streams.video[0])
-                    if packet.size and not packet.is_discard
-                ]
+                for packet in container.demux(container.streams.video[0]):
+                    if packet.size and not packet.is_discard:
+                        packets.append(Packet(packet.pts, packet.dts, packet.is_keyframe, packet.pos))
             except av.FFmpegError as error:
-                do = "export the movie again; the file is damaged"
-                raise self._refusal("readable packets", _words(error), do) from error
+                broken = words(error)
             # AVI stores no presentation stamps: where frames are reordered, FFmpeg's guesses are wrong after a seek.
-            guessed = container.format.name == "avi" and any(pts != dts for pts, dts, _ in packets)
-        return index_packets(packets, guessed)
+            guessed = container.format.name == "avi" and any(packet.pts != packet.dts for packet in packets)
+        return index_packets(packets, guessed), broken
 
-    def _container(self) -> av.container.InputContainer:
-        try:
-            container = av.open(str(self.path))
-        except (av.FFmpegError, OSError, ValueError) as error:
-            do = "check that it plays; export it again if not"
-            raise self._refusal("a readable movie", _words(error), do) from error
-        if not container.streams.video:
-            container.close()
-            raise self._refusal("a movie with pictures", "no video stream", "name the movie's own file")
-        context: Any = container.streams.video[0].codec_context  # None for a codec that FFmpeg does not know
-        if context is None:
-            container.close()
-            raise self._refusal("a movie that FFmpeg decodes", "an unknown codec", "export it as FFV1 in .mkv")
-        context.thread_type, context.thread_count = "SLICE", THREADS
-        context.options = {"err_detect": "crccheck+explode"}
-        return container
+    @property
+    def _index(self) -> PacketIndex:
+        return self._packets[0]
+
+    @property
+    def _read_error(self) -> tuple[str, ...]:
+        count, broken = self._index.count, self._packets[1]
+        return (f"damaged: reading it breaks off after {count} frames, {broken}",) if broken else ()
 
     def _wanted(self, numbers: list[int]) -> Iterator[Grey]:
         """Yield the pictures of increasing frame numbers, jumping over what need not be decoded."""
-        with self._container() as container:
+        for got in self._recovered(numbers):
+            if isinstance(got, MovieError):
+                raise got
+            yield got
+
+    def _recovered(self, numbers: list[int]) -> Iterator[Grey | MovieError]:
+        """Yield a picture or the reason why there is none for each of increasing frame numbers."""
+        with opened(self.path) as container:
             for run in self._index.runs(numbers):
                 yield from self._run(container, run)
 
-    def _run(self, container: av.container.InputContainer, numbers: list[int]) -> Iterator[Grey]:
+    def _run(self, container: av.container.InputContainer, numbers: list[int]) -> Iterator[Grey | MovieError]:
         key = self._seek(container, numbers[0])
         pictures = self._pictures(container, numbers, key)
-        try:
-            first = next(pictures)
-        except MovieError:
-            if key == 0:
-                raise
+        first = next(pictures)
+        if isinstance(first, MovieError) and key > 0 and not self._index.each_alone:
             # Frames beside a key frame may lean on frames before it (open groups of pictures): only the way from
             # the start tells whether the fault is the file's or the seek's.
-            with self._container() as fresh:
+            with opened(self.path) as fresh:
                 yield from self._pictures(fresh, numbers, 0)
             return
         yield first
         yield from pictures
-
-    def _pictures(self, container: av.container.InputContainer, numbers: list[int], key: int) -> Iterator[Grey]:
-        """Yield the pictures of increasing frame numbers, decoding from frame `key`, where the container stands."""
-        waiting = iter(numbers)
-        wanted = next(waiting, None)
-        for number, frame in self._numbered(container, self._index.number_of, key):
-            if number == wanted:
-                yield self._picture(frame, number)
-                wanted = next(waiting, None)
-            if wanted is None or number > wanted:
-                break
-        if wanted is not None:
-            raise self._damage("none from the decoder", wanted)
 
     def _seek(self, container: av.container.InputContainer, number: int) -> int:
         """Go to the last key frame at or before frame `number`, and return that key frame's number."""
@@ -143,34 +128,84 @@ class VideoMovie:
             try:
                 container.seek(stamp, stream=container.streams.video[0])
             except av.FFmpegError as error:
-                raise self._damage(_words(error), number) from error
+                raise self._damage(words(error), number) from error
         return key
 
-    def _numbered(
-        self, container: av.container.InputContainer, number_of: dict[int, int], number: int = 0
-    ) -> Iterator[tuple[int, av.VideoFrame]]:
-        """Decode from where the container stands, with the frame numbers; `number` counts where stamps do not tell."""
-        try:
-            for frame in container.decode(video=0):
-                number = number_of.get(frame.pts, number) if frame.pts is not None else number
-                if frame.is_corrupt:
-                    raise self._damage("a damaged one", number)
-                yield number, frame
-                number += 1
-        except av.FFmpegError as error:
-            raise self._damage(_words(error), number) from error
+    def _pictures(
+        self, container: av.container.InputContainer, numbers: list[int], key: int
+    ) -> Iterator[Grey | MovieError]:
+        """Yield for each of increasing frame numbers its picture or the reason why there is none.
+
+        Args:
+            container: stands at frame `key`, or before it.
+            numbers: of the frames wanted.
+            key: what is damaged before this frame does not count, since the seek may have cut off what it leans on.
+        """
+        waiting = iter(numbers)
+        wanted = next(waiting, None)
+        spoilt: dict[int, str] = {}
+        for number, frame in self._decoded(container):
+            if wanted is None:
+                return
+            if isinstance(frame, str):
+                if number >= key:
+                    spoilt |= {lost: frame for lost in self._index.spoilt_by(number) if lost not in spoilt}
+                continue
+            while wanted is not None and wanted < number:
+                yield self._damage(spoilt.get(wanted, NOTHING), wanted)
+                wanted = next(waiting, None)
+            if wanted == number:
+                yield self._damage(spoilt[number], number) if number in spoilt else self._picture(frame, number)
+                wanted = next(waiting, None)
+                if wanted is None:
+                    return
+        while wanted is not None:
+            yield self._damage(spoilt.get(wanted, NOTHING), wanted)
+            wanted = next(waiting, None)
+
+    def _decoded(self, container: av.container.InputContainer) -> Iterator[tuple[int, av.VideoFrame | str]]:
+        """Decode from where the container stands: frames with their numbers, and in words what cannot be decoded."""
+        following = 0  # for movies whose frames can only be counted, from the start
+        for packet in _demuxed(container):
+            number = self._index.number(packet.pts, packet.pos)
+            if number is not None:
+                packet.pts = number  # the decoder hands it on to the frame, whatever the order
+            try:
+                frames = packet.decode()
+            except av.FFmpegError as error:
+                yield (following if number is None else number), words(error)
+                continue
+            for frame in frames:
+                number = following if frame.pts is None or not self._index.number_of else frame.pts
+                following = number + 1
+                yield number, ("a damaged one" if frame.is_corrupt else frame)
 
     def _damage(self, got: str, number: int) -> MovieError:
         do = "export the movie again, or leave the frame out with frames: in the experiment"
         return self._refusal("a decodable picture", got, do, number)
 
-    def _picture(self, frame: av.VideoFrame, number: int) -> Grey:
+    def _picture(self, frame: av.VideoFrame, number: int) -> Grey | MovieError:
         if (frame.height, frame.width) != self.frame_shape or frame.format.name != self._format:
             expected, got = f"{self.frame_shape} {self._format}", f"{(frame.height, frame.width)} {frame.format.name}"
-            raise self._refusal(f"pictures of one kind, {expected}", got, "split the movie where it changes", number)
+            return self._refusal(f"pictures of one kind, {expected}", got, "split the movie where it changes", number)
         return grey_values(frame)
 
 
-def _words(error: Exception) -> str:
-    """Return an error of FFmpeg in one line, without the file's name, which our message has already."""
-    return f"'{getattr(error, 'strerror', None) or str(error).splitlines()[0]}'"
+def _demuxed(container: av.container.InputContainer) -> Iterator[Any]:
+    """Yield the packets as far as the file can be read, the empty one that ends decoding last."""
+    try:
+        yield from container.demux(container.streams.video[0])
+    except av.FFmpegError:
+        return  # told in the remarks: the table of packets broke off at the same place
+
+
+def _first_frame(container: av.container.InputContainer) -> av.VideoFrame | None:
+    """Return the first frame that can be decoded, None where there is none."""
+    for packet in _demuxed(container):
+        try:
+            frames: list[av.VideoFrame] = packet.decode()
+        except av.FFmpegError:
+            continue  # a dead frame at the start does not make the movie unreadable
+        if frames:
+            return frames[0]
+    return None

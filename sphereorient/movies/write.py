@@ -67,3 +67,8 @@ def _encode(container: av.container.OutputContainer, path: Path, frames: Iterabl
         container.mux(stream.encode(frame))
     container.mux(stream.encode(None))
     return number + 1
+
+
+def write_movie(path: Path | str, frames: Iterable[Grey], frame_rate_hz: float = 25.0) -> int:
+    """Write."""
+    return write_ffv1(path, frames, frame_rate_hz)

@@ -6,9 +6,10 @@ from sphereorient.orient.candidates import Candidates
 from sphereorient.orient.cold import Poses, cold_start
 from sphereorient.orient.crop import crop_disk
 from sphereorient.orient.extraction import extract_paint
-from sphereorient.orient.eye import Eye, Fitter, base_table
+from sphereorient.orient.eye import Eye, Fitter, Optics, base_table
 from sphereorient.orient.gather import PoseTable, pose_table
 from sphereorient.orient.grey_search import GreySearch
+from sphereorient.orient.light import Light
 from sphereorient.orient.pixels import LinesOfSight
 from sphereorient.orient.proposer import Proposals, Proposer
 from sphereorient.orient.refine import Fit, refine
@@ -25,7 +26,9 @@ __all__ = [
     "Fitter",
     "GreySearch",
     "GreySearchSettings",
+    "Light",
     "LinesOfSight",
+    "Optics",
     "OrientSettings",
     "PoseTable",
     "Poses",

@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.locate import LocateSettings
+from sphereorient.locate import LocateSettings, Shot
 from sphereorient.orient.blocks import BlockTracker
 from sphereorient.orient.cold import Poses, no_pose
-from sphereorient.orient.eye import Picture
 from sphereorient.orient.proposer import Proposer
 from sphereorient.orient.settings import RefineSettings
 from sphereorient.orient.study import Study
@@ -38,9 +37,9 @@ class ApartTracker:
         """Return the lengths of the blocks that are followed side by side; see `BlockTracker`."""
         return self.trackers[0].windows(frames)
 
-    def track(self, pictures: Sequence[Sequence[Picture]], window: Sequence[int]) -> Iterator[Poses]:
+    def track(self, shots: Sequence[Sequence[Shot]], window: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
         """Follow the blocks of one window; see `BlockTracker`."""
-        each = [tracker.track([movie], window) for tracker, movie in zip(self.trackers, pictures, strict=True)]
+        each = [tracker.track([movie], window, time_s) for tracker, movie in zip(self.trackers, shots, strict=True)]
         yield from (told_apart(poses) for poses in zip(*each, strict=True))
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.locate import LocateSettings
+from sphereorient.locate import LocateSettings, Shot
 from sphereorient.orient.cold import Poses, cold_start, poses_of
 from sphereorient.orient.eye import Fitter, Picture
 from sphereorient.orient.proposer import Proposer
@@ -23,6 +23,7 @@ from sphereorient.trajectory import Reason
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
 NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
 FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
+LONG_STEP = 3.0  # times the step before: after a longer one the motion before says little
 MOVE_SHARE = 0.3  # of the radius: how far the ball may have moved where nothing is known of its motion
 ASTRAY_SHARE = 0.01  # of the radius: how far a place may be from where three frames say it is
 
@@ -45,6 +46,7 @@ class _Lane:
 
     first: int
     last: int  # + 1
+    time_s: Sequence[float]  # of the window's frames
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
 
     def expected(self, frame: int, radius_mm: float) -> _Expected | None:
@@ -56,16 +58,24 @@ class _Lane:
         reason = tuple(Reason.LOW_SCORE if why is Reason.OK else why for why in rows[-1].reason)
         if len(rows) < 2 or numbers[-2] != frame - 2:
             return self._beside(rows[-1], reason, radius_mm)
+        t0, t1, t2 = (self.time_s[k] for k in range(frame - 2, frame + 1))
+        on = (t2 - t1) / (t1 - t0)  # 1 for even frames
+        if on > LONG_STEP:
+            return self._beside(rows[-1], reason, radius_mm)
         *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
         *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
         *_, R0, R1 = (poses.R_lab_body[0] for poses in rows)
-        turn, move, spread = so3.log(R1 @ R0.mT), X1 - X0, 4 * C1 + C0
+        turn, move, spread = on * so3.log(R1 @ R0.mT), on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
         if len(rows) == 3:
-            turn = 2 * turn - so3.log(R0 @ rows[0].R_lab_body[0].mT)
-            further = 9 * C1 + 9 * C0 + rows[0].covariance[0, 3:, 3:]
+            before = (t1 - t0) / (t0 - self.time_s[frame - 3])
+            # The rate changes from the middle of one step to that of the next as it did between the two before.
+            more = (t2 - t0) / (t1 - self.time_s[frame - 3])
+            turn = (1 + more) * turn - on * before * more * so3.log(R0 @ rows[0].R_lab_body[0].mT)
+            a, b = on * (1 + more), on * before * more
+            further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * rows[0].covariance[0, 3:, 3:]
             # Not so the distances that one camera tells: they scatter by more than the ball is accelerated.
             if float(further.diagonal().sum()) < (ASTRAY_SHARE * radius_mm) ** 2:
-                move, spread = 2 * move - (X0 - rows[0].position_lab_mm[0]), further
+                move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
         astray = (ASTRAY_SHARE * radius_mm) ** 2 * torch.eye(3, dtype=torch.float64)
         return _Expected(
             position_lab_mm=X1 + move,
@@ -131,28 +141,29 @@ class BlockTracker:
         lengths = [last - first for first, last in pairwise([*firsts, frames.stop])]
         return [lengths[k : k + self.settings.lanes] for k in range(0, len(lengths), self.settings.lanes)]
 
-    def track(self, pictures: Sequence[Sequence[Picture]], window: Sequence[int]) -> Iterator[Poses]:
+    def track(self, shots: Sequence[Sequence[Shot]], window: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
         """Follow the blocks of one window.
 
         Args:
-            pictures: of each eye, the frames of these blocks in order.
+            shots: of each eye, the frames of these blocks in order.
             window: lengths of the blocks.
+            time_s: of the same frames.
 
         Yields:
             The poses of each frame, in order.
         """
         firsts = list(accumulate([0, *window[:-1]]))
-        lanes = [_Lane(first, first + length) for first, length in zip(firsts, window, strict=True)]
+        lanes = [_Lane(first, first + length, time_s) for first, length in zip(firsts, window, strict=True)]
         found: dict[int, Poses] = {}
         for k in range(max(window)):
             now = [lane for lane in lanes if lane.first + k < lane.last]
-            frames = {lane.first: [movie[lane.first + k] for movie in pictures] for lane in now}
+            frames = {lane.first: [movie[lane.first + k] for movie in shots] for lane in now}
             for lane, poses in zip(now, self._step(now, k, frames), strict=True):
                 lane.saw(lane.first + k, poses)
                 found[lane.first + k] = poses
         yield from (found[k] for k in range(sum(window)))
 
-    def _step(self, lanes: Sequence[_Lane], k: int, frames: Mapping[int, Sequence[Picture]]) -> Iterator[Poses]:
+    def _step(self, lanes: Sequence[_Lane], k: int, frames: Mapping[int, Sequence[Shot]]) -> Iterator[Poses]:
         """Measure one frame of each lane: predicted where that holds, searched for where not."""
         expected = {lane.first: lane.expected(lane.first + k, self.fitter.radius_mm) for lane in lanes}
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
@@ -161,16 +172,19 @@ class BlockTracker:
             poses = followed.get(lane.first)
             yield self._search(frames[lane.first]) if poses is None else poses
 
-    def _follow(self, expected: Sequence[_Expected], frames: Sequence[Sequence[Picture]]) -> list[Poses | None]:
+    def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Shot]]) -> list[Poses | None]:
         """Fit expected poses, all in one batch of fixed size; None where the pictures do not bear one out."""
         if not expected:
             return []
         asked, missing = len(expected), self.settings.lanes - len(expected)
-        expected, frames = [*expected, *[expected[-1]] * missing], [*frames, *[frames[-1]] * missing]
+        expected, shots = [*expected, *[expected[-1]] * missing], [*shots, *[shots[-1]] * missing]
+        frames = [[shot.picture for shot in row] for row in shots]
+        usable = torch.tensor([[shot.usable for shot in row] for row in shots])
         X, R, use, precision = (
             torch.stack([getattr(one, name) for one in expected])
             for name in ("position_lab_mm", "R_lab_body", "use", "place_precision")
         )
+        use = use & usable
         if any(one.rough for one in expected):
             X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
         fit = self._fitted(frames, X, R, use, precision)
@@ -181,21 +195,20 @@ class BlockTracker:
             best = torch.where(good, torch.inf, -torch.inf)
             for camera in range(use.shape[1]):
                 only = torch.zeros_like(use)
-                only[:, camera] = True
+                only[:, camera] = usable[:, camera]
                 alone = self._fitted(frames, X, R, only, precision)
                 better = self._borne_out(alone, only) & (alone.score[:, camera] > best)
                 fit, use = _chosen(better, alone, fit), torch.where(better[:, None], only, use)
                 best = torch.where(better, alone.score[:, camera], best)
             good = best > -torch.inf
-        if not bool(use.all()):
+        if bool((usable & ~use).any()):
             # A camera that was blind may see again: that shows at the pose which all of them give together.
-            every = torch.ones_like(use)
-            both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, every, precision)
-            back = good & ~use.all(1) & self._borne_out(both, every)
-            fit, use = _chosen(back, both, fit), use | back[:, None]
+            both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, usable, precision)
+            back = good & (usable & ~use).any(1) & self._borne_out(both, usable)
+            fit, use = _chosen(back, both, fit), torch.where(back[:, None], usable, use)
         reasons = [
-            [Reason.OK if ok else why for ok, why in zip(row, one.reason, strict=True)]
-            for row, one in zip(use.tolist(), expected, strict=True)
+            [_reason(ok, shot, why) for ok, shot, why in zip(row, of_frame, one.reason, strict=True)]
+            for row, of_frame, one in zip(use.tolist(), shots, expected, strict=True)
         ]
         good = good & within
         return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if good[n] else None for n in range(asked)]
@@ -247,19 +260,20 @@ class BlockTracker:
     def _borne_out(self, fit: Fit, use: Tensor) -> Tensor:
         """Poses that have arrived and that all pictures in use explain well, (B,) bool."""
         explained = (fit.score >= self.score_min) | ~use
-        good: Tensor = explained.all(1) & (fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD)
+        good: Tensor = use.any(1) & explained.all(1) & (fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD)
         return good
 
-    def _search(self, frames: Sequence[Picture]) -> Poses:
+    def _search(self, shots: Sequence[Shot]) -> Poses:
         """Find the poses of a frame of which nothing is known, by those cameras whose pictures bear them out."""
         count = self.settings.candidates
         poses = cold_start(
-            self.fitter, self.proposers, frames, self.locating, candidates=count, score_min=self.clear_score
+            self.fitter, self.proposers, shots, self.locating, candidates=count, score_min=self.clear_score
         )
         if not len(poses):
             return poses
-        if not bool(poses.use.all()):
-            poses = self._all_seeing(poses, frames)
+        frames, usable = [shot.picture for shot in shots], torch.tensor([shot.usable for shot in shots])
+        if bool((usable & ~poses.use).any()):
+            poses = self._all_seeing(poses, frames, usable)
         seen = poses.use & (poses.score[0] >= self.score_min)
         reason = [
             Reason.LOW_SCORE if was and not now else why
@@ -274,10 +288,10 @@ class BlockTracker:
         fit = self.fitter.fit(pixels, X, R, seen.expand(len(poses), -1), fine, 4)
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 
-    def _all_seeing(self, poses: Poses, frames: Sequence[Picture]) -> Poses:
+    def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
         """Fit poses to all pictures, where that explains all: a disk without an outline may still be there."""
         X, R, optics = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics
-        every = torch.ones_like(poses.use).expand(len(poses), -1)
+        every = usable.expand(len(poses), -1)
         for level, iterations in ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)):
             pixels = self.fitter.pixels([frames] * len(poses), X, level)
             fit = self.fitter.fit(pixels, X, R, every, level, iterations)
@@ -285,7 +299,16 @@ class BlockTracker:
         order = fit.nll.argsort(stable=True)
         if not bool(self._borne_out(fit, every)[order[0]]):
             return poses
-        return poses_of(fit, order, torch.ones_like(poses.use), [Reason.OK] * len(poses.use))
+        return poses_of(
+            fit, order, usable, [Reason.OK if ok else why for ok, why in zip(usable, poses.reason, strict=True)]
+        )
+
+
+def _reason(used: bool, shot: Shot, before: Reason) -> Reason:
+    """Say why a camera does not count: its picture is none, or it was blind before."""
+    if used:
+        return Reason.OK
+    return before if shot.usable else shot.reason
 
 
 def _chosen(rows: Tensor, one: Fit, other: Fit) -> Fit:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import R_cam_view
-from sphereorient.locate import LocateSettings, find_ball, find_positions, sightings_of
+from sphereorient.locate import LocateSettings, Shot, find_ball, find_positions, sightings_of
 from sphereorient.locate.find import Found
 from sphereorient.orient.crop import crop_disk
 from sphereorient.orient.eye import Fitter, Picture
@@ -73,7 +73,7 @@ def no_pose(cameras: int, reason: Sequence[Reason]) -> Poses:
 def cold_start(
     fitter: Fitter,
     proposers: Mapping[str, Proposer],
-    pictures: Sequence[Picture],
+    shots: Sequence[Shot],
     locating: LocateSettings,
     *,
     candidates: int,
@@ -85,7 +85,7 @@ def cold_start(
     Args:
         fitter: with the C eyes.
         proposers: of their names.
-        pictures: C frames.
+        shots: C frames; those that cannot be used take no part.
         locating: how outlines are found.
         candidates: proposals of each camera that are fitted.
         finalists: poses that are fitted to all detail.
@@ -95,18 +95,19 @@ def cold_start(
     Returns:
         Poses, or none with the reasons.
     """
-    poses = _with_outlines(fitter, proposers, pictures, locating, candidates, finalists)
+    pictures = [shot.picture for shot in shots]
+    poses = _with_outlines(fitter, proposers, shots, locating, candidates, finalists)
     for tolerance in NARROWER:
-        if _best_score(poses) >= score_min:
+        if _best_score(poses) >= score_min or not any(shot.usable for shot in shots):
             break
         narrower = locating.model_copy(update={"diameter_tolerance": min(tolerance, locating.diameter_tolerance)})
-        again = _with_outlines(fitter, proposers, pictures, narrower, candidates, finalists)
+        again = _with_outlines(fitter, proposers, shots, narrower, candidates, finalists)
         poses = max(poses, again, key=_best_score)
-    if _best_score(poses) < score_min:
+    if _best_score(poses) < score_min and any(shot.usable for shot in shots):
         # No rim that is right: the paint itself tells where the disk is.
         scanned = [
-            scan_ball(frame, eye, proposers[eye.name], locating)
-            for eye, frame in zip(fitter.eyes, pictures, strict=True)
+            scan_ball(shot.picture, eye, proposers[eye.name], locating) if shot.usable else (None, shot.reason)
+            for eye, shot in zip(fitter.eyes, shots, strict=True)
         ]
         again = _poses(fitter, proposers, pictures, scanned, candidates=candidates, finalists=finalists)
         poses = max(poses, again, key=_best_score)
@@ -120,15 +121,16 @@ def _best_score(poses: Poses) -> float:
 def _with_outlines(
     fitter: Fitter,
     proposers: Mapping[str, Proposer],
-    pictures: Sequence[Picture],
+    shots: Sequence[Shot],
     locating: LocateSettings,
     candidates: int,
     finalists: int,
 ) -> Poses:
     found = [
-        find_ball(frame, eye.background, eye.diameter_px, locating)
-        for eye, frame in zip(fitter.eyes, pictures, strict=True)
+        find_ball(shot.picture, eye.background, eye.diameter_px, locating) if shot.usable else (None, shot.reason)
+        for eye, shot in zip(fitter.eyes, shots, strict=True)
     ]
+    pictures = [shot.picture for shot in shots]
     ask = partial(_poses, fitter, proposers, pictures, candidates=candidates, finalists=finalists)
     use = [outline is not None for outline, _ in found]
     if all(use) and len(use) > 1 and _apart_mm(fitter, found) > GAP_SHARE * fitter.radius_mm:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
-from sphereorient.locate import LocateSettings
+from sphereorient.locate import LocateSettings, Shot
 from sphereorient.orient.cold import Poses, cold_start
 from sphereorient.orient.eye import FINEST_PX, Eye, Fitter, Optics, Picture, level_of
 from sphereorient.orient.light import Light
@@ -60,7 +60,7 @@ class Study:
 
 def study(
     eyes: Sequence[Eye],
-    pictures: Sequence[Sequence[Picture]],
+    shots: Sequence[Sequence[Shot]],
     base: PaintTable,
     proposers: Mapping[str, Proposer],
     radius_mm: float,
@@ -71,7 +71,7 @@ def study(
 
     Args:
         eyes: C of them.
-        pictures: n times C frames, spread over the movie.
+        shots: n times C frames, spread over the movie.
         base: finest table of the paint.
         proposers: by name of eye.
         radius_mm: of the sphere.
@@ -92,18 +92,19 @@ def study(
         light=light,
     )
 
-    def search(seeing: Fitter, frames: Sequence[Sequence[Picture]]) -> list[Poses]:
+    def search(seeing: Fitter, frames: Sequence[Sequence[Shot]]) -> list[Poses]:
         ask = partial(cold_start, seeing, proposers, locating=locating, candidates=settings.candidates)
         with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
             return list(pool.map(ask, frames))
 
-    found = search(fitter, pictures)
+    found = search(fitter, shots)
+    pictures = [[shot.picture for shot in frame] for frame in shots]
     if not _clear(found):
         raise _nothing(found)
     gain, gap_px = _apart(fitter, pictures, found)
     if gain > APART_GAIN or gap_px > APART_PX:
         # A pose between what the cameras see would teach a light that is nowhere.
-        each = [search(fitter.of(k), [[frames[k]] for frames in pictures]) for k in range(len(eyes))]
+        each = [search(fitter.of(k), [[frames[k]] for frames in shots]) for k in range(len(eyes))]
         frame, X, R, use = _seen_by_each(each)
         wrong = _wrong_scores([poses for of_camera in each for poses in of_camera])
     else:

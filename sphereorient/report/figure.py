@@ -17,9 +17,10 @@ from sphereorient import so3
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.evaluate import Score
-from sphereorient.experiment import Experiment, movie_span, open_movies
+from sphereorient.experiment import Experiment, open_movies
 from sphereorient.sphere import SphereRenderer, load_texture, orthographic_view, reduced_texture
-from sphereorient.trajectory import Trajectory
+from sphereorient.timeline import timeline
+from sphereorient.trajectory import Reason, Trajectory
 
 # Okabe and Ito's colours: told apart by colour-blind readers, and in grey print.
 AXIS_COLOURS = ("#D55E00", "#009E73", "#0072B2")
@@ -52,13 +53,12 @@ def _frames_part(part: Any, track: Trajectory, experiment: Experiment) -> None:
     names = list(track.cameras)
     chosen = _spread_valid(track, 8 // len(names))
     texture = load_texture(experiment.texture_path)
-    first = round(track.time[0] * track.frame_rate)
     pictures = {}
     with ExitStack() as opened:
-        for name, movie in open_movies(experiment, names).items():
-            opened.enter_context(movie)
-            shift = movie_span(experiment, name, range(first, first + len(track)))[0]
-            pictures[name] = movie.sample([shift + k for k in chosen])
+        movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
+        rows = timeline(experiment, movies).rows
+        for name, movie in movies.items():
+            pictures[name] = movie.sample([int(rows[name][k]) for k in chosen])
     for beside, name in zip(part.subfigures(1, len(names), squeeze=False)[0], names, strict=True):
         axes = beside.subplots(2, len(chosen), squeeze=False)
         for column, (k, picture) in enumerate(zip(chosen, pictures[name], strict=True)):
@@ -72,9 +72,12 @@ def _frames_part(part: Any, track: Trajectory, experiment: Experiment) -> None:
 
 
 def _spread_valid(track: Trajectory, count: int) -> list[int]:
-    valid = np.flatnonzero(track.valid)
+    blind = np.zeros(len(track), dtype=bool)
+    for camera in track.cameras.values():
+        blind |= np.isin(camera.reason, [Reason.MISSING, Reason.UNDECODABLE])
+    valid = np.flatnonzero(track.valid & ~blind)
     if not len(valid):
-        valid = np.arange(len(track))
+        valid = np.flatnonzero(~blind)
     return [int(valid[int(i)]) for i in np.linspace(0, len(valid) - 1, min(count, len(valid)))]
 
 

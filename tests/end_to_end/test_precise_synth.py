@@ -27,8 +27,9 @@ from precise_examples import (
     write,
 )
 
-from sphereorient import pipeline, so3
+from sphereorient import precise, so3
 from sphereorient.evaluate import score_track
+from sphereorient.locate import Shot
 from sphereorient.orient import BlockTracker, Poses
 from sphereorient.pipeline import track_movies
 from sphereorient.trajectory import Flag, Reason, Trajectory
@@ -367,6 +368,7 @@ def test_a_part_of_the_movie_keeps_the_clock(short, tmp_path, frames):
 FINGERPRINT = """
 import hashlib, sys
 import h5py
+from sphereorient.locate import Shot
 from sphereorient.pipeline import track_movies
 track_movies(sys.argv[1]).save(sys.argv[2])
 digest = hashlib.sha256()
@@ -402,7 +404,7 @@ def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tm
             super().__init__(*parts)
             made.append(self)
 
-    monkeypatch.setattr(pipeline, "BlockTracker", Kept)
+    monkeypatch.setattr(precise, "BlockTracker", Kept)
     experiment = write(short.without_ball(np.arange(37, 39), ("cam1",)), tmp_path)
     track_movies(experiment, settings=settings("refine.block_frames=16"))
     (tracker,) = made
@@ -411,7 +413,8 @@ def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tm
     def poses_of(*blocks: int) -> list[str]:
         """Follow blocks, by number, in one window."""
         rows = np.concatenate([np.arange(16 * block, 16 * block + 16) for block in blocks])
-        return [_digest(poses) for poses in tracker.track([movie[rows] for movie in pictures], [16] * len(blocks))]
+        shots = [[Shot(picture=picture) for picture in movie[rows]] for movie in pictures]
+        return [_digest(poses) for poses in tracker.track(shots, [16] * len(blocks), (rows / 600.0).tolist())]
 
     each = [poses_of(block) for block in range(3)]
     assert [poses_of(block) for block in (2, 0, 1)] == [each[2], each[0], each[1]]

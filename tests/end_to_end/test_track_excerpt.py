@@ -168,8 +168,8 @@ def _other_size(folder: Path) -> None:
     _replace(folder / "cameras.yaml", "- 650", "- 640")
 
 
-def _other_length(folder: Path) -> None:
-    (folder / "experiment.yaml").write_text((folder / "experiment.yaml").read_text() + "start: {cam1: 3}\n")
+def _no_frames_left(folder: Path) -> None:
+    (folder / "experiment.yaml").write_text((folder / "experiment.yaml").read_text() + "start: {cam1: 40}\n")
 
 
 def _not_a_number(folder: Path) -> None:
@@ -217,7 +217,7 @@ def _replace(path: Path, old: str, new: str) -> None:
         (_empty, ["none.npy"]),
         (_texture, ["texture.png", "twice as wide as high", "2048 x 1014"]),
         (_other_size, ["640 x 640", "650 x 650"]),
-        (_other_length, ["37 (cam1)", "40 (cam2)", "frames: [0, 37]"]),
+        (_no_frames_left, ["0 (cam1)", "40 (cam2)", "correct start:"]),
         (_not_a_number, ["cameras.yaml", "cam1", "nan"]),
         (_no_rotation, ["cameras.yaml", "cam1", "rotation"]),
         (_unknown_key, ["framerate", "frame_rate"]),

@@ -62,7 +62,7 @@ def scene() -> np.ndarray:
 
 
 def test_the_mean_is_learnt_without_the_ball_where_it_dwells(dwelling, scene):
-    learnt = learn_background(Pictures(dwelling), range(len(dwelling)), 60.0, SETTINGS)
+    learnt = learn_background(dwelling, 60.0, SETTINGS)
     error = np.abs(learnt.mean - scene)
     assert error.max() < 4
     assert np.percentile(error, 99) < 1.5
@@ -72,7 +72,7 @@ def test_the_mean_is_learnt_without_the_ball_where_it_dwells(dwelling, scene):
 
 
 def test_the_noise_is_learnt_without_the_ball_where_it_dwells(dwelling):
-    learnt = learn_background(Pictures(dwelling), range(len(dwelling)), 60.0, SETTINGS)
+    learnt = learn_background(dwelling, 60.0, SETTINGS)
     assert learnt.typical_noise == pytest.approx(1.5, rel=0.15)
     assert np.percentile(learnt.noise, 99) < 4
     assert np.percentile(measure_background(dwelling).noise, 99) > 20
@@ -87,7 +87,7 @@ def test_a_passing_ball_leaves_no_trace_in_the_mean(scene):
 
 def test_a_given_empty_picture_is_the_mean_and_only_noise_is_measured(dwelling, scene):
     empty = scene.astype(np.float32)
-    given = learn_background(Pictures(dwelling), range(len(dwelling)), 60.0, SETTINGS, empty)
+    given = learn_background(dwelling, 60.0, SETTINGS, empty)
     np.testing.assert_array_equal(given.mean, empty)
     assert 1.2 < given.typical_noise < 2.5  # 1.5; the ball is in a third of this small picture
     assert np.percentile(given.noise, 99) < 8  # also below the ball, which covers some pixels in most frames
@@ -256,7 +256,7 @@ def test_a_bad_background_is_refused_in_one_line(tmp_path, write, words):
 def test_the_expected_diameter_is_only_needed_to_find_the_ball():
     """Without a ball to find, what is learnt is what was measured."""
     frames = np.stack([filmed(np.full(SHAPE, BACK, np.float32), seed=k) for k in range(6)])
-    learnt = learn_background(Pictures(frames), range(6), DIAMETER, SETTINGS)
+    learnt = learn_background(frames, DIAMETER, SETTINGS)
     measured = measure_background(frames)
     np.testing.assert_array_equal(learnt.mean, measured.mean)
     np.testing.assert_array_equal(learnt.noise, measured.noise)

@@ -1,0 +1,93 @@
+"""One camera's share of an experiment: the pictures of its frames, faults included."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.cameras import Camera
+from sphereorient.errors import MovieError, refusal
+from sphereorient.locate import Background, Shot, screened, spread_frames, uniform
+from sphereorient.movies import Grey, Movie, readable
+from sphereorient.timeline import NONE
+from sphereorient.trajectory import Reason
+
+GLARE_SHARE = 0.5  # of the pixels at full scale: such a picture teaches nothing of the scene
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reel:
+    """A camera, its movie, and which of its pictures show the frames; made by the pipeline, read by the stages."""
+
+    name: str
+    camera: Camera
+    movie: Movie
+    rows: NDArray[np.int64]  # (N,), the movie's own numbers of the frames; NONE where it has no picture
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.rows)
+
+    def pictures(self, first: int = 0, last: int | None = None) -> Iterator[tuple[Grey | None, Reason]]:
+        """Yield the pictures of frames first .. last - 1 of the experiment, and None with the reason where one is none.
+
+        Args:
+            first: counted from the first frame that is used.
+            last: + 1; None: to the end.
+        """
+        rows = self.rows[first:last]
+        there = rows[rows != NONE]
+        found = self._read(there.tolist())
+        for row in rows.tolist():
+            if row == NONE:
+                yield None, Reason.MISSING
+                continue
+            picture = next(found)
+            yield picture, Reason.UNDECODABLE if picture is None else Reason.OK
+
+    def shots(self, background: Background, first: int = 0, last: int | None = None) -> Iterator[Shot]:
+        """Yield the same pictures as the tracker takes them, those that cannot show the ball marked.
+
+        What is told of a frame depends on it and the one before alone, whichever frame is the first.
+        """
+        lead = min(first, 1)
+        blank = np.zeros(self.movie.frame_shape, self.movie.dtype)
+        before: Grey | None = None
+        for k, (picture, reason) in enumerate(self.pictures(first - lead, last)):
+            if k >= lead:
+                shot = Shot(picture=blank, reason=reason)
+                yield shot if picture is None else screened(picture, before, background)
+            before = picture
+
+    def spread(self, count: int) -> Grey:
+        """Return at most `count` readable pictures spread evenly over the frames, (n, H, W).
+
+        Raises:
+            MovieError: none of them is readable.
+        """
+        numbers = self.rows[self.rows != NONE].tolist()
+        wanted = [numbers[k] for k in spread_frames(range(len(numbers)), count)]
+        try:
+            pictures = list(self.movie.sample(wanted))
+        except MovieError:
+            pictures = [picture for picture in self._read(wanted) if picture is not None]
+        good = [picture for picture in pictures if not (uniform(picture) or _glares(picture))]
+        if not good:
+            got, do = "none (black, white or damaged ones)", "check the movie with `sphereorient movie`"
+            raise MovieError(refusal(str(self.movie.path), expected="readable pictures", got=got, do=do))
+        return np.stack(good)
+
+    def _read(self, numbers: Sequence[int]) -> Iterator[Grey | None]:
+        """Yield pictures by their own numbers, those that follow each other in one go."""
+        begin = 0
+        for end in range(1, len(numbers) + 1):
+            if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:
+                yield from readable(self.movie, numbers[begin], numbers[end - 1] + 1)
+                begin = end
+
+
+def _glares(picture: Grey) -> bool:
+    return float(np.mean(picture[::4, ::4] == np.iinfo(picture.dtype).max)) > GLARE_SHARE
