@@ -12,7 +12,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from sphereorient.experiment import Experiment
+from sphereorient.experiment import MOVIES_OWN, Experiment
+from sphereorient.movies import movie_files
 
 PACKAGES = ("sphereorient", "torch", "kornia", "numpy", "scipy", "opencv-python-headless", "h5py", "av")
 
@@ -36,15 +37,29 @@ def sha256(path: Path) -> str:
 
 def provenance(experiment: Experiment, cameras: Sequence[str], command: str) -> dict[str, Any]:
     """Return what the track's attribute `provenance` holds, all of it fit for JSON."""
-    inputs = [experiment.path, experiment.cameras_path, *(experiment.movie_paths[name] for name in cameras)]
+    inputs = [experiment.path, experiment.cameras_path]
     inputs += [experiment.background_paths[name] for name in cameras if name in experiment.background_paths]
     if experiment.texture_path is not None:
         inputs.append(experiment.texture_path)
+    if experiment.times not in (None, MOVIES_OWN):
+        inputs.append(Path(str(experiment.times)))
+    hashes = {path: sha256(path) for path in inputs}
+    hashes |= {(movie := experiment.movie_paths[name]): _movie_sha256(movie) for name in cameras}
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
         "platform": f"{platform.system()} {platform.machine()}, {sys.implementation.name}",
         "versions": versions(),
         # By their place beside experiment.yaml: two cameras' movies in two folders often share a name.
-        "sha256": {Path(os.path.relpath(path, experiment.folder)).as_posix(): sha256(path) for path in inputs},
+        "sha256": {
+            Path(os.path.relpath(path, experiment.folder)).as_posix(): digest for path, digest in hashes.items()
+        },
     }
+
+
+def _movie_sha256(path: Path) -> str:
+    """Return the hash of a movie's file, or of the hashes of its pictures in their order."""
+    files = movie_files(path)
+    if len(files) == 1:
+        return sha256(files[0])
+    return hashlib.sha256("".join(sha256(file) for file in files).encode()).hexdigest()

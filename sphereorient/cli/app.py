@@ -99,7 +99,7 @@ def progress_bar(quiet: bool = False) -> Iterator[Advance]:
                 tasks[stage] = bar.add_task(stage, total=total, rate="")
             elapsed = bar.tasks[bar.task_ids.index(tasks[stage])].elapsed
             rate = f"{done / elapsed:.1f} frames/s" if done and elapsed else ""
-            bar.update(tasks[stage], completed=done, rate=rate)
+            bar.update(tasks[stage], completed=done, total=total, rate=rate)
 
         yield advance
 

@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import ExperimentPath, app, check_writable, progress_bar
+from sphereorient.cli.app import app, check_writable, progress_bar
+from sphereorient.errors import OutputError, SettingsError, refusal
 
 if TYPE_CHECKING:
+    from sphereorient.jobs import Outcome, Request
     from sphereorient.trajectory import Trajectory
+
+EXIT_SOME_FAILED = 1  # of several experiments
 
 
 @app.command()
 def track(
-    experiment: ExperimentPath,
-    out: Annotated[Path, typer.Option("--out", "-o", help="HDF5 file to write (schema sphereorient-track/1).")],
+    experiments: Annotated[
+        list[Path], typer.Argument(metavar="EXPERIMENT...", help="experiment.yaml (docs/data-format.md), or several.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="HDF5 file to write; for several experiments the folder of their tracks."),
+    ],
     method: Annotated[
         str, typer.Option(help="precise: refined poses with covariances; paper: Zimmermann et al. 2011, corrected.")
     ] = "precise",
@@ -27,29 +37,96 @@ def track(
     ] = None,
     cameras: Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")] = None,
     device: Annotated[str, typer.Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu",
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Worker processes on this machine.")] = 1,
+    cluster: Annotated[
+        str | None,
+        typer.Option(help="Workers of a Dask cluster: its scheduler's address or file; local for this machine."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with what a run that was cut off has left beside --out.")
+    ] = False,
+    learnt: Annotated[
+        Path | None, typer.Option(help="Measure with what another run of these cameras learnt (--save-learnt).")
+    ] = None,
+    save_learnt: Annotated[
+        Path | None, typer.Option(help="Keep what was learnt: empty scenes, light, scores, process noise.")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
 ) -> None:
-    """Track the sphere of an experiment: position and orientation of every frame."""
-    check_writable(out)
-    from sphereorient.pipeline import track_movies
+    """Track the sphere of an experiment, or of many: position and orientation of every frame."""
+    many = len(experiments) > 1 or out.is_dir()
+    check_writable(out / "tracks" if many else out)
+    if save_learnt is not None:
+        check_writable(save_learnt)
+        _refuse_shared(save_learnt, many)
+    from sphereorient.jobs import Request, track_kept
+    from sphereorient.jobs.drive import tracks_of
     from sphereorient.settings import load_settings
 
     chosen = load_settings(settings, set_ or [])
-    command = " ".join(["sphereorient", *sys.argv[1:]])
-    names = None if cameras is None else [name.strip() for name in cameras.split(",") if name.strip()]
-    with progress_bar(quiet) as advance:
-        result = track_movies(
-            experiment,
+    names = None if cameras is None else tuple(name.strip() for name in cameras.split(",") if name.strip())
+    requests = [
+        Request(
+            experiment=experiment,
+            out=path,
             method=method,
             settings=chosen,
             cameras=names,
             device=device,
-            progress=advance,
-            command=command,
+            learnt=learnt,
+            save_learnt=save_learnt,
+            command=" ".join(["sphereorient", *sys.argv[1:]]),
         )
-    result.save(out)
+        for experiment, path in zip(experiments, tracks_of(experiments, out), strict=True)
+    ]
+    if many or jobs > 1 or cluster is not None:
+        _track_side_by_side(requests, jobs, cluster, resume, quiet)
+        return
+    with progress_bar(quiet) as advance:
+        result = track_kept(requests[0], resume=resume, progress=advance)
     if not quiet:
         _print_summary(result, out)
+
+
+def _refuse_shared(path: Path, many: bool) -> None:
+    if many:
+        do = "track them one by one"
+        raise SettingsError(refusal(f"--save-learnt {path}", expected="one experiment", got="several", do=do))
+
+
+def _track_side_by_side(requests: Sequence[Request], jobs: int, cluster: str | None, resume: bool, quiet: bool) -> None:
+    """Track on worker processes or a cluster, and print what became of each experiment."""
+    from sphereorient.jobs import track_experiments
+    from sphereorient.jobs.crew import ProcessCrew, dask_crew
+
+    crew = ProcessCrew(jobs) if cluster is None else dask_crew(cluster, jobs if jobs > 1 else None)
+    with progress_bar(quiet) as advance:
+        outcomes = track_experiments(requests, crew, resume=resume, progress=advance)
+    failed = [outcome for outcome in outcomes if outcome.error is not None]
+    if len(outcomes) == 1 and failed:
+        raise OutputError(str(failed[0].error))
+    if not quiet:
+        _print_table(outcomes)
+    for outcome in failed:
+        typer.echo(f"sphereorient: {outcome.name}: {outcome.error}", err=True)
+    if failed:
+        raise typer.Exit(EXIT_SOME_FAILED)
+
+
+def _print_table(outcomes: Sequence[Outcome]) -> None:
+    """Say what became of each experiment."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table()
+    for heading in ("track", "frames", "valid", "s", "frames/s", ""):
+        table.add_column(heading, justify="left" if heading in ("track", "") else "right")
+    for outcome in outcomes:
+        rate = f"{outcome.frames / outcome.seconds:.1f}" if outcome.frames else ""
+        counts = (str(outcome.frames), str(outcome.valid)) if outcome.error is None else ("", "")
+        told = str(outcome.request.out) if outcome.error is None else "failed, see below"
+        table.add_row(outcome.name, *counts, f"{outcome.seconds:.0f}", rate, told)
+    Console().print(table)
 
 
 def _print_summary(result: Trajectory, out: Path) -> None:
@@ -57,6 +134,8 @@ def _print_summary(result: Trajectory, out: Path) -> None:
     from sphereorient.calibrate.table import contradiction_lines
 
     summary = result.summary()
+    for remark in result.provenance.get("remarks", []):
+        typer.echo(f"note: {remark}")
     typer.echo(f"{summary['valid']} of {summary['frames']} frames valid (position and orientation measured)")
     for name, lost in summary["lost"].items():
         text = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"

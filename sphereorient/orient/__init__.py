@@ -3,7 +3,7 @@
 from sphereorient.orient.apart import ApartTracker
 from sphereorient.orient.blocks import BlockTracker
 from sphereorient.orient.candidates import Candidates
-from sphereorient.orient.cold import Poses, cold_start
+from sphereorient.orient.cold import POSE_PARTS, Poses, cold_start
 from sphereorient.orient.crop import crop_disk
 from sphereorient.orient.extraction import extract_paint
 from sphereorient.orient.eye import Eye, Fitter, Optics, base_table
@@ -18,6 +18,7 @@ from sphereorient.orient.settings import GreySearchSettings, OrientSettings, Ref
 from sphereorient.orient.study import Study, study
 
 __all__ = [
+    "POSE_PARTS",
     "ApartTracker",
     "BlockTracker",
     "Candidates",

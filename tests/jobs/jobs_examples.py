@@ -1,0 +1,35 @@
+"""The excerpt as a run of several windows, and how two tracks are compared."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+from conftest import REPO
+
+EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
+SHORT_BLOCKS = ["--set", "refine.block_frames=2"]  # windows of eight frames: five in the excerpt
+COMMAND = [sys.executable, "-m", "sphereorient.cli", "track"]
+
+
+def datasets(path: Path) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
+    """Every dataset of a track, to the last bit."""
+    found = {}
+
+    def keep(name: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset):
+            values = np.asarray(item[()])
+            found[name] = (str(values.dtype), values.shape, values.tobytes())
+
+    with h5py.File(path, "r") as file:
+        file.visititems(keep)
+    return found
+
+
+def run(*arguments: object, **more: object) -> subprocess.CompletedProcess[str]:
+    """Run the command line."""
+    words = [*COMMAND, *map(str, arguments)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=300, check=False, **more)
