@@ -20,7 +20,7 @@ from sphereorient.orient import Eye, Fitter, Light, LinesOfSight, Optics, Study,
 from sphereorient.recording import Recording
 
 SCHEMA = "sphereorient-learnt/1"
-NUMBERS = ("blur_px", "widest_px", "score_min", "right_score")
+NUMBERS = ("blur_px", "widest_px", "score_min", "right_score", "usual_apart_rad")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,6 +34,7 @@ class Learnt:
     widest_px: float
     score_min: float
     right_score: float
+    usual_apart_rad: float
     together: bool
     process: ProcessNoise | None = None  # None: no track yet, or too short a one
     acceleration_rad_s2: float | None = None  # that the path was chosen with
@@ -50,6 +51,7 @@ class Learnt:
             widest_px=fitter.widest_px,
             score_min=study.score_min,
             right_score=study.right_score,
+            usual_apart_rad=study.usual_apart_rad,
             together=study.together,
         )
 
@@ -77,7 +79,13 @@ class Learnt:
         fitter = Fitter(
             eyes=eyes, radius_mm=recording.radius_mm, optics=optics, light=self.light, widest_px=self.widest_px
         )
-        return Study(fitter=fitter, score_min=self.score_min, right_score=self.right_score, together=self.together)
+        return Study(
+            fitter=fitter,
+            score_min=self.score_min,
+            right_score=self.right_score,
+            usual_apart_rad=self.usual_apart_rad,
+            together=self.together,
+        )
 
     def save(self, path: Path) -> None:
         """Write everything as HDF5, aside and then under its name.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, pairwise
+from itertools import accumulate, combinations, pairwise
 
 import torch
 from torch import Tensor
@@ -24,6 +24,9 @@ ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
 NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
 FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
 LONG_STEP = 3.0  # times the step before: after a longer one the motion before says little
+CONTRADICTS_USUAL = 4.0  # times as far apart as the cameras' own turns usually are, and
+CONTRADICTS_SIGMAS = 2.8  # of these turns, wider where a bubble hides much: then they look at different instants
+AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
 MOVE_SHARE = 0.3  # of the radius: how far the ball may have moved where nothing is known of its motion
 ASTRAY_SHARE = 0.01  # of the radius: how far a place may be from where three frames say it is
 
@@ -126,6 +129,7 @@ class BlockTracker:
         self.fitter: Fitter = learnt.fitter
         self.score_min = learnt.score_min
         self.clear_score = learnt.clear_score
+        self.usual_apart_rad = learnt.usual_apart_rad
         self.proposers = proposers
         self.locating = locating
         self.settings = settings
@@ -188,27 +192,43 @@ class BlockTracker:
         if any(one.rough for one in expected):
             X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
         fit = self._fitted(frames, X, R, use, precision)
-        good = self._borne_out(fit, use)
+        good = first = self._borne_out(fit, use)
         within = self.fitter.largest_px(X) <= self.fitter.widest_px  # others are searched for, frame by frame
+        before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
+        alone: list[Fit] = []
         if not bool((good | ~within).all()):
-            # One picture without the ball spoils what all say together: each camera by itself, the best one counts.
-            best = torch.where(good, torch.inf, -torch.inf)
-            for camera in range(use.shape[1]):
-                only = torch.zeros_like(use)
-                only[:, camera] = usable[:, camera]
-                alone = self._fitted(frames, X, R, only, precision)
-                better = self._borne_out(alone, only) & (alone.score[:, camera] > best)
-                fit, use = _chosen(better, alone, fit), torch.where(better[:, None], only, use)
-                best = torch.where(better, alone.score[:, camera], best)
-            good = best > -torch.inf
+            # One picture without the ball spoils what all say together: each camera by itself; of two that say
+            # different things the one that the frames before bear out counts.
+            alone = [self._fitted(frames, X, R, _only(usable, k), precision) for k in range(use.shape[1])]
+            told = [self._borne_out(one, _only(usable, k)) for k, one in enumerate(alone)]
+            astray = [
+                torch.where(right, so3.geodesic_distance(one.R_lab_body, R), torch.inf)
+                for one, right in zip(alone, told, strict=True)
+            ]
+            nearest, which = torch.stack(astray).min(0)
+            for k, one in enumerate(alone):
+                chosen = ~good & torch.isfinite(nearest) & (which == k)
+                fit, use = _chosen(chosen, one, fit), torch.where(chosen[:, None], _only(usable, k), use)
+            good = good | torch.isfinite(nearest)
+        # What is told of another camera only where this frame itself asks: it must not depend on those beside it.
+        doubtful = ~first | before.any(1)
         if bool((usable & ~use).any()):
             # A camera that was blind may see again: that shows at the pose which all of them give together.
             both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, usable, precision)
-            back = good & (usable & ~use).any(1) & self._borne_out(both, usable)
+            unused = good & (usable & ~use).any(1)
+            limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
+            contradicts = self._contradictory(both, usable, limit)
+            back = unused & self._borne_out(both, usable) & ~contradicts
+            doubtful = doubtful | (unused & contradicts)
             fit, use = _chosen(back, both, fit), torch.where(back[:, None], usable, use)
+        others = (good & doubtful)[:, None] & usable & ~use
+        for k in range(use.shape[1] if bool(others.any()) else 0):
+            one = alone[k] if alone else self._fitted(frames, X, R, _only(usable, k), precision)
+            others[:, k] &= self._borne_out(one, _only(usable, k))
+            fit = _beside(fit, one, others[:, k], k)
         reasons = [
-            [_reason(ok, shot, why) for ok, shot, why in zip(row, of_frame, one.reason, strict=True)]
-            for row, of_frame, one in zip(use.tolist(), shots, expected, strict=True)
+            [_reason(*of_camera) for of_camera in zip(used, told_too, row, one.reason, strict=True)]
+            for used, told_too, row, one in zip(use.tolist(), others.tolist(), shots, expected, strict=True)
         ]
         good = good & within
         return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if good[n] else None for n in range(asked)]
@@ -260,8 +280,20 @@ class BlockTracker:
     def _borne_out(self, fit: Fit, use: Tensor) -> Tensor:
         """Poses that have arrived and that all pictures in use explain well, (B,) bool."""
         explained = (fit.score >= self.score_min) | ~use
-        good: Tensor = use.any(1) & explained.all(1) & (fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD)
+        arrived = fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD
+        good: Tensor = use.any(1) & explained.all(1) & arrived & ~self._contradictory(fit, use)
         return good
+
+    def _contradictory(self, said: Fit | Poses, use: Tensor, limit: Tensor | float = 1.0) -> Tensor:
+        """Poses of which two cameras say different things, (B,) bool: their pictures are not of one instant."""
+        wrong = torch.zeros(len(use), dtype=torch.bool)
+        for k, m in combinations(range(use.shape[1]), 2):
+            apart = said.own_turn[:, k] - said.own_turn[:, m]
+            spread = said.own_covariance[:, k] + said.own_covariance[:, m]
+            away = (apart[:, None] @ torch.linalg.pinv(spread) @ apart[..., None])[:, 0, 0].clamp_min(0).sqrt()
+            far = apart.norm(dim=-1) > limit * CONTRADICTS_USUAL * self.usual_apart_rad
+            wrong = wrong | (use[:, k] & use[:, m] & far & (away > limit * CONTRADICTS_SIGMAS))
+        return wrong
 
     def _search(self, shots: Sequence[Shot]) -> Poses:
         """Find the poses of a frame of which nothing is known, by those cameras whose pictures bear them out."""
@@ -279,6 +311,8 @@ class BlockTracker:
             Reason.LOW_SCORE if was and not now else why
             for was, now, why in zip(poses.use.tolist(), seen.tolist(), poses.reason, strict=True)
         ]
+        if bool(self._contradictory(poses, seen.expand(len(poses), -1))[0]):
+            return self._by_each(poses, frames, seen)
         if bool((seen == poses.use).all()) or not bool(seen.any()):
             # Nothing is thrown away where no camera is sure: the path decides.
             return replace(poses, use=seen, reason=tuple(reason))
@@ -287,6 +321,25 @@ class BlockTracker:
         pixels = self.fitter.pixels([frames] * len(poses), X, fine)
         fit = self.fitter.fit(pixels, X, R, seen.expand(len(poses), -1), fine, 4)
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
+
+    def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
+        """Fit poses to each camera's picture alone; the first that bears one out counts, the others contradict."""
+        X, R, fine = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics.fine
+        pixels = self.fitter.pixels([frames] * len(poses), X, fine)
+        each = seen.expand(len(poses), -1)
+        alone = [self.fitter.fit(pixels, X, R, _only(each, k), fine, 4) for k in range(len(seen))]
+        right = [bool(seen[k]) and bool(self._borne_out(one, _only(each, k))[0]) for k, one in enumerate(alone)]
+        if not any(right):
+            return poses
+        main = right.index(True)
+        fit = alone[main]
+        for k, one in enumerate(alone):
+            if k != main and right[k]:
+                fit = _beside(fit, one, torch.ones(len(poses), dtype=torch.bool), k)
+        reason = [
+            Reason.OK if k == main else Reason.CONTRADICTS if right[k] else why for k, why in enumerate(poses.reason)
+        ]
+        return poses_of(fit, fit.nll.argsort(stable=True), _only(each, main)[0], reason)
 
     def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
         """Fit poses to all pictures, where that explains all: a disk without an outline may still be there."""
@@ -304,11 +357,37 @@ class BlockTracker:
         )
 
 
-def _reason(used: bool, shot: Shot, before: Reason) -> Reason:
-    """Say why a camera does not count: its picture is none, or it was blind before."""
+def _only(usable: Tensor, camera: int) -> Tensor:
+    """Leave one camera of those usable (B, C)."""
+    only = torch.zeros_like(usable)
+    only[:, camera] = usable[:, camera]
+    return only
+
+
+def _beside(fit: Fit, other: Fit, rows: Tensor, camera: int) -> Fit:
+    """Put what a camera says by itself beside poses (B,) that it has no part in."""
+    if not bool(rows.any()):
+        return fit
+    own = {
+        "own_turn": so3.log(other.R_lab_body @ fit.R_lab_body.mT),
+        "own_move": other.position_lab_mm - fit.position_lab_mm,
+        **{name: getattr(other, name)[:, camera] for name in ("own_covariance", "deviation", "score")},
+    }
+    told = {name: getattr(fit, name).clone() for name in own}
+    for name, value in own.items():
+        told[name][rows, camera] = value[rows]
+    return replace(fit, **told)
+
+
+def _reason(used: bool, contradicts: bool, shot: Shot, before: Reason) -> Reason:
+    """Say why a camera does not count: its picture is none, it says something else, or it was blind before."""
     if used:
         return Reason.OK
-    return before if shot.usable else shot.reason
+    if contradicts:
+        return Reason.CONTRADICTS
+    if not shot.usable:
+        return shot.reason
+    return before if before in (Reason.NOT_FOUND, Reason.OUTLINE) else Reason.LOW_SCORE
 
 
 def _chosen(rows: Tensor, one: Fit, other: Fit) -> Fit:

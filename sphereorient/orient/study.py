@@ -30,6 +30,8 @@ TRIED = 6  # frames
 APART_GAIN = 1.5  # cameras that leave so many times more unexplained together than alone are followed one by one
 APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
 FAR_APART_PX = 1.5  # and by more than this, one pose for all cameras is none
+FEWEST_BOTH = 4  # frames that tell what is usual between two cameras
+LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
 FIRST_BLUR = 0.625  # px: a pixel's own width and a good lens
@@ -42,6 +44,7 @@ class Study:
     fitter: Fitter
     score_min: float  # between right and wrong poses
     right_score: float  # typical of right poses
+    usual_apart_rad: float = math.inf  # typical angle between what two cameras by themselves say of one pose
     together: bool = True  # whether the cameras see one ball in one place, as they do unless they were bumped
 
     def of(self, camera: int) -> Study:
@@ -124,7 +127,18 @@ def study(
     fitter = replace(fitter, widest_px=widest)
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
     score_min = 0.5 * (right + min(highest, right))
-    return Study(fitter=fitter, score_min=score_min, right_score=right, together=together)
+    apart_rad = _usual_apart(fit, use)
+    return Study(fitter=fitter, score_min=score_min, right_score=right, usual_apart_rad=apart_rad, together=together)
+
+
+def _usual_apart(fit: Fit, use: Tensor) -> float:
+    """Return the median angle between the turns of two cameras that see the ball together; infinite without any."""
+    angles = [
+        (fit.own_turn[:, k] - fit.own_turn[:, m]).norm(dim=-1)[use[:, k] & use[:, m]]
+        for k, m in combinations(range(use.shape[1]), 2)
+    ]
+    both = torch.cat([torch.zeros(0, dtype=torch.float64), *angles])
+    return float(both.median()) if len(both) >= FEWEST_BOTH else math.inf
 
 
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
@@ -228,7 +242,8 @@ def _best_blur(fitter: Fitter, base: PaintTable, pixels: Pixels, fit: Fit, use: 
         if k not in left:
             level = level_of(base, BLURS[k], 0.0, radius_px)
             tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 2)
-            left[k] = float((1.0 - tried.score)[use].median())
+            # Of all pictures together: their curves differ in height by much and in shape by little.
+            left[k] = float((1.0 - tried.score)[use].clamp_min(LEAST_LEFT).log().mean())
         return left[k]
 
     # Downhill from the first guess: each table of the paint costs a tenth of a second.
