@@ -14,6 +14,7 @@ from sphereorient import locate
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, load_experiment, open_movies, outside_paths
+from sphereorient.movies import flipped_picture
 from sphereorient.reel import Reel
 from sphereorient.settings import Settings
 from sphereorient.sphere import load_texture
@@ -72,6 +73,8 @@ class Recording:
         """Learn what one camera shows without the ball, from `count` frames or the experiment's own picture."""
         path = self.experiment.background_paths.get(reel.name)
         empty = None if path is None else locate.load_background(path, reel.movie.frame_shape)
+        if empty is not None:  # a frame of the movie as its file holds it
+            empty = flipped_picture(empty, self.experiment.flip.get(reel.name, "none"))
         diameter_px = self.diameter_px(reel.name, settings)
         return locate.learn_background(reel.spread(count), diameter_px, settings.locate, empty)
 

@@ -95,8 +95,9 @@ def contradiction_lines(track: Trajectory) -> list[str]:
         return []
     return [
         f"The cameras contradict each other in {contrary} of the {seen} frames in which both see the sphere: one has "
-        "moved since its calibration, or cameras.yaml is of another set-up.",
-        "Repair it: sphereorient calibrate CAMERAS.yaml --refine-with TRACK.h5 --out REPAIRED.yaml, name REPAIRED.yaml "
+        "moved since its calibration, cameras.yaml is of another set-up, or a movie has lost or doubled frames.",
+        "Find out: sphereorient check EXPERIMENT tells movies that are out of step. If they are not, repair the "
+        "cameras: sphereorient calibrate CAMERAS.yaml --refine-with TRACK.h5 --out REPAIRED.yaml, name REPAIRED.yaml "
         "in experiment.yaml, and track again. If that does not help, take new pictures of the plate.",
     ]
 

@@ -117,7 +117,8 @@ def _radial_edges(
         Where there is such a fall: unit directions (n, 2), signed distances from the circle (n,), px, steepness (n,).
     """
     step = 0.5
-    offset = np.arange(-reach[0], reach[1] + step / 2, step)
+    # Two samples to each side of a fall are needed, however small the circle.
+    offset = np.arange(-max(reach[0], 2 * step), max(reach[1], 2 * step) + step / 2, step)
     angle = np.arange(PROFILES) * (2 * np.pi / PROFILES)
     outward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     at = circle[:2] + outward[:, None] * (circle[2] + offset)[None, :, None]

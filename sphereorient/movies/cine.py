@@ -1,7 +1,8 @@
-"""Movies of Phantom cameras (.cine), mapped into memory; JPEG-compressed ones go through FFmpeg."""
+"""Movies of Phantom cameras (.cine), mapped into memory."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -12,8 +13,7 @@ from sphereorient.movies.cine_header import CineHeader, read_header, refuse
 from sphereorient.movies.cine_pixels import LAYOUTS, Layout
 from sphereorient.movies.indexed import IndexedMovie, missing_remark
 from sphereorient.movies.luma import COLOUR_REMARK
-from sphereorient.movies.movie import Grey, Movie
-from sphereorient.movies.video import VideoMovie
+from sphereorient.movies.movie import Grey
 
 FRAMES_A_MAP = 64  # see NpyMovie: keeps memory flat
 JPEG, FILTER_ARRAY = 1, 2
@@ -21,10 +21,14 @@ PREFIX = 8  # bytes before the pixels at least: size of the annotation, size of 
 
 
 class CineMovie(IndexedMovie):
-    """A .cine file of uncompressed or packed images."""
+    """A .cine file of uncompressed or packed images.
 
-    def __init__(self, path: Path, header: CineHeader) -> None:
-        self._header = header
+    Raises:
+        MovieError: not a .cine file, damaged, compressed, or of raw colours of a filter array.
+    """
+
+    def __init__(self, path: Path) -> None:
+        header = self._header = read_header(path)
         self._layout = _layout(path, header)
         self._offsets = header.offsets
         self._top_down = header.setup.flip_vertical != self._layout.packed
@@ -35,8 +39,10 @@ class CineMovie(IndexedMovie):
         if count < 1:
             raise refuse(path, "at least one whole image", "none", "copy it from the camera again")
         times_s, remarks = cine_times(header, count)
+        bits = header.setup.real_bits
         super().__init__(
             path,
+            f".cine, {self._layout.name}" + (f" ({bits} of them used)" if 0 < bits < self._layout.bits else ""),
             count,
             (header.height, header.width),
             np.dtype(self._layout.dtype),
@@ -45,13 +51,14 @@ class CineMovie(IndexedMovie):
         )
 
     def _first_image(self, path: Path) -> tuple[int, int]:
-        """Return the bytes of an image and those before its pixels, by the first image that tells them."""
+        """Return the bytes of an image and those before its pixels, as most of the first images have them."""
         content = np.memmap(path, np.uint8, "r")
-        for offset in self._offsets[:FRAMES_A_MAP]:
-            prefix, size = _prefix_and_size(content, int(offset))
-            if size > 0:
-                return size, prefix
-        raise refuse(path, "at least one whole image", "none", "copy it from the camera again")
+        found = Counter(_prefix_and_size(content, int(offset)) for offset in self._offsets[:FRAMES_A_MAP])
+        found.pop((0, 0), None)
+        if not found:
+            raise refuse(path, "at least one whole image", "none", "copy it from the camera again")
+        (prefix, size), _ = found.most_common(1)[0]
+        return size, prefix
 
     def _check_stride(self, path: Path) -> int:
         """Return the bytes of a row, by the size of an image: rows may be padded."""
@@ -95,30 +102,6 @@ class CineMovie(IndexedMovie):
         return np.array(upright, self.dtype, order="C")  # a copy: the memory is the file's
 
 
-class CineVideoMovie(VideoMovie):
-    """A .cine file of JPEG-compressed images: FFmpeg's pictures, the header's times."""
-
-    def __init__(self, path: Path, header: CineHeader) -> None:
-        super().__init__(path)
-        self.times_s, self._header_remarks = cine_times(header, len(self))
-        self._header_remarks = (*missing_remark(header.told, len(self)), *self._header_remarks)
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """What a user should know: see Movie."""
-        return (*super().remarks, *self._header_remarks)
-
-
-def open_cine(path: Path) -> Movie:
-    """Open a .cine file.
-
-    Raises:
-        MovieError: not a .cine file, damaged, or of pixels that are not grey: raw colours of a filter array.
-    """
-    header = read_header(path)
-    return CineVideoMovie(path, header) if header.compression == JPEG else CineMovie(path, header)
-
-
 def cine_times(header: CineHeader, count: int) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
     """Return the time of each frame from the trigger, (count,), s, and what is to be said about it.
 
@@ -141,6 +124,9 @@ def _layout(path: Path, header: CineHeader) -> Layout:
     if header.compression == FILTER_ARRAY:
         do = "export it from the camera's software as interpolated colour or grey"
         raise refuse(path, "grey or colour pixels", "raw colours of a filter array, one a pixel", do)
+    if header.compression == JPEG:
+        do = "export it uncompressed from the camera's software"
+        raise refuse(path, "uncompressed or packed images", "JPEG in .cine, which nothing here decodes", do)
     layout = LAYOUTS.get((header.packing, header.bits))
     if layout is None or header.compression != 0:
         got = f"{header.bits} bit, compression {header.compression}, packing {header.packing}"

@@ -17,13 +17,18 @@ from sphereorient.movies.readable import readable
 STEPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}
 
 
+def flipped_picture(picture: NDArray[Any], how: str) -> NDArray[Any]:
+    """Turn a picture (..., H, W) as `flipped` turns a movie's."""
+    rows, columns = STEPS[how]
+    return np.ascontiguousarray(picture[..., ::rows, ::columns])
+
+
 class FlippedMovie:
     """Another movie with its rows, its columns or both turned round; numbers, times and length are the other's."""
 
     def __init__(self, movie: Movie, how: str) -> None:
         self._movie = movie
         self._how = how
-        self._rows, self._columns = STEPS[how]
 
     @property
     def path(self) -> Path:
@@ -39,6 +44,11 @@ class FlippedMovie:
     def dtype(self) -> np.dtype[Any]:
         """uint8 or uint16."""
         return self._movie.dtype
+
+    @property
+    def format(self) -> str:
+        """How the file holds the pictures, in words."""
+        return self._movie.format
 
     @property
     def times_s(self) -> NDArray[np.float64] | None:
@@ -68,7 +78,7 @@ class FlippedMovie:
         return self._turned(self._movie.sample(indices))
 
     def _turned(self, pictures: Grey) -> Grey:
-        return np.ascontiguousarray(pictures[..., :: self._rows, :: self._columns])
+        return flipped_picture(pictures, self._how)
 
     def close(self) -> None:
         """Let go of the file."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sphereorient.errors import MovieError, refusal
+from sphereorient.movies.luma import luma
 from sphereorient.movies.movie import Grey
 
 if TYPE_CHECKING:
@@ -44,8 +45,17 @@ def grey_values(frame: av.VideoFrame) -> Grey:
     pixel_format = frame.format
     if _has_grey_plane(pixel_format):
         return _plane_0(frame)
-    wanted = "gray" if grey_dtype(pixel_format).itemsize == 1 else "gray16le"
-    return _plane_0(frame.reformat(format=wanted))
+    return _colour(frame, grey_dtype(pixel_format), pixel_format.components[0].bits)
+
+
+def _colour(frame: av.VideoFrame, dtype: np.dtype[Any], bits: int) -> Grey:
+    # FFmpeg only puts the channels side by side here; its own grey would follow another formula than our formats'.
+    interleaved = frame.reformat(format="rgb24" if dtype.itemsize == 1 else "rgb48le")
+    values = _plane_0(interleaved, samples=3).reshape(frame.height, frame.width, 3)
+    if dtype.itemsize == 2:
+        values = values >> (16 - bits)  # 10 and 12 bit come scaled to 16, by their own leading bits
+    red, green, blue = np.moveaxis(values, 2, 0)
+    return luma(red, green, blue)
 
 
 def _is_colour(pixel_format: av.VideoFormat) -> bool:
@@ -59,8 +69,9 @@ def _has_grey_plane(pixel_format: av.VideoFormat) -> bool:
     return alone and pixel_format.name.startswith(PLANE_0_IS_GREY) and "f32" not in pixel_format.name
 
 
-def _plane_0(frame: av.VideoFrame) -> Grey:
-    plane, height, width = frame.planes[0], frame.height, frame.width
+def _plane_0(frame: av.VideoFrame, samples: int = 1) -> Grey:
+    """Return the values of the first plane, (H, W), or (H, samples W) where pixels hold several."""
+    plane, height, width = frame.planes[0], frame.height, frame.width * samples
     dtype = grey_dtype(frame.format)
     stored = dtype.newbyteorder(">" if frame.format.is_big_endian else "<")
     # Rows are padded to line_size, which is negative where the picture is stored bottom-up; buffer_ptr is then the

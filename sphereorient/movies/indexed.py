@@ -20,6 +20,7 @@ class IndexedMovie(HoldsNothing, ABC):
     def __init__(
         self,
         path: Path,
+        form: str,
         count: int,
         frame_shape: tuple[int, int],
         dtype: np.dtype[Any],
@@ -27,6 +28,7 @@ class IndexedMovie(HoldsNothing, ABC):
         remarks: Sequence[str] = (),
     ) -> None:
         self.path = path
+        self.format = form
         self.frame_shape = frame_shape
         self.dtype = dtype
         self.times_s = times_s

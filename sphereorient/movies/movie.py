@@ -31,6 +31,10 @@ class Movie(Protocol):
         """uint8, or uint16 where the file holds more than 8 bits; values are those of the file, not rescaled."""
 
     @property
+    def format(self) -> str:
+        """How the file holds the pictures, in words: container or kind of file, codec, bits."""
+
+    @property
     def times_s(self) -> NDArray[np.float64] | None:
         """Time of each frame by the file's own stamps, (N,), s; None where it has none or rounds them (MKV, AVI)."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from sphereorient.movies.movie import Grey
 # Frames read through one map of the file. Pages that were read stay in the process while it holds the map, and would
 # add up to the whole movie: a new map for every few frames keeps memory flat.
 FRAMES_A_MAP = 64
+# What numpy raises on a header that is none: it reads it as a literal of Python, and old ones as its tokens.
+DAMAGE = (OSError, ValueError, EOFError, TypeError, LookupError, SyntaxError, TokenError, RecursionError, MemoryError)
 ZIP = b"PK"  # numpy's archives of several arrays, whatever their suffix
 
 
@@ -35,6 +38,7 @@ class NpyMovie(IndexedMovie):
             raise MovieError(refusal(str(path), expected="at least one whole frame", got="a cut off file", do=do))
         super().__init__(
             path,
+            "numpy array",
             count,
             (shape[1], shape[2]),
             self._stored.newbyteorder("="),
@@ -56,10 +60,11 @@ def _header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
             version = np.lib.format.read_magic(file)
             reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             shape, fortran_order, dtype = reader(file)
-        except (OSError, ValueError, EOFError) as error:
+        except DAMAGE as error:
             file.seek(0)
             archive = file.read(2) == ZIP
-            got = "an archive of arrays" if archive else f"'{str(error).splitlines()[0]}'"
+            text = f"'{str(error)[:200].splitlines()[0]}'" if str(error) else type(error).__name__
+            got = "an archive of arrays" if archive else text
             expected = "one .npy array" if archive else "a .npy array without objects"
             raise MovieError(refusal(str(path), expected=expected, got=got, do=do)) from error
         if fortran_order and len(shape) > 1:

@@ -6,8 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sphereorient.errors import MovieError, refusal
+from sphereorient.movies.cine import CineMovie
+from sphereorient.movies.hdf5 import Hdf5Movie, split_path
 from sphereorient.movies.movie import Movie
 from sphereorient.movies.npy import NpyMovie
+from sphereorient.movies.picture import PICTURES
+from sphereorient.movies.sequence import SequenceMovie, is_pattern, sequence_files
+from sphereorient.movies.tiff import TiffMovie
 from sphereorient.movies.video import VideoMovie
 
 READERS: dict[str, Callable[[Path], Movie]] = {
@@ -16,6 +21,11 @@ READERS: dict[str, Callable[[Path], Movie]] = {
     ".mp4": VideoMovie,
     ".mov": VideoMovie,
     ".npy": NpyMovie,
+    ".cine": CineMovie,
+    ".tif": TiffMovie,
+    ".tiff": TiffMovie,
+    ".h5": Hdf5Movie,
+    ".hdf5": Hdf5Movie,
 }
 
 
@@ -23,26 +33,44 @@ def open_movie(path: Path | str) -> Movie:
     """Open a movie by the suffix of its file.
 
     Args:
-        path: .mkv, .avi, .mp4, .mov (any codec that FFmpeg decodes) or .npy ((N, H, W), uint8 or uint16).
+        path: .mkv, .avi, .mp4, .mov (any codec that FFmpeg decodes), .cine, .tif, .tiff (a stack), .npy ((N, H, W),
+            uint8 or uint16), .h5, .hdf5 (its only such data set, or `file.h5::group/dataset`); or single pictures: a
+            folder, or a pattern with * or %05d in its last part.
 
     Returns:
         The movie; use it in a `with` block.
 
     Raises:
-        MovieError: missing, a folder, of another suffix, unreadable, or empty.
+        MovieError: missing, of another suffix, unreadable, or empty.
     """
     path = Path(path)
-    if path.is_dir():
-        raise MovieError(refusal(str(path), expected="a movie file", got="a folder", do="name the file in it"))
-    if not path.is_file():
+    file = split_path(path)[0]
+    if path.is_dir() or (is_pattern(path) and not file.is_file()):
+        return SequenceMovie(path)
+    if not file.is_file():
         raise MovieError(refusal(str(path), expected="a movie file", got="no such file", do="correct the path"))
-    reader = READERS.get(path.suffix.lower())
+    suffix = file.suffix.lower()
+    if suffix in PICTURES and suffix not in READERS:
+        do = f"name all of them: their folder, or a pattern such as '*{file.suffix}'"
+        raise MovieError(refusal(str(path), expected="a movie", got="one picture", do=do))
+    reader = READERS.get(suffix)
     if reader is None:
         got, do = f"'{path.suffix}'", "convert it, lossless: ffmpeg -i MOVIE -c:v ffv1 -pix_fmt gray MOVIE.mkv"
-        raise MovieError(refusal(str(path), expected=f"a movie of type {' '.join(READERS)}", got=got, do=do))
+        expected = f"a movie of type {' '.join(READERS)} or a folder of pictures"
+        raise MovieError(refusal(str(path), expected=expected, got=got, do=do))
     return reader(path)
 
 
 def movie_files(path: Path | str) -> list[Path]:
-    """Return the files that a movie is made of, for fingerprints: one, or the pictures of a sequence."""
-    return [Path(path)]
+    """Return the files that a movie is made of: one, or the pictures of a sequence.
+
+    Args:
+        path: as `open_movie` takes it.
+
+    Raises:
+        MovieError: a folder or a pattern without pictures.
+    """
+    path = Path(path)
+    file = split_path(path)[0]
+    many = path.is_dir() or (is_pattern(path) and not file.is_file())
+    return sequence_files(path) if many else [file]

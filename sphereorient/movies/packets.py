@@ -5,8 +5,14 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from functools import reduce
 from itertools import pairwise
+from math import gcd
 from typing import NamedTuple
+
+MOST_MISSING = 10  # times the packets that are there: beyond, the stamps are not those of an even movie
+OFF_GRID = 0.45  # of the time between frames: stamps further off are not those of an even movie
 
 
 class Packet(NamedTuple):
@@ -22,7 +28,7 @@ class Packet(NamedTuple):
 class PacketIndex:
     """What demuxing alone tells: how many frames there are, their numbers, and where decoding may start."""
 
-    count: int
+    count: int  # frames, those among them that have no packet
     by_place: bool  # whether `number_of` takes the packets' places in the file, else their presentation stamps
     number_of: dict[int, int]  # stamp or place -> frame number; empty where neither tells
     keys: tuple[tuple[int, int], ...]  # (frame number, stamp to seek to) of the key frames, increasing
@@ -32,7 +38,12 @@ class PacketIndex:
     @property
     def each_alone(self) -> bool:
         """Whether every frame is a key frame, predicted from no other."""
-        return len(self.groups) == self.count
+        return len(self.groups) == len(self.order)
+
+    @property
+    def missing(self) -> list[int]:
+        """Frames that the stamps leave out."""
+        return sorted(set(range(self.count)) - set(self.order)) if len(self.order) not in (0, self.count) else []
 
     def number(self, pts: int | None, pos: int | None) -> int | None:
         """Return the frame number of a packet, None where the table does not tell."""
@@ -61,41 +72,54 @@ class PacketIndex:
         """
         if not self.order:
             return range(number, self.count)
-        if self.each_alone:
+        if self.each_alone or number not in self.order:
             return (number,)
-        place = self.order.index(number)
-        ends = [*self.groups[bisect_right(self.groups, place) :], self.count, self.count][:2]
+        place, end = self.order.index(number), len(self.order)
+        ends = [*self.groups[bisect_right(self.groups, place) :], end, end][:2]
         following = self.order[ends[0] : ends[1]]
         return (*self.order[place : ends[0]], *(leading for leading in following[1:] if leading < following[0]))
 
 
-def index_packets(packets: list[Packet], guessed: bool) -> PacketIndex:
+def index_packets(packets: list[Packet], guessed: bool, step: Fraction | None = None) -> PacketIndex:
     """Number the packets of a movie by their time stamps, or by their place in the file where stamps do not tell.
 
     Args:
         packets: in the order of the file.
         guessed: whether the presentation stamps are not the file's own.
+        step: time between frames by the header, in units of the stamps; where all stamps keep to it, a gap between
+            them is a frame that was lost, and those after it keep their numbers.
     """
     stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
     if not guessed and len(stamps) == len(packets):
-        return _by_stamps(packets, stamps)
+        return _by_stamps(packets, stamps, step)
     places = [packet.pos for packet in packets if packet.pos is not None and packet.pos >= 0]
     if all(packet.key for packet in packets) and len(set(places)) == len(packets):
         return _by_places(packets, places)
     return PacketIndex(count=len(packets), by_place=False, number_of={}, keys=((0, 0),))
 
 
-def _by_stamps(packets: list[Packet], stamps: list[int]) -> PacketIndex:
-    number_of = {stamp: number for number, stamp in enumerate(stamps)}
+def _by_stamps(packets: list[Packet], stamps: list[int], step: Fraction | None) -> PacketIndex:
+    numbers = (_on_grid(stamps, step) if step and stamps else None) or range(len(stamps))
+    number_of = dict(zip(stamps, numbers, strict=True))
     order = tuple(number_of[packet.pts] for packet in packets if packet.pts is not None)
     # Seeking to the decoding stamp lands on the key frame or before it, whichever of the two a container searches.
     keys = sorted(
-        (number, stamps[number] if packet.dts is None else packet.dts)
+        (number, packet.pts if packet.dts is None else packet.dts)
         for number, packet in zip(order, packets, strict=True)
-        if packet.key
+        if packet.key and packet.pts is not None
     )
     groups = tuple(place for place, packet in enumerate(packets) if packet.key)
-    return PacketIndex(len(packets), False, number_of, tuple(keys) or ((0, 0),), order, groups)
+    return PacketIndex(max(order, default=-1) + 1, False, number_of, tuple(keys) or ((0, 0),), order, groups)
+
+
+def _on_grid(stamps: list[int], step: Fraction) -> list[int] | None:
+    """Return the frame numbers of increasing stamps in steps of `step`, None where they do not keep to it."""
+    numbers = [round((stamp - stamps[0]) / step) for stamp in stamps]
+    off = max(abs(stamp - stamps[0] - number * step) for stamp, number in zip(stamps, numbers, strict=True))
+    if off > min(1, OFF_GRID * step) or numbers[-1] > MOST_MISSING * len(stamps) or len(set(numbers)) < len(stamps):
+        return None
+    every = reduce(gcd, numbers, 0) or 1  # headers that count fields tell of two a frame
+    return [number // every for number in numbers]
 
 
 def _by_places(packets: list[Packet], places: list[int]) -> PacketIndex:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import reduce
+from itertools import pairwise
 from pathlib import Path
 
 from sphereorient.errors import MovieError, refusal
@@ -18,7 +20,7 @@ WILD = re.compile(r"(\*|%0?\d*d)")
 DIGITS = re.compile(r"(\d+)")
 MOST_MISSING = 100  # times the pictures that are there: beyond, the numbers are no frame numbers
 SHOWN = 5  # gaps named in a remark
-TRIED = 64  # pictures looked at for the size, where the first ones are damaged
+ENOUGH, TRIED = 5, 64  # pictures that tell the size; those looked at where the first ones are damaged
 
 
 class SequenceMovie(IndexedMovie):
@@ -33,13 +35,14 @@ class SequenceMovie(IndexedMovie):
             got, do = f"{len(numbers)} with numbers from {numbers[0]} to {numbers[-1]}", "number them by frame"
             raise MovieError(refusal(str(path), expected="pictures numbered by frame", got=got, do=do))
         self._files = {(number - numbers[0]) // step: numbered[number] for number in numbers}
-        picture, colour = _first_picture(path, list(self._files.values()))
+        picture, colour = _usual_picture(path, list(self._files.values()))
         remarks = list(_number_remarks(numbers, step, count))
         if colour:
             remarks.append(COLOUR_REMARK)
         if self._files[0].suffix.lower() in LOSSY:
             remarks.append("JPEG loses fine detail of the pictures")
-        super().__init__(path, count, (picture.shape[0], picture.shape[1]), picture.dtype, remarks=remarks)
+        form = f"{len(numbers)} pictures, {self._files[0].suffix.lower()[1:]}"
+        super().__init__(path, form, count, (picture.shape[0], picture.shape[1]), picture.dtype, remarks=remarks)
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
         for number in numbers:
@@ -88,10 +91,12 @@ def _pieces(pattern: str) -> list[str]:
 
 def _numbered(path: Path, files: list[Path]) -> dict[int, Path]:
     """Return number -> file: the number is the one part of the names that differs from file to file."""
-    names = [DIGITS.split(file.stem) + [file.suffix] for file in files]
+    names = [DIGITS.split(file.stem) for file in files]
+    words = [(*name[0::2], file.suffix) for name, file in zip(names, files, strict=True)]
     do = "choose one movie's pictures by a pattern, such as cam1_*.tif"
-    if len({tuple(name[0::2]) for name in names}) > 1:
-        got = f"{files[0].name} beside {next(f.name for f, n in zip(files, names, strict=True) if n[0::2] != names[0][0::2])}"
+    other = next((file for file, word in zip(files, words, strict=True) if word != words[0]), None)
+    if other is not None:
+        got = f"{files[0].name} beside {other.name}"
         raise MovieError(refusal(str(path), expected="names alike but for a number", got=got, do=do))
     numbers = [name[1::2] for name in names]
     varying = [place for place, column in enumerate(zip(*numbers, strict=True)) if len(set(map(int, column))) > 1]
@@ -106,20 +111,28 @@ def _numbered(path: Path, files: list[Path]) -> dict[int, Path]:
     return numbered
 
 
-def _first_picture(path: Path, files: list[Path]) -> tuple[Grey, bool]:
-    """Return the first picture that can be decoded, and whether it is in colour."""
+def _usual_picture(path: Path, files: list[Path]) -> tuple[Grey, bool]:
+    """Return a picture of the size and type that most of the first ones have, and whether it is in colour."""
+    found: list[tuple[Grey, bool]] = []
+    last: MovieError | None = None
     for file in files[:TRIED]:
         try:
-            return read_picture(file)
+            found.append(read_picture(file))
         except MovieError as error:
             last = error
-    raise MovieError(refusal(str(path), expected="pictures", got="none that can be decoded", do="export again")) from last
+        if len(found) == ENOUGH:
+            break
+    if not found:
+        got, do = "none that can be decoded", "export them again"
+        raise MovieError(refusal(str(path), expected="pictures", got=got, do=do)) from last
+    (shape, dtype), _ = Counter((picture.shape, picture.dtype) for picture, _ in found).most_common(1)[0]
+    return next(one for one in found if (one[0].shape, one[0].dtype) == (shape, dtype))
 
 
 def _number_remarks(numbers: list[int], step: int, count: int) -> Iterator[str]:
     if step > 1:
         yield f"numbered in steps of {step}: taken as consecutive frames"
-    gaps = [(a + step, b - step) for a, b in zip(numbers, numbers[1:], strict=False) if b > a + step]
+    gaps = [(a + step, b - step) for a, b in pairwise(numbers) if b > a + step]
     if gaps:
         named = [f"{a}" if a == b else f"{a} .. {b}" for a, b in gaps[:SHOWN]]
         more = [f"{len(gaps) - SHOWN} more gaps"] if len(gaps) > SHOWN else []

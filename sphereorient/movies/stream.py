@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
 
 from sphereorient.errors import MovieError, refusal
+from sphereorient.movies.indexed import missing_remark
 from sphereorient.movies.luma import COLOUR_REMARK
 
+LOSSLESS = "lossless"
+SHOWN = 8  # missing frames named in a remark
+SLACK = 1.5  # frames by which a rounded duration may be too long
 THREADS = 2  # slices of one frame in parallel: 1.8 times faster for FFV1 on 2 cores, and errors keep their frame
 
 
@@ -39,20 +44,32 @@ def opened(path: Path) -> av.container.InputContainer:
     return container
 
 
-def stream_remarks(container: av.container.InputContainer, pixel_format: str, count: int) -> tuple[str, ...]:
+def frame_step(container: av.container.InputContainer) -> Fraction | None:
+    """Return the time between frames by the header, in units of the stamps, None where it tells of none."""
+    stream = container.streams.video[0]
+    if not stream.average_rate or not stream.time_base:
+        return None
+    return 1 / (stream.average_rate * stream.time_base)
+
+
+def stream_remarks(
+    container: av.container.InputContainer, pixel_format: str, count: int, missing: list[int]
+) -> tuple[str, ...]:
     """Return what a user should know of a movie.
 
     Args:
         container: the movie.
         pixel_format: name of that of its frames.
-        count: of its frames that are there.
+        count: of its frames, up to the last one that is there.
+        missing: numbers of frames that its stamps leave out.
     """
     stream = container.streams.video[0]
-    remarks = []
-    if stream.frames > count:
-        remarks.append(f"truncated: its header tells of {stream.frames} frames, {count} are there")
-    if loss(stream.codec_context):
-        remarks.append(f"codec {stream.codec_context.name} {loss(stream.codec_context)}")
+    remarks = list(missing_remark(_told(container, count), count))
+    if missing:
+        some = ", ".join(map(str, missing[:SHOWN])) + (" ..." if len(missing) > SHOWN else "")
+        remarks.append(f"its time stamps leave out frames, which count as unreadable ({len(missing)}): {some}")
+    if loss(stream.codec_context) != LOSSLESS:
+        remarks.append(f"codec {stream.codec_context.name} ({loss(stream.codec_context)}): fine detail may be lost")
     if av.VideoFormat(pixel_format).is_rgb:
         remarks.append(COLOUR_REMARK)
     elif not pixel_format.startswith("gray"):
@@ -61,11 +78,24 @@ def stream_remarks(container: av.container.InputContainer, pixel_format: str, co
 
 
 def loss(context: av.CodecContext) -> str:
-    """Return in words whether a codec loses grey values, empty where it does not."""
+    """Return in words whether a codec loses grey values."""
     codec = context.codec
     if not codec.lossy:
-        return ""
-    return "may lose fine detail of the pictures" if codec.lossless else "loses fine detail of the pictures"
+        return LOSSLESS
+    return "may be lossy" if codec.lossless else "lossy"
+
+
+def _told(container: av.container.InputContainer, count: int) -> int:
+    """Return how many frames the header tells of, 0 where it does not, or of no more than there are."""
+    stream = container.streams.video[0]
+    if stream.frames:
+        return int(stream.frames)
+    # Matroska tells no number, but the duration of what was written.
+    matroska = "matroska" in container.format.name and len(container.streams) == 1
+    if not (matroska and container.duration and stream.average_rate):
+        return 0
+    whole = container.duration * stream.average_rate / av.time_base
+    return round(whole) if count < whole - SLACK else 0
 
 
 def words(error: Exception) -> str:

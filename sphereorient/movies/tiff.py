@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import lzma
 import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,13 +18,16 @@ from sphereorient.errors import MovieError, refusal
 from sphereorient.movies.indexed import IndexedMovie, missing_remark
 from sphereorient.movies.luma import COLOUR_REMARK, luma
 from sphereorient.movies.movie import Grey
+from sphereorient.movies.tiff_lzw import LZW, decode_lzw
 
 if TYPE_CHECKING:
-    from tifffile import TiffFile, TiffPage
+    from tifffile import TiffFile
 
 # What tifffile raises on files that are no TIFF or damaged ones, as it runs into what is not as it should be.
-DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, OSError, EOFError, RuntimeError)
-DAMAGE += (MemoryError, AssertionError, struct.error)
+DAMAGE = (
+    *(ValueError, TypeError, LookupError, ArithmeticError, AttributeError, OSError, EOFError, RuntimeError),
+    *(MemoryError, AssertionError, struct.error, zlib.error, lzma.LZMAError),
+)
 WHITE_IS_ZERO, BLACK_IS_ZERO, RGB = 0, 1, 2  # PhotometricInterpretation
 UNCOMPRESSED = 1
 ORIENTATION = 274  # tag: where row 0 and column 0 are
@@ -39,9 +44,11 @@ class TiffMovie(IndexedMovie):
     def __init__(self, path: Path) -> None:
         with _opened(path) as file:
             page = _first_page(path, file)
+            form = f"TIFF, {np.dtype(page.dtype).itemsize * 8} bit, {_compression(page)}"
             pages, told = len(file.pages), _told(path, file)
             self._kind = (page.shape, page.dtype)
             self.colour = page.photometric == RGB
+            self._planar = page.axes == "SYX"
             self._white_is_zero = page.photometric == WHITE_IS_ZERO
             self._steps = _steps(path, page)
             self._stored = np.dtype(page.dtype).newbyteorder(file.byteorder)
@@ -50,10 +57,11 @@ class TiffMovie(IndexedMovie):
             count = min(told, whole) if self._offset is not None else pages
         remarks = missing_remark(told, count) + ((COLOUR_REMARK,) if self.colour else ())
         remarks += ("stored with white as 0: turned round",) if self._white_is_zero else ()
-        super().__init__(path, count, (page.imagelength, page.imagewidth), np.dtype(page.dtype), remarks=remarks)
+        shape = (int(page.imagelength), int(page.imagewidth))
+        super().__init__(path, form, count, shape, np.dtype(page.dtype), remarks=remarks)
 
     @staticmethod
-    def _whole_values(path: Path, page: TiffPage) -> int:
+    def _whole_values(path: Path, page: Any) -> int:
         """Return how many pictures fit between the first one's values and the end of the file.
 
         ImageJ's stacks above 4 GB have one page only, and a stack that was cut off has lost its table of pages: in both
@@ -80,11 +88,11 @@ class TiffMovie(IndexedMovie):
 
     def _page(self, file: TiffFile, number: int) -> Grey:
         try:
-            page = file.pages[number]
+            page: Any = file.pages[number]
             if (page.shape, page.dtype) != self._kind:
                 raise self._damage(number, f"a page {page.shape} of {page.dtype}")
             _check_claim(page)
-            return self._grey(page.asarray())
+            return self._grey(decode_lzw(page) if page.compression == LZW else page.asarray())
         except DAMAGE as error:
             raise self._damage(number, words(error)) from error
 
@@ -92,7 +100,7 @@ class TiffMovie(IndexedMovie):
         """Return grey values as they are to be seen: of the machine's byte order, black as 0, row 0 on top."""
         values = values.astype(self.dtype)
         if values.ndim == 3:
-            channels = values if len(values) in (2, 3, 4) and values.shape[2] > 4 else np.moveaxis(values, 2, 0)
+            channels = values if self._planar else np.moveaxis(values, 2, 0)
             values = luma(*channels[:3]) if self.colour else channels[0]
         if self._white_is_zero:
             values = np.iinfo(self.dtype).max - values
@@ -118,10 +126,10 @@ def _opened(path: Path) -> Iterator[TiffFile]:
         yield file
 
 
-def _first_page(path: Path, file: TiffFile) -> TiffPage:
+def _first_page(path: Path, file: TiffFile) -> Any:
     """Return the first page, refused where its pixels are not grey or colour of 8 or 16 bit."""
     try:
-        page = file.pages[0]
+        page: Any = file.pages[0]
         kind = f"{np.dtype(page.dtype)}, photometric {page.photometric}, {page.shape}"
         known = page.photometric in (WHITE_IS_ZERO, BLACK_IS_ZERO, RGB) and page.dtype in (np.uint8, np.uint16)
         _check_claim(page)
@@ -162,10 +170,15 @@ def _told(path: Path, file: TiffFile) -> int:
     return told
 
 
-def _steps(path: Path, page: TiffPage) -> tuple[int, int]:
+def _compression(page: Any) -> str:
+    return "uncompressed" if page.compression == UNCOMPRESSED else str(getattr(page.compression, "name", "")).lower()
+
+
+def _steps(path: Path, page: Any) -> tuple[int, int]:
     tag = page.tags.get(ORIENTATION)
-    steps = STEPS.get(1 if tag is None else tag.value)
+    orientation = 1 if tag is None else tag.value
+    steps = STEPS.get(orientation)
     if steps is None:
-        got, do = f"orientation {tag.value}", "export it upright"
+        got, do = f"orientation {orientation}", "export it upright"
         raise MovieError(refusal(str(path), expected="pages that are not turned by 90 degrees", got=got, do=do))
     return steps

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
+from sphereorient.movies.ffv1_sums import sums_are_right
 from sphereorient.movies.grey import check_format, grey_dtype, grey_values
 from sphereorient.movies.movie import Grey, HoldsNothing, check_indices, check_range
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
-from sphereorient.movies.stream import opened, stream_remarks, words
+from sphereorient.movies.stream import frame_step, loss, opened, stream_remarks, words
 
 NOTHING = "none from the decoder"
+PACKETS_TRIED = 8  # of FFV1: one whose check sums are right tells that all should have them
 
 
 class VideoMovie(HoldsNothing):
@@ -33,6 +36,8 @@ class VideoMovie(HoldsNothing):
                 raise self._refusal("a movie with frames", "no frame", "record or export it again")
             check_format(str(path), frame.format)
             self._format = frame.format.name
+            codec = container.streams.video[0].codec_context
+            self.format = f"{path.suffix[1:].lower()}, codec {codec.name} ({loss(codec)}), pixels {frame.format.name}"
             self.frame_shape: tuple[int, int] = (frame.height, frame.width)
             self.dtype: np.dtype[Any] = grey_dtype(frame.format)
 
@@ -44,7 +49,7 @@ class VideoMovie(HoldsNothing):
     def remarks(self) -> tuple[str, ...]:
         """What a user should know: see Movie."""
         with opened(self.path) as container:
-            return (*self._read_error, *stream_remarks(container, self._format, len(self)))
+            return (*self._read_error, *stream_remarks(container, self._format, len(self), self._index.missing))
 
     def frames(self, first: int = 0, last: int | None = None) -> Iterator[Grey]:
         """Yield frames first .. last - 1 in order, (H, W) each."""
@@ -84,7 +89,16 @@ class VideoMovie(HoldsNothing):
                 broken = words(error)
             # AVI stores no presentation stamps: where frames are reordered, FFmpeg's guesses are wrong after a seek.
             guessed = container.format.name == "avi" and any(packet.pts != packet.dts for packet in packets)
-        return index_packets(packets, guessed), broken
+            step = frame_step(container)
+        return index_packets(packets, guessed, step), broken
+
+    @cached_property
+    def _summed(self) -> bool:
+        """Whether the packets carry check sums that can be held against them."""
+        with opened(self.path) as container:
+            if container.streams.video[0].codec_context.name != "ffv1":
+                return False
+            return any(sums_are_right(bytes(packet)) for packet in islice(_demuxed(container), PACKETS_TRIED))
 
     @property
     def _index(self) -> PacketIndex:
@@ -170,6 +184,9 @@ class VideoMovie(HoldsNothing):
             number = self._index.number(packet.pts, packet.pos)
             if number is not None:
                 packet.pts = number  # the decoder hands it on to the frame, whatever the order
+            if packet.size and self._summed and not sums_are_right(bytes(packet)):
+                yield (following if number is None else number), "one whose check sum is wrong"
+                continue
             try:
                 frames = packet.decode()
             except av.FFmpegError as error:

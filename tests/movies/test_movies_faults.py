@@ -20,17 +20,18 @@ def refused(path: Path, message: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+def test_a_missing_file_and_a_folder_without_pictures_are_refused(tmp_path):
     refused(tmp_path / "none.mkv", "expected a movie file, got no such file")
-    refused(tmp_path, "got a folder")
+    refused(tmp_path, "expected pictures .*, got none")
 
 
 def test_an_unknown_suffix_is_refused_with_the_known_ones(tmp_path):
-    (tmp_path / "movie.cine").write_bytes(b"CI")
-    refused(tmp_path / "movie.cine", r"expected a movie of type \.mkv \.avi \.mp4 \.mov \.npy, got '\.cine'")
+    (tmp_path / "movie.wmv").write_bytes(b"")
+    known = r"\.mkv \.avi \.mp4 \.mov \.npy \.cine \.tif \.tiff \.h5 \.hdf5 or a folder of pictures"
+    refused(tmp_path / "movie.wmv", f"expected a movie of type {known}, got '.wmv'")
 
 
-@pytest.mark.parametrize("suffix", [".mkv", ".avi", ".mp4", ".mov", ".npy"])
+@pytest.mark.parametrize("suffix", [".mkv", ".avi", ".mp4", ".mov", ".npy", ".cine", ".tif", ".h5"])
 @pytest.mark.parametrize("content", [b"", b"no movie at all" * 100], ids=["empty", "text"])
 def test_files_that_are_no_movies_are_refused(tmp_path, suffix, content):
     path = tmp_path / f"movie{suffix}"

@@ -1,0 +1,72 @@
+"""`sphereorient check`."""
+
+from __future__ import annotations
+
+import shutil
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sphereorient.cli.app import ExperimentPath, app, check_writable, progress_bar, put_aside
+
+if TYPE_CHECKING:
+    from sphereorient.preflight import Finding
+
+EXIT_FAULT = 1  # a run would fail, or its numbers would be wrong
+COLOURS = {"ok": typer.colors.GREEN, "warning": typer.colors.YELLOW, "fault": typer.colors.RED}
+MARK, TITLE = 9, 25  # columns of the list
+
+
+@app.command()
+def check(
+    experiment: ExperimentPath,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Figure to write (.png, .pdf); EXPERIMENT.check.png here without it."),
+    ] = None,
+    settings: Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set locate.diameter_px=90.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and only warnings and faults.")] = False,
+) -> None:
+    """Check an experiment in seconds before it is tracked: what was found, and what to do. Exit code 1: some fault."""
+    picture = Path(f"{experiment.stem}.check.png") if out is None else out
+    check_writable(picture)
+    from sphereorient.preflight import Severity, preflight
+    from sphereorient.report import preflight_figure
+    from sphereorient.settings import load_settings
+
+    chosen = load_settings(settings, set_ or [])
+    with progress_bar(quiet) as advance:
+        result = preflight(experiment, chosen, advance)
+        advance("figure", 0, 1)
+        with put_aside(picture) as partial:
+            preflight_figure(result, partial)
+        advance("figure", 1, 1)
+    _print(result.findings, quiet)
+    if not quiet:
+        counts = [sum(one.severity is severity for one in result.findings) for severity in Severity]
+        typer.echo(f"faults: {counts[2]}, warnings: {counts[1]}, without complaint: {counts[0]}. Wrote {picture}")
+    if result.severity is Severity.FAULT:
+        raise typer.Exit(EXIT_FAULT)
+
+
+def _print(findings: Sequence[Finding], quiet: bool) -> None:
+    """Print findings, one a paragraph: mark, title, what was measured; below it what to do."""
+    width = max(60, shutil.get_terminal_size().columns)
+    margin = " " * (MARK + TITLE)
+    for finding in findings:
+        if quiet and finding.severity == "ok":
+            continue
+        mark = typer.style(f"{finding.severity:{MARK}}", fg=COLOURS[finding.severity], bold=finding.severity != "ok")
+        measured = textwrap.wrap(finding.measured, width - len(margin)) or [""]
+        typer.echo(f"{mark}{finding.title:{TITLE}}{measured[0]}")
+        for line in measured[1:]:
+            typer.echo(margin + line)
+        if finding.advice:
+            for line in textwrap.wrap(f"do: {finding.advice}", width - len(margin), subsequent_indent="    "):
+                typer.echo(margin + line)

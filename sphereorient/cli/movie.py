@@ -1,0 +1,176 @@
+"""`sphereorient movie` and `convert`."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sphereorient.cli.app import Advance, app, check_writable, progress_bar, put_aside
+from sphereorient.errors import MovieError, OutputError, refusal
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from sphereorient.movies import Grey, Movie
+    from sphereorient.movies.survey import Survey
+
+Source = Annotated[
+    str, typer.Argument(metavar="FILE", help="A movie, a folder of pictures, a pattern, or file.h5::dataset.")
+]
+Flip = Annotated[str, typer.Option(help="Turn round: none, vertical (rows), horizontal (columns), both.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
+SHOWN = 12  # numbers of frames named in a line
+LINE = 100  # characters
+UNEVEN = 1e-3  # of the usual time between frames
+
+
+@app.command()
+def movie(
+    source: Source,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Contact sheet (.png, .pdf); FILE.contact.png here without it.")
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, max=240, help="Frames on the sheet.")] = 24,
+    every: Annotated[bool, typer.Option("--all", help="Look at every frame, not only at those of the sheet.")] = False,
+    flip: Flip = "none",
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Tell what is in a movie, and draw a contact sheet of it."""
+    sheet = Path(f"{_stem(source)}.contact.png") if out is None else out
+    check_writable(sheet)
+    from sphereorient.movies import flipped, open_movie
+    from sphereorient.movies.survey import survey
+    from sphereorient.report.contact_sheet import contact_sheet
+
+    with flipped(open_movie(source), flip) as opened:
+        with progress_bar(quiet) as advance:
+            seen = survey(opened, count, every, lambda done, total: advance("look", done, total))
+            advance("sheet", 0, 1)
+            with put_aside(sheet) as partial:
+                contact_sheet(opened, seen, partial)
+            advance("sheet", 1, 1)
+        for title, text in [*facts(opened), *findings(opened, seen), ("sheet", str(sheet))]:
+            typer.echo(textwrap.fill(text, LINE, initial_indent=f"{title:14}", subsequent_indent=" " * 14))
+
+
+@app.command()
+def convert(
+    source: Source,
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="Movie to write: .mkv (FFV1), .h5 or .hdf5.")],
+    frames: Annotated[str, typer.Option(metavar="A:B", help="Frames A to B - 1 only; 100: is from 100 on.")] = ":",
+    flip: Flip = "none",
+    rate: Annotated[float, typer.Option(min=1.0e-3, max=1.0e6, help="Frames per second of .mkv, for players.")] = 25.0,
+    quiet: Quiet = False,
+) -> None:
+    """Write a movie of any format as FFV1 (.mkv) or HDF5 (.h5), grey values unchanged."""
+    check_writable(target)
+    from sphereorient.movies import flipped, movie_files, open_movie, write_movie
+    from sphereorient.movies.write import times_path
+
+    if target.resolve() in [file.resolve() for file in movie_files(source)]:
+        do = "choose another name"
+        raise OutputError(refusal(str(target), expected="another file than the movie", got="the movie", do=do))
+    with flipped(open_movie(source), flip) as opened:
+        first, last = _range(frames, opened)
+        times_s = None if opened.times_s is None else opened.times_s[first:last]
+        dead: list[int] = []
+        with progress_bar(quiet) as advance:
+            count = write_movie(target, _pictures(opened, first, last, dead, advance), times_s, rate)
+        if quiet:
+            return
+        for remark in opened.remarks:
+            typer.echo(f"{source}: {remark}")
+        if dead:
+            left = "black" if target.suffix.lower() == ".mkv" else "left out, still counted"
+            typer.echo(f"Not decodable, {left}: {_frames(len(dead))}, {_numbers(dead)}")
+        typer.echo(f"Wrote {target}: {_frames(count)}" + (f", {first} .. {last - 1} of the movie" if first else ""))
+        if times_s is not None and target.suffix.lower() == ".mkv":
+            typer.echo(f"Wrote {times_path(target)}: their times (experiment.yaml, times:)")
+
+
+def facts(opened: Movie) -> list[tuple[str, str]]:
+    """Return what the file says of itself, as title and text."""
+    height, width = opened.frame_shape
+    size = _size(opened.path)
+    return [
+        ("file", f"{opened.path}" + (f", {size / 1e6:.1f} MB" if size else "")),
+        ("format", opened.format),
+        ("pictures", f"{width} x {height} px, {8 * opened.dtype.itemsize} bit"),
+        ("frames", str(len(opened))),
+        ("times", _times(opened.times_s)),
+        *(("remark", remark) for remark in opened.remarks),
+    ]
+
+
+def findings(opened: Movie, seen: Survey) -> list[tuple[str, str]]:
+    """Return what was seen in the frames, as title and text."""
+    whole = "all frames" if seen.looked == len(opened) else f"{seen.looked} of {len(opened)} frames"
+    lines = [("looked at", f"{whole}: grey levels {seen.lowest} .. {seen.highest}")]
+    for fault, numbers in seen.faults.items():
+        lines.append((fault, f"{_frames(len(numbers))}: {_numbers(numbers)}" if numbers else "none"))
+    return lines
+
+
+def _times(times_s: NDArray[np.float64] | None) -> str:
+    if times_s is None:
+        return "none that are exact: give frame_rate or times in experiment.yaml"
+    if len(times_s) < 2:
+        return f"{times_s[0]:.9g} s"
+    import numpy as np
+
+    steps = np.diff(times_s)
+    usual = float(np.median(steps))
+    span = f"{times_s[0]:.9g} .. {times_s[-1]:.9g} s"
+    off = np.flatnonzero(np.abs(steps - usual) > UNEVEN * usual)
+    if not len(off):
+        return f"{span}, even: {1 / usual:.6g} Hz"
+    longest = int(np.argmax(steps))
+    gap = f"the longest, {steps[longest]:.6g} s, after frame {longest}"
+    return f"{span}, not even: usually {1 / usual:.6g} Hz, {len(off)} of {len(steps)} steps differ, {gap}"
+
+
+def _size(path: Path) -> int:
+    """Return the bytes of the files that a movie is made of."""
+    from sphereorient.movies import movie_files
+
+    return sum(file.stat().st_size for file in movie_files(path))
+
+
+def _frames(count: int) -> str:
+    return "1 frame" if count == 1 else f"{count} frames"
+
+
+def _numbers(numbers: Sequence[int]) -> str:
+    more = f" and {len(numbers) - SHOWN} more" if len(numbers) > SHOWN else ""
+    return ", ".join(map(str, numbers[:SHOWN])) + more
+
+
+def _stem(source: str) -> str:
+    """Return the movie's name without what a file's name cannot hold."""
+    return re.sub(r"[^\w.+-]+", "_", Path(source.replace("::", "_").rstrip("/")).name) or "movie"
+
+
+def _range(text: str, opened: Movie) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", text.strip())
+    first, last = (int(found[1] or 0), int(found[2] or len(opened))) if found else (0, 0)
+    if not 0 <= first < last <= len(opened):
+        expected, do = f"A:B within 0:{len(opened)}, A below B", "correct --frames"
+        raise MovieError(refusal(f"--frames {text}", expected=expected, got=f"'{text}'", do=do))
+    return first, last
+
+
+def _pictures(opened: Movie, first: int, last: int, dead: list[int], advance: Advance) -> Iterator[Grey | None]:
+    """Yield the frames to write, noting those that cannot be decoded in `dead`."""
+    from sphereorient.movies import readable
+
+    for number, picture in enumerate(readable(opened, first, last), start=first):
+        if picture is None:
+            dead.append(number)
+        yield picture
+        advance("convert", number + 1 - first, last - first)

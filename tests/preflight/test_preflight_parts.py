@@ -1,0 +1,194 @@
+"""The measures of the check against oracles: outlines, blur, gaps, what start: must say."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import assert_close
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sphereorient.cameras import PinholeCamera, Port, PortCamera, triangulate
+from sphereorient.cameras.telecentric import TelecentricCamera
+from sphereorient.locate import Background
+from sphereorient.locate.outline import Outline
+from sphereorient.preflight import Finding, Severity
+from sphereorient.preflight.diameter import expected_outline_px
+from sphereorient.preflight.exposure import limb_blur_px
+from sphereorient.preflight.finding import worst
+from sphereorient.preflight.gap import gaps_between
+from sphereorient.preflight.look import pair_starts, read_rows, sample_frames
+from sphereorient.preflight.offset import REACH, Steps, gap_by_offset, started
+
+
+def f64(value: object) -> torch.Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def pinhole(R: list[list[float]]) -> PinholeCamera:
+    return PinholeCamera(
+        image_size=(300, 300),
+        f_px=f64(1400.0),
+        centre_px=f64((149.5, 149.5)),
+        R_cam_lab=f64(R),
+        T_cam_lab_mm=f64((0.0, 0.0, 400.0)),
+    )
+
+
+ALONG_Y = pinhole([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+DOWN_Z = pinhole([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+WALL = Port(
+    normal=f64((0.0, -1.0, 0.0)),
+    offset_mm=f64(120.0),
+    thickness_mm=f64(12.0),
+    n_glass=f64(1.49),
+    n_fluid=f64(1.36),
+)
+PORT = PortCamera(camera=ALONG_Y, port=WALL)
+
+
+@pytest.mark.parametrize("camera", [ALONG_Y, DOWN_Z, PORT], ids=["pinhole", "other pinhole", "port"])
+def test_the_expected_outline_encloses_the_spheres_picture_and_touches_it(camera):
+    """Oracle: the picture of many points of the sphere; its hull is the outline."""
+    centre, radius_mm = f64([8.0, -12.0, 5.0]), 9.0
+    normal = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    dots = camera.project(centre + radius_mm * normal.double()).numpy().astype(np.float32)
+    hull = cv2.convexHull(dots)[:, 0].astype(np.float64)
+    outline = expected_outline_px(camera, centre, radius_mm).numpy()
+    middle = outline.mean(0)
+    got = np.linalg.norm(outline - middle, axis=1).mean()
+    assert got == pytest.approx(np.linalg.norm(hull - middle, axis=1).mean(), abs=0.03)
+
+
+def test_the_gap_is_that_of_triangulation_and_its_sign_tells_the_side():
+    uv = [f64([[150.0, 140.0], [160.0, 150.0]]), f64([[153.0, 120.0], [157.0, 170.0]])]
+    gaps = gaps_between([ALONG_Y, DOWN_Z], uv)
+    _, expected = triangulate(ALONG_Y.rays(uv[0]), DOWN_Z.rays(uv[1]))
+    assert_close(gaps.signed_mm.abs(), expected)
+    assert float(gaps.signed_mm[0] * gaps.signed_mm[1]) < 0  # one to the left, one to the right
+
+
+def test_a_gap_in_px_is_how_far_the_first_picture_must_move():
+    centre = f64([[3.0, 2.0, -4.0]])
+    first, second = ALONG_Y.project(centre), DOWN_Z.project(centre)
+    gaps = gaps_between([ALONG_Y, DOWN_Z], [first + f64([2.0, 0.0]), second])
+    assert float(gaps.signed_px.abs()) == pytest.approx(2.0, rel=0.01)
+
+
+def places(count: int, moving: float = 0.8) -> torch.Tensor:
+    """A ball that swings through the volume, (count, 3), mm."""
+    t = torch.arange(count, dtype=torch.float64)
+    return torch.stack([8 * torch.sin(moving * t / 8), 5 * torch.cos(t / 11), 4 * torch.sin(t / 9)], dim=-1)
+
+
+def steps_of(late: int, knock_px: float = 0.0, moving: float = 0.8) -> Steps:
+    """Steps of two stretches, the second movie `late` frames behind and the first camera knocked."""
+    path = places(80, moving)
+    stretches = []
+    for begin in (10, 40):
+        here = ALONG_Y.project(path[begin : begin + 20]) + f64([knock_px, 0.0])
+        stretches.append((here, DOWN_Z.project(path[begin - late : begin - late + 20])))
+    return gap_by_offset(("one", "two"), (ALONG_Y, DOWN_Z), stretches)
+
+
+@pytest.mark.parametrize("late", range(-7, 8))
+def test_the_least_gap_is_at_the_planted_offset(late):
+    steps = steps_of(late)
+    assert steps.shift == late
+    assert steps.best == pytest.approx(late, abs=0.1)
+    assert float(steps.gap_px[REACH + late]) < 1e-6
+
+
+@pytest.mark.parametrize("late", [-3, 0, 2])
+def test_a_knock_does_not_hide_the_offset_where_the_motion_varies(late):
+    steps = steps_of(late, knock_px=40.0)
+    assert steps.shift == late
+    assert steps.in_step_px > 30  # and what the knock leaves stays visible
+
+
+def test_a_ball_that_hardly_moves_tells_nothing():
+    assert math.isnan(steps_of(2, moving=0.02).best)
+
+
+@given(st.integers(0, 30), st.integers(0, 30), st.integers(-REACH, REACH))
+def test_the_start_advised_shifts_by_the_offset_and_is_never_negative(first, second, shift):
+    zero = torch.zeros(2 * REACH + 1)
+    steps = Steps(offset=zero, gap_px=zero, varying_px=zero, moved_px=1.0, best=float(shift), names=("a", "b"))
+    new_first, new_second = started({"a": first, "b": second}, steps)
+    assert new_second - new_first == second - first + shift
+    assert min(new_first, new_second) >= 0
+    assert new_first == first or new_second == 0  # no frame more is lost than must be
+
+
+@pytest.mark.parametrize("blur_px", [0.7, 1.2, 2.0])
+def test_the_blur_of_the_limb_is_that_of_the_lens(blur_px):
+    """A white disk over black, supersampled, blurred by a known Gaussian; the pixel's own width comes on top."""
+    row, column = np.mgrid[:800, :800] / 8 - 0.5 + 1 / 16
+    fine = 180.0 * ((row - 49.3) ** 2 + (column - 50.1) ** 2 < 30.0**2)
+    fine = cv2.GaussianBlur(fine, (0, 0), 8 * blur_px)
+    picture = fine.reshape(100, 8, 100, 8).mean((1, 3))
+    noisy = np.rint(picture + 20 + np.random.default_rng(0).normal(0, 1.5, picture.shape)).astype(np.uint8)
+    background = Background(
+        mean=np.full((100, 100), 20, np.float32), noise=np.full((100, 100), 1.5, np.float32), full_scale=255.0
+    )
+    outline = Outline(u_px=50.1, v_px=49.3, radius_px=30.0, rms_px=0.1, coverage=1.0)
+    look = SimpleNamespace(balls=[(noisy, outline)] * 3, background=background)
+    assert limb_blur_px(look) == pytest.approx(math.hypot(blur_px, 12**-0.5), rel=0.08)
+
+
+@given(st.integers(0, 5000))
+def test_the_frames_looked_at_are_few_in_order_and_have_their_neighbours(count):
+    frames = sample_frames(count)
+    assert frames == sorted(set(frames))
+    assert len(frames) <= 40
+    assert all(0 <= k < count for k in frames)
+    assert all(k in frames and k + 1 in frames for k in pair_starts(count))
+    if count:
+        assert {0, count - 1} <= set(frames)
+
+
+class Sevens:
+    """A movie of which each seventh frame cannot be decoded."""
+
+    path = Path("sevens.npy")
+    frame_shape, dtype = (2, 2), np.dtype(np.uint8)
+
+    def __len__(self) -> int:
+        return 40
+
+    def readable(self, first: int, last: int) -> object:
+        return iter([None if k % 7 == 0 else np.full((2, 2), k, np.uint8) for k in range(first, last)])
+
+
+def test_rows_are_read_in_order_with_gaps_where_there_is_no_picture(monkeypatch):
+    monkeypatch.setattr("sphereorient.preflight.look.readable", lambda movie, first, last: movie.readable(first, last))
+    rows = [3, 4, 5, -1, 7, 8, 20, -1, -1, 30]
+    read = [None if one is None else int(one[0, 0]) for one in read_rows(Sevens(), rows)]
+    assert read == [3, 4, 5, None, None, 8, 20, None, None, 30]
+
+
+def test_the_worst_severity_counts():
+    def one(severity: Severity) -> Finding:
+        return Finding(title="", severity=severity, measured="")
+
+    assert worst([]) is Severity.OK
+    assert worst([one(Severity.OK), one(Severity.FAULT), one(Severity.WARNING)]) is Severity.FAULT
+
+
+def test_a_telecentric_camera_expects_its_own_scale():
+    camera = TelecentricCamera(
+        image_size=(300, 300),
+        scale_mm_px=f64(0.25),
+        centre_px=f64((149.5, 149.5)),
+        R_cam_lab=ALONG_Y.R_cam_lab,
+        T_cam_lab_mm=ALONG_Y.T_cam_lab_mm,
+    )
+    outline = expected_outline_px(camera, f64([5.0, 1.0, 2.0]), 9.0)
+    radius = (outline - outline.mean(0)).norm(dim=-1)
+    assert_close(radius, torch.full_like(radius, 9.0 / 0.25), atol=0.02)

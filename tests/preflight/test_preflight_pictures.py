@@ -1,0 +1,146 @@
+"""Faults of pictures, light and files are told; whatever an experiment lacks, the check goes on."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from conftest import REPO, SHARED
+from preflight_examples import Example, checked, clean_example, complaints, of, write
+
+from sphereorient.errors import MovieError
+from sphereorient.preflight import Severity, preflight
+from sphereorient.settings import load_settings
+
+FAULT, WARNING, OK = Severity.FAULT, Severity.WARNING, Severity.OK
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
+    return clean_example(tmp_path_factory)
+
+
+def test_without_pictures_of_the_empty_scene_it_is_learnt(clean, tmp_path):
+    result = checked(clean, tmp_path, backgrounds=None)
+    assert "learnt" in of(result, "background cam1").measured
+    assert of(result, "ball cam1").severity is OK
+    assert of(result, "lines of sight").severity is OK
+
+
+@pytest.mark.parametrize("gain", [1.8, 3.0])
+def test_a_saturated_movie_is_told(clean, tmp_path, gain):
+    result = checked(clean.spoilt(lambda movie: np.clip(15 + (movie - 15.0) * gain, 0, 255)), tmp_path)
+    told = [one for one in result.findings if one.severity is not OK and "saturated" in one.measured]
+    assert told
+    assert all("expose shorter" in one.advice for one in told)
+
+
+def test_a_movie_wholly_white_is_a_fault_and_no_crash(clean, tmp_path):
+    result = checked(clean.spoilt(lambda movie: np.clip(movie * 100.0, 0, 255), ("cam1",)), tmp_path)
+    assert result.severity is FAULT
+    assert of(result, "pictures cam1").severity is FAULT
+    assert "saturated" in of(result, "pictures cam1").measured
+
+
+def test_a_dim_movie_is_told(clean, tmp_path):
+    dim = clean.spoilt(lambda movie: np.rint(15 + (movie - 15.0) * 0.1))
+    assert of(checked(dim, tmp_path), "exposure cam1").severity is WARNING
+
+
+def test_a_movie_out_of_focus_is_told(clean, tmp_path):
+    soft = clean.spoilt(lambda movie: np.stack([cv2.GaussianBlur(one, (0, 0), 2.0) for one in movie]))
+    assert of(checked(soft, tmp_path), "sharpness cam1").severity is WARNING
+
+
+def test_black_and_repeated_pictures_are_counted(clean, tmp_path):
+    def spoil(movie: np.ndarray) -> np.ndarray:
+        movie = movie.copy()
+        movie[-1] = 0
+        movie[1] = movie[0]
+        return movie
+
+    found = of(checked(clean.spoilt(spoil, ("cam2",)), tmp_path), "pictures cam2")
+    assert found.severity is WARNING
+    assert "1 dark" in found.measured
+    assert "1 repeated" in found.measured
+
+
+def test_one_camera_is_checked_alone(clean, tmp_path):
+    one = replace(clean, pictures={"cam1": clean.pictures["cam1"]})
+    result = checked(one, tmp_path, backgrounds={"cam1": "empty_cam1.png"})
+    assert {one.title for one in result.findings if one.severity is not OK} == {"paint"}  # no map
+    assert result.steps is None
+
+
+def test_a_ball_of_unknown_size_is_measured_and_the_setting_named(clean, tmp_path):
+    one = replace(clean, pictures={"cam1": clean.pictures["cam1"]})
+    path = write(one, tmp_path, backgrounds={"cam1": "empty_cam1.png"}, sphere={"diameter": None})
+    found = of(preflight(path), "size of the ball, cam1")
+    assert found.severity is WARNING
+    size = int(found.advice.split("diameter_px to ")[1].split()[0])
+    assert size == pytest.approx(56, abs=4)
+    told = of(preflight(path, load_settings(None, [f"locate.diameter_px={size}"])), "size of the ball, cam1")
+    assert told.severity is OK
+
+
+def test_a_fixed_ball_needs_pictures_without_it(clean, tmp_path):
+    sphere = {"diameter": 18.0, "fixed": True}
+    still = clean.spoilt(lambda movie: np.repeat(movie[:1], 12, axis=0))
+    still = still.spoilt(lambda movie: movie + np.random.default_rng(0).integers(0, 3, movie.shape))
+    assert of(checked(still, tmp_path / "with", sphere=sphere), "background cam1").severity is OK
+    without = checked(still, tmp_path / "without", sphere=sphere, backgrounds=None)
+    assert of(without, "background cam1").severity is FAULT
+    assert of(without, "ball cam1").severity is OK
+
+
+def test_movies_of_unequal_length_are_told(clean, tmp_path):
+    result = checked(clean.spoilt(lambda movie: movie[:50], ("cam2",)), tmp_path)
+    assert of(result, "frames").severity is WARNING
+    assert of(result, "lines of sight").severity is OK
+
+
+def test_files_outside_the_folder_are_told(clean, tmp_path):
+    path = write(clean, tmp_path / "inside", cameras="../cameras.yaml")
+    (tmp_path / "cameras.yaml").write_text((tmp_path / "inside" / "cameras.yaml").read_text())
+    found = of(preflight(path), "files elsewhere")
+    assert found.severity is WARNING
+    assert "../cameras.yaml" in found.measured
+
+
+def test_a_missing_movie_is_an_error_and_no_finding(clean, tmp_path):
+    path = write(clean, tmp_path)
+    (tmp_path / "cam2.npy").unlink()
+    with pytest.raises(MovieError, match=r"cam2\.npy"):
+        preflight(path)
+
+
+def test_a_movie_of_a_single_frame_is_checked_without_a_crash(clean, tmp_path):
+    result = checked(clean.spoilt(lambda movie: movie[:1]), tmp_path)
+    assert of(result, "ball cam1").severity is OK
+
+
+@pytest.mark.shared
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["experiment", "tank"])
+def test_the_path_traced_experiments_have_no_fault(name):
+    result = preflight(SHARED / name / "experiment.yaml")
+    assert result.severity is not FAULT, complaints(result)
+    assert of(result, "movies in step").severity is OK
+
+
+@pytest.mark.slow
+def test_a_truncated_movie_with_holes_is_checked_for_what_is_left(tmp_path):
+    shutil.copytree(REPO / "synthetic_data" / "excerpt", tmp_path / "copy")
+    path = tmp_path / "copy" / "cam1.mkv"
+    damaged = bytearray(path.read_bytes())
+    for hole in (len(damaged) // 3, len(damaged) // 2):
+        damaged[hole : hole + 3000] = bytes(3000)
+    path.write_bytes(damaged[: int(0.9 * len(damaged))])
+    result = preflight(tmp_path / "copy" / "experiment.yaml")
+    assert "2 undecodable" in of(result, "pictures cam1").measured
+    assert "truncated" in of(result, "movie cam1").measured
+    assert result.severity is WARNING
+    assert of(result, "movies in step").severity is OK
