@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,8 @@ import h5py
 import numpy as np
 import torch
 
-from sphereorient.errors import OutputError, TrackError, refusal
+from sphereorient.errors import TrackError, refusal
+from sphereorient.hdf5_out import whole_hdf5
 from sphereorient.locate import Background
 from sphereorient.motion import Learnt as Motion
 from sphereorient.motion import Prior, ProcessNoise
@@ -93,16 +93,8 @@ class Learnt:
         Raises:
             OutputError: the file cannot be written.
         """
-        aside = path.with_name(f".{path.name}.{os.getpid()}.part")
-        try:
-            with h5py.File(aside, "w") as file:
-                _write(self, file)
-            aside.replace(path)
-        except (OSError, RuntimeError) as error:
-            do = "check the space left and the permissions of the folder"
-            raise OutputError(refusal(str(path), expected="a file to write", got=str(error), do=do)) from error
-        finally:
-            aside.unlink(missing_ok=True)
+        with whole_hdf5(path) as file:
+            _write(self, file)
 
     @classmethod
     def load(cls, path: Path) -> Learnt:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import textwrap
 from collections.abc import Iterable
 from pathlib import Path
@@ -62,10 +63,26 @@ def _load(model: type[Model], path: Path | None, overrides: Iterable[str]) -> Mo
     tree = {} if path is None else _read(path)
     for text in overrides:
         _override(tree, text, depth=2 if model is Settings else 1)
+    source = str(path) if path else "settings"
     try:
-        return model.model_validate(tree)
+        settings = model.model_validate(tree)
     except ValidationError as error:
-        raise SettingsError(_explain(error, str(path) if path else "settings", model)) from None
+        raise SettingsError(_explain(error, source, model)) from None
+    if key := _not_finite(settings.model_dump()):
+        do = "correct the value"
+        raise SettingsError(refusal(f"{source}, {key}", expected="a finite number", got="another", do=do))
+    return settings
+
+
+def _not_finite(value: Any) -> str:
+    """Return the key of a number that is infinite or none; nothing where all are finite."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, tuple | list) else ()
+    for key, inner in items:
+        if isinstance(inner, float) and not math.isfinite(inner):
+            return str(key)
+        if below := _not_finite(inner):
+            return f"{key}.{below}"
+    return ""
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, ShapeError, TrackError, refusal
+from sphereorient.hdf5_out import whole_hdf5
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -260,17 +260,8 @@ class Trajectory:
         if not path.parent.is_dir():
             do = "create it first or choose another place"
             raise OutputError(refusal(str(path), expected=f"a folder {path.parent}", got="none", do=do))
-        # beside the final name, so that os.replace stays within one file system and is atomic
-        aside = path.with_name(f".{path.name}.{os.getpid()}.part")
-        try:
-            with h5py.File(aside, "w", track_order=False) as file:
-                _write(self, file)
-            aside.replace(path)
-        except (OSError, RuntimeError) as error:  # a full disk comes out of HDF5 as either
-            do = "check the space left and the permissions of the folder"
-            raise OutputError(refusal(str(path), expected="a file to write", got=str(error), do=do)) from error
-        finally:
-            aside.unlink(missing_ok=True)
+        with whole_hdf5(path) as file:
+            _write(self, file)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

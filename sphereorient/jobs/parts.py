@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sphereorient.errors import OutputError, TrackError, refusal
-from sphereorient.jobs.poses_file import read_poses, to_disk, write_poses
+from sphereorient.jobs.poses_file import read_poses, write_poses
 from sphereorient.jobs.request import Request, differing, fingerprint
 from sphereorient.learnt import Learnt
 from sphereorient.orient import Poses
@@ -58,9 +59,11 @@ class Parts:
         try:
             self.remove()
             self.folder.mkdir()
-            aside = self.folder / ".run.json"
-            aside.write_text(json.dumps(dict(told), indent=1), encoding="utf-8")
-            to_disk(aside)
+            aside = self.folder / ".run.json.part"
+            with aside.open("w", encoding="utf-8") as file:
+                json.dump(dict(told), file, indent=1)
+                file.flush()
+                os.fsync(file.fileno())
             aside.replace(self._run)
         except OSError as error:
             do = "check the space left and the permissions of the folder"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import h5py
 import numpy as np
 import torch
 
-from sphereorient.errors import OutputError, refusal
+from sphereorient.hdf5_out import whole_hdf5
 from sphereorient.orient import POSE_PARTS, Poses
 from sphereorient.trajectory import Reason
 
@@ -23,22 +22,13 @@ def write_poses(path: Path, poses: Sequence[Poses]) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with h5py.File(aside, "w") as file:
-            file.attrs["schema"] = SCHEMA
-            file["count"] = np.array([len(one) for one in poses])
-            file["use"] = np.stack([one.use.numpy() for one in poses])
-            file["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
-            for name in POSE_PARTS:
-                file[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
-        to_disk(aside)
-        aside.replace(path)
-    except (OSError, RuntimeError) as error:
-        do = "check the space left, then run again with --resume"
-        raise OutputError(refusal(str(path), expected="a file to write", got=str(error), do=do)) from error
-    finally:
-        aside.unlink(missing_ok=True)
+    with whole_hdf5(path, "check the space left, then run again with --resume") as file:
+        file.attrs["schema"] = SCHEMA
+        file["count"] = np.array([len(one) for one in poses])
+        file["use"] = np.stack([one.use.numpy() for one in poses])
+        file["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
+        for name in POSE_PARTS:
+            file[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
 
 
 def read_poses(path: Path) -> list[Poses] | None:
@@ -57,9 +47,3 @@ def read_poses(path: Path) -> list[Poses] | None:
         Poses(**{name: parts[name][k].clone() for name in POSE_PARTS}, use=use[k].clone(), reason=tuple(reason[k]))
         for k in range(len(count))
     ]
-
-
-def to_disk(path: Path) -> None:
-    """Make sure that a file outlives a power cut before anything points at it."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())

@@ -7,4 +7,14 @@ from sphereorient.movies.open import movie_files, open_movie
 from sphereorient.movies.readable import readable
 from sphereorient.movies.write import write_movie
 
-__all__ = ["Grey", "Movie", "flipped", "flipped_picture", "movie_files", "open_movie", "readable", "write_ffv1", "write_movie"]
+__all__ = [
+    "Grey",
+    "Movie",
+    "flipped",
+    "flipped_picture",
+    "movie_files",
+    "open_movie",
+    "readable",
+    "write_ffv1",
+    "write_movie",
+]

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, OutputError, refusal
+from sphereorient.hdf5_out import GuardedFile
 from sphereorient.movies.ffv1 import check_alike, check_kind, write_ffv1
-from sphereorient.movies.guarded_file import GuardedFile
 from sphereorient.movies.movie import Grey
 
 PLAYER_RATE_HZ = 25.0

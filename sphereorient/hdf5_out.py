@@ -1,9 +1,44 @@
-"""A file for HDF5 to write to that keeps calm when the disk is full."""
+"""HDF5 files that appear whole or not at all, also when the disk is full or the power fails."""
 
 from __future__ import annotations
 
 import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+import h5py
+
+from sphereorient.errors import OutputError, refusal
+
+ROOM = "check the space left and the permissions of the folder"
+
+
+@contextmanager
+def whole_hdf5(path: Path, do: str = ROOM) -> Iterator[h5py.File]:
+    """Give an HDF5 file to fill, which takes its place under its name, on the disk, when all is written.
+
+    Args:
+        path: the file; an old one is replaced at the end.
+        do: the remedy, for the message.
+
+    Raises:
+        OutputError: it cannot be written; what was there before is still there.
+    """
+    aside = path.with_name(f".{path.name}.part")
+    try:
+        with GuardedFile(aside) as guarded:
+            with h5py.File(guarded, "w", track_order=False) as file:
+                yield file
+            guarded.check()
+            guarded.to_disk()
+        aside.replace(path)
+    except (OSError, RuntimeError) as error:  # a full disk comes out of HDF5 as either
+        got = f"'{(getattr(error, 'strerror', None) or str(error)).splitlines()[0]}'"
+        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
+    finally:
+        aside.unlink(missing_ok=True)
 
 
 class GuardedFile(io.RawIOBase):
@@ -21,6 +56,10 @@ class GuardedFile(io.RawIOBase):
         """Raise the error of an earlier write, if there was one."""
         if self._error is not None:
             raise self._error
+
+    def to_disk(self) -> None:
+        """Make sure that the bytes outlive a power cut before anything points at them."""
+        os.fsync(self._file.fileno())
 
     def write(self, content: bytes) -> int:  # type: ignore[override]
         """Write all bytes, or none from the first error on."""
