@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.cameras.whole_file import read_whole
 from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.movies import Movie
@@ -22,7 +23,7 @@ LATE_STEPS = 0.05  # stamps that differ by more, usually, are worth a remark
 EVEN_STEPS = 1e-3  # times that keep to a grid this well are evenly spaced
 ON_GRID = 0.02  # of a step: frames this near to a grid are on it
 LONGEST_PAUSE = 50  # steps; nothing goes on over longer ones
-TIMES_BYTES = 1 << 28  # larger files are no table of times
+TIMES_BYTES = 1 << 24  # larger files are no table of times
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -145,14 +146,11 @@ def load_times(path: Path) -> Floats:
         ExperimentError: missing, too large, not a number in a line, or times that do not increase.
     """
     do = "write one time a line, in seconds, increasing"
-    if not path.is_file():
-        raise ExperimentError(refusal(str(path), expected="a table of times", got="no such file", do="correct times:"))
-    if path.stat().st_size > TIMES_BYTES:
-        raise ExperimentError(refusal(str(path), expected="a table of times", got="a file of over 256 MB", do=do))
+    content = read_whole(path, TIMES_BYTES, "a table of times", ExperimentError, "correct times:")
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        got = f"'{str(error).splitlines()[0]}'"
+        lines = content.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        got = "bytes that are no text"
         raise ExperimentError(refusal(str(path), expected="a text file", got=got, do=do)) from error
     values: list[float] = []
     for number, line in enumerate(lines, 1):

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SCHEMA = "sphereorient-track/1"
+LARGEST_RATIO = 1200  # by which compression shrinks a dataset at most: one that claims more is not in the file
+LONGEST_NAME = 100  # of a camera, characters
+# What h5py raises on damaged files, depending on the place where HDF5 notices; ShapeError and broken JSON among them.
+DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)
 Floats = NDArray[np.float64]
 
 
@@ -119,7 +123,11 @@ class CameraTrack:
 
     def __post_init__(self) -> None:
         """Compare the lengths of the parts."""
-        candidates = int(self.candidate_offset[-1]) if np.size(self.candidate_offset) else 0
+        offset = np.asarray(self.candidate_offset)
+        if offset.size and (np.diff(offset, prepend=0) < 0).any():
+            got, do = f"{offset[:5].tolist()}", "count the candidates frame by frame"
+            raise ShapeError(refusal("CameraTrack.candidate_offset", expected="0 and increasing", got=got, do=do))
+        candidates = int(offset[-1]) if offset.size else 0
         frames = len(self.reason)
         _check_shapes(self, {"frames": frames, "offsets": frames + 1, "candidates": candidates})
 
@@ -277,17 +285,21 @@ class Trajectory:
             TrackError: no such file, no HDF5 file, another schema, or a dataset is missing or has a wrong shape.
         """
         path = Path(path)
+        got, do = "no file", "pass the track.h5 that `sphereorient track` wrote"
         try:
+            if path.exists():
+                got = "something else"
+            if not path.is_file():  # a pipe would be waited for
+                raise FileNotFoundError(path)
             file = h5py.File(path, "r")
-        except OSError as error:
-            got = "something else" if path.is_file() else "no file"
-            do = "pass the track.h5 that `sphereorient track` wrote"
+        except (OSError, ValueError, RuntimeError) as error:
             raise TrackError(refusal(str(path), expected="an HDF5 file", got=got, do=do)) from error
-        with file:
-            try:
+        try:
+            with file:
                 return cls(**_read(file))
-            except (ValueError, OSError) as error:  # ShapeError, unreadable JSON, a broken block
-                raise TrackError(f"{path}: {error}") from error
+        except DAMAGE as error:  # ShapeError, unreadable JSON, a broken block
+            got, do = f"'{' '.join(str(error).split())[:200]}'", "write the track again"
+            raise TrackError(refusal(str(path), expected="a whole track", got=got, do=do)) from error
 
     def at(self, rows: NDArray[np.int64]) -> Self:
         """Return some of the frames, in increasing order.
@@ -367,19 +379,38 @@ def _write_camera(camera: CameraTrack, group: h5py.Group) -> None:
     _write_dataset(group, "reason", np.array([str(r) for r in camera.reason], f"S{width}"), _REASON)
 
 
-def _dataset(group: h5py.Group, place: str) -> NDArray[Any]:
-    """Return a dataset's values."""
-    dataset = group.get(place)
-    if not isinstance(dataset, h5py.Dataset):
+def _dataset(group: h5py.Group, place: str, dtype: str) -> NDArray[Any]:
+    """Return a dataset's values, refused before anything is read where it lies elsewhere or claims too much."""
+    dataset = _inside(group, place)
+    got = ""
+    if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
+        got = "none"
+    elif dataset.external or dataset.is_virtual:
+        got = "one that lies in other files"
+    elif dataset.nbytes > LARGEST_RATIO * Path(group.file.filename).stat().st_size:
+        got = f"one that claims {dataset.nbytes / 1e6:.3g} MB"
+    elif not (dataset.dtype.kind == "S" if dtype == "S" else np.can_cast(dataset.dtype, dtype, "same_kind")):
+        got = f"values of type {dataset.dtype}"[:100]
+    if got:
         name, do = f"{group.file.filename}: {group.name.rstrip('/')}/{place}", "write the track again"
-        raise TrackError(refusal(name, expected="a dataset", got="none", do=do))
+        raise TrackError(refusal(name, expected="a dataset", got=got, do=do))
     return np.asarray(dataset[()])
+
+
+def _inside(group: h5py.Group, place: str) -> Any:
+    """Return what lies at a place in a group; None where there is nothing, or a link, which may lead to other files."""
+    here: Any = group
+    for part in place.split("/"):
+        if not isinstance(here, h5py.Group) or not isinstance(here.get(part, getlink=True), h5py.HardLink):
+            return None
+        here = here[part]
+    return here
 
 
 def _values(group: h5py.Group, record: type[Any]) -> dict[str, Any]:
     """Return all datasets of a record by field name."""
     known = {
-        name: _dataset(group, place).astype(c.dtype)
+        name: _dataset(group, place, c.dtype).astype(c.dtype)
         for name, place, c in _paths(record)
         if not c.since or place in group
     }
@@ -401,20 +432,26 @@ def _read(file: h5py.File) -> dict[str, Any]:
     schema = file.attrs.get("schema")
     if schema != SCHEMA:
         do = "pass a track, or update sphereorient where the track is newer"
-        raise TrackError(refusal(f"{file.filename}: schema", expected=SCHEMA, got=str(schema), do=do))
-    cameras = file.get("cameras", {})
+        raise TrackError(
+            refusal(f"{file.filename}: schema", expected=SCHEMA, got=repr(str(schema))[1:60].strip("'"), do=do)
+        )
+    cameras = _inside(file, "cameras")
     return _values(file, Trajectory) | {
-        "cameras": {name: _read_camera(group) for name, group in cameras.items()},
+        "cameras": {name: _read_camera(cameras, name) for name in cameras or ()},
         "frame_rate": float(_attribute(file, "frame_rate")),
         "provenance": json.loads(_attribute(file, "provenance")),
         **{name: str(_attribute(file, name)) for name in ("method", "settings", "experiment")},
     }
 
 
-def _read_camera(group: h5py.Group) -> CameraTrack:
+def _read_camera(cameras: h5py.Group, name: str) -> CameraTrack:
     """Return the record of one camera."""
+    group = _inside(cameras, name)
+    if not isinstance(group, h5py.Group) or not name.isprintable() or len(name) > LONGEST_NAME:
+        label, do = f"{cameras.file.filename}: cameras", "write the track again"
+        raise TrackError(refusal(label, expected="groups with names", got=repr(name)[:60], do=do))
     known = {str(reason): reason for reason in Reason}
-    texts = [text.decode() for text in _dataset(group, "reason").tolist()]
+    texts = [text.decode() for text in _dataset(group, "reason", "S").tolist()]
     return CameraTrack(reason=tuple(known.get(text, text) for text in texts), **_values(group, CameraTrack))
 
 

@@ -16,7 +16,7 @@ from sphereorient.cameras.calibration import plate_from_entry
 from sphereorient.cameras.calibration.entry import Target
 from sphereorient.cameras.entries import PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
-from sphereorient.cameras.yaml_file import read_document, refuse_unknown, validated
+from sphereorient.cameras.yaml_file import read_document, refuse_unknown, short, validated
 from sphereorient.errors import CameraError, refusal
 
 SCHEMA = "sphereorient-calibration/1"
@@ -111,11 +111,21 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
         surveyed=_surveyed(keys, path, numbers) if keys.pictures else IN_THE_LAB,
         pictures=pictures,
         points={name: path.parent / file for name, file in keys.points.items()},
-        ports={name: entry.port() for name, entry in keys.ports.items()},
+        ports=_ports(keys, path),
         fit_ports=keys.fit_ports,
     )
     _check_ports(keys, path, document.cameras)
     return document
+
+
+def _ports(keys: CalibrationKeys, path: Path) -> dict[str, Port]:
+    ports = {}
+    for name, entry in keys.ports.items():
+        try:
+            ports[name] = entry.port()
+        except CameraError as error:
+            raise CameraError(f"{path}, ports, {name}, {error}") from None
+    return ports
 
 
 def _check_ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> None:
@@ -140,7 +150,7 @@ def _pose_numbers(keys: CalibrationKeys, path: Path) -> tuple[int, ...]:
         pose = entry.get("pose")
         if isinstance(pose, bool) or not isinstance(pose, int):
             expected, do = "a whole number", "number the plate's poses"
-            raise CameraError(refusal(f"{path}, pictures, {k}, pose", expected=expected, got=repr(pose), do=do))
+            raise CameraError(refusal(f"{path}, pictures, {k}, pose", expected=expected, got=short(pose), do=do))
         numbers.append(pose)
     return tuple(sorted(set(numbers)))
 
@@ -157,7 +167,7 @@ def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> tu
                 continue
             where = f"{path}, pictures, {k}, {name}"
             if not isinstance(file, str):
-                raise CameraError(refusal(where, expected="a file", got=repr(file), do="name a picture"))
+                raise CameraError(refusal(where, expected="a file", got=short(file), do="name a picture"))
             if (row, name) in seen:
                 got, do = f"a second one of pose {entry['pose']}", "give every pose its own number"
                 raise CameraError(refusal(where, expected="one picture of a pose", got=got, do=do))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 
 from sphereorient.calibrate.document import CalibrationDocument, Picture
 from sphereorient.cameras.calibration import PlateView
+from sphereorient.cameras.whole_file import TABLE_BYTES, read_whole
+from sphereorient.cameras.yaml_file import short
 from sphereorient.errors import CameraError, refusal
 
 COLUMNS = ("x", "y", "z", "u", "v")  # mm, mm, mm, px, px
@@ -42,13 +45,11 @@ def read_points(path: Path) -> NDArray[np.float64]:
     Raises:
         CameraError: as `read_tables`.
     """
+    content = read_whole(path, TABLE_BYTES, "a table", CameraError, "correct the path")
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
-    except FileNotFoundError:
-        do = "correct the path"
-        raise CameraError(refusal(str(path), expected="a table", got="no such file", do=do)) from None
-    except (OSError, UnicodeDecodeError, csv.Error) as fault:
+        text = content.decode("utf-8-sig")
+        rows = list(csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True))
+    except (UnicodeDecodeError, csv.Error) as fault:
         do = "save the table as CSV"
         raise CameraError(refusal(str(path), expected="a table", got="a file that is none", do=do)) from fault
     known = [name.strip() for name in rows[0] if name is not None] if rows else []
@@ -68,5 +69,5 @@ def _number(path: Path, k: int, row: dict[str, str], name: str) -> float:
         value = float("nan")
     if not np.isfinite(value):
         do = "correct the number, or leave the point out"
-        raise CameraError(refusal(f"{path}, row {k + 1}, {name}", expected="a number", got=repr(text), do=do))
+        raise CameraError(refusal(f"{path}, row {k + 1}, {name}", expected="a number", got=short(text), do=do))
     return value

@@ -8,9 +8,12 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from sphereorient.cameras.yaml_file import short
 from sphereorient.errors import CameraError, ShapeError, check_tail, refusal
 
 ROTATION_TOLERANCE = 1e-5  # of |R R^T - I|: moves a point at the rim of a 1000 px picture by less than 0.01 px
+LARGEST = 1e30  # of any parameter: no camera has such numbers, and what is computed of them must stay finite
+MAX_SIDE_PX = 65_536  # of a picture: twice what any camera has
 RIM_STEPS = 33  # points per side of the picture where the distortion is tried; both corners are among them
 
 
@@ -18,14 +21,14 @@ def as_parameter(name: str, value: Tensor | float | Sequence[float], *shape: int
     """Return a camera parameter as float64 tensor, still part of its graph.
 
     Raises:
-        CameraError: another shape, or a number that is not finite.
+        CameraError: another shape, or a number that is not finite or beyond LARGEST.
     """
     # Not as_tensor alone: it would round plain numbers to float32 first.
     tensor = value.to(torch.float64) if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
     if tuple(tensor.shape) != shape:
         expected, got = f"shape {shape}", f"shape {tuple(tensor.shape)}"
         raise CameraError(refusal(name, expected=expected, got=got, do="correct the camera"))
-    if not bool(torch.isfinite(tensor.detach()).all()):
+    if not bool((tensor.detach().abs() <= LARGEST).all()):
         got = str(tensor.detach().tolist())
         raise CameraError(refusal(name, expected="finite numbers", got=got, do="correct the camera"))
     return tensor
@@ -44,14 +47,17 @@ def check_positive(name: str, value: Tensor) -> None:
 
 
 def check_image_size(name: str, size: Sequence[int]) -> None:
-    """Refuse a picture size that is not two positive whole numbers.
+    """Refuse a picture size that is not two positive whole numbers, or larger than pictures are.
 
     Raises:
         CameraError: it is not.
     """
     if len(size) != 2 or not all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in size):
         do = "write width and height in pixels"
-        raise CameraError(refusal(name, expected="two whole numbers above zero", got=str(tuple(size)), do=do))
+        raise CameraError(refusal(name, expected="two whole numbers above zero", got=short(tuple(size)), do=do))
+    if max(size) > MAX_SIDE_PX:
+        expected, do = f"at most {MAX_SIDE_PX} px a side", "write width and height in pixels"
+        raise CameraError(refusal(name, expected=expected, got=short(tuple(size)), do=do))
 
 
 def check_rotation(name: str, R: Tensor) -> None:

@@ -13,11 +13,12 @@ from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.entries import CovarianceEntry
 from sphereorient.cameras.parameters import parameter_names
 from sphereorient.cameras.registry import build_camera, describe_camera
-from sphereorient.cameras.yaml_file import read_document, refuse_unknown, validated, write_document
+from sphereorient.cameras.yaml_file import read_document, refuse_unknown, short, validated, write_document
 from sphereorient.errors import CameraError, refusal
 
 SCHEMA = "sphereorient-cameras/1"
 KEYS = ("cameras", "covariance")
+MOST = 100  # cameras of a file
 
 
 def load_cameras(path: Path | str) -> dict[str, Camera]:
@@ -40,7 +41,10 @@ def load_cameras(path: Path | str) -> dict[str, Camera]:
     entries = document.get("cameras")
     if not isinstance(entries, dict) or not entries:
         do = "write one camera or more below 'cameras:'"
-        raise CameraError(refusal(f"{path}, cameras", expected="named cameras", got=repr(entries)[:60], do=do))
+        raise CameraError(refusal(f"{path}, cameras", expected="named cameras", got=short(entries), do=do))
+    if len(entries) > MOST:
+        got, do = f"{len(entries)}", "write those of one experiment"
+        raise CameraError(refusal(f"{path}, cameras", expected=f"at most {MOST} cameras", got=got, do=do))
     return {str(name): build_camera(entry, f"{path}, {name}") for name, entry in entries.items()}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from pathlib import Path
 
 import cv2
@@ -11,9 +13,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras.brown import BrownCamera
+from sphereorient.cameras.whole_file import TEXT_BYTES, read_whole
+from sphereorient.cameras.yaml_file import short
 from sphereorient.errors import CameraError, OutputError, refusal
 
 SUFFIXES = (".yml", ".yaml", ".xml", ".json")  # by them OpenCV chooses the format
+MOST = 64  # numbers of a matrix that is read: OpenCV makes room for what the file claims before it counts
+# OpenCV's parser calls itself for each level, down to a crash. No level without one of these; its files have dozens.
+OPENER = re.compile(rb"[\[{]|-\s|<[^/?!]")
+MOST_OPENERS, MOST_BLANKS = 3000, 200  # the second: levels that indentation makes
 LENGTHS = (4, 5, 8, 12, 14)  # of distortion_coefficients, in OpenCV's order k1 k2 p1 p2 k3 ...
 
 Array = NDArray[np.float64]
@@ -45,7 +53,7 @@ def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> 
         storage.release()
     if K[0, 1] != 0 or K[1, 0] != 0 or not np.allclose(K[2], (0, 0, 1)):
         expected = "fx and fy on the diagonal, cx and cy in the last column, zeros and a one elsewhere"
-        raise _refused(path, "camera_matrix", expected, str(K.round(6).tolist()), "calibrate without shear")
+        raise _refused(path, "camera_matrix", expected, short(K.round(6).tolist()), "calibrate without shear")
     try:
         return BrownCamera(
             image_size=size,
@@ -91,15 +99,17 @@ def save_opencv(path: Path | str, camera: BrownCamera) -> None:
 
 
 def _opened(path: Path) -> cv2.FileStorage:
-    if not path.is_file():
-        got = "a folder" if path.is_dir() else "no such file"
-        raise CameraError(_line(path, "a file of OpenCV's FileStorage", got, "correct the path"))
+    expected = "a file of OpenCV's FileStorage"
+    content = read_whole(path, TEXT_BYTES, expected, CameraError, "correct the path")
+    if len(OPENER.findall(content)) > MOST_OPENERS or re.search(rb"[ \t]{%d}" % MOST_BLANKS, content):
+        got, do = "one with thousands of lists, tags or levels", "name the file of one camera"
+        raise CameraError(_line(path, expected, got, do))
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     except (cv2.error, SystemError):  # SystemError: how a parser's fault comes out of the constructor
         storage = None
-    if storage is None or not storage.isOpened():
-        raise CameraError(_line(path, "a file of OpenCV's FileStorage", "another", "write it with cv2.FileStorage"))
+    if storage is None or not storage.isOpened() or not storage.root().isMap():
+        raise CameraError(_line(path, expected, "another", "write it with cv2.FileStorage"))
     return storage
 
 
@@ -107,11 +117,32 @@ def _node(storage: cv2.FileStorage, key: str) -> Array | None:
     node = storage.getNode(key)
     if node.empty() or not node.isMap():
         return None
+    if not _claims_few(node):
+        return None
     try:
         matrix = node.mat()
     except cv2.error:
         return None
-    return None if matrix is None else np.asarray(matrix, np.float64)
+    return None if matrix is None or matrix.size > MOST else np.asarray(matrix, np.float64)
+
+
+def _claims_few(node: cv2.FileNode) -> bool:
+    """Tell whether a matrix claims no more than MOST numbers, by its rows and columns or by the sizes of its axes."""
+    axes = node.getNode("sizes")
+    if axes.empty():
+        sides = [_whole(node.getNode(side)) for side in ("rows", "cols")]
+    else:
+        sides = [_whole(axes.at(k)) for k in range(axes.size())] if axes.isSeq() and axes.size() < 4 else [_whole(axes)]
+    known = [side for side in sides if side is not None and 0 < side <= MOST]
+    return len(known) == len(sides) and math.prod(known) <= MOST
+
+
+def _whole(node: cv2.FileNode) -> int | None:
+    """Return a whole number; None for anything else."""
+    if not (node.isInt() or node.isReal()):
+        return None
+    number = float(node.real())
+    return int(number) if number.is_integer() else None
 
 
 def _matrix(storage: cv2.FileStorage, path: Path, key: str, shape: tuple[int, int]) -> Array:
@@ -165,10 +196,11 @@ def _optional(storage: cv2.FileStorage, keys: tuple[str, ...], path: Path, size:
 
 
 def _size(storage: cv2.FileStorage, path: Path, image_size: tuple[int, int] | None) -> tuple[int, int]:
-    width, height = (int(storage.getNode(key).real()) for key in ("image_width", "image_height"))
+    width, height = (_whole(storage.getNode(key)) or 0 for key in ("image_width", "image_height"))
     if width > 0 and height > 0:
         if image_size not in (None, (width, height)):
-            raise _refused(path, "image_width, image_height", str(image_size), f"({width}, {height})", "correct one")
+            got = short((width, height))
+            raise _refused(path, "image_width, image_height", str(image_size), got, "correct one")
         return width, height
     if image_size is None:
         raise _refused(path, "image_width, image_height", "two whole numbers", "none", "give image_size")

@@ -20,6 +20,8 @@ from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.openptv_camera import OpenPTVCamera
 from sphereorient.cameras.pinhole import middle_of_picture
 from sphereorient.cameras.port import Port, PortCamera
+from sphereorient.cameras.whole_file import TEXT_BYTES, read_whole
+from sphereorient.cameras.yaml_file import short
 from sphereorient.errors import CameraError, OutputError, refusal
 
 ORI_PARTS = "centre, angles, matrix, xh yh cc, glass vector"
@@ -122,14 +124,17 @@ def load_ptv_par(path: Path | str) -> PtvPar:
     path = Path(path)
     words = _words(path, "\n")
     count = words[0].strip() if words else ""
-    if not count.isdigit():
+    if not (count.isascii() and count.isdigit() and len(count) < 4):
         do = "name OpenPTV's ptv.par"
-        raise CameraError(refusal(str(path), expected="the number of cameras first", got=f"'{count[:20]}'", do=do))
+        raise CameraError(refusal(str(path), expected="the number of cameras first", got=short(count[:20]), do=do))
     numbers = _numbers(path, words[1 + 2 * int(count) :], PAR_NUMBERS, PAR_PARTS)
     imx, imy, pix_x, pix_y, chfield, n_air, n_glass, n_fluid, thickness_mm = numbers[3:]
     if chfield != 0:
         got, do = f"chfield {chfield:g}", "make whole frames of the fields first"
         raise CameraError(refusal(str(path), expected="whole frames (chfield 0)", got=got, do=do))
+    if min(imx, imy, pix_x, pix_y, n_air, n_glass, n_fluid) <= 0:
+        expected, do = "sizes, pixels and indices above zero", f"correct them ({PAR_PARTS})"
+        raise CameraError(refusal(str(path), expected=expected, got="zero or less", do=do))
     return PtvPar(
         image_size=(int(imx), int(imy)),
         pixel_pitch_mm=(pix_x, pix_y),
@@ -218,13 +223,12 @@ def _axes() -> Tensor:
 
 
 def _words(path: Path, separator: str | None = None) -> list[str]:
+    content = read_whole(path, TEXT_BYTES, "a text file of OpenPTV", CameraError, "correct the path")
     try:
-        return path.read_text(encoding="utf-8").strip().split(separator)
-    except FileNotFoundError:
-        got, do = "no such file", "correct the path"
-    except (OSError, UnicodeDecodeError):
-        got, do = "a folder" if path.is_dir() else "bytes that are no text", "name OpenPTV's file"
-    raise CameraError(refusal(str(path), expected="a text file of OpenPTV", got=got, do=do))
+        return content.decode("utf-8-sig").strip().split(separator)
+    except UnicodeDecodeError:
+        expected, got, do = "a text file of OpenPTV", "bytes that are no text", "name OpenPTV's file"
+        raise CameraError(refusal(str(path), expected=expected, got=got, do=do)) from None
 
 
 def _numbers(path: Path, words: Sequence[str], count: int, parts: str) -> list[float]:
@@ -239,7 +243,7 @@ def _numbers(path: Path, words: Sequence[str], count: int, parts: str) -> list[f
             number = math.nan
         if not math.isfinite(number):
             name, do = f"{path}, number {place + 1} of {count}", f"correct it ({parts})"
-            raise CameraError(refusal(name, expected="a finite number", got=f"'{word[:20]}'", do=do))
+            raise CameraError(refusal(name, expected="a finite number", got=short(word[:20]), do=do))
         numbers.append(number)
     return numbers
 

@@ -25,7 +25,7 @@ from sphereorient.cameras.pinhole import PinholeCamera
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.cameras.telecentric import TelecentricCamera
 from sphereorient.cameras.tsai import TsaiCamera
-from sphereorient.cameras.yaml_file import refuse_unknown, validated
+from sphereorient.cameras.yaml_file import refuse_unknown, short, validated
 from sphereorient.errors import CameraError, refusal
 
 
@@ -95,7 +95,7 @@ def build_camera(entry: object, where: str) -> Camera:
         CameraError: no mapping, an unknown model or key, a missing key, or an impossible parameter, port or covariance.
     """
     if not isinstance(entry, Mapping):
-        raise CameraError(refusal(where, expected="the keys of a camera", got=repr(entry), do="indent them below it"))
+        raise CameraError(refusal(where, expected="the keys of a camera", got=short(entry), do="indent them below it"))
     if "model" not in entry:
         raise CameraError(refusal(f"{where}, model", expected=f"one of {', '.join(MODELS)}", got="none", do="add it"))
     if not isinstance(entry["model"], str) or entry["model"] not in MODELS:

@@ -12,9 +12,12 @@ from typing import Any, TypeVar, get_args
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from sphereorient.cameras.bounded_yaml import FAULTS, parse_yaml
+from sphereorient.cameras.whole_file import TEXT_BYTES, read_whole
 from sphereorient.errors import OutputError, SphereOrientError, refusal
 
 Model = TypeVar("Model", bound=BaseModel)
+SHOWN = 20  # known names in a message
 
 
 def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> dict[str, Any]:
@@ -31,24 +34,38 @@ def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> di
     Raises:
         error: missing, unreadable, not YAML, not a mapping, or of another schema.
     """
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise error(refusal(str(path), expected="a YAML file", got="no such file", do="correct the path")) from None
-    except (OSError, UnicodeDecodeError) as fault:
-        got = "a folder" if path.is_dir() else f"'{getattr(fault, 'strerror', None) or 'bytes that are no text'}'"
-        raise error(refusal(str(path), expected="a readable YAML file", got=got, do="name a text file")) from fault
-    except (yaml.YAMLError, ValueError) as fault:  # ValueError: dates that do not exist, and the like
-        do = "correct the file there"
-        raise error(refusal(str(path), expected="YAML", got=_yaml_words(fault), do=do)) from fault
+    document = read_yaml(path, error)
     if not isinstance(document, dict):
-        got = "an empty file" if document is None else _short(document)
+        got = "an empty file" if document is None else short(document)
         raise error(refusal(str(path), expected="keys and values", got=got, do=f"begin with 'schema: {schema}'"))
     found = document.pop("schema", None)
     if found != schema:
-        got, do = "none" if found is None else _short(found), f"name a {schema.partition('/')[0]} file of this version"
+        got, do = "none" if found is None else short(found), f"name a {schema.partition('/')[0]} file of this version"
         raise error(refusal(f"{path}, schema", expected=schema, got=got, do=do))
     return document
+
+
+def read_yaml(path: Path, error: type[SphereOrientError]) -> Any:
+    """Read a YAML file of plain values, whoever wrote it.
+
+    Args:
+        path: the file, UTF-8, at most TEXT_BYTES.
+        error: the error to raise.
+
+    Returns:
+        What it says; None where it is empty.
+
+    Raises:
+        error: missing, unreadable, no text, or no YAML that `parse_yaml` takes.
+    """
+    content = read_whole(path, TEXT_BYTES, "a YAML file", error, "correct the path")
+    try:
+        return parse_yaml(content.decode("utf-8-sig"))  # editors of some systems put a mark in front
+    except UnicodeDecodeError:
+        got, do = "bytes that are no text", "save it as UTF-8"
+        raise error(refusal(str(path), expected="a YAML file", got=got, do=do)) from None
+    except FAULTS as fault:
+        raise error(refusal(str(path), expected="YAML", got=yaml_words(fault), do="correct the file there")) from fault
 
 
 def validated(model: type[Model], data: Any, where: str, error: type[SphereOrientError]) -> Model:
@@ -72,9 +89,10 @@ def validated(model: type[Model], data: Any, where: str, error: type[SphereOrien
 def refuse_unknown(key: object, known: Iterable[str], where: str) -> str:
     """Word the refusal of a key or name that is not known, with the nearest one that is."""
     names = [str(name) for name in known]
+    shown = names if len(names) <= SHOWN else [*names[:SHOWN], "..."]
     near = difflib.get_close_matches(str(key), names, n=1, cutoff=0.5)
     do = f"write '{near[0]}' instead" if near else "remove it"
-    return refusal(where, expected=f"one of {', '.join(names)}", got=f"'{key}'", do=do)
+    return refusal(where, expected=f"one of {', '.join(shown)}", got=short(str(key)), do=do)
 
 
 def write_document(path: Path, schema: str, document: Mapping[str, Any], comment: str = "") -> None:
@@ -126,12 +144,14 @@ def _worded(fault: ValidationError, model: type[BaseModel], where: str) -> str:
         return refusal(name, expected="a value", got="none", do="add the key")
     expected = message.removeprefix("Value error, ").removeprefix("Input should be ")
     expected = expected[:1].lower() + expected[1:]
-    return refusal(name, expected=expected, got=_short(first["input"]), do="correct the value")
+    return refusal(name, expected=expected, got=short(first["input"]), do="correct the value")
 
 
 def _keys(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
     """Return the keys of the model that stands at a place inside another."""
     for step in place:
+        if str(step) not in model.model_fields:  # a name or a number that the file gives, such as a camera's
+            continue
         annotation = model.model_fields[str(step)].annotation
         inner = [kind for kind in (annotation, *get_args(annotation)) if _is_model(kind)]
         model = inner[0]
@@ -142,12 +162,15 @@ def _is_model(kind: object) -> bool:
     return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
-def _short(value: object) -> str:
+def short(value: object) -> str:
+    """Return a value as one line of at most 60 characters, for a message."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _yaml_words(fault: Exception) -> str:
+def yaml_words(fault: Exception) -> str:
+    """Word what is wrong with a YAML text in one short line."""
     mark = getattr(fault, "problem_mark", None)
-    problem = getattr(fault, "problem", None) or str(fault).splitlines()[0]
+    problem = " ".join((getattr(fault, "problem", None) or str(fault).partition("\n")[0]).split())
+    problem = problem if len(problem) <= 120 else problem[:117] + "..."
     return f"'{problem}'" + (f" in line {mark.line + 1}" if mark else "")

@@ -7,11 +7,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.cameras.whole_file import read_whole
 from sphereorient.errors import ExperimentError, refusal
+from sphereorient.sphere.picture_claim import claimed_pixels, decoded_grey
 
 # A pixel's scatter is read off at this share of its frames, and divided by what that is for Gaussian noise in standard
 # deviations. About a background taken from the movie: things that turn and glitter move a pixel in more frames than
@@ -19,6 +20,7 @@ from sphereorient.errors import ExperimentError, refusal
 # of the movie, a tenth of the frames shows the scene.
 MEASURED_SHARE, MEASURED_SIGMAS = 0.8, 1.2816
 GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
+BYTES_A_PIXEL, HEADER_BYTES = 8, 1_000_000  # of a picture without any compression, and what may stand before it
 FEW = 10  # frames; the share above means nothing in fewer, and all pixels are taken to be alike
 
 
@@ -58,13 +60,15 @@ def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.floa
         ExperimentError: the file is missing, no picture, or of another size than the movie's frames.
     """
     name, do = f"background {path}", "save a frame without the ball as PNG, in the movie's own grey levels"
-    picture = None
-    if path.is_file():
-        data = np.fromfile(path, dtype=np.uint8)
-        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if data.size else None
+    height, width = frame_shape
+    content = read_whole(path, BYTES_A_PIXEL * height * width + HEADER_BYTES, "a picture", ExperimentError, do)
+    claimed = claimed_pixels(content)
+    if claimed is not None and claimed > height * width:  # told before room is made for it
+        expected, got = f"{width} x {height} px as the movie", f"{claimed} px"
+        raise ExperimentError(refusal(name, expected=expected, got=got, do=do))
+    picture = None if claimed is None else decoded_grey(content)
     if picture is None:
-        got = "a file that is none" if path.exists() else "no such file"
-        raise ExperimentError(refusal(name, expected="a picture", got=got, do=do))
+        raise ExperimentError(refusal(name, expected="a picture", got="a file that is none", do=do))
     if picture.shape != frame_shape:
         expected, got = (f"{shape[1]} x {shape[0]} px as the movie" for shape in (frame_shape, picture.shape))
         raise ExperimentError(refusal(name, expected=expected, got=got.removesuffix(" as the movie"), do=do))

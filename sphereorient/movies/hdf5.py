@@ -102,6 +102,12 @@ def words(error: Exception) -> str:
     return f"'{str(error).splitlines()[0][:200]}'" if str(error) else type(error).__name__
 
 
+def _shown(name: object) -> str:
+    """Return a name out of the file as one line of at most 60 characters."""
+    text = str(name)
+    return (text if text.isprintable() else repr(text))[:60]
+
+
 def _refuse(path: Path, expected: str, got: str, do: str) -> MovieError:
     return MovieError(refusal(str(path), expected=expected, got=got, do=do))
 
@@ -141,7 +147,7 @@ def _follow(path: Path, file: Any, name: str) -> Any:
     for part in name.strip("/").split("/"):
         link = here.get(part, getlink=True) if isinstance(here, h5py.Group) and part else None
         if link is None:
-            known = ", ".join(_movies(file)) or "no data set (N, H, W)"
+            known = ", ".join(map(_shown, _movies(file)[:5])) or "no data set (N, H, W)"
             raise _refuse(path, "a data set that the file has", f"'{name}'", f"name one of: {known}")
         if not isinstance(link, h5py.HardLink):
             do = "name the data set itself, copied into this file"
@@ -153,7 +159,7 @@ def _follow(path: Path, file: Any, name: str) -> Any:
 def _only(path: Path, file: Any) -> Any:
     names = _movies(file)
     if len(names) != 1:
-        got = ", ".join(names[:5]) or "none"
+        got = ", ".join(map(_shown, names[:5])) or "none"
         do = "name one: file.h5::group/dataset"
         raise _refuse(path, "one data set (N, H, W) of uint8 or uint16", got, do)
     return file[names[0]]
@@ -214,7 +220,7 @@ def _times(data: Any, told: int, count: int) -> tuple[NDArray[np.float64] | None
             return None, (f"its '{name}' is not used: it is not one number a frame",)
         unit = times.attrs.get("units", "s")
         if unit != "s":
-            return None, (f"its '{name}' is not used: in {unit}, not in s",)
+            return None, (f"its '{name}' is not used: in {_shown(unit)}, not in s",)
         if times.external or times.is_virtual:
             return None, (f"its '{name}' is not used: it lies in other files",)
         seconds = times[:count].astype(np.float64)

@@ -70,4 +70,4 @@ def _header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
         if fortran_order and len(shape) > 1:
             do = "save numpy.ascontiguousarray of it"
             raise MovieError(refusal(str(path), expected="an array (N, H, W), in rows", got="columns first", do=do))
-        return shape, dtype, file.tell()
+        return tuple(int(size) for size in shape), dtype, file.tell()  # a header may say True

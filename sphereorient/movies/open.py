@@ -45,9 +45,9 @@ def open_movie(path: Path | str) -> Movie:
     """
     path = Path(path)
     file = split_path(path)[0]
-    if path.is_dir() or (is_pattern(path) and not file.is_file()):
+    if _is(path, Path.is_dir) or (is_pattern(path) and not _is(file, Path.is_file)):
         return SequenceMovie(path)
-    if not file.is_file():
+    if not _is(file, Path.is_file):
         raise MovieError(refusal(str(path), expected="a movie file", got="no such file", do="correct the path"))
     suffix = file.suffix.lower()
     if suffix in PICTURES and suffix not in READERS:
@@ -61,6 +61,14 @@ def open_movie(path: Path | str) -> Movie:
     return reader(path)
 
 
+def _is(path: Path, kind: Callable[[Path], bool]) -> bool:
+    """Ask what a path is, also one too long for any file, at which Path's own methods raise."""
+    try:
+        return kind(path)
+    except OSError:
+        return False
+
+
 def movie_files(path: Path | str) -> list[Path]:
     """Return the files that a movie is made of: one, or the pictures of a sequence.
 
@@ -72,5 +80,5 @@ def movie_files(path: Path | str) -> list[Path]:
     """
     path = Path(path)
     file = split_path(path)[0]
-    many = path.is_dir() or (is_pattern(path) and not file.is_file())
+    many = _is(path, Path.is_dir) or (is_pattern(path) and not _is(file, Path.is_file))
     return sequence_files(path) if many else [file]

@@ -18,6 +18,8 @@ LOSSY = (".jpg", ".jpeg")
 PICTURES = (".png", ".bmp", ".pgm", ".ppm", *LOSSY, *TIFF)
 # A black picture shrinks to a thousandth at most: a header that claims more has no such picture behind it.
 LARGEST_RATIO = 1200
+MOST_PIXELS = 1 << 26  # more than any camera has that films
+LARGEST_BYTES = 1 << 28  # of a picture's file, which is read whole
 
 
 def read_picture(path: Path) -> tuple[Grey, bool]:
@@ -30,8 +32,14 @@ def read_picture(path: Path) -> tuple[Grey, bool]:
         raise _refuse(path, "a picture", "no such file", "find it, or record it as missing")
     if path.suffix.lower() in TIFF:
         return _tiff(path)
+    if path.stat().st_size > LARGEST_BYTES:
+        raise _refuse(path, "a picture", "a file as large as a movie", "export it again")
     content = path.read_bytes()
-    if claimed_bytes(content) > LARGEST_RATIO * max(len(content), 1):
+    claimed = claimed_bytes(content)
+    if claimed > MOST_PIXELS:
+        do = "cut out the part where the ball is"
+        raise _refuse(path, f"at most {MOST_PIXELS / 1e6:.3g} million pixels", f"{claimed / 1e6:.3g} million", do)
+    if claimed > LARGEST_RATIO * max(len(content), 1):
         raise _refuse(path, "a picture", "a header that claims more than the file can hold", "export it again")
     try:
         # As it is stored: neither turned by the camera's note of its position nor made 8 bit.

@@ -144,8 +144,9 @@ def _first_page(path: Path, file: TiffFile) -> Any:
 
 def _check_claim(page: Any) -> None:
     """Refuse a page that claims more than what is stored of it can hold."""
-    if not page.nbytes or page.nbytes > LARGEST_RATIO * sum(page.databytecounts):
-        raise ValueError(f"a page {page.shape} with {sum(page.databytecounts)} bytes of pixels")
+    stored = min(sum(page.databytecounts), page.parent.filehandle.size)  # the counts are a claim as well
+    if not page.nbytes or page.nbytes > LARGEST_RATIO * stored:
+        raise ValueError(f"a page {page.shape} with {stored} bytes of pixels")
 
 
 def _told(path: Path, file: TiffFile) -> int:

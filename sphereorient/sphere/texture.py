@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import cv2
 import kornia.geometry.transform as kornia_transform
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from sphereorient.cameras.whole_file import read_whole
 from sphereorient.errors import ShapeError, TextureError, check_tail, refusal
+from sphereorient.sphere.picture_claim import claimed_pixels, decoded_grey
 
+PICTURE_BYTES = 100_000_000
+MOST_PIXELS = 2**25  # 8192 x 4096: finer than a ball of 2600 px shows it
 WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}  # grey level of white paint by type of picture
 
 
@@ -29,14 +32,16 @@ def load_texture(path: Path) -> Tensor:
     Raises:
         TextureError: the file is missing, no picture, not 2:1, smaller than 16 x 8, or of one grey only.
     """
-    name = f"texture {path}"
-    if not path.is_file():
-        raise TextureError(
-            refusal(name, expected="a picture file", got="no such file", do="correct sphere.texture in the experiment")
+    name, do = f"texture {path}", "correct sphere.texture in the experiment"
+    content = read_whole(path, PICTURE_BYTES, "a picture file", TextureError, do)
+    claimed = claimed_pixels(content)
+    if claimed is not None and claimed > MOST_PIXELS:
+        expected, do = (
+            f"a picture of at most {MOST_PIXELS / 1e6:.3g} million pixels",
+            "export it smaller, as 8192 x 4096",
         )
-    content = np.fromfile(path, dtype=np.uint8)
-    # OpenCV throws at an empty file where it returns None for any other that does not decode.
-    picture = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if len(content) else None
+        raise TextureError(refusal(name, expected=expected, got=f"{claimed / 1e6:.3g} million", do=do))
+    picture = None if claimed is None else decoded_grey(content)
     if picture is None:
         raise TextureError(
             refusal(

@@ -235,7 +235,7 @@ def write_small(path: Path) -> None:
     ("write", "words"),
     [
         (lambda path: None, ["no such file"]),
-        (Path.mkdir, ["a file that is none"]),
+        (Path.mkdir, ["a folder"]),
         (write_nothing, ["a file that is none"]),
         (write_text, ["a file that is none"]),
         (write_small, ["17 x 12 px as the movie", "20 x 10 px"]),

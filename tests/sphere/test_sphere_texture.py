@@ -214,6 +214,6 @@ def test_a_file_that_is_no_picture_is_refused(tmp_path, content):
 
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    for path in (tmp_path / "texture.png", tmp_path):
-        with pytest.raises(TextureError, match="got no such file"):
+    for path, got in ((tmp_path / "texture.png", "no such file"), (tmp_path, "a folder")):
+        with pytest.raises(TextureError, match=f"got {got}"):
             load_texture(path)

@@ -1,0 +1,199 @@
+"""What an answer to a hostile input is, and what is none: the one place that decides."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import socket
+import time
+import unicodedata
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sphereorient.errors import SphereOrientError
+
+PATIENCE_S = 8  # a load that takes longer hangs
+LONGEST = 500  # characters of a message, without the folder of the test
+MEMORY_MB = 300  # by which a load may raise the peak of the process
+SPARSE_BYTES = 1_000_000_000
+ROOM_MB = 2000  # of address space beyond what the process has: what allocates more fails at once
+
+Load = Callable[[Path], Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One hostile input: what it is called, what lies in the file, and what stands in the file's place."""
+
+    name: str
+    content: bytes = b""
+    place: str = "file"  # file, missing, folder, fifo, device, socket, loop, long name, sparse, padded
+
+    def put(self, path: Path) -> Path:
+        """Make the input at a path, and return the path to open."""
+        if path.is_dir() and not path.is_symlink():
+            path.rmdir()
+        path.unlink(missing_ok=True)
+        return PLACES[self.place](path, self.content)
+
+
+def _file(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def _missing(path: Path, content: bytes) -> Path:
+    return path
+
+
+def _folder(path: Path, content: bytes) -> Path:
+    path.mkdir()
+    return path
+
+
+def _fifo(path: Path, content: bytes) -> Path:
+    os.mkfifo(path)
+    return path
+
+
+def _device(path: Path, content: bytes) -> Path:
+    path.symlink_to("/dev/zero")
+    return path
+
+
+def _socket(path: Path, content: bytes) -> Path:
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+    return path
+
+
+def _loop(path: Path, content: bytes) -> Path:
+    path.symlink_to(path.name)
+    return path
+
+
+def _long_name(path: Path, content: bytes) -> Path:
+    return path.with_name("x" * 300 + path.suffix)
+
+
+def _sparse(path: Path, content: bytes) -> Path:
+    """A file with zeros behind what it begins with; none of them is on the disk."""
+    path.write_bytes(content)
+    os.truncate(path, SPARSE_BYTES)
+    return path
+
+
+def _padded(path: Path, content: bytes) -> Path:
+    """A recording whose file was made large beforehand: what video libraries search for a next frame."""
+    path.write_bytes(content)
+    os.truncate(path, len(content) + SPARSE_BYTES // 20)
+    return path
+
+
+PLACES: dict[str, Callable[[Path, bytes], Path]] = {
+    "file": _file,
+    "missing": _missing,
+    "folder": _folder,
+    "fifo": _fifo,
+    "device": _device,
+    "socket": _socket,
+    "loop": _loop,
+    "long name": _long_name,
+    "sparse": _sparse,
+    "padded": _padded,
+}
+
+
+@dataclass
+class Tally:
+    """What became of the inputs of one family."""
+
+    refused: int = 0
+    accepted: int = 0
+    faults: list[str] = field(default_factory=list)
+    seen: set[tuple[str, bytes]] = field(default_factory=set)
+    slowest_s: float = 0.0
+    slowest: str = ""
+
+    def judge(self, case: Case, load: Load, path: Path) -> None:
+        """Load one input, unless the same was loaded before, and note what came of it."""
+        if (case.place, case.content) in self.seen:
+            return
+        self.seen.add((case.place, case.content))
+        opened = case.put(path)
+        begun, peak = time.perf_counter(), _peak_mb()
+        fault = self._answer(load, opened)
+        grown, took = _peak_mb() - peak, time.perf_counter() - begun
+        if took > self.slowest_s:
+            self.slowest_s, self.slowest = took, case.name
+        if took > PATIENCE_S and "Hang" not in fault:  # signals wait where a library does not come back
+            fault = f"{fault}; took {took:.0f} s"
+        if grown > MEMORY_MB:
+            fault = f"{fault}; took {grown:.0f} MB"
+        if fault:
+            self.faults.append(f"{case.name} ({case.place}): {fault.strip('; ')[:400]}; {case.content[:60]!r}")
+
+    def _answer(self, load: Load, path: Path) -> str:
+        """Return what is wrong with the answer; nothing where the input was refused in one line, or accepted."""
+        try:
+            with _alarm():
+                load(path)
+        except SphereOrientError as error:
+            self.refused += 1
+            return _wrong_with(str(error), path)
+        except BaseException as error:  # whatever else comes out is the finding
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        self.accepted += 1
+        return ""
+
+
+def _wrong_with(message: str, path: Path) -> str:
+    if len(message.splitlines()) != 1 or any(unicodedata.category(letter) in ("Cc", "Cs") for letter in message):
+        return f"not one line without controls: {message[:200]!r}"
+    # Where the hostile file names another one, by an absolute path, the fault may lie there.
+    if path.name not in message and str(path.parent) not in message and not message.startswith("/"):
+        return f"does not name the file: {message[:200]}"
+    if len(message.replace(str(path.parent), "")) > LONGEST + (len(path.name) if len(path.name) > 255 else 0):
+        return f"{len(message)} characters: {message[:200]}"
+    return ""
+
+
+class Hang(Exception):
+    """The load took longer than anybody waits."""
+
+
+@contextmanager
+def _alarm() -> Iterator[None]:
+    def ring(*_: object) -> None:
+        raise Hang(f"no answer in {PATIENCE_S} s")
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+@contextmanager
+def little_memory() -> Iterator[None]:
+    """Let the process have no more than ROOM_MB of address space beyond what it has."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + ROOM_MB * 2**20
+    resource.setrlimit(resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

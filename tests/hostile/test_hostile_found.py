@@ -1,0 +1,289 @@
+"""What hostile inputs once broke, one test a finding: each of these hung, crashed, filled the memory or lied."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+from hostile_files import bomb_png, encoded, pattern, png, tiff
+from hostile_kinds import BOMBS
+from hostile_texts import OPENCV, ORI, PAR, PINHOLE, calibration_documents, camera, cameras_documents, points_family
+
+from sphereorient.calibrate import load_calibration
+from sphereorient.calibrate.points import read_points
+from sphereorient.cameras import Camera, load_cameras
+from sphereorient.cameras.bounded_yaml import parse_yaml
+from sphereorient.cameras.opencv_file import load_opencv
+from sphereorient.cameras.openptv import load_openptv, load_ptv_par
+from sphereorient.cameras.whole_file import read_whole
+from sphereorient.errors import CameraError, ExperimentError, SettingsError, TextureError
+from sphereorient.locate import load_background
+from sphereorient.settings import load_settings
+from sphereorient.sphere import load_texture
+
+
+def written(path: Path, content: str | bytes) -> Path:
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def one_camera(folder: Path, **keys: object) -> dict[str, Camera]:
+    document = {"schema": "sphereorient-cameras/1", "cameras": {"cam1": PINHOLE | keys}}
+    return load_cameras(written(folder / "cameras.yaml", yaml.safe_dump(document)))
+
+
+# Places where no file is
+
+
+@pytest.mark.parametrize(
+    "load", [load_cameras, load_settings, load_calibration, read_points, load_opencv, load_texture]
+)
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path, load):
+    os.mkfifo(tmp_path / "pipe.yml")
+    with pytest.raises((CameraError, SettingsError, TextureError), match=r"pipe\.yml: expected .* got a pipe"):
+        load(tmp_path / "pipe.yml")
+
+
+def test_a_device_a_loop_a_long_name_and_a_large_file_are_refused_unread(tmp_path):
+    (tmp_path / "device").symlink_to("/dev/zero")
+    (tmp_path / "loop").symlink_to("loop")
+    written(tmp_path / "large", "")
+    os.truncate(tmp_path / "large", 10**12)
+    got = {
+        "device": "a pipe, a socket or a device",
+        "loop": "symbolic links",
+        "large": "1e[+]06 MB",
+        "a" * 300: "too long",
+    }
+    got["zero\0byte"] = "a name that no file can have"
+    for name, words in got.items():
+        with pytest.raises(CameraError, match=words):
+            read_whole(tmp_path / name, 1000, "a file", CameraError, "correct the path")
+
+
+# YAML
+
+
+@pytest.mark.parametrize("name", ["billion laughs", "billion keys", "merged without end", "many items", "many keys"])
+def test_what_unfolds_or_is_too_much_is_refused(name):
+    with pytest.raises(yaml.YAMLError, match="more than 20000 values"):
+        parse_yaml(BOMBS[name])
+
+
+@pytest.mark.parametrize("name", ["deep lists", "deep mappings", "deep blocks", "deep keys", "deep lines"])
+def test_nesting_is_refused_before_it_recurses(name):
+    with pytest.raises(yaml.YAMLError, match="more than 30 levels"):
+        parse_yaml(BOMBS[name])
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("&a [*a]", "contains itself"),
+        ("&a {b: {<<: *a}}", "contains itself"),
+        ("a: 1\nb: 2\na: 3", "the key 'a' twice"),
+        ("{? [a] : 1}", "no name"),
+        ("{'a\\tb': 1}".replace("'", '"'), "control characters"),
+        ("k" * 101 + ": 1", "no name"),
+        ("!!python/object/apply:os.system ['true']", "a tag"),
+        ("!!timestamp x", "a tag"),  # once an AttributeError
+        ("!!int ''", "a tag"),  # once an IndexError
+        ("!!bool 7", "a tag"),  # once a KeyError
+        ('"a\\0b"', "control characters"),
+        ('"a\\u2028b"', "several lines"),
+        ("9" * 65, "more than 64 characters"),
+        (":".join(["1"] * 500) + ".5", "more than 64 characters"),  # once an OverflowError
+        ("x" * 5000, "more than 4096 characters"),
+    ],
+)
+def test_what_yaml_could_do_and_ours_does_not_is_refused(text, problem):
+    with pytest.raises(yaml.YAMLError, match=problem):
+        parse_yaml(text)
+
+
+def test_aliases_merge_keys_and_a_mark_in_front_still_work(tmp_path):
+    text = "base: &base {f: 1, g: [1, 2]}\none: {<<: *base, f: 2}\ntwo: *base\n"
+    assert parse_yaml(text) == {"base": (base := {"f": 1, "g": [1, 2]}), "one": base | {"f": 2}, "two": base}
+    document = yaml.safe_dump(cameras_documents()[0])
+    assert list(load_cameras(written(tmp_path / "cameras.yaml", "\ufeff" + document))) == ["cam1"]
+    assert parse_yaml("name: fl\u00fcssig \U0001f600 \u3000") == {"name": "fl\u00fcssig \U0001f600 \u3000".strip(" ")}
+
+
+def test_a_covariance_of_a_hundred_parameters_is_not_too_much():
+    rows = np.eye(100).tolist()
+    assert parse_yaml(yaml.safe_dump({"matrix": rows}))["matrix"] == rows
+
+
+def test_an_unknown_key_below_a_name_that_the_file_gives_is_refused(tmp_path):
+    # Once a KeyError: the name cam1 was looked up among the keys of a port.
+    document = calibration_documents()[0]
+    document["ports"] = {"cam1": document["ports"]["cam1"] | {"n_glas": 1.5}}
+    with pytest.raises(CameraError, match=r"calibration\.yaml, ports, cam1: .* got 'n_glas'; "):
+        load_calibration(written(tmp_path / "calibration.yaml", yaml.safe_dump(document)))
+
+
+# Cameras
+
+
+@pytest.mark.parametrize("key", ["k", "p"])
+def test_distortions_whose_powers_overflow_are_refused(tmp_path, key):
+    # Once a LinAlgError out of the roots of the polynomial.
+    document = {
+        "schema": "sphereorient-cameras/1",
+        "cameras": {"cam1": camera("brown") | {key: [1e308, 1e308, 1e308][: 3 if key == "k" else 2]}},
+    }
+    with pytest.raises(CameraError, match=f"cam1, {key}: expected finite numbers"):
+        load_cameras(written(tmp_path / "cameras.yaml", yaml.safe_dump(document)))
+
+
+def test_a_picture_of_a_trillion_pixels_is_no_cameras(tmp_path):
+    with pytest.raises(CameraError, match="cam1, image_size: expected at most 65536 px a side"):
+        one_camera(tmp_path, image_size=[1_000_000, 1_000_000])
+
+
+def test_messages_do_not_hold_whole_files(tmp_path):
+    for model in ("x" * 4000, list(range(5000)), {f"k{k}": k for k in range(3000)}):
+        with pytest.raises(CameraError) as refused:
+            one_camera(tmp_path, model=model)
+        assert len(str(refused.value).replace(str(tmp_path), "")) < 300
+
+
+# Calibrations
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"columns": 10**9}, "plate, columns: expected a whole number, 2 or more, at most 1000"),
+        ({"pitch": 10**30}, "plate, pitch: expected a length"),
+        ({"fiducials": [[0, 0], [float("inf"), 0], [0, 2]]}, "plate, fiducials: expected three grid indices"),
+        ({"fiducials": 3}, "plate, fiducials: expected three grid indices"),
+        ({"dot_diameter": 9.0}, "calibration.yaml, plate: expected dots that do not touch"),
+        ({"type": "charuco"}, "calibration.yaml, plate: expected the keys"),
+    ],
+)
+def test_a_plate_that_is_none_is_refused_with_the_name_of_the_file(tmp_path, change, words):
+    document = calibration_documents()[0]
+    document["plate"] = document["plate"] | change
+    with pytest.raises(CameraError, match=words) as refused:
+        load_calibration(written(tmp_path / "calibration.yaml", yaml.safe_dump(document)))
+    assert str(tmp_path / "calibration.yaml") in str(refused.value)
+
+
+def test_a_dictionary_that_is_no_text_is_refused(tmp_path):
+    # Once an AttributeError.
+    document = calibration_documents()[3]
+    document["plate"] = document["plate"] | {"dictionary": 4}
+    with pytest.raises(CameraError, match="plate, dictionary: expected a name, got 4"):
+        load_calibration(written(tmp_path / "calibration.yaml", yaml.safe_dump(document)))
+
+
+def test_a_port_that_is_none_is_refused_with_the_name_of_the_file(tmp_path):
+    document = calibration_documents()[0]
+    document["ports"] = {"cam1": document["ports"]["cam1"] | {"normal": [0.0, 0.0, 0.0]}}
+    with pytest.raises(CameraError, match=r"calibration\.yaml, ports, cam1, "):
+        load_calibration(written(tmp_path / "calibration.yaml", yaml.safe_dump(document)))
+
+
+def test_a_table_as_large_as_a_movie_is_refused_unread(tmp_path):
+    path = written(tmp_path / points_family().file, "x,y,z,u,v\n")
+    os.truncate(path, 10**10)
+    with pytest.raises(CameraError, match=r"expected a table, got 1e\+04 MB"):
+        read_points(path)
+
+
+# OpenCV's and OpenPTV's files
+
+
+@pytest.mark.parametrize(
+    ("suffix", "nested"), [("yml", "a: " + "[" * 100_000), ("yml", "a: " + "- " * 100_000), ("xml", "<a>" * 100_000)]
+)
+def test_nesting_on_which_opencvs_parser_crashes_is_refused_before_it_sees_it(tmp_path, suffix, nested):
+    with pytest.raises(CameraError, match="thousands of lists"):
+        load_opencv(written(tmp_path / f"cam.{suffix}", OPENCV[suffix] + nested))
+
+
+@pytest.mark.parametrize("claim", ["100000", "2147483647", "-1", "0", "1.5", "x"])
+def test_a_matrix_that_claims_much_is_not_made_room_for(tmp_path, claim):
+    text = OPENCV["yml"].replace("rows: 3", f"rows: {claim}").replace("cols: 3", f"cols: {claim}")
+    with pytest.raises(CameraError, match="camera_matrix: expected an OpenCV matrix, got none"):
+        load_opencv(written(tmp_path / "cam.yml", text))
+
+
+def test_an_opencv_file_without_keys_and_sizes_that_are_no_numbers_are_refused(tmp_path):
+    for text, words in (
+        ("%YAML:1.0\n---\n- 1\n", "expected a file of OpenCV's FileStorage"),  # once a cv2.error
+        (OPENCV["yml"].replace("640", ".Inf"), "image_width, image_height"),  # once an OverflowError
+        (OPENCV["yml"].replace("640", ".Nan"), "image_width, image_height"),  # once a ValueError
+    ):
+        with pytest.raises(CameraError, match=words):
+            load_opencv(written(tmp_path / "cam.yml", text))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\u00b2" + PAR[1:],  # a digit to isdigit, none to int
+        "9" * 5000 + PAR[1:],
+        PAR.replace("0.012", "0.0"),  # once a ZeroDivisionError
+        PAR.replace("\n0\n1\n1.49", "\n0\n0\n1.49"),
+        PAR.replace("1280", "nan"),
+    ],
+    ids=["digit", "digits", "pitch", "index", "nan"],
+)
+def test_a_ptv_par_that_is_none_is_refused(tmp_path, text):
+    with pytest.raises(CameraError, match=r"ptv\.par") as refused:
+        load_openptv(written(tmp_path / "cam.ori", ORI), load_ptv_par(written(tmp_path / "ptv.par", text)))
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_an_ori_with_a_mark_in_front_is_read_and_one_with_controls_is_refused_in_print(tmp_path):
+    par = load_ptv_par(written(tmp_path / "ptv.par", PAR))
+    load_openptv(written(tmp_path / "cam.ori", "\ufeff" + ORI), par)
+    with pytest.raises(CameraError, match=r"number 1 of 21: expected a finite number, got '\\x1b105.2632'"):
+        load_openptv(written(tmp_path / "cam.ori", "\x1b" + ORI), par)
+
+
+# Pictures
+
+
+@pytest.mark.parametrize(
+    "content",
+    [png(30_000, 15_000), bomb_png(20_000, 10_000), tiff(65_536, 32_768), tiff(65_536, 32_768, big=True)],
+    ids=["png", "bomb", "tiff", "tiff big"],
+)
+def test_a_picture_that_claims_too_much_is_refused_before_room_is_made(tmp_path, content):
+    with pytest.raises(TextureError, match=r"expected a picture of at most 33\.6 million pixels, got"):
+        load_texture(written(tmp_path / "texture.png", content))
+    with pytest.raises(ExperimentError, match="expected 32 x 16 px as the movie, got"):
+        load_background(written(tmp_path / "empty.png", content), (16, 32))
+
+
+def test_formats_whose_size_is_not_told_before_decoding_are_refused(tmp_path):
+    with pytest.raises(TextureError, match="expected a PNG, TIFF or JPEG picture"):
+        load_texture(written(tmp_path / "texture.png", encoded(".webp", np.dstack([pattern()] * 3))))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".bmp", ".pgm"])
+def test_pictures_of_the_usual_formats_are_read_as_before(tmp_path, suffix):
+    content = encoded(suffix, pattern())
+    expected = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    path = written(tmp_path / f"texture{suffix}", content)
+    assert torch.equal(load_texture(path), torch.from_numpy(expected.astype(np.float32) / 255))
+    np.testing.assert_array_equal(load_background(path, (16, 32)), expected)
+
+
+# Settings
+
+
+@pytest.mark.parametrize(
+    "text", ["motion: {truncate: .inf}", "motion: {truncate: '1e400'}", "motion: {truncate: .nan}"]
+)
+def test_settings_that_are_no_finite_numbers_are_refused(tmp_path, text):
+    with pytest.raises(SettingsError, match=r"settings\.yaml, motion\.truncate"):
+        load_settings(written(tmp_path / "settings.yaml", text))
