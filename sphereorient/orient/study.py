@@ -31,6 +31,7 @@ APART_GAIN = 1.5  # cameras that leave so many times more unexplained together t
 APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
 FAR_APART_PX = 1.5  # and by more than this, one pose for all cameras is none
 FEWEST_BOTH = 4  # frames that tell what is usual between two cameras
+NO_BETTER = 0.05  # poses that explain the pictures by less more than wrong ones do are wrong as well
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
@@ -82,7 +83,7 @@ def study(
         settings: blur, if given.
 
     Raises:
-        ExperimentError: no frame has a pose.
+        ExperimentError: no frame has a pose, or none that is better than wrong ones.
     """
     diameter_px = max(eye.diameter_px for eye in eyes)
     blur_px = settings.blur_px or FIRST_BLUR
@@ -124,6 +125,8 @@ def study(
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
     highest = float(wrong.quantile(0.9)) if len(wrong) else 0.0
+    if right < highest + NO_BETTER:
+        raise _unexplained(right)
     fitter = replace(fitter, widest_px=widest)
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
     score_min = 0.5 * (right + min(highest, right))
@@ -210,6 +213,13 @@ def _nothing(found: Sequence[Poses]) -> ExperimentError:
     else:
         expected, do = "the sphere in some frame", "check sphere.diameter and the cameras, or set locate.diameter_px"
     return ExperimentError(refusal("movies", expected=expected, got=got, do=do))
+
+
+def _unexplained(score: float) -> ExperimentError:
+    """Say that the best poses are no better than wrong ones: the pictures are not of this map."""
+    do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
+    got = f"poses that explain {100 * score:.0f} % of the pictures, as wrong ones do"
+    return ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
 
 
 def _clear(found: Sequence[Poses]) -> list[int]:

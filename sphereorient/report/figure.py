@@ -56,9 +56,11 @@ def _frames_part(part: Any, track: Trajectory, experiment: Experiment) -> None:
     pictures = {}
     with ExitStack() as opened:
         movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
-        rows = timeline(experiment, movies).rows
+        frames = timeline(experiment, movies)
+        # By their times: the track may be of a part of the experiment.
+        at = np.abs(frames.time_s[:, None] - track.time[chosen]).argmin(0)
         for name, movie in movies.items():
-            pictures[name] = movie.sample([int(rows[name][k]) for k in chosen])
+            pictures[name] = movie.sample(frames.rows[name][at].tolist())
     for beside, name in zip(part.subfigures(1, len(names), squeeze=False)[0], names, strict=True):
         axes = beside.subplots(2, len(chosen), squeeze=False)
         for column, (k, picture) in enumerate(zip(chosen, pictures[name], strict=True)):
