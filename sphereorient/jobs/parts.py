@@ -53,7 +53,11 @@ class Parts:
                 do = "run without --resume to start over"
                 got = f"parts of a run with another {', '.join(others)}"
                 raise TrackError(refusal(str(self.folder), expected="parts of this run", got=got, do=do))
-            yield
+            try:
+                yield
+            finally:
+                if self.folder.is_dir() and not any(self.folder.glob("*.h5")):
+                    self.remove()  # a run that came to nothing leaves nothing
 
     def _make(self, told: Mapping[str, str]) -> None:
         try:

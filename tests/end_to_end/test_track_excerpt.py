@@ -223,7 +223,7 @@ def _replace(path: Path, old: str, new: str) -> None:
         (_unknown_key, ["framerate", "frame_rate"]),
         (_masks, ["masks"]),
         (_fixed, ["backgrounds"]),
-        (_no_ball, ["readable pictures", "black, white or damaged"]),
+        (_no_ball, ["sphere in some frame", "not_found"]),
     ],
     ids=lambda value: value.__name__.strip("_") if callable(value) else "",
 )
