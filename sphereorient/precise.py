@@ -104,12 +104,12 @@ def study_shots(recording: Recording, eyes: Sequence[Eye], count: int) -> list[t
             ),
             strict=True,
         )
-        before: tuple[Shot, ...] = ()
+        best = next(frames)
         for shots in frames:
-            before = max(before, shots, key=lambda each: sum(shot.usable for shot in each))
-            if all(shot.usable for shot in shots):
+            if all(shot.usable for shot in best):
                 break
-        taken.append(before)
+            best = max(best, shots, key=lambda each: sum(shot.usable for shot in each))
+        taken.append(best)
     return taken
 
 

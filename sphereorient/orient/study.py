@@ -31,6 +31,7 @@ APART_GAIN = 1.5  # cameras that leave so many times more unexplained together t
 APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
 FAR_APART_PX = 1.5  # and by more than this, one pose for all cameras is none
 FEWEST_BOTH = 4  # frames that tell what is usual between two cameras
+TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees a ball, but not where the other does
 NO_BETTER = 0.05  # poses that explain the pictures by less more than wrong ones do are wrong as well
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
@@ -156,7 +157,8 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     whole = [k for k, poses in enumerate(found) if len(poses) and bool(poses.use.all())]
     if cameras == 1:
         return 1.0, 0.0
-    if len(whole) < sum(len(poses) > 0 for poses in found) / 2:
+    torn = [poses for poses in found if len(poses) and any(why in TORN for why in poses.reason)]
+    if len(whole) < len(torn):
         return math.inf, math.inf  # outlines that miss each other already
     if not whole:
         return 1.0, 0.0
