@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+EVERY = 64  # states; between them the smoother computes the covariances once more, to the same bits
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Chain:
@@ -41,7 +43,7 @@ class Filtered:
     """What the past says, frame by frame; made by `run_filter`."""
 
     state: Floats  # (N, D), after the frame's own measurement
-    covariance: Floats  # (N, D, D)
+    covariance: Floats  # (M, D, D), of every EVERY-th state from the first on: all of them would be most of the memory
     gain: Floats  # (N, D, 3)
     innovation: Floats  # (N, 3)
     inverse: Floats  # (N, 3, 3), inverse covariance of the innovation
@@ -56,23 +58,24 @@ def run_filter(chain: Chain) -> Filtered:
     """
     count, size = len(chain.measured), chain.start.shape[0]
     x, P, F = np.zeros(size), chain.start, np.zeros((size, size))
-    states, covariances = np.empty((count, size)), np.empty((count, size, size))
+    states, covariances = np.empty((count, size)), np.empty((-(-count // EVERY), size, size))
     gains, innovations, inverses = np.zeros((count, size, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3))
     for k in range(count):  # a recursion: each frame needs the one before
         if k:
             F = chain.transition(k - 1, F)
             x = F @ x
             x[:3] += chain.drift[k - 1]
-            P = F @ P @ F.T + chain.noise[chain.kind[k - 1]]
+            P = _carried(chain, k, P, F)
         if chain.used[k]:
             inverse = np.linalg.inv(P[:3, :3] + chain.covariance[k])
             gain = P[:, :3] @ inverse
             innovation = chain.measured[k] - x[:3]
             x = x + gain @ innovation
-            P = P - gain @ P[:3]
-            P = 0.5 * (P + P.T)
+            P = _told(P, gain)
             gains[k], innovations[k], inverses[k] = gain, innovation, inverse
-        states[k], covariances[k] = x, P
+        states[k] = x
+        if k % EVERY == 0:
+            covariances[k // EVERY] = P
     seen = chain.used
     return Filtered(
         state=states,
@@ -83,6 +86,33 @@ def run_filter(chain: Chain) -> Filtered:
         misfit=float(np.einsum("ni,nij,nj->", innovations, inverses, innovations)),
         log_determinant=-float(np.linalg.slogdet(inverses[seen])[1].sum()),
     )
+
+
+def _carried(chain: Chain, k: int, P: Floats, F: Floats) -> Floats:
+    """Return the covariance before the measurement of state k, from the one before it; F: the transition to k."""
+    carried: Floats = F @ P @ F.T + chain.noise[chain.kind[k - 1]]
+    return carried
+
+
+def _told(P: Floats, gain: Floats) -> Floats:
+    """Return the covariance after a measurement."""
+    P = P - gain @ P[:3]
+    return 0.5 * (P + P.T)
+
+
+def _covariances(chain: Chain, filtered: Filtered, first: int) -> Floats:
+    """Return the covariances of the states from a kept one to the next, once more."""
+    count = min(EVERY, len(filtered.state) - first)
+    P = filtered.covariance[first // EVERY]
+    F = np.zeros_like(P)
+    found = np.empty((count, *P.shape))
+    found[0] = P
+    for k in range(first + 1, first + count):
+        P = _carried(chain, k, P, chain.transition(k - 1, F))
+        if chain.used[k]:
+            P = _told(P, filtered.gain[k])
+        found[k - first] = P
+    return found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,7 +140,9 @@ def smooth(chain: Chain, filtered: Filtered, wanted: Floats) -> States:
     state, surprise = filtered.state.copy(), np.zeros(count)
     covariance = np.empty((count, len(wanted), len(wanted)))
     for k in range(count - 1, -1, -1):
-        P = filtered.covariance[k]
+        if k == count - 1 or k % EVERY == EVERY - 1:
+            block = _covariances(chain, filtered, k - k % EVERY)
+        P = block[k % EVERY]
         state[k] -= P @ pull
         half = wanted @ P
         covariance[k] = half @ wanted.T - half @ hold @ half.T
