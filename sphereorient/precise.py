@@ -20,9 +20,11 @@ from sphereorient.orient import (
     GreySearch,
     LinesOfSight,
     Poses,
+    PoseTable,
     Proposer,
     Study,
     base_table,
+    joined_tables,
     pose_table,
     study,
 )
@@ -158,21 +160,20 @@ def _taken(shots: Iterator[Shot], count: int) -> list[Shot]:
 
 
 def join(
-    recording: Recording, known: Study, poses: Sequence[Poses], settings: Settings, given: Learnt | None = None
+    recording: Recording, known: Study, table: PoseTable, settings: Settings, given: Learnt | None = None
 ) -> tuple[Trajectory, Learnt]:
     """Choose the history, smooth it, and put everything into the noun that comes out.
 
     Args:
         recording: with the times.
         known: light and scores that the poses were measured with.
-        poses: of all frames.
+        table: poses of all frames.
         settings: of the path and the smoother.
         given: the motion as another run learnt it; None learns it.
 
     Returns:
         The track, and what it taught.
     """
-    table = pose_table(poses, len(known.fitter.eyes))
     hypotheses = Hypotheses(
         R_lab_body=table.R_lab_body, nll=table.nll, covariance_rad2=table.covariance[..., :3, :3], mask=table.mask
     )
@@ -204,10 +205,10 @@ def track_precise(
         seeing = follower(recording, *learn(recording, settings, progress), settings, device)
     else:
         seeing = follower_of(recording, given, settings, device)
-    poses: list[Poses] = []
+    tables: list[PoseTable] = []
     total = len(recording.timeline)
     progress("track", 0, total)
     for window, measured in follow(seeing, seeing.windows):
-        poses += measured
+        tables.append(pose_table(measured, len(recording.reels)))
         progress("track", window.last, total)
-    return join(recording, seeing.study, poses, settings, given)
+    return join(recording, seeing.study, joined_tables(tables), settings, given)

@@ -12,7 +12,7 @@ from conftest import REPO
 ROOMS = (
     "errors hdf5_out so3 cameras movies sphere experiment timeline trajectory locate orient assemble motion synth "
     "learn paint settings provenance results reel recording learnt paper precise pipeline calibrate preflight "
-    "jobs evaluate report cli"
+    "jobs evaluate statistics report cli"
 )
 ORDER = ROOMS.split(" ")
 FILES = sorted((REPO / "sphereorient").rglob("*.py"))

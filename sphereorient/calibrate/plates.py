@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -22,8 +21,11 @@ from sphereorient.cameras.calibration.bundle import Fitted, adjust
 from sphereorient.cameras.calibration.guess import guess_from_points, guess_rig
 from sphereorient.cameras.calibration.problem import Problem, Rig, fitted_parameters, gathered
 from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.cameras.whole_file import read_whole
 from sphereorient.errors import CameraError, refusal
+from sphereorient.sphere.picture_claim import claimed_pixels, decoded_grey
 
+LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a plate
 Progress = Callable[[str, int, int], None]
 CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tied where one reading fits this well
 # Standard deviations of what counts as undetermined: of focal length, distance, picture's width; rad
@@ -147,10 +149,10 @@ def read_grey(path: Path, image_size: tuple[int, int]) -> NDArray[Any]:
     Raises:
         CameraError: no such file, no picture, or one of another size.
     """
-    if not path.is_file():
-        raise CameraError(refusal(str(path), expected="a picture", got="no such file", do="correct the path"))
-    data = np.fromfile(path, np.uint8)
-    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if data.size else None
+    content = read_whole(path, LARGEST_BYTES, "a picture", CameraError, "correct the path")
+    pixels = claimed_pixels(content)
+    # A file that claims more than any camera has is not decoded to find out.
+    picture = decoded_grey(content) if pixels is not None and pixels <= LARGEST_PIXELS else None
     if picture is None:
         raise CameraError(refusal(str(path), expected="a picture", got="a file that is none", do="save it as PNG"))
     if picture.shape != image_size[::-1]:

@@ -6,16 +6,30 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from sphereorient import __version__
 from sphereorient.errors import OutputError, SphereOrientError, refusal
 
+
+class InOrder(TyperGroup):
+    """Commands in the order in which a user meets them, not in that of their files."""
+
+    ORDER = ("track", "check", "movie", "convert", "calibrate", "check-cameras", "synth", "settings", "info")
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names, those that are not in the order last."""
+        known = {name: place for place, name in enumerate(self.ORDER)}
+        return sorted(super().list_commands(ctx), key=lambda name: known.get(name, len(known)))
+
+
 app = typer.Typer(
+    cls=InOrder,
     name="sphereorient",
     help="Measure position and absolute orientation of a painted sphere from high-speed movies.",
     no_args_is_help=True,
@@ -91,10 +105,13 @@ def progress_bar(quiet: bool = False) -> Iterator[Advance]:
         TextColumn("left"),
         TimeRemainingColumn(),
     ]
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        tasks: dict[str, Any] = {}
+    bar = Progress(*columns, console=Console(stderr=True))
+    tasks: dict[str, Any] = {}
+    with ExitStack() as shown:
 
         def advance(stage: str, done: int, total: int) -> None:
+            if not tasks:
+                shown.enter_context(bar)  # not before: a command that is refused at once prints one line
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=total, rate="")
             elapsed = bar.tasks[bar.task_ids.index(tasks[stage])].elapsed

@@ -10,7 +10,7 @@ from sphereorient.errors import OutputError, TrackError, refusal
 from sphereorient.jobs.parts import Parts
 from sphereorient.jobs.request import Request
 from sphereorient.learnt import Learnt
-from sphereorient.orient import Poses
+from sphereorient.orient import PoseTable, joined_tables, pose_table
 from sphereorient.paper import track_paper
 from sphereorient.pipeline import check_method, finished, one_thread, torch_device
 from sphereorient.precise import Follower, Window, follow, follower, follower_of, join, learn
@@ -47,7 +47,7 @@ class Run:
     def join(self, seeing: Follower, progress: Progress = silent) -> Trajectory:
         """Put the measured windows together, and write the track."""
         progress("join", 0, 1)
-        poses: list[Poses] = []
+        tables: list[PoseTable] = []
         for window in seeing.windows:
             found = self.parts.read(window)
             if found is None:
@@ -55,8 +55,8 @@ class Run:
                 path.unlink(missing_ok=True)
                 do = "run again with --resume; only this part is measured again"
                 raise TrackError(refusal(str(path), expected="the poses of a window", got="a damaged file", do=do))
-            poses += found
-        track, learnt = join(self.recording, seeing.study, poses, self.request.settings, self.given)
+            tables.append(pose_table(found, len(self.recording.reels)))
+        track, learnt = join(self.recording, seeing.study, joined_tables(tables), self.request.settings, self.given)
         if self.request.save_learnt is not None:
             learnt.save(self.request.save_learnt)
         return self.written(track, progress)

@@ -69,14 +69,8 @@ def _pieces(paths: Sequence[Path], most: int) -> list[Path]:
     if total > most:
         count = max(1, round(len(starts) * most / total))
         starts = [starts[k] for k in np.linspace(0, len(starts) - 1, count).round().astype(int)]
-    pieces = [_cut(path, slice(k, k + PIECE)) for path, k in starts]
+    pieces = [path.part(slice(k, k + PIECE)) for path, k in starts]
     return [piece for piece in pieces if piece.used.sum() >= FEWEST]
-
-
-def _cut(path: Path, part: slice) -> Path:
-    """Return a part of a path."""
-    by_instant = ("time", "covariance", "seen", "used", "rate", "value", "reference")
-    return replace(path, **{name: getattr(path, name)[part] for name in by_instant})
 
 
 def _learnt(pieces: Sequence[Path], band: float | None, settings: SmoothSettings) -> Learnt:

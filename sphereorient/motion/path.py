@@ -23,6 +23,8 @@ Bools = NDArray[np.bool_]
 
 SIZE = 3 * (2 + ORDER)
 UNKNOWN = 100.0  # standard deviation of the start from its reference, in sigmas of a measurement: next to no pull
+BY_INSTANT = ("time", "covariance", "seen", "used", "rate", "value", "reference")
+TOGETHER = 1024  # steps computed at once: the nodes of all of them would be most of the memory
 VOTES = 5  # neighbouring turns of which the median is typical
 LEFT_OUT = 6  # frames in a row that the first guess may leave out
 DELTA, MEAN, RATE = slice(0, 3), slice(3, 6), slice(6, SIZE)
@@ -73,6 +75,26 @@ class Path:
         """Return the reference's random rate (N, ORDER, 3) in the units of another pole."""
         return self.rate * (self.pole / prior.pole) ** np.arange(ORDER)[:, None]
 
+    def part(self, instants: slice) -> Self:
+        """Return some instants of the path."""
+        return replace(self, **{name: getattr(self, name)[instants] for name in BY_INSTANT})
+
+    def steps(self, prior: Prior, weight: Floats, by_rate: Floats) -> tuple[Floats, Floats]:
+        """Return what a step takes over from the state, (M, 3, SIZE), and its drift (M, 3).
+
+        Args:
+            prior: of the rate.
+            weight: (M, NODES), of the nodes of each step.
+            by_rate: (M, NODES, ORDER), the same times how the rate's state grows to them.
+        """
+        count = len(weight)
+        carry, jump = self.jumps(prior)
+        turned = carry[:, :NODES].reshape(count, NODES, 9).mT
+        from_mean = (turned @ weight[..., None]).reshape(count, 3, 3)
+        from_rate = (turned @ by_rate).reshape(count, 3, 3, ORDER).mT.reshape(count, 3, 3 * ORDER)
+        drift = -jump - (from_rate @ self.scaled(prior)[:-1].reshape(count, -1, 1))[..., 0]
+        return np.concatenate([carry[:, NODES], from_mean, from_rate], axis=2), drift
+
     def chain(self, prior: Prior) -> Chain:
         """Return the problem, linear about the reference.
 
@@ -81,12 +103,13 @@ class Path:
         step = np.diff(self.time)
         count = len(step)
         lengths, kind = np.unique(np.round(step, 9), return_inverse=True)
-        carry, jump = self.jumps(prior)
         at, weight = nodes(lengths)
         by_rate = weight[..., None] * grown_rate(at * prior.pole)
-        turned = carry[:, :NODES].reshape(count, NODES, 9).mT
-        from_mean = (turned @ weight[kind][..., None]).reshape(count, 3, 3)
-        from_rate = (turned @ by_rate[kind]).reshape(count, 3, 3, ORDER).mT.reshape(count, 3, 3 * ORDER)
+        carried, drift = np.zeros((count, 3, SIZE)), np.zeros((count, 3))
+        for k in range(0, count, TOGETHER):
+            some = slice(k, min(k + TOGETHER, count))
+            piece = self.part(slice(some.start, some.stop + 1))
+            carried[some], drift[some] = piece.steps(prior, weight[kind[some]], by_rate[kind[some]])
         eye = np.eye(3)
         grown_by = np.zeros((len(lengths), SIZE - 3, SIZE - 3))
         grown_by[:, :3, :3], grown_by[:, 3:, 3:] = eye, _by_axis(grown(lengths * prior.pole))
@@ -99,8 +122,8 @@ class Path:
         start[MEAN, MEAN] = (self.unknown_rate + self.sigma) ** 2 * eye
         start[RATE, RATE] = prior.deviation**2 * np.kron(STATIONARY, eye)
         return Chain(
-            carried=np.concatenate([carry[:, NODES], from_mean, from_rate], axis=2),
-            drift=-jump - (from_rate @ self.scaled(prior)[:-1].reshape(count, -1, 1))[..., 0],
+            carried=carried,
+            drift=drift,
             kind=kind,
             grown=grown_by,
             noise=noise,

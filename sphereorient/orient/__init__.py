@@ -7,7 +7,7 @@ from sphereorient.orient.cold import POSE_PARTS, Poses, cold_start
 from sphereorient.orient.crop import crop_disk
 from sphereorient.orient.extraction import extract_paint
 from sphereorient.orient.eye import Eye, Fitter, Optics, base_table
-from sphereorient.orient.gather import PoseTable, pose_table
+from sphereorient.orient.gather import PoseTable, joined_tables, pose_table
 from sphereorient.orient.grey_search import GreySearch
 from sphereorient.orient.light import Light
 from sphereorient.orient.pixels import LinesOfSight
@@ -42,6 +42,7 @@ __all__ = [
     "cold_start",
     "crop_disk",
     "extract_paint",
+    "joined_tables",
     "pose_table",
     "refine",
     "study",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -73,3 +73,26 @@ def pose_table(frames: Sequence[Poses], cameras: int) -> PoseTable:
         use=torch.stack([poses.use for poses in frames]),
         reason=tuple(poses.reason for poses in frames),
     )
+
+
+def joined_tables(tables: Sequence[PoseTable]) -> PoseTable:
+    """Return the frames of several tables, one after the other."""
+    width = max(table.mask.shape[1] for table in tables)
+    wide = [_widened(table, width) for table in tables]
+    parts = {name: torch.cat([getattr(table, name) for table in wide]) for name in ("mask", *POSE_PARTS, "use")}
+    return PoseTable(**parts, reason=tuple(why for table in wide for why in table.reason))
+
+
+def _widened(table: PoseTable, width: int) -> PoseTable:
+    """Add places that are not in use."""
+    more = width - table.mask.shape[1]
+    if not more:
+        return table
+    parts = {}
+    for name in ("mask", *POSE_PARTS):
+        part = getattr(table, name)
+        empty = part.new_zeros(len(part), more, *part.shape[2:])
+        if name == "R_lab_body":
+            empty = empty + torch.eye(3, dtype=part.dtype)
+        parts[name] = torch.cat([part, empty], dim=1)
+    return replace(table, **parts)
