@@ -138,7 +138,7 @@ def main() -> None:
     except Exception as error:
         code = _usage_error(error)
     if code == EXIT_INTERRUPTED:
-        typer.echo("sphereorient: interrupted; nothing was written.", err=True)
+        typer.echo("sphereorient: interrupted; no result was written.", err=True)
     sys.exit(code)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -82,10 +83,22 @@ def track(
     if many or jobs > 1 or cluster is not None:
         _track_side_by_side(requests, jobs, cluster, resume, quiet)
         return
-    with progress_bar(quiet) as advance:
+    with _kept(requests), progress_bar(quiet) as advance:
         result = track_kept(requests[0], resume=resume, progress=advance)
     if not quiet:
         _print_summary(result, out)
+
+
+@contextmanager
+def _kept(requests: Sequence[Request]) -> Iterator[None]:
+    """Say, to who stops a run, what is kept of it."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):
+        for request in requests:
+            if request.parts.is_dir():
+                typer.echo(f"sphereorient: what is done of {request.out} is kept; --resume goes on with it.", err=True)
+        raise
 
 
 def _refuse_shared(path: Path, many: bool) -> None:
@@ -100,7 +113,7 @@ def _track_side_by_side(requests: Sequence[Request], jobs: int, cluster: str | N
     from sphereorient.jobs.crew import ProcessCrew, dask_crew
 
     crew = ProcessCrew(jobs) if cluster is None else dask_crew(cluster, jobs if jobs > 1 else None)
-    with progress_bar(quiet) as advance:
+    with _kept(requests), progress_bar(quiet) as advance:
         outcomes = track_experiments(requests, crew, resume=resume, progress=advance)
     failed = [outcome for outcome in outcomes if outcome.error is not None]
     if len(outcomes) == 1 and failed:

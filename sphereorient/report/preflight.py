@@ -163,6 +163,8 @@ def _draw_balance(ax: Any, result: Preflight) -> None:
         ax.clabel(drawn, fmt="%.0f %%", fontsize=7)
     ax.set(xticks=[-180, -90, 0, 90, 180], yticks=[-90, 0, 90])
     ax.tick_params(labelsize=7)
+    ax.set_xlabel("longitude on the ball (degrees)", fontsize=8)
+    ax.set_ylabel("latitude", fontsize=8)
     ax.set_title(
         f"the map; lines: brightness of the view from there, {100 * seen.min():.0f} to {100 * seen.max():.0f} %",
         fontsize=9,
