@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -88,7 +89,7 @@ def _widened(table: PoseTable, width: int) -> PoseTable:
     more = width - table.mask.shape[1]
     if not more:
         return table
-    parts = {}
+    parts: dict[str, Any] = {}
     for name in ("mask", *POSE_PARTS):
         part = getattr(table, name)
         empty = part.new_zeros(len(part), more, *part.shape[2:])
