@@ -20,7 +20,10 @@ from sphereorient.errors import OutputError, SphereOrientError, refusal
 class InOrder(TyperGroup):
     """Commands in the order in which a user meets them, not in that of their files."""
 
-    ORDER = ("track", "check", "movie", "convert", "calibrate", "check-cameras", "synth", "settings", "info")
+    ORDER = (
+        *("track", "overlay", "export", "view"),
+        *("check", "movie", "convert", "calibrate", "check-cameras", "synth", "settings", "info"),
+    )
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names, those that are not in the order last."""

@@ -1,0 +1,193 @@
+"""The sphere as a track says that a camera saw it: outline, axes, trail, and the picture re-rendered in its light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient.cameras import Camera
+from sphereorient.errors import TextureError, refusal
+from sphereorient.experiment import Experiment
+from sphereorient.movies import Grey
+from sphereorient.preflight.diameter import expected_outline_px
+from sphereorient.sphere import sample_texture, sphere_normals
+from sphereorient.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+MARGIN = 1.3  # half the side of a crop, in radii of the ball
+SLANT = 0.3  # cosine of the angle of sight below which the paint is too foreshortened to teach the light
+FINE = 2  # samples along each side of a pixel
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Path3D:
+    """Position and orientation of N frames, the smoother's where a frame has none of its own; made by `path_of`."""
+
+    position_mm: Floats  # (N, 3), lab
+    R_lab_body: Floats  # (N, 3, 3)
+    smoothed: NDArray[np.bool_]  # (N,), whether either is the smoother's
+    radius_mm: float  # of the sphere; 1 where lengths are in radii
+
+    @property
+    def whole(self) -> NDArray[np.bool_]:
+        """Frames with both, (N,)."""
+        return finite_rows(self.position_mm) & finite_rows(self.R_lab_body)
+
+
+def finite_rows(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which rows (N, ...) hold no NaN, (N,)."""
+    return np.asarray(np.isfinite(values).all(tuple(range(1, values.ndim))), np.bool_)
+
+
+def path_of(track: Trajectory, radius_mm: float) -> Path3D:
+    """Return what a track says of every frame; `radius_mm` is of the sphere, 1 where lengths are in radii."""
+    no_position, no_orientation = ~finite_rows(track.position), ~finite_rows(track.orientation)
+    position = np.where(no_position[:, None], track.position_smooth, track.position)
+    orientation = np.where(no_orientation[:, None, None], track.orientation_smooth, track.orientation)
+    smoothed = (no_position | no_orientation) & finite_rows(position) & finite_rows(orientation)
+    return Path3D(position_mm=position, R_lab_body=orientation, smoothed=smoothed, radius_mm=radius_mm)
+
+
+def radius_of(experiment: Experiment) -> float:
+    """Return the radius of the sphere, mm; 1 where its diameter is not known and lengths are in radii."""
+    return 1.0 if experiment.diameter_mm is None else experiment.diameter_mm / 2
+
+
+def outline_px(camera: Camera, path: Path3D, k: int) -> Floats:
+    """Return the outline that a camera shows of the sphere in frame k, closed, (n, 2) px; NaN without a position."""
+    around = expected_outline_px(camera, torch.from_numpy(path.position_mm[k]), path.radius_mm).numpy()
+    return np.concatenate([around, around[:1]])
+
+
+def axes_px(camera: Camera, path: Path3D, k: int) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the tips of the body axes on the sphere in frame k, (3, 2) px, and whether each is on the near side."""
+    centre, R = torch.from_numpy(path.position_mm[k]), torch.from_numpy(path.R_lab_body[k])
+    sight = camera.rays(camera.project(centre)).direction_lab
+    tips = camera.project(centre + path.radius_mm * R.mT)  # rows: the columns of R are the axes
+    return tips.numpy(), (R.mT @ sight < 0).numpy()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Window:
+    """A square of a camera's picture; made by `window`, sampled by `crop` and `Model`."""
+
+    centre_px: Floats  # (2,)
+    half_px: float
+    side: int  # samples along each side
+
+    def grid_px(self, fine: int = 1) -> Floats:
+        """Return where the picture is sampled, (fine side, fine side, 2) as (u, v)."""
+        count = fine * self.side
+        at = ((np.arange(count) + 0.5) * (2 / count) - 1) * self.half_px
+        u, v = np.meshgrid(self.centre_px[0] + at, self.centre_px[1] + at)
+        return np.stack([u, v], axis=-1)
+
+
+def crop(picture: Grey, window: Window) -> NDArray[np.float32]:
+    """Return a picture within a window, (side, side) grey levels; NaN outside of the picture."""
+    at = window.grid_px().astype(np.float32)
+    u, v, nan = at[..., 0], at[..., 1], float("nan")
+    grey = picture.astype(np.float32)
+    found = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=nan)
+    return np.asarray(found, np.float32)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Seen:
+    """The paint in a window and the basis of the light there, (side, side, ...); made by `Model.look`."""
+
+    paint: NDArray[np.float32]  # 0 black .. 1 white; NaN outside of the ball
+    basis: NDArray[np.float32]  # (side, side, 4): 1, normal's right and down, cosine of the angle of sight
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """A camera, the map, and where the ball was; renders what the camera must have seen."""
+
+    camera: Camera
+    texture: Tensor | None  # (H, 2 H), as fine as the window shows it; None: nothing can be rendered
+    path: Path3D
+
+    def look(self, k: int, window: Window) -> Seen:
+        """Return paint and light's basis in a window of frame k, the mean of finer samples; through ports too."""
+        if self.texture is None:
+            do = "draw the track of an experiment with a texture"
+            raise TextureError(refusal("model", expected="a map of the paint", got="none", do=do))
+        uv = torch.from_numpy(window.grid_px(FINE))
+        rays = self.camera.rays(uv)
+        centre, R = torch.from_numpy(self.path.position_mm[k]), torch.from_numpy(self.path.R_lab_body[k])
+        normal, hit = sphere_normals(rays.origin_lab_mm, rays.direction_lab, centre, self.path.radius_mm)
+        paint = sample_texture(self.texture, (normal @ R).float())
+        across = normal @ self.camera.R_cam_lab.mT
+        sight = -(normal * rays.direction_lab).sum(-1, keepdim=True)
+        parts = torch.cat([paint[..., None], torch.ones_like(sight), across[..., :2], sight], dim=-1)
+        parts = torch.where(hit[..., None], parts, torch.full_like(parts, torch.nan))
+        side = window.side
+        mean = parts.reshape(side, FINE, side, FINE, 5).mean((1, 3)).numpy().astype(np.float32)
+        return Seen(paint=mean[..., 0], basis=mean[..., 1:])
+
+    def window(self, k: int, half_px: float, side: int) -> Window:
+        """Return the window around the ball in frame k."""
+        centre = self.camera.project(torch.from_numpy(self.path.position_mm[k])).numpy()
+        return Window(centre_px=centre, half_px=half_px, side=side)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LightFit:
+    """Grey levels of white and black paint over the disk, one for a whole movie; made by `fit_light`."""
+
+    gain: Floats  # (4,), coefficients of the basis: white less black
+    offset: Floats  # (4,), black
+
+    @property
+    def contrast(self) -> float:
+        """White less black paint in the middle of the disk, grey levels."""
+        return float(max(self.gain[0] + self.gain[3], 1e-6))
+
+    def picture(self, seen: Seen, filmed: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+        """Return the grey levels expected, (side, side); NaN outside of the ball.
+
+        Args:
+            seen: paint and basis.
+            filmed: (side, side) grey levels; the whole is made as bright as this, within a factor of two.
+        """
+        grey = (seen.basis @ self.gain) * seen.paint + seen.basis @ self.offset
+        if filmed is not None:
+            good = np.isfinite(grey) & np.isfinite(filmed)
+            # Of the sums, not by least squares: that would darken a sphere whose paint is in the wrong place.
+            grey = grey * np.clip(filmed[good].sum() / max(float(grey[good].sum()), 1e-9), 0.5, 2.0)
+        return np.asarray(grey, np.float32)
+
+
+def fit_light(pairs: Sequence[tuple[Seen, NDArray[np.float32]]]) -> LightFit | None:
+    """Match the light roughly: gain and offset, each a plane plus the fall to the rim, by least squares.
+
+    One light for all frames, but for a factor (`LightFit.picture`): fitted frame by frame, it would explain a part of
+    what a wrong orientation leaves.
+
+    Args:
+        pairs: of some frames, what the model sees and the crop, grey levels.
+
+    Returns:
+        None where no pixel can be compared.
+    """
+    rows, greys = [np.zeros((0, 8))], [np.zeros(0)]
+    for seen, grey in pairs:
+        with np.errstate(invalid="ignore"):
+            good = np.isfinite(grey) & (seen.basis[..., 3] > SLANT)
+        basis = seen.basis[good].astype(np.float64)
+        rows.append(np.concatenate([basis * seen.paint[good][:, None], basis], axis=1))
+        greys.append(grey[good].astype(np.float64))
+    design, target = np.concatenate(rows), np.concatenate(greys)
+    if len(target) < 8:
+        return None
+    # A weak pull to zero keeps coefficients finite where the paint seen is of one grey.
+    ridge = 1e-3 * np.sqrt(len(target)) * np.eye(8)
+    solved = np.linalg.lstsq(np.concatenate([design, ridge]), np.concatenate([target, np.zeros(8)]), rcond=None)[0]
+    return LightFit(gain=solved[:4], offset=solved[4:])

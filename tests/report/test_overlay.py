@@ -1,0 +1,362 @@
+"""The overlay shows what the track says, where the movie shows it."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import replace
+
+import av
+import numpy as np
+import pytest
+import torch
+from overlay_examples import EXCERPT, RADIUS_MM, camera_changed, changed, command, excerpt, true_track
+from scipy.spatial.transform import Rotation
+
+from sphereorient.cameras import load_cameras
+from sphereorient.errors import ExperimentError, OutputError, TrackError
+from sphereorient.report.doubts import FLAG_WORDS, REASON_WORDS, doubts, flag_words
+from sphereorient.report.overlay import overlay_movie, pictures_at, prepared
+from sphereorient.report.overlay_canvas import AXES, DOUBT, LOST, OUTLINE, Canvas, Panel
+from sphereorient.report.overlay_model import LightFit, Model, Seen, axes_px, crop, fit_light, outline_px, path_of
+from sphereorient.report.overlay_video import write_video
+from sphereorient.report.overlay_view import BLANK, own_distance_px, residual_colours
+from sphereorient.trajectory import Flag, Reason
+
+K = 20  # a frame
+
+
+@pytest.fixture(scope="module")
+def ready():
+    """The page of the true track, the pictures of frame 20, and the model of each camera."""
+    with ExitStack() as opened:
+        page, reels = prepared(true_track(), excerpt(), None, opened)
+        pictures = {name: next(pictures_at(reel, np.array([K]))) for name, reel in reels.items()}
+        yield page, pictures
+
+
+def looking_along_y(tmp_path):
+    """DESIGN's check of signs: a camera that looks along lab +y, lab z up, 200 mm before the origin."""
+    text = """schema: sphereorient-cameras/1
+cameras:
+  cam: {model: pinhole, f_px: 1000.0, centre: [100, 100], image_size: [201, 201],
+        R: [[1, 0, 0], [0, 0, -1], [0, 1, 0]], T: [0, 0, 200]}
+"""
+    path = tmp_path / "cameras.yaml"
+    path.write_text(text)
+    return load_cameras(path)["cam"]
+
+
+def test_axes_are_drawn_where_designs_check_of_signs_has_them(tmp_path):
+    camera = looking_along_y(tmp_path)
+    track = true_track(("cam1",), 0, 1)
+    Rz = Rotation.from_euler("z", -90, degrees=True).as_matrix()
+    path = path_of(changed(track, 0, position=np.zeros(3), orientation=Rz), 1.0)
+    tips, near = axes_px(camera, path, 0)
+    assert near.tolist() == [True, False, False]  # x towards the camera; y and z in the picture's plane
+    np.testing.assert_allclose(tips, [[100, 100], [105, 100], [100, 95]], atol=1e-9)  # y right, z up
+
+
+def test_lines_of_sight_through_the_outline_touch_the_sphere():
+    track = true_track()
+    path = path_of(track, RADIUS_MM)
+    for camera in excerpt().cameras.values():
+        rays = camera.rays(torch.from_numpy(outline_px(camera, path, K)))
+        to_centre = torch.from_numpy(path.position_mm[K]) - rays.origin_lab_mm
+        away = torch.linalg.cross(to_centre, rays.direction_lab).norm(dim=-1)
+        np.testing.assert_allclose(away.numpy(), RADIUS_MM, rtol=2e-3)
+
+
+def test_frames_without_a_measurement_are_the_smoothers():
+    track = changed(true_track(), 5, position=np.nan, orientation=np.nan)
+    path = path_of(track, RADIUS_MM)
+    np.testing.assert_array_equal(path.position_mm[5], track.position_smooth[5])
+    assert np.flatnonzero(path.smoothed).tolist() == [5]
+    lost = path_of(changed(track, 5, position_smooth=np.nan), RADIUS_MM)
+    assert not lost.whole[5]
+    assert not lost.smoothed.any()
+
+
+def relative_residual(ready, name: str, R_lab_body=None) -> float:
+    page, pictures = ready
+    [view] = [view for view in page.views if view.name == name]
+    path = view.model.path
+    if R_lab_body is not None:
+        turned = path.R_lab_body.copy()
+        turned[K] = R_lab_body
+        path = replace(path, R_lab_body=turned)
+    model = Model(camera=view.model.camera, texture=view.model.texture, path=path)
+    window = model.window(K, view.half_px, 100)
+    filmed = crop(pictures[name], window)
+    left = filmed - view.light.picture(model.look(K, window), filmed)
+    return float(np.sqrt(np.nanmean(left**2))) / view.light.contrast
+
+
+@pytest.mark.parametrize("name", ["cam1", "cam2"])
+def test_the_residual_is_small_for_the_true_orientation_only(ready, name):
+    track = true_track()
+    at_truth = relative_residual(ready, name)
+    assert at_truth < 0.13
+    for wrong in ([0.2, 0, 0], [0, 0.2, 0], [0, 0, 0.2], [0, 0, np.pi]):
+        assert relative_residual(ready, name, Rotation.from_rotvec(wrong).as_matrix() @ track.orientation[K]) > (
+            1.8 * at_truth
+        )
+    assert relative_residual(ready, name, track.orientation[K].T) > 3 * at_truth  # the other reading of R_lab_body
+
+
+def planted(rng, gain, offset):
+    at = np.linspace(-1, 1, 40)
+    x, y = np.meshgrid(at, at)
+    with np.errstate(invalid="ignore"):
+        depth = np.sqrt(1 - x**2 - y**2)
+    basis = np.stack([np.where(np.isnan(depth), np.nan, 1.0), x, y, depth], axis=-1)
+    seen = Seen(paint=rng.random(x.shape).round().astype(np.float32), basis=basis.astype(np.float32))
+    return seen, (seen.paint * (basis @ gain) + basis @ offset).astype(np.float32)
+
+
+def test_planted_light_is_found_again():
+    rng = np.random.default_rng(3)
+    gain, offset = np.array([120.0, 8.0, -5.0, 40.0]), np.array([12.0, 0.0, 3.0, 4.0])
+    found = fit_light([planted(rng, gain, offset) for _ in range(4)])
+    np.testing.assert_allclose(found.gain, gain, atol=0.2)
+    np.testing.assert_allclose(found.offset, offset, atol=0.2)
+    assert found.contrast == pytest.approx(160, abs=0.3)
+
+
+def test_brightness_follows_the_frame_within_a_factor_of_two():
+    gain = np.array([100.0, 0, 0, 0])
+    seen, grey = planted(np.random.default_rng(4), gain, np.zeros(4))
+    light = LightFit(gain=gain, offset=np.zeros(4))
+    np.testing.assert_allclose(light.picture(seen, 0.7 * grey), 0.7 * grey, rtol=1e-5)
+    np.testing.assert_allclose(light.picture(seen, 9.0 * grey), 2.0 * grey, rtol=1e-5)
+
+
+def test_without_pixels_there_is_no_light():
+    assert fit_light([]) is None
+
+
+def test_residuals_have_one_fixed_scale():
+    black, orange, blue, half, blank = residual_colours(np.array([[0, 0.5, -3.0, 0.25, np.nan]], np.float32))[0]
+    assert black.tolist() == [0, 0, 0]
+    assert tuple(orange) == AXES[0]
+    assert tuple(blue) == AXES[2]
+    assert abs(int(half[0]) - AXES[0][0] / 2) <= 1
+    assert blank.tolist() == [BLANK] * 3
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5, 3.0])
+def test_a_line_lies_on_the_pixel_that_it_names(scale):
+    """Whole numbers are the middle of pixels: column 7 of a picture enlarged 3 times is 21 to 23, its middle 22."""
+    canvas = Canvas(90, 60)
+    size = (round(20 * scale), round(10 * scale))
+    panel = Panel(canvas, (10, 10), size, (-0.5, -0.5), scale)
+    panel.show(np.zeros((10, 20), np.uint8))
+    inside = canvas.pixels[10 : 10 + size[1], 10 : 10 + size[0], 0]
+    panel.line(np.array([[7.0, 0.0], [7.0, 9.0]]), (255, 255, 255))
+    share = inside.sum(0, dtype=float)
+    assert np.average(np.arange(size[0]), weights=share) == pytest.approx(7.5 * scale - 0.5, abs=0.3)
+    inside[:] = 0
+    panel.line(np.array([[0.0, 4.0], [19.0, 4.0]]), (255, 255, 255))
+    share = inside.sum(1, dtype=float)
+    assert np.average(np.arange(size[1]), weights=share) == pytest.approx(4.5 * scale - 0.5, abs=0.3)
+
+
+def test_lines_stop_at_gaps_and_at_the_edge():
+    canvas = Canvas(40, 40)
+    panel = Panel(canvas, (10, 10), (20, 20), (-0.5, -0.5), 1.0)
+    before = canvas.pixels.copy()
+    panel.line(np.array([[-1e12, 5.0], [np.nan, 5.0], [30.0, 5.0], [4.0, np.inf]]), (255, 0, 0))
+    np.testing.assert_array_equal(canvas.pixels, before)
+    panel.line(np.array([[-50.0, 5.0], [50.0, 5.0]]), (255, 0, 0))
+    changed_at = np.nonzero((canvas.pixels != before).any(-1))
+    assert (changed_at[1].min(), changed_at[1].max()) == (10, 29)
+
+
+def test_every_flag_and_reason_has_words():
+    assert set(FLAG_WORDS) == set(Flag)
+    assert set(REASON_WORDS) == set(Reason)
+    words = [*FLAG_WORDS.values(), *REASON_WORDS.values()]
+    assert len(set(words)) == len(words)
+
+
+def test_doubts_are_told_in_words():
+    track = true_track()
+    assert doubts(track, 3) == []
+    bad = changed(track, 3, flags=Flag.SPIKE | Flag.ONE_CAMERA, valid=False)
+    bad = camera_changed(bad, "cam2", 3, reason=Reason.DARK)
+    assert doubts(bad, 3) == ["not valid", "one camera only", "the orientation jumps", "cam2: too dark"]
+    assert doubts(camera_changed(track, "cam2", 3, reason="of_tomorrow"), 3) == ["cam2: of_tomorrow"]
+
+
+def test_one_camera_is_no_news_where_there_is_no_other():
+    track = changed(true_track(("cam1",)), slice(None), flags=Flag.ONE_CAMERA)
+    assert flag_words(track, 0) == []
+
+
+def test_frames_of_doubt_are_marked(ready):
+    page, pictures = ready
+    plain = page.draw(K, pictures)
+    assert plain.shape[0] % 2 == plain.shape[1] % 2 == 0
+    doubtful = replace(page, track=changed(page.track, K, flags=Flag.DOUBTFUL_FIT))
+    lost = replace(page, track=changed(page.track, K, valid=False))
+    corner = (slice(62, 65), slice(10, 13))  # of the first camera's frame
+    assert (doubtful.draw(K, pictures)[corner] == DOUBT).all()
+    assert (lost.draw(K, pictures)[corner] == LOST).all()
+    assert not (plain[corner] == DOUBT).all()
+    assert "doubt: picture explained less well" in doubtful.state(K)[0]
+    assert "not valid" in lost.state(K)[0]
+
+
+def test_a_camera_that_by_itself_sees_the_ball_elsewhere_is_shown(ready):
+    page, pictures = ready
+    centre = page.track.cameras["cam1"].centre_px[K]
+    off = camera_changed(page.track, "cam1", K, centre_px=centre + np.array([6.0, 8.0]), reason=Reason.CONTRADICTS)
+    [view, _] = page.views
+    assert own_distance_px(view, page.track.cameras["cam1"], K) < 1e-3
+    assert own_distance_px(view, off.cameras["cam1"], K) == pytest.approx(10, abs=1e-3)
+    crop_of = (slice(86, 396), slice(460, 770))
+    before, after = (replace(page, track=track).draw(K, pictures)[crop_of] for track in (page.track, off))
+    assert (before != after).any(-1).sum() > 200
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_frame_without_pictures_or_measurement_is_drawn(ready):
+    page, _ = ready
+    nothing = {"position": np.nan, "orientation": np.nan, "position_smooth": np.nan, "orientation_smooth": np.nan}
+    track = changed(page.track, K, valid=False, **nothing)
+    for name in track.cameras:
+        track = camera_changed(track, name, K, reason=Reason.MISSING, centre_px=np.nan, radius_px=np.nan)
+    view = [replace(v, model=replace(v.model, path=path_of(track, 9.0))) for v in page.views]
+    trails = [replace(v, trail_px=np.where(np.arange(40)[:, None] == K, np.nan, v.trail_px)) for v in view]
+    drawn = replace(page, track=track, views=trails).draw(K, {"cam1": None, "cam2": None})
+    assert drawn.std() > 5
+
+
+def read(path):
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        facts = stream.codec_context.name, stream.codec_context.pix_fmt, float(stream.average_rate)
+        return facts, [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+
+
+def test_the_movie_is_h264_that_players_show(tmp_path):
+    out = tmp_path / "overlay.mp4"
+    steps = []
+    count = overlay_movie(
+        true_track(), excerpt(), out, frames=(10, 16), every=2, fps=12, progress=lambda *at: steps.append(at)
+    )
+    facts, pictures = read(out)
+    assert facts == ("h264", "yuv420p", 12.0)
+    assert count == len(pictures) == 3
+    assert steps == [(1, 3), (2, 3), (3, 3)]
+    assert list(tmp_path.iterdir()) == [out]
+    assert not np.array_equal(pictures[0], pictures[1])
+
+
+def test_a_part_of_the_track_shows_its_own_frames(tmp_path):
+    """The clock does not restart: frame 12 of the experiment is row 0 of a track of frames 12 to 29."""
+    with ExitStack() as opened:
+        whole, reels = prepared(true_track(("cam1",)), excerpt(), None, opened)
+        part, of_part = prepared(true_track(("cam1",), 12, 30), excerpt(), None, opened)
+        assert part.numbers.tolist() == list(range(12, 30))
+        assert whole.numbers.tolist() == list(range(40))
+        first = next(pictures_at(of_part["cam1"], np.array([0])))
+        np.testing.assert_array_equal(first, next(pictures_at(reels["cam1"], np.array([12]))))
+    with pytest.raises(TrackError, match=r"--frames: expected frames within 12:30, got 30:; correct --frames"):
+        overlay_movie(true_track(("cam1",), 12, 30), excerpt(), tmp_path / "o.mp4", frames=(30, None))
+
+
+def test_a_movie_that_fails_leaves_the_old_one(tmp_path):
+    out = tmp_path / "overlay.mp4"
+    out.write_bytes(b"old")
+
+    def pictures():
+        yield np.zeros((64, 64, 3), np.uint8)
+        raise TrackError("in the middle")
+
+    with pytest.raises(TrackError, match="in the middle"):
+        write_video(out, pictures(), 25)
+    assert out.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_pictures_are_taken_one_by_one(tmp_path):
+    """A long movie needs no more memory than a short one: no picture is kept while the next ones are written."""
+    import weakref
+
+    alive = []
+
+    def pictures():
+        for shade in range(0, 200, 2):
+            picture = np.full((64, 64, 3), shade, np.uint8)
+            alive.append(weakref.ref(picture))
+            yield picture
+            del picture
+            assert sum(ref() is not None for ref in alive) < 4
+
+    assert write_video(tmp_path / "o.mkv", pictures(), 25) == 100
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"cameras": ["cam3"]}, ExperimentError, "cam3"),
+        ({"cameras": []}, ExperimentError, "--cameras"),
+        ({"path": "overlay.gif"}, OutputError, "expected .mp4"),
+        ({"frames": (90, 99)}, TrackError, "within 0:40, got 90:99"),
+    ],
+)
+def test_refusals_are_one_line(tmp_path, arguments, error, words):
+    path = tmp_path / arguments.pop("path", "overlay.mp4")
+    with pytest.raises(error, match=words) as caught:
+        overlay_movie(true_track(), excerpt(), path, **arguments)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_tracks_of_other_times_are_refused(tmp_path):
+    late = true_track()
+    with pytest.raises(TrackError, match="the experiment that the track was measured from"):
+        overlay_movie(replace(late, time=late.time + 100), excerpt(), tmp_path / "o.mp4")
+
+
+def test_without_a_map_outline_and_axes_are_shown(tmp_path):
+    """A ball whose paint is not known yet is drawn on all the same."""
+    with ExitStack() as opened:
+        page, reels = prepared(true_track(("cam1",)), replace(excerpt(), texture_path=None), None, opened)
+        picture = next(pictures_at(reels["cam1"], np.array([K])))
+    assert page.views[0].light is None
+    drawn = page.draw(K, {"cam1": picture})
+    assert (np.abs(drawn.astype(int) - OUTLINE) < 40).all(-1).sum() > 300
+    assert page.views[0].why_unlit == "no map of the paint"
+
+
+def test_the_command_writes_movie_and_sheet(tmp_path, monkeypatch, capsys):
+    true_track().save(tmp_path / "track.h5")
+    out, sheet = tmp_path / "o.mp4", tmp_path / "worst.png"
+    words = ["overlay", EXCERPT / "experiment.yaml", tmp_path / "track.h5", "--cameras", "cam2"]
+    code, printed, _ = command(
+        monkeypatch, capsys, *words, "--out", out, "--frames", "38:", "--worst", sheet, "--count", 2
+    )
+    assert code == 0
+    assert f"Wrote {out}: 2 frames" in printed
+    assert f"Wrote {sheet}: 2 frames" in printed
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["o.mp4", "track.h5", "worst.png"]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ([], "expected something to write, got neither --out nor --worst"),
+        (["--out", "o.mp4", "--frames", "9:3"], "--frames 9:3: expected A:B, A below B"),
+        (["--out", "nowhere/o.mp4"], "expected an existing folder nowhere"),
+        (["--out", "o.avi"], "expected .mp4 .m4v .mov .mkv, got '.avi'"),
+    ],
+)
+def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, words, told):
+    monkeypatch.chdir(tmp_path)
+    true_track().save(tmp_path / "track.h5")
+    code, _, said = command(monkeypatch, capsys, "overlay", EXCERPT / "experiment.yaml", "track.h5", *words)
+    assert code == 2
+    assert told in said
+    assert said.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["track.h5"]
