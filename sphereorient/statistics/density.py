@@ -1,0 +1,203 @@
+"""Probability densities of normalised components, with the stretched exponential beside the Gaussian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfcx, log_ndtr
+
+from sphereorient.statistics.bootstrap import Interval, bootstrap, per_segment
+from sphereorient.statistics.segments import Ensemble
+from sphereorient.statistics.settings import BootstrapSettings
+
+Floats = NDArray[np.float64]
+
+ROOT3 = np.sqrt(3.0)
+WIDEST_S = 1.5  # flatness 14,000: beyond it the fit looks no further
+NARROWEST_S = 0.02  # nearly the uniform law, flatness 1.8
+NODES = 120  # values of a at which the likelihood is tabulated
+FINE_BINS = 2000  # of ln|x|, for the likelihood: its rounding of x is 0.5 %
+SMALLEST, LARGEST = 1e-4, 1e3  # |x| that the likelihood tells apart
+TINY = 1e-300
+
+
+def stretched_exponential(x: Floats, a: Floats | float) -> Floats:
+    """Return the density of unit variance that the paper fits to accelerations.
+
+    It is that of a uniform number times a log-normal one: p(x) = exp(3 a^2 / 2) / (4 sqrt 3)
+    erfc((ln|x / sqrt 3| + 2 a^2) / (sqrt 2 a)). By erfc and in logarithms, since 1 - erf is 0 from |x| = 30 on.
+
+    Args:
+        x: (...), in standard deviations.
+        a: width of the logarithm; flatness is 9/5 exp(4 a^2). Broadcasts against x.
+
+    Returns:
+        (...), density.
+
+    Source: Mordant, Crawford and Bodenschatz 2004, Physica D 193, 245; the paper, section IV.
+    """
+    return np.asarray(np.exp(log_stretched_exponential(x, a)))
+
+
+def log_stretched_exponential(x: Floats, a: Floats | float) -> Floats:
+    """Return the logarithm of `stretched_exponential`, finite wherever a float holds it."""
+    a = np.asarray(a, np.float64)
+    size = np.maximum(np.abs(x), TINY)
+    z = (np.log(size / ROOT3) + 2 * a**2) / (np.sqrt(2) * a)
+    return np.asarray(1.5 * a**2 - np.log(4 * ROOT3) + _log_erfc(z))
+
+
+def _log_erfc(z: Floats) -> Floats:
+    """Return ln erfc(z) without underflow."""
+    far = np.maximum(z, 0.0)
+    near = np.log(2.0) + log_ndtr(-np.sqrt(2) * np.minimum(z, 0.0))
+    return np.asarray(np.where(z > 0, np.log(erfcx(far)) - far**2, near), np.float64)
+
+
+def flatness_of(a: Floats | float) -> Floats:
+    """Return the flatness of the stretched exponential, 9/5 exp(4 a^2)."""
+    return np.asarray(1.8 * np.exp(4 * np.asarray(a) ** 2))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StretchedFit:
+    """The stretched exponential nearest to the data; made by `fit_stretched`."""
+
+    a: Interval  # scalar
+    flatness: Interval  # 9/5 exp(4 a^2)
+    log_likelihood: float  # mean per sample, of values in standard deviations
+    log_likelihood_gaussian: float  # of the Gaussian, for comparison
+
+    @property
+    def better_than_gaussian(self) -> bool:
+        """Whether the data are likelier under it than under the Gaussian."""
+        return self.log_likelihood > self.log_likelihood_gaussian
+
+
+def fit_stretched(
+    x: Floats, segment: NDArray[np.int64], segments: int, settings: BootstrapSettings | None = None
+) -> StretchedFit:
+    """Fit the stretched exponential by maximum likelihood, with intervals from resampled segments.
+
+    Mean and standard deviation are the sample's own; one sample one vote, so that the fit asks where most of the data
+    lie and not, as the flatness does, for the few largest.
+
+    Args:
+        x: (M,), one component, any unit.
+        segment: (M,), 0 .. segments - 1, increasing.
+        segments: their number.
+        settings: of the bootstrap.
+
+    Returns:
+        The fit.
+    """
+    normal = (x - x.mean()) / x.std()
+    edges = np.linspace(np.log(SMALLEST), np.log(LARGEST), FINE_BINS + 1)
+    logs = np.log(np.clip(np.abs(normal), SMALLEST, LARGEST))
+    bins = np.clip(((logs - edges[0]) / (edges[1] - edges[0])).astype(np.int64), 0, FINE_BINS - 1)
+    middle = (edges[1:] + edges[:-1]) / 2
+    used = np.flatnonzero(np.bincount(bins, minlength=FINE_BINS))
+    counts = np.bincount(segment * FINE_BINS + bins, minlength=segments * FINE_BINS).reshape(segments, FINE_BINS)
+    squares = per_segment(np.stack([normal, normal**2], axis=1), segment, segments)
+    sums = np.concatenate([counts[:, used].astype(np.float64), squares], axis=1)
+    likelihood = _Likelihood(middle[used])
+    found = bootstrap(sums, likelihood.fit, settings)
+    best = float(found.value[0])
+    return StretchedFit(
+        a=found.part(0),
+        flatness=found.part(1),
+        log_likelihood=float(log_stretched_exponential(normal, best).mean()),
+        log_likelihood_gaussian=float(-0.5 * np.log(2 * np.pi) - 0.5 * (normal**2).mean()),
+    )
+
+
+class _Likelihood:
+    """The likelihood of binned data as a smooth function of a and of the scale."""
+
+    def __init__(self, log_x: Floats) -> None:
+        """Tabulate it for the bins' ln|x|, (K,)."""
+        self.nodes = np.linspace(NARROWEST_S, WIDEST_S, NODES)
+        self.table = log_stretched_exponential(np.exp(log_x)[:, None], self.nodes)
+        # d/d ln|x|: a resampled ensemble has another standard deviation, by which its values are to be divided
+        step = 1e-3
+        up, down = (log_stretched_exponential(np.exp(log_x + s)[:, None], self.nodes) for s in (step, -step))
+        self.slope = (up - down) / (2 * step)
+
+    def fit(self, totals: Floats) -> Floats:
+        """Return a and flatness (..., 2) of counts and squares (..., K + 2)."""
+        counts, first, second = totals[..., :-2], totals[..., -2], totals[..., -1]
+        number = counts.sum(-1)
+        log_scale = 0.5 * np.log(second / number - (first / number) ** 2)
+        value = counts @ self.table - log_scale[..., None] * (counts @ self.slope)
+        a = self.nodes[0] + _peak(value) * (self.nodes[1] - self.nodes[0])
+        return np.stack([a, flatness_of(a)], axis=-1)
+
+
+def _peak(value: Floats) -> Floats:
+    """Return the place of the largest value along the last axis, between the nodes, by a parabola."""
+    k = np.clip(value.argmax(-1), 1, value.shape[-1] - 2)[..., None]
+    left, mid, right = (np.take_along_axis(value, k + j, axis=-1)[..., 0] for j in (-1, 0, 1))
+    bend = left - 2 * mid + right
+    shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0)
+    return np.asarray(np.clip(k[..., 0] + shift, 0, value.shape[-1] - 1))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Density:
+    """PDF of one component in its standard deviations; made by `density`, drawn by the report."""
+
+    edges: Floats  # (B + 1,)
+    pdf: Interval  # (B,)
+    counts: NDArray[np.int64]  # (B,)
+    fit: StretchedFit
+
+    @property
+    def centres(self) -> Floats:
+        """(B,), middle of each bin."""
+        return np.asarray((self.edges[1:] + self.edges[:-1]) / 2)
+
+
+def density(
+    ensemble: Ensemble,
+    quantity: str,
+    component: int,
+    *,
+    bins: int = 61,
+    reach: float = 10.0,
+    settings: BootstrapSettings | None = None,
+) -> Density:
+    """Return the PDF of a component, its error bars, and the fit.
+
+    Args:
+        ensemble: the samples.
+        quantity: a name in UNITS.
+        component: 0, 1, 2.
+        bins: their number.
+        reach: of the bins to either side, standard deviations.
+        settings: of the bootstrap.
+    """
+    x = ensemble.values[quantity][:, component]
+    return density_of(x, ensemble.segment, ensemble.segments, bins=bins, reach=reach, settings=settings)
+
+
+def density_of(
+    x: Floats,
+    segment: NDArray[np.int64],
+    segments: int,
+    *,
+    bins: int = 61,
+    reach: float = 10.0,
+    settings: BootstrapSettings | None = None,
+) -> Density:
+    """Return the PDF of numbers (M,) in rows of segments, as `density` does."""
+    normal = (x - x.mean()) / x.std()
+    edges = np.linspace(-reach, reach, bins + 1)
+    place = np.searchsorted(edges, normal, side="right") - 1
+    inside = (place >= 0) & (place < bins)
+    flat = np.bincount(segment[inside] * bins + place[inside], minlength=segments * bins).reshape(segments, bins)
+    sums = np.concatenate([flat, np.bincount(segment, minlength=segments)[:, None]], axis=1).astype(np.float64)
+    width = edges[1] - edges[0]
+    pdf = bootstrap(sums, lambda totals: totals[..., :-1] / (totals[..., -1:] * width), settings)
+    return Density(edges=edges, pdf=pdf, counts=flat.sum(0), fit=fit_stretched(x, segment, segments, settings))

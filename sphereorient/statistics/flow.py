@@ -1,0 +1,100 @@
+"""The flow's own scales, and the dimensionless numbers that compare the sphere with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sphereorient.statistics.moments import Moments
+
+M_PER_MM = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlowScales:
+    """Kolmogorov's scales and what they were computed from; made by `flow_scales`."""
+
+    viscosity_m2_s: float
+    dissipation_w_kg: float
+    eta_m: float
+    tau_eta_s: float
+
+
+def flow_scales(viscosity_m2_s: float, dissipation_w_kg: float) -> FlowScales:
+    """Return eta = (nu^3 / epsilon)^(1/4) and tau_eta = (nu / epsilon)^(1/2).
+
+    Args:
+        viscosity_m2_s: kinematic viscosity of the liquid in use: water-glycerol is not water.
+        dissipation_w_kg: energy dissipated per mass, W/kg.
+
+    Source: Kolmogorov 1941; ERRATA A5 for the paper's values, which are water's.
+    """
+    return FlowScales(
+        viscosity_m2_s=viscosity_m2_s,
+        dissipation_w_kg=dissipation_w_kg,
+        eta_m=(viscosity_m2_s**3 / dissipation_w_kg) ** 0.25,
+        tau_eta_s=(viscosity_m2_s / dissipation_w_kg) ** 0.5,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """One dimensionless number, in words and symbols; made by `comparisons`."""
+
+    name: str
+    formula: str
+    value: float
+
+
+def comparisons(
+    table: dict[str, Moments],
+    diameter_mm: float,
+    flow: FlowScales | None = None,
+    *,
+    u_rms_m_s: float | None = None,
+    integral_length_m: float | None = None,
+) -> list[Comparison]:
+    """Return the dimensionless numbers that the given inputs allow.
+
+    The sphere's rms values are corrected ones, root mean square over the three components.
+
+    Args:
+        table: moments by quantity.
+        diameter_mm: of the sphere.
+        flow: the flow's scales, where viscosity and dissipation are known.
+        u_rms_m_s: rms velocity of the flow by component.
+        integral_length_m: of the flow.
+
+    Source: the paper, section IV: omega_rms against u_rms / D; ERRATA A5.
+    """
+    diameter_m = diameter_mm * M_PER_MM
+    v, a, omega, alpha = (_per_component(table[q]) for q in ("velocity", "acceleration", "omega_lab", "alpha_lab"))
+    rows = [
+        ("sphere's rate of shear, rad/s", "v_rms / D", v / diameter_m),
+        ("rotation against translation", "omega_rms D / v_rms", omega * diameter_m / v),
+        ("angular against linear acceleration", "alpha_rms D / a_rms", alpha * diameter_m / a),
+    ]
+    if u_rms_m_s:
+        rows += [
+            ("flow's rate of shear, rad/s", "u_rms / D", u_rms_m_s / diameter_m),
+            ("rotation against the flow", "omega_rms D / u_rms", omega * diameter_m / u_rms_m_s),
+            ("velocity against the flow", "v_rms / u_rms", v / u_rms_m_s),
+        ]
+    if integral_length_m:
+        rows.append(("size against the integral length", "D / L", diameter_m / integral_length_m))
+    if flow:
+        acceleration = (flow.dissipation_w_kg**3 / flow.viscosity_m2_s) ** 0.25
+        rows += [
+            ("size against Kolmogorov's length", "D / eta", diameter_m / flow.eta_m),
+            ("rotation at Kolmogorov's rate", "omega_rms tau_eta", omega * flow.tau_eta_s),
+            ("acceleration in Kolmogorov's units", "a_rms / (epsilon^3 / nu)^(1/4)", a / acceleration),
+        ]
+    return [Comparison(name=name, formula=formula, value=float(value)) for name, formula, value in rows]
+
+
+def _per_component(moments: Moments) -> float:
+    """Return the rms of one component, the mean square over the three; as measured where nothing is known of noise."""
+    corrected = moments.corrected_rms.value[:3]
+    rms = corrected if np.isfinite(corrected).all() else moments.rms.value[:3]
+    return float(np.sqrt((rms**2).mean()))

@@ -1,0 +1,134 @@
+"""Table I: mean, rms, skewness and flatness of every quantity, with intervals and without the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.statistics.bootstrap import Interval, bootstrap, per_segment
+from sphereorient.statistics.segments import UNITS, Ensemble
+from sphereorient.statistics.settings import BootstrapSettings
+
+Floats = NDArray[np.float64]
+
+COMPONENTS = ("x", "y", "z", "norm")
+STATISTICS = ("mean", "rms", "skewness", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
+WARN_SHARE = 0.1  # of a variance; more noise than that is worth a warning
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Moments:
+    """Moments of one quantity; made by `moments`, read by the report. Four columns: x, y, z, norm."""
+
+    quantity: str
+    units: str
+    mean: Interval  # (4,) each
+    rms: Interval  # about the mean
+    skewness: Interval
+    flatness: Interval
+    corrected_rms: Interval  # of the motion itself, by the track's own sigmas; NaN for the norm
+    corrected_flatness: Interval
+    noise_share: Interval  # of the variance: what is noise, or what the smoother lost
+    samples: int
+    segments: int
+
+    @property
+    def noisy(self) -> bool:
+        """Whether more than 10 % of a component's variance is noise."""
+        return bool(np.any(self.noise_share.value[:3] > WARN_SHARE))
+
+
+def table_of_moments(ensemble: Ensemble, settings: BootstrapSettings | None = None) -> Mapping[str, Moments]:
+    """Return the moments of v, a, omega and alpha in lab and body, by name; the paper's Table I."""
+    return {quantity: moments(ensemble, quantity, settings) for quantity in UNITS}
+
+
+def moments(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Moments:
+    """Return the moments of one quantity.
+
+    Args:
+        ensemble: the samples.
+        quantity: a name in UNITS.
+        settings: of the bootstrap over segments.
+
+    Returns:
+        Moments by component and of the norm, with intervals.
+
+    Source: the paper, Table I; the rows called lab there belong to no frame (ERRATA E6).
+    """
+    x = with_norm(ensemble.values[quantity])
+    sigma = np.concatenate([ensemble.sigmas[quantity], np.full((len(x), 1), np.nan)], axis=1)
+    sign = 1.0 if ensemble.error == "added" else -1.0
+    centre, scale = x.mean(0), _scale(x)
+    sums = _sums((x - centre) / scale, sigma / scale, ensemble)
+    found = bootstrap(sums, lambda totals: _statistics(totals, sign), settings)
+    parts = {name: _in_units(found, k, name, centre, scale) for k, name in enumerate(STATISTICS)}
+    return Moments(quantity=quantity, units=UNITS[quantity], **parts, samples=len(ensemble), segments=ensemble.segments)
+
+
+def with_norm(x: Floats) -> Floats:
+    """Return (M, 4): x, y, z, norm of (M, 3)."""
+    return np.concatenate([x, np.linalg.norm(x, axis=1, keepdims=True)], axis=1)
+
+
+def _scale(x: Floats) -> Floats:
+    """Return a size of each column; 1 where all values are equal, a rounding's width included."""
+    deviation = x.std(0)
+    return np.where(deviation > 1e-12 * np.abs(x).max(0), deviation, 1.0)
+
+
+def _sums(x: Floats, sigma: Floats, ensemble: Ensemble) -> Floats:
+    """Return what each segment contributes, (S, 4, 8): number, four powers of x, and what corrects for noise."""
+    x2, s2 = x * x, sigma * sigma
+    powers = np.stack([np.ones_like(x), x, x2, x2 * x, x2 * x2, s2, s2 * s2, x2 * s2], axis=-1)
+    return per_segment(powers, ensemble.segment, ensemble.segments)
+
+
+def _statistics(totals: Floats, sign: float) -> Floats:
+    """Return STATISTICS of total sums (..., 4, 8), as (..., 7, 4), of normalised values."""
+    mean, m2, m3, m4, s2, s4, x2s2 = np.moveaxis(totals[..., 1:] / totals[..., :1], -1, 0)
+    var = m2 - mean**2
+    third = m3 - 3 * mean * m2 + 2 * mean**3
+    fourth = m4 - 4 * mean * m3 + 6 * mean**2 * m2 - 3 * mean**4
+    mixed = x2s2 - mean**2 * s2  # the mean is small: it was subtracted before
+    true_var, true_fourth = without_noise(var, fourth, s2, s4, mixed, sign)
+    share = s2 / np.where(sign > 0, var, true_var)
+    return np.stack(
+        [mean, np.sqrt(var), third / var**1.5, fourth / var**2, np.sqrt(true_var), true_fourth / true_var**2, share],
+        axis=-2,
+    )
+
+
+def without_noise(
+    var: Floats, fourth: Floats, s2: Floats, s4: Floats, mixed: Floats, sign: float
+) -> tuple[Floats, Floats]:
+    """Return variance and fourth moment of the motion itself from those of what was measured.
+
+    Noise that a kernel let through is independent of the motion and normal, with a variance of its own in every frame:
+    it is taken off (sign 1). A smoother's estimate lacks what it could not follow: its variance is put back (sign -1),
+    and the flatness left as it is, since what was lost of bursts is as intermittent as they are and no normal noise.
+
+    Args:
+        var: (...), variance that was measured.
+        fourth: (...), fourth central moment that was measured.
+        s2: (...), mean of sigma^2.
+        s4: (...), mean of sigma^4.
+        mixed: (...), mean of (x - mean)^2 sigma^2.
+        sign: 1 takes noise off, -1 puts back what was smoothed away.
+
+    Returns:
+        Variance and fourth moment, (...) each.
+    """
+    if sign > 0:  # <x'^2 s^2> = <x^2 s^2> - <s^4>
+        return var - s2, fourth - 6 * (mixed - s4) - 3 * s4
+    return var + s2, fourth * (1 + s2 / var) ** 2
+
+
+def _in_units(found: Interval, k: int, name: str, centre: Floats, scale: Floats) -> Interval:
+    """Return one statistic in the quantity's own units."""
+    shift = centre if name == "mean" else 0.0
+    factor = scale if name in ("mean", "rms", "corrected_rms") else 1.0
+    return found.part(k).scaled(factor, shift)

@@ -1,0 +1,30 @@
+"""Settings of the room statistics."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class SegmentSettings(BaseModel):
+    """Which frames and segments of a track go into its statistics."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    min_frames: int = Field(50, ge=2, description="segments with fewer frames are left out, as the paper does")
+    min_integral_times: float = Field(
+        0.25, ge=0, description="segments shorter than this many integral times of the velocity are left out"
+    )
+    integral_time_s: float | None = Field(
+        None, gt=0, description="integral time of the velocity, s; without it only min_frames counts"
+    )
+    keep_extrapolated: bool = Field(False, description="also use frames that the smoother filled from their neighbours")
+
+
+class BootstrapSettings(BaseModel):
+    """How the error bars are drawn: whole segments are resampled, since frames of one segment are not independent."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    resamples: int = Field(1000, ge=100, description="number of resampled ensembles")
+    level: float = Field(0.95, gt=0, lt=1, description="probability that an interval is to hold the true value")
+    seed: int = Field(2011, ge=0, description="of the resampling; the same seed gives the same intervals")

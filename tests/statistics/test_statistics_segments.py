@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from statistics_examples import STEP_S, track
+
+from sphereorient.errors import TrackError
+from sphereorient.statistics.segments import ensemble_of
+from sphereorient.statistics.settings import SegmentSettings
+from sphereorient.trajectory import Flag, Trajectory
+
+
+def test_short_segments_are_left_out_and_the_others_numbered_anew():
+    found = ensemble_of(track([60, 49, 50, 3, 80]))
+    assert np.bincount(found.segment).tolist() == [60, 50, 80]
+    assert np.diff(found.starts).tolist() == [60, 50, 80]
+    np.testing.assert_allclose(found.span_s, np.array([60, 50, 80]) * STEP_S)
+
+
+def test_segments_shorter_than_a_quarter_of_the_integral_time_are_left_out():
+    settings = SegmentSettings(integral_time_s=4 * 69.5 * STEP_S)
+    assert np.bincount(ensemble_of(track([60, 70, 80]), settings).segment).tolist() == [70, 80]
+
+
+def test_extrapolated_frames_leave_a_gap_in_time_unless_kept():
+    whole = track([60, 60])
+    flags = whole.flags.copy()
+    flags[5:8] = Flag.EXTRAPOLATED
+    marked = replace(whole, flags=flags)
+    found = ensemble_of(marked)
+    assert len(found) == 117
+    assert found.frame[4:6].tolist() == [4, 8]
+    assert len(ensemble_of(marked, SegmentSettings(keep_extrapolated=True))) == 120
+
+
+def test_frames_without_a_motion_do_not_count():
+    whole = track([60, 60])
+    alpha = whole.alpha_lab.copy()
+    alpha[:4] = np.nan
+    found = ensemble_of(replace(whole, alpha_lab=alpha))
+    assert len(found) == 116
+    assert all(np.isfinite(x).all() for x in found.values.values())
+
+
+def test_equal_numbers_of_segments_in_two_tracks_are_different_segments():
+    found = ensemble_of([track([60, 70]), track([80])])
+    assert np.bincount(found.segment).tolist() == [60, 70, 80]
+    assert found.track.tolist() == [0, 0, 1]
+
+
+def test_uneven_times_round_to_the_nearest_frame():
+    whole = track([60, 60])
+    rng = np.random.default_rng(0)
+    time = whole.time + 0.1 * STEP_S * rng.uniform(-1, 1, len(whole))
+    found = ensemble_of(replace(whole, time=time))
+    assert found.frame[:60].tolist() == list(range(60))
+
+
+def test_part_of_an_ensemble_has_the_segments_in_order():
+    whole = ensemble_of(track([60, 70, 80]))
+    part = whole.at(np.array([True, False, True]))
+    assert np.bincount(part.segment).tolist() == [60, 80]
+    np.testing.assert_array_equal(part.values["velocity"][60:], whole.values["velocity"][130:])
+
+
+@pytest.mark.parametrize(
+    ("tracks", "words"),
+    [
+        (track([60, 20]), "at least two segments"),
+        ([], "no valid frame"),
+        (Trajectory.empty(np.arange(5.0)), "no valid frame"),
+        ([track([60, 60]), track([60, 60], method="paper")], "one method"),
+    ],
+)
+def test_what_cannot_be_a_sample_is_refused_in_one_line(tracks, words):
+    with pytest.raises(TrackError, match=words) as caught:
+        ensemble_of(tracks)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_smoothers_sigma_is_what_it_removed_and_a_kernels_what_it_let_through():
+    assert ensemble_of(track([60, 60])).error == "removed"
+    assert ensemble_of(track([60, 60], method="paper")).error == "added"
