@@ -10,7 +10,7 @@ from pathlib import Path
 
 import h5py
 
-from sphereorient.errors import OutputError, refusal
+from sphereorient.outputs import put_aside
 
 ROOM = "check the space left and the permissions of the folder"
 
@@ -26,19 +26,12 @@ def whole_hdf5(path: Path, do: str = ROOM) -> Iterator[h5py.File]:
     Raises:
         OutputError: it cannot be written; what was there before is still there.
     """
-    aside = path.with_name(f".{path.name}.part")
-    try:
-        with GuardedFile(aside) as guarded:
-            with h5py.File(guarded, "w", track_order=False) as file:
-                yield file
-            guarded.check()
-            guarded.to_disk()
-        aside.replace(path)
-    except (OSError, RuntimeError) as error:  # a full disk comes out of HDF5 as either
-        got = f"'{(getattr(error, 'strerror', None) or str(error)).splitlines()[0]}'"
-        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
-    finally:
-        aside.unlink(missing_ok=True)
+    # A full disk comes out of HDF5 as either error.
+    with put_aside(path, do, also=(RuntimeError,)) as aside, GuardedFile(aside) as guarded:
+        with h5py.File(guarded, "w", track_order=False) as file:
+            yield file
+        guarded.check()
+        guarded.to_disk()
 
 
 class GuardedFile(io.RawIOBase):

@@ -7,7 +7,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import locate
@@ -71,10 +73,7 @@ class Recording:
 
     def empty_scene(self, reel: Reel, count: int, settings: Settings) -> locate.Background:
         """Learn what one camera shows without the ball, from `count` frames or the experiment's own picture."""
-        path = self.experiment.background_paths.get(reel.name)
-        empty = None if path is None else locate.load_background(path, reel.movie.frame_shape)
-        if empty is not None:  # a frame of the movie as its file holds it
-            empty = flipped_picture(empty, self.experiment.flip.get(reel.name, "none"))
+        empty = given_scene(self.experiment, reel.name, reel.movie.frame_shape)
         diameter_px = self.diameter_px(reel.name, settings)
         return locate.learn_background(reel.spread(count), diameter_px, settings.locate, empty)
 
@@ -83,6 +82,15 @@ class Recording:
         grid, place = self.timeline.gridded()
         reels = [replace(reel, rows=grid.rows[reel.name]) for reel in self.reels]
         return replace(self, timeline=grid, reels=reels), place
+
+
+def given_scene(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.float32] | None:
+    """Return the experiment's own picture of a camera's scene without the ball, None where it gives none."""
+    path = experiment.background_paths.get(name)
+    if path is None:
+        return None
+    # It is a frame of the movie as its file holds it.
+    return flipped_picture(locate.load_background(path, frame_shape), experiment.flip.get(name, "none"))
 
 
 @contextmanager

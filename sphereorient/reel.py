@@ -39,14 +39,9 @@ class Reel:
             last: + 1; None: to the end.
         """
         rows = self.rows[first:last]
-        there = rows[rows != NONE]
-        found = self._read(there.tolist())
-        for row in rows.tolist():
-            if row == NONE:
-                yield None, Reason.MISSING
-                continue
-            picture = next(found)
-            yield picture, Reason.UNDECODABLE if picture is None else Reason.OK
+        for row, picture in zip(rows.tolist(), pictures_of(self.movie, rows), strict=True):
+            why = Reason.MISSING if row == NONE else Reason.UNDECODABLE
+            yield picture, why if picture is None else Reason.OK
 
     def shots(self, background: Background, first: int = 0, last: int | None = None) -> Iterator[Shot]:
         """Yield the same pictures as the tracker takes them, those that cannot show the ball marked.
@@ -73,20 +68,28 @@ class Reel:
         try:
             pictures = list(self.movie.sample(wanted))
         except MovieError:
-            pictures = [picture for picture in self._read(wanted) if picture is not None]
+            pictures = [picture for picture in _read(self.movie, wanted) if picture is not None]
         good = [picture for picture in pictures if not (uniform(picture) or _glares(picture))]
         if not good:
             got, do = "none (black, white or damaged ones)", "check the movie with `sphereorient movie`"
             raise MovieError(refusal(str(self.movie.path), expected="readable pictures", got=got, do=do))
         return np.stack(good)
 
-    def _read(self, numbers: Sequence[int]) -> Iterator[Grey | None]:
-        """Yield pictures by their own numbers, those that follow each other in one go."""
-        begin = 0
-        for end in range(1, len(numbers) + 1):
-            if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:
-                yield from readable(self.movie, numbers[begin], numbers[end - 1] + 1)
-                begin = end
+
+def pictures_of(movie: Movie, rows: NDArray[np.int64]) -> Iterator[Grey | None]:
+    """Yield pictures of a movie by their numbers (N,), None for NONE and for those that cannot be decoded."""
+    found = _read(movie, rows[rows != NONE].tolist())
+    for row in rows.tolist():
+        yield None if row == NONE else next(found)
+
+
+def _read(movie: Movie, numbers: Sequence[int]) -> Iterator[Grey | None]:
+    """Yield pictures by their own numbers, those that follow each other in one go."""
+    begin = 0
+    for end in range(1, len(numbers) + 1):
+        if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:
+            yield from readable(movie, numbers[begin], numbers[end - 1] + 1)
+            begin = end
 
 
 def _glares(picture: Grey) -> bool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sphereorient.cameras.whole_file import read_whole
 from sphereorient.errors import ExperimentError, MovieError, refusal
-from sphereorient.experiment import Experiment
+from sphereorient.experiment import MOVIES_OWN, Experiment
 from sphereorient.movies import Movie
 
 Rows = NDArray[np.int64]
@@ -92,7 +92,7 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
     Source: DESIGN section 2 (Time). Stamps of MKV take no part: they are rounded to 1 ms.
     """
-    if experiment.times == "movies":
+    if experiment.times == MOVIES_OWN:
         whole = _stamped(experiment, movies)
     else:
         whole = _counted(experiment, movies)

@@ -10,8 +10,8 @@ import pytest
 from conftest import REPO
 
 ROOMS = (
-    "errors hdf5_out so3 cameras movies sphere experiment timeline trajectory locate orient assemble motion synth "
-    "learn paint settings provenance results reel recording learnt paper precise pipeline calibrate preflight "
+    "errors outputs hdf5_out so3 cameras movies sphere experiment timeline trajectory locate orient assemble motion "
+    "synth learn paint settings provenance results reel recording learnt paper precise pipeline calibrate preflight "
     "jobs evaluate statistics report cli"
 )
 ORDER = ROOMS.split(" ")

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable
+from sphereorient.outputs import put_aside
 
 
 @app.command()
@@ -22,9 +23,8 @@ def settings(
         typer.echo(settings_yaml())
         return
     check_writable(out)
-    aside = out.with_name(out.name + ".partial")
-    aside.write_text(settings_yaml(), encoding="utf-8")
-    aside.replace(out)
+    with put_aside(out) as aside:
+        aside.write_text(settings_yaml(), encoding="utf-8")
 
 
 @app.command()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -69,15 +70,17 @@ def check_writable(out: Path) -> None:
         raise OutputError(refusal(f"--out {out}", expected="a writable folder", got=f"{folder}, which is not", do=do))
 
 
-@contextmanager
-def put_aside(path: Path) -> Iterator[Path]:
-    """Give a name to write under; what was written takes its place at the end, or vanishes where something failed."""
-    aside = path.with_name(f"{path.stem}.partial{path.suffix}")
-    try:
-        yield aside
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
+def camera_names(text: str | None) -> list[str] | None:
+    """Return the names in cam1,cam2; None where nothing was said."""
+    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
+
+
+def frame_range(text: str) -> tuple[int | None, int | None] | None:
+    """Return first and last + 1 of A:B, None where left out; None for anything else."""
+    found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", text.strip())
+    if not found:
+        return None
+    return (int(found[1]) if found[1] else None, int(found[2]) if found[2] else None)
 
 
 Advance = Callable[[str, int, int], None]

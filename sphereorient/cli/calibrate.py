@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from sphereorient.cli.app import ExperimentPath, app, check_writable, progress_bar, put_aside
+from sphereorient.cli.app import ExperimentPath, app, check_writable, progress_bar
 from sphereorient.errors import ExperimentError, OutputError, refusal
+from sphereorient.outputs import put_aside
 
 
 @app.command()

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import ExperimentPath, app, check_writable, progress_bar, put_aside
+from sphereorient.cli.app import ExperimentPath, app, check_writable, progress_bar
+from sphereorient.outputs import put_aside
 
 if TYPE_CHECKING:
     from sphereorient.preflight import Finding

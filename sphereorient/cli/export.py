@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, progress_bar, put_aside
+from sphereorient.cli.app import app, check_writable, progress_bar
+from sphereorient.outputs import put_aside
 
 TrackPath = Annotated[Path, typer.Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")]
 

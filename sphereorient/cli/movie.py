@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import Advance, app, check_writable, progress_bar, put_aside
+from sphereorient.cli.app import Advance, app, check_writable, frame_range, progress_bar
 from sphereorient.errors import MovieError, OutputError, refusal
+from sphereorient.outputs import put_aside
 
 if TYPE_CHECKING:
     import numpy as np
@@ -157,8 +158,8 @@ def _stem(source: str) -> str:
 
 
 def _range(text: str, opened: Movie) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", text.strip())
-    first, last = (int(found[1] or 0), int(found[2] or len(opened))) if found else (0, 0)
+    found = frame_range(text)
+    first, last = (found[0] or 0, len(opened) if found[1] is None else found[1]) if found else (0, 0)
     if not 0 <= first < last <= len(opened):
         expected, do = f"A:B within 0:{len(opened)}, A below B", "correct --frames"
         raise MovieError(refusal(f"--frames {text}", expected=expected, got=f"'{text}'", do=do))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from sphereorient.cli.app import ExperimentPath, app, check_writable, progress_bar, put_aside
+from sphereorient.cli.app import ExperimentPath, app, camera_names, check_writable, frame_range, progress_bar
 from sphereorient.errors import OutputError, SettingsError, refusal
+from sphereorient.outputs import put_aside
 
 
 @app.command()
@@ -41,7 +41,7 @@ def overlay(
     from sphereorient.trajectory import Trajectory
 
     loaded, seen = load_experiment(experiment), Trajectory.load(track)
-    names = None if cameras is None else [name.strip() for name in cameras.split(",") if name.strip()]
+    names = camera_names(cameras)
     with progress_bar(quiet) as advance:
         if out is not None:
             shown = overlay_movie(
@@ -67,8 +67,8 @@ def overlay(
 
 def _range(text: str) -> tuple[int | None, int | None]:
     """Return first and last + 1 of A:B, None where left out."""
-    found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", text.strip())
-    if not found or (found[1] and found[2] and int(found[1]) >= int(found[2])):
+    found = frame_range(text)
+    if found is None or (found[0] is not None and found[1] is not None and found[0] >= found[1]):
         do = "write e.g. --frames 100:200"
         raise SettingsError(refusal(f"--frames {text}", expected="A:B, A below B", got=f"'{text}'", do=do))
-    return (int(found[1]) if found[1] else None, int(found[2]) if found[2] else None)
+    return found

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, progress_bar
+from sphereorient.cli.app import app, camera_names, check_writable, progress_bar
 from sphereorient.errors import OutputError, SettingsError, refusal
 
 if TYPE_CHECKING:
@@ -65,14 +65,14 @@ def track(
     from sphereorient.settings import load_settings
 
     chosen = load_settings(settings, set_ or [])
-    names = None if cameras is None else tuple(name.strip() for name in cameras.split(",") if name.strip())
+    names = camera_names(cameras)
     requests = [
         Request(
             experiment=experiment,
             out=path,
             method=method,
             settings=chosen,
-            cameras=names,
+            cameras=None if names is None else tuple(names),
             device=device,
             learnt=learnt,
             save_learnt=save_learnt,

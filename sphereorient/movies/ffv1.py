@@ -10,8 +10,9 @@ from pathlib import Path
 import av
 import numpy as np
 
-from sphereorient.errors import MovieError, OutputError, refusal
+from sphereorient.errors import MovieError, refusal
 from sphereorient.movies.movie import Grey
+from sphereorient.outputs import put_aside
 
 PIXEL_FORMATS = {np.dtype(np.uint8): "gray", np.dtype(np.uint16): "gray16le"}
 # Every frame a key frame, with check sums: any frame can be read alone, and damage stays in its frame.
@@ -31,18 +32,8 @@ def write_ffv1(path: Path | str, frames: Iterable[Grey], frame_rate_hz: float) -
         OutputError: the file cannot be written.
     """
     path = Path(path)
-    aside = path.with_name(f".{path.name}.partial")
-    try:
-        with av.open(str(aside), "w", format="matroska") as container:
-            count = _encode(container, path, frames, Fraction(frame_rate_hz).limit_denominator(1_000_000))
-        aside.replace(path)
-    except (av.FFmpegError, OSError) as error:
-        got = f"'{getattr(error, 'strerror', None) or error}'"
-        do = "choose a folder that exists and may be written"
-        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
-    finally:
-        aside.unlink(missing_ok=True)
-    return count
+    with put_aside(path, also=(av.FFmpegError,)) as aside, av.open(str(aside), "w", format="matroska") as container:
+        return _encode(container, path, frames, Fraction(frame_rate_hz).limit_denominator(1_000_000))
 
 
 def _encode(container: av.container.OutputContainer, path: Path, frames: Iterable[Grey], rate: Fraction) -> int:

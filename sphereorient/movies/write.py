@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import MovieError, OutputError, refusal
+from sphereorient.errors import MovieError, refusal
 from sphereorient.hdf5_out import GuardedFile
 from sphereorient.movies.ffv1 import check_alike, check_kind, write_ffv1
 from sphereorient.movies.movie import Grey
+from sphereorient.outputs import put_aside
 
 PLAYER_RATE_HZ = 25.0
 FRAMES, TIME = "frames", "time"  # names of the data sets
@@ -53,7 +54,8 @@ def write_movie(
     count = write_ffv1(path, _black_where_none(path, frames), frame_rate_hz)
     if times_s is not None:
         text = "".join(f"{time!r}\n" for time in np.asarray(times_s, np.float64).tolist())
-        _aside(times_path(path), lambda aside: aside.write_text(f"time_s\n{text}", encoding="utf-8"))
+        with put_aside(times_path(path)) as aside:
+            aside.write_text(f"time_s\n{text}", encoding="utf-8")
     return count
 
 
@@ -64,22 +66,8 @@ def times_path(path: Path) -> Path:
 
 def write_hdf5(path: Path, frames: Iterable[Grey | None], times_s: NDArray[np.float64] | None = None) -> int:
     """Write frames as the data set `frames` (N, H, W), a chunk each, and times as `time` (N,); see `write_movie`."""
-    return _aside(path, lambda aside: _fill(aside, path, frames, times_s))
-
-
-def _aside(path: Path, write: Callable[[Path], int]) -> int:
-    """Write under another name, which takes the place of `path` when all is there."""
-    aside = path.with_name(f".{path.name}.partial")
-    try:
-        result = write(aside)
-        aside.replace(path)
-    except (OSError, RuntimeError) as error:
-        got = f"'{(getattr(error, 'strerror', None) or str(error)).splitlines()[0]}'"
-        do = "choose a folder that exists, may be written and has room"
-        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
-    finally:
-        aside.unlink(missing_ok=True)
-    return result
+    with put_aside(path, also=(RuntimeError,)) as aside:
+        return _fill(aside, path, frames, times_s)
 
 
 def _fill(aside: Path, path: Path, frames: Iterable[Grey | None], times_s: NDArray[np.float64] | None) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -19,7 +19,6 @@ from sphereorient.locate import (
     Sightings,
     find_ball,
     learn_background,
-    load_background,
     screened,
     sightings_of,
     spread_frames,
@@ -28,7 +27,9 @@ from sphereorient.locate import (
 from sphereorient.locate.background import measure_background
 from sphereorient.locate.find import Found
 from sphereorient.locate.outline import Outline
-from sphereorient.movies import Movie, readable
+from sphereorient.movies import Movie
+from sphereorient.recording import given_scene
+from sphereorient.reel import pictures_of
 from sphereorient.timeline import NONE, Timeline
 from sphereorient.trajectory import Reason
 
@@ -100,21 +101,6 @@ def sample_frames(count: int) -> list[int]:
     return sorted({*spread_frames(range(count), SPREAD), *(k + 1 for k in pair_starts(count))})
 
 
-def read_rows(movie: Movie, rows: Sequence[int]) -> Iterator[Grey | None]:
-    """Yield pictures of a movie by number, increasing; None for NONE, and where a frame cannot be decoded."""
-    k = 0
-    while k < len(rows):
-        if rows[k] == NONE:
-            yield None
-            k += 1
-            continue
-        last = k + 1
-        while last < len(rows) and rows[last] == rows[last - 1] + 1:
-            last += 1
-        yield from readable(movie, rows[k], rows[last - 1] + 1)
-        k = last
-
-
 def look_at(
     name: str,
     experiment: Experiment,
@@ -139,7 +125,7 @@ def look_at(
     """
     frame = np.asarray(sample_frames(len(timeline)), np.int64)
     row = timeline.rows[name][frame]
-    picture = tuple(read_rows(movie, row.tolist()))
+    picture = tuple(pictures_of(movie, row))
     shown = [one for one in picture if one is not None and not uniform(one)]
     shown = shown or [one for one in picture if one is not None]
     if not shown:
@@ -180,7 +166,7 @@ def look_closer(look: Look, timeline: Timeline, frames: Sequence[int], settings:
     """Look at other frames of the same camera: the same background, the same size of ball."""
     frame = np.asarray(frames, np.int64)
     row = timeline.rows[look.name][frame]
-    picture = tuple(read_rows(look.movie, row.tolist()))
+    picture = tuple(pictures_of(look.movie, row))
     screen = _screen(row, picture, look.background)
     found = _found(picture, screen, look.background, look.diameter_px, settings)
     return replace(look, frame=frame, row=row, picture=picture, screen=screen, found=found)
@@ -223,10 +209,9 @@ def _empty_scene(
 ) -> Background:
     """Learn what the camera shows without the ball, from frames that show something."""
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
-    given = experiment.background_paths.get(name)
-    if given is None and experiment.fixed:
+    empty = given_scene(experiment, name, movie.frame_shape)
+    if empty is None and experiment.fixed:
         return _around(some)
-    empty = None if given is None else load_background(given, movie.frame_shape)
     return learn_background(some, diameter_px, settings, empty)
 
 

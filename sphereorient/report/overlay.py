@@ -15,7 +15,7 @@ from sphereorient.cameras.yaml_file import refuse_unknown
 from sphereorient.errors import ExperimentError, TrackError, refusal
 from sphereorient.experiment import Experiment, open_movies
 from sphereorient.movies import Grey, Movie
-from sphereorient.reel import Reel
+from sphereorient.reel import Reel, pictures_of
 from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of, radius_of
 from sphereorient.report.overlay_page import Page, crop_side
 from sphereorient.report.overlay_video import check_video_name, write_video
@@ -160,10 +160,8 @@ def _pictures(
 
 
 def pictures_at(reel: Reel, chosen: Rows) -> Iterator[Grey | None]:
-    """Yield a camera's pictures of some frames of the track, in increasing order; None where there is none."""
-    part = Reel(name=reel.name, camera=reel.camera, movie=reel.movie, rows=reel.rows[chosen])
-    for picture, _ in part.pictures():
-        yield picture
+    """Return a camera's pictures of some frames of the track, in increasing order; None where there is none."""
+    return pictures_of(reel.movie, reel.rows[chosen])
 
 
 def _view(track: Trajectory, model: Model, reel: Reel) -> View:

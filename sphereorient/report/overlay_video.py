@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, refusal
+from sphereorient.outputs import put_aside
 
 Colour = NDArray[np.uint8]  # (H, W, 3), red green blue
 FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
@@ -42,25 +42,12 @@ def write_video(path: Path, pictures: Iterable[Colour], fps: float) -> int:
         OutputError: another suffix, no picture, or the file cannot be written; an old one is still there.
     """
     check_video_name(path)
-    with _aside(path) as aside, av.open(str(aside), "w", format=FORMATS[path.suffix.lower()]) as container:
+    kind = FORMATS[path.suffix.lower()]
+    with put_aside(path, also=(av.FFmpegError,)) as aside, av.open(str(aside), "w", format=kind) as container:
         count = _encode(container, pictures, Fraction(fps).limit_denominator(1000))
         if not count:
             raise OutputError(refusal(str(path), expected="pictures to write", got="none", do="ask for more frames"))
     return count
-
-
-@contextmanager
-def _aside(path: Path) -> Iterator[Path]:
-    aside = path.with_name(f".{path.name}.partial")
-    try:
-        yield aside
-        aside.replace(path)
-    except (av.FFmpegError, OSError) as error:
-        got = f"'{getattr(error, 'strerror', None) or error}'"
-        do = "choose a folder that exists, may be written and has room"
-        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
-    finally:
-        aside.unlink(missing_ok=True)
 
 
 def _encode(container: Any, pictures: Iterable[Colour], rate: Fraction) -> int:

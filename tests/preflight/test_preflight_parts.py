@@ -23,8 +23,9 @@ from sphereorient.preflight.diameter import expected_outline_px
 from sphereorient.preflight.exposure import limb_blur_px
 from sphereorient.preflight.finding import worst
 from sphereorient.preflight.gap import gaps_between
-from sphereorient.preflight.look import pair_starts, read_rows, sample_frames
+from sphereorient.preflight.look import pair_starts, sample_frames
 from sphereorient.preflight.offset import REACH, Steps, gap_by_offset, started
+from sphereorient.reel import pictures_of
 
 
 def f64(value: object) -> torch.Tensor:
@@ -167,9 +168,9 @@ class Sevens:
 
 
 def test_rows_are_read_in_order_with_gaps_where_there_is_no_picture(monkeypatch):
-    monkeypatch.setattr("sphereorient.preflight.look.readable", lambda movie, first, last: movie.readable(first, last))
-    rows = [3, 4, 5, -1, 7, 8, 20, -1, -1, 30]
-    read = [None if one is None else int(one[0, 0]) for one in read_rows(Sevens(), rows)]
+    monkeypatch.setattr("sphereorient.reel.readable", lambda movie, first, last: movie.readable(first, last))
+    rows = np.array([3, 4, 5, -1, 7, 8, 20, -1, -1, 30])
+    read = [None if one is None else int(one[0, 0]) for one in pictures_of(Sevens(), rows)]
     assert read == [3, 4, 5, None, None, 8, 20, None, None, 30]
 
 

@@ -1,0 +1,35 @@
+"""Results that appear whole or not at all: written under another name first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sphereorient.errors import OutputError, refusal
+
+ROOM = "choose a folder that exists, may be written and has room"
+
+
+@contextmanager
+def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()) -> Iterator[Path]:
+    """Give a name to write under; what was written takes its place at the end, or vanishes where something failed.
+
+    Args:
+        path: the file; an old one is replaced at the end. The other name has its suffix, which libraries go by.
+        do: the remedy, for the message.
+        also: what a library raises, beside OSError, where it cannot write.
+
+    Raises:
+        OutputError: it cannot be written; what was there before is still there.
+    """
+    aside = path.with_name(f".{path.stem}.partial{path.suffix}")
+    failures: tuple[type[Exception], ...] = (OSError, *also)
+    try:
+        yield aside
+        aside.replace(path)
+    except failures as error:
+        got = f"'{(getattr(error, 'strerror', None) or str(error)).splitlines()[0]}'"
+        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
+    finally:
+        aside.unlink(missing_ok=True)
