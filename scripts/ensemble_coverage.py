@@ -24,9 +24,10 @@ from sphereorient.motion import ProcessNoise
 from sphereorient.statistics.density import fit_stretched
 from sphereorient.statistics.moments import moments
 from sphereorient.statistics.segments import UNITS, Ensemble, ensemble_of
-from sphereorient.statistics.settings import BootstrapSettings
+from sphereorient.statistics.settings import BootstrapSettings, SegmentSettings
 from sphereorient.synth.ensemble import EnsembleSpec, Nominal, draw_ensemble, nominal
 from sphereorient.synth.ensemble_tracks import exact_track, smoothed_track
+from sphereorient.trajectory import Trajectory
 
 NOISE_DEG, ROUGH_DEG, NOISE_MM = 0.1, 2.0, 0.05
 WITHIN = 0.03  # recovery of each rms
@@ -85,11 +86,17 @@ def repeat(work: Work) -> Result:
     true = draw_ensemble(work.spec, work.seed)
     track, _ = smoothed_track(true, NOISE_DEG, NOISE_MM, work.seed, work.known)
     few = BootstrapSettings(resamples=100)
-    clean = {key: value for key, value, _, _ in measure(ensemble_of(exact_track(true)), few)}
+    ensemble = ensemble_of(track)
+    clean = {key: value for key, value, _, _ in measure(same_frames(exact_track(true), ensemble), few)}
     return {
-        key: (value / clean[key], low <= work.truth[key] <= high)
-        for key, value, low, high in measure(ensemble_of(track), DRAWS)
+        key: (value / clean[key], low <= work.truth[key] <= high) for key, value, low, high in measure(ensemble, DRAWS)
     }
+
+
+def same_frames(exact: Trajectory, ensemble: Ensemble) -> Ensemble:
+    """Return the noise-free ensemble of just those frames that are in another one."""
+    rows = np.searchsorted(exact.time, ensemble.time_s - 0.5 * ensemble.step_s)
+    return ensemble_of(exact.at(rows), SegmentSettings(min_frames=2))
 
 
 def truths(spec: EnsembleSpec) -> dict[tuple[str, str, int], float]:

@@ -19,6 +19,7 @@ from sphereorient.errors import SettingsError, refusal
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
 from sphereorient.orient.settings import GreySearchSettings, OrientSettings, RefineSettings
+from sphereorient.statistics.settings import StatisticsSettings
 from sphereorient.synth.settings import SynthSettings
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -39,6 +40,7 @@ class Settings(BaseModel):
     orient: OrientSettings = Field(default_factory=OrientSettings, description="where could it point (paper)")
     assemble: AssembleSettings = Field(default_factory=AssembleSettings, description="which candidate is true (paper)")
     motion: MotionSettings = Field(default_factory=MotionSettings, description="velocities, accelerations (paper)")
+    statistics: StatisticsSettings = Field(default_factory=StatisticsSettings, description="numbers of a report")
 
 
 def load_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> Settings:

@@ -27,7 +27,7 @@ from sphereorient.settings import (
 )
 from sphereorient.synth.settings import SynthSettings
 
-ROOMS = ["locate", "search", "refine", "path", "smooth", "orient", "assemble", "motion"]
+ROOMS = ["locate", "search", "refine", "path", "smooth", "orient", "assemble", "motion", "statistics"]
 CHANGES = [
     "locate.diameter_px=78.5",
     "locate.gap_frames_max=0",

@@ -3,7 +3,8 @@
 from sphereorient.statistics.bootstrap import Interval
 from sphereorient.statistics.moments import Moments, table_of_moments
 from sphereorient.statistics.segments import Ensemble, ensemble_of
-from sphereorient.statistics.settings import BootstrapSettings, SegmentSettings
+from sphereorient.statistics.settings import BootstrapSettings, SegmentSettings, StatisticsSettings
+from sphereorient.statistics.summary import Summary, Surroundings, summarise
 
 __all__ = [
     "BootstrapSettings",
@@ -11,6 +12,10 @@ __all__ = [
     "Interval",
     "Moments",
     "SegmentSettings",
+    "StatisticsSettings",
+    "Summary",
+    "Surroundings",
     "ensemble_of",
+    "summarise",
     "table_of_moments",
 ]

@@ -15,6 +15,7 @@ from sphereorient.statistics.settings import BootstrapSettings
 Floats = NDArray[np.float64]
 Statistic = Callable[[Floats], Floats]  # sums (..., K) over segments to values (..., Q)
 
+FEWEST = 2  # segments; of one nothing is known about the scatter
 AT_ONCE = 4_000_000  # numbers of a block of weights
 
 
@@ -78,7 +79,7 @@ def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | 
         settings: resamples, level, seed.
 
     Returns:
-        Values and intervals, of the statistic's shape; NaN where the statistic is.
+        Values and intervals, of the statistic's shape; NaN where the statistic is. One segment has no intervals.
 
     Source: Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 14.
     """
@@ -91,6 +92,9 @@ def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | 
             return np.asarray(statistic(totals.reshape(*totals.shape[:-1], *sums.shape[1:])), np.float64)
 
     value = at(total)
+    if len(sums) < FEWEST:
+        unknown = np.full_like(value, np.nan)
+        return Interval(value=value, low=unknown, high=unknown, error=unknown)
     drawn = _by_blocks(lambda rows: at(_resampled(flat, rows, settings)), settings.resamples, len(flat))
     without = _by_blocks(lambda rows: at(total - flat[rows]), len(flat), len(flat) + flat.shape[1])
     low, high = _bca(value, drawn, without, settings.level)

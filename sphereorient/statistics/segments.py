@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import TrackError, refusal
+from sphereorient.statistics.bootstrap import FEWEST
 from sphereorient.statistics.settings import SegmentSettings
 from sphereorient.trajectory import Flag, Trajectory
 
@@ -24,7 +25,6 @@ UNITS = {
     "alpha_lab": "rad/s^2",
     "alpha_body": "rad/s^2",
 }
-FEWEST = 2  # segments; of one nothing is known about the scatter
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,24 +74,29 @@ class Ensemble:
 
 
 def ensemble_of(
-    tracks: Trajectory | Sequence[Trajectory], settings: SegmentSettings | None = None, name: str = "tracks"
+    tracks: Trajectory | Sequence[Trajectory],
+    settings: SegmentSettings | None = None,
+    name: str = "tracks",
+    fewest: int = FEWEST,
 ) -> Ensemble:
     """Collect the usable segments of tracks.
 
     A frame is usable where all six quantities and the smoother's position and orientation are there, and it was not
-    extrapolated; a segment, where enough usable frames are in it.
+    extrapolated; a segment, where enough usable frames are in it. Of a segment that counts, the frames at its ends,
+    known from one side only and so with larger errors, are then left out: what they say is noise first.
 
     Args:
         tracks: one or many.
         settings: which frames and segments count; None takes the paper's.
         name: what the tracks are called in a message.
+        fewest: segments that must be left; of one, statistics have no intervals.
 
     Returns:
         The ensemble. Its `error` is "removed" where the tracks come from a smoother, whose sigma is that of the motion
         it could not follow; "added" where from a kernel, whose sigma is that of the noise it let through.
 
     Raises:
-        TrackError: no usable frame, fewer than two segments, or tracks of kinds that do not go together.
+        TrackError: no usable frame, too few segments, or tracks of kinds that do not go together.
 
     Source: the paper, section IV: segments above 0.25 T_L; ERRATA, settings of the paper: 50 frames.
     """
@@ -107,7 +112,7 @@ def ensemble_of(
         do = "look at the track's reasons with `sphereorient check`"
         raise TrackError(refusal(name, expected="frames with a motion", got="no valid frame", do=do))
     whole = {key: np.concatenate([piece[key] for piece in pieces]) for key in pieces[0]}
-    return _chosen(whole, step_s, _error(many[0].method), settings, name)
+    return _chosen(whole, step_s, _error(many[0].method), settings, name, fewest)
 
 
 def _error(method: str) -> Literal["added", "removed"]:
@@ -139,7 +144,19 @@ def _pieces(track: Trajectory, number: int, settings: SegmentSettings) -> dict[s
         **{quantity: getattr(track, quantity) for quantity in UNITS},
         **{f"{quantity}_sigma": getattr(track, f"{quantity}_sigma") for quantity in UNITS},
     }
+    parts["sure"] = _sure(track, rows, settings.max_sigma)
     return {key: values[rows] for key, values in parts.items()} | {"track": np.full(len(rows), number)}
+
+
+def _sure(track: Trajectory, rows: NDArray[np.int64], most: float) -> NDArray[np.bool_]:
+    """Return which frames (N,) have errors of no more than `most` times the usual ones; unknown ones are taken."""
+    sure = np.ones(len(track), dtype=bool)
+    for name in ("acceleration_sigma", "alpha_lab_sigma"):
+        size = np.linalg.norm(getattr(track, name), axis=1)
+        known = rows[np.isfinite(size[rows])]
+        if len(known):
+            sure &= ~(size > most * np.median(size[known]))
+    return sure
 
 
 def _chosen(
@@ -148,19 +165,27 @@ def _chosen(
     error: Literal["added", "removed"],
     settings: SegmentSettings,
     name: str,
+    fewest: int,
 ) -> Ensemble:
-    """Number the segments, leave out the short ones."""
+    """Number the segments, cut the long ones, leave out the short ones."""
     time_s = whole["time_s"]
     first = np.ones(len(time_s), dtype=bool)
     first[1:] = (np.diff(whole["label"]) != 0) | (np.diff(whole["track"]) != 0)
+    if settings.max_duration_s is not None:
+        first[1:] |= np.diff(_piece(time_s, first, settings.max_duration_s)) != 0
     number, begin = np.cumsum(first) - 1, np.flatnonzero(first)
     frames = np.bincount(number)
     last = begin + frames - 1
     span_s = time_s[last] - time_s[begin] + step_s
     least_s = settings.min_integral_times * (settings.integral_time_s or 0.0)
     kept = (frames >= settings.min_frames) & (span_s >= least_s)
-    _refuse_few(int(kept.sum()), name, f"of at least {settings.min_frames} frames and {least_s:.3g} s")
-    rows = kept[number]
+    _refuse_few(int(kept.sum()), name, f"of at least {settings.min_frames} frames and {least_s:.3g} s", fewest)
+    some = np.bincount(number, weights=whole["sure"], minlength=len(kept)) > 0
+    kept &= some
+    _refuse_few(
+        int(kept.sum()), name, "with frames whose errors are not larger than usual (statistics.max_sigma)", fewest
+    )
+    rows = kept[number] & whole["sure"]
     return Ensemble(
         time_s=time_s[rows],
         frame=np.rint((time_s - time_s[begin][number]) / step_s).astype(np.int64)[rows],
@@ -176,9 +201,19 @@ def _chosen(
     )
 
 
-def _refuse_few(count: int, name: str, which: str = "") -> None:
+def _piece(time_s: Floats, first: NDArray[np.bool_], longest_s: float) -> Rows:
+    """Return the number of the piece of its segment that each row is in, (M,): pieces equal, none above longest_s."""
+    number, begin = np.cumsum(first) - 1, np.flatnonzero(first)
+    end = np.append(begin[1:], len(time_s)) - 1
+    span_s = time_s[end] - time_s[begin]
+    pieces = np.maximum(np.ceil(span_s / longest_s * (1 - 1e-9)), 1)
+    share = (time_s - time_s[begin][number]) / np.maximum(span_s, 1e-300)[number]
+    return np.asarray(np.minimum(np.floor(share * pieces[number]), pieces[number] - 1), np.int64)
+
+
+def _refuse_few(count: int, name: str, which: str = "", fewest: int = FEWEST) -> None:
     """Refuse an ensemble without scatter."""
-    if count < FEWEST:
-        expected = " ".join(["at least two segments", which]).strip()
-        do = "pass more tracks, or lower statistics.min_frames"
+    if count < fewest:
+        expected = " ".join([f"at least {'two segments' if fewest > 1 else 'one segment'}", which]).strip()
+        do = "pass more tracks, lower statistics.min_frames, or cut long ones with statistics.max_duration_s"
         raise TrackError(refusal(name, expected=expected, got=str(count), do=do))

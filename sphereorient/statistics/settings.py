@@ -15,7 +15,19 @@ class SegmentSettings(BaseModel):
         0.25, ge=0, description="segments shorter than this many integral times of the velocity are left out"
     )
     integral_time_s: float | None = Field(
-        None, gt=0, description="integral time of the velocity, s; without it only min_frames counts"
+        None, gt=0, description="integral time of the velocity, s; null: the report measures it on these tracks"
+    )
+    max_duration_s: float | None = Field(
+        None,
+        gt=0,
+        description="longer segments are cut into pieces of this duration, s, which then count as independent: for few "
+        "long records; several integral times",
+    )
+    max_sigma: float = Field(
+        3.0,
+        gt=1,
+        description="frames whose stated error of acceleration or alpha is more than so many times their track's "
+        "median are left out: the ends of segments, where the smoother knows one side only",
     )
     keep_extrapolated: bool = Field(False, description="also use frames that the smoother filled from their neighbours")
 
@@ -28,3 +40,7 @@ class BootstrapSettings(BaseModel):
     resamples: int = Field(1000, ge=100, description="number of resampled ensembles")
     level: float = Field(0.95, gt=0, lt=1, description="probability that an interval is to hold the true value")
     seed: int = Field(2011, ge=0, description="of the resampling; the same seed gives the same intervals")
+
+
+class StatisticsSettings(BootstrapSettings, SegmentSettings):
+    """Statistics of tracks: which segments count, and how the error bars are drawn."""

@@ -1,28 +1,30 @@
 """A smooth stationary random rate whose rms and flatness, and those of its derivative, are known in closed form.
 
-rate = rms (sqrt(1 - b) g1 + sqrt(b / <A^2>) A g2): two independent Gaussian processes, the second switched on and off
-by A = cos^BURST of a phase that turns evenly from a random start. Given the phase everything is Gaussian, so that all
-moments are means over the phase. Bounded bursts and not a log-normal factor: the flatness of 300 segments would else
-hang on the largest event in them.
+rate = rms (sqrt(1 - b) g1 + sqrt(b / <A^2>) A g2): two independent Gaussian processes, the second swollen and calmed
+by A, whose logarithm is a sum of DEPTH cos(phase) over phases that turn evenly from random starts. Given the phases
+everything is Gaussian, so that all moments are means over them. Nearly the log-normal factor of turbulence, and so
+nearly the stretched exponential, but bounded: the flatness of 300 segments would else hang on the largest event in
+them.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import i0e, ndtri
 
 Floats = NDArray[np.float64]
 
-BURST = 6  # power of the cosine; 4 would not reach a flatness of 7.6 in the derivative
-TURN = 0.25  # rate of the phase over that of g2: a burst holds a few swings
+TURNS = (0.2, 0.3, 0.45)  # rates of the phases over that of g2: a burst holds a few swings
+DEPTH = 0.55  # of each phase's part in ln A; 0.47 would not reach a flatness of 7.6 in the derivative
 WAVES = 24  # sines of each Gaussian process
 GAUSSIAN = 3.0  # its flatness
-_PHASE = np.linspace(0.0, 2 * np.pi, 256, endpoint=False)  # means over it are exact for these polynomials
+NODES = 32  # of each phase: means over so many are exact to rounding for these smooth periodic functions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +49,11 @@ class Law:
             flatness: of the rate, 3 or more.
             derivative_flatness: of its derivative; 3 where the flatness is 3, else up to about 9.
         """
-        modulation, burst, slope, flat = _burst()
+        modulation, growth, flat = _burst()
         share = math.sqrt(max(flatness - GAUSSIAN, 0.0) / (modulation - GAUSSIAN))
         steep = math.sqrt(max(derivative_flatness - GAUSSIAN, 0.0) / (flat - GAUSSIAN))
         whole = (derivative_rms / rms) ** 2
         slow = math.sqrt((1 - steep) * whole / (1 - share))
-        growth = 1 + TURN**2 * slope / burst  # of the burst's derivative by its own rise and fall
         fast = math.sqrt(steep * whole / (max(share, 1e-12) * growth))
         return cls(
             rms=rms,
@@ -66,9 +67,10 @@ class Law:
 
     def correlation(self, lag_s: Floats) -> Floats:
         """Return the autocorrelation of the rate at lags (...), s."""
-        values = np.cos(_PHASE) ** BURST
-        turned = np.cos(_PHASE + self.fast * TURN * np.asarray(lag_s)[..., None]) ** BURST
-        burst = (values * turned).mean(-1) / (values**2).mean()
+        # <exp(c cos p) exp(c cos(p + d))> = I0(2 c cos(d / 2)); i0e(x) = exp(-|x|) I0(x)
+        angle = np.abs(np.cos(self.fast * np.array(TURNS) * np.asarray(lag_s)[..., None] / 2))
+        log_burst = np.log(i0e(2 * DEPTH * angle) / i0e(2 * DEPTH)) - 2 * DEPTH * (1 - angle)
+        burst = np.exp(log_burst.sum(-1))
         slow, fast = (
             np.cos(rate * _spectrum() * np.asarray(lag_s)[..., None]).mean(-1) for rate in (self.slow, self.fast)
         )
@@ -77,7 +79,7 @@ class Law:
     def draw(self, segments: int, rng: np.random.Generator) -> Draw:
         """Draw independent realisations, one a segment."""
         coefficients = rng.standard_normal((segments, 2, 2, WAVES)) / math.sqrt(WAVES)
-        return Draw(law=self, coefficients=coefficients, phase=rng.uniform(0.0, 2 * np.pi, segments))
+        return Draw(law=self, coefficients=coefficients, phase=rng.uniform(0.0, 2 * np.pi, (segments, len(TURNS))))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,18 +88,19 @@ class Draw:
 
     law: Law
     coefficients: Floats  # (S, 2 processes, cosine and sine, WAVES)
-    phase: Floats  # (S,), of the bursts at time 0
+    phase: Floats  # (S, 3), of the bursts at time 0
 
     def at(self, time_s: Floats, segment: NDArray[np.int64]) -> tuple[Floats, Floats]:
         """Return the rate and its derivative, (M,) each, at times (M,) since the start of their segments."""
         law = self.law
         g1, g1_slope = self._gaussian(0, law.slow, time_s, segment)
         g2, g2_slope = self._gaussian(1, law.fast, time_s, segment)
-        turn = law.fast * TURN
-        angle = self.phase[segment] + turn * time_s
-        burst = np.cos(angle) ** BURST
-        rise = -BURST * turn * np.cos(angle) ** (BURST - 1) * np.sin(angle)
-        calm, strong = law.rms * math.sqrt(1 - law.share), law.rms * math.sqrt(law.share / _burst()[1])
+        turn = law.fast * np.array(TURNS)
+        angle = self.phase[segment] + turn * time_s[:, None]
+        burst = np.exp(DEPTH * np.cos(angle).sum(1))
+        rise = -DEPTH * burst * (np.sin(angle) @ turn)
+        calm = law.rms * math.sqrt(1 - law.share)
+        strong = law.rms * math.sqrt(law.share) / float(i0e(2 * DEPTH) * math.exp(2 * DEPTH)) ** (len(TURNS) / 2)
         return calm * g1 + strong * burst * g2, calm * g1_slope + strong * (rise * g2 + burst * g2_slope)
 
     def integral(self, time_s: Floats, segment: NDArray[np.int64]) -> Floats:
@@ -123,9 +126,13 @@ def _spectrum() -> Floats:
     return np.asarray(rates / np.sqrt((rates**2).mean()))
 
 
-def _burst() -> tuple[float, float, float, float]:
-    """Return flatness of A g2, <A^2>, <A'^2> (per phase) and the flatness of the derivative of A g2."""
-    A, A_slope = np.cos(_PHASE) ** BURST, -BURST * np.cos(_PHASE) ** (BURST - 1) * np.sin(_PHASE)
-    var, slope_var = A**2, TURN**2 * A_slope**2 + A**2
-    flat, slope_flat = (GAUSSIAN * (v**2).mean() / v.mean() ** 2 for v in (var, slope_var))
-    return float(flat), float(var.mean()), float((A_slope**2).mean()), float(slope_flat)
+@cache
+def _burst() -> tuple[float, float, float]:
+    """Return the flatness of A g2, the mean square of its derivative over that of A g2' alone, and its flatness."""
+    angle = np.linspace(0.0, 2 * np.pi, NODES, endpoint=False)
+    phases = np.meshgrid(*(angle for _ in TURNS), indexing="ij")
+    var = np.exp(2 * DEPTH * sum(np.cos(phase) for phase in phases))
+    own = DEPTH * sum(turn * np.sin(phase) for turn, phase in zip(TURNS, phases, strict=True))  # A' / A
+    slope_var = var * (1 + own**2)
+    flat, slope_flat = (GAUSSIAN * float((v**2).mean() / v.mean() ** 2) for v in (var, slope_var))
+    return flat, float(slope_var.mean() / var.mean()), slope_flat
