@@ -1,6 +1,19 @@
 """The command line: parse, call, print. Heavy packages are imported inside the commands, so that help is quick."""
 
-from sphereorient.cli import about, calibrate, check, export, movie, overlay, synth, track, view
+from sphereorient.cli import about, calibrate, check, export, movie, overlay, report, synth, track, view
 from sphereorient.cli.app import app, main
 
-__all__ = ["about", "app", "calibrate", "check", "export", "main", "movie", "overlay", "synth", "track", "view"]
+__all__ = [
+    "about",
+    "app",
+    "calibrate",
+    "check",
+    "export",
+    "main",
+    "movie",
+    "overlay",
+    "report",
+    "synth",
+    "track",
+    "view",
+]

@@ -22,7 +22,7 @@ class InOrder(TyperGroup):
     """Commands in the order in which a user meets them, not in that of their files."""
 
     ORDER = (
-        *("track", "overlay", "export", "view"),
+        *("track", "report", "overlay", "export", "view"),
         *("check", "movie", "convert", "calibrate", "check-cameras", "synth", "settings", "info"),
     )
 
@@ -87,8 +87,8 @@ Advance = Callable[[str, int, int], None]
 
 
 @contextmanager
-def progress_bar(quiet: bool = False) -> Iterator[Advance]:
-    """Show one line of progress a stage, with frames per second and time left; nothing where `quiet`."""
+def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]:
+    """Show one line of progress a stage, with units per second, if any, and time left; nothing where `quiet`."""
     if quiet:
         yield lambda stage, done, total: None
         return
@@ -121,7 +121,7 @@ def progress_bar(quiet: bool = False) -> Iterator[Advance]:
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=total, rate="")
             elapsed = bar.tasks[bar.task_ids.index(tasks[stage])].elapsed
-            rate = f"{done / elapsed:.1f} frames/s" if done and elapsed else ""
+            rate = f"{done / elapsed:.1f} {unit}/s" if unit and done and elapsed else ""
             bar.update(tasks[stage], completed=done, total=total, rate=rate)
 
         yield advance

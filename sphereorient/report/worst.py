@@ -85,8 +85,14 @@ def _columns(page: Page) -> int:
     return max(1, PICTURES // (2 * len(page.views)))
 
 
+def pairs_size(page: Page) -> tuple[int, int]:
+    """Return width and height of what `draw_pairs` draws, px."""
+    return 2 * len(page.views) * (TILE + GAP) - GAP, TILE
+
+
 def _tile_size(page: Page) -> tuple[int, int]:
-    return 2 * len(page.views) * (TILE + GAP) - GAP, TITLE + TILE + LINES * LINE + 10
+    width, height = pairs_size(page)
+    return width, TITLE + height + LINES * LINE + 10
 
 
 def _sheet(page: Page, count: int) -> Canvas:
@@ -110,15 +116,30 @@ def _tile(canvas: Canvas, page: Page, bad: BadFrame, place: int, pictures: Mappi
     top = HEAD + place // _columns(page) * (height + BETWEEN)
     k = bad.k
     canvas.text((left, top + 15), f"frame {int(page.numbers[k])}, {page.track.time[k]:.4f} s", 14)
-    for column, view in enumerate(page.views):
-        at = (left + 2 * column * (TILE + GAP), top + TITLE)
-        _pair(canvas, view, page.track, k, pictures[view.name], at)
+    draw_pairs(canvas, page, k, pictures, (left, top + TITLE))
     lines = [line for words in bad.words for line in textwrap.wrap(words, int(width / LETTER_PX))]
     if len(lines) > LINES:
         lines = [*lines[: LINES - 1], f"{lines[LINES - 1]} ..."]
     colour = ink.INK if bad.words[0].startswith("not in doubt") else ink.DOUBT
     for row, line in enumerate(lines):
         canvas.text((left, top + TITLE + TILE + 17 + row * LINE), line, 13, colour)
+
+
+def draw_pairs(
+    canvas: Canvas, page: Page, k: int, pictures: Mapping[str, Grey | None], corner: tuple[int, int]
+) -> None:
+    """Draw of each camera, side by side, the crop with outline and the re-rendered sphere with axes.
+
+    Args:
+        canvas: what is drawn on.
+        page: of `overlay.prepared`.
+        k: row of the track.
+        pictures: (h, w) of each camera; None where it has none.
+        corner: column and row of the top left corner, px.
+    """
+    for column, view in enumerate(page.views):
+        at = (corner[0] + 2 * column * (TILE + GAP), corner[1])
+        _pair(canvas, view, page.track, k, pictures[view.name], at)
 
 
 def _pair(canvas: Canvas, view: View, track: Trajectory, k: int, picture: Grey | None, corner: tuple[int, int]) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -32,35 +33,69 @@ class CameraDistance:
 
 
 def camera_distances(
-    track: Trajectory, uncorrected: Mapping[str, Floats] | None = None, bins: int = 60
+    tracks: Trajectory | Sequence[Trajectory],
+    uncorrected: Sequence[Mapping[str, Floats] | None] = (),
+    bins: int = 60,
 ) -> list[CameraDistance]:
-    """Return the distances for every pair of cameras; none with one camera.
+    """Return the distances for every pair of cameras, frames of all tracks together; none with one camera.
 
     Args:
-        track: each camera's own R_lab_body, in which perspective is corrected.
-        uncorrected: (N, 3, 3) by camera, the same without this correction; None where it is not known.
+        tracks: each camera's own R_lab_body, in which perspective is corrected.
+        uncorrected: of each track (N, 3, 3) by camera, the same without this correction, as `without_perspective`
+            returns it; None, or nothing at all, where it is not known.
         bins: of the PDF, from 0 to the largest distance or 180 degrees.
 
     Source: the paper, section III, distance of the two cameras; the angle by ERRATA A3.
     """
-    found = []
-    for pair in combinations(sorted(track.cameras), 2):
-        apart = _distance(*(track.cameras[name].orientation for name in pair))
-        rough = None
-        if uncorrected is not None and all(name in uncorrected for name in pair):
-            rough = _distance(*(uncorrected[name] for name in pair))
-        top = max([float(x.max()) for x in (apart, rough) if x is not None and len(x)], default=np.pi)
-        edges = np.linspace(0.0, max(top, 1e-9), bins + 1)
-        found.append(
-            CameraDistance(
-                cameras=(pair[0], pair[1]),
-                distance_rad=apart,
-                edges_rad=edges,
-                pdf=_pdf(apart, edges),
-                uncorrected_rad=rough,
-                uncorrected_pdf=None if rough is None else _pdf(rough, edges),
-            )
-        )
+    many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
+    rough = [*uncorrected, *[None] * (len(many) - len(uncorrected))]
+    apart: dict[tuple[str, str], list[Floats]] = {}
+    apart_rough: dict[tuple[str, str], list[Floats]] = {}
+    for track, other in zip(many, rough, strict=True):
+        for a, b in combinations(sorted(track.cameras), 2):
+            seen = _distance(track.cameras[a].orientation, track.cameras[b].orientation)
+            apart.setdefault((a, b), []).append(seen)
+            if other is not None and a in other and b in other:
+                apart_rough.setdefault((a, b), []).append(_distance(other[a], other[b]))
+    return [_pooled(pair, parts, apart_rough.get(pair), bins) for pair, parts in apart.items()]
+
+
+def _pooled(pair: tuple[str, str], parts: list[Floats], rough_parts: list[Floats] | None, bins: int) -> CameraDistance:
+    apart = np.concatenate(parts)
+    rough = None if rough_parts is None else np.concatenate(rough_parts)
+    top = max([float(x.max()) for x in (apart, rough) if x is not None and len(x)], default=np.pi)
+    edges = np.linspace(0.0, max(top, 1e-9), bins + 1)
+    return CameraDistance(
+        cameras=pair,
+        distance_rad=apart,
+        edges_rad=edges,
+        pdf=_pdf(apart, edges),
+        uncorrected_rad=rough,
+        uncorrected_pdf=None if rough is None else _pdf(rough, edges),
+    )
+
+
+def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, Floats]:
+    """Return what each camera's orientation would be with its sight taken for parallel to its axis.
+
+    Args:
+        track: each camera's own R_lab_body (N, 3, 3) and the projected centre.
+        cameras: by name; those of the track that are missing here are left out.
+
+    Returns:
+        R_lab_cam R_cam_view^T R_cam_lab R_lab_body, (N, 3, 3) by camera; NaN where the camera has none.
+
+    Source: the paper, section III, R_persp; its sign by ERRATA A1.
+    """
+    import torch
+
+    found = {}
+    for name, seen in track.cameras.items():
+        if name in cameras:
+            to_cam = cameras[name].R_cam_lab
+            direction_cam = cameras[name].rays(torch.from_numpy(seen.centre_px)).direction_lab @ to_cam.mT
+            turn = to_cam.mT @ R_cam_view(direction_cam).mT @ to_cam
+            found[name] = (turn @ torch.from_numpy(seen.orientation)).numpy()
     return found
 
 

@@ -99,10 +99,10 @@ def _curve_and_times(totals: Floats, lag_s: Floats) -> Floats:
 
 
 def integral_time(curve: Floats, lag_s: Floats) -> Floats:
-    """Return the integral up to the first zero, (..., C), of curves (..., L, C) at lags (L,)."""
+    """Return the integral up to the first zero, (..., C), of curves (..., L, C) at lags (L,); it ends before a NaN."""
     a, b = curve[..., :-1, :], curve[..., 1:, :]
     step = np.diff(lag_s)[:, None]
-    before = np.logical_and.accumulate(a > 0, axis=-2)
+    before = np.logical_and.accumulate((a > 0) & np.isfinite(b), axis=-2)
     share = np.where(b > 0, 1.0, a / np.where(b > 0, 1.0, np.maximum(a - b, 1e-300)))  # of the step before the zero
     area = share * step * np.where(b > 0, a + b, a) / 2
     return np.asarray(np.where(before, area, 0.0).sum(-2))

@@ -86,15 +86,20 @@ def zero_mean_p_value(rows: Floats) -> float:
     return float(fisher.sf(t2 * (count - size) / (size * (count - 1)), size, count - size))
 
 
-def anisotropic_frame(lab: Isotropy, body: Isotropy) -> Literal["lab", "body", "both", "neither"]:
+def anisotropic_frame(lab: Isotropy, body: Isotropy, level: float = 0.05) -> Literal["lab", "body", "both", "neither"]:
     """Say in which frame a vector prefers directions.
 
     A flow that has axes shows in the lab and is averaged out in a body that tumbles; a body whose axes differ shows in
     the body.
+
+    Args:
+        lab: the test on lab components.
+        body: the test on body components.
+        level: p-values below it count.
     """
-    if lab.isotropic:
-        return "neither" if body.isotropic else "body"
-    return "lab" if body.isotropic else "both"
+    if lab.p_value >= level:
+        return "neither" if body.p_value >= level else "body"
+    return "lab" if body.p_value >= level else "both"
 
 
 @dataclass(frozen=True, kw_only=True)

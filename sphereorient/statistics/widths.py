@@ -59,6 +59,8 @@ def width_curve(
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
     sums = np.concatenate([_by_width(track, quantity, widths_frames) for track in many])
+    if not len(sums):
+        sums = np.zeros((1, len(widths_frames), 3, 6))  # 0 / 0: nothing is known
     found = bootstrap(sums, _statistics, settings)
     names = ("rms", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
     return WidthCurve(

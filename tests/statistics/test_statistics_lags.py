@@ -103,3 +103,8 @@ def test_increments_over_one_frame_have_the_accelerations_tails():  # ERRATA E7
 def test_lags_that_no_segment_reaches_are_left_out():
     found = increments(ensemble([20] * 30), lags_s=[5 * STEP_S, 19 * STEP_S, 100 * STEP_S], settings=FEW)
     assert found.lag_frames.tolist() == [5, 19]
+
+
+def test_an_integral_ends_before_lags_that_no_pair_reaches():
+    curve = np.array([[1.0], [0.8], [0.6], [np.nan], [0.9]])
+    assert integral_time(curve, np.arange(5.0)) == pytest.approx(0.9 + 0.7)

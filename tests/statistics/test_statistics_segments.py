@@ -83,3 +83,38 @@ def test_what_cannot_be_a_sample_is_refused_in_one_line(tracks, words):
 def test_a_smoothers_sigma_is_what_it_removed_and_a_kernels_what_it_let_through():
     assert ensemble_of(track([60, 60])).error == "removed"
     assert ensemble_of(track([60, 60], method="paper")).error == "added"
+
+
+def test_frames_with_errors_far_above_the_usual_are_left_out_and_the_segment_keeps_its_duration():
+    whole = track([60, 60])
+    sigma = whole.alpha_lab_sigma.copy()
+    sigma[:2] *= 3.1
+    sigma[57:60] = np.nan  # not known: no reason to leave it out
+    found = ensemble_of(replace(whole, alpha_lab_sigma=sigma))
+    assert len(found) == 118
+    assert found.frame[:3].tolist() == [2, 3, 4]
+    np.testing.assert_allclose(found.span_s, 60 * STEP_S)
+    assert len(ensemble_of(replace(whole, alpha_lab_sigma=sigma), SegmentSettings(max_sigma=3.2))) == 120
+
+
+def test_errors_of_the_acceleration_count_as_well():
+    whole = track([60, 60])
+    sigma = whole.acceleration_sigma.copy()
+    sigma[70:80] *= 5
+    assert len(ensemble_of(replace(whole, acceleration_sigma=sigma))) == 110
+
+
+def test_long_segments_are_cut_into_equal_pieces():
+    found = ensemble_of(track([600, 60]), SegmentSettings(max_duration_s=200 * STEP_S))
+    assert np.bincount(found.segment).tolist() == [200, 200, 200, 60]
+    assert found.frame[200] == 0
+    assert found.time_s[200] - found.time_s[199] == pytest.approx(STEP_S)
+    assert (found.span_s <= 201 * STEP_S).all()
+
+
+def test_of_one_segment_an_ensemble_only_where_it_is_asked_for():
+    with pytest.raises(TrackError, match=r"at least two segments of at least 50 frames.*got 1.*max_duration_s"):
+        ensemble_of(track([60]))
+    assert ensemble_of(track([60]), fewest=1).segments == 1
+    with pytest.raises(TrackError, match="at least one segment"):
+        ensemble_of(track([40]), fewest=1)

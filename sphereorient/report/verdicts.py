@@ -1,0 +1,183 @@
+"""What the numbers of a report say, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from sphereorient.statistics import Interval, Summary
+from sphereorient.statistics.cameras import CameraDistance
+from sphereorient.statistics.isotropy import anisotropic_frame
+from sphereorient.statistics.summary import Distributions
+from sphereorient.trajectory import Trajectory
+
+FEW_SEGMENTS = 20  # below, intervals and tests say little
+LOST_SHARE = 0.05  # of the frames: worth a look
+GAUSSIAN = 3.0  # flatness
+CLEAR, WEAK = 0.001, 0.05  # p-values below which a finding is clear, or worth a word: a report makes a dozen tests
+
+
+class Grade(StrEnum):
+    """How a verdict is marked."""
+
+    GOOD = "good"
+    NEUTRAL = "neutral"
+    DOUBT = "doubt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """One sentence on the tracks; made by `verdicts`, printed on the page."""
+
+    title: str
+    grade: Grade
+    words: str
+
+
+def verdicts(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> list[Verdict]:
+    """Return what there is to say, the tracks themselves first.
+
+    Args:
+        summary: the statistics.
+        tracks: by the name of their file.
+        distances: between the cameras of all tracks.
+    """
+    found = [*_measured(tracks), *_segments(summary), *_noise(summary), *_apart(distances)]
+    if (more := summary.distributions) is not None:
+        found += [*_tails(summary, more), *_attitude(more), *_frames(more), *_isotropy(more), *_lift(more)]
+    return found
+
+
+def _say(title: str, words: str, good: bool | None = None) -> Verdict:
+    grade = Grade.NEUTRAL if good is None else Grade.GOOD if good else Grade.DOUBT
+    return Verdict(title=title, grade=grade, words=words)
+
+
+def _measured(tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
+    frames = sum(len(track) for track in tracks.values())
+    valid = sum(int(track.valid.sum()) for track in tracks.values())
+    share = valid / max(frames, 1)
+    words = f"{valid:,} of {frames:,} frames valid ({100 * share:.4g} %)"
+    worst = min(tracks, key=lambda name: float(tracks[name].valid.mean()) if len(tracks[name]) else 0.0)
+    if len(tracks) > 1 and valid < frames:
+        words += f"; fewest in {worst}, {100 * float(tracks[worst].valid.mean()):.4g} %"
+    yield _say("Measured", words, share >= 1 - LOST_SHARE)
+    told = dict.fromkeys(remark for track in tracks.values() for remark in track.provenance.get("remarks", ()))
+    for remark in list(told)[:5]:
+        yield _say("Remark", str(remark), good=False)
+
+
+def _segments(summary: Summary) -> Iterator[Verdict]:
+    count = summary.ensemble.segments
+    if summary.distributions is None:
+        words = "one segment only: no intervals and no distributions, since nothing says how another one would differ; "
+        words += "pass more tracks, or cut a long record with --set statistics.max_duration_s=SECONDS"
+        yield _say("Segments", words, good=False)
+        return
+    words = f"{count:,} segments, {len(summary.ensemble):,} samples"
+    if np.isfinite(summary.integral_time_s):
+        least = summary.settings.min_integral_times * summary.integral_time_s
+        words += f", each longer than {least:.3g} s (integral time of the velocity {summary.integral_time_s:.3g} s)"
+    if count < FEW_SEGMENTS:
+        words += "; so few tell little of the tails, and intervals of the flatness are too narrow"
+    yield _say("Segments", words, None if count >= FEW_SEGMENTS else False)
+
+
+def _noise(summary: Summary) -> Iterator[Verdict]:
+    if not summary.warnings:
+        what = "noise" if summary.ensemble.error == "added" else "smoothed away"
+        largest = max(float(np.nanmax(part.noise_share.value[:3])) for part in summary.table.values())
+        if np.isfinite(largest):
+            yield _say("Noise", f"at most {100 * largest:.2g} % of any variance is {what}", good=True)
+        return
+    for warning in summary.warnings:
+        yield _say("Noise", f"{warning.words}: trust the corrected values, if any", good=False)
+
+
+def _apart(distances: Sequence[CameraDistance]) -> Iterator[Verdict]:
+    for one in distances:
+        if not len(one.distance_rad):
+            continue
+        median, far = np.rad2deg(np.quantile(one.distance_rad, (0.5, 0.95)))
+        words = (
+            f"{' and '.join(one.cameras)} by themselves differ by {median:.2g}\u00b0 (median), {far:.2g}\u00b0 (95 %)"
+        )
+        if one.uncorrected_rad is not None and len(one.uncorrected_rad):
+            words += f"; without correction of perspective by {np.rad2deg(np.median(one.uncorrected_rad)):.2g}\u00b0"
+        yield _say("Cameras", words)
+
+
+def _tails(summary: Summary, more: Distributions) -> Iterator[Verdict]:
+    for quantity in ("velocity", "acceleration", "omega_lab", "alpha_lab"):
+        flat = summary.table[quantity].corrected_flatness
+        flat = flat if np.isfinite(flat.value[:3]).all() else summary.table[quantity].flatness
+        fits = more.densities[quantity]
+        told = ", ".join(told_interval(flat, i) for i in range(3))
+        heavy = all(flat.low[i] > GAUSSIAN for i in range(3))
+        light = all(flat.high[i] < GAUSSIAN for i in range(3))
+        kind = "heavier tails than" if heavy else "lighter tails than" if light else "not told from"
+        words = f"flatness of x, y, z: {told}: {kind} a Gaussian"
+        if heavy and all(part.fit.better_than_gaussian for part in fits):
+            a = ", ".join(told_interval(part.fit.a, ()) for part in fits)
+            words += f"; the stretched exponential fits better, a = {a}"
+        yield _say(f"Tails of {quantity}", words)
+
+
+def told_interval(found: Interval, key: int | tuple[()]) -> str:
+    """Return value and interval as text."""
+    value, low, high = (float(np.asarray(x)[key]) for x in (found.value, found.low, found.high))
+    if not np.isfinite(low + high):
+        return f"{value:.3g}"
+    return f"{value:.3g} ({low:.3g} to {high:.3g})"
+
+
+def _attitude(more: Distributions) -> Iterator[Verdict]:
+    test = more.uniformity
+    how = f"p = {test.p_value:.2g}, as good as {test.effective:.0f} independent attitudes"
+    if test.p_value < CLEAR:
+        yield _say("Attitudes", f"not all attitudes are equally likely ({how})", good=False)
+    elif test.p_value < WEAK:
+        yield _say("Attitudes", f"weak signs that not all attitudes are equally likely ({how})")
+    else:
+        yield _say("Attitudes", f"nothing against all attitudes being equally likely ({how})")
+
+
+def _frames(more: Distributions) -> Iterator[Verdict]:
+    for name, row in more.rows.items():
+        own = name.removeprefix("omega_")
+        sizes = f"off the turns by {100 * row.lab_residual:.3g} % in lab, {100 * row.body_residual:.3g} % in body"
+        if row.frame in (own, "both"):
+            yield _say(f"Frame of {name}", f"written in {own} components ({sizes})", good=True)
+        else:
+            told = "no frame's components" if row.frame == "none" else f"components of the {row.frame}"
+            yield _say(f"Frame of {name}", f"{told} ({sizes}): see ERRATA E6 in docs/paper-map.md", good=False)
+
+
+def _isotropy(more: Distributions) -> Iterator[Verdict]:
+    meaning = {
+        "lab": "prefers directions of the lab and none of the body: the flow, or the forcing, has axes",
+        "body": "prefers directions of the body and none of the lab: the sphere's own axes differ",
+        "both": "prefers directions in lab and in body",
+        "neither": "nothing against isotropy in lab and in body",
+    }
+    for stem in ("omega", "alpha"):
+        lab, body = more.isotropies[f"{stem}_lab"], more.isotropies[f"{stem}_body"]
+        if not np.isfinite(lab.p_value + body.p_value):
+            yield _say(f"Isotropy of {stem}", "too few segments for a test")
+            continue
+        p = f"p = {lab.p_value:.2g} in lab, {body.p_value:.2g} in body"
+        clear, weak = (anisotropic_frame(lab, body, level) for level in (CLEAR, WEAK))
+        words = meaning[clear]
+        if clear == "neither" and weak != "neither":
+            words = f"weak signs only that it {meaning[weak].split(':')[0]}"
+        yield _say(f"Isotropy of {stem}", f"{words} ({p})")
+
+
+def _lift(more: Distributions) -> Iterator[Verdict]:
+    found = more.lift.correlation
+    clear = bool(found.low[3] > 0 or found.high[3] < 0)
+    seen = "the acceleration follows omega x v" if clear else "no correlation of the acceleration with omega x v"
+    yield _say("Lift", f"{seen}: cosine {told_interval(found, 3)}")

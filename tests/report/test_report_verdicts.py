@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sphereorient.report.verdicts import Grade, verdicts
+from sphereorient.statistics import StatisticsSettings, summarise
+from sphereorient.statistics.cameras import CameraDistance
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
+from sphereorient.synth.ensemble_tracks import exact_track, filtered_track
+
+FEW = StatisticsSettings(resamples=100)
+
+
+def said(track, distances=(), settings=FEW):
+    tracks = track if isinstance(track, dict) else {"track.h5": track}
+    found = verdicts(summarise(list(tracks.values()), settings), tracks, distances)
+    assert all(verdict.words and not verdict.words.endswith(".") for verdict in found)
+    return {verdict.title: verdict for verdict in found}
+
+
+@pytest.fixture(scope="module")
+def lab():
+    return exact_track(draw_ensemble(EnsembleSpec(segments=250, mean_frames=90.0), 11))
+
+
+@pytest.fixture(scope="module")
+def body():
+    spec = EnsembleSpec(segments=250, mean_frames=90.0, frame="body", omega_rms=(7.0, 12.0, 8.0))
+    return exact_track(draw_ensemble(spec, 12))
+
+
+def test_a_flow_with_axes_is_told_from_a_body_with_axes(body):
+    flow = exact_track(draw_ensemble(EnsembleSpec(segments=250, mean_frames=90.0, omega_rms=(7.0, 12.0, 8.0)), 12))
+    assert "prefers directions of the lab and none of the body" in said(flow)["Isotropy of omega"].words
+    assert "prefers directions of the body and none of the lab" in said(body)["Isotropy of omega"].words
+
+
+def test_rows_that_belong_to_no_frame_are_told(lab):
+    good = said(lab)
+    assert good["Frame of omega_lab"].grade == Grade.GOOD
+    assert good["Frame of omega_body"].grade == Grade.GOOD
+    printed = np.einsum("nij,nj->ni", lab.orientation_smooth, lab.omega_lab)  # ERRATA E6: R omega_lab
+    wrong = said(replace(lab, omega_lab=printed, omega_body=lab.omega_lab))
+    assert wrong["Frame of omega_lab"].grade == Grade.DOUBT
+    assert "no frame's components" in wrong["Frame of omega_lab"].words
+    assert "components of the lab" in wrong["Frame of omega_body"].words
+
+
+def test_tails_are_named_by_their_kind(lab):
+    found = said(lab)
+    assert "heavier tails than a Gaussian" in found["Tails of alpha_lab"].words
+    assert "stretched exponential fits better" in found["Tails of alpha_lab"].words
+    assert "not told from a Gaussian" in found["Tails of velocity"].words
+
+
+def test_attitudes_that_prefer_a_direction_are_told(lab):
+    assert said(lab)["Attitudes"].grade == Grade.NEUTRAL
+    still = np.tile(np.eye(3), (len(lab), 1, 1))
+    biased = replace(lab, orientation_smooth=np.where((lab.segment % 4 == 0)[:, None, None], still, lab.orientation))
+    found = said(biased)["Attitudes"]
+    assert found.grade == Grade.DOUBT
+    assert found.words.startswith("not all attitudes are equally likely")
+
+
+def test_noise_and_lost_frames_and_few_segments_are_marked(lab):
+    rough = filtered_track(draw_ensemble(EnsembleSpec(segments=15, mean_frames=90.0), 5), 2.0, 0.05, 5)
+    found = said(replace(rough, valid=np.arange(len(rough)) % 2 == 0))
+    assert found["Noise"].grade == Grade.DOUBT
+    assert "is noise" in found["Noise"].words
+    assert found["Measured"].grade == Grade.DOUBT
+    assert "(50.04 %)" in found["Measured"].words
+    assert found["Segments"].grade == Grade.DOUBT
+    assert said(lab)["Noise"].grade == Grade.GOOD
+
+
+def test_remarks_of_the_run_are_repeated_once(lab):
+    part = lab.at(np.arange(5000))
+    marked = replace(part, provenance={"remarks": ["cam2 is a frame late"]})
+    found = verdicts(summarise([marked, marked], FEW), {"a": marked, "b": marked}, [])
+    assert [verdict.words for verdict in found if verdict.title == "Remark"] == ["cam2 is a frame late"]
+
+
+def test_distances_are_told_in_degrees(lab):
+    part = lab.at(np.arange(5000))
+    edges = np.linspace(0, 0.2, 11)
+    one = CameraDistance(cameras=("a", "b"), distance_rad=np.full(9, 0.1), edges_rad=edges, pdf=np.ones(10),
+                         uncorrected_rad=np.full(9, 0.2), uncorrected_pdf=np.ones(10))  # fmt: skip
+    words = said(part, [one])["Cameras"].words
+    assert "5.7°" in words
+    assert "without correction of perspective by 11°" in words
+
+
+def test_of_one_segment_it_is_said_what_to_do(lab):
+    one = lab.at(np.flatnonzero(lab.segment == np.bincount(lab.segment).argmax()))
+    found = said(one)
+    assert found["Segments"].grade == Grade.DOUBT
+    assert "max_duration_s" in found["Segments"].words
+    assert "Attitudes" not in found

@@ -1,0 +1,273 @@
+"""Planted trouble comes out in the strip and the stretches, and the pictures show the ball."""
+
+from __future__ import annotations
+
+import html
+import io
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from overlay_examples import camera_changed, changed, excerpt, true_track
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from sphereorient.errors import SphereOrientError
+from sphereorient.report.gallery import chosen_frames, gallery
+from sphereorient.report.strip import frame_numbers, stretches, strip_of
+from sphereorient.report.strip_html import strip_assets, strip_html
+from sphereorient.report.worst import GAP, TILE
+from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
+
+TURN = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
+
+
+def good_track(frames: int, names: tuple[str, ...] = ("cam1", "cam2"), first: int = 0) -> Trajectory:
+    """A track without pictures in which nothing is wrong, 600 Hz, errors of 0.1 degree and 0.2 mm."""
+    cov = np.tile(np.eye(3), (frames, 1, 1))
+    seen = {
+        name: replace(
+            CameraTrack.empty(frames),
+            reason=("ok",) * frames,
+            score=np.full(frames, 0.95),
+            orientation=cov,
+        )
+        for name in names
+    }
+    track = Trajectory.empty((first + np.arange(frames)) / 600.0, cameras=names, frame_rate=600.0, experiment="planted")
+    covs = {"orientation_cov": cov * np.deg2rad(0.1) ** 2, "position_cov": cov * 0.04}
+    return replace(track, valid=np.ones(frames, bool), cameras=seen, **covs)
+
+
+def troubled() -> Trajectory:
+    """Of 300 frames: 60 .. 79 not valid, 85 and 200 with flags, 120 .. 122 lost by one camera."""
+    track = changed(good_track(300), slice(60, 80), valid=False, orientation_cov=np.nan, position_cov=np.nan)
+    track = camera_changed(track, "cam1", slice(60, 80), reason=Reason.DARK, score=np.nan, orientation=np.nan)
+    track = camera_changed(track, "cam2", slice(60, 70), reason=Reason.OUTLINE, score=np.nan, orientation=np.nan)
+    track = changed(track, 85, flags=Flag.SPIKE)
+    track = changed(track, 200, flags=Flag.SPIKE | Flag.RECOVERED)
+    return camera_changed(track, "cam2", slice(120, 123), reason=Reason.LOW_SCORE)
+
+
+def test_stretches_are_the_planted_ones_longest_first_with_their_reasons_counted():
+    found = stretches(troubled())
+    assert [(one.first, one.last, one.doubtful, one.not_valid) for one in found] == [
+        (60, 85, 1, 20),  # five good frames between the gap and the spike
+        (120, 122, 3, 0),
+        (200, 200, 1, 0),
+    ]
+    assert [one.frames for one in found] == [26, 3, 1]
+    assert found[0].reasons == (("cam1: too dark", 20), ("cam2: no clear outline", 10), ("the orientation jumps", 1))
+    assert found[1].reasons == (("cam2: no orientation explains the picture", 3),)
+    assert dict(found[2].reasons) == {"found again after a loss": 1, "the orientation jumps": 1}
+    assert found[0].start_s == pytest.approx(0.1)
+    assert found[0].end_s == pytest.approx(85 / 600)
+
+
+@pytest.mark.parametrize(("second", "count"), [(19, 1), (20, 1), (21, 2)])
+def test_ten_good_frames_between_part_two_stretches_and_nine_do_not(second, count):
+    track = changed(changed(good_track(40), 10, flags=Flag.SPIKE), second, flags=Flag.SPIKE)
+    assert len(stretches(track)) == count
+
+
+def test_of_equally_long_stretches_the_one_that_is_not_valid_is_first():
+    track = changed(changed(good_track(60), 10, flags=Flag.SPIKE), 40, valid=False)
+    assert [one.first for one in stretches(track)] == [40, 10]
+
+
+def test_the_strip_says_of_every_frame_what_was_planted():
+    track = camera_changed(troubled(), "cam1", 5, score=0.6)
+    track = camera_changed(track, "cam1", 7, orientation=TURN)
+    strip = strip_of(track)
+    status = np.zeros(300, int)
+    status[[85, 120, 121, 122, 200]] = 1
+    status[60:80] = 2
+    assert strip.status == tuple(status)
+    assert strip.counts == (275, 5, 20)
+    assert strip.number == strip.row == tuple(range(300))
+    words = {camera.name: [strip.reason_words[code] for code in camera.reason] for camera in strip.cameras}
+    assert words["cam1"] == ["measured"] * 60 + ["too dark"] * 20 + ["measured"] * 220
+    assert set(words["cam2"][60:70]) == {"no clear outline"}
+    assert set(words["cam2"][70:80]) == {"measured"}
+    assert words["cam2"][121] == "no orientation explains the picture"
+    told = dict(strip.flag_words)
+    assert {told[bit] for bit in told if strip.flags[200] & bit} == {
+        "found again after a loss",
+        "the orientation jumps",
+    }
+    assert [k for k in range(300) if strip.flags[k]] == [85, 200]
+    assert strip.cameras[0].score[5] == 0.6
+    assert strip.cameras[0].score[61] is None
+    assert strip.orientation_error_deg[0] == 0.1
+    assert strip.position_error_mm[0] == 0.2
+    assert strip.orientation_error_deg[61] is None
+    assert strip.apart_deg is not None
+    assert strip.apart_deg[7] == pytest.approx(np.rad2deg(0.1), rel=1e-3)
+    assert strip.apart_deg[8] == 0.0
+
+
+@pytest.mark.parametrize("frames", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+def test_one_bad_frame_of_a_million_survives(frames):
+    bad, per_bin = frames * 7 // 9, frames // 20_000
+    track = changed(good_track(frames), bad, valid=False, flags=Flag.AMBIGUOUS)
+    track = camera_changed(track, "cam2", bad, reason=Reason.DARK, score=0.2, orientation=TURN)
+    cov = np.array(track.orientation_cov)
+    cov[bad] *= 900
+    strip = strip_of(replace(track, orientation_cov=cov))
+    assert strip.per_bin == per_bin
+    assert len(strip.status) == 20_000
+    place = bad // per_bin
+    assert [k for k, status in enumerate(strip.status) if status] == [place]
+    assert strip.number[place] == strip.row[place] == bad
+    assert strip.time_s[place] == pytest.approx(bad / 600)
+    assert strip.orientation_error_deg[place] == 3.0
+    assert strip.cameras[1].score[place] == 0.2
+    assert strip.cameras[0].score[place] == 0.95
+    assert strip.reason_words[strip.cameras[1].reason[place]] == "too dark"
+    assert strip.flags[place] == Flag.AMBIGUOUS
+    assert strip.apart_deg is not None
+    assert strip.apart_deg[place] == pytest.approx(np.rad2deg(0.1), rel=1e-3)
+    assert [(one.first, one.frames) for one in stretches(track)] == [(bad, 1)]
+
+
+def test_the_last_bin_may_be_shorter_and_a_gap_in_a_bin_hides_no_error():
+    track = changed(good_track(20_001), 20_000, valid=False)
+    track = changed(track, 4, orientation_cov=np.nan)
+    strip = strip_of(track)
+    assert (strip.per_bin, len(strip.status), strip.status[-1], strip.row[-1]) == (2, 10_001, 2, 20_000)
+    assert strip.orientation_error_deg[2] == 0.1
+
+
+def test_numbers_are_the_experiments():
+    assert strip_of(good_track(30, first=100)).number[:2] == (100, 101)
+    uneven = replace(good_track(4), time=np.array([0.0, 0.0013, 0.0022, 0.0051]))
+    assert frame_numbers(uneven).tolist() == [0, 1, 2, 3]
+    given = stretches(changed(good_track(30), 3, valid=False), np.arange(1000, 1030))
+    assert (given[0].first, given[0].first_number) == (3, 1003)
+
+
+def test_one_camera_only_is_no_doubt_where_there_is_no_other():
+    alone = changed(good_track(30, ("cam1",)), slice(None), flags=Flag.ONE_CAMERA)
+    assert stretches(alone) == []
+    assert set(strip_of(alone).flags) == {0}
+    assert strip_of(alone).apart_deg is None
+    of_two = changed(good_track(30), slice(None), flags=Flag.ONE_CAMERA)
+    assert stretches(of_two)[0].reasons == (("one camera only", 30),)
+
+
+def test_a_reason_of_a_newer_file_is_shown_as_it_is():
+    track = camera_changed(good_track(30), "cam1", 4, reason="eaten")
+    assert stretches(track)[0].reasons == (("cam1: eaten", 1),)
+
+
+@pytest.mark.parametrize("frames", [0, 1, 50])
+def test_nothing_measured_is_json_and_a_page(frames):
+    track = Trajectory.empty(np.arange(frames) / 600.0, cameras=("cam1",))
+    text = json.dumps(strip_of(track).as_json(), allow_nan=False)
+    assert json.loads(text)["counts"] == [0, 0, frames]
+    assert "Quality of every frame" in strip_html("empty", track, None)
+
+
+def data_of(page: str) -> dict[str, object]:
+    """The data of a section as a browser finds it: up to the first end of a script."""
+    start = page.index('<script type="application/json">') + len('<script type="application/json">')
+    return json.loads(page[start : page.index("</script", start)], parse_constant=pytest.fail)
+
+
+def test_a_hostile_name_stays_a_name():
+    name = '</script><img src=x onerror=alert(1)> & "quoted"'
+    track = replace(troubled(), experiment=name)
+    track = replace(track, cameras={name: track.cameras["cam1"], "cam2": track.cameras["cam2"]})
+    page = strip_html(name, track, None)
+    assert "<img" not in page
+    assert page.count("</script>") == 1
+    assert data_of(page)["name"] == name
+    assert html.escape("</script><img src=x") in page
+
+
+def test_the_page_has_no_number_that_json_lacks_and_a_row_a_stretch():
+    page = strip_html("planted", troubled(), None)
+    assert len(data_of(page)["status"]) == 300
+    assert re.findall(r'data-first="(\d+)" data-last="(\d+)"', page) == [("60", "85"), ("120", "122"), ("200", "200")]
+    assert "cam1: too dark (20); cam2: no clear outline (10); the orientation jumps (1)" in page
+
+
+def test_style_and_script_ask_for_nothing_from_elsewhere():
+    for text in strip_assets():
+        assert len(text) > 1000
+        assert not re.search(r"https?:|@import|url\(|fetch\(|</", text)
+
+
+def lost_excerpt() -> Trajectory:
+    """The excerpt, 40 frames, of which 20 .. 27 are not valid and lack a position, and 5 is flagged."""
+    track = changed(true_track(), slice(20, 28), valid=False)
+    track = camera_changed(track, "cam1", slice(20, 28), reason=Reason.DARK)
+    return changed(track, 5, flags=Flag.SPIKE)
+
+
+def test_pictures_are_of_the_bad_frames_and_of_good_ones_between():
+    track = changed(changed(good_track(3000), slice(1000, 1400), valid=False), 2500, flags=Flag.SPIKE)
+    why = chosen_frames(track, 60)
+    assert len(why) == 60
+    assert "the orientation jumps" in why[2500]
+    assert why[1000][0].startswith("gap of 400 frames")
+    bad = [k for k in why if 1000 <= k < 1400]
+    good = sorted(k for k, words in why.items() if words == ("good; to compare with",))
+    assert len(bad) > 20
+    assert len(good) >= 20
+    assert np.diff([1000, *sorted(bad), 1400]).max() < 40
+    assert np.diff([0, *good, 3000]).max() < 600  # the stretch of 400 has none
+    assert next(iter(why)) in bad
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 500])
+def test_there_are_not_more_pictures_than_asked_and_the_first_is_of_the_worst(count):
+    why = chosen_frames(lost_excerpt(), count)
+    assert len(why) == min(count, 40)
+    assert not count or 20 <= next(iter(why)) < 28
+
+
+def test_a_track_without_trouble_is_shown_evenly():
+    rows = sorted(chosen_frames(good_track(1000), 10))
+    assert len(rows) == 10
+    assert max(np.diff(rows)) <= 101
+
+
+def test_the_pictures_show_the_ball_within_its_outline():
+    track, told = lost_excerpt(), []
+    shown = gallery(track, excerpt(), count=6, progress=lambda done, total: told.append((done, total)))
+    rows = [frame.k for frame in shown.frames]
+    assert rows == sorted(rows)
+    assert 5 in rows
+    assert any(20 <= k < 28 for k in rows)
+    assert sum(track.valid[k] and k != 5 for k in rows) >= 2
+    assert told == [(done, 6) for done in range(1, 7)]
+    assert {frame.status for frame in shown.frames} == {0, 1, 2}
+    assert sorted(frame.rank for frame in shown.frames) == list(range(6))
+    for frame in shown.frames:
+        assert frame.number == frame.k
+        picture = np.asarray(Image.open(io.BytesIO(frame.jpeg)).convert("L"), np.float64)
+        assert picture.shape == (TILE, 4 * (TILE + GAP) - GAP) == shown.size[::-1]
+        v, u = np.mgrid[:TILE, :TILE]
+        radius = np.hypot(u - TILE / 2, v - TILE / 2) / (TILE / 2 / 1.3)  # a crop is 1.3 radii wide
+        for left in range(0, picture.shape[1], TILE + GAP):
+            tile = picture[:, left : left + TILE]
+            assert tile[radius < 0.85].mean() > 2 * tile[(radius > 1.1) & (v > 30)].mean()
+            assert tile[radius < 0.85].std() > 20  # painted
+
+
+def test_the_page_holds_the_pictures_and_why_they_are_there():
+    shown = gallery(lost_excerpt(), excerpt(), count=15)
+    page = strip_html("excerpt", lost_excerpt(), shown)
+    assert page.count("data:image/jpeg;base64,") == 15
+    assert page.index("frame 5</b>") > 0
+    assert "3 more pictures" in page
+    assert "doubtful; alone among good ones; the orientation jumps" in page
+
+
+def test_a_movie_that_cannot_be_opened_is_not_passed_over(tmp_path):
+    gone = replace(excerpt(), movie_paths=dict.fromkeys(excerpt().movie_paths, tmp_path / "gone.mkv"))
+    with pytest.raises(SphereOrientError, match=r"gone\.mkv"):
+        gallery(true_track(), gone, count=3)

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from statistics_examples import STEP_S, track
+
+from sphereorient.statistics import StatisticsSettings, Surroundings, summarise
+from sphereorient.statistics.correlation import correlation
+from sphereorient.statistics.segments import UNITS, ensemble_of
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
+from sphereorient.synth.ensemble_tracks import filtered_track
+
+FEW = StatisticsSettings(resamples=100)
+
+
+@pytest.fixture(scope="module")
+def planted():
+    spec = EnsembleSpec(segments=60, mean_frames=90.0)
+    return spec, filtered_track(draw_ensemble(spec, 3), 0.1, 0.05, 3)
+
+
+@pytest.fixture(scope="module")
+def whole(planted):
+    return summarise(planted[1], FEW, Surroundings(diameter_mm=18.0, viscosity_m2_s=8e-6, dissipation_w_kg=1.7))
+
+
+def test_everything_is_there_and_belongs_to_the_same_samples(whole):
+    more = whole.distributions
+    assert whole.table.keys() == more.densities.keys() == more.isotropies.keys() == UNITS.keys()
+    assert {part.samples for part in whole.table.values()} == {len(whole.ensemble)}
+    for parts in more.densities.values():
+        assert all(part.counts.sum() > 0.99 * len(whole.ensemble) for part in parts)
+    assert more.increments.lag_frames[0] == 1
+    assert next(iter(more.increment_densities)) == 1
+    assert more.increments.lag_s[-1] == pytest.approx(more.correlations["omega_lab"].integral_time_s.value[3], rel=0.2)
+    assert {name: row.frame for name, row in more.rows.items()} == {"omega_lab": "lab", "omega_body": "body"}
+
+
+def test_the_velocitys_integral_time_is_measured_and_chooses_the_segments(planted, whole):
+    _, tracked = planted
+    by_all = correlation(ensemble_of(tracked), "velocity", settings=FEW).integral_time_s.value[3]
+    assert whole.integral_time_s == pytest.approx(float(by_all))
+    assert whole.ensemble.span_s.min() >= 0.25 * whole.integral_time_s
+    longer = summarise(tracked, FEW.model_copy(update={"min_integral_times": 1.5}))
+    assert longer.ensemble.segments < whole.ensemble.segments
+    assert longer.ensemble.span_s.min() >= 1.5 * longer.integral_time_s
+
+
+def test_an_integral_time_that_is_given_is_not_measured(planted):
+    found = summarise(planted[1], FEW.model_copy(update={"integral_time_s": 0.3}))
+    assert found.integral_time_s == 0.3
+    assert found.ensemble.span_s.min() >= 0.075
+
+
+def test_the_surroundings_make_the_dimensionless_numbers(whole):
+    numbers = {one.formula: one.value for one in whole.comparisons}
+    v, omega = (np.sqrt(np.square(whole.table[q].corrected_rms.value[:3]).mean()) for q in ("velocity", "omega_lab"))
+    assert numbers["omega_rms D / v_rms"] == pytest.approx(omega * 0.018 / v)
+    assert numbers["D / eta"] == pytest.approx(0.018 / (8e-6**3 / 1.7) ** 0.25)
+    assert not summarise(track([60, 60]), FEW).comparisons
+
+
+def test_one_segment_has_numbers_and_no_intervals():
+    one = track([80])
+    found = summarise(one, FEW)
+    rows = one.segment >= 0
+    assert found.distributions is None
+    np.testing.assert_allclose(found.table["alpha_lab"].rms.value[:3], one.alpha_lab[rows].std(0))
+    assert np.isnan(found.table["alpha_lab"].rms.low).all()
+    assert np.isnan(found.integral_time_s)
+
+
+def test_a_long_record_cut_into_pieces_has_intervals_and_no_durations():
+    found = summarise(track([900]), FEW.model_copy(update={"max_duration_s": 90 * STEP_S, "integral_time_s": 0.01}))
+    assert found.ensemble.segments == 10
+    assert found.distributions.durations is None
+    assert np.isfinite(found.table["omega_lab"].rms.low).all()
+
+
+def test_noise_is_warned_of_by_name():
+    noisy = track([80, 80])
+    sigma = noisy.alpha_body_sigma.copy()
+    sigma[:, 1] = 0.5
+    found = summarise(replace(noisy, alpha_body_sigma=sigma), FEW)
+    assert [(one.quantity, one.component) for one in found.warnings] == [("alpha_body", "y")]
+
+
+def test_the_progress_goes_up_to_its_end(planted):
+    steps = []
+    summarise(planted[1], FEW, progress=lambda done, total: steps.append((done, total)))
+    done, totals = zip(*steps, strict=True)
+    assert set(totals) == {10}
+    assert list(done) == sorted(done)
+    assert done[-1] == 10
