@@ -1,6 +1,6 @@
 """Check on synthetic ensembles that the statistics are right and their intervals honest.
 
-    scripts/ensemble_coverage.py [--repetitions 100] [--processes 2] [--segments 300] [--mean-frames 100]
+    scripts/ensemble_coverage.py [--repetitions 100] [--processes 2] [--segments 300] [--mean-frames 150]
 
 Each repetition draws tracks whose true statistics are those of the paper's Table I (exponential durations, alpha of
 flatness 7.6, omega of 4), measures them with 0.1 degree and 0.05 mm of white noise, smooths them as the precise method
@@ -145,7 +145,7 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=100)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--segments", type=int, default=300)
-    parser.add_argument("--mean-frames", type=float, default=100.0)
+    parser.add_argument("--mean-frames", type=float, default=150.0)
     options = parser.parse_args()
     spec = EnsembleSpec(segments=options.segments, mean_frames=options.mean_frames)
     truth = truths(spec)

@@ -47,6 +47,8 @@ def choose_worst(track: Trajectory, count: int) -> list[BadFrame]:
         for k, words in ranked:
             why.setdefault(k, []).append(words)
     for turn in range(max((len(ranked) for ranked in kinds), default=0)):
+        if len(taken) >= count:
+            break
         for ranked in kinds:
             if turn < len(ranked) and _is_new(ranked[turn][0], taken):
                 taken.append(ranked[turn][0])

@@ -114,12 +114,22 @@ def _by_blocks(part: Callable[[NDArray[np.int64]], Floats], count: int, width: i
 
 def _resampled(flat: Floats, rows: NDArray[np.int64], settings: BootstrapSettings) -> Floats:
     """Return the total sums of some of the resampled ensembles."""
-    segments = len(flat)
+    return np.asarray(resampled_weights(len(flat), rows, settings) @ flat, np.float64)
+
+
+def resampled_weights(segments: int, rows: NDArray[np.int64], settings: BootstrapSettings) -> Floats:
+    """Return how often each segment is in some of the resampled ensembles, (B, segments).
+
+    Args:
+        segments: their number.
+        rows: (B,), numbers of the resamples; each has its own seed, so that blocks do not change the numbers.
+        settings: the seed.
+    """
     weights = np.empty((len(rows), segments))
-    for place, row in enumerate(rows.tolist()):  # each resample has its own seed: blocks do not change the numbers
+    for place, row in enumerate(rows.tolist()):
         draw = np.random.default_rng([settings.seed, row]).integers(0, segments, segments)
         weights[place] = np.bincount(draw, minlength=segments)
-    return np.asarray(weights @ flat, np.float64)
+    return weights
 
 
 def _bca(value: Floats, drawn: Floats, without: Floats, level: float) -> tuple[Floats, Floats]:

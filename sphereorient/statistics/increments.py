@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, scattered
+from sphereorient.statistics.bootstrap import Interval, scattered
 from sphereorient.statistics.density import Density, density_of
 from sphereorient.statistics.lags import Pairs
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
+from sphereorient.statistics.studentized import studentized
 
 Floats = NDArray[np.float64]
 
@@ -68,14 +69,15 @@ def increments(
         sums.append(scattered(np.stack([np.ones_like(d2), d2, d2 * d2], axis=-1), segment, ensemble.segments))
         counts.append(len(first))
         lags.append(lag)
-    found = bootstrap(np.stack(sums, axis=1), _statistics, settings)
+    whole = np.stack(sums, axis=1)  # (S, L, 3, 3)
+    found = studentized(whole.reshape(*whole.shape[:2], 9), _statistics, np.ones(8, bool), settings)
     frames = np.array(lags, dtype=np.int64)
     return Increments(
         quantity=quantity,
         lag_s=np.asarray(frames * ensemble.step_s, np.float64),
         lag_frames=frames,
-        rms=found.part(0),
-        flatness=found.part(1),
+        rms=found.part((..., slice(0, 4))),
+        flatness=found.part((..., slice(4, 8))),
         pairs=np.array(counts),
     )
 
@@ -115,7 +117,8 @@ def _lags(
 
 
 def _statistics(totals: Floats) -> Floats:
-    """Return rms and flatness (..., 2, L, 4) of sums (..., L, 3, 3)."""
-    whole = np.concatenate([totals, totals.sum(-2, keepdims=True)], axis=-2)
+    """Return rms, and behind them flatness, (..., L, 8) of sums (..., L, 9): by component number, square, fourth."""
+    parts = totals.reshape(*totals.shape[:-1], 3, 3)
+    whole = np.concatenate([parts, parts.sum(-2, keepdims=True)], axis=-2)
     count, second, fourth = np.moveaxis(whole, -1, 0)
-    return np.stack([np.sqrt(second / count), fourth * count / second**2], axis=-3)
+    return np.concatenate([np.sqrt(second / count), fourth * count / second**2], axis=-1)

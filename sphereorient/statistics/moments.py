@@ -8,14 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, per_segment
+from sphereorient.statistics.bootstrap import Interval, per_segment
 from sphereorient.statistics.segments import UNITS, Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
+from sphereorient.statistics.studentized import studentized
 
 Floats = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "z", "norm")
 STATISTICS = ("mean", "rms", "skewness", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
+POSITIVE = np.array([False, True, False, True, True, True, True])
 WARN_SHARE = 0.1  # of a variance; more noise than that is worth a warning
 
 
@@ -64,7 +66,7 @@ def moments(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | Non
     sign = 1.0 if ensemble.error == "added" else -1.0
     centre, scale = x.mean(0), _scale(x)
     sums = _sums((x - centre) / scale, sigma / scale, ensemble)
-    found = bootstrap(sums, lambda totals: _statistics(totals, sign), settings)
+    found = studentized(sums, lambda totals: _statistics(totals, sign), POSITIVE, settings)
     parts = {name: _in_units(found, k, name, centre, scale) for k, name in enumerate(STATISTICS)}
     return Moments(quantity=quantity, units=UNITS[quantity], **parts, samples=len(ensemble), segments=ensemble.segments)
 
@@ -88,7 +90,7 @@ def _sums(x: Floats, sigma: Floats, ensemble: Ensemble) -> Floats:
 
 
 def _statistics(totals: Floats, sign: float) -> Floats:
-    """Return STATISTICS of total sums (..., 4, 8), as (..., 7, 4), of normalised values."""
+    """Return STATISTICS of total sums (..., 4, 8), as (..., 4, 7), of normalised values."""
     mean, m2, m3, m4, s2, s4, x2s2 = np.moveaxis(totals[..., 1:] / totals[..., :1], -1, 0)
     var = m2 - mean**2
     third = m3 - 3 * mean * m2 + 2 * mean**3
@@ -98,7 +100,7 @@ def _statistics(totals: Floats, sign: float) -> Floats:
     share = s2 / np.where(sign > 0, var, true_var)
     return np.stack(
         [mean, np.sqrt(var), third / var**1.5, fourth / var**2, np.sqrt(true_var), true_fourth / true_var**2, share],
-        axis=-2,
+        axis=-1,
     )
 
 
@@ -131,4 +133,4 @@ def _in_units(found: Interval, k: int, name: str, centre: Floats, scale: Floats)
     """Return one statistic in the quantity's own units."""
     shift = centre if name == "mean" else 0.0
     factor = scale if name in ("mean", "rms", "corrected_rms") else 1.0
-    return found.part(k).scaled(factor, shift)
+    return found.part((slice(None), k)).scaled(factor, shift)

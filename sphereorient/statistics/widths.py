@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, scattered
+from sphereorient.statistics.bootstrap import Interval, scattered
 from sphereorient.statistics.moments import without_noise
 from sphereorient.statistics.settings import BootstrapSettings
+from sphereorient.statistics.studentized import studentized
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -61,13 +62,19 @@ def width_curve(
     sums = np.concatenate([_by_width(track, quantity, widths_frames) for track in many])
     if not len(sums):
         sums = np.zeros((1, len(widths_frames), 3, 6))  # 0 / 0: nothing is known
-    found = bootstrap(sums, _statistics, settings)
+    found = studentized(sums.reshape(len(sums), -1, 6), _statistics, np.ones(5, bool), settings)
     names = ("rms", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
     return WidthCurve(
         quantity=quantity,
         width_s=np.array(widths_frames) * _step(many[0]),
-        **{name: found.part(k) for k, name in enumerate(names)},
+        **{name: _by_component(found.part((slice(None), k))) for k, name in enumerate(names)},
     )
+
+
+def _by_component(found: Interval) -> Interval:
+    """Return values (3 W,) as (W, 3)."""
+    value, low, high, error = (x.reshape(-1, 3) for x in (found.value, found.low, found.high, found.error))
+    return Interval(value=value, low=low, high=high, error=error)
 
 
 def _step(track: Trajectory) -> float:
@@ -159,7 +166,7 @@ def _convolved(x: Floats, kernel: Floats) -> Floats:
 
 
 def _statistics(totals: Floats) -> Floats:
-    """Return rms, flatness, both corrected, and the share of noise, (..., 5, W, 3), of sums (..., W, 3, 6)."""
+    """Return rms, flatness, both corrected, and the share of noise, (..., 3 W, 5), of sums (..., 3 W, 6)."""
     var, fourth, s2, s4, mixed = np.moveaxis(totals[..., 1:] / totals[..., :1], -1, 0)
     true_var, true_fourth = without_noise(var, fourth, s2, s4, mixed, 1.0)
-    return np.stack([np.sqrt(var), fourth / var**2, np.sqrt(true_var), true_fourth / true_var**2, s2 / var], axis=-3)
+    return np.stack([np.sqrt(var), fourth / var**2, np.sqrt(true_var), true_fourth / true_var**2, s2 / var], axis=-1)

@@ -20,11 +20,11 @@ from scipy.special import i0e, ndtri
 
 Floats = NDArray[np.float64]
 
-TURNS = (0.2, 0.3, 0.45)  # rates of the phases over that of g2: a burst holds a few swings
-DEPTH = 0.55  # of each phase's part in ln A; 0.47 would not reach a flatness of 7.6 in the derivative
+TURNS = (0.25, 0.4)  # rates of the phases over that of g2: a burst holds a few swings
+DEPTH = 0.66  # of each phase's part in ln A; 0.63 would not reach a flatness of 7.6 in the derivative
 WAVES = 24  # sines of each Gaussian process
 GAUSSIAN = 3.0  # its flatness
-NODES = 32  # of each phase: means over so many are exact to rounding for these smooth periodic functions
+NODES = 64  # of each phase: means over so many are exact to rounding for these smooth periodic functions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ class Draw:
 
     law: Law
     coefficients: Floats  # (S, 2 processes, cosine and sine, WAVES)
-    phase: Floats  # (S, 3), of the bursts at time 0
+    phase: Floats  # (S, 2), of the bursts at time 0
 
     def at(self, time_s: Floats, segment: NDArray[np.int64]) -> tuple[Floats, Floats]:
         """Return the rate and its derivative, (M,) each, at times (M,) since the start of their segments."""

@@ -15,7 +15,7 @@ from sphereorient.statistics.cameras import CameraDistance
 
 Floats = NDArray[np.float64]
 
-TOO_WIDE = 8.0  # medians: even bins that reach further show the nearer distances as one bar
+TOO_WIDE = 15.0  # medians: even bins that reach further show the nearer distances as one bar
 NEAREST = 30.0  # the smaller median over the first of the geometric bins
 BINS = 36  # geometric ones
 

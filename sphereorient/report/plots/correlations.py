@@ -14,7 +14,6 @@ from sphereorient.statistics.correlation import Correlation
 
 LOOKS = (*COMPONENTS, ALL)
 SHOWN_TIMES, SHOWN_ZEROS = 4.0, 1.5  # integral times, or lags of the first zero, that are shown
-NAME = "integral time"
 
 
 @in_style
@@ -61,14 +60,12 @@ def _panel(axes: Axes, correlation: Correlation) -> None:
         axes.hlines(place, [float(time.low)], [float(time.high)], color=look.colour, linewidth=0.9)
     axes.set_xlim(0.0, _reach_ms(correlation))
     axes.set_ylim(bottom=min(axes.get_ylim()[0], -0.3), top=1.05)
-    legend_above(axes)
+    legend_above(axes, title="integral time")
 
 
 def _time_words(correlation: Correlation, i: int) -> str:
     words = told(correlation.integral_time_s.part(i), "ms", 1e3)
-    if words == "unknown" or correlation.reached_zero[i]:
-        return f"{NAME} {words}"
-    return f"{NAME} above {words}, zero not reached"
+    return words if words == "unknown" or correlation.reached_zero[i] else f"above {words}, zero not reached"
 
 
 def _reach_ms(correlation: Correlation) -> float:

@@ -56,7 +56,7 @@ def densities_figure(summary: Summary, quantities: Sequence[str] = tuple(UNITS))
     for axes in panels[: len(quantities)][-columns:]:
         axes.set_xlabel("component (standard deviations)")
         axes.tick_params(labelbottom=True)
-    legend_of_figure(figure, _handles(), ncols=3)
+    legend_of_figure(figure, _handles(), ncols=3 if columns > 1 else 1)
     return figure
 
 

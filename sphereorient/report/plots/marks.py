@@ -90,7 +90,7 @@ def plain_logarithms(axis: Axis) -> None:
     low, high = axis.get_view_interval()
     decades = abs(math.log10(high / low)) if low > 0 and high > 0 else 1.0
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 2.5 else (1.0,)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: np.format_float_positional(value, precision=12, trim="-")))
     axis.set_minor_formatter(NullFormatter())
 
 

@@ -37,6 +37,7 @@ def shown_part(track: Trajectory, most: int = MOST_FRAMES) -> Part:
         whole = len(rows)
         rows = rows[_best(track.valid[rows], most)]
         which = "the longest segment" if whole <= most else f"the best {most:,} frames of the longest segment"
+        which = which if (track.segment >= 0).any() else "none of them in a segment"
         words = f"shown: frames {rows[0]:,} to {rows[-1]:,} of {len(track):,}, {which}"
     part = track.at(rows)
     return Part(track=part, words=words, broken=_broken(track, part))

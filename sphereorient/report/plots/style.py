@@ -39,6 +39,7 @@ SETTINGS: Final[dict[str, Any]] = {
     "xtick.labelsize": 7,
     "ytick.labelsize": 7,
     "legend.fontsize": 7,
+    "legend.title_fontsize": 7,
     "legend.frameon": False,
     "legend.handlelength": 2.6,  # inches enough to tell the dashes apart
     "lines.linewidth": 1.1,

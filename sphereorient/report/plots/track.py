@@ -99,7 +99,9 @@ def _angles(axes: Axes, time: Floats, part: Part) -> None:
 
 def tait_bryan_deg(R_lab_body: Floats) -> Floats:
     """Return theta_x, theta_y, theta_z (N, 3), degrees, of orientations (N, 3, 3); NaN where these are."""
-    return np.asarray(np.rad2deg(so3.to_tait_bryan(torch.from_numpy(R_lab_body)).numpy()), np.float64)
+    theta_rad = so3.to_tait_bryan(torch.from_numpy(R_lab_body)).numpy()
+    known = np.isfinite(R_lab_body.reshape(-1, 9)).all(1, keepdims=True)  # of NaN it makes theta_z = 0, as at a pole
+    return np.where(known, np.rad2deg(theta_rad), np.nan)
 
 
 def _sigma_deg(R_lab_body: Floats, cov_lab_rad2: Floats) -> Floats:
