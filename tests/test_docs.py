@@ -157,14 +157,15 @@ def test_the_commands_and_the_python_of_the_walkthrough_run(tmp_path, monkeypatc
     (tmp_path / "out").mkdir()
     lines = (line for block in blocks("walkthrough.md", "") for line in block.splitlines())
     commands = [line for line in lines if line.startswith(".venv/bin/")]
-    assert len(commands) == 3
+    assert len(commands) == 5
     for command in commands:
         subprocess.run(command.split(), cwd=tmp_path, check=True, capture_output=True)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     for block in blocks("walkthrough.md", "python"):
         exec(block, names)
-    assert (tmp_path / "out" / "try" / "track.csv").is_file()
+    for name in ("track.csv", "report/index.html", "overlay.mp4"):
+        assert (tmp_path / "out" / "try" / name).is_file()
 
 
 @pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
