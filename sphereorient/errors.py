@@ -53,6 +53,10 @@ class TrackError(SphereOrientError):
     """A file is not a track that this version reads."""
 
 
+class BenchError(SphereOrientError):
+    """Results of a benchmark that are missing, damaged, or of another version or plan."""
+
+
 class OutputError(SphereOrientError):
     """A result cannot be written."""
 

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.assemble.semiring import MIN_PLUS, Semiring
+from sphereorient.assemble.visits import Visits, visits_of
 from sphereorient.errors import ShapeError, check_tail, refusal
 
 PAIRS_AT_ONCE = 1 << 16  # candidate pairs whose 3 x 3 products are held at once, 5 MB
 
-Reduction = Callable[[Tensor], tuple[Tensor, Tensor]]  # totals (..., from, to) -> total and origin of each `to`
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Swept:
+    """What `sweep` carried along M steps; a state is the last one (C) or two (C, C) candidates of a path."""
+
+    totals: Tensor  # (..., M, *state), less the levels of the step and of all before it
+    level: Tensor  # (..., M), taken off in each step
+    origins: Tensor | None  # (..., M - 1, *state) int64, the oldest candidate of the state before; None: all of them
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,64 +86,82 @@ def shortest_path(edge_cost: Tensor, mask: Tensor) -> ShortestPath:
 
     Source: Bellman 1957, Viterbi 1967; min-plus algebra.
     """
+    check_edges(edge_cost, mask)
+    if 0 in mask.shape[-2:]:
+        choice = mask.new_full(mask.shape[:-1], -1, dtype=torch.int64)
+        return ShortestPath(choice=choice, cost=edge_cost.sum((-3, -2, -1)))
+    visits = visits_of(mask)
+    swept = sweep(*first_order(edge_cost.detach(), visits), MIN_PLUS)
+    assert swept.origins is not None
+    last = swept.totals[..., -1, :]
+    held = _walk_back(last.argmin(-1, keepdim=True), swept.origins).gather(-1, visits.rank)
+    blocked = torch.isinf(last).all(-1)
+    choice = torch.where(visits.visited & ~blocked[..., None], held, -1)
+    cost = torch.where(blocked, torch.inf, _cost_along(edge_cost, held, visits.visited))
+    return ShortestPath(choice=choice, cost=cost)
+
+
+def check_edges(edge_cost: Tensor, mask: Tensor) -> None:
+    """Refuse edges (..., N - 1, C, C) that do not belong to a mask (..., N, C).
+
+    Raises:
+        ShapeError: they do not.
+    """
     *_, steps, width = mask.shape
     if edge_cost.shape != (*mask.shape[:-2], max(steps - 1, 0), width, width):
         got = f"{tuple(edge_cost.shape)} and {tuple(mask.shape)}"
         do = "compute edges between neighbours"
         raise ShapeError(refusal("edge_cost and mask", expected="(..., N - 1, C, C) and (..., N, C)", got=got, do=do))
-    if steps == 0 or width == 0:
-        choice = mask.new_full(mask.shape[:-1], -1, dtype=torch.int64)
-        return ShortestPath(choice=choice, cost=edge_cost.sum((-3, -2, -1)))
-    last, origin = sweep(edge_cost.detach(), mask, _least)
-    held = _walk_back(last.argmin(-1, keepdim=True), origin)
-    visited = mask.any(-1)
-    blocked = torch.isinf(last).all(-1) & visited.any(-1)
-    choice = torch.where(visited & ~blocked[..., None], held, -1)
-    cost = torch.where(blocked, torch.inf, _cost_along(edge_cost, held, visited))
-    return ShortestPath(choice=choice, cost=cost)
 
 
-def _least(arriving: Tensor) -> tuple[Tensor, Tensor]:
-    """Reduce (..., from, to) to the cheapest total and its origin; of equals the lowest index."""
-    # Not min(-2): it wakes all threads for the smallest tensor, on busy cores the sweep then takes ten times as long.
-    origin = arriving.argmin(-2)
-    return arriving.gather(-2, origin[..., None, :])[..., 0, :], origin
-
-
-def sweep(edge_cost: Tensor, mask: Tensor, reduce: Reduction) -> tuple[Tensor, Tensor]:
-    """Carry totals from the first step to the last: the recursion, whatever the semiring.
+def first_order(edge_cost: Tensor, visits: Visits, node_cost: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Return what `sweep` takes: totals of the first step (..., C) and edges (..., M - 1, C, C), without holes.
 
     Args:
         edge_cost: (..., N - 1, C, C), as `shortest_path`.
-        mask: (..., N, C) bool, N and C at least 1.
-        reduce: the semiring's sum over origins; its product is +, its zero inf.
-
-    Returns:
-        Totals of the last step visited (..., C), inf where masked, and the origins that `reduce` names,
-        (..., N - 1, C); into an empty step each index comes from itself.
+        visits: of the mask.
+        node_cost: (..., N, C), what a candidate costs whatever comes before; None: nothing.
     """
-    width = mask.shape[-1]
-    visited = mask.any(-1)
-    edges = torch.where(_usable(mask, visited), edge_cost, torch.inf)
-    first = visited & (visited.cumsum(-1) == 1)
-    start = torch.where(mask, 0.0, torch.inf).to(edge_cost.dtype)
-    stay = torch.arange(width, device=mask.device)
-    total, origins = start[..., 0, :], []
-    for k in range(mask.shape[-2] - 1):  # a recursion: each step needs the one before
-        best, origin = reduce(total[..., :, None] + edges[..., k, :, :])
-        best = torch.where(first[..., k + 1, None], start[..., k + 1, :], best)
-        total = torch.where(visited[..., k + 1, None], best, total)
-        origins.append(torch.where(visited[..., k + 1, None], origin, stay))
-    none = mask.new_zeros((*total.shape[:-1], 0, width), dtype=torch.int64)
-    return total, torch.stack(origins, dim=-2) if origins else none
+    edges, start = visits.rows(edge_cost, back=1, first=1), edge_cost.new_zeros(visits.mask[..., 0, :].shape)
+    if node_cost is not None:
+        node = visits.rows(node_cost)
+        edges, start = edges + node[..., 1:, None, :], start + node[..., 0, :]
+    edges = torch.where(visits.real[..., 1:, None, None], edges, 0.0)
+    usable = visits.mask[..., :-1, :, None] & visits.mask[..., 1:, None, :]
+    start = torch.where(visits.real[..., :1], start, 0.0)
+    return torch.where(visits.mask[..., 0, :], start, torch.inf), torch.where(usable, edges, torch.inf)
 
 
-def _usable(mask: Tensor, visited: Tensor) -> Tensor:
-    """Edges between candidates, (..., N - 1, C, C) bool; those over empty steps come from the last step visited."""
-    step = torch.arange(mask.shape[-2], device=mask.device)
-    held = torch.where(visited, step, 0).cummax(-1).values[..., :-1]
-    origin = mask.gather(-2, held[..., None].expand(*held.shape, mask.shape[-1]))
-    return origin[..., :, None] & mask[..., 1:, None, :]
+def sweep(start: Tensor, edges: Tensor, semiring: Semiring, order: int = 1) -> Swept:
+    """Carry totals from the first step to the last: the recursion, whatever the semiring and the order.
+
+    Args:
+        start: (..., *state), totals of the first step: of each candidate (C,) in the first order, of each pair of the
+            candidate before and this one (C, C) in the second; inf where there is none.
+        edges: (..., M - 1, *state, C), cost of going on from each state to each candidate of the next step, inf where
+            there is no way.
+        semiring: the sum over origins, the oldest candidates of the states; the product along the way.
+        order: 1 or 2, the number of candidates in a state.
+    """
+    axis = -order - 1  # of the origins, once the candidates of the next step stand behind the state
+    level = start.new_zeros(start.shape[: start.ndim - order])
+    total, totals, levels, origins = start, [start], [level], []
+    for edge in edges.unbind(axis - 1):  # a recursion: each step needs the one before
+        total, origin = semiring.sum(semiring.product(total.unsqueeze(-1), edge), axis)
+        if semiring.levelled:
+            level = total.amin(tuple(range(-order, 0)), keepdim=True).clamp_max(torch.finfo(total.dtype).max)
+            total, level = total - level, level.flatten(-order)[..., 0]
+        totals.append(total)
+        levels.append(level)
+        if origin is not None:
+            origins.append(origin)
+    none = edges.new_zeros((*start.shape[: start.ndim - order], 0, *start.shape[start.ndim - order :]))
+    known = torch.stack(origins, dim=axis) if origins else none.to(torch.int64)
+    return Swept(
+        totals=torch.stack(totals, dim=axis),
+        level=torch.stack(levels, dim=-1),
+        origins=None if semiring.levelled else known,
+    )
 
 
 def _walk_back(end: Tensor, origin: Tensor) -> Tensor:

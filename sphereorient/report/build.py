@@ -109,7 +109,7 @@ def _plans(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequen
     yield (
         "noise",
         "What of each variance is noise, or was smoothed away.",
-        lambda: plots.noise_figure(summary.table),
+        lambda: plots.noise_figure(summary.table, summary.ensemble.error),
         True,
     )
     more = summary.distributions
@@ -118,7 +118,7 @@ def _plans(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequen
     caption = "PDFs of the components in their standard deviations, the stretched exponential and the Gaussian."
     yield "densities", caption, lambda: plots.densities_figure(summary, list(more.densities)), False
     caption = "Increments of omega over lags: PDFs, shifted by decades, and flatness."
-    yield "increments", caption, lambda: plots.increments_figure(more), False
+    yield "increments", caption, lambda: plots.increments_figure(more, summary.table), False
     caption = "Autocorrelations and integral times."
     yield "correlations", caption, lambda: plots.correlations_figure(more.correlations), False
     caption = "Euler angles against the law of uniform attitudes."

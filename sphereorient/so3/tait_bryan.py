@@ -43,7 +43,7 @@ def to_tait_bryan(R: Tensor) -> Tensor:
 
     Returns:
         (..., 3), theta_x, theta_y, theta_z, rad. At cos(theta_y) = 0 (below four roundings) only theta_x + theta_z
-        or theta_x - theta_z is defined: theta_z is set to 0, and its gradient.
+        or theta_x - theta_z is defined: theta_z is set to 0, and its gradient. NaN for NaN.
 
     Raises:
         ShapeError: the last axes are not (3, 3).
@@ -53,7 +53,7 @@ def to_tait_bryan(R: Tensor) -> Tensor:
     """
     check_tail("R", R, 3, 3)
     cos_y = torch.linalg.vector_norm(R[..., 0, :2], dim=-1)
-    defined = cos_y > 4 * torch.finfo(R.dtype).eps
+    defined = ~(cos_y <= 4 * torch.finfo(R.dtype).eps)  # of no rotation, NaN, all three angles are NaN
     zero, one = torch.zeros_like(cos_y), torch.ones_like(cos_y)
     theta_z = torch.atan2(torch.where(defined, -R[..., 0, 1], zero), torch.where(defined, R[..., 0, 0], one))
     # R Rz^T = Rx Ry, whose second column (0, cos theta_x, sin theta_x) does not shrink with cos theta_y.

@@ -1,5 +1,7 @@
-"""Movies with truth: random motion, random paint, and the scene that two cameras see."""
+"""Movies with truth: random motion, random paint, the scene that two cameras see, and what spoils it."""
 
+from sphereorient.synth.degrade import DEGRADATIONS, degrade, severity
+from sphereorient.synth.degrade_scene import write_degraded
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion
 from sphereorient.synth.scene import Scene, make_scene, render_frame
 from sphereorient.synth.settings import SynthSettings
@@ -7,13 +9,17 @@ from sphereorient.synth.textures import random_texture
 from sphereorient.synth.write import write_experiment
 
 __all__ = [
+    "DEGRADATIONS",
     "Motion6D",
     "RandomMotion",
     "Scene",
     "SynthSettings",
+    "degrade",
     "make_scene",
     "random_motion",
     "random_texture",
     "render_frame",
+    "severity",
+    "write_degraded",
     "write_experiment",
 ]

@@ -54,22 +54,56 @@ def render_frame(
     Raises:
         CameraError: a ball that is not wholly before the camera, or not wholly in the liquid.
     """
+    picture, _ = expose(scene, camera, position_lab_mm, R_lab_body)
+    return digitise(picture, scene.settings, rng)
+
+
+def expose(
+    scene: Scene, camera: Camera, position_lab_mm: Tensor, R_lab_body: Tensor
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the light of one exposure without noise, grey levels, and the share of each pixel that the ball fills.
+
+    Args:
+        scene: map, light, levels.
+        camera: any model.
+        position_lab_mm: (E, 3), centre at the E instants of the exposure.
+        R_lab_body: (E, 3, 3), orientation at these instants.
+
+    Returns:
+        (H, W) float32 both, blurred by the optics.
+
+    Raises:
+        CameraError: a ball that is not wholly before the camera, or not wholly in the liquid.
+    """
     settings = scene.settings
     width, height = camera.image_size
     picture = np.full((height, width), settings.background, np.float32)
+    cover = np.zeros((height, width), np.float32)
     for position, R in zip(position_lab_mm, R_lab_body, strict=True):
-        _add_sphere(picture, scene, camera, position, R, 1.0 / len(position_lab_mm))
+        _add_sphere(picture, cover, scene, camera, position, R, 1.0 / len(position_lab_mm))
     if settings.blur_px > 0:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), settings.blur_px))
+        cover = np.asarray(cv2.GaussianBlur(cover, (0, 0), settings.blur_px))
+    return picture, cover
+
+
+def digitise(picture: NDArray[np.float32], settings: SynthSettings, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Add the camera's noise to grey levels (H, W) and round them to 8 bits."""
     sigma = np.sqrt(settings.read_noise**2 + settings.shot_noise**2 * np.maximum(picture, 0))
     noisy = picture + sigma * rng.standard_normal(picture.shape, dtype=np.float32)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
 def _add_sphere(
-    picture: NDArray[np.float32], scene: Scene, camera: Camera, position: Tensor, R_lab_body: Tensor, share: float
+    picture: NDArray[np.float32],
+    cover: NDArray[np.float32],
+    scene: Scene,
+    camera: Camera,
+    position: Tensor,
+    R_lab_body: Tensor,
+    share: float,
 ) -> None:
-    """Blend the sphere at one instant over the background with weight `share`."""
+    """Blend the sphere at one instant over the background with weight `share`, and add what it covers to `cover`."""
     settings = scene.settings
     u, v = camera.project(position).tolist()
     height, width = picture.shape
@@ -93,3 +127,4 @@ def _add_sphere(
     fine = torch.stack([torch.where(hit, grey, 0.0), hit.double()])
     mean = torch.nn.functional.avg_pool2d(fine[None], SUPERSAMPLING)[0].numpy().astype(np.float32)
     picture[top:bottom, left:right] += share * (mean[0] - mean[1] * settings.background)
+    cover[top:bottom, left:right] += share * mean[1]

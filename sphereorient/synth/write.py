@@ -17,8 +17,9 @@ from torch import Tensor
 from sphereorient.cameras import Camera, TsaiCamera, save_cameras
 from sphereorient.errors import OutputError, refusal
 from sphereorient.movies import write_ffv1
+from sphereorient.synth.filming import Filming, Shown
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion
-from sphereorient.synth.scene import make_scene, render_frame
+from sphereorient.synth.scene import Scene, digitise, expose, make_scene
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.textures import random_texture
 
@@ -53,7 +54,10 @@ def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
 
 
 def write_experiment(
-    folder: Path, settings: SynthSettings, progress: Callable[[int], None] = lambda done: None
+    folder: Path,
+    settings: SynthSettings,
+    progress: Callable[[int], None] = lambda done: None,
+    filming: Filming | None = None,
 ) -> Path:
     """Render a two-camera experiment with exact truth.
 
@@ -61,6 +65,7 @@ def write_experiment(
         folder: made where it is missing; files of an older run are replaced.
         settings: the scene.
         progress: called with the number of frames rendered since the last call.
+        filming: what befalls the pictures, and what the files tell of the scene; nothing, and the truth, if None.
 
     Returns:
         Path of experiment.yaml. Beside it: cam1.mkv, cam2.mkv, pictures of the scene without the
@@ -75,11 +80,30 @@ def write_experiment(
         raise OutputError(
             refusal(f"folder {folder}", expected="a folder that can be made", got=str(error), do="choose another --out")
         ) from None
-    texture = random_texture(settings.texture, settings.seed)
-    grey = np.rint(texture.numpy() * 255).astype(np.uint8)
+    filming = filming or Filming()
+    # In whole grey levels, as the file holds it.
+    texture = _as_file(random_texture(settings.texture, settings.seed)) / np.float32(255)
     cameras = default_cameras(settings)
     time_s = torch.arange(settings.frames, dtype=torch.float64) / settings.frame_rate
-    motion = random_motion(
+    motion = motion_of(settings)
+    scene = make_scene(filming.paint(torch.from_numpy(texture)), settings)
+    for index, (name, camera) in enumerate(cameras.items()):
+        frames = _frames(scene, (name, camera), motion, filming, np.random.default_rng([settings.seed, index]))
+        write_ffv1(folder / f"{name}.mkv", _told(frames, progress), settings.frame_rate)
+        _write_picture(folder / f"empty_{name}.png", _without_the_ball(settings, name, camera, filming))
+    _write_picture(folder / "texture.png", _as_file(filming.told_texture(torch.from_numpy(texture))))
+    told = filming.told_cameras(cameras)
+    exact = "exact cameras" if told is cameras else "cameras, wrong on purpose"
+    save_cameras(folder / "cameras.yaml", told, comment=f"{exact}; X_cam = R X_lab + T, mm")
+    _write_truth(folder / "truth.h5", motion.at(time_s), cameras)
+    path = folder / "experiment.yaml"
+    path.write_text(yaml.safe_dump(_experiment(settings, cameras, filming), sort_keys=False), encoding="utf-8")
+    return path
+
+
+def motion_of(settings: SynthSettings) -> RandomMotion:
+    """Draw the motion of a synthetic experiment."""
+    return random_motion(
         settings.velocity_rms,
         settings.velocity_time,
         settings.omega_rms,
@@ -87,18 +111,12 @@ def write_experiment(
         settings.volume_mm,
         settings.seed,
     )
-    for index, (name, camera) in enumerate(cameras.items()):
-        frames = _frames(settings, torch.from_numpy(grey / np.float32(255)), camera, motion, index, progress)
-        write_ffv1(folder / f"{name}.mkv", frames, settings.frame_rate)
-        # As a careful lab does: a picture of the scene without the ball, before it is let in.
-        empty = np.full(camera.image_size[::-1], round(settings.background), np.uint8)
-        _write_picture(folder / f"empty_{name}.png", empty)
-    _write_picture(folder / "texture.png", grey)
-    save_cameras(folder / "cameras.yaml", cameras, comment="exact cameras; X_cam = R X_lab + T, mm")
-    _write_truth(folder / "truth.h5", motion.at(time_s), cameras)
-    path = folder / "experiment.yaml"
-    path.write_text(yaml.safe_dump(_experiment(settings, cameras), sort_keys=False), encoding="utf-8")
-    return path
+
+
+def _as_file(texture: Tensor) -> NDArray[np.uint8]:
+    """Return a map, 0 black .. 1 white, in the grey levels of its file."""
+    grey: NDArray[np.uint8] = np.rint(texture.numpy() * 255).astype(np.uint8)
+    return grey
 
 
 def _write_picture(path: Path, grey: NDArray[np.uint8]) -> None:
@@ -107,24 +125,38 @@ def _write_picture(path: Path, grey: NDArray[np.uint8]) -> None:
 
 
 def _frames(
-    settings: SynthSettings,
-    texture: Tensor,
-    camera: Camera,
-    motion: RandomMotion,
-    index: int,
-    progress: Callable[[int], None],
+    scene: Scene, named: tuple[str, Camera], motion: RandomMotion, filming: Filming, rng: np.random.Generator
 ) -> Iterator[NDArray[np.uint8]]:
     """Render the movie of one camera, frame by frame."""
+    settings, (name, camera) = scene.settings, named
     count = settings.exposure_samples
     within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
     time_s = torch.arange(settings.frames, dtype=torch.float64) / settings.frame_rate
     now = motion.at((time_s[:, None] + within).reshape(-1))
-    scene = make_scene(texture, settings)
-    rng = np.random.default_rng([settings.seed, index])
+    lost = filming.lost(name, settings.frames)
     for k in range(settings.frames):
-        these = slice(k * count, (k + 1) * count)
-        yield render_frame(scene, camera, now.position_lab_mm[these], now.R_lab_body[these], rng)
+        position, R_lab_body = (x[k * count : (k + 1) * count] for x in (now.position_lab_mm, now.R_lab_body))
+        picture, cover = expose(scene, camera, position, R_lab_body)
+        shown = Shown(name=name, camera=camera, frame=k, cover=cover, position_lab_mm=position.mean(0))
+        # Noise is drawn for lost frames too, so that all others stay what they would be without the loss.
+        frame = digitise(filming.picture(picture, shown), settings, rng)
+        yield np.zeros_like(frame) if k in lost else frame
+
+
+def _told(frames: Iterator[NDArray[np.uint8]], progress: Callable[[int], None]) -> Iterator[NDArray[np.uint8]]:
+    for frame in frames:
+        yield frame
         progress(1)
+
+
+def _without_the_ball(settings: SynthSettings, name: str, camera: Camera, filming: Filming) -> NDArray[np.uint8]:
+    """Return a picture of the scene before the ball is let in, as a careful lab takes: averaged, without noise."""
+    size = camera.image_size[::-1]
+    cover, origin = np.zeros(size, np.float32), torch.zeros(3, dtype=torch.float64)
+    shown = Shown(name=name, camera=camera, frame=None, cover=cover, position_lab_mm=origin)
+    empty = filming.picture(np.full(size, settings.background, np.float32), shown)
+    rounded: NDArray[np.uint8] = np.clip(np.rint(empty), 0, 255).astype(np.uint8)
+    return rounded
 
 
 def _write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> None:
@@ -149,7 +181,7 @@ def _write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> 
     aside.replace(path)
 
 
-def _experiment(settings: SynthSettings, cameras: Mapping[str, Camera]) -> dict[str, Any]:
+def _experiment(settings: SynthSettings, cameras: Mapping[str, Camera], filming: Filming) -> dict[str, Any]:
     # A momentary exposure is written as none: the experiment's key is a duration above 0.
     exposure = {"exposure": settings.exposure} if settings.exposure > 0 else {}
     return {
@@ -157,7 +189,7 @@ def _experiment(settings: SynthSettings, cameras: Mapping[str, Camera]) -> dict[
         "name": settings.name,
         "frame_rate": settings.frame_rate,
         **exposure,
-        "sphere": {"diameter": settings.diameter_mm, "texture": "texture.png"},
+        "sphere": {"diameter": filming.told_diameter_mm(settings.diameter_mm), "texture": "texture.png"},
         "cameras": "cameras.yaml",
         "backgrounds": {name: f"empty_{name}.png" for name in cameras},
         "movies": {name: f"{name}.mkv" for name in cameras},

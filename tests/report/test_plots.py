@@ -293,7 +293,7 @@ def test_legends_cover_no_data_and_leave_the_page_nowhere(name):
 @every_figure
 def test_the_same_input_gives_the_same_bytes_whatever_the_users_own_style(name, tmp_path):
     first = plots.write_figure(FIGURES[name](), tmp_path / "first.one")
-    with matplotlib.rc_context({"font.size": 20, "lines.linewidth": 7, "axes.grid": False, "pdf.fonttype": 3}):
+    with matplotlib.rc_context({"font.size": 20, "lines.linewidth": 7, "axes.facecolor": "yellow", "pdf.fonttype": 3}):
         again = plots.write_figure(FIGURES[name](), tmp_path / "again")
         assert matplotlib.rcParams["font.size"] == 20  # it is still the user's afterwards
     assert [path.name for path in first] == ["first.one.png", "first.one.pdf"]

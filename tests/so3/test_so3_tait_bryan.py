@@ -188,3 +188,11 @@ def test_wrong_shapes_are_refused():
             function(torch.zeros(2))
     with pytest.raises(ShapeError, match=r"\(\.\.\., 3, 3\)"):
         so3.to_tait_bryan(torch.zeros(3))
+
+
+def test_no_rotation_has_no_angles(dtype):
+    R = torch.eye(3, dtype=dtype).repeat(2, 1, 1)
+    R[1] = torch.nan
+    theta = so3.to_tait_bryan(R)
+    assert torch.isfinite(theta[0]).all()
+    assert torch.isnan(theta[1]).all()

@@ -63,6 +63,7 @@ def track_figure(track: Trajectory) -> Figure:
         axes.margins(x=0.01)
         if _is_empty(axes):
             say_empty(axes)
+            axes.set_yticks([])
     for axes in panels[-1]:
         axes.set_xlabel(f"time ({unit})")
     figure.align_ylabels()

@@ -1,0 +1,359 @@
+"""Degradations of pictures: torch operations on batches, for benchmarks and for training alike.
+
+Every operation takes pictures in grey levels before noise and rounding, a physical value (`severities`), where the
+ball is, and a generator, and returns pictures in the same dtype. At the value at which nothing happens the pictures
+come back unchanged. All random numbers come from the generator, item by item: a batch is the stack of its singles.
+That is why Kornia's filters are used here and its augmentations are not, which draw from torch's global generator.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import torch
+from kornia.filters import filter2d, gaussian_blur2d
+from torch import Tensor
+
+from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
+from sphereorient.synth.severities import DEGRADATIONS, Degradation, degradation, severity
+
+__all__ = ["DEGRADATIONS", "OPERATIONS", "Degradation", "Disk", "degradation", "degrade", "severity", "to_bytes"]
+
+WHITE_LEVEL = 255  # of 8 bits
+VEIL = 95.0  # grey level of turbid liquid
+OCCLUDER, SPECK, GLINT = 30.0, 12.0, 120.0  # grey levels of what passes before the ball, of dirt, of a bubble's glint
+LOBES, LOBE_RADII = 2, 0.12  # highlights: how many, and their sigma in radii of the ball
+BUBBLE_RADII = 0.12  # radius of a bubble in radii of the ball
+SPECKS_PER_PX2 = 6e-4  # three before the paper's ball
+CLUTTER_PX = 6.0  # Gaussian that makes the structure behind the ball: about as coarse as the paint
+DARKEST = 1.0  # grey level below which shot noise grows no smaller: its root has no finite slope at 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Disk:
+    """Where the ball is in pictures (..., H, W); given by who rendered them, read by the operations."""
+
+    centre_px: Tensor  # (..., 2) as (u, v)
+    radius_px: Tensor  # (...)
+    cover: Tensor | None = None  # (..., H, W), the share of each pixel that the ball fills; None: a round disk's
+
+    def __post_init__(self) -> None:
+        """Refuse centres that are none."""
+        check_tail("centre_px", self.centre_px, 2)
+
+    def offset(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how far right and down of the centre each pixel is, (..., H, W) each, px."""
+        height, width = pictures.shape[-2:]
+        centre = self.centre_px.to(pictures)[..., None, None, :]
+        right = torch.arange(width, dtype=pictures.dtype, device=pictures.device)
+        down = torch.arange(height, dtype=pictures.dtype, device=pictures.device)[:, None]
+        return right - centre[..., 0], down - centre[..., 1]
+
+    def radius(self, pictures: Tensor) -> Tensor:
+        """Return the radius with axes for rows and columns, (..., 1, 1), px."""
+        return self.radius_px.to(pictures)[..., None, None]
+
+    def covered(self, pictures: Tensor) -> Tensor:
+        """Return the share of each pixel that the ball fills, (..., H, W)."""
+        if self.cover is not None:
+            return self.cover.to(pictures)
+        return _round(*self.offset(pictures), self.radius(pictures))
+
+
+Operation = Callable[[Tensor, float, Disk, torch.Generator], Tensor]
+
+
+def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torch.Generator) -> Tensor:
+    """Apply degradations of pictures, in the order of `DEGRADATIONS` whatever the order of `values`.
+
+    Args:
+        pictures: (..., H, W), grey levels, not rounded; float32 or float64.
+        disk: where the ball is.
+        values: name of an operation -> physical value; `severity(name, level)` gives those of the levels.
+        rng: of all that is random.
+
+    Returns:
+        (..., H, W) grey levels, neither rounded nor clipped: `to_bytes` comes last.
+
+    Raises:
+        SettingsError: an unknown name, one that does not act on pictures, or an impossible value.
+        ShapeError: no pictures.
+    """
+    if pictures.ndim < 2 or not pictures.is_floating_point():
+        got, do = f"{tuple(pictures.shape)} {pictures.dtype}", "pass grey levels as floats"
+        raise ShapeError(refusal("pictures", expected="(..., H, W) floats", got=got, do=do))
+    for name, value in values.items():
+        row = degradation(name)
+        if name not in OPERATIONS:
+            expected, do = f"one of {', '.join(OPERATIONS)}", "apply it with write_degraded, which films the scene"
+            raise SettingsError(refusal("degradation of pictures", expected=expected, got=name, do=do))
+        row.check(value)
+    for name, operation in OPERATIONS.items():
+        if name in values and values[name] != DEGRADATIONS[name].nothing:
+            pictures = operation(pictures, values[name], disk, rng)
+    return pictures
+
+
+def to_bytes(pictures: Tensor) -> Tensor:
+    """Round grey levels to 8 bits, (..., H, W) uint8; what exceeds 255 is clipped, as a sensor does."""
+    return pictures.round().clamp(0, WHITE_LEVEL).to(torch.uint8)
+
+
+# The light on the ball.
+
+
+def uneven_light(pictures: Tensor, ratio: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Dim the ball from one limb, which keeps its light, to the opposite one, which has 1 / ratio of it."""
+    angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]
+    right, down = disk.offset(pictures)
+    across = ((right * angle.cos() + down * angle.sin()) / disk.radius(pictures)).clamp(-1, 1)
+    left = torch.exp(0.5 * math.log(ratio) * (across - 1))
+    return pictures * (1 + disk.covered(pictures) * (left - 1))
+
+
+def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Add lamps mirrored in the paint: Gaussian lobes whose peaks are `peak` grey levels above the paint."""
+    draw = _uniform(pictures, rng, LOBES, 2)
+    radius = disk.radius(pictures)
+    right, down = disk.offset(pictures)
+    light = torch.zeros_like(pictures)
+    for lobe in range(LOBES):
+        # Half a turn each, so that two lobes do not fall on each other; a lamp beside the camera is mirrored near
+        # the middle, one at right angles to it at 0.7 radii.
+        angle = math.pi * (lobe + draw[..., lobe, 0, None, None])
+        away = (0.2 + 0.5 * draw[..., lobe, 1, None, None]) * radius
+        square = (right - away * angle.cos()).square() + (down - away * angle.sin()).square()
+        light = light + torch.exp(-0.5 * square / (LOBE_RADII * radius).square())
+    return pictures + peak * disk.covered(pictures) * light
+
+
+# What is behind and before the ball.
+
+
+def background_clutter(pictures: Tensor, rms: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Add structure behind the ball, at least 0, evenly distributed, with this standard deviation in grey levels."""
+    field = blurred(_normal(pictures, rng), CLUTTER_PX)
+    field = (field - _mean(field)) / _spread(field)
+    even = torch.special.ndtr(field)
+    even = even - even.amin((-2, -1), keepdim=True)
+    clutter: Tensor = (rms / _spread(even)) * even
+    return pictures + (1 - disk.covered(pictures)) * clutter
+
+
+def occlusion(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Hide this share of the disk behind a dark disk of the same size, on any side."""
+    if share == 0:
+        return pictures
+    angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]
+    radius = disk.radius(pictures)
+    away = _distance_of_overlap(share) * radius
+    right, down = disk.offset(pictures)
+    hidden = _round(right - away * angle.cos(), down - away * angle.sin(), radius)
+    return pictures + hidden * (OCCLUDER - pictures)
+
+
+def bubbles(pictures: Tensor, number: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Scatter bubbles before the disk: clear in the middle, dark towards the rim, with a glint at the upper left."""
+    count = round(number)
+    draw = _uniform(pictures, rng, count, 2)
+    radius = disk.radius(pictures)
+    size = BUBBLE_RADII * radius
+    right, down = disk.offset(pictures)
+    for k in range(count):  # one after the other: all at once would hold `count` pictures per picture
+        angle = 2 * math.pi * draw[..., k, 0, None, None]
+        away = draw[..., k, 1, None, None].sqrt() * radius
+        x, y = right - away * angle.cos(), down - away * angle.sin()
+        inside = _round(x, y, size)
+        fourth = ((x.square() + y.square()) / size.square()).square()
+        glint = torch.exp(-0.5 * ((x + 0.4 * size).square() + (y + 0.4 * size).square()) / (0.15 * size).square())
+        pictures = pictures * (1 - inside * (0.15 + 0.6 * fourth).clamp_max(0.75)) + GLINT * inside * glint
+    return pictures
+
+
+def dirt(pictures: Tensor, radius_px: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Put dark round specks of this radius anywhere in the picture, `SPECKS_PER_PX2` of them per pixel."""
+    if radius_px == 0:
+        return pictures
+    height, width = pictures.shape[-2:]
+    half = math.ceil(radius_px)
+    # Middles beyond the border too, so that specks reach in from there.
+    wider = pictures.new_empty((*pictures.shape[:-2], height + 2 * half, width + 2 * half))
+    middles = (torch.rand(wider.shape, generator=rng, dtype=wider.dtype, device=rng.device) < SPECKS_PER_PX2).to(wider)
+    at = torch.arange(-half, half + 1, dtype=pictures.dtype, device=pictures.device)
+    speck = _round(at, at[:, None], pictures.new_tensor(radius_px))
+    if pictures.numel() == 0:
+        return pictures
+    flat = middles.reshape(-1, 1, *wider.shape[-2:])
+    hidden = filter2d(flat, speck[None], border_type="constant", padding="valid").clamp_max(1)
+    return pictures + hidden.reshape(pictures.shape) * (SPECK - pictures)
+
+
+# The way to the sensor.
+
+
+def contrast_loss(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Move all grey levels towards the veil by this share of the way."""
+    return pictures + share * (VEIL - pictures)
+
+
+def defocus(pictures: Tensor, sigma_px: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Blur with a Gaussian of this standard deviation, px."""
+    return blurred(pictures, sigma_px)
+
+
+def saturation(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Give every picture as much light that this share of its white paint exceeds 255; `to_bytes` clips.
+
+    White paint is what is brighter than the middle between the disk's darkest and brightest pixels. A movie has one
+    exposure throughout: there `degrade_scene` finds the gain from a ball that is white all over.
+    """
+    if share == 0:
+        return pictures
+    inside = (disk.covered(pictures) > 0.99).expand(pictures.shape).flatten(-2)
+    grey = pictures.flatten(-2)
+    low = grey.masked_fill(~inside, math.inf).amin(-1, keepdim=True)
+    high = grey.masked_fill(~inside, -math.inf).amax(-1, keepdim=True)
+    return pictures * gain_to_clip(grey, inside & (grey > 0.5 * (low + high)), share)[..., None, None]
+
+
+def gain_to_clip(grey: Tensor, white: Tensor, share: float) -> Tensor:
+    """Return the factor that takes a share of white pixels above 255, 1 where more are already.
+
+    Args:
+        grey: (..., P), grey levels.
+        white: (..., P) bool, which of them show white paint.
+        share: in 0 .. 1.
+
+    Returns:
+        (...), no unit.
+    """
+    count = white.sum(-1, keepdim=True)
+    falling = grey.masked_fill(~white, -math.inf).sort(-1, descending=True).values
+    limit = (share * count).round().long().minimum((count - 1).clamp_min(0))
+    level = falling.gather(-1, limit)[..., 0]
+    level = torch.where(level > 0, level, torch.full_like(level, WHITE_LEVEL))  # no white paint in sight
+    gain: Tensor = (WHITE_LEVEL / level).clamp_min(1)
+    return gain
+
+
+def shot_noise(pictures: Tensor, per_root: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Add white noise of `per_root` grey levels times the root of each pixel's grey level."""
+    return pictures + per_root * pictures.clamp_min(DARKEST).sqrt() * _normal(pictures, rng)
+
+
+def read_noise(pictures: Tensor, sigma: float, disk: Disk, rng: torch.Generator) -> Tensor:
+    """Add white noise of this standard deviation, grey levels."""
+    return pictures + sigma * _normal(pictures, rng)
+
+
+OPERATIONS: Mapping[str, Operation] = MappingProxyType(
+    {
+        "uneven_light": uneven_light,
+        "highlights": highlights,
+        "background_clutter": background_clutter,
+        "occlusion": occlusion,
+        "bubbles": bubbles,
+        "dirt": dirt,
+        "contrast_loss": contrast_loss,
+        "defocus": defocus,
+        "saturation": saturation,
+        "shot_noise": shot_noise,
+        "read_noise": read_noise,
+    }
+)
+
+
+# Movies, and what is told of the disk.
+
+
+def drop_frames(movie: Tensor, share: float, rng: torch.Generator) -> Tensor:
+    """Make frames of movies black.
+
+    Args:
+        movie: (..., N, H, W), grey levels.
+        share: of the N frames, rounded to a whole number of them.
+        rng: draws which.
+
+    Returns:
+        (..., N, H, W).
+    """
+    degradation("dropped_frames").check(share)
+    lost = lost_frames(movie[..., 0, 0], share, rng)
+    return torch.where(lost[..., None, None], torch.zeros_like(movie), movie)
+
+
+def lost_frames(like: Tensor, share: float, rng: torch.Generator) -> Tensor:
+    """Draw which frames are lost, (..., N) bool, for a tensor (..., N): round(share N) of each row."""
+    count = like.shape[-1]
+    draw = torch.rand(like.shape, generator=rng, dtype=torch.float64, device=rng.device).to(like.device)
+    return draw.argsort(-1).argsort(-1) < round(share * count)
+
+
+def centre_error(disk: Disk, error_px: float, rng: torch.Generator) -> Disk:
+    """Return the disk that a method is told whose centre is off by this many px, in any direction."""
+    degradation("centre_error").check(error_px)
+    centre = disk.centre_px
+    draw = torch.rand((*centre.shape[:-1], 1), generator=rng, dtype=centre.dtype, device=rng.device).to(centre)
+    angle = 2 * math.pi * draw
+    off = error_px * torch.cat([angle.cos(), angle.sin()], dim=-1)
+    return Disk(centre_px=centre + off, radius_px=disk.radius_px)
+
+
+def radius_error(disk: Disk, error_px: float) -> Disk:
+    """Return the disk that a method is told whose radius is too large by this many px."""
+    degradation("radius_error").check(error_px)
+    return Disk(centre_px=disk.centre_px, radius_px=disk.radius_px + error_px)
+
+
+# Parts of the operations.
+
+
+def blurred(pictures: Tensor, sigma_px: float) -> Tensor:
+    """Blur pictures (..., H, W) with a Gaussian, px; beyond the border they go on as they end."""
+    if sigma_px == 0 or pictures.numel() == 0:
+        return pictures
+    size = 2 * math.ceil(4 * sigma_px) + 1
+    flat = pictures.reshape(-1, 1, *pictures.shape[-2:])
+    smooth: Tensor = gaussian_blur2d(flat, (size, size), (sigma_px, sigma_px), border_type="replicate")
+    return smooth.reshape(pictures.shape)
+
+
+def _round(right: Tensor, down: Tensor, radius_px: Tensor) -> Tensor:
+    """Share of each pixel inside a circle, the border one pixel wide."""
+    square = right.square() + down.square()
+    # The root has no slope at the middle of the circle, where the share does not change either.
+    distance = square.clamp_min(1e-6).sqrt()
+    return (radius_px - distance + 0.5).clamp(0, 1)
+
+
+def _distance_of_overlap(share: float) -> float:
+    """Distance, in radii, of two equal circles of which one hides this share of the other (bisection)."""
+    near, far = 0.0, 2.0
+    for _ in range(50):
+        middle = 0.5 * (near + far)
+        overlap = (2 * math.acos(middle / 2) - middle * math.sqrt(1 - middle**2 / 4)) / math.pi
+        near, far = (middle, far) if overlap > share else (near, middle)
+    return near
+
+
+def _uniform(pictures: Tensor, rng: torch.Generator, *tail: int) -> Tensor:
+    """Numbers in 0 .. 1 for each picture, (..., *tail): those of one picture are drawn together."""
+    shape = (*pictures.shape[:-2], *tail)
+    return torch.rand(shape, generator=rng, dtype=pictures.dtype, device=rng.device).to(pictures.device)
+
+
+def _normal(pictures: Tensor, rng: torch.Generator) -> Tensor:
+    draw = torch.randn(pictures.shape, generator=rng, dtype=pictures.dtype, device=rng.device)
+    return draw.to(pictures.device)
+
+
+def _mean(field: Tensor) -> Tensor:
+    return field.mean((-2, -1), keepdim=True)
+
+
+def _spread(field: Tensor) -> Tensor:
+    """Standard deviation over each picture, (..., 1, 1)."""
+    return (field - _mean(field)).square().mean((-2, -1), keepdim=True).sqrt()
