@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfcx, log_ndtr
+from scipy.special import erfcx, log_ndtr, logsumexp
 
 from sphereorient.statistics.bootstrap import Interval, bootstrap, per_segment
+from sphereorient.statistics.moments import noise_let_through
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
 
@@ -21,6 +22,8 @@ NODES = 120  # values of a at which the likelihood is tabulated
 FINE_BINS = 2000  # of ln|x|, for the likelihood: its rounding of x is 0.5 %
 SMALLEST, LARGEST = 1e-4, 1e3  # |x| that the likelihood tells apart
 TINY = 1e-300
+HERMITE = 24  # nodes for the noise
+AT_ONCE = 100_000  # samples
 
 
 def stretched_exponential(x: Floats, a: Floats | float) -> Floats:
@@ -76,8 +79,33 @@ class StretchedFit:
         return self.log_likelihood > self.log_likelihood_gaussian
 
 
+def log_noisy_stretched(x: Floats, a: Floats | float, noise_share: float) -> Floats:
+    """Return the logarithm of the density of unit variance of which a share is normal noise; Gauss-Hermite's rule.
+
+    Args:
+        x: (...), in standard deviations of the sum.
+        a: of the stretched exponential beneath; broadcasts against x.
+        noise_share: of the variance, 0 .. below 1.
+    """
+    if noise_share <= 0:
+        return log_stretched_exponential(x, a)
+    place, weight = np.polynomial.hermite_e.hermegauss(HERMITE)
+    clean = np.sqrt(1 - noise_share)
+    logs = np.stack(
+        [
+            np.log(w / np.sqrt(2 * np.pi)) + log_stretched_exponential((x - np.sqrt(noise_share) * z) / clean, a)
+            for z, w in zip(place, weight, strict=True)
+        ]
+    )
+    return np.asarray(logsumexp(logs, axis=0) - np.log(clean), np.float64)
+
+
 def fit_stretched(
-    x: Floats, segment: NDArray[np.int64], segments: int, settings: BootstrapSettings | None = None
+    x: Floats,
+    segment: NDArray[np.int64],
+    segments: int,
+    settings: BootstrapSettings | None = None,
+    noise_share: float = 0.0,
 ) -> StretchedFit:
     """Fit the stretched exponential by maximum likelihood, with intervals from resampled segments.
 
@@ -89,6 +117,8 @@ def fit_stretched(
         segment: (M,), 0 .. segments - 1, increasing.
         segments: their number.
         settings: of the bootstrap.
+        noise_share: of the variance, as `moments.noise_let_through` knows it: the fit is of what lies beneath it. Noise
+            fills the peak of a density, and would make a smaller.
 
     Returns:
         The fit.
@@ -102,27 +132,33 @@ def fit_stretched(
     counts = np.bincount(segment * FINE_BINS + bins, minlength=segments * FINE_BINS).reshape(segments, FINE_BINS)
     squares = per_segment(np.stack([normal, normal**2], axis=1), segment, segments)
     sums = np.concatenate([counts[:, used].astype(np.float64), squares], axis=1)
-    likelihood = _Likelihood(middle[used])
+    likelihood = _Likelihood(middle[used], noise_share)
     found = bootstrap(sums, likelihood.fit, settings)
     best = float(found.value[0])
     return StretchedFit(
         a=found.part(0),
         flatness=found.part(1),
-        log_likelihood=float(log_stretched_exponential(normal, best).mean()),
+        log_likelihood=float(_mean_of(normal, best, noise_share)),
         log_likelihood_gaussian=float(-0.5 * np.log(2 * np.pi) - 0.5 * (normal**2).mean()),
     )
+
+
+def _mean_of(normal: Floats, a: float, noise_share: float) -> float:
+    """Return the mean logarithm of the density, of many samples in pieces."""
+    pieces = [normal[k : k + AT_ONCE] for k in range(0, len(normal), AT_ONCE)]
+    return float(sum(log_noisy_stretched(piece, a, noise_share).sum() for piece in pieces) / len(normal))
 
 
 class _Likelihood:
     """The likelihood of binned data as a smooth function of a and of the scale."""
 
-    def __init__(self, log_x: Floats) -> None:
+    def __init__(self, log_x: Floats, noise_share: float) -> None:
         """Tabulate it for the bins' ln|x|, (K,)."""
         self.nodes = np.linspace(NARROWEST_S, WIDEST_S, NODES)
-        self.table = log_stretched_exponential(np.exp(log_x)[:, None], self.nodes)
+        self.table = log_noisy_stretched(np.exp(log_x)[:, None], self.nodes, noise_share)
         # d/d ln|x|: a resampled ensemble has another standard deviation, by which its values are to be divided
         step = 1e-3
-        up, down = (log_stretched_exponential(np.exp(log_x + s)[:, None], self.nodes) for s in (step, -step))
+        up, down = (log_noisy_stretched(np.exp(log_x + s)[:, None], self.nodes, noise_share) for s in (step, -step))
         self.slope = (up - down) / (2 * step)
 
     def fit(self, totals: Floats) -> Floats:
@@ -168,7 +204,7 @@ def density(
     reach: float = 10.0,
     settings: BootstrapSettings | None = None,
 ) -> Density:
-    """Return the PDF of a component, its error bars, and the fit.
+    """Return the PDF of a component as measured, its error bars, and the fit to what lies beneath the noise.
 
     Args:
         ensemble: the samples.
@@ -179,7 +215,10 @@ def density(
         settings: of the bootstrap.
     """
     x = ensemble.values[quantity][:, component]
-    return density_of(x, ensemble.segment, ensemble.segments, bins=bins, reach=reach, settings=settings)
+    share = noise_let_through(ensemble, quantity, component)
+    return density_of(
+        x, ensemble.segment, ensemble.segments, bins=bins, reach=reach, settings=settings, noise_share=share
+    )
 
 
 def density_of(
@@ -190,6 +229,7 @@ def density_of(
     bins: int = 61,
     reach: float = 10.0,
     settings: BootstrapSettings | None = None,
+    noise_share: float = 0.0,
 ) -> Density:
     """Return the PDF of numbers (M,) in rows of segments, as `density` does."""
     normal = (x - x.mean()) / x.std()
@@ -200,4 +240,6 @@ def density_of(
     sums = np.concatenate([flat, np.bincount(segment, minlength=segments)[:, None]], axis=1).astype(np.float64)
     width = edges[1] - edges[0]
     pdf = bootstrap(sums, lambda totals: totals[..., :-1] / (totals[..., -1:] * width), settings)
-    return Density(edges=edges, pdf=pdf, counts=flat.sum(0), fit=fit_stretched(x, segment, segments, settings))
+    return Density(
+        edges=edges, pdf=pdf, counts=flat.sum(0), fit=fit_stretched(x, segment, segments, settings, noise_share)
+    )

@@ -18,6 +18,9 @@ Floats = NDArray[np.float64]
 COMPONENTS = ("x", "y", "z", "norm")
 STATISTICS = ("mean", "rms", "skewness", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
 POSITIVE = np.array([False, True, False, True, True, True, True])
+LET_THROUGH = (
+    0.65  # of the variance of a smoother's error: scripts/ensemble_coverage.py measures it for alpha and omega
+)
 WARN_SHARE = 0.1  # of a variance; more noise than that is worth a warning
 
 
@@ -110,8 +113,9 @@ def without_noise(
     """Return variance and fourth moment of the motion itself from those of what was measured.
 
     Noise that a kernel let through is independent of the motion and normal, with a variance of its own in every frame:
-    it is taken off (sign 1). A smoother's estimate lacks what it could not follow: its variance is put back (sign -1),
-    and the flatness left as it is, since what was lost of bursts is as intermittent as they are and no normal noise.
+    it is taken off (sign 1). A smoother's estimate lacks what it could not follow: its variance is put back (sign -1).
+    Of its error the greater part is noise that it let through all the same (LET_THROUGH); what it lost is taken to be
+    as intermittent as what it followed, so that the flatness is that of the estimate without this noise.
 
     Args:
         var: (...), variance that was measured.
@@ -124,9 +128,31 @@ def without_noise(
     Returns:
         Variance and fourth moment, (...) each.
     """
-    if sign > 0:  # <x'^2 s^2> = <x^2 s^2> - <s^4>
-        return var - s2, fourth - 6 * (mixed - s4) - 3 * s4
-    return var + s2, fourth * (1 + s2 / var) ** 2
+    part = 1.0 if sign > 0 else LET_THROUGH
+    clean_var = var - part * s2
+    # <x'^2 s^2> = <x^2 s^2> - <s^4>
+    clean_fourth = fourth - 6 * (part * mixed - part**2 * s4) - 3 * part**2 * s4
+    if sign > 0:
+        return clean_var, clean_fourth
+    return var + s2, clean_fourth * ((var + s2) / clean_var) ** 2
+
+
+def noise_let_through(ensemble: Ensemble, quantity: str, component: int) -> float:
+    """Return what share of a component's measured variance is noise that a kernel or the smoother let through.
+
+    Args:
+        ensemble: the samples.
+        quantity: a name in UNITS.
+        component: 0, 1, 2.
+
+    Returns:
+        0 .. 0.9; 0 where the errors are not known.
+    """
+    var = float(ensemble.values[quantity][:, component].var())
+    noise = float(np.square(ensemble.sigmas[quantity][:, component]).mean())
+    if not (np.isfinite(noise) and var > 0):
+        return 0.0
+    return min((1.0 if ensemble.error == "added" else LET_THROUGH) * noise / var, 0.9)
 
 
 def _in_units(found: Interval, k: int, name: str, centre: Floats, scale: Floats) -> Interval:

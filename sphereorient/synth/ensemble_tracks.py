@@ -37,7 +37,12 @@ def exact_track(true: TrueTracks) -> Trajectory:
 
 
 def smoothed_track(
-    true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, known: ProcessNoise | None = None
+    true: TrueTracks,
+    noise_deg: float,
+    noise_mm: float,
+    seed: int,
+    known: ProcessNoise | None = None,
+    silent: bool = False,
 ) -> tuple[Trajectory, ProcessNoise]:
     """Measure an ensemble with white noise and smooth it with `motion.smooth_motion`.
 
@@ -47,11 +52,14 @@ def smoothed_track(
         noise_mm: of each coordinate of the position.
         seed: of the noise.
         known: what an earlier ensemble taught the smoother; None learns from this one.
+        silent: measure without noise, and smooth as if there were noise: what smoothing alone does.
 
     Returns:
         The track as the precise method writes it, and what the smoother learnt; 0.4 ms a frame.
     """
     track = _noisy(true, noise_deg, noise_mm, seed, "precise")
+    if silent:
+        track = replace(track, position=true.position_mm, orientation=true.R_lab_body)
     found = smooth_motion(
         torch.from_numpy(track.time),
         torch.from_numpy(track.position),

@@ -10,6 +10,7 @@ from sphereorient.statistics.density import (
     density,
     fit_stretched,
     flatness_of,
+    log_noisy_stretched,
     log_stretched_exponential,
     stretched_exponential,
 )
@@ -92,3 +93,25 @@ def test_a_density_is_that_of_the_law_within_its_error_bars():
     off = (found.pdf.value - law)[near] / found.pdf.error[near]
     assert np.abs(off).mean() < 1.3
     assert found.counts.sum() <= 200_000
+
+
+def test_a_noisy_density_is_the_convolution():
+    a, share = 0.7, 0.05
+    x = np.linspace(-12, 12, 6001)
+    step = x[1] - x[0]
+    clean, noise = np.sqrt(1 - share), np.sqrt(share)
+    kernel = np.exp(-((x / noise) ** 2) / 2) / (noise * np.sqrt(2 * np.pi))
+    expected = np.convolve(stretched_exponential(x / clean, a) / clean, kernel, mode="same") * step
+    found = np.exp(log_noisy_stretched(x, a, share))
+    inner = np.abs(x) < 8
+    np.testing.assert_allclose(found[inner], expected[inner], rtol=2e-3)
+
+
+def test_the_fit_sees_through_noise_that_it_is_told_of():
+    rng = np.random.default_rng(11)
+    x = planted(0.7, 200_000, 11)
+    noisy = x + np.sqrt(0.05) * x.std() * rng.standard_normal(len(x))
+    segment = np.arange(200_000) // 1000
+    told, untold = (fit_stretched(noisy, segment, 200, FEW, share) for share in (0.05 / 1.05, 0.0))
+    assert float(told.a.value) == pytest.approx(0.7, abs=0.01)
+    assert float(untold.a.value) < 0.68

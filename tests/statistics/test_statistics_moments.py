@@ -8,7 +8,7 @@ from scipy import stats
 from statistics_examples import ensemble
 
 from sphereorient.statistics.bootstrap import bootstrap, per_segment
-from sphereorient.statistics.moments import moments, table_of_moments
+from sphereorient.statistics.moments import LET_THROUGH, moments, table_of_moments
 from sphereorient.statistics.noise import noise_warnings
 from sphereorient.statistics.settings import BootstrapSettings
 
@@ -106,6 +106,17 @@ def test_what_a_smoother_removed_is_put_back():
     np.testing.assert_allclose(found.corrected_rms.value[:3], 1.0, rtol=0.01)
     np.testing.assert_allclose(found.corrected_flatness.value[:3], 3.0, rtol=0.02)
     np.testing.assert_allclose(found.noise_share.value[:3], 0.2, rtol=0.02)
+
+
+def test_noise_that_a_smoother_let_through_does_not_flatten_heavy_tails():
+    # what LET_THROUGH says of the error is noise: a shrunk motion plus noise of that variance
+    rng = np.random.default_rng(9)
+    motion = rng.laplace(0, np.sqrt(0.5), (400_000, 3))
+    sigma = 0.3
+    estimate = 0.97 * motion + np.sqrt(LET_THROUGH) * sigma * rng.standard_normal(motion.shape)
+    found = moments(ensemble([4000] * 100, error="removed", velocity=estimate, sigma=sigma), "velocity", FEW)
+    assert found.flatness.value[:3].max() < 5.75
+    np.testing.assert_allclose(found.corrected_flatness.value[:3], 6.0, rtol=0.03)
 
 
 @pytest.mark.parametrize(("share", "warned"), [(0.08, False), (0.13, True)])
