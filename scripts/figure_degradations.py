@@ -47,7 +47,8 @@ operations on batches (`sphereorient/synth/degrade.py`), changes of the scene an
 experiment with exact truth and any number of them at once; `synth.degrade` applies those of pictures to a batch.
 Level 1 is a good lab on a bad day, level 5 is where failure is expected. They are applied in the order of the table,
 which is that of the light: scene, paint, light, what is behind and before the ball, liquid, lens, sensor, memory; last
-comes what the method is told. "Default" means the scene of `sphereorient synth` ([parameters](parameters.md)). Made by `scripts/figure_degradations.py`, table and figure alike.
+comes what the method is told. "Default" means the scene of `sphereorient synth` ([parameters](parameters.md)).
+Table and figure are made by `scripts/figure_degradations.py`.
 
 ![each degradation without, and at levels 1, 3 and 5](degradations.png)
 

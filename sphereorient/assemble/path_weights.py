@@ -29,7 +29,9 @@ class Weights:
     noise: float = 1.0  # the orientations' sigmas are this many times what they claim
     tail: float = 4.0  # degrees of freedom of Student's t
     outlier_probability: float = 0.01  # that an orientation does not follow from the motion
-    missing_probability: float = 0.01  # that no candidate of a frame is right
+    missing_probability: float = 0.01  # that no candidate of a frame is right although one was in the frame before
+    missing_again_probability: float = 0.5  # that none is after a frame in which none was
+    doubt_probability: float = 0.01  # that the pictures say nothing on which of a frame's candidates is right
     stuck_probability: float = 0.3  # that a false candidate stands where one stood before
     temperature: float = 1.0  # of all costs
 
@@ -72,7 +74,7 @@ class PathWeights(nn.Module):
 
     def value(self, name: str) -> Tensor:
         """Return one number as it stands in `Weights`, 0-dimensional, differentiable."""
-        raw: Tensor = self.get_parameter(name)
+        raw: Tensor = getattr(self, name)
         return torch.sigmoid(raw) if name.endswith("probability") else raw.exp()
 
     def weights(self) -> Weights:
@@ -84,29 +86,42 @@ class PathWeights(nn.Module):
 
         Frames without any candidate are skipped: the motion is carried over them.
         """
-        triple, node, mask = self._costs(frames)
-        return soft_path_of_pairs(triple, mask, node_cost=node)
+        triple, pair, node, mask = self._costs(frames)
+        return soft_path_of_pairs(triple, mask, pair_cost=pair, node_cost=node)
 
     def shortest_path(self, frames: Frames) -> ShortestPath:
         """Return the most probable history; choice C: no candidate of the frame is right."""
-        triple, node, mask = self._costs(frames)
-        return shortest_path_of_pairs(triple, mask, node_cost=node)
+        triple, pair, node, mask = self._costs(frames)
+        return shortest_path_of_pairs(triple, mask, pair_cost=pair, node_cost=node)
 
-    def _costs(self, frames: Frames) -> tuple[Tensor, Tensor, Tensor]:
-        """Costs of triples and candidates, over the temperature, and mask; place C, none, stands in visited frames."""
-        pictures = torch.where(frames.mask, -self._as("quality", frames.nll) * frames.nll, -torch.inf)
-        missing = self._as("missing_probability", frames.nll)
+    def _costs(self, frames: Frames) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Costs of triples, pairs and candidates, over the temperature, and mask; place C, none, in visited frames."""
         visited = frames.mask.any(-1, keepdim=True)
-        # A frame without candidates has no share: the zeros in it keep the gradient clear of inf - inf.
-        share = torch.log_softmax(torch.where(visited, pictures, 0.0), -1)
-        node = -torch.cat([share + torch.log1p(-missing), missing.log().expand_as(share[..., :1])], -1)
         mask = torch.cat([frames.mask, visited], -1)
-        temperature = self._as("temperature", frames.nll)
         eye = torch.eye(3, dtype=frames.R_lab_body.dtype, device=mask.device)
         R = torch.cat([frames.R_lab_body, eye.expand_as(frames.R_lab_body[..., :1, :, :])], -3)
         variance = torch.cat([frames.variance_rad2, torch.full_like(frames.nll[..., :1], LOST_RAD2)], -1)
-        triple = self.triple_costs(R, variance, frames.time_s, mask)
-        return triple / temperature, torch.where(mask, node, 0.0) / temperature, mask
+        triple, temperature = self.triple_costs(R, variance, frames.time_s, mask), self._as("temperature", frames.nll)
+        pair, node = self._again(mask, frames.nll), self._pictures(frames)
+        return triple / temperature, pair / temperature, node / temperature, mask
+
+    def _pictures(self, frames: Frames) -> Tensor:
+        """What each candidate, and none, costs by the pictures alone, (..., N, C + 1)."""
+        visited, missing = frames.mask.any(-1, keepdim=True), self._as("missing_probability", frames.nll)
+        claimed = torch.where(frames.mask, -self._as("quality", frames.nll) * frames.nll, -torch.inf)
+        # A frame without candidates has no share: the zeros in it keep the gradient clear of inf - inf.
+        share = torch.log_softmax(torch.where(visited, claimed, 0.0), -1)
+        doubt, count = self._as("doubt_probability", frames.nll), frames.mask.sum(-1, keepdim=True).clamp_min(1)
+        share = torch.logaddexp(share + torch.log1p(-doubt), doubt.log() - count.to(share).log())
+        right = torch.where(frames.mask, share, 0.0) + torch.log1p(-missing)
+        return -torch.cat([right, missing.log().expand_as(share[..., :1])], -1)
+
+    def _again(self, mask: Tensor, like: Tensor) -> Tensor:
+        """What it costs more, or less, to miss or to hit after a miss, (..., N - 1, C + 1, C + 1)."""
+        fresh, again = self._as("missing_probability", like), self._as("missing_again_probability", like)
+        none = torch.arange(mask.shape[-1], device=mask.device) == mask.shape[-1] - 1
+        after = torch.where(none, fresh.log() - again.log(), torch.log1p(-fresh) - torch.log1p(-again))
+        return torch.where(none[:, None], after, 0.0).expand(*mask[..., 1:, 0].shape, *[mask.shape[-1]] * 2)
 
     def triple_costs(self, R_lab_body: Tensor, variance_rad2: Tensor, time_s: Tensor, mask: Tensor) -> Tensor:
         """Return what it costs that three candidates in a row are right: how badly the third follows from the two.
@@ -129,7 +144,7 @@ class PathWeights(nn.Module):
         steps = mask.shape[-2]
         still = self._still(links, R_lab_body, variance_rad2)
         width = max(mask.shape[-1], 1)
-        chunk = max(1, TRIPLES_AT_ONCE // (width**3 * max(mask[..., 0, 0].numel(), 1)))
+        chunk = max(1, TRIPLES_AT_ONCE // (width**3 * max(math.prod(mask.shape[:-2]), 1)))
         parts = [
             self._chunk(links, variance_rad2, still, slice(at, min(at + chunk, steps)))
             for at in range(2, steps, chunk)

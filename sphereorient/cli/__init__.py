@@ -1,11 +1,12 @@
 """The command line: parse, call, print. Heavy packages are imported inside the commands, so that help is quick."""
 
-from sphereorient.cli import about, calibrate, check, export, movie, overlay, report, synth, track, view
+from sphereorient.cli import about, bench, calibrate, check, export, movie, overlay, report, synth, track, view
 from sphereorient.cli.app import app, main
 
 __all__ = [
     "about",
     "app",
+    "bench",
     "calibrate",
     "check",
     "export",

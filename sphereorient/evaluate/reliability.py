@@ -48,7 +48,9 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
     said, came = said[known], came[known]
     if bins < 1 or np.any((said < 0) | (said > 1 + 1e-9)):
         got = f"{bins} bins, probabilities to {said.max(initial=0.0):g}"
-        raise ShapeError(refusal("reliability", expected="a bin or more, probabilities in 0 .. 1", got=got, do="mend it"))
+        raise ShapeError(
+            refusal("reliability", expected="a bin or more, probabilities in 0 .. 1", got=got, do="mend it")
+        )
     order = np.argsort(said, kind="stable")
     said, came = said[order], came[order]
     edges = _edges(said, bins)

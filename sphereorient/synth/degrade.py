@@ -116,15 +116,15 @@ def uneven_light(pictures: Tensor, ratio: float, disk: Disk, rng: torch.Generato
 
 def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) -> Tensor:
     """Add lamps mirrored in the paint: Gaussian lobes whose peaks are `peak` grey levels above the paint."""
-    draw = _uniform(pictures, rng, LOBES, 2)
+    draw = _uniform(pictures, rng, 1 + LOBES)[..., None, None]
     radius = disk.radius(pictures)
     right, down = disk.offset(pictures)
     light = torch.zeros_like(pictures)
     for lobe in range(LOBES):
-        # Half a turn each, so that two lobes do not fall on each other; a lamp beside the camera is mirrored near
+        # Spread around the middle, so that they do not fall on each other; a lamp beside the camera is mirrored near
         # the middle, one at right angles to it at 0.7 radii.
-        angle = math.pi * (lobe + draw[..., lobe, 0, None, None])
-        away = (0.2 + 0.5 * draw[..., lobe, 1, None, None]) * radius
+        angle = 2 * math.pi * (draw[..., 0, :, :] + lobe / LOBES)
+        away = (0.2 + 0.5 * draw[..., 1 + lobe, :, :]) * radius
         square = (right - away * angle.cos()).square() + (down - away * angle.sin()).square()
         light = light + torch.exp(-0.5 * square / (LOBE_RADII * radius).square())
     return pictures + peak * disk.covered(pictures) * light

@@ -1,0 +1,127 @@
+"""The picture and the table of the robustness benchmark."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sphereorient.evaluate.robustness.results import Line, Results, lines_of
+from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
+from sphereorient.outputs import put_aside
+from sphereorient.report.plots.style import new_figure
+from sphereorient.synth.severities import DEGRADATIONS
+
+COLUMNS = 5
+PANEL = 2.6, 2.5  # inches
+LOOKS = (("#0072B2", "-", "o"), ("#D55E00", "--", "s"), ("#009E73", "-.", "^"), ("#CC79A7", ":", "v"))
+LEAST_DEG, MOST_DEG = 3e-3, 180.0
+
+
+def robustness_figure(results: Results) -> Figure:
+    """Draw error and lost frames of each method against severity, a panel for each degradation, worst first.
+
+    Above: median (thick) and 95th percentile (thin) of the orientation's error. Below: share of the frames that are
+    wrong by more than 10 degrees or without an orientation, after assembly. Worst is where the first method has most
+    such frames, and then the largest error.
+
+    Args:
+        results: of `run_benchmark`.
+    """
+    lines = list(lines_of(results))
+    kinds = worst_first(lines, results.methods)
+    rows = math.ceil(len(kinds) / COLUMNS)
+    figure = new_figure(COLUMNS * PANEL[0], rows * PANEL[1] + 0.6)
+    parts = np.ravel(figure.subfigures(rows, COLUMNS, squeeze=False))
+    for place, (part, kind) in enumerate(zip(parts, kinds, strict=False)):
+        _panel(part, kind, [line for line in lines if line.kind == kind], results.methods, place % COLUMNS == 0)
+    handles, names = parts[0].axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=len(names), fontsize=9, frameon=False)
+    return figure
+
+
+def worst_first(lines: Sequence[Line], methods: Sequence[str]) -> list[str]:
+    """Return the kinds of scenes, without the clean ones, those first that are hardest for the first method."""
+
+    def hardness(kind: str) -> tuple[float, float]:
+        own = [line for line in lines if line.kind == kind and line.method == methods[0]]
+        bad = max((line.wrong_after + line.lost for line in own), default=0.0)
+        error = max((line.p95_deg for line in own if math.isfinite(line.p95_deg)), default=MOST_DEG)
+        return -bad, -error
+
+    return sorted(dict.fromkeys(line.kind for line in lines if line.kind != CLEAN), key=hardness)
+
+
+def _panel(part: Any, kind: str, lines: Sequence[Line], methods: Sequence[str], first: bool) -> None:
+    above, below = part.subplots(2, 1, sharex=True, height_ratios=(2.2, 1), gridspec_kw={"hspace": 0.08})
+    levels = sorted({line.level for line in lines})
+    for k, method in enumerate(methods):
+        colour, style, marker = LOOKS[k % len(LOOKS)]
+        own = sorted((line for line in lines if line.method == method), key=lambda line: line.level)
+        x = [line.level for line in own]
+        above.plot(
+            x, [line.p50_deg for line in own], style, color=colour, marker=marker, ms=4, label=f"{method}, median"
+        )
+        above.plot(x, [line.p95_deg for line in own], style, color=colour, lw=0.8, alpha=0.8, label=f"{method}, 95 %")
+        share = [100 * (line.wrong_after + line.lost) for line in own]
+        below.plot(x, share, style, color=colour, marker=marker, ms=4, clip_on=False)
+    above.set(yscale="log", ylim=(LEAST_DEG, MOST_DEG), yticks=[0.01, 0.1, 1, 10, 100])
+    above.set_yticklabels(["0.01", "0.1", "1", "10", "100"])
+    below.set(ylim=(0, 100), yticks=[0, 50, 100], xticks=levels)
+    below.set_xticklabels(_values(kind, levels), fontsize=7)
+    below.set_xlabel(_unit(kind), fontsize=8)
+    above.set_title(kind.replace("_", " "), fontsize=9, pad=3)
+    if first:
+        above.set_ylabel("error (degrees)", fontsize=8)
+        below.set_ylabel("wrong or\nlost (%)", fontsize=8)
+    for axes in (above, below):
+        axes.tick_params(labelsize=7)
+        axes.grid(alpha=0.3)
+
+
+def _values(kind: str, levels: Sequence[int]) -> list[str]:
+    if kind == TOGETHER:
+        return [str(level) for level in levels]
+    return [f"{DEGRADATIONS[kind].values[level - 1]:g}" for level in levels]
+
+
+def _unit(kind: str) -> str:
+    return "severity of each" if kind == TOGETHER else DEGRADATIONS[kind].unit
+
+
+def write_table(results: Results, path: Path) -> None:
+    """Write the rows of the table as CSV, aside first."""
+    rows = []
+    for line in lines_of(results):
+        row = asdict(line)
+        recall = row.pop("recall")
+        rows.append(row | {f"recall_{first}": share for first, share in recall.items()})
+    with put_aside(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def markdown(results: Results) -> str:
+    """Return the table as a page of the docs has it: by degradation and level, each method's error and bad frames."""
+    methods = results.methods
+    lines = {(line.kind, line.level, line.method): line for line in lines_of(results)}
+    head = ["", "value", *(f"{m}: median, 95 % (degrees); wrong, lost (%)" for m in methods)]
+    text = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    for kind, level in dict.fromkeys((line.kind, line.level) for line in lines.values()):
+        value = "" if kind == CLEAN else f"{_values(kind, [level])[0]} {_unit(kind)}"
+        cells = [_cell(lines[kind, level, method]) for method in methods if (kind, level, method) in lines]
+        text.append(f"| {kind.replace('_', ' ')} | {value} | {' | '.join(cells)} |")
+    return "\n".join(text) + "\n"
+
+
+def _cell(line: Line) -> str:
+    if not math.isfinite(line.p50_deg):
+        return "refused" if line.refused else "nothing"
+    return f"{line.p50_deg:.3g}, {line.p95_deg:.3g}; {100 * line.wrong_after:.0f}, {100 * line.lost:.0f}"
