@@ -84,7 +84,9 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     for name, spent in rows(arguments.frames, arguments.candidates).items():
         costs, shortest, soft, gradient = spent
-        print(f"| {name} | {costs:.2f} | {shortest:.2f} | {soft:.2f} | {costs + shortest + soft:.2f} | {gradient:.2f} |")
+        print(
+            f"| {name} | {costs:.2f} | {shortest:.2f} | {soft:.2f} | {costs + shortest + soft:.2f} | {gradient:.2f} |"
+        )
 
 
 if __name__ == "__main__":

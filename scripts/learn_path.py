@@ -4,8 +4,8 @@
 
 No pictures: true orientations with noise among false candidates, with likelihoods that overlap. The likelihoods claim
 three times the nats that they are worth and the orientations' sigmas are claimed 1.7 times too small, as fits to
-pictures do that leave out what neighbouring pixels share; with --honest both are worth what they claim. Learning: gradient through the soft path of the mean negative
-log probability of what is true, over whole movies. Prints Markdown.
+pictures do that leave out what neighbouring pixels share; with --honest both are worth what they claim. Learning:
+gradient through the soft path of the mean negative log probability of what is true, over whole movies. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -186,7 +186,9 @@ def compared(after: Answer, before: Answer, known: Labelled) -> str:
     parts = []
     for what, x, scale, unit in (("wrong frames", change, 100, " %"), ("negative log-likelihood", nats, 1, " nats")):
         mean, scatter = scale * np.mean(x), scale * np.std(x, ddof=1) / math.sqrt(len(x))
-        parts.append(f"{what} {mean:.3f} ± {scatter:.3f}{unit} less ({np.sum(x > 0)} movies better, {np.sum(x < 0)} worse)")
+        parts.append(
+            f"{what} {mean:.3f} ± {scatter:.3f}{unit} less ({np.sum(x > 0)} movies better, {np.sum(x < 0)} worse)"
+        )
     return "; ".join(parts)
 
 
@@ -207,7 +209,7 @@ def main() -> None:
     for entry in fields(Weights):
         print(f"| {entry.name} | {getattr(HAND_SET, entry.name):.4g} | {getattr(learnt, entry.name):.4g} |")
     print(f"\n{2 * count} other movies:\n")
-    print("| path | wrong frames, % | of these a false candidate, % | true one there and not taken, % | nats | ECE (chance) |")
+    print("| path | wrong frames, % | false one taken, % | true one there and not taken, % | nats | ECE (chance) |")
     print("|---|---|---|---|---|---|")
     quiet = replace(HAND_SET, acceleration_rad_s2=learnt.acceleration_rad_s2)
     said = {name: answer(w, other) for name, w in (("hand-set", HAND_SET), ("hand-set, acceleration learnt", quiet))}

@@ -10,8 +10,8 @@ import pytest
 from conftest import REPO
 
 ROOMS = (
-    "errors outputs hdf5_out so3 cameras movies sphere experiment timeline trajectory locate orient assemble motion "
-    "synth statistics learn paint settings provenance results reel recording learnt paper precise pipeline calibrate "
+    "errors outputs hdf5_out so3 cameras movies sphere experiment timeline trajectory locate orient assemble "
+    "differentiable motion synth statistics learn paint settings provenance results reel recording learnt paper precise pipeline calibrate "
     "preflight jobs evaluate report cli"
 )
 ORDER = ROOMS.split(" ")

@@ -146,8 +146,7 @@ class PathWeights(nn.Module):
         width = max(mask.shape[-1], 1)
         chunk = max(1, TRIPLES_AT_ONCE // (width**3 * max(math.prod(mask.shape[:-2]), 1)))
         parts = [
-            self._chunk(links, variance_rad2, still, slice(at, min(at + chunk, steps)))
-            for at in range(2, steps, chunk)
+            self._chunk(links, variance_rad2, still, slice(at, min(at + chunk, steps))) for at in range(2, steps, chunk)
         ]
         none = R_lab_body.new_zeros((*mask.shape[:-2], 0, *[mask.shape[-1]] * 3))
         return torch.cat(parts, -4) if parts else none
@@ -212,7 +211,7 @@ def _links(R_lab_body: Tensor, time_s: Tensor, mask: Tensor) -> _Links:
     # One product of (3C, 3) and (3, 3C) a step, not C^2 small ones: those take ten times as long.
     width = mask.shape[-1]
     after, first = R_lab_body.flatten(-3, -2), rows.flatten(-3, -2)
-    every = (after @ first.mT).unflatten(-1, (width, 3)).unflatten(-3, (width, 3))  # (..., to, 3, from, 3)
+    every = (after @ first.mT).reshape(*mask.shape[:-1], width, 3, width, 3)  # (..., to, 3, from, 3)
     turn = every.permute(*range(mask.ndim - 1), -2, -4, -3, -1)
     return _Links(turn=turn, dt_s=torch.where(dt > 0, dt, 1.0).to(R_lab_body), before=before)
 

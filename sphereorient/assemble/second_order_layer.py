@@ -122,7 +122,7 @@ def _second_order(
 
 
 def _walk_back(last: Tensor, origins: Tensor) -> Tensor:
-    """Follow the origins (..., M - 1, C, C) from the cheapest last pair: (..., M + 1), the place before the first too."""
+    """Follow the origins (..., M - 1, C, C) from the cheapest last pair: (..., M + 1), with the place before."""
     width = last.shape[-1]
     end = last.mT.flatten(-2).argmin(-1, keepdim=True)  # of equals the lowest last place, then the lowest before
     here, before = end // width, end % width

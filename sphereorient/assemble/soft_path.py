@@ -26,9 +26,7 @@ class SoftPath:
     pair_marginals: Tensor  # (..., N - 1, C, C), of edge k into step k + 1, from the step visited last; 0 into others
 
 
-def soft_path(
-    edge_cost: Tensor, mask: Tensor, temperature: float = 1.0, node_cost: Tensor | None = None
-) -> SoftPath:
+def soft_path(edge_cost: Tensor, mask: Tensor, temperature: float = 1.0, node_cost: Tensor | None = None) -> SoftPath:
     """Weigh all paths that visit one candidate in each step; towards temperature 0 only `shortest_path`'s counts.
 
     Args:
@@ -71,7 +69,9 @@ def nothing(edge_cost: Tensor, mask: Tensor) -> SoftPath:
     *batch, steps, width = mask.shape
     pairs = edge_cost.new_zeros((*batch, max(steps - 1, 0), width, width))
     return SoftPath(
-        free_energy=edge_cost.flatten(len(batch)).sum(-1), marginals=edge_cost.new_zeros(mask.shape), pair_marginals=pairs
+        free_energy=edge_cost.flatten(len(batch)).sum(-1),
+        marginals=edge_cost.new_zeros(mask.shape),
+        pair_marginals=pairs,
     )
 
 

@@ -29,7 +29,7 @@ def all_paths(start: Tensor, edges: Tensor, order: int, temperature: float) -> t
 
     Source: Baum and others 1970; Mensch and Blondel 2018, Differentiable dynamic programming, algorithms 1 and 2.
     """
-    free, first, links = _AllPaths.apply(start, edges, order, temperature)
+    free, first, links = _AllPaths.apply(start, edges, order, temperature)  # type: ignore[no-untyped-call]
     return free, first, links
 
 
@@ -63,7 +63,8 @@ class _AllPaths(Function):
             to_start, to_edges = row * first, row[..., None, None] * links
         if of_first is not None or of_links is not None:
             # The edges go in as they are, so that a further derivative ends in a refusal and not in a silent 0.
-            bend = _Curvature.apply(of_first, of_links, edges, totals, ctx.order, ctx.temperature)
+            along = of_first, of_links, edges, totals, ctx.order, ctx.temperature
+            bend = _Curvature.apply(*along)  # type: ignore[no-untyped-call]
             to_start = bend[0] if to_start is None else to_start + bend[0]
             to_edges = bend[1] if to_edges is None else to_edges + bend[1]
         return to_start, to_edges, None, None
@@ -118,7 +119,7 @@ def _shares(totals: Tensor, edges: Tensor, order: int, temperature: float) -> tu
 
 
 def _backward(shares: Tensor, end: Tensor, added: Tensor | None, order: int) -> Tensor:
-    """Probabilities of all states (..., M, *state) from those of the last; `added` (..., M - 1, *state) comes on top."""
+    """Probabilities of all states (..., M, *state) from those of the last, `added` (..., M - 1, *state) on top."""
     weight, weights = end, [end]
     more = added.unbind(-order - 1) if added is not None else ()
     for k, share in reversed(list(enumerate(shares.unbind(-order - 2)))):
@@ -128,9 +129,7 @@ def _backward(shares: Tensor, end: Tensor, added: Tensor | None, order: int) -> 
     return torch.stack(weights[::-1], dim=-order - 1)
 
 
-def _forward(
-    shares: Tensor, to_first: Tensor | None, to_links: Tensor | None, totals: Tensor, order: int
-) -> Tensor:
+def _forward(shares: Tensor, to_first: Tensor | None, to_links: Tensor | None, totals: Tensor, order: int) -> Tensor:
     """Change of all totals (..., M, *state) along a direction in the first totals and the edges."""
     axis = -order - 1
     change = to_first if to_first is not None else torch.zeros_like(totals.select(axis, 0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import itertools
 import math
 from dataclasses import fields, replace
@@ -9,7 +10,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 from assemble_examples import RATE_HZ, times, turning
-from conftest import assert_close
+from conftest import REPO, assert_close
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_t
 from torch import Tensor
@@ -59,7 +60,9 @@ def slow_still(R: list[Rotation], after: Rotation, variance: list[float], here: 
     for before, error in zip(R, variance, strict=True):
         chord = 2 * math.sin((after * before.inv()).magnitude() / 2)
         spread = (w.acceleration_rad_s2 * dt**2) ** 2 + 3 * w.noise**2 * (error + here)
-        ratios.append(8 * math.pi**2 * multivariate_t.pdf([chord, 0, 0], shape=spread * torch.eye(3).numpy(), df=w.tail))
+        ratios.append(
+            8 * math.pi**2 * multivariate_t.pdf([chord, 0, 0], shape=spread * torch.eye(3).numpy(), df=w.tail)
+        )
     return max(ratios)
 
 
@@ -70,7 +73,7 @@ def test_costs_of_triples_agree_with_a_slow_loop_at_uneven_times_and_over_a_hole
     time = torch.tensor([0.0, 1.0, 2.5, 3.0, 4.0], dtype=torch.float64) / RATE_HZ
     mask = torch.ones(5, 2, dtype=torch.bool)
     mask[2] = False
-    got = PathWeights(w).triple_costs(R, variance, time, mask)
+    got = PathWeights(w).triple_costs(R, variance, time, mask).detach()
     turned = [[Rotation.from_matrix(each.numpy()) for each in frame] for frame in R]
     for a, b, c in ((0, 1, 3), (1, 3, 4)):
         for i, j, k in itertools.product(range(2), repeat=3):
@@ -146,7 +149,7 @@ def test_what_the_pictures_say_decides_between_twins(rng):
     strong, weak = PathWeights(replace(WEIGHTS, quality=1.0)), PathWeights(replace(WEIGHTS, quality=1e-3))
     assert strong.shortest_path(every).choice.tolist() == [1] * 30
     assert strong.soft_path(every).marginals[15, 1] > 0.99
-    assert abs(float(weak.soft_path(every).marginals[15, 1]) - 0.5) < 0.02
+    assert abs(float(weak.soft_path(every).marginals[15, 1].detach()) - 0.5) < 0.02
 
 
 def test_at_a_greater_temperature_less_is_sure(rng):
@@ -176,7 +179,8 @@ def test_a_batch_is_the_stack_of_its_movies(batch, rng):
 
 
 def test_gradients_of_all_weights_agree_with_differences(rng):
-    every = movie(turning(6, 4.0), so3.random_rotations(6, generator=rng))
+    nll = torch.rand(6, 2, generator=rng, dtype=torch.float64)
+    every = movie(turning(6, 4.0), so3.random_rotations(6, generator=rng), nll=nll)
     every.mask[3] = False
     model = PathWeights(WEIGHTS)
     names = [entry.name for entry in fields(Weights)]
@@ -236,3 +240,9 @@ def test_weights_come_back_as_they_went_in_and_impossible_ones_are_refused():
         replace(WEIGHTS, noise=-1.0)
     with pytest.raises(ShapeError, match=r"Frames\.nll: expected shape"):
         replace(movie(turning(4)), nll=torch.zeros(3, 1))
+
+
+def test_the_example_of_the_page_runs():
+    failed, tried = doctest.testfile(str(REPO / "docs" / "assembly.md"), module_relative=False)
+    assert tried >= 12
+    assert failed == 0

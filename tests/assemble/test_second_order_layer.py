@@ -121,9 +121,7 @@ def test_gradient_of_the_least_cost_is_one_on_what_the_path_pays():
     path.cost.sum().backward()
     taken = torch.nn.functional.one_hot(path.choice.clamp_min(0), 2) * (path.choice >= 0)[..., None]
     assert_close(inputs[2].grad, taken.double())
-    assert torch.autograd.gradcheck(
-        lambda *x: shortest_path_of_pairs(x[0], costs.mask, x[1], x[2]).cost, inputs
-    )
+    assert torch.autograd.gradcheck(lambda *x: shortest_path_of_pairs(x[0], costs.mask, x[1], x[2]).cost, inputs)
 
 
 @pytest.mark.parametrize("seed", SEEDS[:4])

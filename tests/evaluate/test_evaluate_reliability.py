@@ -92,7 +92,8 @@ def test_probabilities_that_are_nan_are_left_out_and_none_is_data():
 
 
 @pytest.mark.parametrize(
-    ("said", "came", "bins"), [([0.1], [True, False], 10), ([1.5], [True], 10), ([-0.1], [True], 10), ([0.1], [True], 0)]
+    ("said", "came", "bins"),
+    [([0.1], [True, False], 10), ([1.5], [True], 10), ([-0.1], [True], 10), ([0.1], [True], 0)],
 )
 def test_impossible_sets_are_refused(said, came, bins):
     with pytest.raises(ShapeError, match="expected"):
