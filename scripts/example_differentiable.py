@@ -48,6 +48,7 @@ TURN_DEG = (3.0, -2.0, 7.0)  # from frame to frame, lab
 EVERY_PX = 2  # every second pixel across and down is compared
 PLACE_MM = 0.05  # standard deviation of the place that both cameras together gave
 LOOKS = ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 1, 0], [0, 0, -1], [-1, 0, 0]])  # along lab +y, along lab -x
+UNIT_DEG = 2.0
 OWN = (0, 1, 0, 1)  # which camera each candidate of a frame is fitted to
 
 
@@ -66,17 +67,6 @@ class Movie:
     texture: Tensor  # (H, 2 H), true
     R_lab_body: Tensor  # (N, 3, 3), true
     position_lab_mm: Tensor  # (N, 3), true
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Recovery:
-    """What came out; one entry a step, the first before any."""
-
-    loss: list[float]  # half the mean squared residual, in units of the noise
-    angle_deg: list[float]  # error of the second camera's rotation
-    spot_rms: list[float]  # error of the texels of the spot, 1 is black for white
-    texture: Tensor  # (H, 2 H), at the end
-    track_deg: tuple[float, float]  # root mean square error of the track, before and after
 
 
 def film() -> Movie:
@@ -197,40 +187,68 @@ def starts(movie: Movie, sight: Rays, ball: PaintedBall) -> tuple[tuple[Tensor, 
     return (R, place.repeat_interleave(len(OWN), 0)), place
 
 
-def recover(steps: int = 80) -> Recovery:
-    """Go down the gradient."""
-    movie = film()
-    spot = (map_directions(MAP_HEIGHT) @ f64(SPOT_AT) / f64(SPOT_AT).norm()) > math.cos(math.radians(SPOT_DEG))
-    texture = torch.where(spot, 1.0 - movie.texture, movie.texture).requires_grad_()
-    turn_deg = f64(TOLD_WRONG_DEG).requires_grad_()  # of the second camera, on top of the truth: to become 0
-    optimiser = torch.optim.Adam([{"params": [texture], "lr": 0.03}, {"params": [turn_deg], "lr": 0.015}])
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, eta_min=1e-4)
-    start, place, iterations = None, None, 30
-    loss_of, angle_of, spot_of, track_of_step = [], [], [], []
-    for _ in range(steps + 1):
-        told = with_parameters(movie.cameras[1], ROTATION, torch.deg2rad(turn_deg))
-        sight, ball = sight_lines(movie, (movie.cameras[0], told)), ball_of(texture)
-        if start is None:
-            start, place = starts(movie, sight, ball)
-        fitted = fit_candidates(movie, sight, ball, start, place, iterations)
+def picture_loss(movie: Movie, sight: Rays, ball: PaintedBall, track: SoftTrack) -> Tensor:
+    """Half the mean squared residual of both cameras' pictures at the expected poses; lost frames left out."""
+    there = track.marginals.detach().sum(-1) > 0
+    seen = replace(movie, grey=movie.grey[there], noise=movie.noise[there])
+    r = misfit(seen, sight, ball, track.position_lab_mm[there], track.R_lab_body[there])
+    return 0.5 * r.square().mean()
+
+
+class Descent:
+    """What is known of the second camera and of the paint, and the loss of it; each call goes on from the last fit."""
+
+    def __init__(self, movie: Movie) -> None:
+        self.movie = movie
+        at = map_directions(MAP_HEIGHT) @ torch.nn.functional.normalize(f64(SPOT_AT), dim=0)
+        self.spot = at > math.cos(math.radians(SPOT_DEG))
+        self.texture = torch.where(self.spot, 1.0 - movie.texture, movie.texture).requires_grad_()
+        # Of the second camera, on top of the truth, so it must become 0; in units in which a step is like a texel's.
+        self.turn = (f64(TOLD_WRONG_DEG) / UNIT_DEG).requires_grad_()
+        self.start: tuple[Tensor, Tensor] | None = None
+        self.place = movie.position_lab_mm
+        self.seen: list[tuple[float, float, float, float]] = []  # loss, degrees, texels, degrees of the track
+
+    def loss(self) -> Tensor:
+        """Fit, weigh, compare."""
+        movie = self.movie
+        told = with_parameters(movie.cameras[1], ROTATION, torch.deg2rad(UNIT_DEG * self.turn))
+        sight, ball = sight_lines(movie, (movie.cameras[0], told)), ball_of(self.texture)
+        iterations = 8 if self.start else 30
+        if self.start is None:
+            self.start, self.place = starts(movie, sight, ball)
+        fitted = fit_candidates(movie, sight, ball, self.start, self.place, iterations)
+        self.start = fitted.R_lab_body.detach(), fitted.position_lab_mm.detach()
         track = track_of(movie, fitted)
-        loss = 0.5 * misfit(movie, sight, ball, track.position_lab_mm, track.R_lab_body).square().mean()
-        loss_of.append(float(loss.detach()))
-        angle_of.append(float(turn_deg.detach().norm()))
-        spot_of.append(float((texture - movie.texture)[spot].detach().square().mean().sqrt()))
-        wrong = so3.geodesic_distance(track.R_lab_body, movie.R_lab_body).detach()
-        track_of_step.append(math.degrees(float(wrong.square().mean().sqrt())))
-        optimiser.zero_grad()
-        print(loss, track.R_lab_body.isnan().any(), track.marginals.isnan().any())
-        loss.backward()
-        print(turn_deg.grad, texture.grad.isnan().sum())
-        optimiser.step()
-        schedule.step()
-        start, iterations = (fitted.R_lab_body.detach(), fitted.position_lab_mm.detach()), 3
-    return Recovery(
-        loss=loss_of,
-        angle_deg=angle_of,
-        spot_rms=spot_of,
-        texture=texture.detach(),
-        track_deg=(track_of_step[0], track_of_step[-1]),
+        loss = picture_loss(movie, sight, ball, track)
+        self._note(loss.detach(), track)
+        return loss
+
+    def _note(self, loss: Tensor, track: SoftTrack) -> None:
+        turn_deg = UNIT_DEG * self.turn.detach().norm()
+        texel = (self.texture.detach() - self.movie.texture)[self.spot].square().mean().sqrt()
+        wrong = torch.rad2deg(so3.geodesic_distance(track.R_lab_body.detach(), self.movie.R_lab_body))
+        rms = wrong[wrong.isfinite()].square().mean().sqrt()
+        self.seen.append((float(loss), float(turn_deg), float(texel), float(rms)))
+
+
+def recover(steps: int = 40) -> Descent:
+    """Go down the gradient: L-BFGS, which asks for nothing but losses and gradients."""
+    descent = Descent(film())
+    optimiser = torch.optim.LBFGS(
+        [descent.texture, descent.turn],
+        max_iter=steps,
+        max_eval=steps,
+        history_size=20,
+        tolerance_change=0.0,
+        line_search_fn="strong_wolfe",
     )
+
+    def closure() -> Tensor:
+        optimiser.zero_grad()
+        loss = descent.loss()
+        loss.backward()
+        return loss.detach()
+
+    optimiser.step(closure)
+    return descent

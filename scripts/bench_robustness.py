@@ -1,0 +1,100 @@
+"""Run the robustness benchmark and put its figures into the docs.
+
+    scripts/bench_robustness.py [--out out/robustness] [--full] [--jobs 2]
+
+The same as `sphereorient bench robustness`; besides, it writes docs/robustness.png, the table in docs/robustness.md and
+docs/robustness-baseline.json, with which later runs are compared, and prints where `precise` is not better than `paper`
+and how well the confidence is calibrated. Ten minutes on two cores; an unfinished run goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sphereorient.cli.app import progress_bar
+from sphereorient.evaluate.reliability import reliability
+from sphereorient.evaluate.robustness import BenchSettings, Outcome, Results, run_benchmark, save_results
+from sphereorient.evaluate.robustness.measure import WRONG_DEG
+from sphereorient.evaluate.robustness.results import Line, lines_of
+from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
+from sphereorient.evaluate.robustness.settings import FULL
+from sphereorient.report.plots.style import write_figure
+from sphereorient.report.robustness import markdown, robustness_figure, write_table
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+BEGIN, END = "<!-- table: scripts/bench_robustness.py -->", "<!-- end of the table -->"
+
+
+def main() -> None:
+    """Read the options, run, write, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=DOCS.parent / "out" / "robustness")
+    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--jobs", type=int, default=2)
+    options = parser.parse_args()
+    options.out.parent.mkdir(exist_ok=True)
+    settings = FULL if options.full else BenchSettings()
+    with progress_bar(unit="") as advance:
+        found = run_benchmark(options.out, settings, jobs=options.jobs, progress=lambda *at: advance("scenes", *at))
+    write_table(found, options.out / "results.csv")
+    figure = robustness_figure(found)
+    write_figure(figure, options.out / "robustness")
+    (DOCS / "robustness.png").write_bytes((options.out / "robustness.png").read_bytes())
+    save_results(found, DOCS / "robustness-baseline.json")
+    page = DOCS / "robustness.md"
+    text = page.read_text("utf-8")
+    head, tail = text.split(BEGIN)[0], text.split(END)[1]
+    page.write_text(f"{head}{BEGIN}\n{markdown(found)}{END}{tail}", "utf-8")
+    tell_methods(found)
+    tell_confidence([one for one in found.outcomes if one.method == "precise"])
+
+
+def tell_methods(found: Results) -> None:
+    """Print in how many degradations and levels `precise` is better than `paper`."""
+    lines = {(line.kind, line.level, line.method): line for line in lines_of(found) if line.kind != CLEAN}
+    places = [key[:2] for key in lines if key[2] == "precise"]
+    nearer, steadier = [], []
+    for place in places:
+        precise, paper = lines[(*place, "precise")], lines[(*place, "paper")]
+        nearer.append(is_nearer(precise, paper))
+        steadier.append(bad(precise) < bad(paper) or bad(precise) == 0)
+        if not (nearer[-1] and steadier[-1]):
+            print(
+                f"{place[0]} {place[1]}: precise {precise.p50_deg:.3g} degrees, {100 * bad(precise):.0f} % wrong or "
+                f"lost; paper {paper.p50_deg:.3g}, {100 * bad(paper):.0f} %; {precise.refused[:100]}"
+            )
+    print(f"precise has the smaller median error in {sum(nearer)} of {len(places)} places,")
+    print(f"and fewer frames wrong or lost, or none, in {sum(steadier)} of {len(places)}")
+
+
+def is_nearer(precise: Line, paper: Line) -> bool:
+    """Say whether the first has the smaller median error; where neither has any, nothing is better."""
+    return bool(precise.p50_deg < paper.p50_deg or (np.isfinite(precise.p50_deg) and np.isnan(paper.p50_deg)))
+
+
+def bad(line: Line) -> float:
+    """Return the share of frames that are wrong or lost."""
+    return line.wrong_after + line.lost
+
+
+def tell_confidence(outcomes: Sequence[Outcome]) -> None:
+    """Print how often orientations are right that claim to be so with a probability."""
+    for name, chosen in (("mixed scenes", [one for one in outcomes if one.kind == TOGETHER]), ("all", outcomes)):
+        pairs = [
+            (claimed, error <= WRONG_DEG)
+            for one in chosen
+            for claimed, error in zip(one.confidence, one.errors_deg.tolist(), strict=True)
+            if claimed is not None and np.isfinite(error)
+        ]
+        if pairs:
+            claimed, right = (np.array(x) for x in zip(*pairs, strict=True))
+            found = reliability(claimed.astype(float), right.astype(bool))
+            print(f"confidence, {name}: {len(pairs)} frames, expected calibration error {found.error:.4f}")
+
+
+if __name__ == "__main__":
+    main()
