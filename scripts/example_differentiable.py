@@ -1,12 +1,12 @@
 """Recover a camera's angle and a spot of wrong paint from a movie by gradient descent; draw docs/differentiable.png.
 
-    scripts/example_differentiable.py [--steps 80] [--out docs/differentiable.png]
+    scripts/example_differentiable.py [--steps 30] [--out docs/differentiable.png]
 
-Ten frames of two cameras are rendered by synth (bilinear paint, nine rays a pixel, optics, noise, 8 bits). The second
-camera is then told 0.3 degrees turned, and the map has black and white exchanged within 20 degrees of one point. Each
-step fits four candidates a frame (each camera by itself, from near and from 60 degrees away), weighs them by the soft
-path, compares both pictures with the expected pose, and goes down the gradient in the camera's rotation and in all
-texels of the map. docs/differentiable.md walks through it.
+Sixteen frames of two cameras are rendered by synth (bilinear paint, nine rays a pixel, optics, noise, 8 bits). The
+second camera is then told 0.3 degrees turned, and the map has black and white exchanged within 20 degrees of one point.
+Each evaluation fits four candidates a frame (each camera by itself, from near and from 60 degrees away), weighs them by
+the soft path, and compares both pictures with the expected pose; L-BFGS goes down the gradient in the camera's rotation
+and in the texels within 35 degrees of that point. docs/differentiable.md walks through it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +23,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras import PinholeCamera, Rays
+from sphereorient.cameras import PinholeCamera, Rays, triangulate
 from sphereorient.cameras.parameters import ROTATION, with_parameters
 from sphereorient.differentiable import SoftTrack, soft_track
 from sphereorient.orient.implicit import ImplicitPose, implicit_pose
@@ -38,17 +37,18 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 REPO = Path(__file__).resolve().parents[1]
-FRAMES, MAP_HEIGHT = 10, 32
+FRAMES, MAP_HEIGHT = 16, 32
 SCENE = SynthSettings(diameter_px=60.0, image_size=(74, 74), blur_px=1.0, read_noise=2.0)
 NOISE, RIM_NOISE = 3.5, 15.0  # grey levels; near the limb the paint is squeezed together, and the model too simple
 RIM = (0.85, 1.05)  # radii
 TOLD_WRONG_DEG = (0.12, 0.25, -0.11)  # of the second camera, about its own x, y, z: 0.3 in all
-SPOT_AT, SPOT_DEG = (0.2, -0.9, 0.4), 20.0  # body; in sight of both cameras in many frames
+SPOT_AT, SPOT_DEG = (0.2, -0.9, 0.4), 20.0  # body; where the map is wrong
+DOUBT_DEG = 35.0  # texels as near to that are free; the others hold the map to the ball
+UNIT_DEG = 1.0  # of the angles in the descent: makes the loss about as curved along them as along texels
 TURN_DEG = (3.0, -2.0, 7.0)  # from frame to frame, lab
 EVERY_PX = 2  # every second pixel across and down is compared
-PLACE_MM = 0.05  # standard deviation of the place that both cameras together gave
+OUTLINE_PX, PLACE_MM = 0.03, 0.01  # standard deviations of the balls' middles as located, and of the place that gives
 LOOKS = ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 1, 0], [0, 0, -1], [-1, 0, 0]])  # along lab +y, along lab -x
-UNIT_DEG = 2.0
 OWN = (0, 1, 0, 1)  # which camera each candidate of a frame is fitted to
 
 
@@ -63,6 +63,7 @@ class Movie:
     grey: Tensor  # (N, 2, P), grey levels of the pixels compared
     noise: Tensor  # (N, 2, P), grey levels, by which the model may miss them
     uv_px: Tensor  # (P, 2), which these are
+    middle_px: Tensor  # (2, N, 2), where the outlines say that the ball is
     cameras: tuple[PinholeCamera, PinholeCamera]  # true
     texture: Tensor  # (H, 2 H), true
     R_lab_body: Tensor  # (N, 3, 3), true
@@ -96,12 +97,14 @@ def film() -> Movie:
     v, u = torch.meshgrid(*(torch.arange(0, side, EVERY_PX) for side in SCENE.image_size[::-1]), indexing="ij")
     grey = torch.from_numpy(np.array(pictures))[:, :, v, u].flatten(2).double()
     uv_px = torch.stack([u, v], dim=-1).reshape(-1, 2).double()
-    middle_px = torch.stack([camera.project(position) for camera in cameras], dim=1)
-    radii = (uv_px - middle_px[:, :, None]).norm(dim=-1) / (SCENE.diameter_px / 2)
+    middle_px = torch.stack([camera.project(position) for camera in cameras])
+    middle_px = middle_px + OUTLINE_PX * torch.randn(middle_px.shape, generator=rng, dtype=torch.float64)
+    radii = (uv_px - middle_px.movedim(0, 1)[:, :, None]).norm(dim=-1) / (SCENE.diameter_px / 2)
     return Movie(
         grey=grey,
         noise=torch.where((radii > RIM[0]) & (radii < RIM[1]), RIM_NOISE, NOISE).double(),
         uv_px=uv_px,
+        middle_px=middle_px,
         cameras=(cameras[0], cameras[1]),
         texture=texture,
         R_lab_body=R,
@@ -133,6 +136,12 @@ def sight_lines(movie: Movie, cameras: tuple[PinholeCamera, PinholeCamera]) -> R
         origin_lab_mm=torch.stack([rays.origin_lab_mm for rays in both]),
         direction_lab=torch.stack([rays.direction_lab for rays in both]),
     )
+
+
+def located(movie: Movie, cameras: tuple[PinholeCamera, PinholeCamera]) -> Tensor:
+    """Places (N, 3), lab, mm, of the ball's outlines."""
+    first, second = (camera.rays(uv_px) for camera, uv_px in zip(cameras, movie.middle_px, strict=True))
+    return triangulate(first, second)[0]
 
 
 def misfit(movie: Movie, sight: Rays, ball: PaintedBall, position_lab_mm: Tensor, R_lab_body: Tensor) -> Tensor:
@@ -170,21 +179,16 @@ def track_of(movie: Movie, fitted: ImplicitPose) -> SoftTrack:
     )
 
 
-def starts(movie: Movie, sight: Rays, ball: PaintedBall) -> tuple[tuple[Tensor, Tensor], Tensor]:
-    """Return where the candidates begin, as a search would leave them, and the places that both cameras give."""
+def starts(movie: Movie) -> tuple[Tensor, Tensor]:
+    """Return where the candidates begin, as a search would leave them: 1.5 and 60 degrees off."""
     rng = torch.Generator().manual_seed(5)
 
     def off(degrees: float) -> Tensor:
         axis = torch.nn.functional.normalize(torch.randn(FRAMES, 3, generator=rng, dtype=torch.float64), dim=-1)
         return so3.exp(math.radians(degrees) * axis) @ movie.R_lab_body
 
-    near = off(1.5)
-    rough = movie.position_lab_mm + 0.2 * torch.randn(FRAMES, 3, generator=rng, dtype=torch.float64)
-    with torch.no_grad():
-        joint = implicit_pose(lambda R, X: misfit(movie, sight, ball, X, R).flatten(1), near, rough)
-    place = joint.position_lab_mm
-    R = torch.stack([near, near, off(60.0), off(60.0)], dim=1).flatten(0, 1)
-    return (R, place.repeat_interleave(len(OWN), 0)), place
+    R = torch.stack([off(1.5), off(1.5), off(60.0), off(60.0)], dim=1).flatten(0, 1)
+    return R, located(movie, movie.cameras).repeat_interleave(len(OWN), 0)
 
 
 def picture_loss(movie: Movie, sight: Rays, ball: PaintedBall, track: SoftTrack) -> Tensor:
@@ -200,25 +204,28 @@ class Descent:
 
     def __init__(self, movie: Movie) -> None:
         self.movie = movie
-        at = map_directions(MAP_HEIGHT) @ torch.nn.functional.normalize(f64(SPOT_AT), dim=0)
-        self.spot = at > math.cos(math.radians(SPOT_DEG))
-        self.texture = torch.where(self.spot, 1.0 - movie.texture, movie.texture).requires_grad_()
-        # Of the second camera, on top of the truth, so it must become 0; in units in which a step is like a texel's.
+        away = map_directions(MAP_HEIGHT) @ torch.nn.functional.normalize(f64(SPOT_AT), dim=0)
+        self.spot, self.doubt = (away > math.cos(math.radians(degrees)) for degrees in (SPOT_DEG, DOUBT_DEG))
+        self.told = torch.where(self.spot, 1.0 - movie.texture, movie.texture)
+        self.texels = self.told[self.doubt].requires_grad_()
+        # Of the second camera, on top of the truth: to become 0.
         self.turn = (f64(TOLD_WRONG_DEG) / UNIT_DEG).requires_grad_()
-        self.start: tuple[Tensor, Tensor] | None = None
-        self.place = movie.position_lab_mm
+        self.start, self.iterations = starts(movie), 30
         self.seen: list[tuple[float, float, float, float]] = []  # loss, degrees, texels, degrees of the track
+
+    @property
+    def texture(self) -> Tensor:
+        """The map (H, 2 H) as it is believed to be."""
+        return self.told.masked_scatter(self.doubt, self.texels)
 
     def loss(self) -> Tensor:
         """Fit, weigh, compare."""
         movie = self.movie
         told = with_parameters(movie.cameras[1], ROTATION, torch.deg2rad(UNIT_DEG * self.turn))
         sight, ball = sight_lines(movie, (movie.cameras[0], told)), ball_of(self.texture)
-        iterations = 8 if self.start else 30
-        if self.start is None:
-            self.start, self.place = starts(movie, sight, ball)
-        fitted = fit_candidates(movie, sight, ball, self.start, self.place, iterations)
-        self.start = fitted.R_lab_body.detach(), fitted.position_lab_mm.detach()
+        place = located(movie, (movie.cameras[0], told))
+        fitted = fit_candidates(movie, sight, ball, self.start, place, self.iterations)
+        self.start, self.iterations = (fitted.R_lab_body.detach(), fitted.position_lab_mm.detach()), 8
         track = track_of(movie, fitted)
         loss = picture_loss(movie, sight, ball, track)
         self._note(loss.detach(), track)
@@ -232,11 +239,11 @@ class Descent:
         self.seen.append((float(loss), float(turn_deg), float(texel), float(rms)))
 
 
-def recover(steps: int = 40) -> Descent:
+def recover(steps: int = 30) -> Descent:
     """Go down the gradient: L-BFGS, which asks for nothing but losses and gradients."""
     descent = Descent(film())
     optimiser = torch.optim.LBFGS(
-        [descent.texture, descent.turn],
+        [descent.texels, descent.turn],
         max_iter=steps,
         max_eval=steps,
         history_size=20,
@@ -252,3 +259,57 @@ def recover(steps: int = 40) -> Descent:
 
     optimiser.step(closure)
     return descent
+
+
+def draw(descent: Descent, out: Path) -> None:
+    """Loss, angle and paint by evaluation, and the map told, recovered and true."""
+    loss, angle_deg, texels, _ = (np.array(column) for column in zip(*descent.seen, strict=True))
+    figure = plt.figure(figsize=(11, 6.4), layout="constrained")
+    grid = figure.add_gridspec(2, 3)
+    curves = (
+        (loss, "half the mean squared residual,\nin units of the noise", True),
+        (angle_deg, "error of the second camera's\nrotation, degrees", False),
+        (texels, "error of the spot's texels, rms\n(1: black for white)", False),
+    )
+    for k, (curve, label, logarithmic) in enumerate(curves):
+        axes = figure.add_subplot(grid[0, k])
+        axes.plot(curve, "-", marker=".", color="C0")
+        axes.set(xlabel="evaluations of loss and gradient", ylabel=label)
+        if logarithmic:
+            axes.set_yscale("log")
+            axes.set_yticks([0.5, 1, 2, 5], labels=["0.5", "1", "2", "5"])
+            axes.minorticks_off()
+        else:
+            axes.set_ylim(0, 1.15 * curve.max())
+        axes.grid(alpha=0.3)
+    maps = (descent.told, descent.texture.detach(), descent.movie.texture)
+    for k, (texture, title) in enumerate(zip(maps, ("map as told", "map recovered", "true map"), strict=True)):
+        axes = figure.add_subplot(grid[1, k])
+        axes.imshow(texture, cmap="gray", vmin=0, vmax=1, extent=(-180, 180, -90, 90))
+        for area, color in ((descent.spot, "C3"), (descent.doubt, "C1")):
+            axes.contour(np.linspace(-177.2, 177.2, 64), np.linspace(87.2, -87.2, 32), area, [0.5], colors=color)
+        axes.set(title=title, xlabel="longitude, degrees", ylabel="latitude, degrees")
+        axes.set(xlim=(-160, 10), ylim=(-40, 80), xticks=range(-150, 1, 50), yticks=range(-30, 61, 30))
+    figure.savefig(out, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Read the options, recover, print, draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=30, help="evaluations of loss and gradient")
+    parser.add_argument("--out", type=Path, default=REPO / "docs" / "differentiable.png")
+    options = parser.parse_args()
+    began = time.monotonic()
+    descent = recover(options.steps)
+    for name, (loss, angle_deg, texels, track_deg) in (("before", descent.seen[0]), ("after", descent.seen[-1])):
+        print(
+            f"{name:7} loss {loss:.3f}  camera {angle_deg:.3f} degrees off  "
+            f"spot {texels:.3f} rms  track {track_deg:.3f} degrees rms"
+        )
+    print(f"{len(descent.seen)} evaluations in {time.monotonic() - began:.0f} s")
+    draw(descent, options.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -127,7 +127,9 @@ def levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: in
         floor = damping[:, None] * diagonal + FLAT  # a flat direction gets no step
         step: Tensor = torch.linalg.solve_ex(normal + torch.diag_embed(floor), -pull[..., None]).result[..., 0]
         R_next, X_next = moved(R, X, step)
-        better = residual(R_next, X_next).square().sum(-1) < r.square().sum(-1)
+        # Near the minimum sums of squares differ by rounding only, and steps go on being good.
+        slack = 1.0 + 8.0 * torch.finfo(X.dtype).eps
+        better = residual(R_next, X_next).square().sum(-1) <= r.square().sum(-1) * slack
         R, X = torch.where(better[:, None, None], R_next, R), torch.where(better[:, None], X_next, X)
         damping = (damping * torch.where(better, EASE, STIFFEN)).clamp(LEAST_DAMPING, MOST_DAMPING)
     return so3.nearest_rotation(R), X

@@ -97,6 +97,7 @@ def _error(at: Statistic, totals: Floats, squares: Floats) -> Floats:
         totals: (..., G, K).
         squares: (..., G, K, K), sums over the segments of the products of their sums.
     """
+    squares = np.nan_to_num(squares)  # what is not known of a group enters only statistics that are NaN anyway
     slopes = []
     for k in range(totals.shape[-1]):
         step = STEP * np.sqrt(squares[..., k, k])

@@ -128,6 +128,16 @@ def test_a_warning_comes_above_a_tenth_of_the_variance(share, warned):
     assert named == ({"velocity"} if warned else set())
 
 
+def test_the_norm_has_intervals_though_nothing_is_known_of_its_noise():
+    found = moments(ensemble([60] * 40, sigma=0.1), "velocity", FEW)
+    for name in ("mean", "rms", "skewness", "flatness"):
+        part = getattr(found, name)
+        assert (part.low < part.value).all(), name
+        assert (part.value < part.high).all(), name
+    assert np.isnan(found.corrected_rms.value[3])
+    assert np.isnan(found.corrected_rms.low[3])
+
+
 def test_a_constant_has_no_scatter_and_no_error():
     found = moments(ensemble([50, 50], velocity=np.full((100, 3), 2.5)), "velocity", FEW)
     assert found.mean.value[:3].tolist() == [2.5] * 3
