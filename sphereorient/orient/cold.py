@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -24,6 +24,8 @@ DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the wides
 PLACE_SHARE = 0.03  # of the radius: how far an outline's centre may be off, dark rims included
 DEPTH_SHARE = 0.08  # of the distance: how far off it may be where one outline's size alone tells it
 NARROWER = (0.15, 0.06)  # deviations from the usual diameter with which outlines are looked for again
+CLEARLY_LESS = 0.1  # of a picture's variance: who explains so much less than another pose is wrong, likely or not
+SURE_NLL = 20.0  # by so much less likely
 GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance see different things
 
 
@@ -214,10 +216,28 @@ def _narrow(
         one = fitter.pixels([pictures], place, level).thinned(every)
         pixels = one.where(torch.arange(len(one)).repeat(len(R)))
         fit = fitter.fit(pixels, X, R, use.expand(len(R), -1), level, iterations, held)
+        fit = replace(fit, nll=explaining_first(fit.nll, fit.score[:, use].mean(-1)))
         chosen = distinct(fit.R_lab_body, fit.nll, keep)
         X, R = fit.position_lab_mm[chosen], fit.R_lab_body[chosen]
         place = X[:1]
     return poses_of(fit, chosen, use, reason)
+
+
+def explaining_first(nll: Tensor, score: Tensor) -> Tensor:
+    """Return the likelihoods (M,) of poses, those that explain clearly less of the pictures behind those that do.
+
+    Likelihood forgives a wide scatter before it forgives worn paint or dirt: of a right pose a tenth of the pixels may
+    be off by many standard deviations, of a wrong one half of them by few of larger ones.
+
+    Args:
+        nll: (M,), negative log-likelihood.
+        score: (M,), share of the pictures' variance that each explains.
+    """
+    behind = score < score.nan_to_num(-1.0).max() - CLEARLY_LESS
+    if not bool((~behind & torch.isfinite(nll)).any()):
+        return nll
+    last = nll[~behind & torch.isfinite(nll)].max()
+    return torch.where(behind, nll.maximum(last + SURE_NLL), nll)
 
 
 def distinct(R: Tensor, nll: Tensor, count: int) -> Tensor:

@@ -107,14 +107,14 @@ def study(
     if not _clear(found):
         raise _nothing(found)
     gain, gap_px = _apart(fitter, pictures, found)
+    looked = found
     if gain > APART_GAIN or gap_px > APART_PX:
         # A pose between what the cameras see would teach a light that is nowhere.
         each = [search(fitter.of(k), [[frames[k]] for frames in shots]) for k in range(len(eyes))]
         frame, X, R, use = _seen_by_each(each)
-        wrong = _wrong_scores([poses for of_camera in each for poses in of_camera])
+        looked = [poses for of_camera in each for poses in of_camera]
     else:
         frame, X, R, use = _seen_by_all(found)
-        wrong = _wrong_scores(found)
     pixels = fitter.pixels([pictures[k] for k in frame], X, fitter.optics.fine)
     pixels = pixels.thinned(max(1, round(pixels.grey.shape[1] / ENOUGH)))
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
@@ -125,9 +125,12 @@ def study(
     fitter, fit = _with_light(fitter, pixels, fit, use, 2)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
-    highest = float(wrong.quantile(0.9)) if len(wrong) else 0.0
+    best, highest = _scores(looked)
+    if max(best, right) < highest + NO_BETTER:
+        raise _unexplained(best)
     if right < highest + NO_BETTER:
-        raise _unexplained(right)
+        # Dirt or a rim that is hidden spoils the light that was learnt: all poses are explained worse than before.
+        highest = right - (best - highest)
     fitter = replace(fitter, widest_px=widest)
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
     score_min = 0.5 * (right + min(highest, right))
@@ -201,9 +204,12 @@ def _seen_by_each(each: Sequence[Sequence[Poses]]) -> Rows:
     return [k for k, _ in rows], X, R, use
 
 
-def _wrong_scores(found: Sequence[Poses]) -> Tensor:
-    """Return how well wrong poses explain clear frames."""
-    return torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in _clear(found)])
+def _scores(found: Sequence[Poses]) -> tuple[float, float]:
+    """Return how well the best poses typically explain clear frames, and how well wrong ones do at their best."""
+    clear = _clear(found)
+    best = torch.cat([found[k].score[0][found[k].use] for k in clear])
+    wrong = torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in clear])
+    return float(best.median()), float(wrong.quantile(0.9)) if len(wrong) else 0.0
 
 
 def _nothing(found: Sequence[Poses]) -> ExperimentError:
