@@ -23,7 +23,6 @@ FINE_BINS = 2000  # of ln|x|, for the likelihood: its rounding of x is 0.5 %
 SMALLEST, LARGEST = 1e-4, 1e3  # |x| that the likelihood tells apart
 TINY = 1e-300
 HERMITE = 24  # nodes for the noise
-AT_ONCE = 100_000  # samples
 
 
 def stretched_exponential(x: Floats, a: Floats | float) -> Floats:
@@ -138,15 +137,10 @@ def fit_stretched(
     return StretchedFit(
         a=found.part(0),
         flatness=found.part(1),
-        log_likelihood=float(_mean_of(normal, best, noise_share)),
+        log_likelihood=float(counts.sum(0)[used] @ log_noisy_stretched(np.exp(middle[used]), best, noise_share))
+        / len(x),
         log_likelihood_gaussian=float(-0.5 * np.log(2 * np.pi) - 0.5 * (normal**2).mean()),
     )
-
-
-def _mean_of(normal: Floats, a: float, noise_share: float) -> float:
-    """Return the mean logarithm of the density, of many samples in pieces."""
-    pieces = [normal[k : k + AT_ONCE] for k in range(0, len(normal), AT_ONCE)]
-    return float(sum(log_noisy_stretched(piece, a, noise_share).sum() for piece in pieces) / len(normal))
 
 
 class _Likelihood:
