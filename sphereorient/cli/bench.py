@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from sphereorient.evaluate.robustness import BenchSettings, Results
 
 EXIT_WORSE = 1  # something got worse
-SHOWN_WRONG_DEG = 10.0
 
 bench = typer.Typer(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
@@ -119,6 +118,7 @@ def score(
     import numpy as np
 
     from sphereorient.evaluate.external import READERS, aligned_errors_deg
+    from sphereorient.evaluate.robustness.measure import WRONG_DEG
     from sphereorient.evaluate.truth import orientations_at, true_orientations
     from sphereorient.trajectory import Trajectory
 
@@ -136,9 +136,10 @@ def score(
     typer.echo(f"{len(there)} of {len(errors)} frames have an orientation")
     if len(there):
         p50, p95, largest = np.percentile(there, (50, 95, 100))
-        wrong = float((there > SHOWN_WRONG_DEG).mean())
+        wrong = float((there > WRONG_DEG).mean())
         typer.echo(
-            f"error, degrees: median {p50:.4g}, 95 % {p95:.4g}, largest {largest:.4g}; above 10: {100 * wrong:.3g} %"
+            f"error, degrees: median {p50:.4g}, 95 % {p95:.4g}, largest {largest:.4g}; "
+            f"above {WRONG_DEG:g}: {100 * wrong:.3g} %"
         )
 
 

@@ -94,16 +94,8 @@ def _alignment(measured: torch.Tensor, true: torch.Tensor, align: str) -> tuple[
     right = measured[0].mT @ true[0]
     for _ in range(ROUNDS if align == "both" else 1):
         if align == "both":
-            left = _nearest((true @ (measured @ right).mT).sum(0))
-        before, right = right, _nearest(((left @ measured).mT @ true).sum(0))
+            left = so3.nearest_rotation((true @ (measured @ right).mT).sum(0))
+        before, right = right, so3.nearest_rotation(((left @ measured).mT @ true).sum(0))
         if (right - before).abs().max() < SETTLED:
             break
     return left, right
-
-
-def _nearest(M: torch.Tensor) -> torch.Tensor:
-    """Return the rotation nearest to a matrix (3, 3)."""
-    U, _, Vh = torch.linalg.svd(M)
-    sign = torch.linalg.det(U @ Vh)
-    rotation: torch.Tensor = U @ torch.diag(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign])) @ Vh
-    return rotation

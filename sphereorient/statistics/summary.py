@@ -126,14 +126,13 @@ def summarise(
     if ensemble.segments >= FEWEST:
         more = _distributions(many, ensemble, settings, lambda done: progress(2 + done, STEPS))
     progress(STEPS, STEPS)
-    known = around.diameter_mm is not None
     return Summary(
         settings=settings,
         surroundings=around,
         ensemble=ensemble,
         table=table,
         warnings=noise_warnings(table, ensemble.error),
-        comparisons=_comparisons(table, around) if known else (),
+        comparisons=_comparisons(table, around),
         distributions=more,
     )
 
@@ -209,9 +208,11 @@ def _multi_lag(tracks: Sequence[Trajectory], settings: StatisticsSettings) -> di
 
 
 def _comparisons(table: dict[str, Moments], around: Surroundings) -> list[Comparison]:
+    if around.diameter_mm is None:
+        return []
     return comparisons(
         table,
-        float(around.diameter_mm or np.nan),
+        around.diameter_mm,
         around.flow,
         u_rms_m_s=around.u_rms_m_s,
         integral_length_m=around.integral_length_m,
