@@ -15,7 +15,8 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from sphereorient.settings import Settings, settings_yaml, synth_settings_yaml
+from sphereorient.learn.settings import ProposerSettings
+from sphereorient.settings import Settings, proposer_settings_yaml, settings_yaml, synth_settings_yaml
 from sphereorient.synth import SynthSettings
 
 REPO = Path(__file__).resolve().parents[1]
@@ -33,13 +34,21 @@ FROM_PAPER = re.compile(r"the paper(:|'s (b|w|\d))")  # "the paper's 12", "the p
 
 def table(model: type[BaseModel], of_method: bool = True) -> list[str]:
     """One row a key; numbers that the description calls the paper's stand out where they are the method's."""
-    rows = ["| key | default | what |", "|---|---|---|"]
-    for key, field in model.model_fields.items():
-        default = list(field.default) if isinstance(field.default, tuple) else field.default
-        shown = "null" if default is None else str(default)
+    return ["| key | default | what |", "|---|---|---|", *rows_of(model(), of_method)]
+
+
+def rows_of(settings: BaseModel, of_method: bool, branch: str = "") -> list[str]:
+    """The rows of a table; those of a branch with its name before the key."""
+    rows = []
+    for key, field in type(settings).model_fields.items():
+        default = getattr(settings, key)
+        if isinstance(default, BaseModel):
+            rows += rows_of(default, of_method, f"{branch}{key}.")
+            continue
+        shown = "null" if default is None else str(list(default) if isinstance(default, tuple) else default)
         if of_method and FROM_PAPER.search(field.description or ""):
             shown = f"**{shown}**"
-        rows.append(f"| `{key}` | {shown} | {field.description} |")
+        rows.append(f"| `{branch}{key}` | {shown} | {field.description} |")
     return rows
 
 
@@ -51,7 +60,14 @@ def parameters() -> str:
         assert isinstance(model, type)
         lines += [f"## {room}: {field.description}", "", inspect.cleandoc(model.__doc__ or ""), "", *table(model), ""]
     lines += ["## synth", "", "Of `sphereorient synth`: `--settings configs/synth.yaml`, `--set key=value`.", ""]
-    return "\n".join([*lines, *table(SynthSettings, of_method=False), ""])
+    lines += [*table(SynthSettings, of_method=False), ""]
+    how = "Of `sphereorient train configs/train_proposer.yaml`; `--set room.key=value` ([proposer.md](proposer.md))."
+    lines += ["## train", "", how, ""]
+    for room, field in ProposerSettings.model_fields.items():
+        model = field.annotation
+        assert isinstance(model, type)
+        lines += [f"### train, {room}: {field.description}", "", *table(model, of_method=False), ""]
+    return "\n".join(lines)
 
 
 def pages() -> dict[Path, str]:
@@ -60,6 +76,7 @@ def pages() -> dict[Path, str]:
         REPO / "docs" / "parameters.md": parameters(),
         REPO / "configs" / "default.yaml": settings_yaml(),
         REPO / "configs" / "synth.yaml": synth_settings_yaml(),
+        REPO / "configs" / "train_proposer.yaml": proposer_settings_yaml(),
     }
 
 

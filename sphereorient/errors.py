@@ -5,9 +5,11 @@
     ├── CameraError                 cameras that are no cameras, or do not belong to the picture
     ├── MovieError                  a movie that is missing, unreadable, empty or of another size
     ├── TextureError                a texture map that is none
+    ├── PaintError                  movies from which no map of the paint can be learnt
     ├── ExperimentError             experiment.yaml: missing, malformed, inconsistent
     ├── SettingsError (ValueError)  an unknown or impossible setting
     ├── TrackError                  a file that is no track, or of another schema
+    ├── CheckpointError             a file that is no trained proposer, or one of another ball
     └── OutputError                 a result that cannot be written
 
 Every message is worded by `refusal`: what was looked at, what was expected, what came, what to do.
@@ -41,6 +43,10 @@ class TextureError(SphereOrientError):
     """A texture map is missing, unreadable or not 2:1."""
 
 
+class PaintError(SphereOrientError):
+    """Movies from which no map of the paint can be learnt."""
+
+
 class ExperimentError(SphereOrientError):
     """An experiment file is missing, malformed or inconsistent."""
 
@@ -51,6 +57,10 @@ class SettingsError(SphereOrientError, ValueError):
 
 class TrackError(SphereOrientError):
     """A file is not a track that this version reads."""
+
+
+class CheckpointError(SphereOrientError):
+    """A file is not a trained proposer that this version reads, or belongs to another ball."""
 
 
 class BenchError(SphereOrientError):

@@ -10,7 +10,8 @@ from torch import Tensor
 from sphereorient import assemble, locate, motion, results
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.locate import Sightings
-from sphereorient.orient import Candidates, Proposals, Proposer, TemplateSearch, crop_disk
+from sphereorient.orient import Candidates, Proposals, crop_disk
+from sphereorient.proposers import paper_proposer
 from sphereorient.recording import Progress, Recording
 from sphereorient.reel import Reel
 from sphereorient.settings import Settings
@@ -73,7 +74,7 @@ def propose_orientations(
     progress(stage, 0, total)
     if not sightings.placed.any():
         return in_the_lab(Proposals.none(sightings.reason), reel.camera, sightings.centre_px)
-    proposer: Proposer = TemplateSearch(texture, locate.size_of(sightings, settings.orient.size_px), settings.orient)
+    proposer = paper_proposer(texture, locate.size_of(sightings, settings.orient.size_px), settings)
     # A place that was filled in from the neighbours helps nothing where the picture is none.
     readable = torch.tensor([reason not in BLIND for reason in sightings.reason])
     placed = sightings.placed & readable

@@ -18,7 +18,8 @@ from sphereorient.experiment import Experiment
 from sphereorient.learnt import Learnt
 from sphereorient.paper import track_paper
 from sphereorient.precise import track_precise
-from sphereorient.provenance import provenance
+from sphereorient.proposers import checkpoint_path
+from sphereorient.provenance import provenance, sha256
 from sphereorient.recording import Progress, Recording, open_recording, silent
 from sphereorient.settings import DEFAULT_METHOD, METHODS, Settings, settings_yaml
 from sphereorient.trajectory import Trajectory
@@ -32,6 +33,7 @@ def track_movies(
     cameras: Sequence[str] | None = None,
     device: str = "cpu",
     learnt: Learnt | None = None,
+    proposer: str | Path | None = None,
     progress: Progress = silent,
     command: str = "sphereorient.track_movies",
 ) -> Trajectory:
@@ -45,6 +47,8 @@ def track_movies(
         cameras: names of those to use; None: all.
         device: where fits are computed, as torch names it: cpu, cuda, cuda:1.
         learnt: what another run learnt of the empty scene, the light and the motion; None learns it (precise only).
+        proposer: a trained network's checkpoint that proposes orientations, "default" for the one that comes along
+            (docs/proposer.md); None: what the settings say, without any the template search.
         progress: told how far each stage is.
         command: what the track's provenance names as its origin.
 
@@ -56,7 +60,7 @@ def track_movies(
     """
     check_method(method, learnt is not None)
     there = torch_device(device)
-    settings = settings or Settings()
+    settings = with_proposer(settings or Settings(), proposer)
     with open_recording(experiment, cameras) as recording, one_thread():
         if method == "paper":
             track = track_paper(recording, settings, progress)
@@ -70,7 +74,16 @@ def finished(track: Trajectory, recording: Recording, method: str, settings: Set
     track = results.with_systematic_errors(track, recording.cameras, recording.covariance, recording.radius_mm)
     origin = provenance(recording.experiment, list(recording.cameras), command)
     origin["remarks"] = list(recording.remarks)
+    if settings.propose.checkpoint is not None:
+        origin["proposer_sha256"] = sha256(checkpoint_path(settings.propose.checkpoint))
     return replace(track, method=method, settings=settings_yaml(settings), provenance=origin)
+
+
+def with_proposer(settings: Settings, proposer: str | Path | None) -> Settings:
+    """Return settings with a checkpoint that proposes; as they are for None."""
+    if proposer is None:
+        return settings
+    return settings.model_copy(update={"propose": settings.propose.model_copy(update={"checkpoint": str(proposer)})})
 
 
 def check_method(method: str, learnt: bool) -> None:

@@ -17,7 +17,6 @@ from sphereorient.orient import (
     ApartTracker,
     BlockTracker,
     Eye,
-    GreySearch,
     LinesOfSight,
     Poses,
     PoseTable,
@@ -28,6 +27,7 @@ from sphereorient.orient import (
     pose_table,
     study,
 )
+from sphereorient.proposers import precise_proposer
 from sphereorient.recording import Progress, Recording
 from sphereorient.reel import Reel
 from sphereorient.settings import Settings
@@ -68,7 +68,7 @@ def learn(recording: Recording, settings: Settings, progress: Progress) -> tuple
     with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products leave the interpreter free
         opening = [pool.submit(open_eye, recording, reel, settings, progress) for reel in recording.reels]
         base = pool.submit(base_table, recording.texture, widest)
-        search = pool.submit(GreySearch, recording.texture, settings.search)
+        search = pool.submit(precise_proposer, recording.texture, settings)
         eyes = [eye.result() for eye in opening]
         proposers: dict[str, Proposer] = {eye.name: search.result() for eye in eyes}
         progress("study", 0, 1)
@@ -128,7 +128,7 @@ def follower(
 def follower_of(recording: Recording, learnt: Learnt, settings: Settings, device: torch.device) -> Follower:
     """Return what measures single frames, with what another run or process learnt."""
     known = learnt.study(recording)
-    search = GreySearch(recording.texture, settings.search)
+    search = precise_proposer(recording.texture, settings)
     return follower(recording, known, {eye.name: search for eye in known.fitter.eyes}, settings, device)
 
 

@@ -16,9 +16,10 @@ from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.cameras.bounded_yaml import FAULTS, parse_yaml
 from sphereorient.cameras.yaml_file import read_yaml, short
 from sphereorient.errors import SettingsError, refusal
+from sphereorient.learn.settings import ProposerSettings
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
-from sphereorient.orient.settings import GreySearchSettings, OrientSettings, RefineSettings
+from sphereorient.orient.settings import GreySearchSettings, OrientSettings, ProposeSettings, RefineSettings
 from sphereorient.statistics.settings import StatisticsSettings
 from sphereorient.synth.settings import SynthSettings
 
@@ -33,6 +34,9 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     locate: LocateSettings = Field(default_factory=LocateSettings, description="where is the sphere (both methods)")
+    propose: ProposeSettings = Field(
+        default_factory=ProposeSettings, description="who proposes orientations (both methods)"
+    )
     search: GreySearchSettings = Field(default_factory=GreySearchSettings, description="where could it point (precise)")
     refine: RefineSettings = Field(default_factory=RefineSettings, description="poses to hundredths (precise)")
     path: PathSettings = Field(default_factory=PathSettings, description="which candidate is true (precise)")
@@ -41,6 +45,10 @@ class Settings(BaseModel):
     assemble: AssembleSettings = Field(default_factory=AssembleSettings, description="which candidate is true (paper)")
     motion: MotionSettings = Field(default_factory=MotionSettings, description="velocities, accelerations (paper)")
     statistics: StatisticsSettings = Field(default_factory=StatisticsSettings, description="numbers of a report")
+
+
+# How many names a key has, parted by dots.
+DEPTHS: dict[type[BaseModel], tuple[int, ...]] = {Settings: (2,), SynthSettings: (1,), ProposerSettings: (2, 3)}
 
 
 def load_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> Settings:
@@ -61,10 +69,15 @@ def load_synth_settings(path: Path | None = None, overrides: Iterable[str] = ())
     return _load(SynthSettings, path, overrides)
 
 
+def load_proposer_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> ProposerSettings:
+    """Read the settings of a proposer's training from a file and from overrides; as `load_settings`."""
+    return _load(ProposerSettings, path, overrides)
+
+
 def _load(model: type[Model], path: Path | None, overrides: Iterable[str]) -> Model:
     tree = {} if path is None else _read(path)
     for text in overrides:
-        _override(tree, text, depth=2 if model is Settings else 1)
+        _override(tree, text, DEPTHS[model])
     source = str(path) if path else "settings"
     try:
         settings = model.model_validate(tree)
@@ -100,12 +113,12 @@ def _read(path: Path) -> dict[str, Any]:
     return tree
 
 
-def _override(tree: dict[str, Any], text: str, depth: int) -> None:
+def _override(tree: dict[str, Any], text: str, depths: tuple[int, ...]) -> None:
     """Put `key=value` into a tree, the key with a room before it where there are rooms."""
     key, equals, value = text.partition("=")
     *rooms, leaf = key.strip().split(".")
-    if not equals or len(rooms) != depth - 1:
-        expected = "room.key=value" if depth == 2 else "key=value"
+    if not equals or len(rooms) + 1 not in depths:
+        expected = "key=value" if depths == (1,) else "room.key=value"
         raise SettingsError(
             refusal(f"--set {text}", expected=expected, got=repr(text), do="give one key and its value")
         )
@@ -157,11 +170,28 @@ def synth_settings_yaml() -> str:
     return "\n".join([head, "", *_commented(SynthSettings(), ""), ""])
 
 
+def proposer_settings_yaml(settings: ProposerSettings | None = None) -> str:
+    """Write the settings of a proposer's training as YAML, commented likewise."""
+    settings = settings or ProposerSettings()
+    lines = ["# Training of a proposer; any key may be left out. --set room.key=value overrides one.", ""]
+    for room, field in ProposerSettings.model_fields.items():
+        lines += [f"{room}:  # {field.description}", *_commented(getattr(settings, room), "  "), ""]
+    return "\n".join(lines)
+
+
 def _commented(branch: BaseModel, indent: str) -> list[str]:
     lines = []
     for key, field in type(branch).model_fields.items():
+        value = getattr(branch, key)
         lines += [f"{indent}# {line}" for line in textwrap.wrap(field.description or "", 110)]
-        lines.append(f"{indent}{key}: {_scalar(getattr(branch, key))}")
+        if isinstance(value, BaseModel):
+            lines += [f"{indent}{key}:", *_commented(value, indent + "  ")]
+            continue
+        shown = _scalar(value)
+        if len(indent + key + shown) > 110 and isinstance(value, tuple):
+            lines += [f"{indent}{key}:", *(f"{indent}  - {_scalar(item)}" for item in value)]
+        else:
+            lines.append(f"{indent}{key}: {shown}")
     return lines
 
 

@@ -20,6 +20,7 @@ from sphereorient.settings import (
     DEFAULT_METHOD,
     METHODS,
     Settings,
+    load_proposer_settings,
     load_settings,
     load_synth_settings,
     settings_yaml,
@@ -27,7 +28,7 @@ from sphereorient.settings import (
 )
 from sphereorient.synth.settings import SynthSettings
 
-ROOMS = ["locate", "search", "refine", "path", "smooth", "orient", "assemble", "motion", "statistics"]
+ROOMS = ["locate", "propose", "search", "refine", "path", "smooth", "orient", "assemble", "motion", "statistics"]
 CHANGES = [
     "locate.diameter_px=78.5",
     "locate.gap_frames_max=0",
@@ -35,6 +36,9 @@ CHANGES = [
     "motion.separations=[1, 3]",
     "motion.min_separations=1",
 ]
+
+
+LOADERS = {"synth": load_synth_settings, "train": load_proposer_settings}
 
 
 def write(folder: Path, text: str) -> Path:
@@ -230,8 +234,7 @@ def test_all_settings_have_a_default_and_a_description_and_are_frozen(model):
 
 def test_the_committed_settings_are_accepted():
     for path in sorted((REPO / "configs").glob("*.yaml")):
-        load = load_synth_settings if path.name.startswith("synth") else load_settings
-        load(path)
+        LOADERS.get(path.stem.partition("_")[0], load_settings)(path)
 
 
 def two_folders(folder: Path):

@@ -1,6 +1,20 @@
 """The command line: parse, call, print. Heavy packages are imported inside the commands, so that help is quick."""
 
-from sphereorient.cli import about, bench, calibrate, check, export, movie, overlay, report, synth, track, view
+from sphereorient.cli import (
+    about,
+    bench,
+    calibrate,
+    check,
+    export,
+    movie,
+    overlay,
+    report,
+    synth,
+    texture,
+    track,
+    train,
+    view,
+)
 from sphereorient.cli.app import app, main
 
 __all__ = [
@@ -15,6 +29,8 @@ __all__ = [
     "overlay",
     "report",
     "synth",
+    "texture",
     "track",
+    "train",
     "view",
 ]

@@ -52,6 +52,10 @@ def track(
     save_learnt: Annotated[
         Path | None, typer.Option(help="Keep what was learnt: empty scenes, light, scores, process noise.")
     ] = None,
+    proposer: Annotated[
+        str | None,
+        typer.Option(help="A trained network proposes orientations: its checkpoint, or default (docs/proposer.md)."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
 ) -> None:
     """Track the sphere of an experiment, or of many: position and orientation of every frame."""
@@ -62,9 +66,10 @@ def track(
         _refuse_shared(save_learnt, many)
     from sphereorient.jobs import Request, track_kept
     from sphereorient.jobs.drive import tracks_of
+    from sphereorient.pipeline import with_proposer
     from sphereorient.settings import load_settings
 
-    chosen = load_settings(settings, set_ or [])
+    chosen = with_proposer(load_settings(settings, set_ or []), proposer)
     names = camera_names(cameras)
     requests = [
         Request(

@@ -11,6 +11,7 @@ from pathlib import Path
 from sphereorient import __version__
 from sphereorient.experiment import MOVIES_OWN, Experiment, load_experiment
 from sphereorient.movies import movie_files
+from sphereorient.proposers import checkpoint_path
 from sphereorient.settings import DEFAULT_METHOD, Settings, settings_yaml
 
 
@@ -67,6 +68,8 @@ def run_id(told: Mapping[str, str]) -> str:
 def _files(request: Request, experiment: Experiment) -> list[tuple[Path, int]]:
     """Return the input files, each with the number of others of its name before it."""
     named = [experiment.cameras_path, experiment.texture_path, request.learnt, *experiment.background_paths.values()]
+    if request.settings.propose.checkpoint is not None:
+        named.append(checkpoint_path(request.settings.propose.checkpoint))
     if experiment.times not in (None, MOVIES_OWN):
         named.append(Path(str(experiment.times)))
     names = request.cameras or tuple(experiment.movie_paths)

@@ -5,6 +5,7 @@ from sphereorient.orient.blocks import BlockTracker
 from sphereorient.orient.candidates import Candidates
 from sphereorient.orient.cold import POSE_PARTS, Poses, cold_start
 from sphereorient.orient.crop import crop_disk
+from sphereorient.orient.doubt import DoubtProposer
 from sphereorient.orient.extraction import extract_paint
 from sphereorient.orient.eye import Eye, Fitter, Optics, base_table
 from sphereorient.orient.gather import PoseTable, joined_tables, pose_table
@@ -14,7 +15,7 @@ from sphereorient.orient.pixels import LinesOfSight
 from sphereorient.orient.proposer import Proposals, Proposer
 from sphereorient.orient.refine import Fit, refine
 from sphereorient.orient.search import TemplateSearch
-from sphereorient.orient.settings import GreySearchSettings, OrientSettings, RefineSettings
+from sphereorient.orient.settings import GreySearchSettings, OrientSettings, ProposeSettings, RefineSettings
 from sphereorient.orient.study import Study, study
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "ApartTracker",
     "BlockTracker",
     "Candidates",
+    "DoubtProposer",
     "Eye",
     "Fit",
     "Fitter",
@@ -34,6 +36,7 @@ __all__ = [
     "PoseTable",
     "Poses",
     "Proposals",
+    "ProposeSettings",
     "Proposer",
     "RefineSettings",
     "Study",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 
@@ -85,6 +87,23 @@ class GreySearchSettings(BaseModel):
     distinct_deg: float = Field(8.0, gt=0, lt=90, description="proposals nearer than this to a better one are the same")
     score_min: float = Field(
         0.45, ge=0, lt=1, description="proposals that explain less of the picture (0..1) are none; smooth noise: 0.36"
+    )
+
+
+class ProposeSettings(BaseModel):
+    """Who proposes orientations: the template search, a trained network, or both (docs/proposer.md)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    checkpoint: str | None = Field(
+        None, description="a trained network's file, `default` for the one that comes along; null: the templates alone"
+    )
+    when: Literal["always", "in_doubt"] = Field(
+        "always",
+        description="always: the network alone; in_doubt: templates first, the network where they explain too little",
+    )
+    sure: float = Field(
+        0.75, ge=0, le=1, description="in_doubt: templates of a score above this need no second opinion"
     )
 
 

@@ -16,14 +16,15 @@ def map_directions(height: int) -> Tensor:
     return torch.stack([lat.cos() * lon.cos(), lat.cos() * lon.sin(), lat.sin()], dim=-1)
 
 
-def _random_directions(count: int, rng: torch.Generator) -> Tensor:
+def random_directions(count: int, rng: torch.Generator) -> Tensor:
+    """Draw directions, (count, 3) float64, evenly over the sphere."""
     draw = torch.randn(count, 3, generator=rng, dtype=torch.float64)
     return torch.nn.functional.normalize(draw, dim=-1)
 
 
 def blobs(height: int, rng: torch.Generator) -> Tensor:
     """Smooth blobs: the sign of a random function of body direction, half the sphere white."""
-    wave = _random_directions(60, rng) * (5 + 5 * torch.rand(60, 1, generator=rng, dtype=torch.float64))
+    wave = random_directions(60, rng) * (5 + 5 * torch.rand(60, 1, generator=rng, dtype=torch.float64))
     phase = 2 * math.pi * torch.rand(60, generator=rng, dtype=torch.float64)
     value = torch.cos(map_directions(height) @ wave.T + phase).sum(-1)
     return _edge(value - value.median(), 0.25)
@@ -31,14 +32,14 @@ def blobs(height: int, rng: torch.Generator) -> Tensor:
 
 def patches(height: int, rng: torch.Generator) -> Tensor:
     """Polygons: the regions nearest to random points, painted black or white in turn."""
-    points = _random_directions(60, rng)
+    points = random_directions(60, rng)
     owner = (map_directions(height) @ points.T).argmax(-1)
     return (owner % 2).float()
 
 
 def dots(height: int, rng: torch.Generator) -> Tensor:
     """Black dots of 8 to 14 degrees radius on white, scattered."""
-    points = _random_directions(34, rng)
+    points = random_directions(34, rng)
     radius = torch.deg2rad(8 + 6 * torch.rand(34, generator=rng, dtype=torch.float64))
     outside = (torch.acos((map_directions(height) @ points.T).clamp(-1, 1)) - radius).amin(-1)
     return _edge(outside, math.pi / height)

@@ -1,0 +1,59 @@
+"""Who proposes orientations: the one place that knows both the template searches and the trained network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import Tensor
+
+from sphereorient.orient import DoubtProposer, GreySearch, Proposer, TemplateSearch
+from sphereorient.orient.settings import ProposeSettings
+from sphereorient.settings import Settings
+
+DEFAULT = "default"  # the checkpoint that comes along
+
+
+def precise_proposer(texture: Tensor, settings: Settings) -> Proposer:
+    """Return who proposes for the precise method.
+
+    Args:
+        texture: (H, 2 H), the map, 0 black .. 1 white.
+        settings: branches `propose` and `search`.
+
+    Raises:
+        CheckpointError: a checkpoint that cannot be used with this map.
+    """
+    network = trained_network(texture, settings.propose)
+    if network is not None and settings.propose.when == "always":
+        return network
+    search = GreySearch(texture, settings.search)
+    return search if network is None else DoubtProposer(search, network, settings.propose.sure)
+
+
+def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:
+    """Return who proposes for the paper's method; templates are made for disks of `size_px`."""
+    network = trained_network(texture, settings.propose)
+    if network is not None and settings.propose.when == "always":
+        return network
+    search = TemplateSearch(texture, size_px, settings.orient)
+    return search if network is None else DoubtProposer(search, network, settings.propose.sure)
+
+
+def trained_network(texture: Tensor, settings: ProposeSettings) -> Proposer | None:
+    """Return the network of a checkpoint, None where none is asked for."""
+    if settings.checkpoint is None:
+        return None
+    # Not before it is wanted: most runs do without.
+    from sphereorient.learn.checkpoint import check_texture, correlator_of, load_checkpoint
+    from sphereorient.learn.proposer import LearnedProposer
+
+    checkpoint = load_checkpoint(checkpoint_path(settings.checkpoint))
+    check_texture(checkpoint, texture)
+    return LearnedProposer(correlator_of(checkpoint), texture, temperature=checkpoint.temperature)
+
+
+def checkpoint_path(named: str) -> Path:
+    """Return the file of a checkpoint, of the one that comes along for `default`."""
+    from sphereorient.learn.proposer import DEFAULT_CHECKPOINT
+
+    return DEFAULT_CHECKPOINT if named == DEFAULT else Path(named)

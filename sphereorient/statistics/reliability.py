@@ -1,0 +1,91 @@
+"""Do probabilities keep what they promise: how often what is said with a probability is so."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sphereorient.errors import ShapeError, refusal
+
+Floats = NDArray[np.float64]
+Z95 = 1.959964  # normal quantile of a two-sided interval of 95 %
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reliability:
+    """A reliability curve in B bins of increasing probability; made by `reliability`."""
+
+    probability: Floats  # (B,), mean of what was said
+    share: Floats  # (B,), of the outcomes that were so
+    low: Floats  # (B,), of the 95 % interval of the share
+    high: Floats  # (B,)
+    count: NDArray[np.int64]  # (B,), outcomes in the bin
+    error: float  # expected calibration error: mean distance of share and probability, each outcome alike; NaN of none
+    chance: float  # the error that probabilities without fault would show by the scatter of as many outcomes
+
+
+def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> Reliability:
+    """Compare probabilities with what came of them, in bins of equal count.
+
+    Args:
+        probability: (N,), 0 .. 1; those that are NaN are left out.
+        outcome: (N,) bool, whether it was so.
+        bins: at most so many; equal probabilities stay in one bin, so there may be fewer.
+
+    Raises:
+        ShapeError: not one outcome a probability, probabilities outside 0 .. 1, or no bin.
+
+    Source: Naeini et al. 2015 (expected calibration error) with bins of equal count; interval: Wilson 1927.
+    """
+    said, came = np.asarray(probability, np.float64), np.asarray(outcome, np.bool_)
+    if said.ndim != 1 or said.shape != came.shape:
+        got, do = f"{said.shape} and {came.shape}", "pass one outcome a probability"
+        raise ShapeError(refusal("probability and outcome", expected="shapes (N,) and (N,)", got=got, do=do))
+    known = np.isfinite(said)
+    said, came = said[known], came[known]
+    if bins < 1 or np.any((said < 0) | (said > 1 + 1e-9)):
+        got = f"{bins} bins, probabilities to {said.max(initial=0.0):g}"
+        raise ShapeError(
+            refusal("reliability", expected="a bin or more, probabilities in 0 .. 1", got=got, do="mend it")
+        )
+    order = np.argsort(said, kind="stable")
+    said, came = said[order], came[order]
+    edges = _edges(said, bins)
+    count = np.diff(edges)
+    mean, spread = _means(said, edges), _means(said * (1 - said), edges)
+    share = _means(came.astype(np.float64), edges)
+    low, high = _wilson(share, count)
+    weight = count / max(len(said), 1)
+    return Reliability(
+        probability=mean,
+        share=share,
+        low=low,
+        high=high,
+        count=count,
+        error=float((weight * np.abs(share - mean)).sum()) if len(said) else math.nan,
+        # Mean distance of a normal number from its mean: sqrt(2 / pi) sigmas.
+        chance=float((weight * np.sqrt(2 / math.pi * np.maximum(spread, 0) / count)).sum()) if len(said) else math.nan,
+    )
+
+
+def _edges(said: Floats, bins: int) -> NDArray[np.int64]:
+    """First outcome of each bin, and the end, (B + 1,); moved on to where the sorted probabilities change."""
+    wanted = said[np.rint(np.linspace(0, len(said), bins + 1)[1:-1]).astype(np.int64)] if len(said) >= bins else said
+    inner = np.searchsorted(said, wanted, side="left")
+    return np.unique(np.concatenate([[0], inner, [len(said)]])).astype(np.int64)
+
+
+def _means(values: Floats, edges: NDArray[np.int64]) -> Floats:
+    """Mean of each bin."""
+    sums = np.add.reduceat(values, edges[:-1]) if len(edges) > 1 else np.zeros(0)
+    return np.asarray(sums / np.diff(edges), np.float64)
+
+
+def _wilson(share: Floats, count: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Ends of the 95 % interval of shares."""
+    middle = (share + Z95**2 / (2 * count)) / (1 + Z95**2 / count)
+    half = Z95 / (1 + Z95**2 / count) * np.sqrt(share * (1 - share) / count + Z95**2 / (4 * count**2))
+    return np.maximum(middle - half, 0.0), np.minimum(middle + half, 1.0)

@@ -1,0 +1,326 @@
+"""Checkpoints: what is written is read, and whatever else a file may be is refused in one line, nothing executed."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from learn_examples import state_of, tiny, untrained
+
+from sphereorient.errors import CheckpointError
+from sphereorient.learn import checkpoint as module
+from sphereorient.learn.checkpoint import (
+    SCHEMA,
+    Checkpoint,
+    check_texture,
+    correlator_of,
+    load_checkpoint,
+    save_checkpoint,
+    texture_sha256,
+)
+from sphereorient.sphere import load_texture
+from sphereorient.synth.textures import random_texture
+
+ABOUT = {"torch": "2.6", "steps": 100, "validation_ece": 0.02}
+
+
+def example(**changes: Any) -> Checkpoint:
+    whole = Checkpoint(settings=tiny(), state=state_of(untrained()), temperature=0.4, about=ABOUT)
+    return replace(whole, **changes)
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(CheckpointError) as caught:
+        load_checkpoint(path)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.endswith(".")
+    assert len(text) < 400
+    assert path.name in text
+    return text
+
+
+def tree_of(path: Path) -> dict[str, Any]:
+    save_checkpoint(path, example())
+    return torch.load(path, weights_only=True)
+
+
+def test_what_is_written_is_read(tmp_path):
+    path = tmp_path / "proposer.ckpt"
+    written = example(texture_sha256="ab" * 32)
+    save_checkpoint(path, written)
+    read = load_checkpoint(path)
+    assert (read.settings, read.temperature, read.texture_sha256) == (tiny(), 0.4, "ab" * 32)
+    assert dict(read.about) == ABOUT
+    assert read.state.keys() == written.state.keys()
+    assert all(torch.equal(read.state[name], tensor) for name, tensor in written.state.items())
+    assert [entry.name for entry in tmp_path.iterdir()] == ["proposer.ckpt"]
+
+
+def test_the_same_checkpoint_gives_the_same_bytes(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        save_checkpoint(tmp_path / folder / "proposer.ckpt", example())
+    assert (tmp_path / "a" / "proposer.ckpt").read_bytes() == (tmp_path / "b" / "proposer.ckpt").read_bytes()
+
+
+def test_the_network_of_a_checkpoint_says_what_it_said_before(tmp_path, rng):
+    save_checkpoint(tmp_path / "proposer.ckpt", example())
+    network = correlator_of(load_checkpoint(tmp_path / "proposer.ckpt"))
+    disks, blurs = 100 * torch.rand(2, 24, 24, generator=rng), torch.randn(32 * 32, 7, generator=rng)
+    with torch.no_grad():
+        assert torch.equal(network(disks, blurs), untrained()(disks, blurs))
+    assert not network.training
+    assert not any(parameter.requires_grad for parameter in network.parameters())
+
+
+class Writer:
+    """A pickle of this writes a file when it is loaded with code."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.write_text, (self.path, "executed")
+
+
+@pytest.mark.parametrize("form", ["torch", "pickle", "legacy", "in the weights"])
+def test_code_in_a_file_is_not_executed(tmp_path, form):
+    mark, path = tmp_path / "mark.txt", tmp_path / "evil.ckpt"
+    if form == "pickle":
+        path.write_bytes(pickle.dumps(Writer(mark)))
+    elif form == "legacy":
+        torch.save({"schema": SCHEMA, "state": Writer(mark)}, path, _use_new_zipfile_serialization=False)
+    elif form == "in the weights":
+        tree = tree_of(path)
+        torch.save({**tree, "state": {**tree["state"], "gain": Writer(mark)}}, path)
+    else:
+        torch.save({"schema": SCHEMA, "state": Writer(mark)}, path)
+    text = refused(path)
+    assert not mark.exists()
+    if form in ("torch", "in the weights"):
+        assert "code" in text
+        torch.load(path, weights_only=False)  # that it would have done so otherwise
+        assert mark.exists()
+
+
+def nothing(path: Path) -> None:
+    """No file at all."""
+
+
+def folder(path: Path) -> None:
+    path.mkdir()
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def random_bytes(path: Path) -> None:
+    path.write_bytes(np.random.default_rng(0).bytes(5000))
+
+
+def half(path: Path) -> None:
+    save_checkpoint(path, example())
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+def flipped(path: Path) -> None:
+    save_checkpoint(path, example())
+    content = bytearray(path.read_bytes())
+    start = content.index(b"data.pkl") + 80
+    content[start : start + 200] = b"\x80" * 200
+    path.write_bytes(bytes(content))
+
+
+def without_weights(path: Path) -> None:
+    save_checkpoint(path, example())
+    whole = zipfile.ZipFile(path)
+    with zipfile.ZipFile(path.with_suffix(".other"), "w") as less:
+        for entry in whole.infolist()[:-8]:
+            less.writestr(entry, whole.read(entry))
+    path.with_suffix(".other").replace(path)
+
+
+def packed(path: Path) -> None:
+    """Few bytes that grow to a hundred million."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", b"\0" * 100_000_000)
+
+
+def claims_much(path: Path) -> None:
+    """One whose directory says that an entry is larger than the file."""
+    save_checkpoint(path, example())
+    whole = zipfile.ZipFile(path)
+    with zipfile.ZipFile(path.with_suffix(".other"), "w") as more:
+        for entry in whole.infolist():
+            more.writestr(entry, whole.read(entry))
+        more.filelist[-1].file_size = 2_000_000_000
+    path.with_suffix(".other").replace(path)
+
+
+def other_archive(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("readme.txt", "not this one")
+
+
+def large(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(module.LARGEST_BYTES + 1)
+
+
+def a_list(path: Path) -> None:
+    torch.save([1, 2], path)
+
+
+def a_tensor(path: Path) -> None:
+    torch.save(torch.zeros(3), path)
+
+
+def whole_module(path: Path) -> None:
+    torch.save(untrained(), path)
+
+
+def bare_state(path: Path) -> None:
+    torch.save(state_of(untrained()), path)
+
+
+FILES: list[tuple[Callable[[Path], None], str]] = [
+    (nothing, "expected a file, got none"),
+    (folder, "got a folder"),
+    (empty, "another file"),
+    (random_bytes, "another file"),
+    (half, "the beginning of one"),
+    (flipped, "expected a file of weights"),
+    (without_weights, "expected a file of weights"),
+    (packed, "packed"),
+    (claims_much, "claims more"),
+    (other_archive, "expected a file of weights"),
+    (large, "at most 64 MB"),
+    (a_list, SCHEMA),
+    (a_tensor, SCHEMA),
+    (whole_module, "code"),
+    (bare_state, SCHEMA),
+]
+
+
+@pytest.mark.parametrize(("make", "words"), FILES, ids=lambda one: getattr(one, "__name__", ""))
+def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, make, words):
+    make(tmp_path / "some.ckpt")
+    assert words in refused(tmp_path / "some.ckpt")
+
+
+def other_weight(value: Any) -> dict[str, Any]:
+    return {"state": {**state_of(untrained()), "gain": value}}
+
+
+def changed_network(**changes: Any) -> dict[str, Any]:
+    tree = tiny().model_dump(mode="json")
+    return {"settings": {**tree, "network": {**tree["network"], **changes}}}
+
+
+LESS = {name: tensor for name, tensor in state_of(untrained()).items() if name != "gain"}
+CHANGES: dict[str, tuple[dict[str, Any], str]] = {
+    "later version": ({"schema": "sphereorient-proposer/2"}, "got 'sphereorient-proposer/2'; train it anew"),
+    "no schema": ({"schema": None}, "got none"),
+    "schema of many letters": ({"schema": "x" * 10_000}, "'xxx"),
+    "key too many": ({"optimizer": 1}, "optimizer"),
+    "weight missing": ({"state": LESS}, "gain"),
+    "weight too many": ({"state": {**state_of(untrained()), "extra": torch.zeros(1)}}, "extra"),
+    "state of another type": ({"state": [1]}, "state"),
+    "shape": (other_weight(torch.zeros(2)), "expected shape (), got (2,)"),
+    "dtype": (other_weight(torch.tensor(0.0, dtype=torch.float64)), "torch.float64"),
+    "whole numbers": (other_weight(torch.tensor(0)), "torch.int64"),
+    "a number": (other_weight(0.0), "a tensor of 32 bit floats"),
+    "nan": (other_weight(torch.tensor(float("nan"))), "gain: expected finite"),
+    "infinite": (other_weight(torch.tensor(float("inf"))), "gain: expected finite"),
+    "sparse": (other_weight(torch.zeros(()).to_sparse()), "gain"),
+    "another width": (changed_network(width=12), "expected shape"),
+    "impossible width": (changed_network(width=10_000), "settings network.width"),
+    "unknown setting": (changed_network(depth=3), "settings network.depth"),
+    "settings that contradict each other": (changed_network(size_px=32), "size_px"),
+    "settings of another type": ({"settings": [1, 2]}, "settings"),
+    "temperature of 0": ({"temperature": 0.0}, "temperature"),
+    "temperature nan": ({"temperature": float("nan")}, "temperature"),
+    "temperature as text": ({"temperature": "1"}, "temperature"),
+    "hash of another length": ({"texture_sha256": "ab"}, "texture_sha256"),
+    "hash of other letters": ({"texture_sha256": "xy" * 32}, "texture_sha256"),
+    "about a list": ({"about": [1]}, "about"),
+    "about nested": ({"about": {"a": {"b": 1}}}, "about"),
+    "about long": ({"about": {"a": "x" * 10_000}}, "about"),
+    "about nan": ({"about": {"a": float("nan")}}, "about"),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_a_changed_checkpoint_is_refused_in_one_line(tmp_path, case):
+    change, words = CHANGES[case]
+    path = tmp_path / "changed.ckpt"
+    torch.save({**tree_of(path), **change}, path)
+    assert words in refused(path)
+
+
+@pytest.mark.parametrize("key", sorted(module.KEYS))
+def test_a_checkpoint_without_one_of_its_keys_is_refused(tmp_path, key):
+    path = tmp_path / "less.ckpt"
+    tree = tree_of(path)
+    del tree[key]
+    torch.save(tree, path)
+    assert "expected" in refused(path)
+
+
+def test_what_would_be_refused_is_not_written(tmp_path):
+    with pytest.raises(CheckpointError, match="finite"):
+        save_checkpoint(
+            tmp_path / "bad.ckpt", example(state={**state_of(untrained()), "gain": torch.tensor(float("nan"))})
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):
+    path = tmp_path / "proposer.ckpt"
+    save_checkpoint(path, example())
+    before = path.read_bytes()
+
+    def full(tree: Any, aside: Path) -> None:
+        aside.write_bytes(b"some")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module.torch, "save", full)
+    with pytest.raises(Exception, match="No space left"):
+        save_checkpoint(path, example(temperature=1.0))
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["proposer.ckpt"]
+
+
+def test_a_map_is_known_by_its_grey_levels_whatever_its_file(tmp_path):
+    grey = (255 * random_texture("dots", 2, 64)).round().to(torch.uint8).numpy()
+    paths = [tmp_path / name for name in ("a.png", "b.tiff", "c.png")]
+    cv2.imwrite(str(paths[0]), grey)
+    cv2.imwrite(str(paths[1]), grey)
+    cv2.imwrite(str(paths[2]), grey.astype(np.uint16) * 257)
+    first, *others = (texture_sha256(load_texture(path)) for path in paths)
+    assert others == [first, first]
+    assert len(first) == 64
+
+
+def test_another_map_than_that_of_the_fine_tuning_is_refused():
+    texture = random_texture("dots", 2, 64)
+    own = example(texture_sha256=texture_sha256(texture))
+    check_texture(own, texture)
+    other = texture.clone()
+    other[10, 10] = 1 - other[10, 10]
+    for wrong in (other, 1 - texture, texture.flip(1), texture[::2, ::2]):
+        with pytest.raises(CheckpointError, match="fine-tuned") as caught:
+            check_texture(own, wrong)
+        assert "\n" not in str(caught.value)
+    check_texture(example(), other)
