@@ -128,8 +128,9 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
     for name, background in learnt.backgrounds.items():
         group = file.create_group(f"cameras/{name}")
         group.attrs["full_scale"], group.attrs["diameter_px"] = background.full_scale, learnt.diameter_px[name]
-        for part in ("mean", "noise"):
-            group.create_dataset(part, data=getattr(background, part), track_times=False)
+        for part in ("mean", "noise", "shown"):
+            if getattr(background, part) is not None:
+                group.create_dataset(part, data=getattr(background, part), track_times=False)
     light = file.create_group("light")
     light.attrs["known"] = learnt.light.known
     for part in ("difference", "black", "noise"):
@@ -151,6 +152,7 @@ def _read(file: h5py.File) -> Learnt:
             mean=np.asarray(group["mean"][()], np.float32),
             noise=np.asarray(group["noise"][()], np.float32),
             full_scale=float(group.attrs["full_scale"]),
+            shown=np.asarray(group["shown"][()], bool) if "shown" in group else None,
         )
         for name, group in groups.items()
     }

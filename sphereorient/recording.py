@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, load_experiment, open_movies, outside_paths
 from sphereorient.movies import flipped_picture
+from sphereorient.paint.fixed import FixedBall, fixed_ball
 from sphereorient.reel import Reel
 from sphereorient.settings import Settings
 from sphereorient.sphere import load_texture
@@ -36,8 +37,9 @@ class Recording:
     experiment: Experiment
     reels: Sequence[Reel]
     timeline: Timeline
-    texture: Tensor
+    texture: Tensor  # (H, 2 H); (0, 0) where it is to be learnt
     remarks: tuple[str, ...]  # what a user should know of the inputs
+    _in_place: dict[str, FixedBall] = field(default_factory=dict, init=False, repr=False)  # found once, on demand
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -69,13 +71,25 @@ class Recording:
     def diameter_px(self, name: str, settings: Settings) -> float:
         """Return the expected diameter of the sphere's picture in one camera."""
         given = settings.locate.diameter_px
+        if given is None and self.experiment.fixed and self.experiment.diameter_mm is None:
+            return 2 * self._fixed_ball(next(reel for reel in self.reels if reel.name == name), settings).outline.radius_px
         return given or locate.expected_diameter_px(name, self.cameras, self.experiment.diameter_mm)
 
     def empty_scene(self, reel: Reel, count: int, settings: Settings) -> locate.Background:
         """Learn what one camera shows without the ball, from `count` frames or the experiment's own picture."""
         empty = given_scene(self.experiment, reel.name, reel.movie.frame_shape)
+        if empty is None and self.experiment.fixed:
+            return self._fixed_ball(reel, settings).scene
         diameter_px = self.diameter_px(reel.name, settings)
-        return locate.learn_background(reel.spread(count), diameter_px, settings.locate, empty)
+        return locate.learn_background(reel.spread(count), diameter_px, settings.locate, empty, reel.shown)
+
+    def _fixed_ball(self, reel: Reel, settings: Settings) -> FixedBall:
+        """Find a ball that turns in its place in one camera's movie."""
+        if reel.name not in self._in_place:
+            empty = given_scene(self.experiment, reel.name, reel.movie.frame_shape)
+            pictures = reel.spread(settings.locate.background_frames)
+            self._in_place[reel.name] = fixed_ball(pictures, settings.locate, empty)
+        return self._in_place[reel.name]
 
     def gridded(self) -> tuple[Recording, Rows]:
         """Return the recording on an even grid of times, and the places of its frames in it; see `Timeline`."""
@@ -93,6 +107,15 @@ def given_scene(experiment: Experiment, name: str, frame_shape: tuple[int, int])
     return flipped_picture(locate.load_background(path, frame_shape), experiment.flip.get(name, "none"))
 
 
+def given_mask(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.bool_] | None:
+    """Return where a camera sees the ball, (H, W), None where nothing hides it."""
+    path = experiment.mask_paths.get(name)
+    if path is None:
+        return None
+    # It is painted on a frame of the movie as its file holds it.
+    return flipped_picture(locate.load_mask(path, frame_shape), experiment.flip.get(name, "none"))
+
+
 @contextmanager
 def open_recording(source: Experiment | str | Path, cameras: Sequence[str] | None = None) -> Iterator[Recording]:
     """Open an experiment for tracking, and close its movies at the end.
@@ -105,14 +128,41 @@ def open_recording(source: Experiment | str | Path, cameras: Sequence[str] | Non
         SphereOrientError: inputs that are missing, unreadable or do not fit together.
     """
     experiment = source if isinstance(source, Experiment) else load_experiment(Path(source))
-    names = _chosen(experiment, cameras)
     texture = load_texture(_texture_path(experiment))
-    _refuse_unsupported(experiment, names)
+    with _opened(experiment, cameras, texture) as recording:
+        yield recording
+
+
+@contextmanager
+def open_unpainted(source: Experiment | str | Path, cameras: Sequence[str] | None = None) -> Iterator[Recording]:
+    """Open an experiment whose map is to be learnt; its `texture`, if any, is not looked at.
+
+    Args:
+        source: the experiment as loaded, or the path of its experiment.yaml.
+        cameras: names of those to use; None: all.
+
+    Raises:
+        SphereOrientError: inputs that are missing, unreadable or do not fit together.
+    """
+    experiment = source if isinstance(source, Experiment) else load_experiment(Path(source))
+    with _opened(experiment, cameras, torch.empty(0, 0)) as recording:
+        yield recording
+
+
+@contextmanager
+def _opened(experiment: Experiment, cameras: Sequence[str] | None, texture: Tensor) -> Iterator[Recording]:
+    names = _chosen(experiment, cameras)
     movies = open_movies(experiment, names)
     try:
         frames = timeline(experiment, movies)
         reels = [
-            Reel(name=name, camera=experiment.cameras[name], movie=movies[name], rows=frames.rows[name])
+            Reel(
+                name=name,
+                camera=experiment.cameras[name],
+                movie=movies[name],
+                rows=frames.rows[name],
+                shown=given_mask(experiment, name, movies[name].frame_shape),
+            )
             for name in names
         ]
         outside = outside_paths(experiment)
@@ -145,17 +195,6 @@ def _chosen(experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:
 
 def _texture_path(experiment: Experiment) -> Path:
     if experiment.texture_path is None:
-        do = "give sphere.texture; learning it from the movie is not part of this version"
+        do = "learn it with `sphereorient map`, then write sphere.texture: the file that this gives"
         raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
     return experiment.texture_path
-
-
-def _refuse_unsupported(experiment: Experiment, names: Sequence[str]) -> None:
-    """Refuse what the file may say and this version would ignore: a wrong result is worse than none."""
-    if any(name in experiment.mask_paths for name in names):
-        do = "remove masks: and see how far the method gets without them"
-        raise ExperimentError(refusal(f"{experiment.path}, masks", expected="none", got="masks", do=do))
-    if experiment.fixed and not all(name in experiment.background_paths for name in names):
-        do = "give backgrounds: pictures of the scene without the ball; a ball at rest is part of the movie's own"
-        got = "a fixed ball without them"
-        raise ExperimentError(refusal(f"{experiment.path}", expected="backgrounds of all cameras", got=got, do=do))

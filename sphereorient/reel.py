@@ -26,6 +26,7 @@ class Reel:
     camera: Camera
     movie: Movie
     rows: NDArray[np.int64]  # (N,), the movie's own numbers of the frames; NONE where it has no picture
+    shown: NDArray[np.bool_] | None = None  # (H, W), False where something hides the ball; None: nowhere
 
     def __len__(self) -> int:
         """Return the number of frames."""

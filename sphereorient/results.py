@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from sphereorient.experiment import Experiment
 from sphereorient.locate import Positions, Sightings
 from sphereorient.motion import Motion, Smoothed
 from sphereorient.orient import Candidates, PoseTable, Study
+from sphereorient.paint.record import LearntMap
 from sphereorient.so3 import exp, geodesic_distance
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
@@ -160,6 +162,55 @@ def precise_track(
         margin=margin.numpy(),
         margin_angle=angle.numpy(),
         cameras={name: precise_camera(k, table, picked, learnt) for k, name in enumerate(names)},
+    )
+
+
+def map_track(
+    experiment: Experiment, clock: Tensor, learnt: LearntMap, settings: str, provenance: Mapping[str, Any]
+) -> Trajectory:
+    """Put the attitudes that were learnt with a map into the noun that comes out; nothing tells their errors.
+
+    Args:
+        experiment: what was filmed.
+        clock: (N,), times of its frames, s.
+        learnt: with as many frames.
+        settings: YAML text of all settings.
+        provenance: where it comes from.
+    """
+    names = [eye.name for eye in learnt.eyes]
+    empty = Trajectory.empty(
+        clock.numpy(),
+        cameras=tuple(names),
+        frame_rate=experiment.frame_rate_hz,
+        method="map",
+        settings=settings,
+        experiment=experiment.name,
+        provenance=provenance,
+    )
+    radius_mm = 1.0 if experiment.diameter_mm is None else experiment.diameter_mm / 2
+    position, R = learnt.position_lab_mm, learnt.R_lab_body
+    cameras = {}
+    for c, eye in enumerate(learnt.eyes):
+        used = learnt.valid & torch.isfinite(learnt.score[:, c])
+        centre_px = torch.where(learnt.valid[:, None], eye.camera.project(position.nan_to_num()), torch.nan)
+        cameras[eye.name] = replace(
+            empty.cameras[eye.name],
+            centre_px=centre_px.numpy(),
+            radius_px=eye.radius_px(position, radius_mm).numpy(),
+            orientation=torch.where(used[:, None, None], R, torch.nan).numpy(),
+            score=learnt.score[:, c].numpy(),
+            reason=tuple(str(Reason.OK if there else Reason.NOT_FOUND) for there in learnt.valid.tolist()),
+        )
+    # Frames beyond those that the map was fitted to only follow these.
+    flags = torch.where(learnt.valid & ~learnt.fitted, int(Flag.EXTRAPOLATED), 0)
+    return replace(
+        empty,
+        valid=learnt.valid.numpy(),
+        position=position.numpy(),
+        orientation=R.numpy(),
+        segment=torch.where(learnt.valid, 0, -1).numpy(),
+        flags=flags.numpy().astype(np.uint32),
+        cameras=cameras,
     )
 
 

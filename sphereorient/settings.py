@@ -20,6 +20,7 @@ from sphereorient.learn.settings import ProposerSettings
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
 from sphereorient.orient.settings import GreySearchSettings, OrientSettings, ProposeSettings, RefineSettings
+from sphereorient.paint.settings import PaintSettings
 from sphereorient.statistics.settings import StatisticsSettings
 from sphereorient.synth.settings import SynthSettings
 
@@ -44,6 +45,7 @@ class Settings(BaseModel):
     orient: OrientSettings = Field(default_factory=OrientSettings, description="where could it point (paper)")
     assemble: AssembleSettings = Field(default_factory=AssembleSettings, description="which candidate is true (paper)")
     motion: MotionSettings = Field(default_factory=MotionSettings, description="velocities, accelerations (paper)")
+    paint: PaintSettings = Field(default_factory=PaintSettings, description="the map from the movies (`map`)")
     statistics: StatisticsSettings = Field(default_factory=StatisticsSettings, description="numbers of a report")
 
 

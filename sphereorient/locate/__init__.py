@@ -1,6 +1,6 @@
 """Where is it: background, blob, outline, gaps."""
 
-from sphereorient.locate.background import Background, load_background, spread_frames
+from sphereorient.locate.background import Background, load_background, load_mask, spread_frames
 from sphereorient.locate.expected import check_seen, expected_diameter_px, size_of
 from sphereorient.locate.find import Found, find_ball, sightings_of
 from sphereorient.locate.gaps import repair
@@ -23,6 +23,7 @@ __all__ = [
     "find_positions",
     "learn_background",
     "load_background",
+    "load_mask",
     "repair",
     "screened",
     "sightings_of",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ class Background:
     mean: NDArray[np.float32]  # (H, W), grey levels
     noise: NDArray[np.float32]  # (H, W), robust standard deviation of each pixel about the mean, grey levels
     full_scale: float  # grey level of a saturated pixel, 255 for 8 bit, 1023 for 10
+    shown: NDArray[np.bool_] | None = None  # (H, W), False where something that does not move hides the ball
 
     @cached_property
     def typical_noise(self) -> float:
@@ -40,9 +41,12 @@ class Background:
     def difference(self, frame: NDArray[np.generic]) -> NDArray[np.float32]:
         """Return |frame - background|, (H, W) float32, grey levels.
 
-        White paint is brighter and black paint often darker than what lies behind: both count as ball.
+        White paint is brighter and black paint often darker than what lies behind: both count as ball. Where the ball
+        is hidden nothing differs.
         """
         out: NDArray[np.float32] = np.abs(frame.astype(np.float32) - self.mean)
+        if self.shown is not None:
+            out[~self.shown] = 0
         return out
 
 
@@ -59,7 +63,26 @@ def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.floa
     Raises:
         ExperimentError: the file is missing, no picture, or of another size than the movie's frames.
     """
-    name, do = f"background {path}", "save a frame without the ball as PNG, in the movie's own grey levels"
+    do = "save a frame without the ball as PNG, in the movie's own grey levels"
+    return np.asarray(_picture(path, f"background {path}", frame_shape, do), np.float32)
+
+
+def load_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Read where the ball can be seen, (H, W): black in the picture is what hides it, white all else.
+
+    Raises:
+        ExperimentError: the file is missing, no picture, of another size than the movie's frames, or all black.
+    """
+    name, do = f"mask {path}", "paint what hides the ball black, all else white, on a frame of the movie"
+    picture = _picture(path, name, frame_shape, do)
+    shown = np.asarray(picture > np.iinfo(picture.dtype).max // 2)
+    if not shown.any():
+        raise ExperimentError(refusal(name, expected="white where the ball is seen", got="black only", do=do))
+    return shown
+
+
+def _picture(path: Path, name: str, frame_shape: tuple[int, int], do: str) -> NDArray[Any]:
+    """Read a grey picture of the size of a movie's frames, (H, W), in its own depth."""
     height, width = frame_shape
     content = read_whole(path, BYTES_A_PIXEL * height * width + HEADER_BYTES, "a picture", ExperimentError, do)
     claimed = claimed_pixels(content)
@@ -72,7 +95,7 @@ def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.floa
     if picture.shape != frame_shape:
         expected, got = (f"{shape[1]} x {shape[0]} px as the movie" for shape in (frame_shape, picture.shape))
         raise ExperimentError(refusal(name, expected=expected, got=got.removesuffix(" as the movie"), do=do))
-    return np.asarray(picture, np.float32)
+    return picture
 
 
 def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None = None) -> Background:
@@ -132,7 +155,7 @@ def without_ball(background: Background, pictures: NDArray[Any], covered: NDArra
     values[covered[:, again]] = np.nan
     mean, noise = background.mean.copy(), background.noise.copy()
     mean[again], noise[again] = _statistics(values, None, background.full_scale)
-    return Background(mean=mean, noise=noise, full_scale=background.full_scale)
+    return replace(background, mean=mean, noise=noise)
 
 
 def _rounding(full_scale: float) -> float:

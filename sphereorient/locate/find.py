@@ -39,7 +39,7 @@ def find_ball(
     blobs = find_blobs(difference, background.noise, diameter_px, settings)
     best: Outline | None = None
     for blob in blobs:
-        outline = fit_outline(difference, background.typical_noise, blob, diameter_px, settings)
+        outline = fit_outline(difference, background.typical_noise, blob, diameter_px, settings, background.shown)
         if outline is not None and (best is None or outline.coverage > best.coverage):
             best = outline
         # The likeliest blob usually is the ball; the others are looked at only where its rim is not convincing.

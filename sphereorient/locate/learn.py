@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ def learn_background(
     diameter_px: float,
     settings: LocateSettings,
     empty: NDArray[np.float32] | None = None,
+    shown: NDArray[np.bool_] | None = None,
 ) -> Background:
     """Learn what a movie shows without the ball.
 
@@ -32,8 +34,9 @@ def learn_background(
         diameter_px: expected diameter of the ball.
         settings: of the room.
         empty: (H, W), the scene without the ball, where there is such a picture; nothing then is left to learn.
+        shown: (H, W), False where something that does not move hides the ball; None: nowhere.
     """
-    background = measure_background(pictures, empty)
+    background = replace(measure_background(pictures, empty), shown=shown)
     if empty is not None:
         return background
     first, before = background, 0

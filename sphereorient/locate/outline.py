@@ -15,6 +15,7 @@ DIRECTIONS = 72  # bins of 5 degrees in which the support of a circle is counted
 BEYOND = 1.0  # weight of a rim place beyond a circle against one on it
 NOISE_FLOOR = 2.0  # below so many sigmas the root is linear: noise is not magnified
 NOISE_STEEPNESS = 0.28  # times the root of the noise: stabilised noise falls as steeply in one place of ten thousand
+NEAR_HIDDEN_PX = 3  # from what hides the ball: edges there are not the rim's
 PROFILES = 180  # radial profiles of the sub-pixel fit; more only repeat the same pixels
 
 
@@ -50,6 +51,15 @@ def _edge_points(window: NDArray[np.float32], steepness: float) -> _Edges:
     keep = norm[:, 0] > 0
     point = np.stack([columns, rows], axis=1).astype(np.float64)[keep]
     return _Edges(point=point, inward=gradient[keep] / norm[keep])
+
+
+def _in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """Return which places (n, 2), window px, lie away from what hides the ball, (n,)."""
+    if clear is None:
+        return np.ones(len(place), bool)
+    limit = np.array(clear.shape[::-1]) - 1
+    u, v = np.rint(place).astype(np.int64).clip(0, limit).T
+    return np.asarray(clear[v, u])
 
 
 def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -107,7 +117,11 @@ def _best_circle(
 
 
 def _radial_edges(
-    window: NDArray[np.float32], circle: NDArray[np.float64], reach: tuple[float, float], steepness: float
+    window: NDArray[np.float32],
+    circle: NDArray[np.float64],
+    reach: tuple[float, float],
+    steepness: float,
+    clear: NDArray[np.bool_] | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Sub-pixel places of the outermost steep fall along radial profiles about a circle.
 
@@ -140,6 +154,7 @@ def _radial_edges(
     bend = left - 2 * middle + right
     limit = np.array(window.shape[::-1]) - 1
     keep = peak.any(1) & (bend < 0) & ((at[:, -1] >= 0) & (at[:, -1] <= limit)).all(1)
+    keep &= _in_the_clear(at[rows, last + 1], clear)
     shift = 0.5 * (left - right)[keep] / bend[keep]
     return outward[keep], offset[last[keep] + 1] + shift * step, middle[keep]
 
@@ -167,11 +182,15 @@ def _consensus(
 
 
 def _fit_circle(
-    window: NDArray[np.float32], circle: NDArray[np.float64], tolerance: float, steepness: float
+    window: NDArray[np.float32],
+    circle: NDArray[np.float64],
+    tolerance: float,
+    steepness: float,
+    clear: NDArray[np.bool_] | None,
 ) -> Outline | None:
     """Consensus and then a least-squares circle with Tukey weights on the sub-pixel places of the rim."""
     for reach in ((0.35 * circle[2], 0.25 * circle[2]), (0.1 * circle[2], 0.1 * circle[2])):
-        outward, offset, fall = _radial_edges(window, circle, reach, steepness)
+        outward, offset, fall = _radial_edges(window, circle, reach, steepness, clear)
         if len(offset) < 12:
             return None
         # Faint falls are the halo of a patch's corner as often as the rim.
@@ -212,6 +231,7 @@ def fit_outline(
     blob: Blob,
     diameter_px: float,
     settings: LocateSettings,
+    shown: NDArray[np.bool_] | None = None,
 ) -> Outline | None:
     """Fit the circle of a ball near a rough place.
 
@@ -224,6 +244,7 @@ def fit_outline(
         blob: rough place.
         diameter_px: expected diameter.
         settings: of the room.
+        shown: (H, W), False where something hides the ball; None: nowhere.
 
     Returns:
         The outline in the picture's pixels, or None where no circle of an allowed size is supported.
@@ -232,7 +253,11 @@ def fit_outline(
     """
     reach = int(np.ceil(0.5 * diameter_px * (1 + settings.diameter_tolerance) + 8))
     left, top = max(0, int(blob.u_px) - reach), max(0, int(blob.v_px) - reach)
-    window = difference[top : int(blob.v_px) + reach + 1, left : int(blob.u_px) + reach + 1]
+    around = np.s_[top : int(blob.v_px) + reach + 1, left : int(blob.u_px) + reach + 1]
+    window, clear = difference[around], None
+    if shown is not None:
+        square = np.ones((2 * NEAR_HIDDEN_PX + 1,) * 2, np.uint8)
+        clear = cv2.erode(shown[around].astype(np.uint8), square) > 0
     if min(window.shape) < 8:
         return None
     window = _stabilised(window, NOISE_FLOOR * noise, settings.edge_blur_px)
@@ -242,11 +267,13 @@ def fit_outline(
     floor = NOISE_STEEPNESS * noise**0.5
     steepness = max(settings.edge_fraction * contrast / (settings.edge_blur_px * 2.5), floor)
     edges = _edge_points(window, steepness)
+    kept = _in_the_clear(edges.point, clear)
+    edges = _Edges(point=edges.point[kept], inward=edges.inward[kept])
     sizes = tuple(0.5 * diameter_px * (1 + sign * settings.diameter_tolerance) for sign in (-1, 1))
     circle = _best_circle(edges, (sizes[0], sizes[1]), settings.edge_tolerance_px)
     if circle is None:
         return None
-    fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor))
+    fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor), clear)
     if fit is None or not sizes[0] < fit.radius_px < sizes[1]:
         return None
     return Outline(

@@ -163,7 +163,15 @@ class Fitter:
         stencil = level.stencil(min(radius_px, 0.5 * max(self.eyes[0].camera.image_size)))
         return stacked(
             [
-                cut_pixels(frame, eye.background.mean, eye.sight, tuple(middles[c][b]), stencil, level.extra_px)
+                cut_pixels(
+                    frame,
+                    eye.background.mean,
+                    eye.sight,
+                    tuple(middles[c][b]),
+                    stencil,
+                    level.extra_px,
+                    eye.background.shown,
+                )
                 for b, frames in enumerate(pictures)
                 for c, (eye, frame) in enumerate(zip(self.eyes, frames, strict=True))
             ]

@@ -139,6 +139,7 @@ def cut_pixels(
     middle_px: tuple[float, float],
     stencil: Stencil,
     blur_px: float = 0.0,
+    shown: NDArray[np.bool_] | None = None,
 ) -> Pixels:
     """Take a disk's pixels out of a frame, as they are: no resampling, so the noise of neighbours stays independent.
 
@@ -149,6 +150,7 @@ def cut_pixels(
         middle_px: (u, v), near the ball's centre.
         stencil: of the places.
         blur_px: standard deviation of a Gaussian laid over frame and background first; tames detail for coarse fits.
+        shown: (H, W), False where something hides the ball; None: nowhere.
 
     Returns:
         One disk.
@@ -158,6 +160,8 @@ def cut_pixels(
     columns, rows = u + stencil.right, v + stencil.down
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     columns, rows = columns.clip(0, width - 1), rows.clip(0, height - 1)
+    if shown is not None:
+        inside &= shown[rows, columns]
     reach = stencil.reach + math.ceil(3 * blur_px)
     left, top = min(max(u - reach, 0), width - 1), min(max(v - reach, 0), height - 1)
     window = np.s_[top : max(v + reach + 1, top + 1), left : max(u + reach + 1, left + 1)]

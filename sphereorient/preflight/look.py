@@ -28,7 +28,7 @@ from sphereorient.locate.background import measure_background
 from sphereorient.locate.find import Found
 from sphereorient.locate.outline import Outline
 from sphereorient.movies import Movie
-from sphereorient.recording import given_scene
+from sphereorient.recording import given_mask, given_scene
 from sphereorient.reel import pictures_of
 from sphereorient.timeline import NONE, Timeline
 from sphereorient.trajectory import Reason
@@ -211,8 +211,8 @@ def _empty_scene(
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
     empty = given_scene(experiment, name, movie.frame_shape)
     if empty is None and experiment.fixed:
-        return _around(some)
-    return learn_background(some, diameter_px, settings, empty)
+        return replace(_around(some), shown=given_mask(experiment, name, movie.frame_shape))
+    return learn_background(some, diameter_px, settings, empty, given_mask(experiment, name, movie.frame_shape))
 
 
 def _around(pictures: Grey) -> Background:

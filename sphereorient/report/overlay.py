@@ -15,6 +15,7 @@ from sphereorient.cameras.yaml_file import refuse_unknown
 from sphereorient.errors import ExperimentError, TrackError, refusal
 from sphereorient.experiment import Experiment, open_movies
 from sphereorient.movies import Grey, Movie
+from sphereorient.recording import given_mask
 from sphereorient.reel import Reel, pictures_of
 from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of, radius_of
 from sphereorient.report.overlay_page import Page, crop_side
@@ -90,7 +91,14 @@ def prepared(
     numbers, rows = frames_of(track, experiment, movies)
     where = path_of(track, radius_of(experiment))
     reels = {
-        name: Reel(name=name, camera=experiment.cameras[name], movie=movies[name], rows=rows[name]) for name in names
+        name: Reel(
+            name=name,
+            camera=experiment.cameras[name],
+            movie=movies[name],
+            rows=rows[name],
+            shown=given_mask(experiment, name, movies[name].frame_shape),
+        )
+        for name in names
     }
     models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in names]
     views = [_view(track, model, reels[name]) for name, model in zip(names, models, strict=True)]

@@ -41,7 +41,15 @@ def paper(experiment: Path) -> Trajectory:
     return track_movies(experiment, method="paper", settings=Settings())
 
 
-TRACKERS: dict[str, Tracker] = {"precise": precise, "paper": paper}
+def precise_network(experiment: Path) -> Trajectory:
+    """Track with `--method precise --proposer default`."""
+    from sphereorient.pipeline import track_movies
+
+    return track_movies(experiment, method="precise", settings=Settings(), proposer="default")
+
+
+TRACKERS: dict[str, Tracker] = {"precise": precise, "paper": paper, "precise_network": precise_network}
+USUAL = ("precise", "paper")  # those of a run that does not name them
 
 
 def run_benchmark(
@@ -57,7 +65,7 @@ def run_benchmark(
     Args:
         folder: of the run; made where it is missing. Its results.json holds everything at the end.
         settings: which scenes.
-        trackers: by the method's name; None: paper and precise. Another proposer comes in here.
+        trackers: by the method's name, see `TRACKERS`; None: paper and precise. Another proposer comes in here.
         jobs: processes, one scene each.
         progress: called with scenes done and all scenes.
 
@@ -67,7 +75,7 @@ def run_benchmark(
     Raises:
         OutputError: the folder holds another run, or cannot be written.
     """
-    chosen = TRACKERS if trackers is None else trackers
+    chosen = trackers_of(USUAL) if trackers is None else trackers
     _prepare(folder, settings)
     scenes = scenes_of(settings)
     missing = [scene for scene in scenes if _missing(folder, scene, chosen)]

@@ -1,0 +1,51 @@
+"""From footage to what is compared: evened disks without a map, pixels with one."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sphereorient.cameras import R_cam_view
+from sphereorient.orient.crop import crop_disk
+from sphereorient.orient.eye import Fitter
+from sphereorient.orient.pixels import Pixels, stacked
+from sphereorient.paint.disks import Disks, even_disks
+from sphereorient.paint.footage import Footage
+from sphereorient.paint.settings import PaintSettings
+
+FAR_RADII = 50.0  # of a camera that does not see the ball: any distance does
+
+
+def disks_of(footage: Footage, frames: Tensor, settings: PaintSettings) -> Disks:
+    """Cut the evened disks of some frames (M,) out of the footage."""
+    size, count, cameras = settings.disk_px, len(frames), len(footage.eyes)
+    pictures = torch.zeros(count, cameras, size, size)
+    R = torch.eye(3, dtype=torch.float64).repeat(count, cameras, 1, 1)
+    far = torch.full((count, cameras), FAR_RADII, dtype=torch.float64)
+    X = footage.position_lab_mm[frames]
+    for c, eye in enumerate(footage.eyes):
+        camera = eye.camera
+        in_camera = X @ camera.R_cam_lab.mT + camera.T_cam_lab_mm
+        far[:, c] = in_camera.norm(dim=-1) / footage.radius_mm
+        R[:, c] = camera.R_cam_lab.mT @ R_cam_view(in_camera)
+        # The limb lies a little before the great circle that `radius_px` measures.
+        limb = eye.radius_px(X, footage.radius_mm) / (1 - far[:, c] ** -2).clamp_min(1e-3).sqrt()
+        middle = camera.project(X)
+        for k, frame in enumerate(frames.tolist()):
+            window = footage.windows[c][frame]
+            if window is not None and bool(footage.seen[frame, c]):
+                u, v = float(middle[k, 0]) - window.left, float(middle[k, 1]) - window.top
+                pictures[k, c] = torch.from_numpy(crop_disk(window.grey, u, v, float(limb[k]), size))
+    return even_disks(pictures, R, far, footage.seen[frames], settings.detail, settings.window)
+
+
+def pixels_of(footage: Footage, fitter: Fitter, frames: Tensor, wanted: int) -> Pixels:
+    """Cut the disks' pixels out, frame by frame, of each disk about as many as wanted."""
+    X = footage.position_lab_mm[frames]
+    radius_px = float(fitter.largest_px(X).max())
+    parts = []
+    for k, frame in enumerate(frames.tolist()):
+        pictures = [[footage.picture(frame, c) for c in range(len(footage.eyes))]]
+        whole = fitter.pixels(pictures, X[k : k + 1], fitter.optics.fine, radius_px)
+        parts.append(whole.thinned(max(1, round(whole.grey.shape[1] / wanted))))
+    return stacked(parts)

@@ -1,0 +1,221 @@
+"""The map, the attitudes and the light from the movies, on one page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.sparse import csr_matrix
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.locate import LocateSettings
+from sphereorient.orient.eye import Eye, Fitter
+from sphereorient.orient.light import Light
+from sphereorient.paint.chain import Chain, find_chain, spread
+from sphereorient.paint.cut import disks_of, pixels_of
+from sphereorient.paint.disks import Disks, disk_places, view_normals
+from sphereorient.paint.footage import Footage, Progress, Source, take_footage, too_few
+from sphereorient.paint.grid import look_up, map_sums, solve_map
+from sphereorient.paint.look import DEPTH_MIN
+from sphereorient.paint.record import LearntMap, Round
+from sphereorient.paint.rounds import LIGHT_ROUNDS, Stage, fitted, map_weight, next_round, optics_of, typical
+from sphereorient.paint.settings import PaintSettings
+from sphereorient.paint.sharpen import sharpened
+from sphereorient.synth.textures import map_directions
+
+FIRST_BLUR_PX = 0.625  # a pixel's own width and a good lens
+FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
+CONTRAST = 0.3  # deviation of the first map about mid-grey
+TEXEL_PX = 0.75  # of the widest disk's middle
+ROW, FINEST_ROWS = 32, 512  # rows of the fitted map are a multiple of the one, and at most the other
+FINER = 2  # the map that comes out has so many times the rows of the fitted one: it is sharper
+
+
+def learn_map(source: Source, settings: PaintSettings, locating: LocateSettings, progress: Progress) -> LearntMap:
+    """Learn the map of the paint and all attitudes from movies alone.
+
+    Args:
+        source: the movies, opened; `recording.Recording` is one. Its texture is not looked at.
+        settings: of the room.
+        locating: how outlines are found.
+        progress: told how far each stage is.
+
+    Returns:
+        The map; see `LearntMap` for the body frame it is in.
+
+    Raises:
+        ExperimentError: the ball is not found.
+        PaintError: one frame only, a sphere that never turns, nothing seen twice, or cameras that see different balls.
+
+    Source: direct alignment of pictures (Lucas and Kanade 1981) on the sphere, a pose graph, and bundle adjustment on
+    grey values with the map among the unknowns.
+    """
+    return learn_from(take_footage(source, settings, locating, progress), settings, progress)
+
+
+def learn_from(footage: Footage, settings: PaintSettings, progress: Progress) -> LearntMap:
+    """Learn a map from footage; see `learn_map`."""
+    frames = torch.nonzero(footage.seen.any(1))[:, 0]
+    if len(frames) < 2:
+        raise too_few(len(frames))
+    progress("chain", 0, 1)
+    disks = disks_of(footage, frames, settings)
+    chain = find_chain(disks, settings)
+    progress("chain", 1, 1)
+    rows = spread(torch.arange(len(frames)), settings.frames_max)
+    first = first_map(disks, chain.R_lab_body, _height(footage.eyes, settings))
+    stage = first_stage(footage, frames[rows], chain.R_lab_body[rows], first, settings)
+    rounds: list[Round] = []
+    for k in range(settings.rounds):
+        progress("map", k, settings.rounds)
+        stage, done = next_round(stage, settings, k)
+        rounds.append(done)
+        if k >= LIGHT_ROUNDS and done.moved_rad < math.radians(settings.arrived_deg):
+            break
+    progress("map", settings.rounds, settings.rounds)
+    arrived = rounds[-1].moved_rad < math.radians(settings.arrived_deg)
+    return _finished(footage, frames, rows, chain, stage, tuple(rounds), arrived)
+
+
+def first_map(disks: Disks, R_lab_body: Tensor, height: int) -> Tensor:
+    """Lay evened disks over the sphere: a first map, (H, 2 H) float32, about mid-grey."""
+    texels = 2 * height * height
+    matrix, right = csr_matrix((texels, texels)), np.zeros(texels)
+    for c in range(disks.layers.shape[1]):
+        normal, share = view_normals(disks.size_px, float(disks.distance_radii[:, c].median()))
+        place, _, depth = disk_places(normal, disks.distance_radii[:, c].median())
+        at = ((place + 1) * (disks.size_px / 2) - 0.5).round().long()
+        grey = disks.layers[:, c, 0].flatten(1)[:, at[1] * disks.size_px + at[0]]
+        body = (R_lab_body.mT.float() @ (disks.R_lab_view[:, c] @ normal)).mT
+        weight = (share * depth.clamp_min(0).square())[None] * disks.seen[:, c][:, None]
+        more, told = map_sums(body.reshape(-1, 3), grey.reshape(-1), weight.reshape(-1), height)
+        matrix, right = matrix + more, right + told
+    even = solve_map(matrix, right, height, FIRST_SMOOTH * typical(matrix.diagonal()))
+    return (0.5 + CONTRAST * even / even.std()).clamp(0, 1).float()
+
+
+def first_stage(
+    footage: Footage, frames: Tensor, R_lab_body: Tensor, texture: Tensor, settings: PaintSettings
+) -> Stage:
+    """Make ready for the rounds: the pixels of some frames (n,), a map to begin with, light unknown."""
+    blur_px = settings.blur_px or FIRST_BLUR_PX
+    noise = torch.tensor([[eye.background.typical_noise**2, 0.02, 0.001, 0.0] for eye in footage.eyes])
+    fitter = Fitter(
+        eyes=footage.eyes,
+        radius_mm=footage.radius_mm,
+        optics=optics_of(texture, footage.eyes, blur_px),
+        light=Light.unknown(len(footage.eyes), noise),
+    )
+    return Stage(
+        frames=frames,
+        pixels=pixels_of(footage, fitter, frames, settings.pixels),
+        use=footage.seen[frames],
+        position_lab_mm=footage.position_lab_mm[frames],
+        R_lab_body=R_lab_body,
+        texture=texture,
+        blur_px=blur_px,
+        fitter=fitter,
+        fixed=footage.fixed,
+    )
+
+
+def _height(eyes: Sequence[Eye], settings: PaintSettings) -> int:
+    """Rows of the fitted map: texels a little finer than pixels in the widest disk's middle."""
+    if settings.height is not None:
+        return settings.height
+    rows = math.pi / 2 / TEXEL_PX * max(eye.diameter_px for eye in eyes)
+    return min(FINEST_ROWS, max(2, round(rows / ROW)) * ROW)
+
+
+def _finished(
+    footage: Footage,
+    frames: Tensor,
+    rows: Tensor,
+    chain: Chain,
+    stage: Stage,
+    rounds: tuple[Round, ...],
+    arrived: bool,
+) -> LearntMap:
+    """Put everything into the noun that comes out."""
+    count, cameras = footage.seen.shape
+    all_R = followed(chain.R_lab_body, rows, stage.R_lab_body)
+    # The body frame is the lab's at the first instant: R_new = R Q^T, and new directions are Q times the old.
+    Q = all_R[0].clone()
+    texture, seen, sigma = finished_map(stage, Q)
+    nothing = torch.full((count, 3, 3), torch.nan, dtype=torch.float64)
+    R, X = nothing.clone(), nothing[:, 0].clone()
+    R[frames], X[frames] = so3.nearest_rotation(all_R @ Q.mT), footage.position_lab_mm[frames]
+    X[frames[rows]] = stage.position_lab_mm
+    _, fit = fitted(stage, 1)
+    score = torch.full((count, cameras), torch.nan, dtype=torch.float64)
+    score[frames[rows]] = torch.where(stage.use, fit.score, torch.nan)
+    valid, told = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
+    valid[frames], told[frames[rows]] = True, True
+    return LearntMap(
+        texture=texture,
+        seen=seen,
+        sigma=sigma,
+        R_lab_body=R,
+        position_lab_mm=X,
+        valid=valid,
+        fitted=told,
+        score=score,
+        eyes=footage.eyes,
+        light=stage.fitter.light,
+        blur_px=stage.blur_px,
+        closure=chain.closure,
+        rounds=rounds,
+        arrived=arrived,
+    )
+
+
+def followed(chain: Tensor, rows: Tensor, told: Tensor) -> Tensor:
+    """Return attitudes of all instants: those of some as given, the others turned as their neighbours were.
+
+    Args:
+        chain: (M, 3, 3), all as the chain has them.
+        rows: (n,) int64, rising, of the given ones.
+        told: (n, 3, 3).
+    """
+    off = so3.log(told @ chain[rows].mT)
+    at = torch.arange(len(chain)).clamp(int(rows[0]), int(rows[-1]))
+    upper = torch.searchsorted(rows, at).clamp(0, len(rows) - 1)
+    lower = (upper - 1).clamp_min(0)
+    span = (rows[upper] - rows[lower]).clamp_min(1)
+    share = ((at - rows[lower]).double() / span).clamp(0, 1)[:, None]
+    R = so3.exp(off[lower] * (1 - share) + off[upper] * share) @ chain
+    R[rows] = told
+    return R
+
+
+def finished_map(stage: Stage, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sharpen the map and turn it: texture, counts and sigma, (H, 2 H) each; new directions are Q times the old."""
+    widest = max(eye.diameter_px for eye in stage.fitter.eyes)
+    height = FINER * len(stage.texture)
+    direction = map_directions(height) @ Q  # Q^T d: where the fitted map holds the new texel
+    texture = look_up(sharpened(stage.texture, 2 * stage.blur_px / widest), direction).clamp(0, 1)
+    weight = look_up(map_weight(stage), direction)
+    seen = _counts(stage, direction)
+    unknown = (seen == 0) | (weight <= 0)
+    sigma = torch.where(unknown, torch.inf, weight.clamp_min(1e-30).rsqrt())
+    return torch.where(unknown, torch.nan, texture).float(), torch.where(unknown, 0, seen), sigma.float()
+
+
+def _counts(stage: Stage, direction_body: Tensor) -> Tensor:
+    """Count the pictures that show each direction (..., 3) of the body, not too slanted."""
+    seen = torch.zeros(direction_body.shape[:-1], dtype=torch.int64)
+    for k, R in enumerate(stage.R_lab_body):
+        for c, eye in enumerate(stage.fitter.eyes):
+            if not bool(stage.use[k, c]):
+                continue
+            camera = eye.camera
+            middle = -(camera.R_cam_lab.mT @ camera.T_cam_lab_mm) - stage.position_lab_mm[k]
+            far = float(middle.norm())
+            towards = (direction_body @ (R.mT @ (middle / far))).float()
+            # Cosine of the slant where the line of sight meets the ball: (D n.e - r) / |D e - r n|.
+            away = (far**2 + stage.fitter.radius_mm**2 - 2 * far * stage.fitter.radius_mm * towards).sqrt()
+            seen += (far * towards - stage.fitter.radius_mm) / away > DEPTH_MIN
+    return seen

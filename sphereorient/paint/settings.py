@@ -1,0 +1,48 @@
+"""Settings of the room paint."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class PaintSettings(BaseModel):
+    """How the map of the paint is learnt from the movies."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    background_frames: int = Field(
+        32, ge=1, description="evenly spread frames whose mean is the background, where the ball moves"
+    )
+    disk_px: int = Field(48, ge=24, le=128, description="side of the disks that are compared without a map, px; even")
+    detail: float = Field(0.06, gt=0, lt=0.5, description="finer detail is blurred away in them, radii")
+    window: float = Field(0.3, gt=0.1, lt=2, description="neighbourhood over which light is taken to be even, radii")
+    turn_max_deg: float = Field(
+        30.0, gt=0, le=180, description="largest turn between neighbouring frames that is looked for; fast spins: more"
+    )
+    baselines: tuple[int, ...] = Field(
+        (1, 2, 4, 8, 16), description="frames between the members of the pairs that make the chain"
+    )
+    keyframe_deg: float = Field(12.0, gt=0, description="turn from one keyframe of the loops to the next")
+    loop_reach_deg: float = Field(
+        24.0, gt=0, le=180, description="drift up to which loops are found again; 180 searches all rotations, slowly"
+    )
+    loop_pairs: int = Field(1500, ge=0, description="pairs of keyframes that are tried for loops, at most")
+    score_min: float = Field(0.7, gt=0, lt=1, description="correlation from which on two pictures show the same paint")
+    frames_max: int = Field(
+        400, ge=2, description="evenly spread frames from which the map is fitted, at most; the others follow them"
+    )
+    height: int | None = Field(
+        None, ge=32, le=512, description="rows of the map; null: one texel is one pixel of the disk's middle"
+    )
+    pixels: int = Field(1600, ge=200, description="pixels of each disk from which the map is fitted, about")
+    blur_px: float | None = Field(
+        None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null learns it"
+    )
+    smooth: float = Field(
+        2.0e-2, gt=0, description="weight that ties neighbouring texels, of the typical texel's own weight"
+    )
+    rounds: int = Field(14, ge=1, description="rounds of attitudes, light and map, at most")
+    arrived_deg: float = Field(
+        0.005, gt=0, description="attitudes that move by less from round to round, rms, have arrived"
+    )
+    turned_min_deg: float = Field(8.0, gt=0, description="a sphere that turns by less in the whole movie does not turn")

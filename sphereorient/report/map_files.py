@@ -1,0 +1,119 @@
+"""A learnt map on disk: the picture that tracking reads, how often each texel was seen, and all the rest."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient.errors import OutputError, TextureError, refusal
+from sphereorient.outputs import put_aside
+from sphereorient.paint import LearntMap
+from sphereorient.sphere.picture_claim import decoded_grey
+from sphereorient.trajectory import Trajectory
+
+UNSEEN = 128  # grey of texels that no picture shows
+MOST = 255  # counts beyond are written as this
+
+
+def seen_path(texture: Path) -> Path:
+    """Return where the counts of a map lie: texture_seen.png beside texture.png."""
+    return texture.with_name(f"{texture.stem}_seen.png")
+
+
+def write_texture(texture: Tensor, path: Path) -> None:
+    """Write a map (H, 2 H), 0 .. 1, NaN where unknown, as 8-bit picture: mid-grey where unknown.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    grey = torch.where(torch.isfinite(texture), 255 * texture, float(UNSEEN))
+    _write_picture(grey.round().clamp(0, 255).byte().numpy(), path)
+
+
+def write_seen(seen: Tensor, path: Path) -> None:
+    """Write counts (H, 2 H) as 8-bit picture, 255 for 255 or more.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    _write_picture(seen.clamp(0, MOST).byte().numpy(), path)
+
+
+def read_seen(path: Path) -> Tensor | None:
+    """Read the counts beside a map, (H, 2 H); None where there are none.
+
+    Raises:
+        TextureError: the file is no grey picture twice as wide as high.
+    """
+    if not path.is_file():
+        return None
+    counts = decoded_grey(path.read_bytes())
+    if counts is None or counts.dtype != np.uint8 or counts.shape[1] != 2 * counts.shape[0]:
+        got = "no picture" if counts is None else f"{counts.shape[1]} x {counts.shape[0]} of {counts.dtype}"
+        do = "take the one that `sphereorient map` wrote, or move it away"
+        raise TextureError(refusal(str(path), expected="8-bit counts, twice as wide as high", got=got, do=do))
+    return torch.from_numpy(counts.astype(np.int64))
+
+
+def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:
+    """Write the attitudes as a track, and in its group `map` everything else that was learnt.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with put_aside(path, also=(RuntimeError,)) as aside:
+        track.save(aside)
+        with h5py.File(aside, "a") as file:
+            _write_map(learnt, file.create_group("map"))
+
+
+def _write_map(learnt: LearntMap, group: h5py.Group) -> None:
+    _put(group, "texture", learnt.texture.numpy(), "1", "paint, 0 black .. 1 white; NaN where never seen")
+    _put(group, "seen", learnt.seen.numpy(), "1", "pictures that show the texel")
+    _put(group, "sigma", learnt.sigma.numpy(), "1", "standard deviation of the paint by noise alone; inf: never seen")
+    _put(group, "fitted", learnt.fitted.numpy(), "1", "frames that the map was fitted to; the others follow them")
+    if learnt.rounds:
+        names = [field.name for field in fields(learnt.rounds[0])]
+        table = np.array([[getattr(one, name) for name in names] for one in learnt.rounds], np.float64)
+        _put(group, "rounds", table, "as named", f"one row a round: {', '.join(names)}")
+    for field in fields(learnt.closure):
+        group.attrs[field.name] = getattr(learnt.closure, field.name)
+    group.attrs["blur_px"], group.attrs["arrived"] = learnt.blur_px, learnt.arrived
+
+
+def _put(group: h5py.Group, name: str, values: NDArray[np.generic], units: str, description: str) -> None:
+    dataset = group.create_dataset(name, data=values, track_times=False, compression="gzip")
+    dataset.attrs["units"], dataset.attrs["description"] = units, description
+
+
+def _write_picture(grey: NDArray[np.uint8], path: Path) -> None:
+    with put_aside(path) as aside:
+        if not cv2.imwrite(str(aside), grey):
+            raise OSError("the picture could not be written")
+
+
+def check_picture_name(path: Path) -> None:
+    """Refuse a name that is no picture's.
+
+    Raises:
+        OutputError: not .png, .tif or .tiff: others lose grey values.
+    """
+    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
+        do = "choose a name such as texture.png"
+        raise OutputError(refusal(f"--out {path}", expected=".png or .tif", got=path.suffix or "no ending", do=do))
+
+
+def shares_seen(seen: Tensor, counts: tuple[int, ...]) -> list[float]:
+    """Return the shares of the sphere that at least so many pictures show."""
+    rows = len(seen)
+    edge = torch.linspace(0, math.pi, rows + 1, dtype=torch.float64).cos()
+    area = (edge[:-1] - edge[1:])[:, None].expand(rows, 2 * rows)
+    return [float((area * (seen >= count)).sum() / area.sum()) for count in counts]
