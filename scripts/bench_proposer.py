@@ -34,6 +34,7 @@ from sphereorient.evaluate.reliability import reliability
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
 from sphereorient.learn.proposer import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.orient import DoubtProposer, GreySearch, GreySearchSettings, Proposals, Proposer, ProposeSettings
+from sphereorient.orient.doubt import resized
 from sphereorient.report.plots.style import write_figure
 from sphereorient.synth import random_texture
 from sphereorient.synth.degrade_scene import misdrawn, worn
@@ -101,6 +102,17 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
+class Smaller:
+    """A proposer that looks at disks with fewer pixels."""
+
+    def __init__(self, proposer: Proposer, size_px: int) -> None:
+        self._proposer, self.size_px = proposer, size_px
+
+    def propose(self, disks: Tensor) -> Proposals:
+        """Propose for (F, S, S) disks."""
+        return self._proposer.propose(resized(disks, self._proposer.size_px))
+
+
 def methods(texture: Tensor, checkpoint: Path) -> Iterator[tuple[str, Proposer]]:
     """Yield what is compared."""
     settings = GreySearchSettings()
@@ -108,7 +120,7 @@ def methods(texture: Tensor, checkpoint: Path) -> Iterator[tuple[str, Proposer]]
     yield "template search", search
     # As fast as the network: smaller pictures, a coarser bank, fewer climbs.
     quick = settings.model_copy(update={"size_px": 24, "step_deg": 15.0, "peaks": 4, "finalists": 2, "rough_steps": 2})
-    yield "template search, quick", GreySearch(texture, quick)
+    yield "template search, quick", Smaller(GreySearch(texture, quick), settings.size_px)
     learnt = load_checkpoint(checkpoint)
     network = LearnedProposer(correlator_of(learnt), texture, temperature=learnt.temperature)
     yield "network", network

@@ -72,7 +72,8 @@ class Recording:
         """Return the expected diameter of the sphere's picture in one camera."""
         given = settings.locate.diameter_px
         if given is None and self.experiment.fixed and self.experiment.diameter_mm is None:
-            return 2 * self._fixed_ball(next(reel for reel in self.reels if reel.name == name), settings).outline.radius_px
+            reel = next(reel for reel in self.reels if reel.name == name)
+            return 2 * self._fixed_ball(reel, settings).outline.radius_px
         return given or locate.expected_diameter_px(name, self.cameras, self.experiment.diameter_mm)
 
     def empty_scene(self, reel: Reel, count: int, settings: Settings) -> locate.Background:

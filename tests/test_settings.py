@@ -28,7 +28,10 @@ from sphereorient.settings import (
 )
 from sphereorient.synth.settings import SynthSettings
 
-ROOMS = ["locate", "propose", "search", "refine", "path", "smooth", "orient", "assemble", "motion", "statistics"]
+ROOMS = [
+    *("locate", "propose", "search", "refine", "path", "smooth"),
+    *("orient", "assemble", "motion", "paint", "statistics"),
+]
 CHANGES = [
     "locate.diameter_px=78.5",
     "locate.gap_frames_max=0",

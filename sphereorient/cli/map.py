@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import resource
 import sys
 import time
 from dataclasses import dataclass
@@ -13,16 +12,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import ExperimentPath, app, camera_names, check_writable, progress_bar
+from sphereorient.cli.app import Advance, ExperimentPath, app, camera_names, check_writable, progress_bar
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from sphereorient.experiment import Experiment
     from sphereorient.paint import LearntMap
     from sphereorient.paint.compare import MapComparison
+    from sphereorient.paint.correct import Correction
     from sphereorient.report.map_figure import Example
+    from sphereorient.settings import Settings
+    from sphereorient.trajectory import Trajectory
 
 OFTEN = 10  # pictures from which on a place counts as well seen
+CHANGED = 0.15  # of black to white paint: a change that is told
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +51,10 @@ class MapPaths:
             moved=texture.with_name(f"{stem.name}_moved.png"),
         )
 
+    def written(self, moved: bool) -> list[Path]:
+        """Return the files that there are, `moved` where an old map was corrected."""
+        return [self.texture, self.seen, self.learnt, self.figure, *([self.moved] if moved else [])]
+
 
 @app.command("map")
 def map_(
@@ -67,74 +75,103 @@ def map_(
 
     check_picture_name(out)
     check_writable(out)
+    from sphereorient.settings import load_settings
+    from sphereorient.sphere import load_texture
+
+    chosen, begun = load_settings(settings, set_ or []), time.perf_counter()
+    old = None if init is None else load_texture(init)
+    paths = MapPaths.beside(out)
+    with progress_bar(quiet) as advance:
+        made = _learn(experiment, camera_names(cameras), chosen, old, advance)
+        advance("figure", 0, 1)
+        compared = _write(made, old, paths)
+        advance("figure", 1, 1)
+    if quiet:
+        return
+    for remark in made.remarks:
+        typer.echo(f"note: {remark}")
+    _print(made.learnt, compared)
+    if made.correction is not None:
+        _print_moved(made.correction.comparison, f"against {init}")
+        typer.echo(f"kept of the old map, never seen here: {100 * made.correction.kept_share:.0f} % of the sphere")
+    typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
+    typer.echo("Wrote " + ", ".join(str(file) for file in paths.written(init is not None)))
+    if made.experiment.texture_path != paths.texture:
+        typer.echo(f"next: write texture: {out.name} under sphere: in the experiment, then `sphereorient track`")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Made:
+    """What was learnt; made by `_learn`, written and printed by the command."""
+
+    experiment: Experiment
+    learnt: LearntMap
+    correction: Correction | None  # of an old map, where one was given
+    track: Trajectory
+    remarks: tuple[str, ...]
+
+
+def _learn(path: Path, names: list[str] | None, settings: Settings, old: Tensor | None, advance: Advance) -> Made:
+    """Learn a map, and bring it into an old one's frame where there is one."""
     from sphereorient.paint import learn_map
     from sphereorient.paint.correct import corrected
     from sphereorient.pipeline import one_thread
     from sphereorient.provenance import provenance
     from sphereorient.recording import open_unpainted
-    from sphereorient.report import map_figure, map_files
     from sphereorient.results import map_track
-    from sphereorient.settings import load_settings, settings_yaml
-    from sphereorient.sphere import load_texture
+    from sphereorient.settings import settings_yaml
 
-    chosen = load_settings(settings, set_ or [])
-    old = None if init is None else load_texture(init)
-    paths, begun = MapPaths.beside(out), time.perf_counter()
-    command = " ".join(["sphereorient", *sys.argv[1:]])
-    with open_unpainted(experiment, camera_names(cameras)) as recording, one_thread(), progress_bar(quiet) as advance:
-        learnt, comparison, kept = learn_map(recording, chosen.paint, chosen.locate, advance), None, 0.0
-        if old is not None:
-            correction = corrected(learnt, old)
-            learnt, comparison, kept = correction.learnt, correction.comparison, correction.kept_share
+    with open_unpainted(path, names) as recording, one_thread():
+        learnt = learn_map(recording, settings.paint, settings.locate, advance)
+        correction = None if old is None else corrected(learnt, old)
+        learnt = learnt if correction is None else correction.learnt
+        command = " ".join(["sphereorient", *sys.argv[1:]])
         origin = provenance(recording.experiment, list(recording.cameras), command)
-        track = map_track(recording.experiment, recording.clock, learnt, settings_yaml(chosen), origin)
-        source = recording.experiment
-        map_files.write_texture(learnt.texture, paths.texture)
-        map_files.write_seen(learnt.seen, paths.seen)
-        map_files.write_learnt(learnt, track, paths.learnt)
-        advance("figure", 0, 1)
-        compared = map_figure.compare_pictures(track, source, paths.texture)
-        map_figure.write_figure(map_figure.map_figure(learnt, compared), paths.figure)
-        if comparison is not None and old is not None:
-            map_figure.write_figure(map_figure.moved_figure(old, comparison), paths.moved)
-        advance("figure", 1, 1)
-    if not quiet:
-        for remark in recording.remarks:
-            typer.echo(f"note: {remark}")
-        _print(learnt, compared, time.perf_counter() - begun)
-        if comparison is not None:
-            _print_moved(comparison, f"against {init}")
-            typer.echo(f"of the old map's paint {100 * kept:.0f} % of the sphere was kept: never seen here")
-        _print_files(paths, init is not None, source.texture_path != paths.texture)
+        track = map_track(recording.experiment, recording.clock, learnt, settings_yaml(settings), origin)
+        return Made(
+            experiment=recording.experiment,
+            learnt=learnt,
+            correction=correction,
+            track=track,
+            remarks=recording.remarks,
+        )
 
 
-def _print(learnt: LearntMap, compared: list[Example], seconds: float) -> None:
+def _write(made: Made, old: Tensor | None, paths: MapPaths) -> list[Example]:
+    """Write all files; return how well re-rendered pictures match."""
+    from sphereorient.report import map_figure, map_files
+
+    map_files.write_texture(made.learnt.texture, paths.texture)
+    map_files.write_seen(made.learnt.seen, paths.seen)
+    map_files.write_learnt(made.learnt, made.track, paths.learnt)
+    compared = map_figure.compare_pictures(made.track, made.experiment, paths.texture)
+    map_figure.write_figure(map_figure.map_figure(made.learnt, compared), paths.figure)
+    if made.correction is not None and old is not None:
+        map_figure.write_figure(map_figure.moved_figure(old, made.correction.comparison), paths.moved)
+    return compared
+
+
+def _print(learnt: LearntMap, compared: list[Example]) -> None:
     """Say what was learnt from what, and whether to believe it."""
     import numpy as np
 
     from sphereorient.report.map_files import shares_seen
 
     seen, often = shares_seen(learnt.seen, (1, OFTEN))
-    valid, fitted, frames = int(learnt.valid.sum()), int(learnt.fitted.sum()), len(learnt.valid)
-    closure = learnt.closure
+    closure, last = learnt.closure, learnt.rounds[-1]
     before, after = (math.degrees(drift) for drift in (closure.drift_before_rad, closure.drift_after_rad))
+    drift = f"drift {before:.2f}° before, {after:.2f}° after" if closure.closed else "the drift is not known"
+    state = "arrived" if learnt.arrived else "not arrived: --set paint.rounds=N for more"
     lines = [
         f"seen: {100 * seen:.1f} % of the sphere, {100 * often:.1f} % of it in {OFTEN} pictures or more",
-        f"frames: {frames}, with the ball {valid}, that the map was fitted to {fitted}",
+        f"frames: {len(learnt.valid)}, with the ball {int(learnt.valid.sum())}, fitted {int(learnt.fitted.sum())}",
+        f"loops: {closure.closed} of {closure.loops} closed; {drift}",
+        f"rounds: {len(learnt.rounds)}, the last moved attitudes by {math.degrees(last.moved_rad):.4f}° ({state})",
     ]
-    if closure.closed:
-        lines.append(f"loops: {closure.closed} of {closure.loops} closed; drift {before:.2f}° before, {after:.2f}° after")
-    else:
-        lines.append(f"loops: none of {closure.loops} closed: the drift of the attitudes is not known")
-    last = learnt.rounds[-1]
-    state = "arrived" if learnt.arrived else "not arrived: --set paint.rounds=N for more"
-    lines.append(f"rounds: {len(learnt.rounds)}, the last moved attitudes by {math.degrees(last.moved_rad):.4f}° ({state})")
     alike = np.array([example.correlation for example in compared])
     if np.isfinite(alike).any():
         middle, low = np.nanmedian(alike), np.nanpercentile(alike, 5)
-        lines.append(f"pictures against re-rendered ones: correlation {middle:.3f} (median), {low:.3f} (worst twentieth)")
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    lines.append(f"time {seconds:.0f} s, memory {memory:.2f} GB")
+        lines.append(f"pictures against re-rendered: correlation {middle:.3f} (median), {low:.3f} (worst twentieth)")
     for line in lines:
         typer.echo(line)
 
@@ -146,13 +183,6 @@ def _print_moved(comparison: MapComparison, against: str) -> None:
         return
     rms, most = math.degrees(comparison.rms_rad), math.degrees(comparison.max_rad)
     typer.echo(f"{against}: paint lies {rms:.2f}° off (rms of {count} patches), {most:.2f}° at most")
-
-
-def _print_files(paths: MapPaths, moved: bool, unknown: bool) -> None:
-    files = [paths.texture, paths.seen, paths.learnt, paths.figure, *([paths.moved] if moved else [])]
-    typer.echo("Wrote " + ", ".join(str(file) for file in files))
-    if unknown:
-        typer.echo(f"next: write texture: {paths.texture.name} under sphere: in the experiment, then `sphereorient track`")
 
 
 @app.command("compare-maps")
@@ -174,37 +204,39 @@ def compare_maps_(
 
     from sphereorient.paint.compare import compare_maps, paint_change, turned_map
     from sphereorient.report import map_figure
+    from sphereorient.so3 import angle
 
     after, before = _known_map(new), _known_map(old)
     comparison = compare_maps(after, before, turned=not same_frame)
     change = paint_change(turned_map(after, comparison.R_other_reference, len(before)), before)
     known = change[torch.isfinite(change)]
-    numbers = {
-        "patches": len(comparison.length_rad),
-        "moved_rms_deg": math.degrees(comparison.rms_rad),
-        "moved_max_deg": math.degrees(comparison.max_rad),
-        "correlation": comparison.correlation,
-        "changed_share": float((known.abs() > map_figure.CHANGE_REACH / 2).float().mean()) if len(known) else math.nan,
-        "R_new_old": comparison.R_other_reference.tolist(),
-    }
+    changed = float((known.abs() > CHANGED).float().mean()) if len(known) else math.nan
     if out is not None:
         map_figure.write_figure(map_figure.moved_figure(before, comparison, change), out)
     if as_json:
-        typer.echo(json.dumps(numbers))
+        typer.echo(json.dumps(_numbers(comparison, changed)))
         return
     _print_moved(comparison, f"{new} against {old}")
-    turn = math.degrees(float(_angle(comparison)))
-    typer.echo(f"body frames turned by {turn:.2f}° against each other; correlation {comparison.correlation:.3f}")
-    changed = 100 * numbers["changed_share"]  # type: ignore[operator]
-    typer.echo(f"paint that changed by more than {map_figure.CHANGE_REACH / 2:g} of black to white: {changed:.1f} % of the map")
+    turn_deg = math.degrees(float(angle(comparison.R_other_reference)))
+    typer.echo(f"body frames: {turn_deg:.2f}° apart; correlation {comparison.correlation:.3f}")
+    typer.echo(
+        f"paint that changed by more than {100 * CHANGED:g} % of black to white: {100 * changed:.1f} % of the map"
+    )
     if out is not None:
         typer.echo(f"Wrote {out}")
 
 
-def _angle(comparison: MapComparison) -> Tensor:
-    from sphereorient.so3 import angle
-
-    return angle(comparison.R_other_reference)
+def _numbers(comparison: MapComparison, changed: float) -> dict[str, object]:
+    """Return the figures of a comparison; what could not be measured is null."""
+    count = len(comparison.length_rad)
+    return {
+        "patches": count,
+        "moved_rms_deg": math.degrees(comparison.rms_rad) if count else None,
+        "moved_max_deg": math.degrees(comparison.max_rad) if count else None,
+        "correlation": comparison.correlation,
+        "changed_share": changed if math.isfinite(changed) else None,
+        "R_new_old": comparison.R_other_reference.tolist(),
+    }
 
 
 def _known_map(path: Path) -> Tensor:

@@ -24,7 +24,7 @@ CLIMBS = 6  # best of them that are brought to the best fit nearby
 BLURS_DEG = (5.0, 2.0, 0.8)  # on the way there
 STEPS = 8
 KNOWN_USUAL = 0.1  # share of the sphere of which a correlation is half believed
-ALIKE_MIN = 0.3  # correlation below which two maps do not show one ball
+ALIKE_MIN = 0.55  # correlation below which two maps do not show one ball; of two balls, or mirrored: up to 0.5
 DIRECTIONS = 500  # in which the displacement is measured
 FINE_BLUR_DEG = 0.5
 SIDE = 256  # of the tables: 0.7 degrees, tangent planes between
@@ -46,12 +46,13 @@ class MapComparison:
     def length_rad(self) -> Tensor:
         """Length of the displacements that could be measured, (n,)."""
         length = self.moved_rad.norm(dim=-1)
-        return length[torch.isfinite(length)]
+        known: Tensor = length[torch.isfinite(length)]
+        return known
 
     @property
     def rms_rad(self) -> float:
         """Root mean square of the displacements, NaN where none was measured."""
-        return float(self.length_rad.square().mean().sqrt())
+        return float(self.length_rad.square().mean().sqrt()) if len(self.length_rad) else math.nan
 
     @property
     def max_rad(self) -> float:
@@ -185,7 +186,8 @@ def _best_rotation(tables: dict[float, list[PaintTable]], shares: list[Tensor], 
         for blur in BLURS_DEG:
             R = _climbed(tables[blur], shares, place, R)
         found.append((float(_trusted(*_correlations(tables[BLURS_DEG[-1]], shares, place, R[None]))[0]), R))
-    return max(found, key=lambda one: one[0])[1]
+    best: Tensor = max(found, key=lambda one: one[0])[1]
+    return best
 
 
 def _trusted(score: Tensor, known: Tensor) -> Tensor:
@@ -198,10 +200,8 @@ def _correlation(tables: list[PaintTable], shares: list[Tensor], place: Tensor, 
     return float(score[0]) if float(known[0]) > 0 else math.nan
 
 
-def _correlations(
-    tables: list[PaintTable], shares: list[Tensor], place: Tensor, R: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Correlate the other map, turned by rotations (M, 3, 3), with the reference; and the share that both know, (M,)."""
+def _correlations(tables: list[PaintTable], shares: list[Tensor], place: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
+    """Correlate the other map, turned by (M, 3, 3), with the reference; and tell the share that both know, (M,)."""
     there = R @ place.T
     a, _ = tables[0].look(there.float())
     b, _ = tables[1].look(place.T[None].float())

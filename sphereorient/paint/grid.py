@@ -148,6 +148,26 @@ def stiffness(height: int) -> csr_matrix:
     return coo_matrix((np.concatenate([w, w, -w, -w]), (rows, columns)), shape=(number.size, number.size)).tocsr()
 
 
+class Gram:
+    """The normal matrix of many look-ups, never written out: to multiply it out takes longer than to solve with it.
+
+    Args:
+        reads: (S, T), what each sample reads of the map, times the root of its weight.
+    """
+
+    def __init__(self, reads: csr_matrix) -> None:
+        self._reads = reads
+
+    def __matmul__(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return its product with values (T,)."""
+        seen = self._reads @ values.astype(self._reads.dtype)
+        return np.asarray(self._reads.T @ seen, np.float64)
+
+    def diagonal(self) -> NDArray[np.float64]:
+        """Return the weights of the texels, (T,)."""
+        return np.asarray(self._reads.power(2).sum(0), np.float64).ravel()
+
+
 def map_sums(
     direction_body: Tensor, value: Tensor, weight: Tensor, height: int
 ) -> tuple[csr_matrix, NDArray[np.float64]]:
@@ -169,19 +189,19 @@ def map_sums(
 
 
 def solve_map(
-    normal: csr_matrix, right: NDArray[np.float64], height: int, smooth: float, iterations: int = 60
+    normal: csr_matrix | Gram, right: NDArray[np.float64], height: int, smooth: float, iterations: int = 60
 ) -> Tensor:
     """Solve for the map, (H, 2 H) float64: weighted least squares with neighbours tied.
 
     Args:
-        normal: (T, T), of all pixels.
+        normal: (T, T), of all pixels, or what stands for it.
         right: (T,).
         height: H.
         smooth: weight of the integral of the squared slope, in the unit of the pixels' weights.
         iterations: of the conjugate gradients, at most.
     """
-    matrix = normal + smooth * stiffness(height)
-    diagonal = matrix.diagonal()
+    ties = smooth * stiffness(height)
+    diagonal = normal.diagonal() + ties.diagonal()
     diagonal[diagonal <= 0] = 1.0
     x = np.zeros_like(right)
     left = right.copy()
@@ -191,7 +211,7 @@ def solve_map(
     for _ in range(iterations):
         if rz <= stop:
             break
-        q = matrix @ p
+        q = normal @ p + ties @ p
         alpha = rz / float(p @ q)
         x += alpha * p
         left -= alpha * q

@@ -29,7 +29,7 @@ class Round:
     """One round of attitudes, light and map."""
 
     moved_rad: float  # rms of the attitudes' moves
-    misfit: float  # mean square of the residuals over the noise expected, before the round's step
+    misfit: float  # mean square of the residuals over the noise expected, the map not yet solved anew
     blur_px: float
 
 
@@ -39,6 +39,10 @@ class LearntMap:
 
     The body frame of a learnt map is arbitrary; it is the lab's at the first instant that has an attitude:
     R_lab_body = identity there.
+
+    Pictures through a mirror give the mirrored map and mirrored turns: one camera cannot tell, nor can two whose
+    pictures' horizontal axes are one line in the lab; the others then contradict each other and are refused. Say
+    `flip:` in the experiment.
     """
 
     texture: Tensor  # (H, 2 H) float32, 0 black .. 1 white; NaN where never seen

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
+from scipy.sparse import vstack
 from torch import Tensor
 
 from sphereorient import so3
@@ -17,7 +17,7 @@ from sphereorient.orient.light import Light, light_maps, light_sums, noise_curve
 from sphereorient.orient.pixels import Pixels
 from sphereorient.orient.refine import Fit
 from sphereorient.paint.chain import moved, spread
-from sphereorient.paint.grid import map_table, solve_map, stiffness, texel_areas
+from sphereorient.paint.grid import Gram, map_table, solve_map, stiffness, texel_areas
 from sphereorient.paint.joint import joint_step, part_of
 from sphereorient.paint.look import DEPTH_MIN, Look, look, look_ups
 from sphereorient.paint.record import Round
@@ -25,6 +25,7 @@ from sphereorient.paint.settings import PaintSettings
 
 FIRST_ROUNDS = 2  # with each instant by itself: as long as the map is blurred, a joint step would believe it
 LIGHT_ROUNDS = 8  # in which light, noise and blur are learnt anew
+SMOOTHEST = 0.2  # as the setting `smooth`, of the first round: attitudes do not follow a map's noise
 BLUR_FRAMES = 32
 BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
 BLUR_PX = (0.25, 3.0)  # narrowest and widest
@@ -80,12 +81,20 @@ def next_round(stage: Stage, settings: PaintSettings, k: int) -> tuple[Stage, Ro
         stage, _ = fitted(stage, 3 if k == 0 else 2)
     if k < LIGHT_ROUNDS:
         stage = with_light(stage)
-    stage, misfit = (with_map if k < FIRST_ROUNDS else together)(stage, settings)
+    smooth = smooth_of(settings, k)
+    if k >= FIRST_ROUNDS:
+        stage = together(stage, smooth)
+    stage, misfit = with_map(stage, smooth)
     if k < LIGHT_ROUNDS:
         stage = rescaled(stage)
     if FIRST_ROUNDS <= k < LIGHT_ROUNDS and settings.blur_px is None:
         stage = replace(stage, blur_px=better_blur(stage))
     return stage, Round(moved_rad=moved(before, stage.R_lab_body), misfit=misfit, blur_px=stage.blur_px)
+
+
+def smooth_of(settings: PaintSettings, k: int) -> float:
+    """Return the weight that ties neighbouring texels in a round: from coarse to fine."""
+    return max(settings.smooth, SMOOTHEST * 0.5**k)
 
 
 def optics_of(blurred: Tensor, eyes: Sequence[Eye], blur_px: float) -> Optics:
@@ -156,45 +165,45 @@ def better_blur(stage: Stage) -> float:
     return min(max(best, BLUR_PX[0]), BLUR_PX[1])
 
 
-def together(stage: Stage, settings: PaintSettings) -> tuple[Stage, float]:
-    """Move all poses and the map by one joint step."""
+def together(stage: Stage, smooth: float) -> Stage:
+    """Move all poses by one joint step, in which the map may give way; ties as in `joint_step`, by typical weights.
+
+    The map itself is left to `with_map`, which is exact at any poses: moved along its slopes it would be damaged, and
+    the next step would only repair it.
+    """
     height = len(stage.texture)
     parts, weight = [], np.zeros(2 * height * height)
-    tally = _Tally()
     for at in stage.looks():
         parts.append(part_of(at, height))
         weight += np.asarray(parts[-1].look_up.power(2).sum(0)).ravel()
-        tally.add(at)
     longest = (LONGEST_SHARE, LONGEST_SHARE * stage.fitter.radius_mm)
-    smooth = settings.smooth * typical(weight)
-    step = joint_step(parts, stage.use, stage.texture, smooth, longest, STEPS, stage.fixed)
+    tie = smooth * typical(weight)
+    step = joint_step(parts, stage.use, stage.texture, tie, longest, STEPS, stage.fixed)
     shorter = (LONGEST_RAD / step.pose[:, :3].norm(dim=1).max().clamp_min(1e-9)).clamp_max(1.0)
     pose = step.pose * shorter
-    changed = replace(
+    return replace(
         stage,
         position_lab_mm=stage.position_lab_mm + pose[:, 3:],
         R_lab_body=so3.nearest_rotation(so3.exp(pose[:, :3]) @ stage.R_lab_body),
-        texture=(stage.texture + (step.map * shorter).float()).clamp(-BEYOND, 1 + BEYOND),
     )
-    return changed, tally.misfit
 
 
-def with_map(stage: Stage, settings: PaintSettings) -> tuple[Stage, float]:
-    """Solve for the map at the poses as they are."""
+def with_map(stage: Stage, smooth: float) -> tuple[Stage, float]:
+    """Solve for the map at the poses as they are, ties as in `solve_map`, by typical weights; and tell the misfit."""
     height = len(stage.texture)
     texels = 2 * height * height
-    normal, right = csr_matrix((texels, texels)), np.zeros(texels)
+    parts, right = [], np.zeros(texels)
     tally = _Tally()
     for at in stage.looks():
         root = at.precision.sqrt()
-        reads = look_ups(at, at.step * root * (at.depth > DEPTH_MIN), texels)
-        normal = normal + reads.T @ reads
-        right += reads.T @ (at.residual * root).reshape(-1).numpy()
+        parts.append(look_ups(at, at.step * root * (at.depth > DEPTH_MIN), texels))
+        right += parts[-1].T @ (at.residual * root).reshape(-1).numpy()
         tally.add(at)
-    smooth = settings.smooth * typical(normal.diagonal())
+    normal = Gram(vstack(parts, format="csr"))
+    tie = smooth * typical(normal.diagonal())
     # The whole map is tied, not the correction alone: else noise would grow from round to round.
-    right -= smooth * (stiffness(height) @ stage.texture.double().numpy().ravel())
-    texture = stage.texture + solve_map(normal, right, height, smooth).float()
+    right -= tie * (stiffness(height) @ stage.texture.double().numpy().ravel())
+    texture = stage.texture + solve_map(normal, right, height, tie).float()
     return replace(stage, texture=texture.clamp(-BEYOND, 1 + BEYOND)), tally.misfit
 
 

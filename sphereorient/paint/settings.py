@@ -39,7 +39,7 @@ class PaintSettings(BaseModel):
         None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null learns it"
     )
     smooth: float = Field(
-        2.0e-2, gt=0, description="weight that ties neighbouring texels, of the typical texel's own weight"
+        4.0e-3, gt=0, description="weight that ties neighbouring texels, of the typical texel's own weight"
     )
     rounds: int = Field(14, ge=1, description="rounds of attitudes, light and map, at most")
     arrived_deg: float = Field(

@@ -114,8 +114,8 @@ def empty_scene(look: Look, experiment: Experiment) -> Finding:
         return Finding(title=title, severity=Severity.OK, measured=measured)
     advice = f"write backgrounds: {{{look.name}: FILE}}, a picture of the scene without the ball"
     if experiment.fixed:
-        measured = "none given, and a ball that is fixed never shows what is behind it"
-        return Finding(title=title, severity=Severity.FAULT, measured=measured, advice=advice)
+        measured = "none given: behind a ball that is fixed is taken to be what lies around it"
+        return Finding(title=title, severity=Severity.WARNING, measured=measured, advice=advice)
     centres = [(outline.u_px, outline.v_px, outline.radius_px) for _, outline in look.balls]
     shares = [sum((u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in centres) / len(centres) for u, v, _ in centres]
     share = max(shares, default=0.0)

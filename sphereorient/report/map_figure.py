@@ -173,7 +173,7 @@ def moved_figure(texture: Tensor, comparison: MapComparison, change: Tensor | No
         change: (H, 2 H), of `paint_change`; None: not drawn.
     """
     figure = new_figure(WIDTH_IN, 4.3 if change is None else 7.7)
-    panels = np.atleast_1d(figure.subplots(1 if change is None else 2, 1))
+    panels = figure.subplots(1 if change is None else 2, 1, squeeze=False)[:, 0]
     axes = panels[0]
     _equirectangular(axes)
     axes.set_facecolor(UNSEEN)
@@ -188,10 +188,11 @@ def moved_figure(texture: Tensor, comparison: MapComparison, change: Tensor | No
     if count:
         rms, most = np.rad2deg([comparison.rms_rad, comparison.max_rad])
         sizes = f"{count} patches located: {rms:.2f}° rms, {most:.2f}° at most; arrows {times:g} times as long"
-    words = "" if change is None else (
-        " Below: how much brighter (red) or darker (blue) paint is than all that the reference has within 1°, in steps "
-        "from black to white."
-    )
+    words = ""
+    if change is not None:
+        words = (
+            " Below: how much brighter (red) or darker (blue) than all that the reference has within 1°; 1 is white."
+        )
     note(figure, f"{sizes}, from where the reference has a patch to where it is. Sand: unknown.{words}")
     return figure
 

@@ -1,0 +1,76 @@
+"""Small rendered movies of a turning ball, and maps that are spoilt in known ways."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import torch
+import yaml
+from torch import Tensor
+
+from sphereorient.sphere import sample_texture
+from sphereorient.synth import SynthSettings, write_experiment
+from sphereorient.synth.textures import map_directions
+
+# 4.6 degrees a frame: both cameras together have seen the whole ball after a few dozen frames.
+SMALL = {
+    "frames": 48,
+    "image_size": (180, 180),
+    "diameter_px": 50.0,
+    "volume_mm": 15.0,
+    "exposure": 1e-4,
+    "exposure_samples": 1,
+    "omega_rms": 40.0,
+    "seed": 5,
+}
+QUICK = ["--set", "paint.rounds=4", "--set", "paint.pixels=600", "--set", "paint.height=64"]
+
+
+def unpainted(folder: Path, **changed: object) -> Path:
+    """Render an experiment and take its map away; the map stays beside it as texture.png."""
+    path = write_experiment(folder, SynthSettings(**{**SMALL, **changed}))
+    rewrite(path, texture=None)
+    return path
+
+
+def rewrite(path: Path, texture: str | None = None, **changed: object) -> None:
+    """Change keys of an experiment: its map, and keys of the top level; None takes them away."""
+    document = yaml.safe_load(path.read_text())
+    document["sphere"].pop("texture", None)
+    if texture is not None:
+        document["sphere"]["texture"] = texture
+    for key, value in changed.items():
+        document.pop(key, None)
+        if value is not None:
+            document[key] = value
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+
+
+def shift_field(direction: Tensor, rms_deg: float) -> Tensor:
+    """A smooth field of rotation vectors, (..., 3), rad, that moves directions (..., 3) by so much, rms."""
+    x, y, z = direction.unbind(-1)
+    turn = torch.stack([torch.sin(2 * y + 1), torch.cos(3 * z), torch.sin(2 * x - 0.5)], dim=-1)
+    everywhere = map_directions(48)
+    a, b, c = everywhere.unbind(-1)
+    whole = torch.stack([torch.sin(2 * b + 1), torch.cos(3 * c), torch.sin(2 * a - 0.5)], dim=-1)
+    moved = torch.linalg.cross(whole, everywhere).square().sum(-1)
+    area = everywhere[..., 2].square().neg().add(1).sqrt()
+    return turn * math.radians(rms_deg) / float((moved * area).sum() / area.sum()) ** 0.5
+
+
+def warped(texture: Tensor, rms_deg: float) -> Tensor:
+    """Return a map (H, 2 H) whose paint is shifted smoothly: it shows at d what lay at exp(field(d)) d."""
+    height = len(texture)
+    direction = map_directions(height)
+    moved = torch.nn.functional.normalize(
+        direction + torch.linalg.cross(shift_field(direction, rms_deg), direction), dim=-1
+    )
+    return sample_texture(texture.double(), moved).to(texture.dtype)
+
+
+def save_map(texture: Tensor, path: Path) -> Path:
+    """Write a map as 8-bit picture."""
+    cv2.imwrite(str(path), (255 * texture).round().clamp(0, 255).byte().numpy())
+    return path
