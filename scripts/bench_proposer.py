@@ -17,7 +17,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -113,10 +113,25 @@ class Smaller:
         return self._proposer.propose(resized(disks, self._proposer.size_px))
 
 
+class Remembering:
+    """A proposer that answers once about the same pictures."""
+
+    def __init__(self, proposer: Proposer) -> None:
+        self._proposer, self.size_px = proposer, proposer.size_px
+        self._asked: Tensor | None = None
+        self._answer = Proposals.none(())
+
+    def propose(self, disks: Tensor) -> Proposals:
+        """Propose for (F, S, S) disks."""
+        if disks is not self._asked:
+            self._answer, self._asked = self._proposer.propose(disks), disks
+        return self._answer
+
+
 def methods(texture: Tensor, checkpoint: Path) -> Iterator[tuple[str, Proposer]]:
     """Yield what is compared."""
     settings = GreySearchSettings()
-    search = GreySearch(texture, settings)
+    search = Remembering(GreySearch(texture, settings))
     yield "template search", search
     # As fast as the network: smaller pictures, a coarser bank, fewer climbs.
     quick = settings.model_copy(update={"size_px": 24, "step_deg": 15.0, "peaks": 4, "finalists": 2, "rough_steps": 2})
@@ -138,6 +153,9 @@ def ball(number: int, families: Sequence[str], checkpoint: Path) -> dict[str, di
         R = so3.random_rotations(BALL, generator=rng).float()
         pictures = filmed(told, R, family, rng)
         found[family] = {name: asked(proposer, pictures, R) for name, proposer in compared.items()}
+        # The templates' answer was at hand.
+        first = found[family]["template search"].seconds
+        found[family]["both"] = replace(found[family]["both"], seconds=found[family]["both"].seconds + first)
     return found
 
 
@@ -175,7 +193,6 @@ def strokes(height: int, rng: torch.Generator) -> Tensor:
 
 def asked(proposer: Proposer, pictures: Tensor, R: Tensor) -> Found:
     """Ask a method, and compare with the truth."""
-    proposer.propose(pictures[:2])
     begin = time.process_time()
     proposals = proposer.propose(pictures)
     seconds = time.process_time() - begin
@@ -292,7 +309,7 @@ def figure(found: Mapping[str, Mapping[str, Found]]) -> Figure:
     axes.set(xlabel=f"right orientation among the first {FIRST} candidates, % of pictures (95 % intervals)")
     axes.set_ylim(-0.6, len(order) - 0.4)
     axes.grid(axis="x", alpha=0.3)
-    axes.legend(loc="lower left")
+    axes.legend(loc="upper left")
     return drawn_on
 
 

@@ -99,8 +99,8 @@ class ProposeSettings(BaseModel):
         None, description="a trained network's file, `default` for the one that comes along; null: the templates alone"
     )
     when: Literal["always", "in_doubt"] = Field(
-        "always",
-        description="always: the network alone; in_doubt: templates first, the network where they explain too little",
+        "in_doubt",
+        description="in_doubt: templates first, the network where they explain too little; always: the network alone",
     )
     sure: float = Field(
         0.75, ge=0, le=1, description="in_doubt: templates of a score above this need no second opinion"

@@ -20,7 +20,7 @@ from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
 from sphereorient.learn.pictures import film_with
 from sphereorient.learn.proposer import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.learn.settings import PictureSettings
-from sphereorient.orient import GreySearch
+from sphereorient.orient import DoubtProposer, GreySearch
 from sphereorient.proposers import paper_proposer, precise_proposer
 from sphereorient.provenance import sha256
 from sphereorient.settings import Settings, load_settings
@@ -52,7 +52,8 @@ def filmed(texture: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize("method", ["precise", "paper"])
 def test_the_excerpt_is_tracked_with_the_network(method: str) -> None:
-    track = track_movies(EXCERPT / "experiment.yaml", method=method, proposer="default")
+    alone = load_settings(None, ["propose.when=always"])
+    track = track_movies(EXCERPT / "experiment.yaml", method=method, settings=alone, proposer="default")
     score = score_track(track, EXCERPT / "truth.h5")
     assert score.valid.all()
     assert np.median(score.orientation_deg) < {"precise": 0.08, "paper": 4.0}[method]
@@ -63,8 +64,10 @@ def test_the_excerpt_is_tracked_with_the_network(method: str) -> None:
 
 @pytest.mark.shared
 @pytest.mark.slow
-def test_the_precise_figures_hold_with_the_network() -> None:
-    track = track_movies(SHARED / "experiment.yaml", proposer="default")
+@pytest.mark.parametrize("when", ["in_doubt", "always"])
+def test_the_precise_figures_hold_with_the_network(when: str) -> None:
+    settings = load_settings(None, [f"propose.when={when}"])
+    track = track_movies(SHARED / "experiment.yaml", settings=settings, proposer="default")
     score = score_track(track, SHARED / "truth.h5")
     p50, p95, _, worst = score.percentiles_deg()
     assert score.valid.all()
@@ -128,12 +131,13 @@ def test_disks_that_show_nothing_have_no_proposal(network: LearnedProposer) -> N
 
 
 def test_settings_choose_who_proposes(texture: torch.Tensor) -> None:
-    alone = load_settings(None, ["propose.checkpoint=default"])
+    alone = load_settings(None, ["propose.checkpoint=default", "propose.when=always"])
     assert isinstance(precise_proposer(texture, Settings()), GreySearch)
     assert isinstance(precise_proposer(texture, alone), LearnedProposer)
     assert isinstance(paper_proposer(texture, 60, alone), LearnedProposer)
-    both = load_settings(None, ["propose.checkpoint=default", "propose.when=in_doubt"])
-    assert precise_proposer(texture, both).size_px == both.search.size_px
+    both = load_settings(None, ["propose.checkpoint=default"])
+    assert isinstance(precise_proposer(texture, both), DoubtProposer)
+    assert isinstance(paper_proposer(texture, 60, both), DoubtProposer)
 
 
 @pytest.mark.parametrize("content", [None, b"nothing of the kind"])
