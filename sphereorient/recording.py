@@ -89,7 +89,7 @@ class Recording:
         if reel.name not in self._in_place:
             empty = given_scene(self.experiment, reel.name, reel.movie.frame_shape)
             pictures = reel.spread(settings.locate.background_frames)
-            self._in_place[reel.name] = fixed_ball(pictures, settings.locate, empty)
+            self._in_place[reel.name] = fixed_ball(pictures, settings.locate, empty, reel.shown)
         return self._in_place[reel.name]
 
     def gridded(self) -> tuple[Recording, Rows]:

@@ -15,6 +15,7 @@ DIRECTIONS = 72  # bins of 5 degrees in which the support of a circle is counted
 BEYOND = 1.0  # weight of a rim place beyond a circle against one on it
 NOISE_FLOOR = 2.0  # below so many sigmas the root is linear: noise is not magnified
 NOISE_STEEPNESS = 0.28  # times the root of the noise: stabilised noise falls as steeply in one place of ten thousand
+LEAST_RIM = 0.25  # of all directions that coverage is a share of at least, however much of the rim is hidden
 NEAR_HIDDEN_PX = 3  # from what hides the ball: edges there are not the rim's
 PROFILES = 180  # radial profiles of the sub-pixel fit; more only repeat the same pixels
 
@@ -27,7 +28,7 @@ class Outline:
     v_px: float
     radius_px: float
     rms_px: float  # of the edges that support the circle about it
-    coverage: float  # share of directions with a supporting edge
+    coverage: float  # share of directions with a supporting edge, of those that nothing hides
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,6 +61,15 @@ def _in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_] | None) -
     limit = np.array(clear.shape[::-1]) - 1
     u, v = np.rint(place).astype(np.int64).clip(0, limit).T
     return np.asarray(clear[v, u])
+
+
+def _rim_in_the_clear(circle: NDArray[np.float64], clear: NDArray[np.bool_] | None) -> float:
+    """Return how many of the directions about a circle show its rim away from what hides the ball."""
+    if clear is None:
+        return DIRECTIONS
+    angle = (np.arange(DIRECTIONS) + 0.5) * (2 * np.pi / DIRECTIONS)
+    rim = circle[:2] + circle[2] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return max(float(_in_the_clear(rim, clear).sum()), LEAST_RIM * DIRECTIONS)
 
 
 def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -212,7 +222,7 @@ def _fit_circle(
     rms = float(np.sqrt((residual[used] ** 2).mean()))
     angle = np.arctan2(outward[used, 1], outward[used, 0])
     direction = ((angle + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
-    coverage = len(np.unique(direction)) / DIRECTIONS
+    coverage = min(len(np.unique(direction)) / _rim_in_the_clear(circle, clear), 1.0)
     return Outline(
         u_px=float(circle[0]), v_px=float(circle[1]), radius_px=float(circle[2]), rms_px=rms, coverage=coverage
     )

@@ -51,16 +51,18 @@ class Fit:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Residuals:
-    """The linear problem at one pose; L disks."""
+class Residuals:
+    """The linear problem at one pose; L disks. Made by `residuals`."""
 
+    view: View
     design: Tensor  # (L, 6 + K, P), derivatives by pose and by the light's coefficients
     residual: Tensor  # (L, P), grey levels
     model: Tensor  # (L, P), grey levels
     variance: Tensor  # (L, P), expected
     weight: Tensor  # (L, P), robust and inside, 0 .. 1
     deviation: Tensor  # (L,), robust standard deviation of the residuals over the noise expected
-    coverage: Tensor  # (L, P), share of each pixel that is ball
+    lit: Tensor  # (L, P), grey levels from black to white paint, the frame's own light included, coverage too
+    over: Tensor  # (L, P), grey levels by which the ball is brighter than what is behind it
 
 
 def light_columns(view: View, light: Light, shading: Shading) -> tuple[Tensor, Tensor, Tensor]:
@@ -115,7 +117,7 @@ def refine(
     seen = use.to(X.dtype)
     state: tuple[Tensor, Tensor] | None = None
     for _ in range(iterations):
-        at = _residuals(pixels, X, R, state, radius_mm, paint, blur_px, light, cameras, shading)
+        at = residuals(pixels, X, R, state, radius_mm, paint, blur_px, light, cameras, shading)
         state = at.model, at.weight
         precision = at.weight / at.variance
         weighted = at.design * precision[:, None]
@@ -163,7 +165,7 @@ def refine(
     )
 
 
-def _residuals(
+def residuals(
     pixels: Pixels,
     X: Tensor,
     R: Tensor,
@@ -174,8 +176,21 @@ def _residuals(
     light: Light,
     cameras: int,
     shading: Shading,
-) -> _Residuals:
-    """Linearise the pictures about a pose, the light's coefficients at their best."""
+) -> Residuals:
+    """Linearise the pictures about poses, the light's coefficients at their best.
+
+    Args:
+        pixels: of B * C disks.
+        X: (B, 3), places of the centre in the lab, mm.
+        R: (B, 3, 3), R_lab_body.
+        state: model and weights of an earlier look, (L, P) each; None: from the picture itself.
+        radius_mm: of the sphere.
+        paint: blurred by `blur_px`.
+        blur_px: as in `refine`.
+        light: of the C cameras.
+        cameras: C.
+        shading: how far a frame's light may differ from it.
+    """
     view = sphere_view(
         pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), radius_mm, paint, blur_px
     )
@@ -203,20 +218,26 @@ def _residuals(
     gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
     offset = (coefficients[:, None, n:] @ tints[:, : columns.shape[1] - n])[:, 0]
     step, ground = difference * gain, black * gain + offset
-    by_paint = (view.coverage * step)[:, None]
-    over = (view.paint * step + ground - pixels.behind)[:, None]
-    by_pose = torch.cat(
-        [by_paint * view.paint_by_rotation, by_paint * view.paint_by_position + over * view.coverage_by_position], dim=1
-    )
-    design = torch.cat([by_pose, columns], dim=1)
-    return _Residuals(
-        design=design,
+    lit = view.coverage * step
+    over = view.paint * step + ground - pixels.behind
+    return Residuals(
+        view=view,
+        design=torch.cat([grey_by_pose(view, lit, over), columns], dim=1),
         residual=residual,
         model=model,
         variance=variance,
         weight=weight,
         deviation=deviation,
-        coverage=view.coverage,
+        lit=lit,
+        over=over,
+    )
+
+
+def grey_by_pose(view: View, lit: Tensor, over: Tensor) -> Tensor:
+    """Return how grey changes with delta (rad) and place (mm), (L, 6, P); `lit` and `over` as in `Residuals`."""
+    paint, limb = lit[:, None], over[:, None]
+    return torch.cat(
+        [paint * view.paint_by_rotation, paint * view.paint_by_position + limb * view.coverage_by_position], dim=1
     )
 
 
@@ -300,7 +321,7 @@ def _bounded_alone(freed: Tensor, to_centre: Tensor, radius_mm: float) -> Tensor
     return step.reshape(freed.shape)[..., 3:]
 
 
-def _shared_scores(at: _Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:
+def _shared_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:
     """Sum over tiles of the outer products of their scores, (L, 6, 6): neighbours' errors are not independent."""
     by_pose = at.design[:, :6] - mixed.mT.to(at.design.dtype) @ at.design[:, 6:]
     score = by_pose * (precision * at.residual)[:, None]
@@ -312,20 +333,20 @@ def _shared_scores(at: _Residuals, precision: Tensor, mixed: Tensor, tile: Tenso
     return few * (tiles @ tiles.mT)
 
 
-def _loss(at: _Residuals, inside: Tensor) -> Tensor:
+def _loss(at: Residuals, inside: Tensor) -> Tensor:
     """Tukey's loss with its scale's own term (L,), natural units: what a wider scatter gains, it pays for."""
     share = (at.residual.square() / (TUKEY**2 * at.variance)).clamp_max(1.0)
     loss = (TUKEY**2 / 6.0) * (1.0 - (1.0 - share) ** 3) + at.deviation.clamp_min(1.0).log()[:, None]
     return (loss * inside).sum(-1).double()
 
 
-def _score(at: _Residuals, inside: Tensor) -> Tensor:
+def _score(at: Residuals, inside: Tensor) -> Tensor:
     """Share of the disk's variance that the model explains, (L,).
 
     Every pixel of the ball counts: those that do not fit are what tells a wrong pose. A bubble counts as dark or
     bright as paint is, however much brighter it shines.
     """
-    share = at.coverage * inside
+    share = at.view.coverage * inside
     share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)
     grey = at.model + at.residual
     spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
@@ -360,8 +381,8 @@ def learn_light(
     """
     cameras = use.shape[1]
     X, R = fit.position_lab_mm, fit.R_lab_body
-    at = _residuals(pixels, X, R, None, radius_mm, paint, blur_px, light, cameras, shading)
-    at = _residuals(pixels, X, R, (at.model, at.weight), radius_mm, paint, blur_px, light, cameras, shading)
+    at = residuals(pixels, X, R, None, radius_mm, paint, blur_px, light, cameras, shading)
+    at = residuals(pixels, X, R, (at.model, at.weight), radius_mm, paint, blur_px, light, cameras, shading)
     view = sphere_view(
         pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), radius_mm, paint, blur_px
     )

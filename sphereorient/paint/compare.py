@@ -23,6 +23,7 @@ CHUNK = 256  # rotations tried at once
 CLIMBS = 6  # best of them that are brought to the best fit nearby
 BLURS_DEG = (5.0, 2.0, 0.8)  # on the way there
 STEPS = 8
+TURN_ROUNDS = 5  # of robust weights
 KNOWN_USUAL = 0.1  # share of the sphere of which a correlation is half believed
 ALIKE_MIN = 0.55  # correlation below which two maps do not show one ball; of two balls, or mirrored: up to 0.5
 DIRECTIONS = 500  # in which the displacement is measured
@@ -90,6 +91,9 @@ def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapCo
     )
     known = _seen_around(shares, direction, R)
     moved = torch.where((shifts.sure & known)[:, None], shifts.shift_rad, torch.nan)
+    if turned:  # brightness alone lets a worn place turn the whole map a little
+        turn, moved = _common_turn(direction, moved)
+        R = R @ so3.exp(turn)
     return MapComparison(R_other_reference=R, correlation=score, direction_body=direction, moved_rad=moved)
 
 
@@ -188,6 +192,22 @@ def _best_rotation(tables: dict[float, list[PaintTable]], shares: list[Tensor], 
         found.append((float(_trusted(*_correlations(tables[BLURS_DEG[-1]], shares, place, R[None]))[0]), R))
     best: Tensor = max(found, key=lambda one: one[0])[1]
     return best
+
+
+def _common_turn(direction: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the rotation (3,), rad, that most displacements (D, 2) share, and what they are without it."""
+    east, north = compass(direction)
+    # turn x d to the east is turn . (d x east), and d x east is north; to the north it is -turn . east.
+    columns = torch.stack([north, -east], dim=1)
+    known = torch.isfinite(moved).all(1)
+    turn = torch.zeros(3, dtype=torch.float64)
+    for _ in range(TURN_ROUNDS):
+        left = moved[known] - columns[known] @ turn
+        length = left.norm(dim=-1)
+        weight = 1 / (1 + (length / (2 * length.median().clamp_min(1e-6))) ** 2) if len(length) else length
+        normal = torch.einsum("n,nki,nkj->ij", weight, columns[known], columns[known]) + 1e-9 * torch.eye(3).double()
+        turn = turn + torch.linalg.solve(normal, torch.einsum("n,nki,nk->i", weight, columns[known], left))
+    return turn, moved - columns @ turn
 
 
 def _trusted(score: Tensor, known: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,6 +14,7 @@ from sphereorient.paint.disks import Disks, even_disks
 from sphereorient.paint.footage import Footage
 from sphereorient.paint.settings import PaintSettings
 
+SHOWN_MIN = 0.99  # share of a disk's pixel that nothing hides, below which it does not count
 FAR_RADII = 50.0  # of a camera that does not see the ball: any distance does
 
 
@@ -20,6 +22,8 @@ def disks_of(footage: Footage, frames: Tensor, settings: PaintSettings) -> Disks
     """Cut the evened disks of some frames (M,) out of the footage."""
     size, count, cameras = settings.disk_px, len(frames), len(footage.eyes)
     pictures = torch.zeros(count, cameras, size, size)
+    hidden = any(eye.background.shown is not None for eye in footage.eyes)
+    shown = torch.ones(count, cameras, size, size) if hidden else None
     R = torch.eye(3, dtype=torch.float64).repeat(count, cameras, 1, 1)
     far = torch.full((count, cameras), FAR_RADII, dtype=torch.float64)
     X = footage.position_lab_mm[frames]
@@ -36,7 +40,11 @@ def disks_of(footage: Footage, frames: Tensor, settings: PaintSettings) -> Disks
             if window is not None and bool(footage.seen[frame, c]):
                 u, v = float(middle[k, 0]) - window.left, float(middle[k, 1]) - window.top
                 pictures[k, c] = torch.from_numpy(crop_disk(window.grey, u, v, float(limb[k]), size))
-    return even_disks(pictures, R, far, footage.seen[frames], settings.detail, settings.window)
+                if shown is not None and eye.background.shown is not None:
+                    whole = eye.background.shown.astype(np.uint8)
+                    told = crop_disk(whole, float(middle[k, 0]), float(middle[k, 1]), float(limb[k]), size)
+                    shown[k, c] = torch.from_numpy(told) > SHOWN_MIN
+    return even_disks(pictures, R, far, footage.seen[frames], settings.detail, settings.window, shown)
 
 
 def pixels_of(footage: Footage, fitter: Fitter, frames: Tensor, wanted: int) -> Pixels:

@@ -26,10 +26,16 @@ class Disks:
     R_lab_view: Tensor  # (N, C, 3, 3) float32
     distance_radii: Tensor  # (N, C), of the camera from the centre
     seen: Tensor  # (N, C) bool, disks that there are
+    shown: Tensor | None = None  # (N, C, S, S) float32, 0 where something hides the ball .. 1; None: nowhere
 
     def __len__(self) -> int:
         """Return the number of instants."""
         return len(self.layers)
+
+    def told(self, rows: Tensor, camera: int) -> Tensor:
+        """Return how much each place of some disks counts, (R, S * S)."""
+        counts = self.seen[rows, camera][:, None] * torch.ones(self.size_px**2)
+        return counts if self.shown is None else counts * self.shown[rows, camera].flatten(1)
 
     @property
     def size_px(self) -> int:
@@ -38,7 +44,13 @@ class Disks:
 
 
 def even_disks(
-    pictures: Tensor, R_lab_view: Tensor, distance_radii: Tensor, seen: Tensor, detail: float, window: float
+    pictures: Tensor,
+    R_lab_view: Tensor,
+    distance_radii: Tensor,
+    seen: Tensor,
+    detail: float,
+    window: float,
+    shown: Tensor | None = None,
 ) -> Disks:
     """Even the disks of a movie.
 
@@ -49,6 +61,7 @@ def even_disks(
         seen: (N, C) bool.
         detail: standard deviation of the Gaussian laid over the pictures first, radii.
         window: standard deviation of the neighbourhood over which light is taken to be even, radii.
+        shown: (N, C, S, S), 0 where something hides the ball .. 1; None: nowhere.
 
     Returns:
         The disks: each place's difference from its neighbourhood over that neighbourhood's own deviation, so that
@@ -58,6 +71,11 @@ def even_disks(
     share = rim_share(size)
     fine, wide = Blur(size, detail), Blur(size, window)
     flat = pictures.reshape(-1, size, size).float()
+    if shown is not None:  # what hides the ball is taken to be as bright as the ball is on the whole
+        part = shown.reshape(-1, size, size)
+        inside = part * share
+        usual = (flat * inside).sum((1, 2), keepdim=True) / inside.sum((1, 2), keepdim=True).clamp_min(1e-6)
+        flat = usual + (flat - usual) * part
     rough = fine(flat) - wide(flat)
     whole = (rough.square() * share).sum((1, 2), keepdim=True) / share.sum()
     # A neighbourhood of one paint has no deviation of its own: half of the disk's keeps its noise small.
@@ -73,6 +91,7 @@ def even_disks(
         R_lab_view=R_lab_view.float(),
         distance_radii=distance_radii.float().clamp(1.01, DEEPEST),
         seen=seen,
+        shown=shown,
     )
 
 
@@ -89,6 +108,7 @@ def reduced(disks: Disks, factor: int) -> Disks:
         R_lab_view=disks.R_lab_view,
         distance_radii=disks.distance_radii,
         seen=disks.seen,
+        shown=None if disks.shown is None else F.avg_pool2d(disks.shown, factor),
     )
 
 

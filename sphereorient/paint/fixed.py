@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -28,13 +28,19 @@ class FixedBall:
     scene: Background
 
 
-def fixed_ball(pictures: NDArray[Any], locating: LocateSettings, empty: NDArray[np.float32] | None = None) -> FixedBall:
+def fixed_ball(
+    pictures: NDArray[Any],
+    locating: LocateSettings,
+    empty: NDArray[np.float32] | None = None,
+    shown: NDArray[np.bool_] | None = None,
+) -> FixedBall:
     """Find a ball that turns in its place.
 
     Args:
         pictures: (n, H, W), evenly spread frames of one movie.
         locating: how outlines are found; `diameter_px` where it is known.
         empty: (H, W), the scene without the ball, where there is such a picture.
+        shown: (H, W), False where something hides the ball; None: nowhere.
 
     Raises:
         PaintError: nothing round changes.
@@ -42,6 +48,8 @@ def fixed_ball(pictures: NDArray[Any], locating: LocateSettings, empty: NDArray[
     grey = pictures.astype(np.float32)
     middle = np.median(grey, axis=0)
     scatter = np.asarray(grey.std(axis=0), np.float32)
+    if shown is not None:
+        scatter = np.where(shown, scatter, np.float32(0))
     usual = float(np.median(scatter)) + 0.3 * float(np.iinfo(pictures.dtype).max) / 255
     moved = (cv2.medianBlur(scatter, WINDOW) > CHANGES * usual).astype(np.uint8)
     count, labels, stats, centres = cv2.connectedComponentsWithStats(moved, connectivity=8)
@@ -49,13 +57,21 @@ def fixed_ball(pictures: NDArray[Any], locating: LocateSettings, empty: NDArray[
         raise _nothing("nothing that changes")
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     inside = (labels == largest).astype(np.uint8)
-    guess = locating.diameter_px or 2 * float(np.sqrt(stats[largest, cv2.CC_STAT_AREA] / np.pi))
+    guess = locating.diameter_px or _diameter(inside, shown is not None)
     change = np.minimum(scatter, np.percentile(scatter[inside > 0], 30))  # the rim's fall, not the paint's wealth
     blob = Blob(u_px=float(centres[largest][0]), v_px=float(centres[largest][1]), merit=1.0)
-    outline = fit_outline(change, 0.2 * usual, blob, guess, locating)
+    outline = fit_outline(change, 0.2 * usual, blob, guess, locating, shown)
     if outline is None or outline.coverage < locating.coverage_min:
         raise _nothing("no circle about what changes")
-    return FixedBall(outline=outline, scene=_scene(middle, scatter, outline, pictures.dtype, empty))
+    scene = replace(_scene(middle, scatter, outline, pictures.dtype, empty), shown=shown)
+    return FixedBall(outline=outline, scene=scene)
+
+
+def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
+    """Return about how wide a region is: by its area, or, where a part may be hidden, by the circle about it."""
+    if hidden:
+        return 2 * float(cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1])
+    return 2 * float(np.sqrt(inside.sum() / np.pi))
 
 
 def _scene(

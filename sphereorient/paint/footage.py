@@ -51,6 +51,10 @@ class Strip(Protocol):
     def camera(self) -> Camera:
         """With its calibration."""
 
+    @property
+    def shown(self) -> NDArray[np.bool_] | None:
+        """Where nothing hides the ball, (H, W); None: everywhere."""
+
     def spread(self, count: int) -> Picture:
         """Return at most `count` pictures spread evenly, (n, H, W)."""
 
@@ -153,7 +157,7 @@ def _moving(source: Source, settings: PaintSettings, locating: LocateSettings, p
         given = locating.diameter_px
         diameter_px = given or expected_diameter_px(reel.name, cameras, source.experiment.diameter_mm)
         empty = _given_scene(source.experiment, reel)
-        background = learn_background(reel.spread(settings.background_frames), diameter_px, locating, empty)
+        background = learn_background(reel.spread(settings.background_frames), diameter_px, locating, empty, reel.shown)
         eye = _eye(reel, background, diameter_px)
         found, row = [], []
         for k, shot in enumerate(reel.shots(background)):
@@ -172,7 +176,8 @@ def _fixed(source: Source, settings: PaintSettings, locating: LocateSettings, pr
     """Take a ball that stays in its place: what changes in the pictures is the ball."""
     eyes, sightings, windows = [], {}, []
     for reel in source.reels:
-        where = fixed_ball(reel.spread(4 * settings.background_frames), locating, _given_scene(source.experiment, reel))
+        pictures, empty = reel.spread(4 * settings.background_frames), _given_scene(source.experiment, reel)
+        where = fixed_ball(pictures, locating, empty, reel.shown)
         outline = where.outline
         eye = _eye(reel, where.scene, 2 * outline.radius_px)
         row: list[Window | None] = []

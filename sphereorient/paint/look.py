@@ -10,16 +10,13 @@ from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from sphereorient.orient.eye import Fitter
-from sphereorient.orient.light import polynomials
-from sphereorient.orient.picture import View, sphere_view
+from sphereorient.orient.picture import View
 from sphereorient.orient.pixels import Pixels
-from sphereorient.orient.refine import NOISE_MIN, TUKEY, light_columns
+from sphereorient.orient.refine import grey_by_pose, residuals
 from sphereorient.paint.grid import READS, SplinePaint
 
-ROUNDS = 2  # of the robust weights
 DEPTH_MIN = 0.2  # cosine of the slant beyond which a pixel tells nothing of the map
-RIDGE = 1e-7
-EVERY = 4  # the scatter is read off from every so-many-th pixel
+POSE = 6  # rows of the pose in a linear problem
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,69 +78,30 @@ def look(
         R_lab_body: (B, 3, 3).
         blur_px: of the pictures.
     """
-    cameras = len(fitter.eyes)
-    X, R = position_lab_mm.repeat_interleave(cameras, 0), R_lab_body.repeat_interleave(cameras, 0)
     paint = SplinePaint(texture, 0.0)
-    view = sphere_view(pixels, X, R, fitter.radius_mm, paint, blur_px)
-    shading = fitter.shading
-    columns, difference, black = light_columns(view, fitter.light, shading)
-    noise = fitter.light.noise.repeat(len(position_lab_mm), 1)
-    beyond = (1 - view.coverage) * pixels.behind
-    target = pixels.grey - beyond
-    expected, weight = pixels.grey, pixels.inside.to(columns.dtype)
-    for _ in range(ROUNDS):
-        found = _solved(columns, target, weight / _variance(expected, noise))
-        painted = (found[:, None] @ columns)[:, 0]
-        residual, expected = target - painted, painted + beyond
-        variance = _variance(expected, noise)
-        variance = variance * _scatter(residual, variance, pixels.inside).clamp_min(1.0)[:, None] ** 2
-        weight = (1 - residual.square() / (TUKEY**2 * variance)).clamp_min(0).square() * pixels.inside
-    tints = polynomials(view.across, max(shading.difference, shading.black))
-    n = (shading.difference + 1) * (shading.difference + 2) // 2
-    gain = (found[:, None, :n] @ tints[:, :n])[:, 0]
-    offset = (found[:, None, n:] @ tints[:, : columns.shape[1] - n])[:, 0]
-    step, ground = difference * gain, black * gain + offset
-    lit = (view.coverage * step)[:, None]
-    over = (view.paint * step + ground - pixels.behind)[:, None]
-    depth = (1 - view.across.square().sum(1)).clamp_min(0).sqrt()
-    # Near the limb the map learns nothing, and so cannot tell the pose anything either.
-    told = lit * (depth > DEPTH_MIN)[:, None]
-    by_pose = torch.cat(
-        [told * view.paint_by_rotation, told * view.paint_by_position + over * view.coverage_by_position], dim=1
+    at = residuals(
+        pixels,
+        position_lab_mm,
+        R_lab_body,
+        None,
+        fitter.radius_mm,
+        paint,
+        blur_px,
+        fitter.light,
+        len(fitter.eyes),
+        fitter.shading,
     )
+    depth = (1 - at.view.across.square().sum(1)).clamp_min(0).sqrt()
     return Look(
-        view=view,
+        view=at.view,
         reads=paint.reads,
         inner=pixels.inner,
         depth=depth,
-        step=lit[:, 0],
-        residual=residual,
-        weight=weight,
-        variance=variance,
-        by_pose=by_pose,
-        by_light=columns,
+        step=at.lit,
+        residual=at.residual,
+        weight=at.weight,
+        variance=at.variance,
+        # Near the limb the map learns nothing, and so cannot tell the pose anything either.
+        by_pose=grey_by_pose(at.view, at.lit * (depth > DEPTH_MIN), at.over),
+        by_light=at.design[:, POSE:],
     )
-
-
-def _solved(columns: Tensor, target: Tensor, precision: Tensor) -> Tensor:
-    """Weighted least squares over the pixels, (L, K)."""
-    weighted = columns * precision[:, None]
-    normal, right = (weighted @ columns.mT).double(), (weighted @ target[..., None]).double()
-    floor = RIDGE * normal.diagonal(dim1=1, dim2=2).clamp_min(0) + 1e-12
-    solution: Tensor = torch.linalg.solve(normal + torch.diag_embed(floor), right)[..., 0]
-    return solution.to(columns.dtype)
-
-
-def _variance(grey: Tensor, noise: Tensor) -> Tensor:
-    """Noise expected at grey levels (L, P) by the curves (L, 4)."""
-    grey = grey.clamp_min(0.0)
-    a, b, c, d = noise[..., None].unbind(1)
-    variance: Tensor = a + grey * (b + grey * (c + grey * d))
-    return variance.clamp_min(NOISE_MIN)
-
-
-def _scatter(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
-    """Robust standard deviation of the residuals over the noise expected, (L,)."""
-    scaled = (residual * variance.rsqrt()).abs()[:, ::EVERY]
-    scaled = torch.where(inside[:, ::EVERY], scaled, torch.nan)
-    return 1.4826 * torch.nan_to_num(scaled.nanmedian(-1).values)

@@ -73,7 +73,7 @@ def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slope
     lower = corner(size) * (1 - tx)[:, None] + corner(size + 1) * tx[:, None]
     found = upper * (1 - ty)[:, None] + lower * ty[:, None]
     near = disks.share.reshape(-1)[cell]
-    weight = depth.clamp_min(0) * near * disks.seen[second, camera][:, None]
+    weight = depth.clamp_min(0) * near * disks.told(second, camera).gather(1, cell)
     if not slopes:
         return _Warp(grey=found[:, 0], by_turn=found[:, :0], weight=weight)
     # d place = scale (d xy - place / sqrt(D^2 - 1) d z), d n = delta x n, view frame.
@@ -94,7 +94,7 @@ def _first_views(disks: Disks, first: Tensor, every: int) -> list[tuple[Tensor, 
         at = ((place + 1) * (disks.size_px / 2) - 0.5).round().long()
         cell = at[1] * disks.size_px + at[0]
         grey = disks.layers[first, camera, 0].flatten(1)[:, cell]
-        weight = (share * depth.clamp_min(0))[None] * disks.seen[first, camera][:, None]
+        weight = (share * depth.clamp_min(0))[None] * disks.told(first, camera)[:, cell]
         views.append((disks.R_lab_view[first, camera] @ normal, grey, weight))
     return views
 

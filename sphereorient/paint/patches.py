@@ -16,6 +16,8 @@ ROUGH_DEG, FINE_DEG = 1.0, 0.5  # steps of the search, and of the places of a pa
 STEPS = 8  # of the climb
 CONTRAST_MIN = 0.15  # deviation of the paint in a patch, of black to white
 ONE_WAY = 0.15  # share of the weaker direction below which edges run one way only, and say nothing along themselves
+NEIGHBOURS, FEWEST, NEAR_DEG = 6, 3, 20.0  # that are asked, that decide, how far they may be
+APART_DEG = 1.0  # from the neighbours' middle shift, beyond which a patch was found in the wrong place
 ALIKE_MIN = 0.8  # correlation below which a patch was not found
 
 
@@ -88,7 +90,20 @@ def patch_shifts(rough: list[PaintTable], fine: list[PaintTable], patches: Patch
     sure = (weaker > ONE_WAY * own.diagonal(dim1=1, dim2=2).sum(-1)) & (reference.std(1) > CONTRAST_MIN)
     sure &= (_alike(grey, reference) > ALIKE_MIN) & (shift.norm(dim=-1) < math.radians(REACH_DEG))
     sure &= (shift - start).norm(dim=-1) < math.radians(ROUGH_DEG)  # a climb that leaves its peak has lost the patch
-    return Shifts(shift_rad=shift, sure=sure)
+    return Shifts(shift_rad=shift, sure=sure & ~_alone(patches.direction, shift, sure))
+
+
+def _alone(direction: Tensor, shift: Tensor, sure: Tensor) -> Tensor:
+    """Return which patches (D,) contradict those around them, which overlap with them: found on another edge."""
+    east, north = compass(direction)
+    moved = shift[:, :1] * east + shift[:, 1:] * north
+    near = (direction @ direction.mT).fill_diagonal_(-1) * sure - (~sure).double()
+    cosine, which = near.topk(min(NEIGHBOURS, len(direction)), dim=1)
+    told = cosine > math.cos(math.radians(NEAR_DEG))
+    others = torch.where(told[..., None], moved[which], torch.nan)
+    apart = (moved - others.nanmedian(1).values).norm(dim=-1)
+    alone: Tensor = (told.sum(1) >= FEWEST) & (apart > math.radians(APART_DEG))
+    return alone
 
 
 def _searched(tables: list[PaintTable], patches: Patches) -> Tensor:

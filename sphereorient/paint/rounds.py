@@ -17,6 +17,7 @@ from sphereorient.orient.light import Light, light_maps, light_sums, noise_curve
 from sphereorient.orient.pixels import Pixels
 from sphereorient.orient.refine import Fit
 from sphereorient.paint.chain import moved, spread
+from sphereorient.paint.footage import Footage
 from sphereorient.paint.grid import Gram, map_table, solve_map, stiffness, texel_areas
 from sphereorient.paint.joint import joint_step, part_of
 from sphereorient.paint.look import DEPTH_MIN, Look, look, look_ups
@@ -36,6 +37,8 @@ STEPS = 60  # of conjugate gradients in it
 BLACK, WHITE = 0.03, 0.97  # shares of the sphere that count as black and white paint
 BEYOND = 0.2  # by how much the map may leave 0 .. 1 on the way
 NOISE_EVERY = 4  # pixels from which the noise is learnt
+MEASURED_STEPS = 2  # of each pose by itself, the map finished
+HELD = 1e12  # 1/mm^2, of a place that is not to move
 OUTLIER2 = 25.0  # squares of residuals, over the noise expected, count up to this
 
 
@@ -115,6 +118,27 @@ def fitted(stage: Stage, steps: int) -> tuple[Stage, Fit]:
     X = fit.position_lab_mm
     X = X.median(0).values.expand(len(X), 3).clone() if stage.fixed else X
     return replace(stage, position_lab_mm=X, R_lab_body=fit.R_lab_body), fit
+
+
+def measured(footage: Footage, stage: Stage) -> tuple[Stage, Fit]:
+    """Fit each instant's pose to the map as it is, by all pixels: the map needs few of each picture, a pose all of its.
+
+    Args:
+        footage: with the pictures.
+        stage: after the last round. A place that all instants share is left as it is.
+    """
+    optics = optics_of(stage.texture, stage.fitter.eyes, stage.blur_px)
+    fitter, fine = replace(stage.fitter, optics=optics), optics.fine
+    held = HELD * torch.eye(3, dtype=torch.float64) if stage.fixed else None
+    parts = []
+    for rows, _ in stage.batches():
+        X, R, use = stage.position_lab_mm[rows], stage.R_lab_body[rows], stage.use[rows]
+        pictures = [[footage.picture(int(k), c) for c in range(use.shape[1])] for k in stage.frames[rows]]
+        known = None if held is None else held.expand(len(rows), 3, 3)
+        parts.append(fitter.fit(fitter.pixels(pictures, X, fine), X, R, use, fine, MEASURED_STEPS, known))
+    fit = Fit(**{name: torch.cat([getattr(part, name) for part in parts]) for name in Fit.__dataclass_fields__})
+    X = stage.position_lab_mm if stage.fixed else fit.position_lab_mm
+    return replace(stage, position_lab_mm=X, R_lab_body=so3.nearest_rotation(fit.R_lab_body)), fit
 
 
 def with_light(stage: Stage) -> Stage:

@@ -12,6 +12,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -137,6 +138,7 @@ def _draw_rounds(axes: Axes, learnt: LearntMap) -> None:
     moved = np.rad2deg([one.moved_rad for one in learnt.rounds])
     axes.semilogy(np.arange(1, len(moved) + 1), moved, color="black", marker="o")
     axes.set(xlabel="round", ylabel="degrees")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_title("attitudes' moves, rms")
 
 
@@ -180,7 +182,7 @@ def moved_figure(texture: Tensor, comparison: MapComparison, change: Tensor | No
     grey = np.ma.masked_invalid(texture.numpy())
     axes.imshow(0.55 + 0.45 * grey, cmap="gray", vmin=0, vmax=1, extent=(-180, 180, -90, 90))
     times = _draw_arrows(axes, comparison)
-    axes.set_title("how far the paint lies from where the reference has it")
+    axes.set_title("how far the paint lies from where the old map has it")
     if change is not None:
         _draw_change(figure, panels[1], change)
     count = len(comparison.length_rad)
@@ -190,10 +192,8 @@ def moved_figure(texture: Tensor, comparison: MapComparison, change: Tensor | No
         sizes = f"{count} patches located: {rms:.2f}° rms, {most:.2f}° at most; arrows {times:g} times as long"
     words = ""
     if change is not None:
-        words = (
-            " Below: how much brighter (red) or darker (blue) than all that the reference has within 1°; 1 is white."
-        )
-    note(figure, f"{sizes}, from where the reference has a patch to where it is. Sand: unknown.{words}")
+        words = " Below: how much brighter (red) or darker (blue) than all that the old map has within 1°; 1 is white."
+    note(figure, f"{sizes}, from where the old map has a patch to where it is. Sand: unknown.{words}")
     return figure
 
 
@@ -206,7 +206,7 @@ def _draw_arrows(axes: Axes, comparison: MapComparison) -> float:
     longitude, latitude = torch.atan2(y, x), torch.asin(z.clamp(-1, 1))
     moved = torch.rad2deg(comparison.moved_rad[known])
     largest = float(moved.norm(dim=-1).quantile(0.95).clamp_min(1e-6))
-    steps = (1, 2, 5, 10, 20, 50, 100, 200, 500)
+    steps = (1, 2, 5, 10, 20, 50)
     times = max([step for step in steps if step * largest <= 2 * LEAST_ARROW_DEG], default=1)
     # East is stretched by the map away from the equator.
     along = moved[:, 0] / latitude.cos().clamp_min(0.1)

@@ -42,6 +42,7 @@ def test_a_half_hidden_ball_is_found_with_a_mask():
     assert outline is not None
     assert np.hypot(outline.u_px - MIDDLE[0], outline.v_px - MIDDLE[1]) < 0.4
     assert outline.radius_px == pytest.approx(DIAMETER / 2, abs=0.4)
+    assert outline.coverage > 0.8, "of the rim that can be seen"
     # Without, the cup's rim is taken for the ball's.
     free, _ = find_ball(frame, even_background(), DIAMETER, SETTINGS)
     assert free is None or abs(free.radius_px - DIAMETER / 2) > 1.0
@@ -68,7 +69,9 @@ def test_a_learnt_background_keeps_the_mask():
 
 def test_hidden_pixels_are_not_inside_a_disk():
     rows = np.repeat(np.arange(SHAPE[0], dtype=np.float32)[:, None], SHAPE[1], 1)
-    pixels = cut_pixels(rows, rows, LinesOfSight(looking_down(image_size=SHAPE[::-1])), MIDDLE, disk_stencil(35.0), shown=shown())
+    pixels = cut_pixels(
+        rows, rows, LinesOfSight(looking_down(image_size=SHAPE[::-1])), MIDDLE, disk_stencil(35.0), shown=shown()
+    )
     assert torch.equal(pixels.inside, pixels.grey < LOW)  # the whole stencil lies within the cup's radius
     assert 0.2 < float(pixels.inside.float().mean()) < 0.95
 

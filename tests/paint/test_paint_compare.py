@@ -65,6 +65,14 @@ def test_a_planted_shift_is_found_where_it_is_with_its_direction(paint, brightne
     assert math.degrees(found.rms_rad) == pytest.approx(1.0, abs=0.15)
 
 
+def test_a_worn_place_does_not_turn_the_map(paint):
+    worn = turned_map(paint, TURN.mT)
+    worn = torch.where(map_directions(HEIGHT)[..., 0] > 0.9, 1.0, worn)
+    found = compare_maps(worn, paint)
+    assert math.degrees(float(so3.geodesic_distance(found.R_other_reference, TURN))) < 0.02
+    assert math.degrees(float(found.length_rad.median())) < 0.05
+
+
 def test_the_shift_of_east_and_north_has_the_sign_of_the_map(paint):
     """Rolled by two columns to the right, all paint lies 360 / 128 degrees further east (at the equator)."""
     found = compare_maps(paint.roll(1, 1), paint, turned=False)

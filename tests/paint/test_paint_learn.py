@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import h5py
@@ -17,7 +18,8 @@ from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.locate import LocateSettings
 from sphereorient.paint import PaintSettings, learn_map, take_footage
-from sphereorient.paint.learn import followed
+from sphereorient.paint.compare import fibonacci
+from sphereorient.paint.learn import SHOWN_MIN, _counts, followed
 from sphereorient.recording import Recording, silent
 from sphereorient.reel import Reel
 from sphereorient.so3 import exp
@@ -94,6 +96,32 @@ def test_frames_between_the_fitted_ones_turn_as_they_do():
     torch.testing.assert_close(R[rows], told)
     torch.testing.assert_close(R[2], exp(0.5 * off) @ chain[2])
     torch.testing.assert_close(R[6], exp(1.5 * off) @ chain[6])
+
+
+def test_a_place_counts_in_the_pictures_that_do_not_show_it_too_slanted():
+    # Near cameras, so that the limb is far from 90 degrees; one picture of four is not used.
+    R = exp(torch.tensor([[0.3, -1.2, 0.4], [2.0, 0.5, -0.7]], dtype=torch.float64))
+    X = torch.tensor([[0.5, 0.2, -0.1], [-0.3, 0.4, 0.0]], dtype=torch.float64)
+    middles = torch.tensor([[0.0, 0.0, 5.0], [4.0, 1.0, 0.0]], dtype=torch.float64)
+    turns = exp(torch.tensor([[0.1, 0.2, 0.3], [1.0, -2.0, 0.4]], dtype=torch.float64))
+    cameras = [SimpleNamespace(R_cam_lab=C, T_cam_lab_mm=-C @ m) for C, m in zip(turns, middles, strict=True)]
+    stage = SimpleNamespace(
+        R_lab_body=R,
+        position_lab_mm=X,
+        use=torch.tensor([[True, True], [False, True]]),
+        fitter=SimpleNamespace(
+            radius_mm=1.5,
+            eyes=[SimpleNamespace(camera=camera, background=SimpleNamespace(shown=None)) for camera in cameras],
+        ),
+    )
+    direction = fibonacci(300)
+    expected = torch.zeros(300, dtype=torch.int64)
+    for k, c in ((0, 0), (0, 1), (1, 1)):
+        normal = direction @ R[k].mT
+        towards = middles[c] - (X[k] + 1.5 * normal)
+        expected += (normal * towards).sum(-1) / towards.norm(dim=-1) > SHOWN_MIN
+    assert len(expected.unique()) > 2
+    torch.testing.assert_close(_counts(stage, direction), expected)
 
 
 @pytest.mark.slow
