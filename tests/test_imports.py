@@ -11,8 +11,8 @@ from conftest import REPO
 
 ROOMS = (
     "errors outputs hdf5_out so3 cameras movies sphere experiment timeline trajectory locate orient assemble "
-    "differentiable motion synth statistics learn paint settings provenance proposers results reel recording learnt paper "
-    "precise pipeline calibrate preflight jobs evaluate report cli"
+    "differentiable motion synth statistics learn paint settings provenance proposers results reel recording learnt "
+    "paper precise pipeline calibrate preflight jobs evaluate report cli"
 )
 ORDER = ROOMS.split(" ")
 FILES = sorted((REPO / "sphereorient").rglob("*.py"))

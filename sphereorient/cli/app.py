@@ -23,8 +23,8 @@ class InOrder(TyperGroup):
 
     ORDER = (
         *("track", "report", "overlay", "export", "view"),
-        *("check", "movie", "convert", "calibrate", "check-cameras", "map", "compare-maps", "synth", "texture", "bench", "train", "evaluate"),
-        *("settings", "info"),
+        *("check", "movie", "convert", "calibrate", "check-cameras", "map", "compare-maps", "synth", "texture"),
+        *("bench", "train", "evaluate", "settings", "info"),
     )
 
     def list_commands(self, ctx: Any) -> list[str]:

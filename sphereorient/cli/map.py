@@ -202,13 +202,14 @@ def compare_maps_(
         check_writable(out)
     import torch
 
-    from sphereorient.paint.compare import compare_maps, paint_change, turned_map
+    from sphereorient.paint.compare import compare_maps, paint_change, turned_map, without_changed
     from sphereorient.report import map_figure
     from sphereorient.so3 import angle
 
     after, before = _known_map(new), _known_map(old)
     comparison = compare_maps(after, before, turned=not same_frame)
     change = paint_change(turned_map(after, comparison.R_other_reference, len(before)), before)
+    comparison = without_changed(comparison, change, CHANGED)
     known = change[torch.isfinite(change)]
     changed = float((known.abs() > CHANGED).float().mean()) if len(known) else math.nan
     if out is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -31,6 +31,7 @@ FINE_BLUR_DEG = 0.5
 SIDE = 256  # of the tables: 0.7 degrees, tangent planes between
 HALF = 0.5  # share of a place's neighbourhood that must have been seen
 RADIUS_DEG = 1.0  # within which the other map must show a brightness: what is only displaced is no wear
+CHANGED_SHARE = 0.01  # of a patch
 REACHES = 16  # directions in which that is looked for
 
 
@@ -158,6 +159,20 @@ def paint_change(new: Tensor, old: Tensor) -> Tensor:
     flat = new.reshape(-1)
     change = flat - torch.minimum(torch.maximum(flat, lowest), highest)
     return torch.where(known.reshape(-1), change, torch.nan).reshape(new.shape)
+
+
+def without_changed(comparison: MapComparison, change: Tensor, most: float) -> MapComparison:
+    """Return a comparison without the patches in which paint itself changed: their shift says nothing.
+
+    Args:
+        comparison: of two maps.
+        change: (H, 2 H), of `paint_change`, in the reference's frame.
+        most: change of a texel from which on it counts.
+    """
+    spots = Patches(direction=comparison.direction_body, R_other_reference=comparison.R_other_reference).points(1.0)
+    changed = (change.abs() > most).double()  # what is unknown has not
+    spoilt = sample_texture(changed, spots).mean(1) > CHANGED_SHARE
+    return replace(comparison, moved_rad=torch.where(spoilt[:, None], torch.nan, comparison.moved_rad))
 
 
 def fibonacci(count: int) -> Tensor:

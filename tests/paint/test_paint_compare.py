@@ -11,7 +11,7 @@ from map_examples import shift_field, warped
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, ShapeError
-from sphereorient.paint.compare import compare_maps, fibonacci, fit_levels, paint_change, turned_map
+from sphereorient.paint.compare import compare_maps, fibonacci, fit_levels, paint_change, turned_map, without_changed
 from sphereorient.paint.correct import nearest
 from sphereorient.paint.patches import compass
 from sphereorient.synth.textures import map_directions, random_texture
@@ -128,6 +128,12 @@ def test_worn_paint_is_shown_and_moved_paint_is_not(paint):
     assert lost.sum() > 10
     assert float(change[lost].median()) > 0.5, "brighter than before: positive"
     assert float(change[~spot].abs().mean()) < 0.005
+    found = compare_maps(worn, paint, turned=False)
+    kept = without_changed(found, change, 0.15)
+    gone = torch.isfinite(found.moved_rad[:, 0]) & torch.isnan(kept.moved_rad[:, 0])
+    near = found.direction_body @ dot > math.cos(math.radians(20))
+    assert not (gone & ~near).any(), "patches away from the worn place keep their shifts"
+    assert torch.isnan(kept.moved_rad[found.direction_body @ dot > math.cos(math.radians(5))]).all()
     unknown = torch.where(spot, torch.nan, paint)
     assert torch.isnan(paint_change(unknown, paint)[spot]).all()
     assert torch.isnan(paint_change(paint, unknown)[spot]).all()
