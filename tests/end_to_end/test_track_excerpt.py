@@ -221,7 +221,7 @@ def _replace(path: Path, old: str, new: str) -> None:
         (_not_a_number, ["cameras.yaml", "cam1", "nan"]),
         (_no_rotation, ["cameras.yaml", "cam1", "rotation"]),
         (_unknown_key, ["framerate", "frame_rate"]),
-        (_masks, ["mask", "no such file"]),
+        (_masks, ["m.png", "no such file", "hides the ball"]),
         (_fixed, ["a ball that turns in its place"]),
         (_no_ball, ["sphere in some frame", "not_found"]),
     ],

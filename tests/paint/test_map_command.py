@@ -77,7 +77,7 @@ def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, mo
     texture, seen = load_texture(out), read_seen(seen_path(out))
     assert seen is not None
     assert seen.shape == texture.shape
-    assert shares_seen(seen, (1,))[0] > 0.95
+    assert shares_seen(seen, (1,))[0] > 0.85
     comparison = compare_maps(texture, load_texture(rendered.parent / "texture.png"))
     assert comparison.correlation > 0.9
     with h5py.File(scene / "learnt_map.h5") as file:
