@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -154,7 +154,7 @@ def _spread(pose: Tensor, count: int, fixed: bool) -> Tensor:
     return torch.cat([pose[:-3].reshape(count, 3), pose[-3:].expand(count, 3)], dim=1) if fixed else pose
 
 
-def _inverse_blocks(blocks: Tensor, damp: Tensor, fixed: bool):  # type: ignore[no-untyped-def]
+def _inverse_blocks(blocks: Tensor, damp: Tensor, fixed: bool) -> Callable[[Tensor], Tensor]:
     """Return the preconditioner of the poses: each instant by itself."""
     blocks = blocks + torch.diag_embed(damp)
     if not fixed:
