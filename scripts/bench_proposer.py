@@ -30,12 +30,12 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cli.app import progress_bar
-from sphereorient.evaluate.reliability import reliability
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
 from sphereorient.learn.proposer import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.orient import DoubtProposer, GreySearch, GreySearchSettings, Proposals, Proposer, ProposeSettings
 from sphereorient.orient.doubt import resized
 from sphereorient.report.plots.style import write_figure
+from sphereorient.statistics.reliability import Z95, reliability, wilson
 from sphereorient.synth import random_texture
 from sphereorient.synth.degrade_scene import misdrawn, worn
 from sphereorient.synth.disks import DISK_DEGRADATIONS, DiskSettings, film_disks
@@ -51,7 +51,6 @@ BALL = 42  # pictures of one map
 WITHIN_DEG, FIRST = 10.0, 5
 MIXED = "two or three at once"
 CLEAN = "none"
-Z95 = 1.959964
 Bools = NDArray[np.bool_]
 
 
@@ -226,10 +225,9 @@ def joined(parts: list[Found]) -> Found:
 
 def interval(right: Bools) -> tuple[float, float, float]:
     """Return a share and its 95 % interval (Wilson 1927)."""
-    n, share = len(right), float(right.mean())
-    middle = (share + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
-    half = Z95 / (1 + Z95**2 / n) * math.sqrt(share * (1 - share) / n + Z95**2 / (4 * n**2))
-    return share, middle - half, middle + half
+    share = float(right.mean())
+    low, high = wilson(np.array([share]), np.array([len(right)]))
+    return share, float(low[0]), float(high[0])
 
 
 def gain(one: Bools, other: Bools) -> tuple[float, float]:

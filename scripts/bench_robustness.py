@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from sphereorient.cli.app import progress_bar
-from sphereorient.evaluate.reliability import reliability
 from sphereorient.evaluate.robustness import BenchSettings, Outcome, Results, run_benchmark, save_results
 from sphereorient.evaluate.robustness.measure import WRONG_DEG
 from sphereorient.evaluate.robustness.results import Line, lines_of
@@ -24,6 +23,7 @@ from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
 from sphereorient.evaluate.robustness.settings import FULL
 from sphereorient.report.plots.style import write_figure
 from sphereorient.report.robustness import markdown, robustness_figure, write_table
+from sphereorient.statistics.reliability import reliability
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 BEGIN, END = "<!-- table: scripts/bench_robustness.py -->", "<!-- end of the table -->"

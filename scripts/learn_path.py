@@ -22,7 +22,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.assemble import Hypotheses, PathSettings, physical_path
 from sphereorient.assemble.path_weights import Frames, PathWeights, Weights
-from sphereorient.evaluate.reliability import reliability
+from sphereorient.statistics.reliability import reliability
 from sphereorient.synth.motion import random_motion
 
 RATE_HZ = 600.0

@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from sphereorient.cli.app import progress_bar
-from sphereorient.evaluate.reliability import reliability
 from sphereorient.evaluate.robustness import BenchSettings, Outcome
 from sphereorient.evaluate.robustness.measure import WRONG_DEG
 from sphereorient.evaluate.robustness.results import from_tree
 from sphereorient.evaluate.robustness.run import KEPT, run_scene, trackers_of
 from sphereorient.evaluate.robustness.scenes import TOGETHER, Scene, scenes_of
+from sphereorient.statistics.reliability import reliability
 from sphereorient.synth.severities import LEVELS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

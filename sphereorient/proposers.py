@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from torch import Tensor
@@ -23,20 +24,20 @@ def precise_proposer(texture: Tensor, settings: Settings) -> Proposer:
     Raises:
         CheckpointError: a checkpoint that cannot be used with this map.
     """
-    network = trained_network(texture, settings.propose)
-    if network is not None and settings.propose.when == "always":
-        return network
-    search = GreySearch(texture, settings.search)
-    return search if network is None else DoubtProposer(search, network, settings.propose.sure)
+    return _proposer(texture, settings.propose, lambda: GreySearch(texture, settings.search))
 
 
 def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:
     """Return who proposes for the paper's method; templates are made for disks of `size_px`."""
-    network = trained_network(texture, settings.propose)
-    if network is not None and settings.propose.when == "always":
+    return _proposer(texture, settings.propose, lambda: TemplateSearch(texture, size_px, settings.orient))
+
+
+def _proposer(texture: Tensor, settings: ProposeSettings, templates: Callable[[], Proposer]) -> Proposer:
+    """Return the network, the templates, or both; a bank of templates is made only where it is asked."""
+    network = trained_network(texture, settings)
+    if network is not None and settings.when == "always":
         return network
-    search = TemplateSearch(texture, size_px, settings.orient)
-    return search if network is None else DoubtProposer(search, network, settings.propose.sure)
+    return templates() if network is None else DoubtProposer(templates(), network, settings.sure)
 
 
 def trained_network(texture: Tensor, settings: ProposeSettings) -> Proposer | None:

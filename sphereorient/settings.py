@@ -159,11 +159,8 @@ def _known_keys(model: Any, parts: list[str]) -> list[str]:
 
 def settings_yaml(settings: Settings | None = None) -> str:
     """Write settings as YAML with each key's description as a comment above it."""
-    settings = settings or Settings()
-    lines = ["# Settings of sphereorient; any key may be left out. --set room.key=value overrides one.", ""]
-    for room, field in Settings.model_fields.items():
-        lines += [f"{room}:  # {field.description}", *_commented(getattr(settings, room), "  "), ""]
-    return "\n".join(lines)
+    head = "# Settings of sphereorient; any key may be left out. --set room.key=value overrides one."
+    return _tree_yaml(head, settings or Settings())
 
 
 def synth_settings_yaml() -> str:
@@ -174,10 +171,14 @@ def synth_settings_yaml() -> str:
 
 def proposer_settings_yaml(settings: ProposerSettings | None = None) -> str:
     """Write the settings of a proposer's training as YAML, commented likewise."""
-    settings = settings or ProposerSettings()
-    lines = ["# Training of a proposer; any key may be left out. --set room.key=value overrides one.", ""]
-    for room, field in ProposerSettings.model_fields.items():
-        lines += [f"{room}:  # {field.description}", *_commented(getattr(settings, room), "  "), ""]
+    head = "# Training of a proposer; any key may be left out. --set room.key=value overrides one."
+    return _tree_yaml(head, settings or ProposerSettings())
+
+
+def _tree_yaml(head: str, tree: BaseModel) -> str:
+    lines = [head, ""]
+    for room, field in type(tree).model_fields.items():
+        lines += [f"{room}:  # {field.description}", *_commented(getattr(tree, room), "  "), ""]
     return "\n".join(lines)
 
 

@@ -241,7 +241,7 @@ def recovered(footage: Footage, stage: Stage, chain: Tensor) -> Stage:
     lost = torch.nonzero(~good)[:, 0]
     R = followed(chain, torch.nonzero(good)[:, 0], stage.R_lab_body[good])[lost]
     X, use = stage.position_lab_mm[lost], stage.use[lost]
-    fitter = replace(stage.fitter, optics=optics_of(stage.texture, stage.fitter.eyes, stage.blur_px))
+    fitter = stage.map_fitter()
     pictures = [[footage.picture(int(k), c) for c in range(use.shape[1])] for k in stage.frames[lost]]
     for level in (fitter.optics.coarse, fitter.optics.middle, fitter.optics.fine):
         fit = fitter.fit(fitter.pixels(pictures, X, level), X, R, use, level, RECOVERY_STEPS)

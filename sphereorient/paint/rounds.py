@@ -56,6 +56,10 @@ class Stage:
     fitter: Fitter  # its own map is none
     fixed: bool  # whether all instants share one place
 
+    def map_fitter(self) -> Fitter:
+        """Return what fits poses to the map as it is."""
+        return replace(self.fitter, optics=optics_of(self.texture, self.fitter.eyes, self.blur_px))
+
     def batches(self) -> Iterator[tuple[Tensor, Pixels]]:
         """Yield rows of instants and their pixels, some at a time."""
         for rows in torch.split(torch.arange(len(self.use)), BATCH):
@@ -108,16 +112,21 @@ def optics_of(blurred: Tensor, eyes: Sequence[Eye], blur_px: float) -> Optics:
 
 def fitted(stage: Stage, steps: int) -> tuple[Stage, Fit]:
     """Fit each instant's pose to the map as it is."""
-    optics = optics_of(stage.texture, stage.fitter.eyes, stage.blur_px)
-    fitter, fine = replace(stage.fitter, optics=optics), optics.fine
+    fitter = stage.map_fitter()
+    fine = fitter.optics.fine
     parts = [
         fitter.fit(pixels, stage.position_lab_mm[rows], stage.R_lab_body[rows], stage.use[rows], fine, steps)
         for rows, pixels in stage.batches()
     ]
-    fit = Fit(**{name: torch.cat([getattr(part, name) for part in parts]) for name in Fit.__dataclass_fields__})
+    fit = _joined(parts)
     X = fit.position_lab_mm
     X = X.median(0).values.expand(len(X), 3).clone() if stage.fixed else X
     return replace(stage, position_lab_mm=X, R_lab_body=fit.R_lab_body), fit
+
+
+def _joined(parts: Sequence[Fit]) -> Fit:
+    """Return the rows of all parts, one after the other."""
+    return Fit(**{name: torch.cat([getattr(part, name) for part in parts]) for name in Fit.__dataclass_fields__})
 
 
 def measured(footage: Footage, stage: Stage) -> tuple[Stage, Fit]:
@@ -127,8 +136,8 @@ def measured(footage: Footage, stage: Stage) -> tuple[Stage, Fit]:
         footage: with the pictures.
         stage: after the last round. A place that all instants share is left as it is.
     """
-    optics = optics_of(stage.texture, stage.fitter.eyes, stage.blur_px)
-    fitter, fine = replace(stage.fitter, optics=optics), optics.fine
+    fitter = stage.map_fitter()
+    fine = fitter.optics.fine
     held = HELD * torch.eye(3, dtype=torch.float64) if stage.fixed else None
     parts = []
     for rows, _ in stage.batches():
@@ -136,7 +145,7 @@ def measured(footage: Footage, stage: Stage) -> tuple[Stage, Fit]:
         pictures = [[footage.picture(int(k), c) for c in range(use.shape[1])] for k in stage.frames[rows]]
         known = None if held is None else held.expand(len(rows), 3, 3)
         parts.append(fitter.fit(fitter.pixels(pictures, X, fine), X, R, use, fine, MEASURED_STEPS, known))
-    fit = Fit(**{name: torch.cat([getattr(part, name) for part in parts]) for name in Fit.__dataclass_fields__})
+    fit = _joined(parts)
     X = stage.position_lab_mm if stage.fixed else fit.position_lab_mm
     return replace(stage, position_lab_mm=X, R_lab_body=so3.nearest_rotation(fit.R_lab_body)), fit
 

@@ -57,7 +57,7 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
     count = np.diff(edges)
     mean, spread = _means(said, edges), _means(said * (1 - said), edges)
     share = _means(came.astype(np.float64), edges)
-    low, high = _wilson(share, count)
+    low, high = wilson(share, count)
     weight = count / max(len(said), 1)
     return Reliability(
         probability=mean,
@@ -84,8 +84,8 @@ def _means(values: Floats, edges: NDArray[np.int64]) -> Floats:
     return np.asarray(sums / np.diff(edges), np.float64)
 
 
-def _wilson(share: Floats, count: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Ends of the 95 % interval of shares."""
+def wilson(share: Floats, count: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Return the ends of the 95 % interval of shares (B,) of `count` outcomes each (Wilson 1927)."""
     middle = (share + Z95**2 / (2 * count)) / (1 + Z95**2 / count)
     half = Z95 / (1 + Z95**2 / count) * np.sqrt(share * (1 - share) / count + Z95**2 / (4 * count**2))
     return np.maximum(middle - half, 0.0), np.minimum(middle + half, 1.0)
