@@ -5,7 +5,8 @@
 Two synthetic movies of other paints, which this script renders; and the shared experiment, its camera cam1 alone, and
 the ball fixed in its place, where they are there. Each movie goes through `sphereorient map`, and with the map learnt
 through `sphereorient track`: processes of their own, one thread. The map is compared with the exact one by our own
-`compare_maps` and, where it is there, by the shared score_map.py. Prints one Markdown table.
+`compare_maps` and, where it is there, by the shared score_map.py. Prints one Markdown table; after the row of the fixed
+ball a second one, with FicTrac's result on the same movie beside ours.
 """
 
 from __future__ import annotations
@@ -49,8 +50,13 @@ COLUMNS = (
     "paint displaced, rms / p50 / max (°), patches",
     "score_map.py: rms / p50 (°), patches",
     "map: CPU s, per frame, GB",
-    "wall s",
+    "track: CPU s, per frame, GB",
+    "map: wall s",
 )
+BESIDE = ("program", "absolute error, p50 / p95 (°)", "step error, p50 (°)", "CPU s per frame", "memory (GB)")
+# Its q_factor, and CPU s per frame on movies of this kind, measured on the same kind of machine (shared
+# docs/ANCHORS.md, 2.1); its memory was not.
+FICTRAC = {6: "0.007", 10: "0.012 to 0.014"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +67,6 @@ class Case:
     experiment: Path
     cameras: str | None = None
     both: bool = False  # whether a constant rotation is removed on both sides; else of the body frame alone
-    tracked: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +76,44 @@ class Usage:
     wall_s: float
     cpu_s: float
     memory_gb: float
+
+    def words(self, frames: int) -> list[str]:
+        """Return CPU s per frame, and GB."""
+        return [f"{self.cpu_s / frames:.3f}", f"{self.memory_gb:.1f}"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attitudes:
+    """What one program measured beside the truth."""
+
+    R: Tensor  # (N, 3, 3), the arbitrary rotations taken off; NaN where there is none
+    R_true: Tensor  # (N, 3, 3)
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.R_true)
+
+    @property
+    def errors_deg(self) -> Tensor:
+        """Angles to the truth, (N,)."""
+        return angles_deg(self.R, self.R_true)
+
+    @property
+    def step_deg(self) -> float:
+        """Median angle between the turns from frame to frame and the true ones."""
+        return float(angles_deg(self.R[1:] @ self.R[:-1].mT, self.R_true[1:] @ self.R_true[:-1].mT).nanmedian())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Row:
+    """One movie: what came out of it, and what that took; made by `measured`."""
+
+    case: Case
+    texture: Path
+    learnt: Attitudes  # with the map
+    learning: Usage
+    tracked: Attitudes  # with the map learnt
+    tracking: Usage
 
 
 def main() -> None:
@@ -92,8 +135,11 @@ def main() -> None:
             case = case_of(name, work, options.shared)
             if case is None:
                 print(f"| {name} | not here: skipped |" + " |" * (len(COLUMNS) - 2), flush=True)
-            else:
-                print(row(case, work, options.shared / "score_map.py", options.overrides), flush=True)
+                continue
+            row = measured(case, work, options.overrides)
+            print(told(row, options.shared / "score_map.py"), flush=True)
+            if case.both:
+                print("\n" + beside_fictrac(row) + "\n", flush=True)
 
 
 def case_of(name: str, work: Path, shared: Path) -> Case | None:
@@ -109,35 +155,64 @@ def case_of(name: str, work: Path, shared: Path) -> Case | None:
         return None
     fixed = name == "fixed_ball"
     camera = "cam1" if name.endswith("_cam1") else None
-    return Case(name=name, experiment=path, cameras=camera, both=fixed, tracked=not fixed)
+    return Case(name=name, experiment=path, cameras=camera, both=fixed)
 
 
-def row(case: Case, work: Path, yardstick: Path, overrides: list[str]) -> str:
-    """Learn, track, compare, and word it."""
-    texture = work / f"{case.name}.png"
+def measured(case: Case, work: Path, overrides: list[str]) -> Row:
+    """Learn the map, and track with it."""
+    texture, track = work / f"{case.name}.png", work / f"{case.name}_track.h5"
     chosen = [word for override in overrides for word in ("--set", override)]
-    learnt = run("map", withheld(case.experiment, None, work / f"{case.name}_bare.yaml"), texture, case.cameras, chosen)
-    true_R = truth(case.experiment.parent / "truth.h5")
-    R = attitudes(texture.with_name(f"{case.name}_map.h5"))
-    tracked, steps = "", aligned(R, true_R, case.both)
-    if case.tracked:
-        track = work / f"{case.name}_track.h5"
-        run("track", withheld(case.experiment, texture, work / f"{case.name}_painted.yaml"), track, case.cameras, [])
-        steps = aligned(attitudes(track), true_R, case.both)
-        tracked = percentiles(angles_deg(*steps))
-    step = angles_deg(steps[0][1:] @ steps[0][:-1].mT, steps[1][1:] @ steps[1][:-1].mT).nanmedian()
-    seen = read_seen(seen_path(texture))
+    bare = withheld(case.experiment, None, work / f"{case.name}_bare.yaml")
+    learning = run("map", bare, texture, case.cameras, chosen)
+    painted = withheld(case.experiment, texture, work / f"{case.name}_painted.yaml")
+    tracking = run("track", painted, track, case.cameras, [])
+    R_true = truth(case.experiment.parent / "truth.h5")
+    learnt, tracked = (
+        Attitudes(R=aligned(attitudes(path), R_true, case.both), R_true=R_true)
+        for path in (texture.with_name(f"{case.name}_map.h5"), track)
+    )
+    return Row(case=case, texture=texture, learnt=learnt, learning=learning, tracked=tracked, tracking=tracking)
+
+
+def told(row: Row, yardstick: Path) -> str:
+    """Word what came out for one movie."""
+    case, frames = row.case, len(row.learnt)
+    seen = read_seen(seen_path(row.texture))
     cells = [
         case.name,
-        percentiles(angles_deg(*aligned(R, true_R, case.both))),
-        tracked,
-        f"{float(step):.3f}",
+        percentiles(row.learnt.errors_deg),
+        percentiles(row.tracked.errors_deg),
+        f"{row.tracked.step_deg:.3f}",
         "" if seen is None else f"{100 * shares_seen(seen, (OFTEN,))[0]:.1f} %",
-        *displaced(texture, load_experiment(case.experiment).texture_path, yardstick),
-        f"{learnt.cpu_s:.0f}, {learnt.cpu_s / len(true_R):.2f}, {learnt.memory_gb:.1f}",
-        f"{learnt.wall_s:.0f}",
+        *displaced(row.texture, load_experiment(case.experiment).texture_path, yardstick),
+        ", ".join([f"{row.learning.cpu_s:.0f}", *row.learning.words(frames)]),
+        ", ".join([f"{row.tracking.cpu_s:.0f}", *row.tracking.words(frames)]),
+        f"{row.learning.wall_s:.0f}",
     ]
     return "| " + " | ".join(cells) + " |"
+
+
+def beside_fictrac(row: Row) -> str:
+    """Word the table of one movie that FicTrac tracked as well."""
+    frames, R_true = len(row.learnt), row.learnt.R_true
+    programs = [
+        ("`sphereorient map`", row.learnt, row.learning.words(frames)),
+        ("`sphereorient track`, map learnt", row.tracked, row.tracking.words(frames)),
+    ]
+    for factor, cpu in FICTRAC.items():
+        path = row.case.experiment.parent / f"s90_4_q{factor}.dat"
+        if path.is_file():
+            theirs = Attitudes(R=aligned(fictrac_attitudes(path), R_true, row.case.both), R_true=R_true)
+            programs.append((f"FicTrac 2.1.2, q_factor {factor}", theirs, [cpu, "not measured"]))
+    lines = ["| " + " | ".join(BESIDE) + " |", "|" + "---|" * len(BESIDE)]
+    for name, found, cost in programs:
+        lines.append("| " + " | ".join([name, percentiles(found.errors_deg), f"{found.step_deg:.3f}", *cost]) + " |")
+    return "\n".join(lines)
+
+
+def fictrac_attitudes(path: Path) -> Tensor:
+    """Read FicTrac's absolute rotations, (N, 3, 3): columns 9 to 11, a rotation vector in the camera's axes."""
+    return so3.exp(torch.from_numpy(np.loadtxt(path, delimiter=",")[:, 8:11]))
 
 
 def withheld(source: Path, texture: Path | None, path: Path) -> Path:
@@ -172,14 +247,14 @@ def attitudes(path: Path) -> Tensor:
     return torch.from_numpy(np.where(track.valid[:, None, None], track.orientation, np.nan))
 
 
-def aligned(R: Tensor, true_R: Tensor, both: bool) -> tuple[Tensor, Tensor]:
-    """Return P R Q nearest to the truth, P the identity unless `both`; and the truth."""
+def aligned(R: Tensor, true_R: Tensor, both: bool) -> Tensor:
+    """Return P R Q nearest to the truth, P the identity unless `both`."""
     known = torch.isfinite(R).flatten(1).all(1)
     P = Q = torch.eye(3, dtype=torch.float64)
     for _ in range(100 if both else 1):
         Q = so3.nearest_rotation(((P @ R[known]).mT @ true_R[known]).mean(0))
         P = so3.nearest_rotation((true_R[known] @ (R[known] @ Q).mT).mean(0)) if both else P
-    return P @ R @ Q, true_R
+    return P @ R @ Q
 
 
 def angles_deg(R: Tensor, S: Tensor) -> Tensor:

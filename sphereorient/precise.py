@@ -23,11 +23,15 @@ from sphereorient.orient import (
     Proposer,
     Study,
     base_table,
+    blur_seen_px,
     joined_tables,
     pose_table,
+    softness,
     study,
 )
-from sphereorient.proposers import precise_proposer
+from sphereorient.orient.held import HeldPlace, held_place
+from sphereorient.orient.study import FIRST_BLUR
+from sphereorient.proposers import SearchOfBlur
 from sphereorient.recording import Progress, Recording
 from sphereorient.reel import Reel
 from sphereorient.settings import Settings
@@ -64,18 +68,34 @@ class Follower:
 
 def learn(recording: Recording, settings: Settings, progress: Progress) -> tuple[Study, Mapping[str, Proposer]]:
     """Learn the empty scenes, blur and light from frames spread over the movies."""
-    widest = max(recording.diameter_px(reel.name, settings) for reel in recording.reels)
     with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products leave the interpreter free
         opening = [pool.submit(open_eye, recording, reel, settings, progress) for reel in recording.reels]
-        base = pool.submit(base_table, recording.texture, widest)
-        search = pool.submit(precise_proposer, recording.texture, settings)
+        search = SearchOfBlur(recording.texture, settings, widest_disk_px(recording, settings))
+        base = pool.submit(base_table, recording.texture, search.diameter_px)
+        sharp = pool.submit(search.of, settings.refine.blur_px or 0.0)
         eyes = [eye.result() for eye in opening]
-        proposers: dict[str, Proposer] = {eye.name: search.result() for eye in eyes}
+        sharp.result()
         progress("study", 0, 1)
         shots = study_shots(recording, eyes, settings.refine.study_frames)
-        learnt = study(eyes, shots, base.result(), proposers, recording.radius_mm, settings.locate, settings.refine)
+        # Of pictures that are soft the search has to know it; those of others need no better first guess than any.
+        seen_px = settings.refine.blur_px or blur_seen_px(eyes, shots, settings.locate)
+        blur_px = seen_px if softness(seen_px, search.diameter_px) else FIRST_BLUR
+        asked = dict.fromkeys((eye.name for eye in eyes), search.of(blur_px))
+        learnt = study(
+            eyes, shots, base.result(), asked, recording.radius_mm, settings.locate, settings.refine, blur_px
+        )
         progress("study", 1, 1)
-    return learnt, proposers
+    return learnt, by_camera(search, learnt)
+
+
+def widest_disk_px(recording: Recording, settings: Settings) -> float:
+    """Return the expected diameter of the ball's largest picture, px."""
+    return max(recording.diameter_px(reel.name, settings) for reel in recording.reels)
+
+
+def by_camera(search: SearchOfBlur, learnt: Study) -> dict[str, Proposer]:
+    """Return who proposes for pictures as blurred as was learnt, by camera."""
+    return dict.fromkeys((eye.name for eye in learnt.fitter.eyes), search.of(learnt.fitter.optics.blur_px))
 
 
 def open_eye(recording: Recording, reel: Reel, settings: Settings, progress: Progress) -> Eye:
@@ -119,17 +139,28 @@ def follower(
     recording: Recording, learnt: Study, proposers: Mapping[str, Proposer], settings: Settings, device: torch.device
 ) -> Follower:
     """Return what measures single frames."""
-    # Cameras that were bumped would pull one pose to and fro between them.
-    kind = BlockTracker if learnt.together else ApartTracker
-    tracker = kind(learnt.on(device), proposers, settings.locate, settings.refine)
+    tracker: BlockTracker | ApartTracker
+    if learnt.together:
+        place = one_place(recording, learnt, proposers, settings) if recording.experiment.fixed else None
+        tracker = BlockTracker(learnt.on(device), proposers, settings.locate, settings.refine, place)
+    else:  # cameras that were bumped would pull one pose to and fro between them
+        tracker = ApartTracker(learnt.on(device), proposers, settings.locate, settings.refine)
     return Follower(recording=recording, study=learnt, tracker=tracker)
+
+
+def one_place(
+    recording: Recording, learnt: Study, proposers: Mapping[str, Proposer], settings: Settings
+) -> HeldPlace | None:
+    """Find the place of a ball that turns in it: of this movie, whichever taught the light."""
+    shots = study_shots(recording, learnt.fitter.eyes, settings.refine.study_frames)
+    return held_place(learnt, proposers, shots, settings.locate, settings.refine)
 
 
 def follower_of(recording: Recording, learnt: Learnt, settings: Settings, device: torch.device) -> Follower:
     """Return what measures single frames, with what another run or process learnt."""
     known = learnt.study(recording)
-    search = precise_proposer(recording.texture, settings)
-    return follower(recording, known, {eye.name: search for eye in known.fitter.eyes}, settings, device)
+    search = SearchOfBlur(recording.texture, settings, widest_disk_px(recording, settings))
+    return follower(recording, known, by_camera(search, known), settings, device)
 
 
 def follow(follower: Follower, windows: Sequence[Window]) -> Iterator[tuple[Window, list[Poses]]]:

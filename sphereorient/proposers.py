@@ -7,24 +7,47 @@ from pathlib import Path
 
 from torch import Tensor
 
-from sphereorient.orient import DoubtProposer, GreySearch, Proposer, TemplateSearch
+from sphereorient.orient import DoubtProposer, GreySearch, Proposer, TemplateSearch, softness
 from sphereorient.orient.settings import ProposeSettings
 from sphereorient.settings import Settings
 
 DEFAULT = "default"  # the checkpoint that comes along
 
 
-def precise_proposer(texture: Tensor, settings: Settings) -> Proposer:
+def precise_proposer(texture: Tensor, settings: Settings, blur: float = 0.0) -> Proposer:
     """Return who proposes for the precise method.
 
     Args:
         texture: (H, 2 H), the map, 0 black .. 1 white.
         settings: branches `propose` and `search`.
+        blur: standard deviation of the pictures' own blur, radii, which templates then have as well; 0: sharp.
 
     Raises:
         CheckpointError: a checkpoint that cannot be used with this map.
     """
-    return _proposer(texture, settings.propose, lambda: GreySearch(texture, settings.search))
+    return _proposer(texture, settings.propose, lambda: GreySearch(texture, settings.search, blur))
+
+
+class SearchOfBlur:
+    """Who proposes for pictures of some blur: one bank of templates for all that are sharp, others as they are asked.
+
+    Args:
+        texture: (H, 2 H), the map, 0 black .. 1 white.
+        settings: branches `propose` and `search`.
+        diameter_px: of the disks that blurs are compared with.
+    """
+
+    def __init__(self, texture: Tensor, settings: Settings, diameter_px: float) -> None:
+        self.diameter_px = diameter_px
+        self._texture, self._settings = texture, settings
+        self._made: dict[float, Proposer] = {}
+
+    def of(self, blur_px: float) -> Proposer:
+        """Return who proposes for pictures of a blur, px."""
+        blur = softness(blur_px, self.diameter_px)
+        if blur not in self._made:
+            self._made[blur] = precise_proposer(self._texture, self._settings, blur)
+        return self._made[blur]
 
 
 def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:

@@ -1,8 +1,7 @@
-"""`sphereorient map` and `compare-maps`."""
+"""`sphereorient map`."""
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import time
@@ -13,20 +12,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sphereorient.cli.app import Advance, ExperimentPath, app, camera_names, check_writable, progress_bar
+from sphereorient.cli.compare_maps import print_moved
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from sphereorient.experiment import Experiment
     from sphereorient.paint import LearntMap
-    from sphereorient.paint.compare import MapComparison
     from sphereorient.paint.correct import Correction
     from sphereorient.report.map_figure import Example
     from sphereorient.settings import Settings
     from sphereorient.trajectory import Trajectory
 
 OFTEN = 10  # pictures from which on a place counts as well seen
-CHANGED = 0.15  # of black to white paint: a change that is told
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +62,9 @@ def map_(
         Path | None, typer.Option(help="An old map: gives the body frame, and the paint of what is never seen.")
     ] = None,
     cameras: Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")] = None,
+    photographs: Annotated[
+        bool, typer.Option("--photographs", help="Pictures in any order, no movie: --set paint.unordered=true.")
+    ] = False,
     settings: Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set paint.rounds=20.")
@@ -78,7 +79,8 @@ def map_(
     from sphereorient.settings import load_settings
     from sphereorient.sphere import load_texture
 
-    chosen, begun = load_settings(settings, set_ or []), time.perf_counter()
+    overrides = [*(set_ or []), *(["paint.unordered=true"] if photographs else [])]
+    chosen, begun = load_settings(settings, overrides), time.perf_counter()
     old = None if init is None else load_texture(init)
     paths = MapPaths.beside(out)
     with progress_bar(quiet) as advance:
@@ -92,7 +94,7 @@ def map_(
         typer.echo(f"note: {remark}")
     _print(made.learnt, compared)
     if made.correction is not None:
-        _print_moved(made.correction.comparison, f"against {init}")
+        print_moved(made.correction.comparison, f"against {init}")
         typer.echo(f"kept of the old map, never seen here: {100 * made.correction.kept_share:.0f} % of the sphere")
     typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
     typer.echo("Wrote " + ", ".join(str(file) for file in paths.written(init is not None)))
@@ -168,86 +170,13 @@ def _print(learnt: LearntMap, compared: list[Example]) -> None:
         f"loops: {closure.closed} of {closure.loops} closed; {drift}",
         f"rounds: {len(learnt.rounds)}, the last moved attitudes by {math.degrees(last.moved_rad):.4f}° ({state})",
     ]
+    alone = ~learnt.valid & learnt.position_lab_mm[:, 0].isfinite()  # of photographs
+    if alone.any():
+        named = ", ".join(str(k) for k in alone.nonzero()[:, 0].tolist())
+        lines.append(f"without an attitude, sharing too little paint with the others: frames {named}")
     alike = np.array([example.correlation for example in compared])
     if np.isfinite(alike).any():
         middle, low = np.nanmedian(alike), np.nanpercentile(alike, 5)
         lines.append(f"pictures against re-rendered: correlation {middle:.3f} (median), {low:.3f} (worst twentieth)")
     for line in lines:
         typer.echo(line)
-
-
-def _print_moved(comparison: MapComparison, against: str) -> None:
-    count = len(comparison.length_rad)
-    if not count:
-        typer.echo(f"{against}: no patch could be located")
-        return
-    rms, most = math.degrees(comparison.rms_rad), math.degrees(comparison.max_rad)
-    typer.echo(f"{against}: paint lies {rms:.2f}° off (rms of {count} patches), {most:.2f}° at most")
-
-
-@app.command("compare-maps")
-def compare_maps_(
-    new: Annotated[Path, typer.Argument(metavar="NEW.png", help="A map; NEW_seen.png beside it tells what it knows.")],
-    old: Annotated[Path, typer.Argument(metavar="OLD.png", help="The map that it is compared with; likewise.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Figure: arrows, and where the paint itself changed.")
-    ] = None,
-    same_frame: Annotated[
-        bool, typer.Option("--same-frame", help="The body frames are one; else a rotation is found and removed.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
-) -> None:
-    """Compare two maps of one ball: how far the paint moved, and where it wore off."""
-    if out is not None:
-        check_writable(out)
-    import torch
-
-    from sphereorient.paint.compare import compare_maps, paint_change, turned_map, without_changed
-    from sphereorient.report import map_figure
-    from sphereorient.so3 import angle
-
-    after, before = _known_map(new), _known_map(old)
-    comparison = compare_maps(after, before, turned=not same_frame)
-    change = paint_change(turned_map(after, comparison.R_other_reference, len(before)), before)
-    comparison = without_changed(comparison, change, CHANGED)
-    known = change[torch.isfinite(change)]
-    changed = float((known.abs() > CHANGED).float().mean()) if len(known) else math.nan
-    if out is not None:
-        map_figure.write_figure(map_figure.moved_figure(before, comparison, change), out)
-    if as_json:
-        typer.echo(json.dumps(_numbers(comparison, changed)))
-        return
-    _print_moved(comparison, f"{new} against {old}")
-    turn_deg = math.degrees(float(angle(comparison.R_other_reference)))
-    typer.echo(f"body frames: {turn_deg:.2f}° apart; correlation {comparison.correlation:.3f}")
-    typer.echo(
-        f"paint that changed by more than {100 * CHANGED:g} % of black to white: {100 * changed:.1f} % of the map"
-    )
-    if out is not None:
-        typer.echo(f"Wrote {out}")
-
-
-def _numbers(comparison: MapComparison, changed: float) -> dict[str, object]:
-    """Return the figures of a comparison; what could not be measured is null."""
-    count = len(comparison.length_rad)
-    return {
-        "patches": count,
-        "moved_rms_deg": math.degrees(comparison.rms_rad) if count else None,
-        "moved_max_deg": math.degrees(comparison.max_rad) if count else None,
-        "correlation": comparison.correlation,
-        "changed_share": changed if math.isfinite(changed) else None,
-        "R_new_old": comparison.R_other_reference.tolist(),
-    }
-
-
-def _known_map(path: Path) -> Tensor:
-    """Read a map, NaN where the counts beside it say that it was never seen."""
-    import torch
-
-    from sphereorient.report.map_files import read_seen, seen_path
-    from sphereorient.sphere import load_texture
-
-    texture, seen = load_texture(path), read_seen(seen_path(path))
-    if seen is None or seen.shape != texture.shape:
-        return texture
-    return torch.where(seen > 0, texture, torch.nan)

@@ -14,6 +14,8 @@ from sphereorient.locate.settings import LocateSettings
 
 ROUNDS = 4  # at most; each finds the ball in more frames, most movies need two
 RIM = 1.15  # of the radius: the ball's halo and shadow belong to it
+LOUD, LOUD_SHARE = 5.0, 0.1  # times the usual noise, and such pixels as a share of the disk, that ask for a second look
+CHANGE_SIGMAS = 0.6745 * 2**0.5  # median of the difference of two normal numbers, in their standard deviation
 
 
 def learn_background(
@@ -38,7 +40,7 @@ def learn_background(
     """
     background = replace(measure_background(pictures, empty), shown=shown)
     if empty is not None:
-        return background
+        return _quieter(background, pictures, diameter_px, settings)
     first, before = background, 0
     for _ in range(ROUNDS):
         covered = _covered(pictures, background, diameter_px, settings)
@@ -48,6 +50,27 @@ def learn_background(
             break
         before = found
     return background
+
+
+def _quieter(
+    background: Background, pictures: NDArray[Any], diameter_px: float, settings: LocateSettings
+) -> Background:
+    """Take pixels to be no noisier than they change from frame to frame, where the ball is not found otherwise.
+
+    About a given scene a pixel that the ball never leaves scatters by all that the ball differs: nothing sticks out of
+    such noise, least a ball that is blurred. What glitters changes from frame to frame and stays hidden.
+    """
+    loud = background.noise > LOUD * background.typical_noise
+    if loud.sum() < LOUD_SHARE * np.pi / 4 * diameter_px**2:
+        return background
+    found = [find_ball(picture, background, diameter_px, settings)[0] is not None for picture in pictures]
+    if 2 * sum(found) >= len(pictures):
+        return background
+    values = pictures[:, loud].astype(np.float32)
+    changed = np.median(np.abs(np.diff(values, axis=0)), axis=0) / CHANGE_SIGMAS
+    noise = background.noise.copy()
+    noise[loud] = np.clip(changed, background.typical_noise, noise[loud])
+    return replace(background, noise=noise)
 
 
 def _covered(

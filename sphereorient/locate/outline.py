@@ -17,6 +17,8 @@ NOISE_FLOOR = 2.0  # below so many sigmas the root is linear: noise is not magni
 NOISE_STEEPNESS = 0.28  # times the root of the noise: stabilised noise falls as steeply in one place of ten thousand
 LEAST_RIM = 0.25  # of all directions that coverage is a share of at least, however much of the rim is hidden
 NEAR_HIDDEN_PX = 3  # from what hides the ball: edges there are not the rim's
+PAINTED = 0.15  # of the variance at the most varied place that the ball's own has at least
+TAKEN_AWAY = 2  # things as round as the ball whose rims are set aside
 PROFILES = 180  # radial profiles of the sub-pixel fit; more only repeat the same pixels
 
 
@@ -103,6 +105,22 @@ def _support(circles: NDArray[np.float64], edges: _Edges, tolerance: float) -> N
     return np.asarray(counted[0].sum(1) - 0.5 * counted[1].sum(1), np.float64)
 
 
+def _painted(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
+    """Tell whether a circle holds something painted: not much less varied than what squares of its size hold elsewhere.
+
+    What passes before the ball, or beside it, may be as round and as large, and its rim is whole where the ball's is
+    not; but it is of one colour.
+    """
+    side = max(3, round(2**0.5 * circle[2]) | 1)  # of the square within the circle
+    mean, square = (
+        cv2.boxFilter(part, -1, (side, side), borderType=cv2.BORDER_REPLICATE) for part in (window, window**2)
+    )
+    variance = square - mean**2
+    limit = np.array(window.shape[::-1]) - 1
+    u, v = np.rint(circle[:2]).astype(np.int64).clip(0, limit)
+    return bool(variance[v, u] >= PAINTED * variance.max())
+
+
 def _best_circle(
     edges: _Edges, radius_range: tuple[float, float], tolerance: float, tries: int = 400
 ) -> NDArray[np.float64] | None:
@@ -124,6 +142,19 @@ def _best_circle(
         return None
     best: NDArray[np.float64] = circles[int(_support(circles, edges, tolerance).argmax())]
     return best
+
+
+def _best_painted(
+    edges: _Edges, window: NDArray[np.float32], radius_range: tuple[float, float], tolerance: float
+) -> NDArray[np.float64] | None:
+    """The best circle with paint in it: rims of what has none are taken away until there is one."""
+    for _ in range(TAKEN_AWAY + 1):
+        circle = _best_circle(edges, radius_range, tolerance)
+        if circle is None or _painted(window, circle):
+            return circle
+        away = np.abs(np.linalg.norm(edges.point - circle[:2], axis=1) - circle[2]) > tolerance
+        edges = _Edges(point=edges.point[away], inward=edges.inward[away])
+    return None
 
 
 def _radial_edges(
@@ -280,7 +311,7 @@ def fit_outline(
     kept = _in_the_clear(edges.point, clear)
     edges = _Edges(point=edges.point[kept], inward=edges.inward[kept])
     sizes = tuple(0.5 * diameter_px * (1 + sign * settings.diameter_tolerance) for sign in (-1, 1))
-    circle = _best_circle(edges, (sizes[0], sizes[1]), settings.edge_tolerance_px)
+    circle = _best_painted(edges, window, (sizes[0], sizes[1]), settings.edge_tolerance_px)
     if circle is None:
         return None
     fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor), clear)

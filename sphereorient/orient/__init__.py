@@ -16,6 +16,7 @@ from sphereorient.orient.proposer import Proposals, Proposer
 from sphereorient.orient.refine import Fit, refine
 from sphereorient.orient.search import TemplateSearch
 from sphereorient.orient.settings import GreySearchSettings, OrientSettings, ProposeSettings, RefineSettings
+from sphereorient.orient.softness import blur_seen_px, softness
 from sphereorient.orient.study import Study, study
 
 __all__ = [
@@ -42,11 +43,13 @@ __all__ = [
     "Study",
     "TemplateSearch",
     "base_table",
+    "blur_seen_px",
     "cold_start",
     "crop_disk",
     "extract_paint",
     "joined_tables",
     "pose_table",
     "refine",
+    "softness",
     "study",
 ]

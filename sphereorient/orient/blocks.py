@@ -12,8 +12,9 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.locate import LocateSettings, Shot
-from sphereorient.orient.cold import Poses, cold_start, poses_of
-from sphereorient.orient.eye import Fitter, Picture
+from sphereorient.orient.cold import Poses, cold_start, explaining_first, poses_of
+from sphereorient.orient.eye import Fitter, Level, Picture
+from sphereorient.orient.held import HeldPlace
 from sphereorient.orient.proposer import Proposer
 from sphereorient.orient.refine import Fit
 from sphereorient.orient.settings import RefineSettings
@@ -117,6 +118,7 @@ class BlockTracker:
         proposers: by name of eye.
         locating: how outlines are found.
         settings: blocks and lanes.
+        place: of a ball that turns in it, with its error; None: each frame tells its own.
     """
 
     def __init__(
@@ -125,6 +127,7 @@ class BlockTracker:
         proposers: Mapping[str, Proposer],
         locating: LocateSettings,
         settings: RefineSettings,
+        place: HeldPlace | None = None,
     ) -> None:
         self.fitter: Fitter = learnt.fitter
         self.score_min = learnt.score_min
@@ -133,6 +136,7 @@ class BlockTracker:
         self.proposers = proposers
         self.locating = locating
         self.settings = settings
+        self.place = place
 
     def windows(self, frames: range) -> list[list[int]]:
         """Return the lengths of the blocks that are followed side by side, window by window.
@@ -169,12 +173,19 @@ class BlockTracker:
 
     def _step(self, lanes: Sequence[_Lane], k: int, frames: Mapping[int, Sequence[Shot]]) -> Iterator[Poses]:
         """Measure one frame of each lane: predicted where that holds, searched for where not."""
-        expected = {lane.first: lane.expected(lane.first + k, self.fitter.radius_mm) for lane in lanes}
+        expected = {lane.first: self._in_place(lane.expected(lane.first + k, self.fitter.radius_mm)) for lane in lanes}
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
         followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
         for lane in lanes:
             poses = followed.get(lane.first)
-            yield self._search(frames[lane.first]) if poses is None else poses
+            poses = self._search(frames[lane.first]) if poses is None else poses
+            yield poses if self.place is None else replace(poses, covariance=self.place.with_error(poses.covariance))
+
+    def _in_place(self, expected: _Expected | None) -> _Expected | None:
+        """Return what is expected, the place as it is known of all frames where it is."""
+        if expected is None or self.place is None:
+            return expected
+        return replace(expected, position_lab_mm=self.place.position_lab_mm, place_precision=self.place.precision)
 
     def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Shot]]) -> list[Poses | None]:
         """Fit expected poses, all in one batch of fixed size; None where the pictures do not bear one out."""
@@ -246,29 +257,38 @@ class BlockTracker:
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
             pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px)
             fit = self.fitter.fit(pixels.thinned(every), X, R, use, level, iterations, precision)
-            X = torch.where(rough[:, None], fit.position_lab_mm, X)
+            X = torch.where(rough[:, None], self._from(fit.position_lab_mm), X)
             R = torch.where(rough[:, None, None], fit.R_lab_body, R)
         return X, R
 
     def _fitted(self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor) -> Fit:
         """Fit poses that are about right: to some of the pixels, longer where that moves them, and then to all."""
-        # With all cameras the pictures tell the place; with one of two its distance is better known from before.
-        precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
+        if self.place is None:
+            # With all cameras the pictures tell the place; with one of two its distance is better known from before.
+            precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
         fine, widest = self.fitter.optics.fine, self.fitter.widest_px
         pixels = self.fitter.pixels(frames, X, fine, widest)
         some = pixels.thinned(FIRST_EVERY)
         fit = self.fitter.fit(some, X, R, use, fine, 1, precision)
         far = self._far(fit, use)
         if bool(far.any()):
-            more = self.fitter.fit(some, fit.position_lab_mm, fit.R_lab_body, use, fine, 2, precision)
+            more = self.fitter.fit(some, self._from(fit.position_lab_mm), fit.R_lab_body, use, fine, 2, precision)
             fit = _chosen(far, more, fit)
-            pixels = self.fitter.pixels(frames, torch.where(far[:, None], fit.position_lab_mm, X), fine, widest)
-        fit = self.fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 1, precision)
+            begin = torch.where(far[:, None], self._from(fit.position_lab_mm), X)
+            pixels = self.fitter.pixels(frames, begin, fine, widest)
+        fit = self.fitter.fit(pixels, self._from(fit.position_lab_mm), fit.R_lab_body, use, fine, 1, precision)
         far = self._far(fit, use)
         if bool(far.any()):
-            more = self.fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3, precision)
+            more = self.fitter.fit(pixels, self._from(fit.position_lab_mm), fit.R_lab_body, use, fine, 3, precision)
             fit = _chosen(far, more, fit)
         return fit
+
+    def _from(self, position_lab_mm: Tensor) -> Tensor:
+        """Return where a further fit begins: where the last one ended (B, 3), or where the ball is in all frames.
+
+        What is known beforehand is of that one place: a fit that began beside it would take that for known.
+        """
+        return position_lab_mm if self.place is None else self.place.position_lab_mm.expand_as(position_lab_mm)
 
     def _far(self, fit: Fit, use: Tensor) -> Tensor:
         """Fits whose last step was so long that another one is wanted, (B,) bool."""
@@ -304,6 +324,8 @@ class BlockTracker:
         if not len(poses):
             return poses
         frames, usable = [shot.picture for shot in shots], torch.tensor([shot.usable for shot in shots])
+        if self.place is not None:
+            poses = self._moved_there(poses, frames)
         if bool((usable & ~poses.use).any()):
             poses = self._all_seeing(poses, frames, usable)
         seen = poses.use & (poses.score[0] >= self.score_min)
@@ -316,18 +338,33 @@ class BlockTracker:
         if bool((seen == poses.use).all()) or not bool(seen.any()):
             # Nothing is thrown away where no camera is sure: the path decides.
             return replace(poses, use=seen, reason=tuple(reason))
-        fine = self.fitter.optics.fine
         X, R = poses.position_lab_mm, poses.R_lab_body
-        pixels = self.fitter.pixels([frames] * len(poses), X, fine)
-        fit = self.fitter.fit(pixels, X, R, seen.expand(len(poses), -1), fine, 4)
+        fit = self._looked_at(frames, X, R, seen.expand(len(poses), -1), self.fitter.optics.fine, 4)
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
+
+    def _looked_at(
+        self, frames: Sequence[Picture], X: Tensor, R: Tensor, use: Tensor, level: Level, iterations: int
+    ) -> Fit:
+        """Fit poses to one frame, of which no other frame tells but where the ball is in all of them."""
+        X = self._from(X)
+        pixels = self.fitter.pixels([frames] * len(X), X, level)
+        known = None if self.place is None else self.place.precision.expand(len(X), 3, 3)
+        return self.fitter.fit(pixels, X, R, use, level, iterations, known)
+
+    def _moved_there(self, poses: Poses, frames: Sequence[Picture]) -> Poses:
+        """Fit poses again where the ball is in all frames."""
+        R, optics = poses.R_lab_body, self.fitter.optics
+        for level, iterations in ((optics.middle, 3), (optics.fine, 4)):
+            fit = self._looked_at(frames, poses.position_lab_mm, R, poses.use.expand(len(R), -1), level, iterations)
+            R = fit.R_lab_body
+        order = explaining_first(fit.nll, fit.score[:, poses.use].mean(-1)).argsort(stable=True)
+        return poses_of(fit, order, poses.use, poses.reason)
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
         """Fit poses to each camera's picture alone; the first that bears one out counts, the others contradict."""
         X, R, fine = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics.fine
-        pixels = self.fitter.pixels([frames] * len(poses), X, fine)
         each = seen.expand(len(poses), -1)
-        alone = [self.fitter.fit(pixels, X, R, _only(each, k), fine, 4) for k in range(len(seen))]
+        alone = [self._looked_at(frames, X, R, _only(each, k), fine, 4) for k in range(len(seen))]
         right = [bool(seen[k]) and bool(self._borne_out(one, _only(each, k))[0]) for k, one in enumerate(alone)]
         if not any(right):
             return poses
@@ -346,8 +383,7 @@ class BlockTracker:
         X, R, optics = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics
         every = usable.expand(len(poses), -1)
         for level, iterations in ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)):
-            pixels = self.fitter.pixels([frames] * len(poses), X, level)
-            fit = self.fitter.fit(pixels, X, R, every, level, iterations)
+            fit = self._looked_at(frames, X, R, every, level, iterations)
             X, R = fit.position_lab_mm, fit.R_lab_body
         order = fit.nll.argsort(stable=True)
         if not bool(self._borne_out(fit, every)[order[0]]):

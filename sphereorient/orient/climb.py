@@ -34,7 +34,7 @@ class Level:
     black: Tensor  # (3, P)
 
 
-def climb_level(view: DiskView, paint: PaintTable, detail: float, every: int) -> Level:
+def climb_level(view: DiskView, paint: PaintTable, detail: float, every: int, blur: float = 0.0) -> Level:
     """Prepare a level.
 
     Args:
@@ -42,6 +42,7 @@ def climb_level(view: DiskView, paint: PaintTable, detail: float, every: int) ->
         paint: as fine as `detail` at least.
         detail: standard deviation of the Gaussian on the sphere, rad, and on the picture, radii.
         every: 1: all pixels, 2: like the white fields of a chess board.
+        blur: standard deviation of the pictures' own blur, radii, if any is to be reckoned with.
     """
     size = view.size_px
     normal = view.normal_view.T.float()
@@ -52,7 +53,7 @@ def climb_level(view: DiskView, paint: PaintTable, detail: float, every: int) ->
     terms = polynomials(normal[:2], WHITE_ORDER)
     return Level(
         blur=Blur(size, math.sqrt(max(detail**2 - (2 * PIXEL / size) ** 2, 1e-6))),
-        paint=paint.blurred(detail),
+        paint=paint.blurred(math.hypot(detail, blur)),
         place=place,
         normal=normal,
         weight=normal[2].square() * share,  # an error of the outline turns far near the limb

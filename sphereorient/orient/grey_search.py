@@ -38,17 +38,18 @@ class GreySearch:
     Args:
         texture: (H, 2 H), the map, 0 black .. 1 white.
         settings: of the search.
+        blur: standard deviation of the pictures' own blur, radii, where it is wider than `detail` or nearly so.
     """
 
-    def __init__(self, texture: Tensor, settings: GreySearchSettings) -> None:
+    def __init__(self, texture: Tensor, settings: GreySearchSettings, blur: float = 0.0) -> None:
         self._settings = settings
         size, distance = settings.size_px, settings.distance_radii
         self._view = orthographic_view(size) if distance is None else perspective_view(size, distance)
         self._evening = Evening(size, detail=settings.detail, window=settings.window, clip=settings.clip)
         pixel_rad = 2.0 / size
-        paint = paint_table(texture, min(pixel_rad, settings.detail), TABLE_SIDE)
-        self._rough = climb_level(self._view, paint, settings.detail, every=2)
-        self._fine = climb_level(self._view, paint, pixel_rad, every=1)
+        paint = paint_table(texture, max(blur, min(pixel_rad, settings.detail)), TABLE_SIDE)
+        self._rough = climb_level(self._view, paint, settings.detail, every=2, blur=blur)
+        self._fine = climb_level(self._view, paint, pixel_rad, every=1, blur=blur)
         grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
         # (GROUP, G): the members of a group lie one below the other, and their maximum is one of whole rows.
         self._grid = grid[compact_groups(grid, GROUP).T]

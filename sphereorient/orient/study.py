@@ -22,10 +22,12 @@ from sphereorient.orient.pixels import Pixels
 from sphereorient.orient.proposer import Proposer
 from sphereorient.orient.refine import Fit
 from sphereorient.orient.settings import RefineSettings
+from sphereorient.orient.softness import softness
 from sphereorient.sphere.paint_table import PaintTable
 from sphereorient.trajectory import Reason
 
-BLURS = tuple(FINEST_PX * 1.25**k for k in range(8))  # px; what is tried where the blur is not given
+FINER = 1.25  # ratio of the blurs that are tried where it is not given, from FINEST_PX on
+WIDEST_BLUR = 0.3  # of the radius: wider ones leave nothing of a paint that a ball can carry
 TRIED = 6  # frames
 APART_GAIN = 1.5  # cameras that leave so many times more unexplained together than alone are followed one by one
 APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
@@ -33,10 +35,19 @@ FAR_APART_PX = 1.5  # and by more than this, one pose for all cameras is none
 FEWEST_BOTH = 4  # frames that tell what is usual between two cameras
 TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees a ball, but not where the other does
 NO_BETTER = 0.05  # poses that explain the pictures by less more than wrong ones do are wrong as well
+TELLING = 2.0  # unless wrong ones leave so many times more unexplained, picture by picture; other maps: 1.6 at most
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
 FIRST_BLUR = 0.625  # px: a pixel's own width and a good lens
+BLUR_ROUNDS = 4
+ALWAYS = 1.0  # score from which on outlines of blurred pictures are believed: the paint is asked where the ball is
+
+
+def blurs_tried(radius_px: float) -> tuple[float, ...]:
+    """Return the blurs, px, among which that of pictures of a disk is looked for."""
+    steps = math.log(max(WIDEST_BLUR * radius_px / FINEST_PX, FINER**7)) / math.log(FINER)
+    return tuple(FINEST_PX * FINER**k for k in range(math.ceil(steps) + 1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,8 +70,10 @@ class Study:
 
     @property
     def clear_score(self) -> float:
-        """Score of a pose that explains its pictures about as well as is typical."""
-        return max(self.score_min, _clear_of(self.right_score))
+        """Score of a pose that explains its pictures about as well as is typical; none does of soft ones."""
+        optics = self.fitter.optics
+        soft = softness(optics.blur_px, max(eye.diameter_px for eye in self.fitter.eyes))
+        return ALWAYS if soft else max(self.score_min, _clear_of(self.right_score))
 
 
 def study(
@@ -71,6 +84,7 @@ def study(
     radius_mm: float,
     locating: LocateSettings,
     settings: RefineSettings,
+    blur_px: float = FIRST_BLUR,
 ) -> Study:
     """Learn blur and light.
 
@@ -82,12 +96,14 @@ def study(
         radius_mm: of the sphere.
         locating: how outlines are found.
         settings: blur, if given.
+        blur_px: that is begun with otherwise.
 
     Raises:
         ExperimentError: no frame has a pose, or none that is better than wrong ones.
     """
     diameter_px = max(eye.diameter_px for eye in eyes)
-    blur_px = settings.blur_px or FIRST_BLUR
+    blur_px = settings.blur_px or blur_px
+    score_min = ALWAYS if softness(blur_px, diameter_px) else 0.0
     noise = torch.tensor([[eye.background.typical_noise**2, 0.02, 0.001, 0.0] for eye in eyes])
     light = Light.unknown(len(eyes), noise)
     fitter = Fitter(
@@ -98,7 +114,9 @@ def study(
     )
 
     def search(seeing: Fitter, frames: Sequence[Sequence[Shot]]) -> list[Poses]:
-        ask = partial(cold_start, seeing, proposers, locating=locating, candidates=settings.candidates)
+        ask = partial(
+            cold_start, seeing, proposers, locating=locating, candidates=settings.candidates, score_min=score_min
+        )
         with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
             return list(pool.map(ask, frames))
 
@@ -119,14 +137,16 @@ def study(
     pixels = pixels.thinned(max(1, round(pixels.grey.shape[1] / ENOUGH)))
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
     fitter, fit = _with_light(fitter, pixels, fit, use, 2)
-    if settings.blur_px is None:
-        blur_px = _best_blur(fitter, base, pixels, fit, use)
-        fitter = replace(fitter, optics=Optics(base, blur_px, diameter_px))
-    fitter, fit = _with_light(fitter, pixels, fit, use, 2)
+    # Light that was learnt with a wrong blur speaks for that blur: where it is wide, they take turns.
+    for _ in range(1 if settings.blur_px or not softness(blur_px, diameter_px) else BLUR_ROUNDS):
+        if settings.blur_px is None:
+            blur_px = _best_blur(fitter, base, pixels, fit, use)
+            fitter = replace(fitter, optics=Optics(base, blur_px, diameter_px))
+        fitter, fit = _with_light(fitter, pixels, fit, use, 2)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
     best, highest = _scores(looked)
-    if max(best, right) < highest + NO_BETTER:
+    if max(best, right) < highest + NO_BETTER and _times_better(looked) < TELLING:
         raise _unexplained(best)
     if right < highest + NO_BETTER:
         # Dirt or a rim that is hidden spoils the light that was learnt: all poses are explained worse than before.
@@ -134,6 +154,8 @@ def study(
     fitter = replace(fitter, widest_px=widest)
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
     score_min = 0.5 * (right + min(highest, right))
+    if softness(blur_px, diameter_px):  # wrong poses explain nearly as much, and right ones scatter
+        score_min = min(score_min, _clear_of(right))
     apart_rad = _usual_apart(fit, use)
     return Study(fitter=fitter, score_min=score_min, right_score=right, usual_apart_rad=apart_rad, together=together)
 
@@ -212,6 +234,18 @@ def _scores(found: Sequence[Poses]) -> tuple[float, float]:
     return float(best.median()), float(wrong.quantile(0.9)) if len(wrong) else 0.0
 
 
+def _times_better(found: Sequence[Poses]) -> float:
+    """Return how many times more of its pictures the second best pose of a clear frame typically leaves unexplained.
+
+    Blurred pictures are mostly disk, and any pose explains most of one; nothing but the ratio then tells.
+    """
+    rows = [(found[k].score[:2], found[k].use) for k in _clear(found) if len(found[k]) > 1]
+    if not rows:
+        return math.inf
+    left = torch.stack([(1 - score[:, use]).mean(1).clamp_min(LEAST_LEFT) for score, use in rows])
+    return float((left[:, 1] / left[:, 0]).median())
+
+
 def _nothing(found: Sequence[Poses]) -> ExperimentError:
     """Say what was missing in all frames: the ball, or a pose of the map that looks like it."""
     reasons = {str(why) for poses in found for why in poses.reason}
@@ -255,25 +289,26 @@ def _best_blur(fitter: Fitter, base: PaintTable, pixels: Pixels, fit: Fit, use: 
     """Return the blur that leaves the least of the pictures unexplained, between the tried ones by a parabola."""
     radius_px = max(eye.diameter_px for eye in fitter.eyes) / 2
     left: dict[int, float] = {}
+    blurs = blurs_tried(radius_px)
 
     def unexplained(k: int) -> float:
         if k not in left:
-            level = level_of(base, BLURS[k], 0.0, radius_px)
+            level = level_of(base, blurs[k], 0.0, radius_px)
             tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 2)
             # Of all pictures together: their curves differ in height by much and in shape by little.
             left[k] = float((1.0 - tried.score)[use].clamp_min(LEAST_LEFT).log().mean())
         return left[k]
 
     # Downhill from the first guess: each table of the paint costs a tenth of a second.
-    k = min(range(len(BLURS)), key=lambda k: abs(BLURS[k] - fitter.optics.blur_px))
+    k = min(range(len(blurs)), key=lambda k: abs(blurs[k] - fitter.optics.blur_px))
     while True:
-        near = [n for n in (k - 1, k, k + 1) if 0 <= n < len(BLURS)]
+        near = [n for n in (k - 1, k, k + 1) if 0 <= n < len(blurs)]
         best = min(near, key=unexplained)
         if best == k:
             break
         k = best
-    if k in (0, len(BLURS) - 1):
-        return BLURS[k]
+    if k in (0, len(blurs) - 1):
+        return blurs[k]
     bend = left[k - 1] - 2 * left[k] + left[k + 1]
     shift = 0.5 * (left[k - 1] - left[k + 1]) / bend if bend > 0 else 0.0
-    return float(BLURS[k] * (BLURS[1] / BLURS[0]) ** shift)
+    return float(blurs[k] * FINER**shift)

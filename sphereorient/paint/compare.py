@@ -31,6 +31,7 @@ FINE_BLUR_DEG = 0.5
 SIDE = 256  # of the tables: 0.7 degrees, tangent planes between
 HALF = 0.5  # share of a place's neighbourhood that must have been seen
 RADIUS_DEG = 1.0  # within which the other map must show a brightness: what is only displaced is no wear
+CHANGED = 0.15  # of black to white paint: a change that is told
 CHANGED_SHARE = 0.01  # of a patch
 REACHES = 16  # directions in which that is looked for
 

@@ -113,7 +113,7 @@ def map_figure(learnt: LearntMap, compared: Sequence[Example]) -> Figure:
 
 
 def _draw_map(axes: Axes, learnt: LearntMap) -> None:
-    _equirectangular(axes)
+    equirectangular(axes)
     axes.set_facecolor(UNSEEN)
     grey = np.ma.masked_invalid(learnt.texture.numpy())
     axes.imshow(grey, cmap="gray", vmin=0, vmax=1, extent=(-180, 180, -90, 90), interpolation="nearest")
@@ -121,7 +121,7 @@ def _draw_map(axes: Axes, learnt: LearntMap) -> None:
 
 
 def _draw_counts(figure: Figure, axes: Axes, learnt: LearntMap) -> None:
-    _equirectangular(axes)
+    equirectangular(axes)
     axes.set_facecolor(UNSEEN)
     counts = np.ma.masked_less(learnt.seen.numpy(), 1)
     most = max(int(learnt.seen.max()), 2)
@@ -159,7 +159,8 @@ def _draw_example(rows: Sequence[Axes], example: Example, first: bool) -> None:
     rows[2].set_xlabel(f"correlation {example.correlation:.3f}", fontsize=7)
 
 
-def _equirectangular(axes: Axes) -> None:
+def equirectangular(axes: Axes) -> None:
+    """Make axes of a map, longitude to the right and latitude upwards, degrees."""
     axes.set(xlim=(-180, 180), ylim=(-90, 90), xticks=[-180, -90, 0, 90, 180], yticks=[-90, -45, 0, 45, 90])
     axes.set(xlabel="longitude (degrees)", aspect="equal")
     axes.grid(visible=False)
@@ -177,7 +178,7 @@ def moved_figure(texture: Tensor, comparison: MapComparison, change: Tensor | No
     figure = new_figure(WIDTH_IN, 4.3 if change is None else 7.7)
     panels = figure.subplots(1 if change is None else 2, 1, squeeze=False)[:, 0]
     axes = panels[0]
-    _equirectangular(axes)
+    equirectangular(axes)
     axes.set_facecolor(UNSEEN)
     grey = np.ma.masked_invalid(texture.numpy())
     axes.imshow(0.55 + 0.45 * grey, cmap="gray", vmin=0, vmax=1, extent=(-180, 180, -90, 90))
@@ -225,7 +226,7 @@ def _draw_arrows(axes: Axes, comparison: MapComparison) -> float:
 
 
 def _draw_change(figure: Figure, axes: Axes, change: Tensor) -> None:
-    _equirectangular(axes)
+    equirectangular(axes)
     axes.set_facecolor(UNSEEN)
     values = np.ma.masked_invalid(change.numpy())
     shown = axes.imshow(values, cmap="RdBu_r", vmin=-CHANGE_REACH, vmax=CHANGE_REACH, extent=(-180, 180, -90, 90))
