@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ NOISE_STEEPNESS = 0.28  # times the root of the noise: stabilised noise falls as
 LEAST_RIM = 0.25  # of all directions that coverage is a share of at least, however much of the rim is hidden
 NEAR_HIDDEN_PX = 3  # from what hides the ball: edges there are not the rim's
 PAINTED = 0.15  # of the variance at the most varied place that the ball's own has at least
-TAKEN_AWAY = 2  # things as round as the ball whose rims are set aside
+SET_ASIDE = 2  # things as round as the ball whose rims are set aside
 PROFILES = 180  # radial profiles of the sub-pixel fit; more only repeat the same pixels
 
 
@@ -144,17 +144,21 @@ def _best_circle(
     return best
 
 
-def _best_painted(
+def _circles(
     edges: _Edges, window: NDArray[np.float32], radius_range: tuple[float, float], tolerance: float
-) -> NDArray[np.float64] | None:
-    """The best circle with paint in it: rims of what has none are taken away until there is one."""
-    for _ in range(TAKEN_AWAY + 1):
+) -> list[NDArray[np.float64]]:
+    """The best circles, one with paint in it first: rims of what has none are set aside until there is one."""
+    found: list[NDArray[np.float64]] = []
+    for _ in range(SET_ASIDE + 1):
         circle = _best_circle(edges, radius_range, tolerance)
-        if circle is None or _painted(window, circle):
-            return circle
+        if circle is None:
+            break
+        if _painted(window, circle):
+            return [circle, *found]
+        found.append(circle)
         away = np.abs(np.linalg.norm(edges.point - circle[:2], axis=1) - circle[2]) > tolerance
         edges = _Edges(point=edges.point[away], inward=edges.inward[away])
-    return None
+    return found
 
 
 def _radial_edges(
@@ -288,7 +292,7 @@ def fit_outline(
         shown: (H, W), False where something hides the ball; None: nowhere.
 
     Returns:
-        The outline in the picture's pixels, or None where no circle of an allowed size is supported.
+        The outline in the picture's pixels, or None where no circle of an allowed size is supported all around.
 
     Source: paper section III A (Canny edges and a circle's fit); the robust part is ours.
     """
@@ -311,16 +315,8 @@ def fit_outline(
     kept = _in_the_clear(edges.point, clear)
     edges = _Edges(point=edges.point[kept], inward=edges.inward[kept])
     sizes = tuple(0.5 * diameter_px * (1 + sign * settings.diameter_tolerance) for sign in (-1, 1))
-    circle = _best_painted(edges, window, (sizes[0], sizes[1]), settings.edge_tolerance_px)
-    if circle is None:
-        return None
-    fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor), clear)
-    if fit is None or not sizes[0] < fit.radius_px < sizes[1]:
-        return None
-    return Outline(
-        u_px=fit.u_px + left,
-        v_px=fit.v_px + top,
-        radius_px=fit.radius_px,
-        rms_px=fit.rms_px,
-        coverage=fit.coverage,
-    )
+    for circle in _circles(edges, window, (sizes[0], sizes[1]), settings.edge_tolerance_px):
+        fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor), clear)
+        if fit is not None and fit.coverage >= settings.coverage_min and sizes[0] < fit.radius_px < sizes[1]:
+            return replace(fit, u_px=fit.u_px + left, v_px=fit.v_px + top)
+    return None

@@ -58,7 +58,12 @@ def _steepest(picture: NDArray[np.float32], eye: Eye, locating: LocateSettings) 
     reach = round(AROUND * eye.diameter_px / 2)
     left, top = max(0, round(blobs[0].u_px) - reach), max(0, round(blobs[0].v_px) - reach)
     window = picture[top : round(blobs[0].v_px) + reach + 1, left : round(blobs[0].u_px) + reach + 1]
-    calm = cv2.GaussianBlur(window, (0, 0), CALM_PX)
+    return steepest_blur_px(window)
+
+
+def steepest_blur_px(picture: NDArray[np.float32]) -> float:
+    """Return the standard deviation of the blur, px, of the steepest edge between the darkest and the brightest."""
+    calm = cv2.GaussianBlur(picture, (0, 0), CALM_PX)
     slope = np.hypot(cv2.Scharr(calm, cv2.CV_32F, 1, 0), cv2.Scharr(calm, cv2.CV_32F, 0, 1)) / 32
     low, high = np.percentile(calm, CONTRAST)
     steepest = float(np.percentile(slope, STEEPEST))

@@ -33,8 +33,9 @@ FEWEST = 4  # such pairs
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Chain:
-    """Attitudes of N instants from pictures alone; made by `find_chain`."""
+    """Attitudes of N instants from pictures alone; made by `find_chain` and `find_photographs`."""
 
+    rows: Tensor  # (N,) int64, rising, of the instants among the disks given; the others have no attitude
     R_lab_body: Tensor  # (N, 3, 3) float64; identity at the first one
     turns: Turns
     closure: Closure
@@ -54,13 +55,22 @@ def find_chain(disks: Disks, settings: PaintSettings) -> Chain:
         do = "learn from a movie in which the ball turns"
         raise PaintError(refusal("movies", expected="the ball in 2 frames at least", got=f"{len(disks)}", do=do))
     R, turns = _chained(disks, settings)
-    turned = float(so3.geodesic_distance(R[:1], R).max())
+    check_turned(R, settings)
+    check_one_ball(disks, R)
+    return close_loops(disks, R, turns, settings)
+
+
+def check_turned(R_lab_body: Tensor, settings: PaintSettings) -> None:
+    """Refuse attitudes (N, 3, 3) of a sphere that does not turn.
+
+    Raises:
+        PaintError: it turns by less than the setting.
+    """
+    turned = float(so3.geodesic_distance(R_lab_body[:1], R_lab_body).max())
     if turned < math.radians(settings.turned_min_deg):
         got = f"{math.degrees(turned):.2g} degrees in all frames together"
         do = "learn from a movie in which the ball turns"
         raise PaintError(refusal("movies", expected="a ball that turns", got=got, do=do))
-    check_one_ball(disks, R)
-    return close_loops(disks, R, turns, settings)
 
 
 def _chained(disks: Disks, settings: PaintSettings) -> tuple[Tensor, Turns]:
@@ -120,14 +130,15 @@ def close_loops(disks: Disks, R_lab_body: Tensor, turns: Turns, settings: PaintS
     chosen = good.where(kept)
     was = so3.log(chosen.R_ji @ (before[chosen.second] @ before[chosen.first].mT).mT)
     return Chain(
+        rows=torch.arange(len(R)),
         R_lab_body=R,
         turns=joined([turns, chosen]),
         closure=Closure(
             pairs=len(turns),
             loops=len(first),
             closed=len(chosen),
-            drift_before_rad=_rms(was),
-            drift_after_rad=_rms(loops[kept]),
+            drift_before_rad=rms(was),
+            drift_after_rad=rms(loops[kept]),
             moved_rad=moved(before, R),
         ),
     )
@@ -161,11 +172,7 @@ def candidates(disks: Disks, R_lab_body: Tensor, keys: Tensor, most: int) -> tup
 
     Those that share most come first; of too many, every so-many-th is taken, so that all times are among them.
     """
-    sight = -disks.R_lab_view[keys, :, :, 2].double()  # from the ball to the camera
-    in_body = (R_lab_body[keys].mT[:, None] @ sight[..., None])[..., 0]
-    alike = torch.einsum("acx,bdx->abcd", in_body, in_body)
-    both = disks.seen[keys][:, None, :, None] & disks.seen[keys][None, :, None, :]
-    alike = torch.where(both, alike, -1.0).flatten(2).amax(2)
+    alike = likeness(disks, R_lab_body, keys)
     a, b = torch.triu_indices(len(keys), len(keys), offset=2)
     wanted = alike[a, b] > NEAR
     a, b = a[wanted], b[wanted]
@@ -173,6 +180,21 @@ def candidates(disks: Disks, R_lab_body: Tensor, keys: Tensor, most: int) -> tup
         chosen = torch.linspace(0, len(a) - 1, most).round().long() if most else torch.zeros(0, dtype=torch.int64)
         a, b = a[chosen], b[chosen]
     return keys[a], keys[b]
+
+
+def likeness(disks: Disks, R_lab_body: Tensor, rows: Tensor) -> Tensor:
+    """Return the cosine between the nearest lines of sight in the body of some instants (K,), each with each, (K, K).
+
+    Args:
+        disks: of N instants.
+        R_lab_body: (N, 3, 3).
+        rows: (K,) int64.
+    """
+    sight = -disks.R_lab_view[rows, :, :, 2].double()  # from the ball to the camera
+    in_body = (R_lab_body[rows].mT[:, None] @ sight[..., None])[..., 0]
+    alike = torch.einsum("acx,bdx->abcd", in_body, in_body)
+    both = disks.seen[rows][:, None, :, None] & disks.seen[rows][None, :, None, :]
+    return torch.where(both, alike, -1.0).flatten(2).amax(2)
 
 
 def check_one_ball(disks: Disks, R_lab_body: Tensor) -> None:
@@ -215,10 +237,11 @@ def _only(disks: Disks, camera: int) -> Disks:
 def moved(before: Tensor, after: Tensor) -> float:
     """Return the rms angle between two sets of attitudes (N, 3, 3), the body frame's own turn taken off, rad."""
     Q = so3.nearest_rotation((before.mT @ after).sum(0))
-    return _rms(so3.log(after @ (before @ Q).mT))
+    return rms(so3.log(after @ (before @ Q).mT))
 
 
-def _rms(vectors: Tensor) -> float:
+def rms(vectors: Tensor) -> float:
+    """Return the root mean square length of vectors (E, 3), 0 of none."""
     return float(vectors.square().sum(-1).mean().sqrt()) if len(vectors) else 0.0
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -47,13 +49,14 @@ def disks_of(footage: Footage, frames: Tensor, settings: PaintSettings) -> Disks
     return even_disks(pictures, R, far, footage.seen[frames], settings.detail, settings.window, shown)
 
 
-def pixels_of(footage: Footage, fitter: Fitter, frames: Tensor, wanted: int) -> Pixels:
-    """Cut the disks' pixels out, frame by frame, of each disk about as many as wanted."""
+def pixels_of(footage: Footage, fitter: Fitter, frames: Tensor, wanted: int, extra_px: float = 0.0) -> Pixels:
+    """Cut the disks' pixels out, frame by frame, of each disk about as many as wanted, the picture blurred first."""
+    level = replace(fitter.optics.fine, extra_px=extra_px)
     X = footage.position_lab_mm[frames]
     radius_px = float(fitter.largest_px(X).max())
     parts = []
     for k, frame in enumerate(frames.tolist()):
         pictures = [[footage.picture(frame, c) for c in range(len(footage.eyes))]]
-        whole = fitter.pixels(pictures, X[k : k + 1], fitter.optics.fine, radius_px)
+        whole = fitter.pixels(pictures, X[k : k + 1], level, radius_px)
         parts.append(whole.thinned(max(1, round(whole.grey.shape[1] / wanted))))
     return stacked(parts)

@@ -32,6 +32,12 @@ class Disks:
         """Return the number of instants."""
         return len(self.layers)
 
+    def where(self, rows: Tensor) -> Disks:
+        """Return some of the instants."""
+        shown = None if self.shown is None else self.shown[rows]
+        names = ("layers", "R_lab_view", "distance_radii", "seen")
+        return Disks(share=self.share, shown=shown, **{name: getattr(self, name)[rows] for name in names})
+
     def told(self, rows: Tensor, camera: int) -> Tensor:
         """Return how much each place of some disks counts, (R, S * S)."""
         counts = self.seen[rows, camera][:, None] * torch.ones(self.size_px**2)

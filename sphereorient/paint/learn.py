@@ -3,40 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
-from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.locate import LocateSettings
-from sphereorient.orient.eye import Eye, Fitter
-from sphereorient.orient.light import Light
+from sphereorient.orient.eye import Eye
 from sphereorient.orient.refine import Fit
-from sphereorient.paint.chain import Chain, find_chain, spread
-from sphereorient.paint.cut import disks_of, pixels_of
-from sphereorient.paint.disks import Disks, disk_places, view_normals
-from sphereorient.paint.footage import Footage, Progress, Source, take_footage, too_few
-from sphereorient.paint.grid import look_up, map_sums, solve_map
+from sphereorient.paint.begin import Start, start_from_movie, start_from_photographs
+from sphereorient.paint.footage import Footage, Progress, Source, take_footage
+from sphereorient.paint.grid import look_up
 from sphereorient.paint.record import LearntMap, Round
-from sphereorient.paint.rounds import LIGHT_ROUNDS, Stage, fitted, map_weight, measured, next_round, optics_of, typical
+from sphereorient.paint.rounds import LIGHT_ROUNDS, Stage, fitted, map_weight, measured, next_round
 from sphereorient.paint.settings import PaintSettings
 from sphereorient.paint.sharpen import sharpened
 from sphereorient.synth.textures import map_directions
 
-FIRST_BLUR_PX = 0.625  # a pixel's own width and a good lens
-FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
-CONTRAST = 0.3  # deviation of the first map about mid-grey
-TEXEL_PX = 0.75  # of the widest disk's middle
 # Cosine of the slant up to which a picture shows a place. More slanted it tells of the paint, but what was never seen
 # better is displaced by a degree and more (measured: rms 0.74 degrees with places down to 0.2, 0.15 from 0.4 on).
 SHOWN_MIN = 0.4
-ROW, FINEST_ROWS = 32, 512  # rows of the fitted map are a multiple of the one, and at most the other
 FINER = 2  # the map that comes out has so many times the rows of the fitted one: it is sharper
-PLACE_ROUNDS = 4  # that find the place of a ball that stays there
 RECOVERED = (3, 6)  # rounds after which instants that do not fit are looked for again
 GOOD_SHARE = 0.85  # of the usual score, from which on an instant fits
 RECOVERY_STEPS = 5  # at each width of detail
@@ -56,7 +44,8 @@ def learn_map(source: Source, settings: PaintSettings, locating: LocateSettings,
 
     Raises:
         ExperimentError: the ball is not found.
-        PaintError: one frame only, a sphere that never turns, nothing seen twice, or cameras that see different balls.
+        PaintError: one frame only, a sphere that never turns, nothing seen twice, or cameras that see different balls;
+            of photographs (the setting `unordered`): fewer than three that share paint, or those of two balls.
 
     Source: direct alignment of pictures (Lucas and Kanade 1981) on the sphere, a pose graph, and bundle adjustment on
     grey values with the map among the unknowns.
@@ -66,115 +55,26 @@ def learn_map(source: Source, settings: PaintSettings, locating: LocateSettings,
 
 def learn_from(footage: Footage, settings: PaintSettings, progress: Progress) -> LearntMap:
     """Learn a map from footage; see `learn_map`."""
-    frames = torch.nonzero(footage.seen.any(1))[:, 0]
-    if len(frames) < 2:
-        raise too_few(len(frames))
-    rows = spread(torch.arange(len(frames)), settings.frames_max)
-    if footage.fixed:
-        footage = _placed(footage, frames, rows, settings, progress)
-    chain, stage = _begun(footage, frames, rows, settings, progress)
+    begin = start_from_photographs if settings.unordered else start_from_movie
+    start = begin(footage, settings, progress)
+    stage, chain = start.stage, start.chain.R_lab_body[start.rows]
     rounds: list[Round] = []
     for k in range(settings.rounds):
         progress("map", k, settings.rounds)
         stage, done = next_round(stage, settings, k)
         rounds.append(done)
         if k in RECOVERED:
-            stage = recovered(footage, stage, chain.R_lab_body[rows])
+            stage = recovered(start.footage, stage, chain)
         if k >= LIGHT_ROUNDS and done.moved_rad < math.radians(settings.arrived_deg):
             break
     progress("map", settings.rounds, settings.rounds)
     arrived = rounds[-1].moved_rad < math.radians(settings.arrived_deg)
-    return _finished(footage, frames, rows, chain, stage, tuple(rounds), arrived)
+    return _finished(start, stage, tuple(rounds), arrived)
 
 
-def _begun(
-    footage: Footage, frames: Tensor, rows: Tensor, settings: PaintSettings, progress: Progress
-) -> tuple[Chain, Stage]:
-    """Find attitudes without a map, and make ready for the rounds."""
-    progress("chain", 0, 1)
-    disks = disks_of(footage, frames, settings)
-    chain = find_chain(disks, settings)
-    progress("chain", 1, 1)
-    first = first_map(disks, chain.R_lab_body, _height(footage.eyes, settings))
-    return chain, first_stage(footage, frames[rows], chain.R_lab_body[rows], first, settings)
-
-
-def _placed(footage: Footage, frames: Tensor, rows: Tensor, settings: PaintSettings, progress: Progress) -> Footage:
-    """Return the footage of a ball that stays where it is with its place as a few rounds find it.
-
-    What changes in the pictures has an outline that is a pixel or two off, the more where the rim is hidden; turns
-    taken from disks about such a place are too long and lean, and rounds alone do not put that right.
-    """
-    _, stage = _begun(footage, frames, rows, settings, progress)
-    for k in range(PLACE_ROUNDS):
-        progress("place", k, PLACE_ROUNDS)
-        stage, _ = next_round(stage, settings, k)
-    progress("place", PLACE_ROUNDS, PLACE_ROUNDS)
-    known = torch.isfinite(footage.position_lab_mm).all(1)[:, None]
-    return replace(footage, position_lab_mm=torch.where(known, stage.position_lab_mm[0], torch.nan))
-
-
-def first_map(disks: Disks, R_lab_body: Tensor, height: int) -> Tensor:
-    """Lay evened disks over the sphere: a first map, (H, 2 H) float32, about mid-grey."""
-    texels = 2 * height * height
-    matrix, right = csr_matrix((texels, texels)), np.zeros(texels)
-    for c in range(disks.layers.shape[1]):
-        normal, share = view_normals(disks.size_px, float(disks.distance_radii[:, c].median()))
-        place, _, depth = disk_places(normal, disks.distance_radii[:, c].median())
-        at = ((place + 1) * (disks.size_px / 2) - 0.5).round().long()
-        cell = at[1] * disks.size_px + at[0]
-        grey = disks.layers[:, c, 0].flatten(1)[:, cell]
-        body = (R_lab_body.mT.float() @ (disks.R_lab_view[:, c] @ normal)).mT
-        weight = (share * depth.clamp_min(0).square())[None] * disks.told(torch.arange(len(disks)), c)[:, cell]
-        more, told = map_sums(body.reshape(-1, 3), grey.reshape(-1), weight.reshape(-1), height)
-        matrix, right = matrix + more, right + told
-    even = solve_map(matrix, right, height, FIRST_SMOOTH * typical(matrix.diagonal()))
-    return (0.5 + CONTRAST * even / even.std()).clamp(0, 1).float()
-
-
-def first_stage(
-    footage: Footage, frames: Tensor, R_lab_body: Tensor, texture: Tensor, settings: PaintSettings
-) -> Stage:
-    """Make ready for the rounds: the pixels of some frames (n,), a map to begin with, light unknown."""
-    blur_px = settings.blur_px or FIRST_BLUR_PX
-    noise = torch.tensor([[eye.background.typical_noise**2, 0.02, 0.001, 0.0] for eye in footage.eyes])
-    fitter = Fitter(
-        eyes=footage.eyes,
-        radius_mm=footage.radius_mm,
-        optics=optics_of(texture, footage.eyes, blur_px),
-        light=Light.unknown(len(footage.eyes), noise),
-    )
-    return Stage(
-        frames=frames,
-        pixels=pixels_of(footage, fitter, frames, settings.pixels),
-        use=footage.seen[frames],
-        position_lab_mm=footage.position_lab_mm[frames],
-        R_lab_body=R_lab_body,
-        texture=texture,
-        blur_px=blur_px,
-        fitter=fitter,
-        fixed=footage.fixed,
-    )
-
-
-def _height(eyes: Sequence[Eye], settings: PaintSettings) -> int:
-    """Rows of the fitted map: texels a little finer than pixels in the widest disk's middle."""
-    if settings.height is not None:
-        return settings.height
-    rows = math.pi / 2 / TEXEL_PX * max(eye.diameter_px for eye in eyes)
-    return min(FINEST_ROWS, max(2, round(rows / ROW)) * ROW)
-
-
-def _finished(
-    footage: Footage,
-    frames: Tensor,
-    rows: Tensor,
-    chain: Chain,
-    stage: Stage,
-    rounds: tuple[Round, ...],
-    arrived: bool,
-) -> LearntMap:
+def _finished(start: Start, stage: Stage, rounds: tuple[Round, ...], arrived: bool) -> LearntMap:
     """Put everything into the noun that comes out."""
+    footage, frames, rows, chain = start.footage, start.frames, start.rows, start.chain
     count, cameras = footage.seen.shape
     stage, fit = measured(footage, stage)
     all_R = followed(chain.R_lab_body, rows, stage.R_lab_body)
@@ -183,7 +83,8 @@ def _finished(
     texture, seen, sigma = finished_map(stage, Q)
     nothing = torch.full((count, 3, 3), torch.nan, dtype=torch.float64)
     R, X = nothing.clone(), nothing[:, 0].clone()
-    R[frames], X[frames] = so3.nearest_rotation(all_R @ Q.mT), footage.position_lab_mm[frames]
+    found = footage.seen.any(1)  # photographs that share no paint with the others have a place and no attitude
+    R[frames], X[found] = so3.nearest_rotation(all_R @ Q.mT), footage.position_lab_mm[found]
     X[frames[rows]] = stage.position_lab_mm
     score = torch.full((count, cameras), torch.nan, dtype=torch.float64)
     score[frames[rows]] = torch.where(stage.use, fit.score, torch.nan)

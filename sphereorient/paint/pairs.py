@@ -63,7 +63,7 @@ def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slope
     column, row = at[:, 0].int(), at[:, 1].int()
     tx, ty = at[:, 0] - column, at[:, 1] - row
     cell = (row * size + column).long()
-    flat = disks.layers[second, camera].reshape(len(second), 3, -1)
+    flat = disks.layers[second, camera].flatten(2)
     layers = flat if slopes else flat[:, :1]
 
     def corner(offset: int) -> Tensor:
@@ -89,14 +89,19 @@ def _first_views(disks: Disks, first: Tensor, every: int) -> list[tuple[Tensor, 
     """Return directions in the lab (E, 3, P), grey (E, P) and weight (E, P) of the first disks, camera by camera."""
     views = []
     for camera in range(disks.layers.shape[1]):
-        normal, share = view_normals(disks.size_px, float(disks.distance_radii[:, camera].median()), every)
-        place, _, depth = disk_places(normal, disks.distance_radii[:, camera].median())
-        at = ((place + 1) * (disks.size_px / 2) - 0.5).round().long()
-        cell = at[1] * disks.size_px + at[0]
-        grey = disks.layers[first, camera, 0].flatten(1)[:, cell]
-        weight = (share * depth.clamp_min(0))[None] * disks.told(first, camera)[:, cell]
+        normal, grey, weight = _sampled(disks, first, camera, every)
         views.append((disks.R_lab_view[first, camera] @ normal, grey, weight))
     return views
+
+
+def _sampled(disks: Disks, rows: Tensor, camera: int, every: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return directions in the view frame (3, P), grey (R, P) and weight (R, P) of one camera's disks."""
+    normal, share = view_normals(disks.size_px, float(disks.distance_radii[:, camera].median()), every)
+    place, _, depth = disk_places(normal, disks.distance_radii[:, camera].median())
+    at = ((place + 1) * (disks.size_px / 2) - 0.5).round().long()
+    cell = at[1] * disks.size_px + at[0]
+    grey = disks.layers[rows, camera, 0].flatten(1)[:, cell]
+    return normal, grey, (share * depth.clamp_min(0))[None] * disks.told(rows, camera)[:, cell]
 
 
 def climb_pairs(disks: Disks, first: Tensor, second: Tensor, R_ji: Tensor, steps: int, every: int = 1) -> Turns:
@@ -146,7 +151,7 @@ def _normal_equations(
     disk_weight = 0.0
     for normal_lab, grey, own in views:
         turned = R @ normal_lab
-        disk_weight += float(own.sum(1).max())
+        disk_weight += float(own.sum(1).max()) if count else 0.0
         for camera in range(disks.layers.shape[1]):
             warp = _warped(disks, second, camera, turned, slopes)
             weight = own * warp.weight
@@ -168,12 +173,16 @@ def _normal_equations(
                 ],
                 dim=1,
             )
-    w, a, b, aa, bb, ab = sums.unbind(1)
+    score, w = _correlation(*sums.unbind(1))
+    return normal, right, score, w / max(disk_weight / len(views), 1e-9)
+
+
+def _correlation(w: Tensor, a: Tensor, b: Tensor, aa: Tensor, bb: Tensor, ab: Tensor) -> tuple[Tensor, Tensor]:
+    """Return correlations (...), and weights above 0, from sums of weights, weighted values, squares and products."""
     w = w.clamp_min(1e-9)
     covariance = ab / w - a * b / w.square()
     deviation = ((aa / w - (a / w).square()) * (bb / w - (b / w).square())).clamp_min(1e-12).sqrt()
-    score = torch.where(w > 1e-6, covariance / deviation, torch.zeros(()))
-    return normal, right, score, w / max(disk_weight / len(views), 1e-9)
+    return torch.where(w > 1e-6, covariance / deviation, torch.zeros(())), w
 
 
 def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, grid: Tensor, every: int = 1) -> Tensor:
@@ -201,3 +210,35 @@ def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, gri
             scores.append(score * (overlap / (overlap + OVERLAP_MIN)))
         best.append(grid[int(torch.cat(scores).argmax())] @ R)
     return torch.stack(best).double()
+
+
+def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tensor, every: int) -> Tensor:
+    """Compare one disk with all first ones of a camera, for all rotations of a grid, (N, M).
+
+    A disk that is turned is looked up once for all that it is compared with; the rest are products of matrices.
+
+    Args:
+        disks: N, small ones, as in `search_pairs`.
+        cameras: of the first disks and of the second one.
+        second: instant of the second one.
+        grid: (M, 3, 3), from the first disk's view frame to the second one's.
+        every: which share of the pixels is looked at.
+
+    Returns:
+        Correlations, shrunk as in `search_pairs`.
+    """
+    camera, other = cameras
+    normal, grey, own = _sampled(disks, torch.arange(len(disks)), camera, every)
+    left = torch.stack([own, own * grey, own * grey.square()])
+    full = float(own.sum(1).max())
+    parts = []
+    for some in torch.split(grid.float(), max(1, LOOKS // normal.shape[1])):
+        rows = torch.full((len(some),), second)
+        warp = _warped(disks, rows, other, disks.R_lab_view[second, other] @ some @ normal, slopes=False)
+        right = torch.stack([warp.weight, warp.weight * warp.grey, warp.weight * warp.grey.square()])
+        sums = torch.einsum("anp,bmp->abnm", left, right)
+        w, a, aa = sums[0, 0], sums[1, 0], sums[2, 0]
+        score, w = _correlation(w, a, sums[0, 1], aa, sums[0, 2], sums[1, 1])
+        overlap = w / max(full, 1e-9)
+        parts.append(score * (overlap / (overlap + OVERLAP_MIN)))
+    return torch.cat(parts, dim=1)

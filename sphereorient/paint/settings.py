@@ -13,6 +13,9 @@ class PaintSettings(BaseModel):
     background_frames: int = Field(
         32, ge=1, description="evenly spread frames whose mean is the background, where the ball moves"
     )
+    unordered: bool = Field(
+        False, description="photographs in any order, at any attitudes: all are compared with all, not neighbours"
+    )
     disk_px: int = Field(48, ge=24, le=128, description="side of the disks that are compared without a map, px; even")
     detail: float = Field(0.06, gt=0, lt=0.5, description="finer detail is blurred away in them, radii")
     window: float = Field(0.3, gt=0.1, lt=2, description="neighbourhood over which light is taken to be even, radii")

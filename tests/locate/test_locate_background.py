@@ -8,11 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from locate_examples import BACK, DIAMETER, SETTINGS, blobs, even_background, filmed, plant, white
+from locate_examples import BACK, DIAMETER, SETTINGS, Paint, blobs, even_background, filmed, plant, white
 
 from sphereorient.errors import ExperimentError
 from sphereorient.locate import Background, learn_background, load_background, spread_frames
 from sphereorient.locate.background import measure_background, without_ball
+from sphereorient.locate.blob import find_blobs
 
 SHAPE = (150, 190)
 SIGMA = 3.0
@@ -260,3 +261,30 @@ def test_the_expected_diameter_is_only_needed_to_find_the_ball():
     measured = measure_background(frames)
     np.testing.assert_array_equal(learnt.mean, measured.mean)
     np.testing.assert_array_equal(learnt.noise, measured.noise)
+
+
+def staying(paint: Paint, blur_px: float, count: int = 24) -> np.ndarray:
+    """A ball that stays where it is, and turns by little: its pixels never show the scene."""
+    sights = [
+        plant(lambda x, y, turn=0.02 * k: paint(x * np.cos(turn) - y * np.sin(turn), y), 80.0, 75.0, 30.0, SHAPE)
+        for k in range(count)
+    ]
+    return np.stack([filmed(sight, seed=k, blur_px=blur_px) for k, sight in enumerate(sights)])
+
+
+def test_a_blurred_ball_that_never_leaves_its_place_is_not_taken_for_noise_of_the_scene():
+    frames = staying(blobs, blur_px=5.0)
+    empty = np.full(SHAPE, BACK, np.float32)
+    background = learn_background(frames, 60.0, SETTINGS, empty)
+    assert measure_background(frames, empty).noise[75, 80] > 50
+    assert background.noise[75, 80] < 10
+    found = find_blobs(background.difference(frames[0]), background.noise, 60.0, SETTINGS)
+    assert np.hypot(found[0].u_px - 80.0, found[0].v_px - 75.0) < 6
+
+
+def test_what_glitters_stays_hidden_also_where_no_ball_is_found():
+    rng = np.random.default_rng(5)
+    frames = np.stack([filmed(np.full(SHAPE, BACK, np.float32), seed=k) for k in range(24)])
+    frames[:, 40:100, 60:120] = rng.integers(60, 250, (24, 60, 60))
+    background = learn_background(frames, 60.0, SETTINGS, np.full(SHAPE, BACK, np.float32))
+    assert np.median(background.noise[45:95, 65:115]) > 40

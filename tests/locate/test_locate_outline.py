@@ -211,3 +211,24 @@ def test_the_same_picture_gives_the_same_outline():
     first, again = (fit_outline(difference, NOISE, blob, DIAMETER, LocateSettings()) for _ in range(2))
     assert first == again
     np.testing.assert_array_equal(difference, before)
+
+
+@pytest.mark.parametrize("colour", [4.0, 40.0, 110.0], ids=["darker", "brighter", "bright"])
+@pytest.mark.parametrize("angle", [0.4, 2.2, 4.0])
+def test_what_passes_before_the_ball_as_round_and_as_large_is_not_taken_for_it(angle, colour):
+    """Its rim is whole, the ball's is not; but nothing is painted on it."""
+    place, radius = (99.37, 84.81), DIAMETER / 2
+    before = np.array(place) + radius * np.array([np.cos(angle), np.sin(angle)])
+
+    def hidden(grey, rows, columns):
+        return np.where((columns - before[0]) ** 2 + (rows - before[1]) ** 2 < radius**2, np.float32(colour), grey)
+
+    outline = outline_of(filmed(plant(blobs, *place, also=hidden)), *place)
+    assert distance_px(outline, place) < 1.0
+    assert abs(outline.radius_px - radius) < 1.0
+    assert outline.coverage < 0.75
+
+
+def test_a_ball_of_one_colour_is_found_as_long_as_nothing_painted_is_there():
+    outline = outline_of(filmed(plant(white, *PLACES[0])), *PLACES[0])
+    assert distance_px(outline, PLACES[0]) < 0.1

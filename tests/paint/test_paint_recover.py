@@ -19,7 +19,8 @@ from sphereorient.experiment import load_experiment
 from sphereorient.locate import LocateSettings
 from sphereorient.movies import open_movie
 from sphereorient.paint import PaintSettings, learn_map, take_footage
-from sphereorient.paint.learn import first_stage, followed, recovered
+from sphereorient.paint.first import first_stage
+from sphereorient.paint.learn import followed, recovered
 from sphereorient.paint.rounds import next_round
 from sphereorient.recording import open_unpainted, silent
 from sphereorient.sphere import load_texture, reduced_texture
