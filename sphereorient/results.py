@@ -189,6 +189,11 @@ def map_track(
     )
     radius_mm = 1.0 if experiment.diameter_mm is None else experiment.diameter_mm / 2
     position, R = learnt.position_lab_mm, learnt.R_lab_body
+    placed = torch.isfinite(position).all(1)  # photographs that share no paint with the others have a place only
+    reasons = tuple(
+        str(Reason.OK if valid else Reason.LOW_SCORE if there else Reason.NOT_FOUND)
+        for valid, there in zip(learnt.valid.tolist(), placed.tolist(), strict=True)
+    )
     cameras = {}
     for c, eye in enumerate(learnt.eyes):
         used = learnt.valid & torch.isfinite(learnt.score[:, c])
@@ -199,7 +204,7 @@ def map_track(
             radius_px=eye.radius_px(position, radius_mm).numpy(),
             orientation=torch.where(used[:, None, None], R, torch.nan).numpy(),
             score=learnt.score[:, c].numpy(),
-            reason=tuple(str(Reason.OK if there else Reason.NOT_FOUND) for there in learnt.valid.tolist()),
+            reason=reasons,
         )
     # Frames beyond those that the map was fitted to only follow these.
     flags = torch.where(learnt.valid & ~learnt.fitted, int(Flag.EXTRAPOLATED), 0)

@@ -21,7 +21,7 @@ class NetworkSettings(BaseModel):
     channels: int = Field(8, ge=1, le=64, description="features of a place, on the picture and on the map")
     hidden: int = Field(48, ge=4, le=256, description="units of the map's network")
     step_deg: float = Field(15.0, ge=6, le=30, description="step of the Lattman grid on which the density is given")
-    nodes: int = Field(64, ge=16, le=192, description="cells of the map's features along each axis")
+    nodes: int = Field(64, ge=16, le=96, description="cells of the map's features along each axis")
 
 
 class PictureSettings(BaseModel):

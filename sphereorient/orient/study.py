@@ -16,9 +16,9 @@ from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.locate import LocateSettings, Shot
 from sphereorient.orient.cold import Poses, cold_start
-from sphereorient.orient.eye import FINEST_PX, Eye, Fitter, Optics, Picture, level_of
+from sphereorient.orient.eye import Eye, Fitter, Optics, Picture
 from sphereorient.orient.light import Light
-from sphereorient.orient.pixels import Pixels
+from sphereorient.orient.light_and_blur import LEAST_LEFT, learn_light_and_blur
 from sphereorient.orient.proposer import Proposer
 from sphereorient.orient.refine import Fit
 from sphereorient.orient.settings import RefineSettings
@@ -26,8 +26,6 @@ from sphereorient.orient.softness import softness
 from sphereorient.sphere.paint_table import PaintTable
 from sphereorient.trajectory import Reason
 
-FINER = 1.25  # ratio of the blurs that are tried where it is not given, from FINEST_PX on
-WIDEST_BLUR = 0.3  # of the radius: wider ones leave nothing of a paint that a ball can carry
 TRIED = 6  # frames
 APART_GAIN = 1.5  # cameras that leave so many times more unexplained together than alone are followed one by one
 APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
@@ -36,18 +34,10 @@ FEWEST_BOTH = 4  # frames that tell what is usual between two cameras
 TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees a ball, but not where the other does
 NO_BETTER = 0.05  # poses that explain the pictures by less more than wrong ones do are wrong as well
 TELLING = 2.0  # unless wrong ones leave so many times more unexplained, picture by picture; other maps: 1.6 at most
-LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
 FIRST_BLUR = 0.625  # px: a pixel's own width and a good lens
-BLUR_ROUNDS = 4
 ALWAYS = 1.0  # score from which on outlines of blurred pictures are believed: the paint is asked where the ball is
-
-
-def blurs_tried(radius_px: float) -> tuple[float, ...]:
-    """Return the blurs, px, among which that of pictures of a disk is looked for."""
-    steps = math.log(max(WIDEST_BLUR * radius_px / FINEST_PX, FINER**7)) / math.log(FINER)
-    return tuple(FINEST_PX * FINER**k for k in range(math.ceil(steps) + 1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,13 +126,7 @@ def study(
     pixels = fitter.pixels([pictures[k] for k in frame], X, fitter.optics.fine)
     pixels = pixels.thinned(max(1, round(pixels.grey.shape[1] / ENOUGH)))
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
-    fitter, fit = _with_light(fitter, pixels, fit, use, 2)
-    # Light that was learnt with a wrong blur speaks for that blur: where it is wide, they take turns.
-    for _ in range(1 if settings.blur_px or not softness(blur_px, diameter_px) else BLUR_ROUNDS):
-        if settings.blur_px is None:
-            blur_px = _best_blur(fitter, base, pixels, fit, use)
-            fitter = replace(fitter, optics=Optics(base, blur_px, diameter_px))
-        fitter, fit = _with_light(fitter, pixels, fit, use, 2)
+    fitter, fit = learn_light_and_blur(fitter, base, pixels, fit, use, given=settings.blur_px is not None)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
     best, highest = _scores(looked)
@@ -154,7 +138,7 @@ def study(
     fitter = replace(fitter, widest_px=widest)
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
     score_min = 0.5 * (right + min(highest, right))
-    if softness(blur_px, diameter_px):  # wrong poses explain nearly as much, and right ones scatter
+    if softness(fitter.optics.blur_px, diameter_px):  # wrong poses explain nearly as much, and right ones scatter
         score_min = min(score_min, _clear_of(right))
     apart_rad = _usual_apart(fit, use)
     return Study(fitter=fitter, score_min=score_min, right_score=right, usual_apart_rad=apart_rad, together=together)
@@ -275,40 +259,3 @@ def _clear(found: Sequence[Poses]) -> list[int]:
 def _clear_of(typical: float) -> float:
     """Return the score that leaves three times as much unexplained as a typical one."""
     return 1 - 3 * (1 - typical)
-
-
-def _with_light(fitter: Fitter, pixels: Pixels, fit: Fit, use: Tensor, rounds: int) -> tuple[Fitter, Fit]:
-    """Learn the light and fit again, some times."""
-    for _ in range(rounds):
-        fitter = fitter.with_light_of(pixels, fit, use)
-        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
-    return fitter, fit
-
-
-def _best_blur(fitter: Fitter, base: PaintTable, pixels: Pixels, fit: Fit, use: Tensor) -> float:
-    """Return the blur that leaves the least of the pictures unexplained, between the tried ones by a parabola."""
-    radius_px = max(eye.diameter_px for eye in fitter.eyes) / 2
-    left: dict[int, float] = {}
-    blurs = blurs_tried(radius_px)
-
-    def unexplained(k: int) -> float:
-        if k not in left:
-            level = level_of(base, blurs[k], 0.0, radius_px)
-            tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 2)
-            # Of all pictures together: their curves differ in height by much and in shape by little.
-            left[k] = float((1.0 - tried.score)[use].clamp_min(LEAST_LEFT).log().mean())
-        return left[k]
-
-    # Downhill from the first guess: each table of the paint costs a tenth of a second.
-    k = min(range(len(blurs)), key=lambda k: abs(blurs[k] - fitter.optics.blur_px))
-    while True:
-        near = [n for n in (k - 1, k, k + 1) if 0 <= n < len(blurs)]
-        best = min(near, key=unexplained)
-        if best == k:
-            break
-        k = best
-    if k in (0, len(blurs) - 1):
-        return blurs[k]
-    bend = left[k - 1] - 2 * left[k] + left[k + 1]
-    shift = 0.5 * (left[k - 1] - left[k + 1]) / bend if bend > 0 else 0.0
-    return float(blurs[k] * FINER**shift)

@@ -1,0 +1,87 @@
+"""What light and blur cost that spoilt pictures teach: why `precise` is wrong where much is hidden or misdrawn.
+
+    scripts/light_limits.py [--work FOLDER] [--scenes occlusion:3 occlusion:4 texture_error:3 texture_error:4]
+
+Scenes of the robustness benchmark, each fitted from the true poses on: with the light and blur that its own pictures
+teach, and with those of the clean movie, everything else alike. Prints median errors of the orientation, degrees, of
+all cameras together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.errors import ExperimentError
+from sphereorient.evaluate.robustness.scenes import CLEAN, Scene, write_scene
+from sphereorient.evaluate.robustness.settings import BenchSettings
+from sphereorient.orient import Fitter, Optics, base_table
+from sphereorient.precise import learn, study_shots
+from sphereorient.recording import Recording, open_recording, silent
+from sphereorient.settings import Settings
+
+SCENES = ["occlusion:2", "occlusion:3", "occlusion:4", "occlusion:5", *(f"texture_error:{k}" for k in (3, 4, 5))]
+STEPS = 20  # of the fits: they have arrived
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--work", type=Path, help="keep the scenes here")
+    parser.add_argument("--scenes", nargs="+", default=SCENES)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    print("| scene | own light and blur | the clean movie's | blur learnt, px |\n|---|---|---|---|", flush=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        work = Path(temporary) if options.work is None else options.work
+        with open_recording(scene(work, CLEAN, 0)) as recording:
+            clean, _ = learn(recording, Settings(), silent)
+        for name, level in (words.split(":") for words in options.scenes):
+            path = scene(work, name, int(level))
+            with open_recording(path) as recording:
+                known = with_map_of(clean.fitter, recording)
+                right = f"{error_deg(known, recording, path):.3f}"
+                try:
+                    own, _ = learn(recording, Settings(), silent)
+                    told = f"{error_deg(own.fitter, recording, path):.3f}", f"{own.fitter.optics.blur_px:.2f}"
+                except ExperimentError:
+                    told = "refused", ""
+            print(f"| {name} {level} | {told[0]} | {right} | {told[1]} |", flush=True)
+
+
+def scene(work: Path, kind: str, level: int) -> Path:
+    """Render a scene of the benchmark, if it is not there."""
+    path = work / f"{kind}-{level}" / "experiment.yaml"
+    if not path.is_file():
+        degradations = {} if kind == CLEAN else {kind: level}
+        one = Scene(kind=kind, level=level, seed=0, number=0, degradations=degradations, frames=BenchSettings().frames)
+        write_scene(path.parent, one)
+    return path
+
+
+def with_map_of(fitter: Fitter, recording: Recording) -> Fitter:
+    """Return the same light and blur with another movie's map."""
+    widest = max(eye.diameter_px for eye in fitter.eyes)
+    return replace(fitter, optics=Optics(base_table(recording.texture, widest), fitter.optics.blur_px, widest))
+
+
+def error_deg(fitter: Fitter, recording: Recording, path: Path) -> float:
+    """Return the median error of the orientation of all frames, fitted from the truth on."""
+    with h5py.File(path.parent / "truth.h5") as truth:
+        X, R = (torch.from_numpy(truth[name][()]) for name in ("position", "orientation"))
+    shots = study_shots(recording, fitter.eyes, len(X))
+    use: Tensor = torch.ones(len(X), len(fitter.eyes), dtype=torch.bool)
+    pixels = fitter.pixels([[shot.picture for shot in frame] for frame in shots], X, fitter.optics.fine)
+    fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, STEPS)
+    return float(torch.rad2deg(so3.geodesic_distance(fit.R_lab_body, R)).median())
+
+
+if __name__ == "__main__":
+    main()
