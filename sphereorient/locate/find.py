@@ -40,15 +40,21 @@ def find_ball(
     best: Outline | None = None
     for blob in blobs:
         outline = fit_outline(difference, background.typical_noise, blob, diameter_px, settings, background.shown)
-        if outline is not None and (best is None or outline.coverage > best.coverage):
+        if outline is not None and (best is None or _likelier(outline, best, settings)):
             best = outline
         # The likeliest blob usually is the ball; the others are looked at only where its rim is not convincing.
-        if best is not None and best.coverage >= max(settings.coverage_min, 0.5):
+        if best is not None and best.painted and best.coverage >= max(settings.coverage_min, 0.5):
             break
     if best is None or best.coverage < settings.coverage_min:
         return None, _why_not(difference, diameter_px, background, blobs, settings)
     reason = _why_unreadable(frame, difference, background, best, settings)
     return (best, Reason.OK) if reason is Reason.OK else (None, reason)
+
+
+def _likelier(one: Outline, other: Outline, settings: LocateSettings) -> bool:
+    """Tell whether an outline is likelier the ball's than another: painted if supported at all, then by its support."""
+    rank = [(each.painted and each.coverage >= settings.coverage_min, each.coverage) for each in (one, other)]
+    return rank[0] > rank[1]
 
 
 def _why_not(

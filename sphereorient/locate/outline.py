@@ -18,6 +18,7 @@ NOISE_STEEPNESS = 0.28  # times the root of the noise: stabilised noise falls as
 LEAST_RIM = 0.25  # of all directions that coverage is a share of at least, however much of the rim is hidden
 NEAR_HIDDEN_PX = 3  # from what hides the ball: edges there are not the rim's
 PAINTED = 0.15  # of the variance at the most varied place that the ball's own has at least
+BESIDE, NEAR_RIM = 0.1, 1.1  # of the disk: so much beside it is something else; radii: its halo is nearer
 SET_ASIDE = 2  # things as round as the ball whose rims are set aside
 PROFILES = 180  # radial profiles of the sub-pixel fit; more only repeat the same pixels
 
@@ -31,6 +32,7 @@ class Outline:
     radius_px: float
     rms_px: float  # of the edges that support the circle about it
     coverage: float  # share of directions with a supporting edge, of those that nothing hides
+    painted: bool = True  # whether more than one grey is seen in it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,6 +123,15 @@ def _painted(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
     return bool(variance[v, u] >= PAINTED * variance.max())
 
 
+def _alone(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
+    """Tell whether a circle holds all that there is: then it may be a ball of one colour."""
+    row, column = np.ogrid[: window.shape[0], : window.shape[1]]
+    away = np.hypot(row - circle[1], column - circle[0]) / circle[2]
+    inside = away < 1
+    beside = (window > 0.5 * np.median(window[inside])) & (away > NEAR_RIM) if inside.any() else inside
+    return float(beside.sum()) < BESIDE * np.pi * circle[2] ** 2
+
+
 def _best_circle(
     edges: _Edges, radius_range: tuple[float, float], tolerance: float, tries: int = 400
 ) -> NDArray[np.float64] | None:
@@ -144,21 +155,18 @@ def _best_circle(
     return best
 
 
-def _circles(
+def _ball_circle(
     edges: _Edges, window: NDArray[np.float32], radius_range: tuple[float, float], tolerance: float
-) -> list[NDArray[np.float64]]:
-    """The best circles, one with paint in it first: rims of what has none are set aside until there is one."""
-    found: list[NDArray[np.float64]] = []
+) -> tuple[NDArray[np.float64] | None, bool]:
+    """The best circle that may be the ball, and whether it is painted: rims of what cannot be it are set aside."""
     for _ in range(SET_ASIDE + 1):
         circle = _best_circle(edges, radius_range, tolerance)
-        if circle is None:
-            break
-        if _painted(window, circle):
-            return [circle, *found]
-        found.append(circle)
+        painted = circle is not None and _painted(window, circle)
+        if circle is None or painted or _alone(window, circle):
+            return circle, painted
         away = np.abs(np.linalg.norm(edges.point - circle[:2], axis=1) - circle[2]) > tolerance
         edges = _Edges(point=edges.point[away], inward=edges.inward[away])
-    return found
+    return None, False
 
 
 def _radial_edges(
@@ -292,7 +300,7 @@ def fit_outline(
         shown: (H, W), False where something hides the ball; None: nowhere.
 
     Returns:
-        The outline in the picture's pixels, or None where no circle of an allowed size is supported all around.
+        The outline in the picture's pixels, or None where no circle of an allowed size is supported.
 
     Source: paper section III A (Canny edges and a circle's fit); the robust part is ours.
     """
@@ -315,8 +323,10 @@ def fit_outline(
     kept = _in_the_clear(edges.point, clear)
     edges = _Edges(point=edges.point[kept], inward=edges.inward[kept])
     sizes = tuple(0.5 * diameter_px * (1 + sign * settings.diameter_tolerance) for sign in (-1, 1))
-    for circle in _circles(edges, window, (sizes[0], sizes[1]), settings.edge_tolerance_px):
-        fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor), clear)
-        if fit is not None and fit.coverage >= settings.coverage_min and sizes[0] < fit.radius_px < sizes[1]:
-            return replace(fit, u_px=fit.u_px + left, v_px=fit.v_px + top)
-    return None
+    circle, painted = _ball_circle(edges, window, (sizes[0], sizes[1]), settings.edge_tolerance_px)
+    if circle is None:
+        return None
+    fit = _fit_circle(window, circle, settings.edge_tolerance_px, max(0.5 * steepness, floor), clear)
+    if fit is None or not sizes[0] < fit.radius_px < sizes[1]:
+        return None
+    return replace(fit, u_px=fit.u_px + left, v_px=fit.v_px + top, painted=painted)
