@@ -129,7 +129,7 @@ def _alone(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
     away = np.hypot(row - circle[1], column - circle[0]) / circle[2]
     inside = away < 1
     beside = (window > 0.5 * np.median(window[inside])) & (away > NEAR_RIM) if inside.any() else inside
-    return float(beside.sum()) < BESIDE * np.pi * circle[2] ** 2
+    return bool(float(beside.sum()) < BESIDE * np.pi * circle[2] ** 2)
 
 
 def _best_circle(
