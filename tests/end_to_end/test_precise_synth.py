@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,6 +16,7 @@ from conftest import REPO
 from precise_examples import (
     CAMERAS,
     Movies,
+    Pictures,
     angle_deg,
     in_sigmas,
     mean_turn,
@@ -28,6 +30,7 @@ from precise_examples import (
 )
 
 from sphereorient import precise, so3
+from sphereorient.errors import ExperimentError
 from sphereorient.evaluate import score_track
 from sphereorient.locate import Shot
 from sphereorient.orient import BlockTracker, Poses
@@ -308,6 +311,36 @@ def test_no_frame_is_lost_with_other_paint_and_light(rendered, tmp_path, request
     report(request.node.callspec.id, track, movies)
     check_right(track, movies, np.arange(len(movies)))
     assert np.median(turned_off(track, movies)) < 0.12
+
+
+def soft(movies: Movies, blur_px: float) -> Movies:
+    """The same, out of focus, the last bits noisy as a sensor makes them."""
+
+    def filmed(movie: Pictures) -> Pictures:
+        blurred = np.stack([cv2.GaussianBlur(one.astype(np.float32), (0, 0), blur_px) for one in movie])
+        noise = np.random.default_rng(0).normal(0, 1.5, movie.shape)
+        return np.clip(np.rint(blurred + noise), 0, 255).astype(np.uint8)
+
+    return movies.spoilt(filmed)
+
+
+@pytest.mark.slow
+def test_pictures_out_of_focus_by_a_seventh_of_the_radius_are_tracked(brisk, tmp_path):
+    track = tracked(soft(brisk.frames(slice(0, 40)), 0.14 * 25.0), tmp_path)
+    assert track.valid.all()
+    off = turned_off(track, brisk.frames(slice(0, 40)))
+    assert np.median(off) < 2.0
+    assert off.max() < 5.0
+
+
+@pytest.mark.slow
+def test_a_mirrored_map_is_refused_of_soft_pictures_too(brisk, tmp_path):
+    """Any pose explains most of a blurred disk: what counts is how much more the best one does."""
+    path = write(soft(brisk.frames(slice(0, 40)), 0.14 * 25.0), tmp_path)
+    texture = path.with_name("texture.png")
+    cv2.imwrite(str(texture), np.ascontiguousarray(cv2.imread(str(texture), cv2.IMREAD_GRAYSCALE)[:, ::-1]))
+    with pytest.raises(ExperimentError, match="the map explains"):
+        track_movies(path, method="precise")
 
 
 @pytest.mark.slow
