@@ -30,7 +30,7 @@ from sphereorient.orient import (
     study,
 )
 from sphereorient.orient.held import HeldPlace, held_place
-from sphereorient.orient.study import FIRST_BLUR
+from sphereorient.orient.softness import FIRST_BLUR_PX
 from sphereorient.proposers import SearchOfBlur
 from sphereorient.recording import Progress, Recording
 from sphereorient.reel import Reel
@@ -79,7 +79,7 @@ def learn(recording: Recording, settings: Settings, progress: Progress) -> tuple
         shots = study_shots(recording, eyes, settings.refine.study_frames)
         # Of pictures that are soft the search has to know it; those of others need no better first guess than any.
         seen_px = settings.refine.blur_px or blur_seen_px(eyes, shots, settings.locate)
-        blur_px = seen_px if softness(seen_px, search.diameter_px) else FIRST_BLUR
+        blur_px = seen_px if softness(seen_px, search.diameter_px) else FIRST_BLUR_PX
         asked = dict.fromkeys((eye.name for eye in eyes), search.of(blur_px))
         learnt = study(
             eyes, shots, base.result(), asked, recording.radius_mm, settings.locate, settings.refine, blur_px

@@ -22,7 +22,7 @@ from sphereorient.orient.light_and_blur import LEAST_LEFT, learn_light_and_blur
 from sphereorient.orient.proposer import Proposer
 from sphereorient.orient.refine import Fit
 from sphereorient.orient.settings import RefineSettings
-from sphereorient.orient.softness import softness
+from sphereorient.orient.softness import FIRST_BLUR_PX, softness
 from sphereorient.sphere.paint_table import PaintTable
 from sphereorient.trajectory import Reason
 
@@ -36,7 +36,6 @@ NO_BETTER = 0.05  # poses that explain the pictures by less more than wrong ones
 TELLING = 2.0  # unless wrong ones leave so many times more unexplained, picture by picture; other maps: 1.6 at most
 ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
-FIRST_BLUR = 0.625  # px: a pixel's own width and a good lens
 ALWAYS = 1.0  # score from which on outlines of blurred pictures are believed: the paint is asked where the ball is
 
 
@@ -74,7 +73,7 @@ def study(
     radius_mm: float,
     locating: LocateSettings,
     settings: RefineSettings,
-    blur_px: float = FIRST_BLUR,
+    blur_px: float = FIRST_BLUR_PX,
 ) -> Study:
     """Learn blur and light.
 

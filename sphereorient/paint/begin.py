@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from sphereorient.orient.softness import FIRST_BLUR_PX
 from sphereorient.paint.chain import Chain, find_chain, spread
 from sphereorient.paint.cut import disks_of
 from sphereorient.paint.disks import Disks
-from sphereorient.paint.first import FIRST_BLUR_PX, ROW, first_map, first_stage, height_of
+from sphereorient.paint.first import ROW, first_map, first_stage, height_of
 from sphereorient.paint.footage import Footage, Progress, too_few
 from sphereorient.paint.photographs import find_photographs, finer_settings
 from sphereorient.paint.rounds import Stage, next_round

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sphereorient.orient.eye import Eye, Fitter
 from sphereorient.orient.light import Light
+from sphereorient.orient.softness import FIRST_BLUR_PX
 from sphereorient.paint.cut import pixels_of
 from sphereorient.paint.disks import Disks, disk_places, view_normals
 from sphereorient.paint.footage import Footage
@@ -19,7 +20,6 @@ from sphereorient.paint.grid import map_sums, solve_map
 from sphereorient.paint.rounds import Stage, optics_of, typical
 from sphereorient.paint.settings import PaintSettings
 
-FIRST_BLUR_PX = 0.625  # a pixel's own width and a good lens
 FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
 CONTRAST = 0.3  # deviation of the first map about mid-grey
 TEXEL_PX = 0.75  # of the widest disk's middle
