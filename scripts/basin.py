@@ -43,7 +43,7 @@ def main() -> None:
             torch.from_numpy(file[key][()])[numbers.start : numbers.stop : every] for key in ("position", "orientation")
         )
     proposers = {eye.name: GreySearch(texture, settings.search) for eye in eyes}
-    base = base_table(texture, max(eye.diameter_px for eye in eyes))
+    base = base_table(texture, widest_px(eyes))
     taken = list(zip(*shots, strict=True))
     fitter = study(eyes, taken[:16], base, proposers, radius_mm, settings.locate, settings.refine).fitter
     frames = [[shot.picture for shot in row] for row in taken]

@@ -108,7 +108,7 @@ def prepared(folder: Path) -> Bench:
         experiment, radius_mm = recording.experiment, recording.radius_mm
     search = GreySearch(texture, settings.search)
     say("search bank, CPU s", f"{cpu_s(lambda: GreySearch(texture, settings.search), 2):.2f}")
-    base = base_table(texture, max(eye.diameter_px for eye in eyes))
+    base = base_table(texture, widest_px(eyes))
     proposers = {eye.name: search for eye in eyes}
     begin = time.process_time()
     learnt = study(eyes, sampled, base, proposers, radius_mm, settings.locate, settings.refine)

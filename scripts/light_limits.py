@@ -68,7 +68,7 @@ def scene(work: Path, kind: str, level: int) -> Path:
 
 def with_map_of(fitter: Fitter, recording: Recording) -> Fitter:
     """Return the same light and blur with another movie's map."""
-    widest = max(eye.diameter_px for eye in fitter.eyes)
+    widest = widest_px(fitter.eyes)
     return replace(fitter, optics=Optics(base_table(recording.texture, widest), fitter.optics.blur_px, widest))
 
 

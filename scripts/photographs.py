@@ -170,7 +170,7 @@ def paired(experiment: Path) -> Solved:
         with open_unpainted(experiment) as recording:
             footage = take_footage(recording, paint, settings.locate, silent)
         frames = torch.nonzero(footage.seen.any(1))[:, 0]
-        finer = finer_settings(paint, max(eye.diameter_px for eye in footage.eyes))
+        finer = finer_settings(paint, widest_px(footage.eyes))
         chain = find_photographs(disks_of(footage, frames, paint), disks_of(footage, frames, finer), paint)
         R[frames[chain.rows]] = chain.R_lab_body
     except PaintError as error:

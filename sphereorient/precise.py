@@ -80,12 +80,12 @@ def learn(recording: Recording, settings: Settings, progress: Progress) -> tuple
         # Of pictures that are soft the search has to know it; those of others need no better first guess than any.
         seen_px = settings.refine.blur_px or blur_seen_px(eyes, shots, settings.locate)
         blur_px = seen_px if softness(seen_px, search.diameter_px) else FIRST_BLUR_PX
-        asked = dict.fromkeys((eye.name for eye in eyes), search.of(blur_px))
+        asked = by_camera(search, eyes, blur_px)
         learnt = study(
             eyes, shots, base.result(), asked, recording.radius_mm, settings.locate, settings.refine, blur_px
         )
         progress("study", 1, 1)
-    return learnt, by_camera(search, learnt)
+    return learnt, by_camera(search, eyes, learnt.fitter.optics.blur_px)
 
 
 def widest_disk_px(recording: Recording, settings: Settings) -> float:
@@ -93,9 +93,9 @@ def widest_disk_px(recording: Recording, settings: Settings) -> float:
     return max(recording.diameter_px(reel.name, settings) for reel in recording.reels)
 
 
-def by_camera(search: SearchOfBlur, learnt: Study) -> dict[str, Proposer]:
-    """Return who proposes for pictures as blurred as was learnt, by camera."""
-    return dict.fromkeys((eye.name for eye in learnt.fitter.eyes), search.of(learnt.fitter.optics.blur_px))
+def by_camera(search: SearchOfBlur, eyes: Sequence[Eye], blur_px: float) -> dict[str, Proposer]:
+    """Return who proposes for each camera's pictures, which are as blurred as that."""
+    return dict.fromkeys((eye.name for eye in eyes), search.of(blur_px))
 
 
 def open_eye(recording: Recording, reel: Reel, settings: Settings, progress: Progress) -> Eye:
@@ -160,7 +160,8 @@ def follower_of(recording: Recording, learnt: Learnt, settings: Settings, device
     """Return what measures single frames, with what another run or process learnt."""
     known = learnt.study(recording)
     search = SearchOfBlur(recording.texture, settings, widest_disk_px(recording, settings))
-    return follower(recording, known, by_camera(search, known), settings, device)
+    proposers = by_camera(search, known.fitter.eyes, known.fitter.optics.blur_px)
+    return follower(recording, known, proposers, settings, device)
 
 
 def follow(follower: Follower, windows: Sequence[Window]) -> Iterator[tuple[Window, list[Poses]]]:

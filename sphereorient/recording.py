@@ -7,16 +7,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import locate
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment import Experiment, load_experiment, open_movies, outside_paths
-from sphereorient.movies import flipped_picture
+from sphereorient.locate.given import given_mask, given_scene
 from sphereorient.paint.fixed import FixedBall, fixed_ball
 from sphereorient.reel import Reel
 from sphereorient.settings import Settings
@@ -97,24 +95,6 @@ class Recording:
         grid, place = self.timeline.gridded()
         reels = [replace(reel, rows=grid.rows[reel.name]) for reel in self.reels]
         return replace(self, timeline=grid, reels=reels), place
-
-
-def given_scene(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.float32] | None:
-    """Return the experiment's own picture of a camera's scene without the ball, None where it gives none."""
-    path = experiment.background_paths.get(name)
-    if path is None:
-        return None
-    # It is a frame of the movie as its file holds it.
-    return flipped_picture(locate.load_background(path, frame_shape), experiment.flip.get(name, "none"))
-
-
-def given_mask(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """Return where a camera sees the ball, (H, W), None where nothing hides it."""
-    path = experiment.mask_paths.get(name)
-    if path is None:
-        return None
-    # It is painted on a frame of the movie as its file holds it.
-    return flipped_picture(locate.load_mask(path, frame_shape), experiment.flip.get(name, "none"))
 
 
 @contextmanager

@@ -47,6 +47,17 @@ class Eye:
         return radius_px
 
 
+def widest_px(eyes: Sequence[Eye]) -> float:
+    """Return the expected diameter of the ball in the camera that sees it largest, px."""
+    return max(eye.diameter_px for eye in eyes)
+
+
+def unknown_light(eyes: Sequence[Eye]) -> Light:
+    """Return the light that first fits begin with: flat, with the scene's noise and a little of a sensor's."""
+    noise = torch.tensor([[eye.background.typical_noise**2, 0.02, 0.001, 0.0] for eye in eyes])
+    return Light.unknown(len(eyes), noise)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Level:
     """One width of detail: what is laid over the picture, which pixels are looked at, the paint as blurred."""

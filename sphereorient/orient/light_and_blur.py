@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from sphereorient.orient.eye import FINEST_PX, Fitter, Optics, level_of
+from sphereorient.orient.eye import FINEST_PX, Fitter, Optics, level_of, widest_px
 from sphereorient.orient.pixels import Pixels
 from sphereorient.orient.refine import Fit
 from sphereorient.orient.softness import softness
@@ -37,7 +37,7 @@ def learn_light_and_blur(
     Returns:
         The fitter that knows both, and its fit.
     """
-    diameter_px = max(eye.diameter_px for eye in fitter.eyes)
+    diameter_px = widest_px(fitter.eyes)
     fitter, fit = _with_light(fitter, pixels, fit, use, LIGHT_ROUNDS)
     soft = not given and softness(fitter.optics.blur_px, diameter_px) > 0
     for _ in range(SOFT_ROUNDS if soft else 1):
@@ -58,7 +58,7 @@ def _with_light(fitter: Fitter, pixels: Pixels, fit: Fit, use: Tensor, rounds: i
 
 def best_blur_px(fitter: Fitter, base: PaintTable, pixels: Pixels, fit: Fit, use: Tensor) -> float:
     """Return the blur that leaves the least of the pictures unexplained, between the tried ones by a parabola."""
-    radius_px = max(eye.diameter_px for eye in fitter.eyes) / 2
+    radius_px = widest_px(fitter.eyes) / 2
     left: dict[int, float] = {}
     blurs = _blurs_tried(radius_px)
 

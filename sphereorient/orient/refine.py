@@ -383,10 +383,7 @@ def learn_light(
     X, R = fit.position_lab_mm, fit.R_lab_body
     at = residuals(pixels, X, R, None, radius_mm, paint, blur_px, light, cameras, shading)
     at = residuals(pixels, X, R, (at.model, at.weight), radius_mm, paint, blur_px, light, cameras, shading)
-    view = sphere_view(
-        pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), radius_mm, paint, blur_px
-    )
-    normal, right = light_sums(view, pixels, at.weight / at.variance * use.reshape(-1, 1))
+    normal, right = light_sums(at.view, pixels, at.weight / at.variance * use.reshape(-1, 1))
     difference, black = light_maps(_by_pose(normal, cameras).sum(0), _by_pose(right, cameras).sum(0))
     counted = pixels.inside & use.reshape(-1, 1)
     noise = torch.stack(

@@ -16,8 +16,7 @@ from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.locate import LocateSettings, Shot
 from sphereorient.orient.cold import Poses, cold_start
-from sphereorient.orient.eye import Eye, Fitter, Optics, Picture
-from sphereorient.orient.light import Light
+from sphereorient.orient.eye import Eye, Fitter, Optics, Picture, unknown_light, widest_px
 from sphereorient.orient.light_and_blur import LEAST_LEFT, learn_light_and_blur
 from sphereorient.orient.proposer import Proposer
 from sphereorient.orient.refine import Fit
@@ -61,7 +60,7 @@ class Study:
     def clear_score(self) -> float:
         """Score of a pose that explains its pictures about as well as is typical; none does of soft ones."""
         optics = self.fitter.optics
-        soft = softness(optics.blur_px, max(eye.diameter_px for eye in self.fitter.eyes))
+        soft = softness(optics.blur_px, widest_px(self.fitter.eyes))
         return ALWAYS if soft else max(self.score_min, _clear_of(self.right_score))
 
 
@@ -90,16 +89,14 @@ def study(
     Raises:
         ExperimentError: no frame has a pose, or none that is better than wrong ones.
     """
-    diameter_px = max(eye.diameter_px for eye in eyes)
+    diameter_px = widest_px(eyes)
     blur_px = settings.blur_px or blur_px
     score_min = ALWAYS if softness(blur_px, diameter_px) else 0.0
-    noise = torch.tensor([[eye.background.typical_noise**2, 0.02, 0.001, 0.0] for eye in eyes])
-    light = Light.unknown(len(eyes), noise)
     fitter = Fitter(
         eyes=eyes,
         radius_mm=radius_mm,
         optics=Optics(base, blur_px, diameter_px),
-        light=light,
+        light=unknown_light(eyes),
     )
 
     def search(seeing: Fitter, frames: Sequence[Sequence[Shot]]) -> list[Poses]:
@@ -185,7 +182,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
         gains.append((1 - joint) / (1 - fit.score[:, camera]).clamp_min(1e-6))
         rays.append(eye.camera.rays(eye.camera.project(X)))
     gap_mm = torch.stack([triangulate(one, other)[1] for one, other in combinations(rays, 2)]).amax(0)
-    px_mm = max(eye.diameter_px for eye in fitter.eyes) / (2 * fitter.radius_mm)
+    px_mm = widest_px(fitter.eyes) / (2 * fitter.radius_mm)
     return float(torch.stack(gains).amax(0).quantile(0.75)), float(gap_mm.quantile(0.75) * px_mm)
 
 

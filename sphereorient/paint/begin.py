@@ -93,7 +93,7 @@ def start_from_photographs(footage: Footage, settings: PaintSettings, progress: 
     """
     progress("photographs", 0, 1)
     frames = spread(_with_ball(footage), settings.frames_max)
-    finer = finer_settings(settings, max(eye.diameter_px for eye in footage.eyes))
+    finer = finer_settings(settings, widest_px(footage.eyes))
     disks = disks_of(footage, frames, finer)
     chain = find_photographs(disks_of(footage, frames, settings), disks, settings)
     progress("photographs", 1, 1)
@@ -118,7 +118,7 @@ def denser(settings: PaintSettings, footage: Footage, frames: Tensor) -> PaintSe
     """
     disks = int(footage.seen[frames].sum())
     pixels = max(settings.pixels, FEW_PIXELS // disks)
-    widest = max(eye.diameter_px for eye in footage.eyes)
+    widest = widest_px(footage.eyes)
     told = disks * min(pixels, math.pi / 4 * widest**2)
     rows = int(math.sqrt(told / PIXELS_A_TEXEL / 2)) // ROW * ROW
     height = settings.height or min(height_of(footage.eyes, settings), max(ROW, rows))
@@ -132,7 +132,7 @@ def _coarse(
 
     Pairs of photographs leave attitudes off by a pixel of theirs and more, from where sharp pictures lead nowhere.
     """
-    extra_px = COARSE * max(eye.diameter_px for eye in footage.eyes) / 2
+    extra_px = COARSE * widest_px(footage.eyes) / 2
     whole_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
     rows = max(ROW, height_of(footage.eyes, settings) // 2)
     coarse = settings.model_copy(update={"blur_px": whole_px, "height": rows})

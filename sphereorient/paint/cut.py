@@ -55,8 +55,7 @@ def pixels_of(footage: Footage, fitter: Fitter, frames: Tensor, wanted: int, ext
     X = footage.position_lab_mm[frames]
     radius_px = float(fitter.largest_px(X).max())
     parts = []
-    for k, frame in enumerate(frames.tolist()):
-        pictures = [[footage.picture(frame, c) for c in range(len(footage.eyes))]]
-        whole = fitter.pixels(pictures, X[k : k + 1], level, radius_px)
+    for k in range(len(frames)):
+        whole = fitter.pixels(footage.pictures(frames[k : k + 1]), X[k : k + 1], level, radius_px)
         parts.append(whole.thinned(max(1, round(whole.grey.shape[1] / wanted))))
     return stacked(parts)

@@ -10,8 +10,7 @@ import torch
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
-from sphereorient.orient.eye import Eye, Fitter
-from sphereorient.orient.light import Light
+from sphereorient.orient.eye import Eye, Fitter, unknown_light, widest_px
 from sphereorient.orient.softness import FIRST_BLUR_PX
 from sphereorient.paint.cut import pixels_of
 from sphereorient.paint.disks import Disks, disk_places, view_normals
@@ -63,12 +62,11 @@ def first_stage(
         extra_px: standard deviation of the Gaussian that is laid over the pictures first, px.
     """
     blur_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
-    noise = torch.tensor([[eye.background.typical_noise**2, 0.02, 0.001, 0.0] for eye in footage.eyes])
     fitter = Fitter(
         eyes=footage.eyes,
         radius_mm=footage.radius_mm,
         optics=optics_of(texture, footage.eyes, blur_px),
-        light=Light.unknown(len(footage.eyes), noise),
+        light=unknown_light(footage.eyes),
     )
     return Stage(
         frames=frames,
@@ -87,5 +85,5 @@ def height_of(eyes: Sequence[Eye], settings: PaintSettings) -> int:
     """Rows of the fitted map: texels a little finer than pixels in the widest disk's middle."""
     if settings.height is not None:
         return settings.height
-    rows = math.pi / 2 / TEXEL_PX * max(eye.diameter_px for eye in eyes)
+    rows = math.pi / 2 / TEXEL_PX * widest_px(eyes)
     return min(FINEST_ROWS, max(2, round(rows / ROW)) * ROW)

@@ -24,11 +24,10 @@ from sphereorient.locate import (
     find_ball,
     find_positions,
     learn_background,
-    load_background,
     repair,
     sightings_of,
 )
-from sphereorient.movies import flipped_picture
+from sphereorient.locate.given import given_scene
 from sphereorient.orient.eye import Eye
 from sphereorient.orient.pixels import LinesOfSight
 from sphereorient.paint.fixed import fixed_ball
@@ -112,6 +111,10 @@ class Footage:
             )
         return whole
 
+    def pictures(self, frames: Tensor) -> list[list[Picture]]:
+        """Return all cameras' whole pictures of some frames (M,)."""
+        return [[self.picture(k, c) for c in range(len(self.eyes))] for k in frames.tolist()]
+
 
 def take_footage(source: Source, settings: PaintSettings, locating: LocateSettings, progress: Progress) -> Footage:
     """Read the movies, find the ball, and cut it out.
@@ -156,7 +159,7 @@ def _moving(source: Source, settings: PaintSettings, locating: LocateSettings, p
     for reel in source.reels:
         given = locating.diameter_px
         diameter_px = given or expected_diameter_px(reel.name, cameras, source.experiment.diameter_mm)
-        empty = _given_scene(source.experiment, reel)
+        empty = given_scene(source.experiment, reel.name, reel.camera.image_size[::-1])
         background = learn_background(reel.spread(settings.background_frames), diameter_px, locating, empty, reel.shown)
         eye = _eye(reel, background, diameter_px)
         found, row = [], []
@@ -176,7 +179,8 @@ def _fixed(source: Source, settings: PaintSettings, locating: LocateSettings, pr
     """Take a ball that stays in its place: what changes in the pictures is the ball."""
     eyes, sightings, windows = [], {}, []
     for reel in source.reels:
-        pictures, empty = reel.spread(4 * settings.background_frames), _given_scene(source.experiment, reel)
+        pictures = reel.spread(4 * settings.background_frames)
+        empty = given_scene(source.experiment, reel.name, reel.camera.image_size[::-1])
         where = fixed_ball(pictures, locating, empty, reel.shown)
         outline = where.outline
         eye = _eye(reel, where.scene, 2 * outline.radius_px)
@@ -196,15 +200,6 @@ def _fixed(source: Source, settings: PaintSettings, locating: LocateSettings, pr
 def _eye(reel: Strip, background: Background, diameter_px: float) -> Eye:
     sight = LinesOfSight(reel.camera)
     return Eye(name=reel.name, camera=reel.camera, background=background, diameter_px=diameter_px, sight=sight)
-
-
-def _given_scene(experiment: Experiment, reel: Strip) -> NDArray[np.float32] | None:
-    """Return the experiment's own picture of the empty scene, None where it gives none."""
-    path = experiment.background_paths.get(reel.name)
-    if path is None:
-        return None
-    width, height = reel.camera.image_size
-    return flipped_picture(load_background(path, (height, width)), experiment.flip.get(reel.name, "none"))
 
 
 def _cut(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Window:

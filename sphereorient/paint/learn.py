@@ -143,7 +143,7 @@ def recovered(footage: Footage, stage: Stage, chain: Tensor) -> Stage:
     R = followed(chain, torch.nonzero(good)[:, 0], stage.R_lab_body[good])[lost]
     X, use = stage.position_lab_mm[lost], stage.use[lost]
     fitter = stage.map_fitter()
-    pictures = [[footage.picture(int(k), c) for c in range(use.shape[1])] for k in stage.frames[lost]]
+    pictures = footage.pictures(stage.frames[lost])
     for level in (fitter.optics.coarse, fitter.optics.middle, fitter.optics.fine):
         fit = fitter.fit(fitter.pixels(pictures, X, level), X, R, use, level, RECOVERY_STEPS)
         R, X = fit.R_lab_body, X if stage.fixed else fit.position_lab_mm
@@ -160,7 +160,7 @@ def _scores(fit: Fit, use: Tensor) -> Tensor:
 
 def finished_map(stage: Stage, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Sharpen the map and turn it: texture, counts and sigma, (H, 2 H) each; new directions are Q times the old."""
-    widest = max(eye.diameter_px for eye in stage.fitter.eyes)
+    widest = widest_px(stage.fitter.eyes)
     height = FINER * len(stage.texture)
     direction = map_directions(height) @ Q  # Q^T d: where the fitted map holds the new texel
     texture = look_up(sharpened(stage.texture, 2 * stage.blur_px / widest), direction).clamp(0, 1)

@@ -106,7 +106,7 @@ def smooth_of(settings: PaintSettings, k: int) -> float:
 
 def optics_of(blurred: Tensor, eyes: Sequence[Eye], blur_px: float) -> Optics:
     """Return the optics of a map (H, 2 H) that is blurred as the pictures are."""
-    widest = max(eye.diameter_px for eye in eyes)
+    widest = widest_px(eyes)
     return Optics(map_table(blurred, 2 * blur_px / widest), blur_px, widest)
 
 
@@ -142,7 +142,7 @@ def measured(footage: Footage, stage: Stage) -> tuple[Stage, Fit]:
     parts = []
     for rows, _ in stage.batches():
         X, R, use = stage.position_lab_mm[rows], stage.R_lab_body[rows], stage.use[rows]
-        pictures = [[footage.picture(int(k), c) for c in range(use.shape[1])] for k in stage.frames[rows]]
+        pictures = footage.pictures(stage.frames[rows])
         known = None if held is None else held.expand(len(rows), 3, 3)
         parts.append(fitter.fit(fitter.pixels(pictures, X, fine), X, R, use, fine, MEASURED_STEPS, known))
     fit = _joined(parts)

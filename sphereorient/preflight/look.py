@@ -26,9 +26,9 @@ from sphereorient.locate import (
 )
 from sphereorient.locate.background import measure_background
 from sphereorient.locate.find import Found
+from sphereorient.locate.given import given_mask, given_scene
 from sphereorient.locate.outline import Outline
 from sphereorient.movies import Movie
-from sphereorient.recording import given_mask, given_scene
 from sphereorient.reel import pictures_of
 from sphereorient.timeline import NONE, Timeline
 from sphereorient.trajectory import Reason

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from sphereorient.cameras.yaml_file import refuse_unknown
 from sphereorient.errors import ExperimentError, TrackError, refusal
 from sphereorient.experiment import Experiment, open_movies
+from sphereorient.locate.given import given_mask
 from sphereorient.movies import Grey, Movie
-from sphereorient.recording import given_mask
 from sphereorient.reel import Reel, pictures_of
 from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of, radius_of
 from sphereorient.report.overlay_page import Page, crop_side
