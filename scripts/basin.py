@@ -17,10 +17,14 @@ import h5py
 import torch
 
 from sphereorient import so3
-from sphereorient.orient import GreySearch, base_table, study
-from sphereorient.precise import open_eye
-from sphereorient.recording import open_recording, silent
-from sphereorient.settings import Settings
+from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.follow.appearance import estimate_appearance
+from sphereorient.locate import screened_frames
+from sphereorient.methods.precise import open_view
+from sphereorient.methods.settings import Settings
+from sphereorient.pose import base_table
+from sphereorient.pose.fitter import widest_px
+from sphereorient.search import GreySearch
 
 REPO = Path(__file__).resolve().parents[1]
 ANGLES_DEG = (1, 2, 4, 6, 8, 10, 14, 20)
@@ -36,18 +40,21 @@ def main() -> None:
     settings, every = Settings(), arguments.every
     with open_recording(arguments.experiment / "experiment.yaml") as recording:
         numbers, texture, radius_mm = recording.frames, recording.texture, recording.radius_mm
-        eyes = [open_eye(recording, reel, settings, silent) for reel in recording.reels]
-        shots = [list(reel.shots(eye.background))[::every] for reel, eye in zip(recording.reels, eyes, strict=True)]
+        views = [open_view(recording, stream, settings, silent) for stream in recording.streams]
+        shots = [
+            list(screened_frames(stream, view.background))[::every]
+            for stream, view in zip(recording.streams, views, strict=True)
+        ]
     with h5py.File(arguments.experiment / "truth.h5") as file:
         X, R = (
             torch.from_numpy(file[key][()])[numbers.start : numbers.stop : every] for key in ("position", "orientation")
         )
-    proposers = {eye.name: GreySearch(texture, settings.search) for eye in eyes}
-    base = base_table(texture, widest_px(eyes))
+    proposers = {view.name: GreySearch(texture, settings.search) for view in views}
+    base = base_table(texture, widest_px(views))
     taken = list(zip(*shots, strict=True))
-    fitter = study(eyes, taken[:16], base, proposers, radius_mm, settings.locate, settings.refine).fitter
+    fitter = estimate_appearance(views, taken[:16], base, proposers, radius_mm, settings.locate, settings.refine).fitter
     frames = [[shot.picture for shot in row] for row in taken]
-    use = torch.ones(len(frames), len(eyes), dtype=torch.bool)
+    use = torch.ones(len(frames), len(views), dtype=torch.bool)
     optics = fitter.optics
     levels = {"coarse": (optics.coarse, 8), "middle": (optics.middle, 8), "fine": (optics.fine, 8)}
     pixels = {name: fitter.pixels(frames, X, level) for name, (level, _) in levels.items()}

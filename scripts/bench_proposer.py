@@ -32,9 +32,9 @@ from sphereorient import so3
 from sphereorient.cli.app import progress_bar
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
 from sphereorient.learn.proposer import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
-from sphereorient.orient import DoubtProposer, GreySearch, GreySearchSettings, Proposals, Proposer, ProposeSettings
-from sphereorient.orient.doubt import resized
 from sphereorient.report.plots.style import write_figure
+from sphereorient.search import FallbackProposer, GreySearch, GreySearchSettings, Proposals, Proposer, ProposeSettings
+from sphereorient.search.fallback import resized
 from sphereorient.statistics.reliability import Z95, reliability, wilson
 from sphereorient.synth import random_texture
 from sphereorient.synth.degrade_scene import misdrawn, worn
@@ -138,7 +138,7 @@ def methods(texture: Tensor, checkpoint: Path) -> Iterator[tuple[str, Proposer]]
     learnt = load_checkpoint(checkpoint)
     network = LearnedProposer(correlator_of(learnt), texture, temperature=learnt.temperature)
     yield "network", network
-    yield "both", DoubtProposer(search, network, ProposeSettings().sure)
+    yield "both", FallbackProposer(search, network, ProposeSettings().sure)
 
 
 def ball(number: int, families: Sequence[str], checkpoint: Path) -> dict[str, dict[str, Found]]:

@@ -23,9 +23,10 @@ from torch import Tensor
 
 from sphereorient import locate, so3
 from sphereorient.cameras import Camera, R_cam_view
-from sphereorient.orient import GreySearch, GreySearchSettings, crop_disk
-from sphereorient.recording import open_recording
-from sphereorient.settings import Settings
+from sphereorient.experiment.recording import open_recording
+from sphereorient.locate import find_scene, screened_frames
+from sphereorient.methods.settings import Settings
+from sphereorient.search import GreySearch, GreySearchSettings, crop_disk
 from sphereorient.sphere import orthographic_view
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
@@ -99,17 +100,17 @@ def on_experiment(folder: Path) -> None:
         search = GreySearch(recording.texture, settings)
         with h5py.File(folder / "truth.h5") as truth:
             R_lab_body = torch.from_numpy(truth["orientation"][:])
-        for reel in recording.reels:
-            background = recording.empty_scene(reel, whole.locate.background_frames, whole)
-            diameter_px = recording.diameter_px(reel.name, whole)
+        for stream in recording.streams:
+            scene = find_scene(recording, stream, whole.locate.background_frames, whole.locate)
+            background, diameter_px = scene.background, scene.diameter_px
             disks, R_view_body = [], []
-            for k, shot in zip(recording.frames, reel.shots(background), strict=True):
+            for k, shot in zip(recording.frames, screened_frames(stream, background), strict=True):
                 outline, _ = locate.find_ball(shot.picture, background, diameter_px, whole.locate)
                 if outline is not None:
                     place = (outline.u_px, outline.v_px, outline.radius_px)
                     disks.append(torch.from_numpy(crop_disk(shot.picture, *place, settings.size_px)))
-                    R_view_body.append(R_lab_view(reel.camera, *place[:2]).mT @ R_lab_body[k])
-            report(f"{folder.name}, {reel.name}", search, torch.stack(disks), torch.stack(R_view_body))
+                    R_view_body.append(R_lab_view(stream.camera, *place[:2]).mT @ R_lab_body[k])
+            report(f"{folder.name}, {stream.name}", search, torch.stack(disks), torch.stack(R_view_body))
 
 
 def report(name: str, search: GreySearch, disks: Tensor, R_view_body: Tensor) -> None:

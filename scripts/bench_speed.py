@@ -25,21 +25,15 @@ import yaml
 
 from sphereorient import locate, so3
 from sphereorient.experiment import Experiment, load_experiment, open_movies
-from sphereorient.locate import Shot
-from sphereorient.orient import (
-    BlockTracker,
-    Eye,
-    GreySearch,
-    Study,
-    base_table,
-    cold_start,
-    crop_disk,
-    extract_paint,
-    study,
-)
-from sphereorient.precise import open_eye, study_shots
-from sphereorient.recording import open_recording, silent
-from sphereorient.settings import Settings
+from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.follow import Appearance, BlockTracker, initialise
+from sphereorient.follow.appearance import estimate_appearance
+from sphereorient.locate import Shot, screened_frames
+from sphereorient.methods.precise import open_view, sample_frames
+from sphereorient.methods.settings import Settings
+from sphereorient.pose import CameraView, base_table
+from sphereorient.pose.fitter import widest_px
+from sphereorient.search import GreySearch, crop_disk, extract_paint
 from sphereorient.sphere import SphereRenderer, load_texture, orthographic_view, reduced_texture
 
 FOLLOWED = 48  # frames over which one prediction after the other is timed
@@ -58,11 +52,11 @@ class Bench:
     """What the stages work on: the first frames of an experiment, and all that is learnt before."""
 
     experiment: Experiment
-    eyes: list[Eye]
+    eyes: list[CameraView]
     shots: list[list[Shot]]  # per eye
     times: list[float]  # of the same frames, s
     search: GreySearch
-    learnt: Study
+    learnt: Appearance
 
 
 def main() -> None:
@@ -98,10 +92,13 @@ def prepared(folder: Path) -> Bench:
     """Learn what the stages need, as the pipeline does."""
     settings = Settings()
     with open_recording(folder / "experiment.yaml") as recording:
-        eyes = [open_eye(recording, reel, settings, silent) for reel in recording.reels]
-        shots = [list(reel.shots(eye.background, 0, FOLLOWED)) for reel, eye in zip(recording.reels, eyes, strict=True)]
-        sampled = study_shots(recording, eyes, settings.refine.study_frames)
-        for reel in recording.reels:
+        eyes = [open_view(recording, reel, settings, silent) for reel in recording.streams]
+        shots = [
+            list(screened_frames(reel, eye.background, 0, FOLLOWED))
+            for reel, eye in zip(recording.streams, eyes, strict=True)
+        ]
+        sampled = sample_frames(recording, eyes, settings.refine.study_frames)
+        for reel in recording.streams:
             decoding = cpu_s(lambda reel=reel: list(reel.pictures(0, 20)), 3) / 20
             say(f"decoding {reel.name}, CPU ms a frame (floor of a movie)", f"{1e3 * decoding:.2f}")
         texture, times = recording.texture, recording.timeline.time_s[:FOLLOWED].tolist()
@@ -111,7 +108,7 @@ def prepared(folder: Path) -> Bench:
     base = base_table(texture, widest_px(eyes))
     proposers = {eye.name: search for eye in eyes}
     begin = time.process_time()
-    learnt = study(eyes, sampled, base, proposers, radius_mm, settings.locate, settings.refine)
+    learnt = estimate_appearance(eyes, sampled, base, proposers, radius_mm, settings.locate, settings.refine)
     say("study (light, blur, noise), CPU s", f"{time.process_time() - begin:.2f}")
     return Bench(experiment=experiment, eyes=eyes, shots=shots, times=times, search=search, learnt=learnt)
 
@@ -136,7 +133,7 @@ def stages(bench: Bench) -> float:
 
     say("first pose of a disk without history (crop, search, climb), CPU ms; bar 20", f"{1e3 * cpu_s(first_pose):.1f}")
     found = cpu_s(
-        lambda: cold_start(
+        lambda: initialise(
             bench.learnt.fitter, proposers, first, settings.locate, candidates=settings.refine.candidates
         )
     )
@@ -186,7 +183,7 @@ def literal(bench: Bench, mean_s: float) -> None:
     paper = cpu_s(once, 1)
     proposers = {each.name: bench.search for each in bench.eyes}
     frames = [movie[0] for movie in bench.shots]
-    ours = cpu_s(lambda: cold_start(bench.learnt.fitter, proposers, frames, Settings().locate, candidates=4)) / len(
+    ours = cpu_s(lambda: initialise(bench.learnt.fitter, proposers, frames, Settings().locate, candidates=4)) / len(
         bench.eyes
     )
     say("the paper's literal search, full-size renderings, CPU s a camera and frame", f"{paper:.1f}")

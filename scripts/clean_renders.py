@@ -24,9 +24,9 @@ from sphereorient import so3
 from sphereorient.cameras import R_cam_view
 from sphereorient.evaluate import Bound, cramer_rao_bound
 from sphereorient.locate import Background
-from sphereorient.orient.eye import Eye, Fitter, Optics, base_table
-from sphereorient.orient.light import Light
-from sphereorient.orient.pixels import LinesOfSight
+from sphereorient.pose.fitter import CameraView, Fitter, Optics, base_table
+from sphereorient.pose.light import Light
+from sphereorient.pose.pixels import LinesOfSight
 from sphereorient.sphere import load_texture
 from sphereorient.synth import random_texture
 from sphereorient.synth.clean import CleanSet, clean_set
@@ -135,7 +135,7 @@ def refined(texture: Tensor, seen: CleanSet, start: Poses) -> Poses:
     noise = seen.optics.noise_share * step
     width, height = seen.camera.image_size
     behind = np.full((height, width), seen.optics.black, np.float32)
-    eye = Eye(
+    view = CameraView(
         name="cam1",
         camera=seen.camera,
         background=Background(mean=behind, noise=np.full_like(behind, noise), full_scale=255.0),
@@ -143,7 +143,7 @@ def refined(texture: Tensor, seen: CleanSet, start: Poses) -> Poses:
         sight=LinesOfSight(seen.camera),
     )
     fitter = Fitter(
-        eyes=[eye],
+        views=[view],
         radius_mm=seen.diameter_mm / 2,
         optics=Optics(
             base_table(texture, seen.diameter_px), math.hypot(seen.optics.sigma_px, math.sqrt(1 / 12)), seen.diameter_px

@@ -20,11 +20,14 @@ from torch import Tensor
 
 from sphereorient import locate, so3
 from sphereorient.cameras import Camera
+from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.follow import initialise
+from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.locate import Background, Shot
-from sphereorient.orient import Eye, GreySearch, LinesOfSight, base_table, cold_start, study
-from sphereorient.precise import open_eye
-from sphereorient.recording import open_recording, silent
-from sphereorient.settings import Settings
+from sphereorient.methods.precise import open_view
+from sphereorient.methods.settings import Settings
+from sphereorient.pose import CameraView, LinesOfSight, base_table
+from sphereorient.search import GreySearch
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
 
@@ -54,18 +57,18 @@ def report(name: str, errors: list[float]) -> None:
 
 
 def errors_deg(
-    eye: Eye, texture: Tensor, radius_mm: float, frames: list[np.ndarray], R_lab_body: Tensor
+    view: CameraView, texture: Tensor, radius_mm: float, frames: list[np.ndarray], R_lab_body: Tensor
 ) -> list[float]:
     """Find each frame by itself; infinite where nothing is found."""
     settings = Settings()
-    search = {eye.name: GreySearch(texture, settings.search)}
+    search = {view.name: GreySearch(texture, settings.search)}
     spread = locate.spread_frames(range(len(frames)), settings.refine.study_frames)
-    base = base_table(texture, eye.diameter_px)
+    base = base_table(texture, view.diameter_px)
     shots = [[Shot(picture=frames[k])] for k in spread]
-    learnt = study([eye], shots, base, search, radius_mm, settings.locate, settings.refine)
+    learnt = estimate_appearance([view], shots, base, search, radius_mm, settings.locate, settings.refine)
     errors = []
     for frame, R in zip(frames, R_lab_body, strict=True):
-        poses = cold_start(
+        poses = initialise(
             learnt.fitter,
             search,
             [Shot(picture=frame)],
@@ -89,16 +92,16 @@ def rendered(paint: str, seed: int, count: int, light: str, ambient: float) -> N
     R_lab_body = so3.random_rotations((count,), generator=generator, dtype=torch.float64)
     place = 10.0 * (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5)
     frames = [render_frame(scene, camera, place[k : k + 1], R_lab_body[k : k + 1], rng) for k in range(count)]
-    eye = rendered_eye(camera, settings)
-    report(f"{paint}, {light}", errors_deg(eye, texture, settings.diameter_mm / 2, frames, R_lab_body))
+    view = rendered_eye(camera, settings)
+    report(f"{paint}, {light}", errors_deg(view, texture, settings.diameter_mm / 2, frames, R_lab_body))
 
 
-def rendered_eye(camera: Camera, settings: SynthSettings) -> Eye:
+def rendered_eye(camera: Camera, settings: SynthSettings) -> CameraView:
     """The camera before its even background, which is known."""
     width, height = camera.image_size
     even = np.full((height, width), settings.background, np.float32)
     background = Background(mean=even, noise=np.full_like(even, settings.read_noise), full_scale=255.0)
-    return Eye(
+    return CameraView(
         name="cam1", camera=camera, background=background, diameter_px=settings.diameter_px, sight=LinesOfSight(camera)
     )
 
@@ -110,11 +113,11 @@ def measured(folder: Path) -> None:
         frames = recording.frames
         with h5py.File(folder / "truth.h5") as file:
             R_lab_body = torch.from_numpy(file["orientation"][()])[frames.start : frames.stop]
-        for reel in recording.reels:
-            eye = open_eye(recording, reel, settings, silent)
-            pictures = [picture for picture, _ in reel.pictures() if picture is not None]
-            errors = errors_deg(eye, recording.texture, recording.radius_mm, pictures, R_lab_body)
-            report(f"{folder.name}, {reel.name}", errors)
+        for stream in recording.streams:
+            view = open_view(recording, stream, settings, silent)
+            pictures = [picture for picture, _ in stream.pictures() if picture is not None]
+            errors = errors_deg(view, recording.texture, recording.radius_mm, pictures, R_lab_body)
+            report(f"{folder.name}, {stream.name}", errors)
 
 
 if __name__ == "__main__":

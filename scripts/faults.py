@@ -26,12 +26,12 @@ import yaml
 from numpy.typing import NDArray
 
 from sphereorient import so3
-from sphereorient.learnt import Learnt
+from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.methods.learnt import Learnt
+from sphereorient.methods.precise import track_precise
+from sphereorient.methods.settings import load_settings
 from sphereorient.movies import open_movie, write_ffv1
-from sphereorient.pipeline import one_thread
-from sphereorient.precise import track_precise
-from sphereorient.recording import open_recording, silent
-from sphereorient.settings import load_settings
+from sphereorient.run.track import one_thread
 from sphereorient.synth import SynthSettings, write_experiment
 from sphereorient.trajectory import Trajectory
 

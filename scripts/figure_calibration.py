@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibrate import calibrate_cameras
-from sphereorient.calibrate.table import summary
+from sphereorient.calibration import DotPlate, calibrate_cameras
+from sphereorient.calibration.table import summary
 from sphereorient.cameras import Port, PortCamera, TsaiCamera, triangulate
-from sphereorient.cameras.calibration import DotPlate
 from sphereorient.report import calibration_figure
 
 REPO = Path(__file__).resolve().parents[1]

@@ -18,11 +18,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from sphereorient.evaluate.design import DesignSettings, Judgement, judge_paint
-from sphereorient.paint.design import PAINTS, facing, scaled_paint
-from sphereorient.report.design import write_design
 from sphereorient.report.plots.style import COMPONENTS, WIDTH_IN, in_style, new_figure
 from sphereorient.sphere import SphereRenderer, orthographic_view
+from sphereorient.tools.design.figure import write_design
+from sphereorient.tools.design.judge import DesignSettings, Judgement, judge_paint
+from sphereorient.tools.design.paint import PAINTS, facing, scaled_paint
 
 REPO = Path(__file__).resolve().parents[1]
 SIZES_DEG = (6.0, 9.0, 14.0, 22.0, 34.0, 50.0)

@@ -20,12 +20,12 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.paint.compare import turned_map
-from sphereorient.paint.series import texel_areas
+from sphereorient.mapping.compare import turned_map
 from sphereorient.report.map_files import write_texture
 from sphereorient.sphere import sample_texture
 from sphereorient.synth import random_texture
 from sphereorient.synth.textures import map_directions
+from sphereorient.tools.wear.series import texel_areas
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 HEIGHT = 256

@@ -22,10 +22,11 @@ from sphereorient import so3
 from sphereorient.errors import ExperimentError
 from sphereorient.evaluate.robustness.scenes import CLEAN, Scene, write_scene
 from sphereorient.evaluate.robustness.settings import BenchSettings
-from sphereorient.orient import Fitter, Optics, base_table
-from sphereorient.precise import learn, study_shots
-from sphereorient.recording import Recording, open_recording, silent
-from sphereorient.settings import Settings
+from sphereorient.experiment.recording import Recording, open_recording, silent
+from sphereorient.methods.precise import learn, sample_frames
+from sphereorient.methods.settings import Settings
+from sphereorient.pose import Fitter, Optics, base_table
+from sphereorient.pose.fitter import widest_px
 
 SCENES = ["occlusion:2", "occlusion:3", "occlusion:4", "occlusion:5", *(f"texture_error:{k}" for k in (3, 4, 5))]
 STEPS = 20  # of the fits: they have arrived
@@ -68,7 +69,7 @@ def scene(work: Path, kind: str, level: int) -> Path:
 
 def with_map_of(fitter: Fitter, recording: Recording) -> Fitter:
     """Return the same light and blur with another movie's map."""
-    widest = widest_px(fitter.eyes)
+    widest = widest_px(fitter.views)
     return replace(fitter, optics=Optics(base_table(recording.texture, widest), fitter.optics.blur_px, widest))
 
 
@@ -76,8 +77,8 @@ def error_deg(fitter: Fitter, recording: Recording, path: Path) -> float:
     """Return the median error of the orientation of all frames, fitted from the truth on."""
     with h5py.File(path.parent / "truth.h5") as truth:
         X, R = (torch.from_numpy(truth[name][()]) for name in ("position", "orientation"))
-    shots = study_shots(recording, fitter.eyes, len(X))
-    use: Tensor = torch.ones(len(X), len(fitter.eyes), dtype=torch.bool)
+    shots = sample_frames(recording, fitter.views, len(X))
+    use: Tensor = torch.ones(len(X), len(fitter.views), dtype=torch.bool)
     pixels = fitter.pixels([[shot.picture for shot in frame] for frame in shots], X, fitter.optics.fine)
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, STEPS)
     return float(torch.rad2deg(so3.geodesic_distance(fit.R_lab_body, R)).median())

@@ -16,7 +16,7 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from sphereorient.learn.settings import ProposerSettings
-from sphereorient.settings import Settings, proposer_settings_yaml, settings_yaml, synth_settings_yaml
+from sphereorient.methods.settings import Settings, proposer_settings_yaml, settings_yaml, synth_settings_yaml
 from sphereorient.synth import SynthSettings
 
 REPO = Path(__file__).resolve().parents[1]

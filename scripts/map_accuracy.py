@@ -29,7 +29,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment, write_experiment
-from sphereorient.paint.compare import compare_maps
+from sphereorient.mapping.compare import compare_maps
 from sphereorient.report.map_files import read_seen, seen_path, shares_seen
 from sphereorient.sphere import load_texture
 from sphereorient.synth import SynthSettings

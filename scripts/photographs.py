@@ -31,13 +31,14 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import save_cameras
 from sphereorient.errors import PaintError
-from sphereorient.paint import take_footage
-from sphereorient.paint.compare import compare_maps
-from sphereorient.paint.cut import disks_of
-from sphereorient.paint.photographs import find_photographs, finer_settings
-from sphereorient.recording import open_unpainted, silent
+from sphereorient.experiment.recording import open_unpainted, silent
+from sphereorient.mapping import take_footage
+from sphereorient.mapping.compare import compare_maps
+from sphereorient.mapping.cut import disks_of
+from sphereorient.mapping.photographs import find_photographs, finer_settings
+from sphereorient.methods.settings import Settings
+from sphereorient.pose.fitter import widest_px
 from sphereorient.report.map_files import read_seen, seen_path
-from sphereorient.settings import Settings
 from sphereorient.sphere import load_texture
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.scene import make_scene, render_frame
@@ -170,7 +171,7 @@ def paired(experiment: Path) -> Solved:
         with open_unpainted(experiment) as recording:
             footage = take_footage(recording, paint, settings.locate, silent)
         frames = torch.nonzero(footage.seen.any(1))[:, 0]
-        finer = finer_settings(paint, widest_px(footage.eyes))
+        finer = finer_settings(paint, widest_px(footage.views))
         chain = find_photographs(disks_of(footage, frames, paint), disks_of(footage, frames, finer), paint)
         R[frames[chain.rows]] = chain.R_lab_body
     except PaintError as error:

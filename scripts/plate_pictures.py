@@ -23,8 +23,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from sphereorient.calibration import DotPlate, PlateView, disk_centre_shift, plate_from_entry, see_plate
 from sphereorient.cameras import Camera, load_cameras
-from sphereorient.cameras.calibration import DotPlate, PlateView, disk_centre_shift, plate_from_entry, see_plate
 
 RIM = 64  # points of a dot's rim that must all be in the picture
 

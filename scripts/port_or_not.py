@@ -20,11 +20,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sphereorient import so3
-from sphereorient.calibrate import calibrate_cameras, load_calibration
+from sphereorient.calibration import calibrate_cameras, load_calibration
 from sphereorient.cameras import Camera, triangulate
 from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
-from sphereorient.pipeline import track_movies
+from sphereorient.run.track import track_movies
 from sphereorient.trajectory import Trajectory
 
 HALF_SIZE_MM = 50.0

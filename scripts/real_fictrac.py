@@ -27,14 +27,14 @@ from numpy.typing import NDArray
 
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
-from sphereorient.paint import LearntMap, learn_from, take_footage
-from sphereorient.paint.chain import find_chain
-from sphereorient.paint.cut import disks_of
-from sphereorient.recording import open_unpainted, silent
+from sphereorient.experiment.recording import open_unpainted, silent
+from sphereorient.mapping import LearntMap, learn_from, take_footage
+from sphereorient.mapping.chain import find_chain
+from sphereorient.mapping.cut import disks_of
+from sphereorient.methods.results import map_track
+from sphereorient.methods.settings import Settings, load_settings
 from sphereorient.report.map_figure import compare_pictures, map_figure, write_figure
 from sphereorient.report.map_files import write_learnt, write_texture
-from sphereorient.results import map_track
-from sphereorient.settings import Settings, load_settings
 from sphereorient.trajectory import Trajectory
 
 REPO = Path(__file__).resolve().parents[1]

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import SphereOrientError
-from sphereorient.paint.dots import DotTable
-from sphereorient.paint.spin import SpinFound, spin_of
+from sphereorient.tools.spin.dots import DotTable
+from sphereorient.tools.spin.spin import SpinFound, spin_of
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "real" / "spindoe"
 WITHIN_DEG = 10.0

@@ -19,13 +19,13 @@ from pathlib import Path
 import torch
 
 from sphereorient import so3
-from sphereorient.calibrate import check_cameras
-from sphereorient.calibrate.sphere import told_by
+from sphereorient.calibration import check_cameras
+from sphereorient.calibration.self_calibration import self_calibrate
+from sphereorient.calibration.sphere import told_by
 from sphereorient.cameras import Camera
-from sphereorient.cameras.calibration.self_calibration import self_calibrate
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.experiment import load_experiment
-from sphereorient.pipeline import track_movies
+from sphereorient.run.track import track_movies
 from sphereorient.trajectory import Trajectory
 
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sphereorient.experiment import Experiment, load_experiment
-    from sphereorient.pipeline import track_movies
-    from sphereorient.settings import Settings, load_settings
+    from sphereorient.methods.settings import Settings, load_settings
+    from sphereorient.run.track import track_movies
     from sphereorient.trajectory import Trajectory
 
 __version__ = "0.1.0"
@@ -15,11 +15,11 @@ __all__ = ["Experiment", "Settings", "Trajectory", "load_experiment", "load_sett
 
 _HOMES = {
     "Experiment": "experiment",
-    "Settings": "settings",
+    "Settings": "methods.settings",
     "Trajectory": "trajectory",
     "load_experiment": "experiment",
-    "load_settings": "settings",
-    "track_movies": "pipeline",
+    "load_settings": "methods.settings",
+    "track_movies": "run.track",
 }
 
 

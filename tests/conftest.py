@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -14,6 +15,8 @@ import torch
 from torch import Tensor
 
 REPO = Path(__file__).resolve().parents[1]
+# Examples of one room serve the tests of others.
+sys.path[:0] = sorted(str(folder) for folder in Path(__file__).parent.rglob("*/") if folder.name != "__pycache__")
 SHARED = REPO.parent / "shared"
 TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-12}
 BATCHES: list[tuple[int, ...]] = [(), (0,), (1,), (2, 1, 3)]

@@ -15,13 +15,13 @@ import pytest
 import yaml
 from conftest import REPO
 
-from sphereorient.calibrate import load_calibration
-from sphereorient.calibrate.document import CalibrationKeys
+from sphereorient.calibration import load_calibration
+from sphereorient.calibration.document import CalibrationKeys
+from sphereorient.calibration.entry import KEYS as PLATE_KEYS
 from sphereorient.cameras import load_cameras
-from sphereorient.cameras.calibration.entry import KEYS as PLATE_KEYS
-from sphereorient.cameras.entries import PortEntry
+from sphereorient.cameras.io.entries import PortEntry
+from sphereorient.cameras.io.registry import MODELS
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT, parameter_names
-from sphereorient.cameras.registry import MODELS
 from sphereorient.experiment import ExperimentKeys, load_experiment
 from sphereorient.trajectory import Flag, Reason, Trajectory
 

@@ -14,7 +14,7 @@ from sphereorient.assemble.segments import find_spikes, number_segments
 from sphereorient.assemble.settings import AssembleSettings
 from sphereorient.assemble.trellis import edge_costs, shortest_path
 from sphereorient.errors import ShapeError, check_tail, refusal
-from sphereorient.orient import Candidates
+from sphereorient.search import Candidates
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -98,8 +98,8 @@ class PathWeights(nn.Module):
         """Costs of triples, pairs and candidates, over the temperature, and mask; place C, none, in visited frames."""
         visited = frames.mask.any(-1, keepdim=True)
         mask = torch.cat([frames.mask, visited], -1)
-        eye = torch.eye(3, dtype=frames.R_lab_body.dtype, device=mask.device)
-        R = torch.cat([frames.R_lab_body, eye.expand_as(frames.R_lab_body[..., :1, :, :])], -3)
+        view = torch.eye(3, dtype=frames.R_lab_body.dtype, device=mask.device)
+        R = torch.cat([frames.R_lab_body, view.expand_as(frames.R_lab_body[..., :1, :, :])], -3)
         variance = torch.cat([frames.variance_rad2, torch.full_like(frames.nll[..., :1], LOST_RAD2)], -1)
         triple, temperature = self.triple_costs(R, variance, frames.time_s, mask), self._as("temperature", frames.nll)
         pair, node = self._again(mask, frames.nll), self._pictures(frames)

@@ -14,7 +14,7 @@ from sphereorient.assemble.repair import Track, repair
 from sphereorient.assemble.segments import find_spikes, moving, number_segments
 from sphereorient.assemble.settings import AssembleSettings
 from sphereorient.errors import ExperimentError, ShapeError, refusal
-from sphereorient.orient import Candidates
+from sphereorient.search import Candidates
 from sphereorient.trajectory import Flag
 
 CHI2_3_MEDIAN = 2.366  # median of a sum of three squared standard normals
@@ -143,10 +143,10 @@ def _mean(tracks: Sequence[Track], share: Tensor) -> Tensor:
     """Weighted mean of the cameras, (N, 3, 3); exactly the one camera's where there is one; NaN where none."""
     present = torch.stack([track.present for track in tracks])[..., None, None]
     R = torch.stack([track.R_lab_body for track in tracks])
-    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    view = torch.eye(3, dtype=R.dtype, device=R.device)
     several = present.sum(0) > 1
     mean = so3.weighted_mean(
-        torch.where(several, R, eye).movedim(0, -3), torch.where(several[..., 0, 0], share, 1.0).movedim(0, -1)
+        torch.where(several, R, view).movedim(0, -3), torch.where(several[..., 0, 0], share, 1.0).movedim(0, -1)
     )
     alone = torch.where(present, R, 0.0).sum(0)
     return torch.where(several, mean, torch.where(present.any(0), alone, torch.nan))

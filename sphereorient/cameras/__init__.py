@@ -2,7 +2,7 @@
 
 from sphereorient.cameras.camera import Camera, Rays
 from sphereorient.cameras.covariance import ParameterCovariance
-from sphereorient.cameras.files import load_cameras, load_covariance, save_cameras
+from sphereorient.cameras.io.files import load_cameras, load_covariance, save_cameras
 from sphereorient.cameras.pinhole import PinholeCamera
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.cameras.triangulate import triangulate

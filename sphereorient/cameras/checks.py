@@ -8,8 +8,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.yaml_file import short
 from sphereorient.errors import CameraError, ShapeError, check_tail, refusal
+from sphereorient.files.yaml_file import short
 
 ROTATION_TOLERANCE = 1e-5  # of |R R^T - I|: moves a point at the rim of a 1000 px picture by less than 0.01 px
 LARGEST = 1e30  # of any parameter: no camera has such numbers, and what is computed of them must stay finite

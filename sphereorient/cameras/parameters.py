@@ -19,8 +19,8 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.port import Port, PortCamera
-from sphereorient.cameras.yaml_file import refuse_unknown
 from sphereorient.errors import CameraError, check_tail, refusal
+from sphereorient.files.yaml_file import refuse_unknown
 
 AnyCamera = TypeVar("AnyCamera", bound=Camera)
 ROTATION = ("rotation_x", "rotation_y", "rotation_z")

@@ -82,7 +82,7 @@ class Port:
         return Rays(origin_lab_mm=torch.where(passes, origin, nan), direction_lab=torch.where(passes, direction, nan))
 
     def entry_point(self, x_lab_mm: Tensor, eye_lab_mm: Tensor) -> Tensor:
-        """Return where light from points in the liquid leaves the wall on its way to an eye in the air.
+        """Return where light from points in the liquid leaves the wall on its way to an view in the air.
 
         Args:
             x_lab_mm: (..., 3), lab, mm, in the liquid.
@@ -94,14 +94,14 @@ class Port:
         Source: Snell's law in the plane of normal and point (textbook), solved for the share of the way along the wall.
         """
         normal = self.normal_lab.to(x_lab_mm)
-        eye = eye_lab_mm.to(x_lab_mm)
-        height = eye @ normal - self.air_side_mm.to(x_lab_mm)
+        view = eye_lab_mm.to(x_lab_mm)
+        height = view @ normal - self.air_side_mm.to(x_lab_mm)
         depth = self.offset_mm.to(x_lab_mm) - x_lab_mm @ normal
         inside = depth >= 0
-        way = torch.where(inside[..., None], x_lab_mm, eye) - eye
+        way = torch.where(inside[..., None], x_lab_mm, view) - view
         along_wall = way - (way @ normal)[..., None] * normal
         share = self._share_in_air(along_wall.square().sum(-1), height, torch.where(inside, depth, height))
-        point = eye - height * normal + share[..., None] * along_wall
+        point = view - height * normal + share[..., None] * along_wall
         return torch.where(inside[..., None], point, torch.full_like(point, torch.nan))
 
     def _share_in_air(self, across2: Tensor, height: Tensor, depth: Tensor) -> Tensor:
@@ -109,7 +109,7 @@ class Port:
 
         With s the sine in air the way is height tan + thickness s / sqrt(n_g^2 - s^2) + depth s / sqrt(n_f^2 - s^2).
         Divided by the whole way it is g(share) = 1 below, which needs no square root of the way and so has gradients
-        straight below the eye as well. g rises and is concave: Newton from the share of steep rays, which is too
+        straight below the view as well. g rises and is concave: Newton from the share of steep rays, which is too
         small, climbs to the root without ever passing it.
         """
         layers = [(self.thickness_mm.to(depth), self.n_glass.to(depth)), (depth, self.n_fluid.to(depth))]

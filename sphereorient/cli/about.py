@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 
 
 @app.command()
@@ -17,7 +17,7 @@ def settings(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write; the screen without it.")] = None,
 ) -> None:
     """Write all settings of the method with their defaults, each one explained."""
-    from sphereorient.settings import settings_yaml
+    from sphereorient.methods.settings import settings_yaml
 
     if out is None:
         typer.echo(settings_yaml())
@@ -32,7 +32,7 @@ def info() -> None:
     """Print versions, threads and device."""
     import torch
 
-    from sphereorient.provenance import versions
+    from sphereorient.files.provenance import versions
 
     for package, number in versions().items():
         typer.echo(f"{package:24} {number}")

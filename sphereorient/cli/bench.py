@@ -10,7 +10,7 @@ import typer
 
 from sphereorient.cli.app import app, check_writable, progress_bar
 from sphereorient.errors import SettingsError, refusal
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 
 if TYPE_CHECKING:
     from sphereorient.evaluate.robustness import BenchSettings, Results

@@ -10,7 +10,7 @@ import typer
 
 from sphereorient.cli.app import ExperimentPath, app, check_writable, progress_bar
 from sphereorient.errors import ExperimentError, OutputError, refusal
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 
 
 @app.command()
@@ -31,7 +31,7 @@ def calibrate(
     if refine_with is not None:
         _repair(source, refine_with, out, command, quiet)
         return
-    from sphereorient.calibrate import calibrate_cameras
+    from sphereorient.calibration import calibrate_cameras
     from sphereorient.cameras import save_cameras
     from sphereorient.report import calibration_figure
 
@@ -45,7 +45,7 @@ def calibrate(
         return
     from rich.console import Console
 
-    from sphereorient.calibrate.table import parameters_table, pictures_table, summary
+    from sphereorient.calibration.table import parameters_table, pictures_table, summary
 
     console = Console()
     console.print(pictures_table(result))
@@ -56,8 +56,8 @@ def calibrate(
 
 def _repair(cameras: Path, track: Path, out: Path, command: str, quiet: bool) -> None:
     """Repair cameras by the sphere."""
-    from sphereorient.calibrate import refine_with_track
-    from sphereorient.calibrate.table import repair_lines
+    from sphereorient.calibration import refine_with_track
+    from sphereorient.calibration.table import repair_lines
     from sphereorient.cameras import load_cameras, save_cameras
 
     result = refine_with_track(cameras, track)
@@ -76,10 +76,10 @@ def check_cameras(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Tell by how much the lines of sight of the cameras miss each other at the sphere, over a movie."""
-    from sphereorient.calibrate import check_cameras as checked
-    from sphereorient.calibrate.table import check_lines, contradiction_lines
+    from sphereorient.calibration import check_cameras as checked
+    from sphereorient.calibration.table import check_lines, contradiction_lines
     from sphereorient.experiment import load_experiment
-    from sphereorient.pipeline import track_movies
+    from sphereorient.run.track import track_movies
     from sphereorient.trajectory import Trajectory
 
     known = load_experiment(experiment)

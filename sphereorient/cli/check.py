@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sphereorient.cli.app import ExperimentPath, app, check_writable, progress_bar
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 
 if TYPE_CHECKING:
     from sphereorient.preflight import Finding
@@ -37,9 +37,9 @@ def check(
     """Check an experiment in seconds before it is tracked: what was found, and what to do. Exit code 1: some fault."""
     picture = Path(f"{experiment.stem}.check.png") if out is None else out
     check_writable(picture)
+    from sphereorient.methods.settings import load_settings
     from sphereorient.preflight import Severity, preflight
     from sphereorient.report import preflight_figure
-    from sphereorient.settings import load_settings
 
     chosen = load_settings(settings, set_ or [])
     with progress_bar(quiet) as advance:

@@ -15,8 +15,8 @@ from sphereorient.errors import PaintError, refusal
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from sphereorient.paint.compare import MapComparison
-    from sphereorient.paint.series import WearSeries
+    from sphereorient.mapping.compare import MapComparison
+    from sphereorient.tools.wear.series import WearSeries
 
 PLACES_TOLD = 10  # worn places that are printed; JSON has all
 
@@ -58,7 +58,7 @@ def compare_maps_(
 
 
 def _compare_two(new: Path, old: Path, out: Path | None, *, turned: bool, as_json: bool) -> None:
-    from sphereorient.paint.compare import CHANGED, compare_maps, paint_change, turned_map, without_changed
+    from sphereorient.mapping.compare import CHANGED, compare_maps, paint_change, turned_map, without_changed
     from sphereorient.report import map_figure
     from sphereorient.so3 import angle
 
@@ -84,8 +84,9 @@ def _compare_two(new: Path, old: Path, out: Path | None, *, turned: bool, as_jso
 
 
 def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
-    from sphereorient.paint.series import wear_series
-    from sphereorient.report import map_figure, wear_figure
+    from sphereorient.report import map_figure
+    from sphereorient.tools.wear import figure as wear_figure
+    from sphereorient.tools.wear.series import wear_series
 
     known = [_known_map(path) for path in maps]
     found = wear_series(known, turned)

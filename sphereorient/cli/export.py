@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable, progress_bar
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 
 TrackPath = Annotated[Path, typer.Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")]
 

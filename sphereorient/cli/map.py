@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from sphereorient.experiment import Experiment
-    from sphereorient.paint import LearntMap
-    from sphereorient.paint.correct import Correction
+    from sphereorient.mapping import LearntMap
+    from sphereorient.mapping.correct import Correction
+    from sphereorient.methods.settings import Settings
     from sphereorient.report.map_figure import Example
-    from sphereorient.settings import Settings
     from sphereorient.trajectory import Trajectory
 
 OFTEN = 10  # pictures from which on a place counts as well seen
@@ -76,7 +76,7 @@ def map_(
 
     check_picture_name(out)
     check_writable(out)
-    from sphereorient.settings import load_settings
+    from sphereorient.methods.settings import load_settings
     from sphereorient.sphere import load_texture
 
     overrides = [*(set_ or []), *(["paint.unordered=true"] if photographs else [])]
@@ -115,20 +115,23 @@ class Made:
 
 def _learn(path: Path, names: list[str] | None, settings: Settings, old: Tensor | None, advance: Advance) -> Made:
     """Learn a map, and bring it into an old one's frame where there is one."""
-    from sphereorient.paint import learn_map
-    from sphereorient.paint.correct import corrected
-    from sphereorient.pipeline import one_thread
-    from sphereorient.provenance import provenance
-    from sphereorient.recording import open_unpainted
-    from sphereorient.results import map_track
-    from sphereorient.settings import settings_yaml
+    from sphereorient.experiment import input_files
+    from sphereorient.experiment.recording import open_unpainted
+    from sphereorient.files.provenance import provenance
+    from sphereorient.mapping import learn_map
+    from sphereorient.mapping.correct import corrected
+    from sphereorient.methods.results import map_track
+    from sphereorient.methods.settings import settings_yaml
+    from sphereorient.run.track import one_thread
 
     with open_unpainted(path, names) as recording, one_thread():
         learnt = learn_map(recording, settings.paint, settings.locate, advance)
         correction = None if old is None else corrected(learnt, old)
         learnt = learnt if correction is None else correction.learnt
         command = " ".join(["sphereorient", *sys.argv[1:]])
-        origin = provenance(recording.experiment, list(recording.cameras), command)
+        origin = provenance(
+            input_files(recording.experiment, list(recording.cameras)), recording.experiment.folder, command
+        )
         track = map_track(recording.experiment, recording.clock, learnt, settings_yaml(settings), origin)
         return Made(
             experiment=recording.experiment,

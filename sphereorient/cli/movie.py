@@ -12,7 +12,7 @@ import typer
 
 from sphereorient.cli.app import Advance, app, check_writable, frame_range, progress_bar
 from sphereorient.errors import MovieError, OutputError, refusal
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 
 if TYPE_CHECKING:
     import numpy as np

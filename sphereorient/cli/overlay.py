@@ -9,7 +9,7 @@ import typer
 
 from sphereorient.cli.app import ExperimentPath, app, camera_names, check_writable, frame_range, progress_bar
 from sphereorient.errors import OutputError, SettingsError, refusal
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 
 
 @app.command()

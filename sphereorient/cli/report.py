@@ -35,8 +35,8 @@ def report(
     """Turn tracks into statistics with error bars, figures, and one page to read them on."""
     check_writable(out)
     from sphereorient.experiment import load_experiment
+    from sphereorient.methods.settings import load_settings
     from sphereorient.report.build import write_report
-    from sphereorient.settings import load_settings
 
     chosen = load_settings(settings, set_ or []).statistics
     known = [load_experiment(path) for path in experiment or ()]

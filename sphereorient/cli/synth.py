@@ -19,7 +19,7 @@ def synth(
 ) -> None:
     """Render a two-camera experiment with exact truth, to try the tracker or to test another."""
     check_writable(out)
-    from sphereorient.settings import load_synth_settings
+    from sphereorient.methods.settings import load_synth_settings
     from sphereorient.synth import write_experiment
 
     chosen = load_synth_settings(settings, set_ or [])

@@ -16,7 +16,7 @@ from sphereorient.errors import OutputError, TextureError, refusal
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from sphereorient.evaluate.design import Judgement
+    from sphereorient.tools.design.judge import Judgement
 
 SPREAD = ("min", "median", "max")
 HEIGHT_MAX = 1024  # of a map that is judged: finer than any ball is seen
@@ -62,8 +62,8 @@ def design(
     """Judge a map before it is painted, or make one; print it on strips that wrap the ball."""
     _check(map_, make, gores, diameter_mm, stroke, diameter_px, noise, 0.0 if diameter_mm is None else diameter_mm)
     check_writable(out)
-    from sphereorient.evaluate.design import DesignSettings, judge_paint, make_paint
-    from sphereorient.paint.design_gores import Gores
+    from sphereorient.tools.design.gores import Gores
+    from sphereorient.tools.design.judge import DesignSettings, judge_paint, make_paint
 
     strips = Gores(count=gores, diameter_mm=diameter_mm) if gores is not None and diameter_mm is not None else None
     settings = DesignSettings(diameter_px=diameter_px, noise_share=noise, views=views)
@@ -82,7 +82,7 @@ def design(
             )
     files = _written(out, painted, judgement, title, make=map_ is None)
     if strips is not None:
-        from sphereorient.report.design import write_gores
+        from sphereorient.tools.design.figure import write_gores
 
         files += write_gores(painted, strips, out)
     if as_json:
@@ -117,8 +117,8 @@ def _loaded(path: Path) -> Tensor:
 
 def _written(out: Path, painted: Tensor, judgement: Judgement, title: str, *, make: bool) -> list[Path]:
     """Write judgement and picture, and the map where it was made; the files."""
-    from sphereorient.outputs import put_aside
-    from sphereorient.report.design import design_figure, write_design
+    from sphereorient.files.outputs import put_aside
+    from sphereorient.tools.design.figure import design_figure, write_design
 
     try:
         out.mkdir(exist_ok=True)

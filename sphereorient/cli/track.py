@@ -14,7 +14,7 @@ from sphereorient.cli.app import app, camera_names, check_writable, progress_bar
 from sphereorient.errors import OutputError, SettingsError, refusal
 
 if TYPE_CHECKING:
-    from sphereorient.jobs import Outcome, Request
+    from sphereorient.run import Outcome, Request
     from sphereorient.trajectory import Trajectory
 
 EXIT_SOME_FAILED = 1  # of several experiments
@@ -64,10 +64,10 @@ def track(
     if save_learnt is not None:
         check_writable(save_learnt)
         _refuse_shared(save_learnt, many)
-    from sphereorient.jobs import Request, track_kept
-    from sphereorient.jobs.drive import tracks_of
-    from sphereorient.pipeline import with_proposer
-    from sphereorient.settings import load_settings
+    from sphereorient.methods.settings import load_settings
+    from sphereorient.run import Request, track_kept
+    from sphereorient.run.drive import tracks_of
+    from sphereorient.run.track import with_proposer
 
     chosen = with_proposer(load_settings(settings, set_ or []), proposer)
     names = camera_names(cameras)
@@ -114,8 +114,8 @@ def _refuse_shared(path: Path, many: bool) -> None:
 
 def _track_side_by_side(requests: Sequence[Request], jobs: int, cluster: str | None, resume: bool, quiet: bool) -> None:
     """Track on worker processes or a cluster, and print what became of each experiment."""
-    from sphereorient.jobs import track_experiments
-    from sphereorient.jobs.crew import ProcessCrew, dask_crew
+    from sphereorient.run import track_experiments
+    from sphereorient.run.crew import ProcessCrew, dask_crew
 
     crew = ProcessCrew(jobs) if cluster is None else dask_crew(cluster, jobs if jobs > 1 else None)
     with _kept(requests), progress_bar(quiet) as advance:
@@ -149,7 +149,7 @@ def _print_table(outcomes: Sequence[Outcome]) -> None:
 
 def _print_summary(result: Trajectory, out: Path) -> None:
     """Say what came out: frames valid, what each camera lost and why, what to do about cameras that moved."""
-    from sphereorient.calibrate.table import contradiction_lines
+    from sphereorient.calibration.table import contradiction_lines
 
     summary = result.summary()
     for remark in result.provenance.get("remarks", []):

@@ -32,8 +32,8 @@ def train(
 ) -> None:
     """Train a network that proposes orientations (docs/proposer.md)."""
     check_writable(out)
-    from sphereorient.outputs import put_aside
-    from sphereorient.settings import load_proposer_settings, proposer_settings_yaml
+    from sphereorient.files.outputs import put_aside
+    from sphereorient.methods.settings import load_proposer_settings, proposer_settings_yaml
 
     settings = load_proposer_settings(config, set_ or [])
     from sphereorient.learn.train import CHECKPOINT, prepare, train
@@ -76,7 +76,7 @@ def evaluate(
     """Try a proposer's checkpoint on balls that no training sees, one degradation after the other."""
     from sphereorient.learn.checkpoint import load_checkpoint
     from sphereorient.learn.trial import try_checkpoint
-    from sphereorient.settings import load_proposer_settings
+    from sphereorient.methods.settings import load_proposer_settings
 
     loaded = load_checkpoint(checkpoint)
     chosen = loaded.settings if config is None else load_proposer_settings(config)

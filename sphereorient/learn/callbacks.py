@@ -10,8 +10,8 @@ from typing import Any
 from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
+from sphereorient.files.outputs import put_aside
 from sphereorient.learn.module import ProposerModule
-from sphereorient.outputs import put_aside
 
 LAST = "last.ckpt"
 Row = dict[str, float]

@@ -15,9 +15,9 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from sphereorient.errors import CheckpointError, SphereOrientError, refusal
+from sphereorient.files.outputs import put_aside
 from sphereorient.learn.network import Correlator
 from sphereorient.learn.settings import NetworkSettings, ProposerSettings
-from sphereorient.outputs import put_aside
 
 SCHEMA = "sphereorient-proposer/1"
 LARGEST_BYTES = 64_000_000  # of the file, and of what is packed in it

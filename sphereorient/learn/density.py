@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.orient.peaks import distinct
+from sphereorient.search.peaks import distinct
 
 LOOKED_AT = 48  # best places of the grid among which tops are sought
 APART_DEG = 25.0  # tops nearer than this to a better one belong to it
@@ -47,8 +47,8 @@ def tops_of(logits: Tensor, grid: Tensor, count: int, temperature: float = 1.0) 
     share = own * probability[:, None]
     weight = (own * (logits / temperature).softmax(-1)[:, None]).sum(-1)
     mean = (share @ flat).reshape(*weight.shape, 3, 3) / share.sum(-1).clamp_min(1e-30)[..., None, None]
-    eye = torch.eye(3, dtype=grid.dtype, device=grid.device)
-    R = so3.nearest_rotation(torch.where(there[..., None, None], mean, eye))
+    view = torch.eye(3, dtype=grid.dtype, device=grid.device)
+    R = so3.nearest_rotation(torch.where(there[..., None, None], mean, view))
     weight = torch.where(there, weight, 0.0)
     best = weight.argsort(dim=1, descending=True, stable=True)
     return Tops(R_view_body=R.gather(1, best[..., None, None].expand_as(R)), probability=weight.gather(1, best))

@@ -10,9 +10,9 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.learn.settings import NetworkSettings
-from sphereorient.orient.evening import rim_share
+from sphereorient.search.normalisation import rim_share
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
-from sphereorient.sphere.paint_table import octahedral_cells, octahedral_directions
+from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 from sphereorient.sphere.view import disk_offsets
 
 SCALES = (0.06, 0.1, 0.16, 0.25, 0.4, 0.7)  # standard deviations, rad, of the blurs that the map's network sees

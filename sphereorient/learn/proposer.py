@@ -12,7 +12,7 @@ from sphereorient import so3
 from sphereorient.errors import ShapeError, refusal
 from sphereorient.learn.density import tops_of
 from sphereorient.learn.network import Correlator, map_blurs
-from sphereorient.orient.proposer import Proposals
+from sphereorient.search.proposer import Proposals
 from sphereorient.trajectory import Reason
 
 # Disks at once. Fixed and filled up with empty disks: the last bits of products depend on how many rows there are, and

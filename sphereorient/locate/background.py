@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from sphereorient.cameras.whole_file import read_whole
-from sphereorient.errors import ExperimentError, refusal
-from sphereorient.sphere.picture_claim import claimed_pixels, decoded_grey
 
 # A pixel's scatter is read off at this share of its frames, and divided by what that is for Gaussian noise in standard
 # deviations. About a background taken from the movie: things that turn and glitter move a pixel in more frames than
@@ -20,7 +15,6 @@ from sphereorient.sphere.picture_claim import claimed_pixels, decoded_grey
 # of the movie, a tenth of the frames shows the scene.
 MEASURED_SHARE, MEASURED_SIGMAS = 0.8, 1.2816
 GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
-BYTES_A_PIXEL, HEADER_BYTES = 8, 1_000_000  # of a picture without any compression, and what may stand before it
 FEW = 10  # frames; the share above means nothing in fewer, and all pixels are taken to be alike
 
 
@@ -48,54 +42,6 @@ class Background:
         if self.shown is not None:
             out[~self.shown] = 0
         return out
-
-
-def spread_frames(frames: range, count: int) -> list[int]:
-    """Return at most `count` frame numbers, evenly spread over a range, ends included."""
-    if len(frames) <= count:
-        return list(frames)
-    return [frames[int(i)] for i in np.linspace(0, len(frames) - 1, count).round()]
-
-
-def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Read a picture of the scene without the ball, (H, W), grey levels.
-
-    Raises:
-        ExperimentError: the file is missing, no picture, or of another size than the movie's frames.
-    """
-    do = "save a frame without the ball as PNG, in the movie's own grey levels"
-    return np.asarray(_picture(path, f"background {path}", frame_shape, do), np.float32)
-
-
-def load_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Read where the ball can be seen, (H, W): black in the picture is what hides it, white all else.
-
-    Raises:
-        ExperimentError: the file is missing, no picture, of another size than the movie's frames, or all black.
-    """
-    name, do = f"mask {path}", "paint what hides the ball black, all else white, on a frame of the movie"
-    picture = _picture(path, name, frame_shape, do)
-    shown = np.asarray(picture > np.iinfo(picture.dtype).max // 2)
-    if not shown.any():
-        raise ExperimentError(refusal(name, expected="white where the ball is seen", got="black only", do=do))
-    return shown
-
-
-def _picture(path: Path, name: str, frame_shape: tuple[int, int], do: str) -> NDArray[Any]:
-    """Read a grey picture of the size of a movie's frames, (H, W), in its own depth."""
-    height, width = frame_shape
-    content = read_whole(path, BYTES_A_PIXEL * height * width + HEADER_BYTES, "a picture", ExperimentError, do)
-    claimed = claimed_pixels(content)
-    if claimed is not None and claimed > height * width:  # told before room is made for it
-        expected, got = f"{width} x {height} px as the movie", f"{claimed} px"
-        raise ExperimentError(refusal(name, expected=expected, got=got, do=do))
-    picture = None if claimed is None else decoded_grey(content)
-    if picture is None:
-        raise ExperimentError(refusal(name, expected="a picture", got="a file that is none", do=do))
-    if picture.shape != frame_shape:
-        expected, got = (f"{shape[1]} x {shape[0]} px as the movie" for shape in (frame_shape, picture.shape))
-        raise ExperimentError(refusal(name, expected=expected, got=got.removesuffix(" as the movie"), do=do))
-    return picture
 
 
 def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None = None) -> Background:

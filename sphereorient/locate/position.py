@@ -110,12 +110,12 @@ def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
     per_px = distance * sine / seen.radius_px  # mm in space per px, at the sphere
     sigma = seen.outline_rms_px * per_px
     outer = rays.direction_lab[:, :, None] * rays.direction_lab[:, None, :]
-    eye = torch.eye(3, dtype=outer.dtype)
+    view = torch.eye(3, dtype=outer.dtype)
     sigma_along = distance * seen.outline_rms_px / seen.radius_px
     return _View(
         rays=rays,
         from_size_mm=rays.origin_lab_mm + (distance - before)[:, None] * rays.direction_lab,
-        across=(eye - outer) / sigma[:, None, None].square(),
+        across=(view - outer) / sigma[:, None, None].square(),
         along=outer / sigma_along[:, None, None].square(),
     )
 
@@ -123,6 +123,6 @@ def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
 def _inverse(information: Tensor) -> Tensor:
     """Inverse of (N, 3, 3) where it exists, NaN elsewhere."""
     finite = torch.isfinite(information).all(-1).all(-1) & (torch.linalg.det(torch.nan_to_num(information)) > 0)
-    eye = torch.eye(3, dtype=information.dtype)
-    inverse = torch.linalg.inv(torch.where(finite[:, None, None], information, eye))
+    view = torch.eye(3, dtype=information.dtype)
+    inverse = torch.linalg.inv(torch.where(finite[:, None, None], information, view))
     return torch.where(finite[:, None, None], inverse, torch.nan)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.experiment.stream import EVERY, CameraStream, uniform
 from sphereorient.locate.background import Background
 from sphereorient.trajectory import Reason
 
 Picture = NDArray[Any]
 
-EVERY = 4  # pixels: a fault of a whole picture shows in every fourth row and column
 LIT_NOISES = 10.0  # a pixel of the empty scene that is lit stands this many noises above black
 LIT_SHARE = 0.1  # of the pixels; a scene that is darker does not tell a lamp that failed
 DARK_LEVEL = 0.3  # of the empty scene's grey level: darker is unlit
@@ -32,12 +33,6 @@ class Shot:
     def usable(self) -> bool:
         """Whether the picture may show the ball."""
         return self.reason is Reason.OK
-
-
-def uniform(picture: Picture) -> bool:
-    """Whether a picture is of one grey: no scene is, with a camera's noise on it."""
-    some = picture[::EVERY, ::EVERY]
-    return bool(some.min() == some.max())
 
 
 def screened(picture: Picture, before: Picture | None, background: Background) -> Shot:
@@ -68,3 +63,25 @@ def screened(picture: Picture, before: Picture | None, background: Background) -
 
 def _uniform_reason(level: float, background: Background) -> Reason:
     return Reason.SATURATED if level > 0.5 * background.full_scale else Reason.DARK
+
+
+def screened_frames(
+    stream: CameraStream, background: Background, first: int = 0, last: int | None = None
+) -> Iterator[Shot]:
+    """Yield one camera's pictures of frames first .. last - 1, those that cannot show the ball marked.
+
+    What is marked of a frame depends on it and the one before alone, whichever frame is the first.
+
+    Args:
+        stream: of the camera.
+        background: of the same movie.
+        first: counted from the first frame that is used.
+        last: + 1; None: to the end.
+    """
+    lead = min(first, 1)
+    blank = np.zeros(stream.movie.frame_shape, stream.movie.dtype)
+    before: Picture | None = None
+    for k, (picture, reason) in enumerate(stream.pictures(first - lead, last)):
+        if k >= lead:
+            yield Shot(picture=blank, reason=reason) if picture is None else screened(picture, before, background)
+        before = picture

@@ -133,11 +133,11 @@ def _stand_out(surprise: Floats, limit: float) -> Bools:
 
 def _wanted(pole: float) -> Floats:
     """Return the rows that take value, rate and its change from a state."""
-    eye = np.eye(3)
+    view = np.eye(3)
     wanted = np.zeros((9, SIZE))
-    wanted[VALUE, DELTA] = eye
-    wanted[SPEED, MEAN] = wanted[SPEED, 6:9] = eye
-    wanted[CHANGE, 9:12] = pole * eye
+    wanted[VALUE, DELTA] = view
+    wanted[SPEED, MEAN] = wanted[SPEED, 6:9] = view
+    wanted[CHANGE, 9:12] = pole * view
     return wanted
 
 

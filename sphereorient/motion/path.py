@@ -110,17 +110,17 @@ class Path:
             some = slice(k, min(k + TOGETHER, count))
             piece = self.part(slice(some.start, some.stop + 1))
             carried[some], drift[some] = piece.steps(prior, weight[kind[some]], by_rate[kind[some]])
-        eye = np.eye(3)
+        view = np.eye(3)
         grown_by = np.zeros((len(lengths), SIZE - 3, SIZE - 3))
-        grown_by[:, :3, :3], grown_by[:, 3:, 3:] = eye, _by_axis(grown(lengths * prior.pole))
+        grown_by[:, :3, :3], grown_by[:, 3:, 3:] = view, _by_axis(grown(lengths * prior.pole))
         keep = np.r_[0:3, 6:SIZE]
         noise = np.zeros((len(lengths), SIZE, SIZE))
         noise[:, keep[:, None], keep] = _by_axis(prior.step_noise(lengths))
         start = np.zeros((SIZE, SIZE))
         # weak beliefs about the reference, which follows the states: they damp a step and leave no bias when settled
-        start[DELTA, DELTA] = (UNKNOWN * self.sigma) ** 2 * eye
-        start[MEAN, MEAN] = (self.unknown_rate + self.sigma) ** 2 * eye
-        start[RATE, RATE] = prior.deviation**2 * np.kron(STATIONARY, eye)
+        start[DELTA, DELTA] = (UNKNOWN * self.sigma) ** 2 * view
+        start[MEAN, MEAN] = (self.unknown_rate + self.sigma) ** 2 * view
+        start[RATE, RATE] = prior.deviation**2 * np.kron(STATIONARY, view)
         return Chain(
             carried=carried,
             drift=drift,

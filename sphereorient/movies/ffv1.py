@@ -11,8 +11,8 @@ import av
 import numpy as np
 
 from sphereorient.errors import MovieError, refusal
+from sphereorient.files.outputs import put_aside
 from sphereorient.movies.movie import Grey
-from sphereorient.outputs import put_aside
 
 PIXEL_FORMATS = {np.dtype(np.uint8): "gray", np.dtype(np.uint16): "gray16le"}
 # Every frame a key frame, with check sums: any frame can be read alone, and damage stays in its frame.

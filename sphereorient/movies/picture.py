@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from sphereorient.errors import MovieError, refusal
+from sphereorient.files.picture_size import claimed_bytes
 from sphereorient.movies.luma import luma
 from sphereorient.movies.movie import Grey
-from sphereorient.movies.picture_size import claimed_bytes
 from sphereorient.movies.tiff import TiffMovie
 
 TIFF = (".tif", ".tiff")

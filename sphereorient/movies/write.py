@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
-from sphereorient.hdf5_out import GuardedFile
+from sphereorient.files.hdf5 import GuardedFile
+from sphereorient.files.outputs import put_aside
 from sphereorient.movies.ffv1 import check_alike, check_kind, write_ffv1
 from sphereorient.movies.movie import Grey
-from sphereorient.outputs import put_aside
 
 PLAYER_RATE_HZ = 25.0
 FRAMES, TIME = "frames", "time"  # names of the data sets

@@ -9,18 +9,18 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.orient.climb import climb, climb_level, level_target
-from sphereorient.orient.evening import Evening
-from sphereorient.orient.settings import GreySearchSettings
 from sphereorient.preflight.finding import Finding, Severity
+from sphereorient.search.normalisation import LocalNormalisation
+from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
+from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import orthographic_view
-from sphereorient.sphere.paint_table import paint_table
+from sphereorient.sphere.texture_table import texture_table
 
 STEP_DEG = 15.0  # of the grid of rotations with which views are compared
 VIEWS = 300  # sides from which the ball is looked at, 8 degrees apart; turning the picture makes no other view
 APART_DEG = 20.0  # nearer rotations show the same view, a little turned
 CLIMBS = 40  # pairs that are turned to their best likeness
-BATCH = 64  # views that are evened at once
+BATCH = 64  # views that are normalised at once
 ALIKE, SAME = 0.85, 0.97  # share of one view that the other explains, from which on single frames are doubtful, useless
 
 
@@ -39,36 +39,36 @@ def most_alike(texture: Tensor, settings: GreySearchSettings) -> Alike:
 
     Args:
         texture: (H, 2 H), the map, 0 black .. 1 white.
-        settings: of the search for orientations, whose eyes are used.
+        settings: of the search for orientations, whose views are used.
     """
     size = settings.size_px
     view = orthographic_view(size)
     normal = view.normal_view.T.contiguous()
-    paint = paint_table(texture, min(2.0 / size, settings.detail), 192)
+    paint = texture_table(texture, min(2.0 / size, settings.detail), 192)
 
     def pictures(R: Tensor) -> Tensor:
-        return view.picture(paint.look(R.mT @ normal)[0])
+        return view.picture(paint.sample(R.mT @ normal)[0])
 
-    evening = Evening(size, detail=settings.detail, window=settings.window, clip=settings.clip)
+    normalisation = LocalNormalisation(size, detail=settings.detail, window=settings.window, clip=settings.clip)
 
-    def evened(R: Tensor) -> Tensor:
-        return torch.cat([evening(pictures(some)) for some in torch.split(R, BATCH)])
+    def normalised(R: Tensor) -> Tensor:
+        return torch.cat([normalisation(pictures(some)) for some in torch.split(R, BATCH)])
 
     seen = towards(spread_directions(VIEWS)).float()
     grid = so3.lattman_grid(math.radians(STEP_DEG)).float()
-    likeness = evened(seen) @ evened(grid).T
+    likeness = normalised(seen) @ normalised(grid).T
     near = _cosine(seen, grid) > math.cos(math.radians(APART_DEG))
     best = likeness.masked_fill(near, -1.0).max(1)
-    rough, fine = climb_level(view, paint, settings.detail, 2), climb_level(view, paint, 2.0 / size, 1)
+    rough, fine = detail_level(view, paint, settings.detail, 2), detail_level(view, paint, 2.0 / size, 1)
     found = Alike(score=0.0, angle_rad=math.pi, pictures=pictures(seen[:1]).expand(2, -1, -1), R_view_body=seen[:2])
     for k in best.values.argsort(descending=True)[:CLIMBS].tolist():
         disk = pictures(seen[k : k + 1])[0]
-        R, _ = climb(rough, level_target(rough, disk), grid[best.indices[k]][None], settings.rough_steps)
-        R, score = climb(fine, level_target(fine, disk), R, settings.fine_steps)
+        R, _ = refine_rotation(rough, level_reference(rough, disk), grid[best.indices[k]][None], settings.rough_steps)
+        R, score = refine_rotation(fine, level_reference(fine, disk), R, settings.fine_steps)
         angle = float(so3.geodesic_distance(seen[k].double(), R[0].double()))
         if float(score) > found.score and angle > math.radians(APART_DEG):
             pair = torch.stack([seen[k], R[0]])
-            shown = view.picture(paint.look(pair.mT @ normal)[0], math.nan)
+            shown = view.picture(paint.sample(pair.mT @ normal)[0], math.nan)
             found = Alike(score=float(score), angle_rad=angle, pictures=shown, R_view_body=pair)
     return found
 

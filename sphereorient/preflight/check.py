@@ -12,15 +12,15 @@ from torch import Tensor
 
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import Experiment, load_experiment, open_movies
+from sphereorient.experiment.timeline import Timeline, timeline
 from sphereorient.locate import expected_diameter_px
+from sphereorient.methods.settings import Settings
 from sphereorient.movies import Movie
-from sphereorient.orient import GreySearch
 from sphereorient.preflight import alike, diameter, exposure, files, gap, match, offset, paint
 from sphereorient.preflight.finding import Finding, Severity, worst
 from sphereorient.preflight.look import Look, look_at, look_closer
-from sphereorient.settings import Settings
+from sphereorient.search import GreySearch
 from sphereorient.sphere import load_texture
-from sphereorient.timeline import Timeline, timeline
 
 Progress = Callable[[str, int, int], None]  # (stage, done, total)
 

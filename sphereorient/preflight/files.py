@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Sequence
 
 from sphereorient.experiment import Experiment, outside_paths
+from sphereorient.experiment.timeline import NONE, Timeline
 from sphereorient.preflight.finding import Finding, Severity
 from sphereorient.preflight.look import Look
-from sphereorient.timeline import NONE, Timeline
 from sphereorient.trajectory import Reason
 
 MANY = 0.5  # share of bad frames from which on a movie is no good

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from sphereorient.cameras import Camera
 from sphereorient.errors import MovieError, refusal
 from sphereorient.experiment import Experiment
+from sphereorient.experiment.given import given_mask, given_scene
+from sphereorient.experiment.stream import pictures_of, spread_frames, uniform
+from sphereorient.experiment.timeline import NONE, Timeline
 from sphereorient.locate import (
     Background,
     LocateSettings,
@@ -21,16 +24,11 @@ from sphereorient.locate import (
     learn_background,
     screened,
     sightings_of,
-    spread_frames,
-    uniform,
 )
 from sphereorient.locate.background import measure_background
 from sphereorient.locate.find import Found
-from sphereorient.locate.given import given_mask, given_scene
 from sphereorient.locate.outline import Outline
 from sphereorient.movies import Movie
-from sphereorient.reel import pictures_of
-from sphereorient.timeline import NONE, Timeline
 from sphereorient.trajectory import Reason
 
 SPREAD = 25  # frames all over the movie: enough for a background

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, R_cam_view
-from sphereorient.locate import spread_frames
-from sphereorient.orient import GreySearch, crop_disk
+from sphereorient.experiment.stream import spread_frames
 from sphereorient.preflight.finding import Finding, Severity
 from sphereorient.preflight.look import Look
+from sphereorient.search import GreySearch, crop_disk
 
 FRAMES = 8  # of each camera
 FITS, POOR = 0.7, 0.55  # share of the picture that the best view of the map explains

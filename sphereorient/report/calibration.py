@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from sphereorient.calibrate import Calibrated, PictureReport
+from sphereorient.calibration import Calibrated, PictureReport
 
 SHOWN = 3  # pictures of each camera
 FOUND, EXPECTED, OUTLIER = "#009E73", "#D55E00", "#CC79A7"  # Okabe and Ito's

@@ -18,8 +18,8 @@ from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.evaluate import Score
 from sphereorient.experiment import Experiment, open_movies
+from sphereorient.experiment.timeline import timeline
 from sphereorient.sphere import SphereRenderer, load_texture, orthographic_view, reduced_texture
-from sphereorient.timeline import timeline
 from sphereorient.trajectory import Reason, Trajectory
 
 # Okabe and Ito's colours: told apart by colour-blind readers, and in grey print.

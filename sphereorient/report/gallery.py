@@ -87,11 +87,11 @@ def gallery(
     status = status_of(track)
     frames = []
     with ExitStack() as opened:
-        page, reels = prepared(track, experiment, None, opened)
-        readers = [pictures_at(reel, rows) for reel in reels.values()]
+        page, streams = prepared(track, experiment, None, opened)
+        readers = [pictures_at(stream, rows) for stream in streams.values()]
         for done, (k, *pictures) in enumerate(zip(rows.tolist(), *readers, strict=True), start=1):
             canvas = Canvas(*pairs_size(page))
-            draw_pairs(canvas, page, k, dict(zip(reels, pictures, strict=True)), (0, 0))
+            draw_pairs(canvas, page, k, dict(zip(streams, pictures, strict=True)), (0, 0))
             frame = GalleryFrame(
                 k=k,
                 number=int(page.numbers[k]),

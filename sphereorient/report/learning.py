@@ -12,9 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from sphereorient.files.outputs import put_aside
 from sphereorient.learn.examples import Example
 from sphereorient.learn.judge import WITHIN_DEG
-from sphereorient.outputs import put_aside
 from sphereorient.report.plots.marks import note
 from sphereorient.report.plots.style import ALL, DPI, GREY, SECOND, SHADE, WIDTH_IN, X, in_style, new_figure
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.experiment import Experiment
-from sphereorient.outputs import put_aside
-from sphereorient.paint import LearntMap
-from sphereorient.paint.compare import MapComparison
+from sphereorient.files.outputs import put_aside
+from sphereorient.mapping import LearntMap
+from sphereorient.mapping.compare import MapComparison
 from sphereorient.report.overlay import pictures_at, prepared
 from sphereorient.report.overlay_model import crop
 from sphereorient.report.overlay_page import crop_side
@@ -61,10 +61,10 @@ def compare_pictures(track: Trajectory, experiment: Experiment, texture: Path) -
     """
     compared = []
     with ExitStack() as opened:
-        page, reels = prepared(track, replace(experiment, texture_path=texture), None, opened)
+        page, streams = prepared(track, replace(experiment, texture_path=texture), None, opened)
         rows = np.flatnonzero(track.valid)
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(COMPARED, len(rows))).round().astype(int))]
-        readers = [pictures_at(reel, rows) for reel in reels.values()]
+        readers = [pictures_at(stream, rows) for stream in streams.values()]
         for k, *pictures in zip(rows.tolist(), *readers, strict=True):
             for view, picture in zip(page.views, pictures, strict=True):
                 if picture is None or view.light is None:
@@ -74,7 +74,7 @@ def compare_pictures(track: Trajectory, experiment: Experiment, texture: Path) -
                 model = view.light.picture(seen, filmed)
                 with np.errstate(invalid="ignore"):
                     good = np.isfinite(model) & np.isfinite(filmed) & (seen.basis[..., 3] > SLANT)
-                shown = reels[view.name].shown
+                shown = streams[view.name].shown
                 if shown is not None:
                     good &= crop((255 * shown).astype(np.uint8), window) > 254
                 alike = float(np.corrcoef(filmed[good], model[good])[0, 1]) if good.sum() > 8 else float("nan")

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import OutputError, TextureError, refusal
-from sphereorient.outputs import put_aside
-from sphereorient.paint import LearntMap
-from sphereorient.sphere.picture_claim import decoded_grey
+from sphereorient.files.outputs import put_aside
+from sphereorient.files.picture_claim import decoded_grey
+from sphereorient.mapping import LearntMap
 from sphereorient.trajectory import Trajectory
 
 UNSEEN = 128  # grey of texels that no picture shows

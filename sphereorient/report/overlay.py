@@ -11,18 +11,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sphereorient.cameras.yaml_file import refuse_unknown
 from sphereorient.errors import ExperimentError, TrackError, refusal
 from sphereorient.experiment import Experiment, open_movies
-from sphereorient.locate.given import given_mask
+from sphereorient.experiment.given import given_mask
+from sphereorient.experiment.stream import CameraStream, pictures_of
+from sphereorient.experiment.timeline import NONE, timeline
+from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Grey, Movie
-from sphereorient.reel import Reel, pictures_of
 from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of, radius_of
 from sphereorient.report.overlay_page import Page, crop_side
 from sphereorient.report.overlay_video import check_video_name, write_video
 from sphereorient.report.overlay_view import View
 from sphereorient.sphere import load_texture, reduced_texture
-from sphereorient.timeline import NONE, timeline
 from sphereorient.trajectory import Trajectory
 
 SAMPLE = 16  # frames from which light and brightness are taken
@@ -66,14 +66,14 @@ def overlay_movie(
     """
     check_video_name(path)
     with ExitStack() as opened:
-        page, reels = prepared(track, experiment, cameras, opened)
+        page, streams = prepared(track, experiment, cameras, opened)
         chosen = _chosen(page.numbers, frames, every)
-        return write_video(path, _pictures(page, reels, chosen, progress), fps)
+        return write_video(path, _pictures(page, streams, chosen, progress), fps)
 
 
 def prepared(
     track: Trajectory, experiment: Experiment, cameras: Sequence[str] | None, opened: ExitStack
-) -> tuple[Page, dict[str, Reel]]:
+) -> tuple[Page, dict[str, CameraStream]]:
     """Open the movies and learn what all pictures share: light, brightness, sizes.
 
     Args:
@@ -90,8 +90,8 @@ def prepared(
     movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
     numbers, rows = frames_of(track, experiment, movies)
     where = path_of(track, radius_of(experiment))
-    reels = {
-        name: Reel(
+    streams = {
+        name: CameraStream(
             name=name,
             camera=experiment.cameras[name],
             movie=movies[name],
@@ -101,8 +101,8 @@ def prepared(
         for name in names
     }
     models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in names]
-    views = [_view(track, model, reels[name]) for name, model in zip(names, models, strict=True)]
-    return Page(track=track, numbers=numbers, views=views), reels
+    views = [_view(track, model, streams[name]) for name, model in zip(names, models, strict=True)]
+    return Page(track=track, numbers=numbers, views=views), streams
 
 
 def frames_of(track: Trajectory, experiment: Experiment, movies: Mapping[str, Movie]) -> tuple[Rows, dict[str, Rows]]:
@@ -159,30 +159,30 @@ def _chosen(numbers: Rows, frames: tuple[int | None, int | None], every: int) ->
 
 
 def _pictures(
-    page: Page, reels: Mapping[str, Reel], chosen: Rows, progress: Callable[[int, int], None]
+    page: Page, streams: Mapping[str, CameraStream], chosen: Rows, progress: Callable[[int, int], None]
 ) -> Iterator[NDArray[np.uint8]]:
-    readers = [pictures_at(reel, chosen) for reel in reels.values()]
+    readers = [pictures_at(stream, chosen) for stream in streams.values()]
     for done, (k, *pictures) in enumerate(zip(chosen.tolist(), *readers, strict=True), start=1):
-        yield page.draw(k, dict(zip(reels, pictures, strict=True)))
+        yield page.draw(k, dict(zip(streams, pictures, strict=True)))
         progress(done, len(chosen))
 
 
-def pictures_at(reel: Reel, chosen: Rows) -> Iterator[Grey | None]:
+def pictures_at(stream: CameraStream, chosen: Rows) -> Iterator[Grey | None]:
     """Return a camera's pictures of some frames of the track, in increasing order; None where there is none."""
-    return pictures_of(reel.movie, reel.rows[chosen])
+    return pictures_of(stream.movie, stream.rows[chosen])
 
 
-def _view(track: Trajectory, model: Model, reel: Reel) -> View:
+def _view(track: Trajectory, model: Model, stream: CameraStream) -> View:
     """Learn light and brightness from frames spread over the track."""
-    seen = track.cameras[reel.name]
+    seen = track.cameras[stream.name]
     position = torch.from_numpy(model.path.position_mm)
     radius = seen.radius_px[np.isfinite(seen.radius_px)]
     half_px = MARGIN * float(np.percentile(radius, 98)) if len(radius) else float("nan")
-    readable = reel.rows != NONE
+    readable = stream.rows != NONE
     good = np.flatnonzero(readable & track.valid & model.path.whole)
     sampled = good if len(good) else np.flatnonzero(readable)
     sampled = np.unique(sampled[np.linspace(0, len(sampled) - 1, min(SAMPLE, len(sampled))).round().astype(int)])
-    pictures = [(int(k), p) for k, p in zip(sampled, pictures_at(reel, sampled), strict=True) if p is not None]
+    pictures = [(int(k), p) for k, p in zip(sampled, pictures_at(stream, sampled), strict=True) if p is not None]
     greys = np.concatenate([np.zeros(0), *(p[::3, ::3].ravel() for _, p in pictures)])
     black, white = np.percentile(greys, (DARK, BRIGHT)) if len(greys) else (0.0, 1.0)
     light: LightFit | None = None
@@ -192,7 +192,7 @@ def _view(track: Trajectory, model: Model, reel: Reel) -> View:
         windows = [(k, model.window(k, half_px, side), picture) for k, picture in pictures]
         light = fit_light([(model.look(k, window), crop(picture, window)) for k, window, picture in windows])
     return View(
-        name=reel.name,
+        name=stream.name,
         model=model,
         light=light,
         black=float(black),

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, refusal
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 
 Colour = NDArray[np.uint8]  # (H, W, 3), red green blue
 FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}

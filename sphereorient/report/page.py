@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from sphereorient.provenance import versions
+from sphereorient.files.provenance import versions
 from sphereorient.report.strip_html import strip_assets
 from sphereorient.report.tables import Table
 from sphereorient.report.verdicts import Verdict

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera
 from sphereorient.experiment import Experiment, open_movies
+from sphereorient.experiment.stream import CameraStream
 from sphereorient.movies import Grey
-from sphereorient.reel import Reel
 from sphereorient.report.export_columns import quaternions
 from sphereorient.report.overlay import frames_of, pictures_at
 from sphereorient.report.overlay_canvas import AXES, OUTLINE, TRAIL
@@ -131,10 +131,11 @@ def log_pictures(
     with ExitStack() as opened:
         movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
         _, rows = frames_of(track, experiment, movies)
-        reels = [
-            Reel(name=name, camera=experiment.cameras[name], movie=movies[name], rows=rows[name]) for name in names
+        streams = [
+            CameraStream(name=name, camera=experiment.cameras[name], movie=movies[name], rows=rows[name])
+            for name in names
         ]
-        readers = [pictures_at(reel, chosen) for reel in reels]
+        readers = [pictures_at(stream, chosen) for stream in streams]
         white: dict[str, float] = {}
         for done, (k, *pictures) in enumerate(zip(chosen.tolist(), *readers, strict=True), start=1):
             set_time(k)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from sphereorient.evaluate.robustness.results import Line, Results, lines_of
 from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 from sphereorient.report.plots.style import new_figure
 from sphereorient.synth.severities import DEGRADATIONS
 

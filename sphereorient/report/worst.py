@@ -63,14 +63,14 @@ def worst_frames(
         raise OutputError(refusal(f"--worst {path}", expected=" ".join(SUFFIXES), got=f"'{path.suffix}'", do=do))
     bad = choose_worst(track, count)
     with ExitStack() as opened:
-        page, reels = prepared(track, experiment, cameras, opened)
+        page, streams = prepared(track, experiment, cameras, opened)
         rows = np.array(sorted(one.k for one in bad), dtype=np.int64)
         places = {one.k: place for place, one in enumerate(bad)}
         canvas = _sheet(page, len(bad))
-        readers = [pictures_at(reel, rows) for reel in reels.values()]
+        readers = [pictures_at(stream, rows) for stream in streams.values()]
         for done, (k, *pictures) in enumerate(zip(rows.tolist(), *readers, strict=True), start=1):
             place = places[k]
-            _tile(canvas, page, bad[place], place, dict(zip(reels, pictures, strict=True)))
+            _tile(canvas, page, bad[place], place, dict(zip(streams, pictures, strict=True)))
             progress(done, len(rows))
     try:
         Image.fromarray(canvas.finished()).save(path)

@@ -26,8 +26,8 @@ def nearest_rotation(M: Tensor) -> Tensor:
     """
     check_tail("M", M, 3, 3)
     finite = M.isfinite().all(-1).all(-1)[..., None, None]
-    eye = torch.eye(3, dtype=M.dtype, device=M.device)
-    M = torch.where(finite, M, eye)
+    view = torch.eye(3, dtype=M.dtype, device=M.device)
+    M = torch.where(finite, M, view)
     U, S, Vh = torch.linalg.svd(M.detach())
     # The determinant's sign goes to the smallest singular value and its direction.
     sign = torch.linalg.det(U @ Vh).sign()[..., None]

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from sphereorient.cameras.whole_file import read_whole
 from sphereorient.errors import ShapeError, TextureError, check_tail, refusal
-from sphereorient.sphere.picture_claim import claimed_pixels, decoded_grey
+from sphereorient.files.picture_claim import claimed_pixels, decoded_grey
+from sphereorient.files.whole_file import read_whole
 
 PICTURE_BYTES = 100_000_000
 MOST_PIXELS = 2**25  # 8192 x 4096: finer than a ball of 2600 px shows it

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from sphereorient.cameras.yaml_file import refuse_unknown
 from sphereorient.errors import SettingsError, refusal
+from sphereorient.files.yaml_file import refuse_unknown
 
 LEVELS = (1, 2, 3, 4, 5)
 Place = Literal["scene", "map", "picture", "movie", "told"]
@@ -146,7 +146,7 @@ _TABLE = (
         unit="px of sigma",
         does="The lens is out of focus: a Gaussian on top of the optics' own.",
         values=(0.7, 1.5, 3.0, 6.0, 10.0),
-        reason="focus set by eye; at 10 patches of 16 px, the default ball's, keep a sixth of their contrast",
+        reason="focus set by view; at 10 patches of 16 px, the default ball's, keep a sixth of their contrast",
         nothing=0.0,
         where="picture",
     ),

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.orient import Candidates
+from sphereorient.search import Candidates
 from sphereorient.trajectory import Reason
 
 RATE_HZ = 600.0

@@ -13,7 +13,7 @@ from conftest import assert_close
 from sphereorient import so3
 from sphereorient.assemble import AssembleSettings, Path, assemble_path, assemble_paths
 from sphereorient.errors import ShapeError
-from sphereorient.orient import Candidates
+from sphereorient.search import Candidates
 from sphereorient.trajectory import Reason
 
 SETTINGS = AssembleSettings()

@@ -11,7 +11,7 @@ import torch
 from camera_examples import ROTVEC, SIZE, T_MM, brown, f64, turned
 from conftest import assert_close
 
-from sphereorient.cameras.opencv_file import load_opencv, save_opencv
+from sphereorient.cameras.io.opencv import load_opencv, save_opencv
 from sphereorient.errors import CameraError, OutputError
 
 K = np.array([[700.0, 0, 331], [0, 715, 228.5], [0, 0, 1]])

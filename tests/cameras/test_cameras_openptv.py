@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sphereorient.cameras import PortCamera
-from sphereorient.cameras.openptv import PtvPar, load_openptv, load_ptv_par, par_of, save_openptv, save_ptv_par
+from sphereorient.cameras.io.openptv import PtvPar, load_openptv, load_ptv_par, par_of, save_openptv, save_ptv_par
 from sphereorient.cameras.openptv_camera import OpenPTVCamera
 from sphereorient.errors import CameraError, OutputError
 

@@ -14,12 +14,12 @@ from conftest import REPO, assert_close
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.assemble.differentiable import SoftTrack, soft_track, turning_costs
 from sphereorient.cameras import PinholeCamera, Rays
 from sphereorient.cameras.parameters import with_parameters
-from sphereorient.differentiable import SoftTrack, soft_track, turning_costs
 from sphereorient.errors import SettingsError, ShapeError
-from sphereorient.orient.implicit import implicit_pose
-from sphereorient.orient.soft_picture import PaintedBall, expected_grey
+from sphereorient.pose.implicit import implicit_pose
+from sphereorient.pose.soft_picture import PaintedBall, expected_grey
 
 FRAMES, SIDE, NOISE = 4, 19, 3.0
 EMPTY = 2  # a frame without a picture

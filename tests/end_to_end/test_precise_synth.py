@@ -29,12 +29,13 @@ from precise_examples import (
     write,
 )
 
-from sphereorient import precise, so3
+from sphereorient import so3
 from sphereorient.errors import ExperimentError
 from sphereorient.evaluate import score_track
+from sphereorient.follow import BlockTracker, Poses
 from sphereorient.locate import Shot
-from sphereorient.orient import BlockTracker, Poses
-from sphereorient.pipeline import track_movies
+from sphereorient.methods import precise
+from sphereorient.run.track import track_movies
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
 EXCERPT = REPO / "synthetic_data" / "excerpt"

@@ -16,14 +16,14 @@ from sphereorient import track_movies
 from sphereorient.cli.app import app
 from sphereorient.errors import CheckpointError, ShapeError
 from sphereorient.evaluate import score_track
+from sphereorient.files.provenance import sha256
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
 from sphereorient.learn.pictures import film_with
 from sphereorient.learn.proposer import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.learn.settings import PictureSettings
-from sphereorient.orient import DoubtProposer, GreySearch
-from sphereorient.proposers import paper_proposer, precise_proposer
-from sphereorient.provenance import sha256
-from sphereorient.settings import Settings, load_settings
+from sphereorient.methods.proposers import paper_proposer, precise_proposer
+from sphereorient.methods.settings import Settings, load_settings
+from sphereorient.search import FallbackProposer, GreySearch
 from sphereorient.so3 import geodesic_distance, random_rotations
 from sphereorient.synth import random_texture
 from sphereorient.trajectory import Reason, Trajectory
@@ -136,8 +136,8 @@ def test_settings_choose_who_proposes(texture: torch.Tensor) -> None:
     assert isinstance(precise_proposer(texture, alone), LearnedProposer)
     assert isinstance(paper_proposer(texture, 60, alone), LearnedProposer)
     both = load_settings(None, ["propose.checkpoint=default"])
-    assert isinstance(precise_proposer(texture, both), DoubtProposer)
-    assert isinstance(paper_proposer(texture, 60, both), DoubtProposer)
+    assert isinstance(precise_proposer(texture, both), FallbackProposer)
+    assert isinstance(paper_proposer(texture, 60, both), FallbackProposer)
 
 
 @pytest.mark.parametrize("content", [None, b"nothing of the kind"])

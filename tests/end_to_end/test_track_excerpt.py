@@ -18,9 +18,9 @@ import yaml
 from conftest import REPO
 
 from sphereorient.evaluate import score_track
+from sphereorient.methods.settings import load_settings
 from sphereorient.movies import open_movie, write_ffv1
-from sphereorient.pipeline import track_movies
-from sphereorient.settings import load_settings
+from sphereorient.run.track import track_movies
 from sphereorient.trajectory import Flag, Trajectory
 
 EXCERPT = REPO / "synthetic_data" / "excerpt"

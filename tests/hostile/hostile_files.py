@@ -24,10 +24,10 @@ sys.path.append(str(REPO / "tests" / "movies"))
 from cine_writer import Cine, write_cine
 from movie_examples import encode
 
-from sphereorient.locate import load_background
+from sphereorient.experiment.given import load_background
+from sphereorient.experiment.timeline import load_times
 from sphereorient.movies import open_movie, readable
 from sphereorient.sphere import load_texture
-from sphereorient.timeline import load_times
 from sphereorient.trajectory import CameraTrack, Trajectory
 
 HUGE = [(0, 0), (1, 0), (16, 8), (32, 16), (65_536, 32_768), (10**6, 5 * 10**5), (2**31 - 1, 2**30), (2**31, 2**30)]

@@ -19,13 +19,13 @@ from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 from pydantic import BaseModel
 
-from sphereorient.calibrate import load_calibration
-from sphereorient.calibrate.points import read_points
+from sphereorient.calibration import load_calibration
+from sphereorient.calibration.points import read_points
 from sphereorient.cameras import load_cameras, load_covariance
-from sphereorient.cameras.opencv_file import load_opencv
-from sphereorient.cameras.openptv import PtvPar, load_openptv, load_ptv_par
+from sphereorient.cameras.io.opencv import load_opencv
+from sphereorient.cameras.io.openptv import PtvPar, load_openptv, load_ptv_par
 from sphereorient.experiment import load_experiment
-from sphereorient.settings import load_settings, load_synth_settings
+from sphereorient.methods.settings import load_settings, load_synth_settings
 
 Generated = SearchStrategy[Case]
 

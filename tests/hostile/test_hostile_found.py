@@ -14,16 +14,16 @@ from hostile_files import bomb_png, encoded, pattern, png, tiff
 from hostile_kinds import BOMBS
 from hostile_texts import OPENCV, ORI, PAR, PINHOLE, calibration_documents, camera, cameras_documents, points_family
 
-from sphereorient.calibrate import load_calibration
-from sphereorient.calibrate.points import read_points
+from sphereorient.calibration import load_calibration
+from sphereorient.calibration.points import read_points
 from sphereorient.cameras import Camera, load_cameras
-from sphereorient.cameras.bounded_yaml import parse_yaml
-from sphereorient.cameras.opencv_file import load_opencv
-from sphereorient.cameras.openptv import load_openptv, load_ptv_par
-from sphereorient.cameras.whole_file import read_whole
+from sphereorient.cameras.io.opencv import load_opencv
+from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par
 from sphereorient.errors import CameraError, ExperimentError, SettingsError, TextureError
-from sphereorient.locate import load_background
-from sphereorient.settings import load_settings
+from sphereorient.experiment.given import load_background
+from sphereorient.files.bounded_yaml import parse_yaml
+from sphereorient.files.whole_file import read_whole
+from sphereorient.methods.settings import load_settings
 from sphereorient.sphere import load_texture
 
 

@@ -17,7 +17,7 @@ from sphereorient.learn.density import first_right, tops_of
 from sphereorient.learn.judge import cross_entropy, logits_of
 from sphereorient.learn.network import SCALES, Correlator, map_blurs
 from sphereorient.learn.pictures import Lesson
-from sphereorient.sphere.paint_table import octahedral_directions
+from sphereorient.sphere.texture_table import octahedral_directions
 from sphereorient.synth.textures import map_directions, random_texture
 
 SIDE = 32

@@ -11,10 +11,11 @@ import torch
 from locate_examples import BACK, DIAMETER, SETTINGS, SHAPE, blobs, even_background, filmed, looking_down, plant
 
 from sphereorient.errors import ExperimentError
-from sphereorient.locate import find_ball, load_mask
+from sphereorient.experiment.given import load_mask
+from sphereorient.locate import find_ball
+from sphereorient.locate.fixed import fixed_ball
 from sphereorient.locate.learn import learn_background
-from sphereorient.orient.pixels import LinesOfSight, cut_pixels, disk_stencil
-from sphereorient.paint.fixed import fixed_ball
+from sphereorient.pose.pixels import LinesOfSight, cut_pixels, disk_stencil
 
 MIDDLE = (99.37, 84.81)
 LOW = int(MIDDLE[1] - 2)  # a cup that fits the ball hides it from this row on

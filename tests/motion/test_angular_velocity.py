@@ -162,8 +162,8 @@ def test_a_lost_frame_costs_its_neighbours_one_separation_only() -> None:
 
 
 def test_a_jump_between_segments_is_no_turn() -> None:
-    eye = torch.eye(3, dtype=torch.float64)
-    R = torch.cat([spinning([0.0, 0, 5], eye, 6), spinning([0.0, 0, 5], quarter_turn([1.0, 0, 0]), 6)])
+    view = torch.eye(3, dtype=torch.float64)
+    R = torch.cat([spinning([0.0, 0, 5], view, 6), spinning([0.0, 0, 5], quarter_turn([1.0, 0, 0]), 6)])
     omega, _ = omega_from_orientations(R, DT, [1, 2], segment=torch.tensor([0] * 6 + [1] * 6))
     assert omega.isnan().any(-1).nonzero().flatten().tolist() == [0, 5, 6, 11]
     seen = omega[omega.isfinite().all(-1)]

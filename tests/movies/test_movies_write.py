@@ -7,8 +7,8 @@ import pytest
 from movie_examples import FRAMES, pictures
 
 from sphereorient.errors import MovieError, OutputError
+from sphereorient.experiment.timeline import load_times
 from sphereorient.movies import open_movie, readable, write_movie
-from sphereorient.timeline import load_times
 
 
 @pytest.mark.parametrize("suffix", ["mkv", "h5", "hdf5"])

@@ -13,10 +13,10 @@ from preflight_examples import PAINTED, Example, checked, clean_example, of
 
 from sphereorient import so3
 from sphereorient.errors import TextureError
-from sphereorient.orient.settings import GreySearchSettings
 from sphereorient.preflight import Severity
 from sphereorient.preflight.alike import Alike, look_alikes, most_alike, spread_directions, towards
 from sphereorient.preflight.paint import measure_paint, paint
+from sphereorient.search.settings import GreySearchSettings
 from sphereorient.synth.textures import map_directions, random_texture
 
 FAULT, WARNING, OK = Severity.FAULT, Severity.WARNING, Severity.OK

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from sphereorient.cameras import PinholeCamera, Port, PortCamera, triangulate
 from sphereorient.cameras.telecentric import TelecentricCamera
+from sphereorient.experiment.stream import pictures_of
 from sphereorient.locate import Background
 from sphereorient.locate.outline import Outline
 from sphereorient.preflight import Finding, Severity
@@ -25,7 +26,6 @@ from sphereorient.preflight.finding import worst
 from sphereorient.preflight.gap import gaps_between
 from sphereorient.preflight.look import pair_starts, sample_frames
 from sphereorient.preflight.offset import REACH, Steps, gap_by_offset, started
-from sphereorient.reel import pictures_of
 
 
 def f64(value: object) -> torch.Tensor:
@@ -168,7 +168,9 @@ class Sevens:
 
 
 def test_rows_are_read_in_order_with_gaps_where_there_is_no_picture(monkeypatch):
-    monkeypatch.setattr("sphereorient.reel.readable", lambda movie, first, last: movie.readable(first, last))
+    monkeypatch.setattr(
+        "sphereorient.experiment.stream.readable", lambda movie, first, last: movie.readable(first, last)
+    )
     rows = np.array([3, 4, 5, -1, 7, 8, 20, -1, -1, 30])
     read = [None if one is None else int(one[0, 0]) for one in pictures_of(Sevens(), rows)]
     assert read == [3, 4, 5, None, None, 8, 20, None, None, 30]

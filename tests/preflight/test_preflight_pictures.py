@@ -12,8 +12,8 @@ from conftest import REPO, SHARED
 from preflight_examples import Example, checked, clean_example, complaints, of, write
 
 from sphereorient.errors import MovieError
+from sphereorient.methods.settings import load_settings
 from sphereorient.preflight import Severity, preflight
-from sphereorient.settings import load_settings
 
 FAULT, WARNING, OK = Severity.FAULT, Severity.WARNING, Severity.OK
 

@@ -29,8 +29,8 @@ K = 20  # a frame
 def ready():
     """The page of the true track, the pictures of frame 20, and the model of each camera."""
     with ExitStack() as opened:
-        page, reels = prepared(true_track(), excerpt(), None, opened)
-        pictures = {name: next(pictures_at(reel, np.array([K]))) for name, reel in reels.items()}
+        page, streams = prepared(true_track(), excerpt(), None, opened)
+        pictures = {name: next(pictures_at(stream, np.array([K]))) for name, stream in streams.items()}
         yield page, pictures
 
 
@@ -255,12 +255,12 @@ def test_the_movie_is_h264_that_players_show(tmp_path):
 def test_a_part_of_the_track_shows_its_own_frames(tmp_path):
     """The clock does not restart: frame 12 of the experiment is row 0 of a track of frames 12 to 29."""
     with ExitStack() as opened:
-        whole, reels = prepared(true_track(("cam1",)), excerpt(), None, opened)
+        whole, streams = prepared(true_track(("cam1",)), excerpt(), None, opened)
         part, of_part = prepared(true_track(("cam1",), 12, 30), excerpt(), None, opened)
         assert part.numbers.tolist() == list(range(12, 30))
         assert whole.numbers.tolist() == list(range(40))
         first = next(pictures_at(of_part["cam1"], np.array([0])))
-        np.testing.assert_array_equal(first, next(pictures_at(reels["cam1"], np.array([12]))))
+        np.testing.assert_array_equal(first, next(pictures_at(streams["cam1"], np.array([12]))))
     with pytest.raises(TrackError, match=r"--frames: expected frames within 12:30, got 30:; correct --frames"):
         overlay_movie(true_track(("cam1",), 12, 30), excerpt(), tmp_path / "o.mp4", frames=(30, None))
 
@@ -322,8 +322,8 @@ def test_tracks_of_other_times_are_refused(tmp_path):
 def test_without_a_map_outline_and_axes_are_shown(tmp_path):
     """A ball whose paint is not known yet is drawn on all the same."""
     with ExitStack() as opened:
-        page, reels = prepared(true_track(("cam1",)), replace(excerpt(), texture_path=None), None, opened)
-        picture = next(pictures_at(reels["cam1"], np.array([K])))
+        page, streams = prepared(true_track(("cam1",)), replace(excerpt(), texture_path=None), None, opened)
+        picture = next(pictures_at(streams["cam1"], np.array([K])))
     assert page.views[0].light is None
     drawn = page.draw(K, {"cam1": picture})
     assert (np.abs(drawn.astype(int) - OUTLINE) < 40).all(-1).sum() > 300

@@ -12,7 +12,13 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.sphere import sample_texture
-from sphereorient.sphere.paint_table import BASE_RAD, PaintTable, octahedral_cells, octahedral_directions, paint_table
+from sphereorient.sphere.texture_table import (
+    BASE_RAD,
+    TextureTable,
+    octahedral_cells,
+    octahedral_directions,
+    texture_table,
+)
 from sphereorient.synth import random_texture
 
 HEIGHT = 256
@@ -30,12 +36,12 @@ def map_of(kind: str) -> Tensor:
 
 
 @cache
-def base_of(kind: str) -> PaintTable:
-    return paint_table(map_of(kind), BASE_RAD)
+def base_of(kind: str) -> TextureTable:
+    return texture_table(map_of(kind), BASE_RAD)
 
 
 @cache
-def table_of(kind: str, blur_rad: float) -> PaintTable:
+def table_of(kind: str, blur_rad: float) -> TextureTable:
     return base_of(kind).blurred(blur_rad)
 
 
@@ -45,9 +51,9 @@ def directions(count: int, seed: int = 1) -> Tensor:
     return torch.nn.functional.normalize(drawn, dim=-1)
 
 
-def looked(table: PaintTable, at: Tensor) -> tuple[Tensor, Tensor]:
+def looked(table: TextureTable, at: Tensor) -> tuple[Tensor, Tensor]:
     """Value (M,) and slope (M, 3) at directions (M, 3)."""
-    value, slope = table.look(at.float().T[None])
+    value, slope = table.sample(at.float().T[None])
     return value[0].double(), slope[0].T.double()
 
 
@@ -109,7 +115,7 @@ def harmonic(at: Tensor) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("blur_rad", [0.017, 0.03, 0.1])
 def test_a_harmonic_fades_by_its_degree_and_its_slope_with_it(blur_rad):
     # The Gaussian on the sphere multiplies degree n by exp(-n (n + 1) blur^2 / 2).
-    table = paint_table(harmonic_map(), blur_rad)
+    table = texture_table(harmonic_map(), blur_rad)
     fades = math.exp(-0.5 * 6 * 7 * blur_rad**2)
     middles = octahedral_directions(table.side)[:: 7 * table.side // 64]
     for at, slope_error in ((directions(400, 2), 5.0 * FAR / table.side), (middles, 0.04)):
@@ -121,7 +127,7 @@ def test_a_harmonic_fades_by_its_degree_and_its_slope_with_it(blur_rad):
 
 
 def test_even_paint_stays_even_and_has_no_slope():
-    table = paint_table(torch.full((64, 128), 0.7), 0.05, 128)
+    table = texture_table(torch.full((64, 128), 0.7), 0.05, 128)
     value, slope = looked(table, directions(500))
     assert_close(value, torch.full_like(value, 0.7), atol=1e-4)
     assert_close(slope, torch.zeros_like(slope), atol=1e-3)
@@ -151,7 +157,7 @@ def test_the_slope_is_how_the_blurred_map_changes(kind, blur_rad):
 @pytest.mark.parametrize("blur_rad", BLURS)
 def test_the_slope_is_the_gradient_of_the_value_that_is_returned(blur_rad):
     at = directions(300).float().T[None].requires_grad_()
-    value, slope = table_of("patches", blur_rad).look(at)
+    value, slope = table_of("patches", blur_rad).sample(at)
     (gradient,) = torch.autograd.grad(value.sum(), at)
     assert_close(gradient, slope.detach(), atol=0.0)
 
@@ -261,7 +267,7 @@ def test_a_map_that_is_turned_gives_a_table_that_is_turned():
     # A quarter turn about the pole is a shift of columns: the octahedron's faces change places.
     texture, at = map_of("patches"), directions(2000)
     quarter = so3.exp(torch.tensor([0.0, 0.0, math.pi / 2], dtype=torch.float64))
-    turned = paint_table(texture.roll(HEIGHT // 2, 1), 0.03)
+    turned = texture_table(texture.roll(HEIGHT // 2, 1), 0.03)
     value, slope = looked(table_of("patches", 0.03), at)
     value_t, slope_t = looked(turned, at @ quarter.mT)
     assert (value_t - value).square().mean().sqrt() < VALUE_RMS
@@ -278,15 +284,15 @@ def test_each_direction_is_looked_up_as_if_it_were_alone(shape):
     disks, places = shape
     at = directions(max(disks * places, 1))[: disks * places].float().reshape(disks, places, 3).movedim(-1, 1)
     table = table_of("patches", 0.03)
-    value, slope = table.look(at)
+    value, slope = table.sample(at)
     assert value.shape == (disks, places)
     assert slope.shape == (disks, 3, places)
     for k in range(disks):
         for p in range(places):
-            one_value, one_slope = table.look(at[k : k + 1, :, p : p + 1])
+            one_value, one_slope = table.sample(at[k : k + 1, :, p : p + 1])
             assert one_value.item() == value[k, p].item()
             assert one_slope[0, :, 0].equal(slope[k, :, p])
 
 
 def test_the_same_map_gives_the_same_table():
-    assert paint_table(map_of("dots"), 0.02, 128).rows.equal(paint_table(map_of("dots"), 0.02, 128).rows)
+    assert texture_table(map_of("dots"), 0.02, 128).rows.equal(texture_table(map_of("dots"), 0.02, 128).rows)

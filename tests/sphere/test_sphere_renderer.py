@@ -39,7 +39,7 @@ def test_turning_the_body_about_the_line_of_sight_turns_the_picture(rng):
     view = orthographic_view(20, torch.float64)
     render = SphereRenderer(random_map(rng), view)
     R_view_body = so3.random_rotations((), generator=rng)
-    # z points away from the camera, y down: a turn by +90 degrees takes right to down, clockwise for the eye.
+    # z points away from the camera, y down: a turn by +90 degrees takes right to down, clockwise for the view.
     turned = render(so3.exp(f64([0, 0, math.pi / 2])) @ R_view_body)
     assert_close(turned, render(R_view_body).rot90(-1), atol=1e-12)
 

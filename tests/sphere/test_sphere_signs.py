@@ -11,7 +11,7 @@ from sphere_examples import R_CAM_LAB_ALONG_Y, f64, map_with_three_dots, templat
 
 from sphereorient import so3
 from sphereorient.cameras import PinholeCamera, R_cam_view
-from sphereorient.orient import crop_disk
+from sphereorient.search import crop_disk
 from sphereorient.sphere import SphereRenderer, orthographic_view, perspective_view, sample_texture, sphere_normals
 from sphereorient.synth import random_texture
 

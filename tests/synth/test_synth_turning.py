@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, R_cam_view
-from sphereorient.orient import OrientSettings, TemplateSearch, crop_disk
+from sphereorient.search import OrientSettings, TemplateSearch, crop_disk
 from sphereorient.synth import SynthSettings, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
 

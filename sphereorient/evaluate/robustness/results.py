@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sphereorient.errors import BenchError, refusal
 from sphereorient.evaluate.robustness.measure import FIRST, Outcome
 from sphereorient.evaluate.robustness.settings import BenchSettings
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 
 SCHEMA = "sphereorient-robustness/1"
 Floats = NDArray[np.float64]

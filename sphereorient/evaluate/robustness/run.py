@@ -17,9 +17,9 @@ from sphereorient.evaluate.robustness.measure import Outcome, measure, no_track
 from sphereorient.evaluate.robustness.results import SCHEMA, Results, as_tree, from_tree, save_results
 from sphereorient.evaluate.robustness.scenes import Scene, scenes_of, write_scene
 from sphereorient.evaluate.robustness.settings import BenchSettings
-from sphereorient.outputs import put_aside
-from sphereorient.provenance import versions
-from sphereorient.settings import Settings
+from sphereorient.files.outputs import put_aside
+from sphereorient.files.provenance import versions
+from sphereorient.methods.settings import Settings
 from sphereorient.trajectory import Trajectory
 
 Tracker = Callable[[Path], Trajectory]  # experiment.yaml to a track; must go through pickle
@@ -29,21 +29,21 @@ PLAN, RESULTS, KEPT = "plan.json", "results.json", "scenes"
 
 def precise(experiment: Path) -> Trajectory:
     """Track with `--method precise`."""
-    from sphereorient.pipeline import track_movies
+    from sphereorient.run.track import track_movies
 
     return track_movies(experiment, method="precise", settings=Settings())
 
 
 def paper(experiment: Path) -> Trajectory:
     """Track with `--method paper`."""
-    from sphereorient.pipeline import track_movies
+    from sphereorient.run.track import track_movies
 
     return track_movies(experiment, method="paper", settings=Settings())
 
 
 def precise_network(experiment: Path) -> Trajectory:
     """Track with `--method precise --proposer default`."""
-    from sphereorient.pipeline import track_movies
+    from sphereorient.run.track import track_movies
 
     return track_movies(experiment, method="precise", settings=Settings(), proposer="default")
 

@@ -13,7 +13,7 @@ import matplotlib.style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from sphereorient.outputs import put_aside
+from sphereorient.files.outputs import put_aside
 from sphereorient.report.figure import AXIS_COLOURS
 
 P = ParamSpec("P")

@@ -1,0 +1,155 @@
+"""Print the rooms of the package, what each imports, and every import that points downwards; draw the picture.
+
+.venv/bin/python scripts/rooms.py            # prints; exits 1 where an import points downwards or in a circle
+.venv/bin/python scripts/rooms.py --write    # also writes the list and the picture of CONTRIBUTING.md
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+REPO = Path(__file__).resolve().parents[1]
+PACKAGE = REPO / "sphereorient"
+# A room imports only from those before it.
+ORDER = [
+    "errors",
+    "files",
+    "so3",
+    "cameras",
+    "movies",
+    "sphere",
+    "trajectory",
+    "calibration",
+    "experiment",
+    "locate",
+    "pose",
+    "search",
+    "follow",
+    "assemble",
+    "motion",
+    "synth",
+    "statistics",
+    "learn",
+    "mapping",
+    "methods",
+    "run",
+    "preflight",
+    "evaluate",
+    "report",
+    "tools",
+    "cli",
+]
+
+
+def modules() -> dict[str, Path]:
+    """Return the modules of the package by dotted name without the package's."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imports(path: Path, known: dict[str, Path]) -> set[str]:
+    """Return the modules of the package that a file imports anywhere, without the package's name."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            raise SystemExit(
+                f"{path}: expected imports from sphereorient in full, got a relative one; write it in full."
+            )
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "sphereorient":
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}".removeprefix("sphereorient.")
+                names.add(whole if whole in known else str(node.module).removeprefix("sphereorient").removeprefix("."))
+        elif isinstance(node, ast.Import):
+            names |= {a.name.removeprefix("sphereorient.") for a in node.names if a.name.startswith("sphereorient.")}
+    return names - {""}
+
+
+def room(module: str) -> str:
+    """Return the room that a module is in."""
+    return module.split(".")[0]
+
+
+def arrows() -> dict[str, set[str]]:
+    """Return the rooms that each room imports."""
+    known = modules()
+    found: dict[str, set[str]] = defaultdict(set)
+    for name, path in known.items():
+        if name:  # the front door hands out names of all rooms, on demand
+            found[room(name)] |= {room(other) for other in imports(path, known)} - {room(name)}
+    return found
+
+
+def downward() -> list[str]:
+    """Return the imports that do not point to an earlier room."""
+    known, found = modules(), []
+    for name, path in known.items():
+        if not name:
+            continue
+        for other in sorted(imports(path, known)):
+            if room(name) not in ORDER or room(other) not in ORDER:
+                found.append(f"{name} -> {other} (not a room)")
+            elif ORDER.index(room(other)) > ORDER.index(room(name)):
+                found.append(f"{name} -> {other}")
+    return found
+
+
+def circles() -> list[str]:
+    """Return the modules that import each other in a circle."""
+    known = modules()
+    graph = {name: imports(path, known) & known.keys() - {name} for name, path in known.items() if name}
+    left = {name: set(others) for name, others in graph.items()}
+    while free := [name for name, others in left.items() if not others & left.keys()]:
+        for name in free:
+            del left[name]
+    return sorted(left)
+
+
+def lines(name: str) -> tuple[int, int]:
+    """Return the lines of a room, and those of them that are code: no blank line, comment or docstring."""
+    total = code = 0
+    for path in PACKAGE.rglob("*.py"):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        if parts[0] != name:
+            continue
+        text = path.read_text()
+        quiet = set()
+        for node in ast.walk(ast.parse(text)):
+            if (
+                isinstance(node, ast.Expr)
+                and isinstance(node.value, ast.Constant)
+                and isinstance(node.value.value, str)
+            ):
+                quiet |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+        rows = text.splitlines()
+        total += len(rows)
+        code += sum(
+            bool(row.strip()) and not row.strip().startswith("#") and k not in quiet for k, row in enumerate(rows, 1)
+        )
+    return total, code
+
+
+def main() -> int:
+    """Print all; return 1 where the rooms are not a line."""
+    found, whole = arrows(), [0, 0]
+    print(f"{'room':12} {'lines':>6} {'code':>6}  imports")
+    for name in ORDER:
+        total, code = lines(name)
+        whole = [whole[0] + total, whole[1] + code]
+        print(f"{name:12} {total:6} {code:6}  {' '.join(sorted(found[name], key=ORDER.index))}")
+    front = len((PACKAGE / "__init__.py").read_text().splitlines())
+    print(f"{'all':12} {whole[0] + front:6} {whole[1]:6}")
+    wrong, round_ = downward(), circles()
+    for arrow in wrong:
+        print(f"downward: {arrow}")
+    print(f"downward imports: {len(wrong)}; modules in circles: {len(round_)} {' '.join(round_)}")
+    return int(bool(wrong or round_))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,28 @@
+"""Cameras from pictures of a plate, from points, and from the sphere itself."""
+
+from sphereorient.calibration.bias import disk_centre_shift
+from sphereorient.calibration.document import load_calibration
+from sphereorient.calibration.entry import plate_from_entry
+from sphereorient.calibration.placing import placed
+from sphereorient.calibration.plate import DotPlate
+from sphereorient.calibration.plates import Calibrated, PictureReport, calibrate_cameras
+from sphereorient.calibration.see import see_plate
+from sphereorient.calibration.sphere import check_cameras, refine_with_track
+from sphereorient.calibration.systematic import systematic_errors
+from sphereorient.calibration.view import PlateView
+
+__all__ = [
+    "Calibrated",
+    "DotPlate",
+    "PictureReport",
+    "PlateView",
+    "calibrate_cameras",
+    "check_cameras",
+    "disk_centre_shift",
+    "load_calibration",
+    "placed",
+    "plate_from_entry",
+    "refine_with_track",
+    "see_plate",
+    "systematic_errors",
+]

@@ -1,0 +1,1 @@
+"""Camera files: our YAML, OpenCV, OpenPTV."""

@@ -1,0 +1,219 @@
+"""OpenCV's calibration files (FileStorage: .yml, .yaml, .xml, .json), read and written."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient.cameras.brown import BrownCamera
+from sphereorient.errors import CameraError, OutputError, refusal
+from sphereorient.files.whole_file import TEXT_BYTES, read_whole
+from sphereorient.files.yaml_file import short
+
+SUFFIXES = (".yml", ".yaml", ".xml", ".json")  # by them OpenCV chooses the format
+MOST = 64  # numbers of a matrix that is read: OpenCV makes room for what the file claims before it counts
+# OpenCV's parser calls itself for each level, down to a crash. No level without one of these; its files have dozens.
+OPENER = re.compile(rb"[\[{]|-\s|<[^/?!]")
+MOST_OPENERS, MOST_BLANKS = 3000, 200  # the second: levels that indentation makes
+LENGTHS = (4, 5, 8, 12, 14)  # of distortion_coefficients, in OpenCV's order k1 k2 p1 p2 k3 ...
+
+Array = NDArray[np.float64]
+
+
+def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> BrownCamera:
+    """Read a camera that OpenCV's calibration has written.
+
+    Args:
+        path: with `camera_matrix` and `distortion_coefficients`, and optionally `R` or `rvec`, `T` or `tvec` (taken as
+            mm; without them the lab is the camera frame), `image_width` and `image_height`.
+        image_size: (W, H), px, for files that do not say it.
+
+    Raises:
+        CameraError: missing or not of OpenCV's making, a key that is missing or no camera's, a camera matrix with
+            shear, or a distortion beyond k1, k2, p1, p2, k3.
+
+    Source: the sample programs' keys; pixels count as ours do, the first one's centre is (0, 0).
+    """
+    path = Path(path)
+    storage = _opened(path)
+    try:
+        K = _matrix(storage, path, "camera_matrix", (3, 3))
+        coefficients = _coefficients(storage, path)
+        R = _rotation(storage, path)
+        T = _optional(storage, ("T", "tvec"), path, 3)
+        size = _size(storage, path, image_size)
+    finally:
+        storage.release()
+    if K[0, 1] != 0 or K[1, 0] != 0 or not np.allclose(K[2], (0, 0, 1)):
+        expected = "fx and fy on the diagonal, cx and cy in the last column, zeros and a one elsewhere"
+        raise _refused(path, "camera_matrix", expected, short(K.round(6).tolist()), "calibrate without shear")
+    try:
+        return BrownCamera(
+            image_size=size,
+            R_cam_lab=_tensor(R),
+            T_cam_lab_mm=_tensor(np.zeros(3) if T is None else T),
+            centre_px=_tensor(K[:2, 2]),
+            f_px=_tensor(K[[0, 1], [0, 1]]),
+            k=_tensor(coefficients[[0, 1, 4]]),
+            p=_tensor(coefficients[[2, 3]]),
+        )
+    except CameraError as error:
+        raise CameraError(f"{path}, {error}") from None
+
+
+def save_opencv(path: Path | str, camera: BrownCamera) -> None:
+    """Write a camera as OpenCV's calibration does, to the last bit.
+
+    Args:
+        path: ending in .yml, .yaml, .xml or .json, which chooses the format.
+        camera: its T is written in mm. What OpenCV has no key for, the covariance, stays out.
+
+    Raises:
+        OutputError: another ending, or a file that cannot be written.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise OutputError(_line(path, f"a name ending in {', '.join(SUFFIXES)}", f"'{path.suffix}'", "rename it"))
+    (fx, fy), (cx, cy) = camera.f_px.tolist(), camera.centre_px.tolist()
+    (k1, k2, k3), (p1, p2) = camera.k.tolist(), camera.p.tolist()
+    if not path.parent.is_dir():  # asked first: OpenCV prints to the terminal when it fails
+        raise OutputError(_line(path, "a file in a folder that exists", f"'{path.parent}'", "make the folder first"))
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    if not storage.isOpened():
+        do = "choose a folder that may be written"
+        raise OutputError(_line(path, "a file that can be written", "one that cannot", do))
+    storage.write("image_width", camera.image_size[0])
+    storage.write("image_height", camera.image_size[1])
+    storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    storage.write("distortion_coefficients", np.array([[k1], [k2], [p1], [p2], [k3]]))
+    storage.write("R", camera.R_cam_lab.detach().numpy())
+    storage.write("T", camera.T_cam_lab_mm.detach().numpy()[:, None])
+    storage.release()
+
+
+def _opened(path: Path) -> cv2.FileStorage:
+    expected = "a file of OpenCV's FileStorage"
+    content = read_whole(path, TEXT_BYTES, expected, CameraError, "correct the path")
+    if len(OPENER.findall(content)) > MOST_OPENERS or re.search(rb"[ \t]{%d}" % MOST_BLANKS, content):
+        got, do = "one with thousands of lists, tags or levels", "name the file of one camera"
+        raise CameraError(_line(path, expected, got, do))
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError):  # SystemError: how a parser's fault comes out of the constructor
+        storage = None
+    if storage is None or not storage.isOpened() or not storage.root().isMap():
+        raise CameraError(_line(path, expected, "another", "write it with cv2.FileStorage"))
+    return storage
+
+
+def _node(storage: cv2.FileStorage, key: str) -> Array | None:
+    node = storage.getNode(key)
+    if node.empty() or not node.isMap():
+        return None
+    if not _claims_few(node):
+        return None
+    try:
+        matrix = node.mat()
+    except cv2.error:
+        return None
+    return None if matrix is None or matrix.size > MOST else np.asarray(matrix, np.float64)
+
+
+def _claims_few(node: cv2.FileNode) -> bool:
+    """Tell whether a matrix claims no more than MOST numbers, by its rows and columns or by the sizes of its axes."""
+    axes = node.getNode("sizes")
+    if axes.empty():
+        sides = [_whole(node.getNode(side)) for side in ("rows", "cols")]
+    else:
+        sides = [_whole(axes.at(k)) for k in range(axes.size())] if axes.isSeq() and axes.size() < 4 else [_whole(axes)]
+    known = [side for side in sides if side is not None and 0 < side <= MOST]
+    return len(known) == len(sides) and math.prod(known) <= MOST
+
+
+def _whole(node: cv2.FileNode) -> int | None:
+    """Return a whole number; None for anything else."""
+    if not (node.isInt() or node.isReal()):
+        return None
+    number = float(node.real())
+    return int(number) if number.is_integer() else None
+
+
+def _matrix(storage: cv2.FileStorage, path: Path, key: str, shape: tuple[int, int]) -> Array:
+    matrix = _node(storage, key)
+    if matrix is None:
+        if _node(storage, "K1") is not None:
+            do = "split the stereo file into one file per camera"
+            raise _refused(path, key, "the matrix of one camera", "a stereo pair (K1, D1, ...)", do)
+        raise _refused(path, key, "an OpenCV matrix", "none", "calibrate with OpenCV, or name the file it wrote")
+    if matrix.shape != shape:
+        raise _refused(path, key, f"{shape[0]} x {shape[1]} numbers", str(matrix.shape), "correct the file")
+    return matrix
+
+
+def _coefficients(storage: cv2.FileStorage, path: Path) -> Array:
+    key = "distortion_coefficients"
+    found = _node(storage, key)
+    if found is None:
+        raise _refused(path, key, "an OpenCV matrix", "none", "write five zeros where there is no distortion")
+    flat = found.reshape(-1)
+    if len(flat) not in LENGTHS:
+        expected = f"{', '.join(map(str, LENGTHS[:-1]))} or {LENGTHS[-1]} numbers"
+        raise _refused(path, key, expected, str(len(flat)), "correct the file")
+    if np.any(flat[5:] != 0):
+        do = "calibrate without CALIB_RATIONAL_MODEL, CALIB_THIN_PRISM_MODEL and CALIB_TILTED_MODEL"
+        raise _refused(path, key, "k1, k2, p1, p2, k3 and nothing else", "further ones that are not 0", do)
+    return np.pad(flat, (0, 1))[:5] if len(flat) == 4 else flat[:5]
+
+
+def _rotation(storage: cv2.FileStorage, path: Path) -> Array:
+    for key in ("R", "rvec"):
+        found = _node(storage, key)
+        if found is None:
+            continue
+        if found.size == 3:
+            return np.asarray(cv2.Rodrigues(found.reshape(3, 1))[0], np.float64)
+        if found.shape == (3, 3):
+            return found
+        raise _refused(path, key, "a matrix of 3 x 3 or a vector of 3 numbers", str(found.shape), "correct the file")
+    return np.eye(3)
+
+
+def _optional(storage: cv2.FileStorage, keys: tuple[str, ...], path: Path, size: int) -> Array | None:
+    for key in keys:
+        found = _node(storage, key)
+        if found is not None and found.size != size:
+            raise _refused(path, key, f"{size} numbers", str(found.shape), "correct the file")
+        if found is not None:
+            return found.reshape(size)
+    return None
+
+
+def _size(storage: cv2.FileStorage, path: Path, image_size: tuple[int, int] | None) -> tuple[int, int]:
+    width, height = (_whole(storage.getNode(key)) or 0 for key in ("image_width", "image_height"))
+    if width > 0 and height > 0:
+        if image_size not in (None, (width, height)):
+            got = short((width, height))
+            raise _refused(path, "image_width, image_height", str(image_size), got, "correct one")
+        return width, height
+    if image_size is None:
+        raise _refused(path, "image_width, image_height", "two whole numbers", "none", "give image_size")
+    return image_size
+
+
+def _tensor(array: Array) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float64))
+
+
+def _refused(path: Path, key: str, expected: str, got: str, do: str) -> CameraError:
+    return CameraError(refusal(f"{path}, {key}", expected=expected, got=got, do=do))
+
+
+def _line(path: Path, expected: str, got: str, do: str) -> str:
+    return refusal(str(path), expected=expected, got=got, do=do)

@@ -1,0 +1,265 @@
+"""OpenPTV's calibration files: .ori and .addpar of a camera, ptv.par of all; read and written.
+
+Their pixels count from the picture's corner, so that the middle of the sensor is (W/2, H/2) and the first pixel's
+centre (0.5, 0.5), as OpenPTV's target detection has it; ours is (0, 0). Their camera looks along its -z with y up.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.cameras.camera import Camera
+from sphereorient.cameras.openptv_camera import OpenPTVCamera
+from sphereorient.cameras.pinhole import middle_of_picture
+from sphereorient.cameras.port import Port, PortCamera
+from sphereorient.errors import CameraError, OutputError, refusal
+from sphereorient.files.whole_file import TEXT_BYTES, read_whole
+from sphereorient.files.yaml_file import short
+
+ORI_PARTS = "centre, angles, matrix, xh yh cc, glass vector"
+ORI_NUMBERS = 21
+ADDPAR_PARTS = "k1 k2 k3 p1 p2 scx she"
+ADDPAR_NUMBERS = 7
+PAR_PARTS = "hp_flag allCam_flag tiff_flag imx imy pix_x pix_y chfield n1 n2 n3 d after the cameras' names"
+PAR_NUMBERS = 12
+NO_ADDPAR = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # what OpenPTV takes where there is no file
+
+
+@dataclass(frozen=True, kw_only=True)
+class PtvPar:
+    """What ptv.par says of all cameras together: the sensor, and the media between camera and liquid."""
+
+    image_size: tuple[int, int]  # W, H px
+    pixel_pitch_mm: tuple[float, float]
+    n_air: float = 1.0
+    n_glass: float = 1.0
+    n_fluid: float = 1.0
+    thickness_mm: float = 0.0
+
+    @property
+    def refracts(self) -> bool:
+        """Whether there is a wall; all indices equal to one switch it off in OpenPTV."""
+        return not self.n_air == self.n_glass == self.n_fluid
+
+
+def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None) -> Camera:
+    """Read a camera of OpenPTV.
+
+    Args:
+        ori: .ori file. Its matrix is not used: as in OpenPTV the angles count.
+        par: from `load_ptv_par`.
+        addpar: .addpar file; None: no distortion.
+
+    Returns:
+        An OpenPTVCamera, lab = OpenPTV's world, mm; behind a port where the media refract.
+
+    Raises:
+        CameraError: a file that is missing, truncated or not of numbers, or numbers that make no camera.
+
+    Source: OpenPTV's read_ori; dm = Rx(omega) Ry(phi) Rz(kappa), R_cam_lab = diag(1, -1, -1) dm^T.
+    """
+    ori = Path(ori)
+    v = _numbers(ori, _words(ori), ORI_NUMBERS, ORI_PARTS)
+    centre, angles, (xh, yh, cc), glass = v[:3], v[3:6], v[15:18], v[18:21]
+    k1, k2, k3, p1, p2, scx, she = NO_ADDPAR if addpar is None else _addpar(Path(addpar))
+    if scx != 1.0:
+        warnings.warn(f"{addpar}: scx = {scx:g} is read as x' = scx x, y' = y, OpenPTV's classic form.", stacklevel=2)
+    R_cam_lab = _axes() @ so3.from_tait_bryan(_tensor(angles)).mT
+    shift_px = _tensor((xh / par.pixel_pitch_mm[0], -yh / par.pixel_pitch_mm[1]))
+    try:
+        camera = OpenPTVCamera(
+            image_size=par.image_size,
+            R_cam_lab=R_cam_lab,
+            T_cam_lab_mm=-R_cam_lab @ _tensor(centre),
+            centre_px=middle_of_picture(par.image_size) + shift_px,
+            f_mm=_tensor(cc),
+            pixel_pitch_mm=_tensor(par.pixel_pitch_mm),
+            k=_tensor((k1, k2, k3)),
+            p=_tensor((p1, p2)),
+            scx=_tensor(scx),
+            she=_tensor(she),
+        )
+        return PortCamera(camera=camera, port=_port(glass, par)) if par.refracts else camera
+    except CameraError as error:
+        raise CameraError(f"{ori}, {error}") from None
+
+
+def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
+    """Write a camera as OpenPTV's .ori and .addpar, to the last digits.
+
+    Args:
+        ori: .ori file; an old one is replaced.
+        addpar: .addpar file; an old one is replaced.
+        camera: an OpenPTVCamera, behind a port or not. The port's indices and thickness go into ptv.par, see `par_of`.
+
+    Raises:
+        CameraError: another model, or a wall on whose liquid side the lab's origin does not lie.
+        OutputError: a file that cannot be written.
+    """
+    inner, glass = _openptv_of(camera), _glass_vector(camera)
+    dm = inner.R_cam_lab.detach().mT @ _axes()
+    angles = so3.to_tait_bryan(dm)
+    shift_mm = (inner.centre_px.detach() - middle_of_picture(inner.image_size)) * inner.pixel_pitch_mm.detach()
+    xh, yh = shift_mm[0], -shift_mm[1]
+    lines = [inner.centre_lab_mm.detach(), angles, *dm, torch.stack([xh, yh]), inner.f_mm.detach()[None], glass]
+    _write(Path(ori), "".join(_row(line) for line in lines))
+    parts = (inner.k, inner.p, inner.scx[None], inner.she[None])
+    _write(Path(addpar), _row(torch.cat([part.detach() for part in parts])))
+
+
+def load_ptv_par(path: Path | str) -> PtvPar:
+    """Read the sensor and the media from ptv.par.
+
+    Raises:
+        CameraError: a file that is missing, truncated, not of numbers, or of interlaced cameras.
+    """
+    path = Path(path)
+    words = _words(path, "\n")
+    count = words[0].strip() if words else ""
+    if not (count.isascii() and count.isdigit() and len(count) < 4):
+        do = "name OpenPTV's ptv.par"
+        raise CameraError(refusal(str(path), expected="the number of cameras first", got=short(count[:20]), do=do))
+    numbers = _numbers(path, words[1 + 2 * int(count) :], PAR_NUMBERS, PAR_PARTS)
+    imx, imy, pix_x, pix_y, chfield, n_air, n_glass, n_fluid, thickness_mm = numbers[3:]
+    if chfield != 0:
+        got, do = f"chfield {chfield:g}", "make whole frames of the fields first"
+        raise CameraError(refusal(str(path), expected="whole frames (chfield 0)", got=got, do=do))
+    if min(imx, imy, pix_x, pix_y, n_air, n_glass, n_fluid) <= 0:
+        expected, do = "sizes, pixels and indices above zero", f"correct them ({PAR_PARTS})"
+        raise CameraError(refusal(str(path), expected=expected, got="zero or less", do=do))
+    return PtvPar(
+        image_size=(int(imx), int(imy)),
+        pixel_pitch_mm=(pix_x, pix_y),
+        n_air=n_air,
+        n_glass=n_glass,
+        n_fluid=n_fluid,
+        thickness_mm=thickness_mm,
+    )
+
+
+def save_ptv_par(path: Path | str, par: PtvPar, names: Sequence[str]) -> None:
+    """Write ptv.par for cameras that share sensor and media.
+
+    Args:
+        path: the file; an old one is replaced.
+        par: from `par_of`.
+        names: of the cameras; their pictures are img/NAME. and cal/NAME.tif, as in OpenPTV's examples.
+
+    Raises:
+        OutputError: a file that cannot be written.
+    """
+    lines = [str(len(names))]
+    for name in names:
+        lines += [f"img/{name}.", f"cal/{name}.tif"]
+    lines += ["1", "0", "1", *map(str, par.image_size), *map(repr, par.pixel_pitch_mm), "0"]
+    lines += map(repr, (par.n_air, par.n_glass, par.n_fluid, par.thickness_mm))
+    _write(Path(path), "\n".join(lines) + "\n")
+
+
+def par_of(camera: Camera) -> PtvPar:
+    """Return what ptv.par has to say of a camera.
+
+    Raises:
+        CameraError: a camera of another model than OpenPTV's.
+    """
+    inner = _openptv_of(camera)
+    pitch_u, pitch_v = inner.pixel_pitch_mm.tolist()
+    par = PtvPar(image_size=inner.image_size, pixel_pitch_mm=(pitch_u, pitch_v))
+    if not isinstance(camera, PortCamera):
+        return par
+    port = camera.port
+    return replace(par, n_glass=port.n_glass.item(), n_fluid=port.n_fluid.item(), thickness_mm=port.thickness_mm.item())
+
+
+def _port(glass_mm: Sequence[float], par: PtvPar) -> Port:
+    vector = _tensor(glass_mm)
+    distance = vector.norm()
+    if float(distance) == 0:
+        do = "write the wall's normal, as long as the wall's liquid side is away from the origin"
+        raise CameraError(refusal("glass vector", expected="a vector longer than 0", got="0 0 0", do=do))
+    return Port(
+        normal=vector / distance,
+        offset_mm=distance,
+        thickness_mm=_tensor(par.thickness_mm),
+        n_glass=_tensor(par.n_glass / par.n_air),
+        n_fluid=_tensor(par.n_fluid / par.n_air),
+    )
+
+
+def _glass_vector(camera: Camera) -> Tensor:
+    if not isinstance(camera, PortCamera):
+        return -camera.R_cam_lab[2].detach()  # OpenPTV divides by its length also where nothing refracts
+    offset = camera.port.offset_mm.detach()
+    if float(offset) <= 0:
+        expected = "a wall with the lab's origin on its liquid side (OpenPTV has only the distance)"
+        got, do = f"offset {float(offset):g}", "move the lab's origin into the liquid"
+        raise CameraError(refusal("port", expected=expected, got=got, do=do))
+    return camera.port.normal_lab.detach() * offset
+
+
+def _openptv_of(camera: Camera) -> OpenPTVCamera:
+    inner = camera.camera if isinstance(camera, PortCamera) else camera
+    if not isinstance(inner, OpenPTVCamera):
+        got, do = type(inner).__name__, "build an OpenPTVCamera; other distortions have no exact counterpart there"
+        raise CameraError(refusal("camera", expected="a camera of model openptv", got=got, do=do))
+    return inner
+
+
+def _addpar(path: Path) -> list[float]:
+    return _numbers(path, _words(path), ADDPAR_NUMBERS, ADDPAR_PARTS)
+
+
+def _axes() -> Tensor:
+    """Take OpenPTV's camera components (y up, looking along -z) to ours, and back."""
+    return torch.diag(_tensor((1.0, -1.0, -1.0)))
+
+
+def _words(path: Path, separator: str | None = None) -> list[str]:
+    content = read_whole(path, TEXT_BYTES, "a text file of OpenPTV", CameraError, "correct the path")
+    try:
+        return content.decode("utf-8-sig").strip().split(separator)
+    except UnicodeDecodeError:
+        expected, got, do = "a text file of OpenPTV", "bytes that are no text", "name OpenPTV's file"
+        raise CameraError(refusal(str(path), expected=expected, got=got, do=do)) from None
+
+
+def _numbers(path: Path, words: Sequence[str], count: int, parts: str) -> list[float]:
+    if len(words) != count:
+        do = "copy the file again, it is cut off" if len(words) < count else "name a file of this kind"
+        raise CameraError(refusal(str(path), expected=f"{count} numbers ({parts})", got=str(len(words)), do=do))
+    numbers = []
+    for place, word in enumerate(words):
+        try:
+            number = float(word)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            name, do = f"{path}, number {place + 1} of {count}", f"correct it ({parts})"
+            raise CameraError(refusal(name, expected="a finite number", got=short(word[:20]), do=do))
+        numbers.append(number)
+    return numbers
+
+
+def _row(numbers: Tensor) -> str:
+    return " ".join(map(repr, numbers.tolist())) + "\n"
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as fault:
+        do = "choose a folder that exists and may be written"
+        got = f"'{fault.strerror}'"
+        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from fault
+
+
+def _tensor(value: object) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)

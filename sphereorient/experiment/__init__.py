@@ -1,0 +1,23 @@
+"""The noun that goes in: experiment, timeline, camera streams, an opened recording."""
+
+from sphereorient.experiment.experiment import (
+    MOVIES_OWN,
+    Experiment,
+    ExperimentKeys,
+    input_files,
+    load_experiment,
+    open_movies,
+    outside_paths,
+    write_experiment,
+)
+
+__all__ = [
+    "MOVIES_OWN",
+    "Experiment",
+    "ExperimentKeys",
+    "input_files",
+    "load_experiment",
+    "open_movies",
+    "outside_paths",
+    "write_experiment",
+]

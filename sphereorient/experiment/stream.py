@@ -1,0 +1,96 @@
+"""One camera's share of an experiment: the pictures of its frames, faults included."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.cameras import Camera
+from sphereorient.errors import MovieError, refusal
+from sphereorient.experiment.timeline import NONE
+from sphereorient.movies import Grey, Movie, readable
+from sphereorient.trajectory.trajectory import Reason
+
+EVERY = 4  # pixels: a fault of a whole picture shows in every fourth row and column
+GLARE_SHARE = 0.5  # of the pixels at full scale: such a picture teaches nothing of the scene
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraStream:
+    """A camera, its movie, and which of its pictures show the frames; made by the pipeline, read by the stages."""
+
+    name: str
+    camera: Camera
+    movie: Movie
+    rows: NDArray[np.int64]  # (N,), the movie's own numbers of the frames; NONE where it has no picture
+    shown: NDArray[np.bool_] | None = None  # (H, W), False where something hides the ball; None: nowhere
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.rows)
+
+    def pictures(self, first: int = 0, last: int | None = None) -> Iterator[tuple[Grey | None, Reason]]:
+        """Yield the pictures of frames first .. last - 1 of the experiment, and None with the reason where one is none.
+
+        Args:
+            first: counted from the first frame that is used.
+            last: + 1; None: to the end.
+        """
+        rows = self.rows[first:last]
+        for row, picture in zip(rows.tolist(), pictures_of(self.movie, rows), strict=True):
+            why = Reason.MISSING if row == NONE else Reason.UNDECODABLE
+            yield picture, why if picture is None else Reason.OK
+
+    def spread(self, count: int) -> Grey:
+        """Return at most `count` readable pictures spread evenly over the frames, (n, H, W).
+
+        Raises:
+            MovieError: none of them is readable.
+        """
+        numbers = self.rows[self.rows != NONE].tolist()
+        wanted = [numbers[k] for k in spread_frames(range(len(numbers)), count)]
+        try:
+            pictures = list(self.movie.sample(wanted))
+        except MovieError:
+            pictures = [picture for picture in _read(self.movie, wanted) if picture is not None]
+        good = [picture for picture in pictures if not (uniform(picture) or _glares(picture))]
+        if not good:
+            got, do = "none (black, white or damaged ones)", "check the movie with `sphereorient movie`"
+            raise MovieError(refusal(str(self.movie.path), expected="readable pictures", got=got, do=do))
+        return np.stack(good)
+
+
+def spread_frames(frames: range, count: int) -> list[int]:
+    """Return at most `count` frame numbers, evenly spread over a range, ends included."""
+    if len(frames) <= count:
+        return list(frames)
+    return [frames[int(i)] for i in np.linspace(0, len(frames) - 1, count).round()]
+
+
+def uniform(picture: Grey) -> bool:
+    """Whether a picture is of one grey: no scene is, with a camera's noise on it."""
+    some = picture[::EVERY, ::EVERY]
+    return bool(some.min() == some.max())
+
+
+def pictures_of(movie: Movie, rows: NDArray[np.int64]) -> Iterator[Grey | None]:
+    """Yield pictures of a movie by their numbers (N,), None for NONE and for those that cannot be decoded."""
+    found = _read(movie, rows[rows != NONE].tolist())
+    for row in rows.tolist():
+        yield None if row == NONE else next(found)
+
+
+def _read(movie: Movie, numbers: Sequence[int]) -> Iterator[Grey | None]:
+    """Yield pictures by their own numbers, those that follow each other in one go."""
+    begin = 0
+    for end in range(1, len(numbers) + 1):
+        if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:
+            yield from readable(movie, numbers[begin], numbers[end - 1] + 1)
+            begin = end
+
+
+def _glares(picture: Grey) -> bool:
+    return float(np.mean(picture[::4, ::4] == np.iinfo(picture.dtype).max)) > GLARE_SHARE

@@ -1,0 +1,258 @@
+"""When each frame of an experiment was taken, and which picture of each movie shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.errors import ExperimentError, MovieError, refusal
+from sphereorient.experiment.experiment import MOVIES_OWN, Experiment
+from sphereorient.files.whole_file import read_whole
+from sphereorient.movies import Movie
+
+Rows = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+NONE = -1  # in `Timeline.rows`: this camera has no picture of the frame
+PAIR_STEPS = 0.5  # of the usual time between frames: stamps of two cameras nearer than this are one instant
+LATE_STEPS = 0.05  # stamps that differ by more, usually, are worth a remark
+EVEN_STEPS = 1e-3  # times that keep to a grid this well are evenly spaced
+ON_GRID = 0.02  # of a step: frames this near to a grid are on it
+LONGEST_PAUSE = 50  # steps; nothing goes on over longer ones
+TIMES_BYTES = 1 << 24  # larger files are no table of times
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Timeline:
+    """N frames of an experiment; made by `timeline`, read by everyone who opens movies."""
+
+    number: Rows  # (N,), of the frames, increasing; blocks begin at round ones
+    time_s: Floats  # (N,), s, increasing: the middle of the exposures
+    rows: Mapping[str, Rows]  # (N,) of each camera: the picture in its movie's own counting, NONE where it has none
+    remarks: tuple[str, ...] = ()  # what a user should know of it
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.number)
+
+    @property
+    def frame_s(self) -> float:
+        """Usual time between frames, s; NaN for a single one."""
+        return float(np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")
+
+    def gridded(self) -> tuple[Timeline, Rows]:
+        """Return the same frames on an even grid of times, those that nobody took put in, and their places in it.
+
+        Raises:
+            ExperimentError: the times keep to no grid.
+        """
+        steps = np.rint(np.diff(self.time_s) / self.frame_s).clip(1, LONGEST_PAUSE).astype(np.int64)
+        place: Rows = np.concatenate([[0], np.cumsum(steps)])
+        off = np.abs(np.diff(self.time_s) - steps * self.frame_s)
+        if (off[steps < LONGEST_PAUSE] > ON_GRID * self.frame_s).any():
+            do = "use --method precise, which takes any times"
+            got = f"steps from {np.diff(self.time_s).min():.4g} to {np.diff(self.time_s).max():.4g} s"
+            raise ExperimentError(refusal("times", expected="frames on an even grid", got=got, do=do))
+        count = int(place[-1]) + 1
+        rows = {name: np.full(count, NONE) for name in self.rows}
+        for name, row in self.rows.items():
+            rows[name][place] = row
+        time_s = np.interp(np.arange(count), place, self.time_s)
+        grid = Timeline(number=self.number[0] + np.arange(count), time_s=time_s, rows=rows, remarks=self.remarks)
+        return grid, place
+
+    @property
+    def even(self) -> bool:
+        """Whether all frames are equally far apart in time."""
+        steps = np.diff(self.time_s)
+        return bool((np.abs(steps - self.frame_s) <= EVEN_STEPS * self.frame_s).all())
+
+
+def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
+    """Tell when the frames were taken, and pair the pictures of the cameras.
+
+    Evenly spaced frames have the time number / frame rate; with `times: FILE` it is that file's value; with
+    `times: movies` the files' own stamps tell, and pictures of two cameras taken at one instant are one frame, however
+    many pictures either camera lost before.
+
+    Args:
+        experiment: the experiment.
+        movies: of the cameras that count, as `open_movies` returns them.
+
+    Returns:
+        The frames of `frames:`, or all. A movie that ends early has no pictures of the last ones, and a remark says so.
+
+    Raises:
+        ExperimentError: a table of times that is none, or of another length.
+        MovieError: no movie has the frames asked for, or stamps are asked for and a movie has none.
+
+    Source: DESIGN section 2 (Time). Stamps of MKV take no part: they are rounded to 1 ms.
+    """
+    if experiment.times == MOVIES_OWN:
+        whole = _stamped(experiment, movies)
+    else:
+        whole = _counted(experiment, movies)
+    if experiment.frames is None:
+        return whole
+    first, last = experiment.frames
+    if len(whole) < last:
+        expected, do = f"{last} frames as frames: says", "lower the end of frames:"
+        raise MovieError(refusal(f"{experiment.path}, movies", expected=expected, got=f"{len(whole)}", do=do))
+    rows = {name: row[first:last] for name, row in whole.rows.items()}
+    return Timeline(number=whole.number[first:last], time_s=whole.time_s[first:last], rows=rows, remarks=whole.remarks)
+
+
+def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
+    """Pictures of one number are one frame."""
+    there = {name: len(movie) - experiment.start.get(name, 0) for name, movie in movies.items()}
+    subject = f"{experiment.path}, movies"
+    if min(there.values()) <= 0:
+        got = " and ".join(f"{count} ({name})" for name, count in there.items())
+        raise MovieError(refusal(subject, expected="frames after start", got=got, do="correct start:"))
+    count = max(there.values())
+    wanted = count if experiment.frames is None else min(count, experiment.frames[1])
+    remarks = tuple(
+        f"{movies[name].path}: no pictures of frames {of_movie} to {wanted - 1}; only the other camera has them"
+        for name, of_movie in there.items()
+        if of_movie < wanted
+    )
+    number = np.arange(count)
+    rows = {
+        name: np.where(number < of_movie, number + experiment.start.get(name, 0), NONE)
+        for name, of_movie in there.items()
+    }
+    if experiment.times is None:
+        time_s = number / experiment.frame_rate_hz
+    else:
+        time_s = _of_length(Path(experiment.times), load_times(Path(experiment.times)), count)
+    return Timeline(number=number, time_s=np.asarray(time_s, np.float64), rows=rows, remarks=remarks)
+
+
+def _of_length(path: Path, time_s: Floats, count: int) -> Floats:
+    if len(time_s) != count:
+        do = "give one time for each frame of the experiment, counted after start:"
+        raise ExperimentError(refusal(str(path), expected=f"{count} times", got=f"{len(time_s)}", do=do))
+    return time_s
+
+
+def load_times(path: Path) -> Floats:
+    """Read a table of times, (N,), s: one a line; a first line of words and lines after # do not count.
+
+    Raises:
+        ExperimentError: missing, too large, not a number in a line, or times that do not increase.
+    """
+    do = "write one time a line, in seconds, increasing"
+    content = read_whole(path, TIMES_BYTES, "a table of times", ExperimentError, "correct times:")
+    try:
+        lines = content.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        got = "bytes that are no text"
+        raise ExperimentError(refusal(str(path), expected="a text file", got=got, do=do)) from error
+    values: list[float] = []
+    for number, line in enumerate(lines, 1):
+        text = line.split("#")[0].strip().rstrip(",;")
+        if not text:
+            continue
+        try:
+            values.append(float(text))
+        except ValueError:
+            if not values and number == 1:  # a heading
+                continue
+            name = f"{path}, line {number}"
+            raise ExperimentError(refusal(name, expected="a number", got=repr(text[:40]), do=do)) from None
+    time_s = np.asarray(values, np.float64)
+    return _increasing(str(path), time_s, do)
+
+
+def _increasing(name: str, time_s: Floats, do: str) -> Floats:
+    wrong = np.flatnonzero(~(np.diff(time_s) > 0))
+    if not len(time_s) or not np.isfinite(time_s).all():
+        got = "none" if not len(time_s) else f"{time_s[~np.isfinite(time_s)][0]}"
+        raise ExperimentError(refusal(name, expected="finite times", got=got, do=do))
+    if len(wrong):
+        k = int(wrong[0])
+        got = f"{time_s[k + 1]:.9g} after {time_s[k]:.9g}"
+        raise ExperimentError(refusal(name, expected="times that increase", got=got, do=do))
+    return time_s
+
+
+def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
+    """Pictures of one instant are one frame."""
+    clocks: dict[str, Floats] = {}
+    for name, movie in movies.items():
+        start = experiment.start.get(name, 0)
+        if movie.times_s is None:
+            do = "write frame_rate:, or times: with a file"
+            raise MovieError(refusal(str(movie.path), expected="time stamps", got="none in this file", do=do))
+        if start >= len(movie):
+            got, do = f"{len(movie)}", "correct start:"
+            raise MovieError(refusal(str(movie.path), expected=f"more than {start} frames", got=got, do=do))
+        stamps = _increasing(f"{movie.path}, time stamps", movie.times_s, "write frame_rate:, or times: with a file")
+        # With start: each clock begins at that picture; without, the stamps are of one clock, the trigger's.
+        clocks[name] = stamps[start:] - stamps[start] if experiment.start_given else stamps[start:]
+    usual_s = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]) if clocks else [np.nan]))
+    names = list(clocks)
+    if len(names) == 1:
+        pairs = np.arange(len(clocks[names[0]]))[:, None]
+    else:
+        pairs = _paired(clocks[names[0]], clocks[names[1]], PAIR_STEPS * usual_s)
+    taken = np.stack([np.where(row >= 0, clocks[name][row], np.nan) for name, row in zip(names, pairs.T, strict=True)])
+    rows = {
+        name: np.where(row >= 0, row + experiment.start.get(name, 0), NONE)
+        for name, row in zip(names, pairs.T, strict=True)
+    }
+    return Timeline(
+        number=np.arange(len(pairs)),
+        time_s=np.nanmean(taken, axis=0),
+        rows=rows,
+        remarks=_stamp_remarks(experiment, movies, names, taken, usual_s),
+    )
+
+
+def _stamp_remarks(
+    experiment: Experiment, movies: Mapping[str, Movie], names: Sequence[str], taken: Floats, usual_s: float
+) -> tuple[str, ...]:
+    """Say how many pictures each camera lacks, and whether the cameras are late on each other."""
+    remarks = [
+        f"{movies[name].path}: {lacking} of {taken.shape[1]} instants have no picture"
+        for name, lacking in zip(names, np.isnan(taken).sum(1).tolist(), strict=True)
+        if lacking
+    ]
+    if len(names) == 2:
+        apart = np.abs(taken[0] - taken[1])
+        late = float(np.nanmedian(apart)) if np.isfinite(apart).any() else np.inf
+        if not np.isfinite(late):
+            remarks.append(f"{experiment.path}: no picture of {names[0]} is of one instant with one of {names[1]}")
+        elif late > LATE_STEPS * usual_s:
+            remarks.append(f"{experiment.path}: the cameras' stamps differ by {late:.3g} s, usually")
+    return tuple(remarks)
+
+
+def _paired(one: Floats, other: Floats, within_s: float) -> Rows:
+    """Pair increasing times nearer than `within_s`; (N, 2) indices in the order of time, NONE where there is none."""
+    after = np.searchsorted(other, one).clip(1, max(len(other) - 1, 1))
+    low = np.clip(after - 1, 0, len(other) - 1)
+    high = np.clip(after, 0, len(other) - 1)
+    nearest = np.where(np.abs(other[high] - one) < np.abs(other[low] - one), high, low)
+    near = np.abs(other[nearest] - one) <= within_s
+    # Two of `one` may have the same neighbour in `other`: the nearer one has it.
+    best = np.full(len(other), NONE)
+    for k in np.flatnonzero(near):
+        j = nearest[k]
+        if best[j] == NONE or abs(other[j] - one[k]) < abs(other[j] - one[best[j]]):
+            best[j] = k
+    partner = np.full(len(one), NONE)
+    there = best >= 0
+    partner[best[there]] = np.flatnonzero(there)
+    alone = np.flatnonzero(~there)
+    pairs = np.concatenate(
+        [np.stack([np.arange(len(one)), partner], 1), np.stack([np.full(len(alone), NONE), alone], 1)]
+    )
+    when = np.where(pairs[:, 0] >= 0, one[pairs[:, 0]], other[pairs[:, 1]])
+    when = np.where((pairs >= 0).all(1), (when + other[pairs[:, 1]]) / 2, when)
+    order: Rows = pairs[np.argsort(when, kind="stable")]
+    return order

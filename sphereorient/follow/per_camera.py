@@ -1,0 +1,79 @@
+"""Cameras that do not fit together, bumped ones say: each follows the ball by itself, and all that they say is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.follow.appearance import Appearance
+from sphereorient.follow.initialise import Poses, no_pose
+from sphereorient.follow.tracker import BlockTracker
+from sphereorient.locate import LocateSettings, Shot
+from sphereorient.search.proposer import Proposer
+from sphereorient.search.settings import RefineSettings
+from sphereorient.trajectory import Reason
+
+
+class PerCameraTracker:
+    """Follows the ball as each camera sees it; the first that sees it gives the pose, the others contradict.
+
+    Args:
+        learnt: blur, light and scores of the movies.
+        proposers: by name of view.
+        locating: how outlines are found.
+        settings: blocks and lanes.
+    """
+
+    def __init__(
+        self, learnt: Appearance, proposers: Mapping[str, Proposer], locating: LocateSettings, settings: RefineSettings
+    ) -> None:
+        count = len(learnt.fitter.views)
+        self.trackers = [BlockTracker(learnt.of(k), proposers, locating, settings) for k in range(count)]
+
+    def windows(self, frames: range) -> list[list[int]]:
+        """Return the lengths of the blocks that are followed side by side; see `BlockTracker`."""
+        return self.trackers[0].windows(frames)
+
+    def track(self, shots: Sequence[Sequence[Shot]], window: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
+        """Follow the blocks of one window; see `BlockTracker`."""
+        each = [tracker.track([movie], window, time_s) for tracker, movie in zip(self.trackers, shots, strict=True)]
+        yield from (cameras_disagree(poses) for poses in zip(*each, strict=True))
+
+
+def cameras_disagree(alone: Sequence[Poses]) -> Poses:
+    """Return one frame's poses of the first camera that sees the ball, with what the others say for themselves.
+
+    Args:
+        alone: C records, each of one camera by itself.
+    """
+    reasons = [poses.reason[0] for poses in alone]
+    seeing = [k for k, poses in enumerate(alone) if len(poses) and bool(poses.use.any())]
+    if not seeing:
+        return no_pose(len(alone), [Reason.LOW_SCORE if why is Reason.OK else why for why in reasons])
+    main = alone[seeing[0]]
+    X, R = main.position_lab_mm, main.R_lab_body
+    own = {name: _blank(getattr(main, name), len(alone)) for name in OWN}
+    for k in seeing:
+        own["own_turn"][:, k] = so3.log(alone[k].R_lab_body[:1] @ R.mT)
+        own["own_move"][:, k] = alone[k].position_lab_mm[:1] - X
+        for name in ("own_covariance", "deviation", "score"):
+            own[name][:, k] = getattr(alone[k], name)[:1, 0]
+    for name in ("own_covariance", "deviation", "score"):
+        own[name][:, seeing[0]] = getattr(main, name)[:, 0]
+    use = torch.zeros(len(alone), dtype=torch.bool)
+    use[seeing[0]] = True
+    told = [Reason.CONTRADICTS if k in seeing[1:] else why for k, why in enumerate(reasons)]
+    return Poses(
+        position_lab_mm=X, R_lab_body=R, covariance=main.covariance, nll=main.nll, use=use, reason=tuple(told), **own
+    )
+
+
+OWN = ("own_turn", "own_covariance", "own_move", "deviation", "score")
+
+
+def _blank(part: Tensor, cameras: int) -> Tensor:
+    """Return zeros for all cameras where `part` (M, 1, ...) has one."""
+    return part.new_zeros(part.shape[0], cameras, *part.shape[2:])

@@ -1,0 +1,115 @@
+"""Section III of the paper, corrected, step by step: each camera by itself, then their fusion."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient import assemble, locate, motion
+from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.experiment.stream import CameraStream
+from sphereorient.locate import Sightings
+from sphereorient.methods import results
+from sphereorient.methods.proposers import paper_proposer
+from sphereorient.methods.settings import Settings
+from sphereorient.search import Candidates, Proposals, crop_disk
+from sphereorient.trajectory import Reason, Trajectory
+
+CHUNK = 64  # frames held at once; a result does not depend on it
+
+
+def track_paper(recording: Recording, settings: Settings, progress: Progress) -> Trajectory:
+    """Measure the movies as the paper does; times that are uneven must keep to a grid."""
+    grid, place = recording.gridded()
+    cameras, clock = grid.cameras, grid.clock
+    sightings = {stream.name: locate_sphere(grid, stream, settings, progress) for stream in grid.streams}
+    locate.check_seen(sightings)
+    positions = locate.find_positions(sightings, cameras, grid.experiment.diameter_mm)
+    candidates = {
+        stream.name: propose_orientations(stream, sightings[stream.name], grid.texture, settings, progress)
+        for stream in grid.streams
+    }
+    paths = assemble.assemble_paths(candidates, clock, settings.assemble)
+    fused = assemble.fuse(paths, candidates, clock, settings.assemble)
+    rate_hz = grid.experiment.frame_rate_hz
+    moved = motion.measure_motion(
+        positions.for_motion(),
+        fused.R_lab_body,
+        fused.segment,
+        rate_hz if np.isfinite(rate_hz) else 1 / grid.timeline.frame_s,
+        settings.motion,
+        position_sigma_mm=positions.covariance_mm2.diagonal(dim1=-2, dim2=-1).sqrt(),
+        orientation_sigma_rad=fused.sigma_rad,
+    )
+    tracks = {name: results.paper_camera(sightings[name], candidates[name], paths[name]) for name in cameras}
+    track = results.paper_track(grid.experiment, clock, positions, fused, moved, tracks)
+    return track if len(track) == len(place) else track.at(place)
+
+
+def locate_sphere(recording: Recording, stream: CameraStream, settings: Settings, progress: Progress) -> Sightings:
+    """Find the sphere's outline in every frame of one camera, outliers replaced and short gaps filled."""
+    stage = f"{stream.name}: locate"
+    progress(stage, 0, len(stream))
+    scene = locate.find_scene(recording, stream, settings.locate.background_frames, settings.locate)
+    found: list[locate.Found] = []
+    for done, shot in enumerate(locate.screened_frames(stream, scene.background), 1):
+        if shot.usable:
+            found.append(locate.find_ball(shot.picture, scene.background, scene.diameter_px, settings.locate))
+        else:
+            found.append((None, shot.reason))
+        if done % CHUNK == 0 or done == len(stream):
+            progress(stage, done, len(stream))
+    return locate.repair(locate.sightings_of(found), settings.locate)
+
+
+def propose_orientations(
+    stream: CameraStream, sightings: Sightings, texture: Tensor, settings: Settings, progress: Progress
+) -> Candidates:
+    """Propose orientations for every frame in which one camera has the sphere, in the lab frame."""
+    stage = f"{stream.name}: orient"
+    total = len(stream)
+    progress(stage, 0, total)
+    if not sightings.placed.any():
+        return in_the_lab(Proposals.none(sightings.reason), stream.camera, sightings.centre_px)
+    proposer = paper_proposer(texture, locate.size_of(sightings, settings.orient.size_px), settings)
+    # A place that was filled in from the neighbours helps nothing where the picture is none.
+    readable = torch.tensor([reason not in BLIND for reason in sightings.reason])
+    placed = sightings.placed & readable
+    proposals = [Proposals.none(sightings.reason[:0])]
+    waiting: list[NDArray[np.float32]] = []
+    done = 0
+    for k, (picture, _) in enumerate(stream.pictures()):
+        if placed[k] and picture is not None:
+            u, v = sightings.centre_px[k].tolist()
+            waiting.append(crop_disk(picture, u, v, float(sightings.radius_px[k]), proposer.size_px))
+        if (k + 1) % CHUNK == 0 or k + 1 == total:
+            found = proposer.propose(torch.from_numpy(np.stack(waiting))) if waiting else Proposals.none(())
+            proposals.append(found.spread(placed[done : k + 1], sightings.reason[done : k + 1]))
+            waiting, done = [], k + 1
+            progress(stage, done, total)
+    return in_the_lab(Proposals.joined(proposals), stream.camera, sightings.centre_px)
+
+
+BLIND = (Reason.UNDECODABLE, Reason.MISSING, Reason.REPEATED, Reason.DARK, Reason.SATURATED)
+
+
+def in_the_lab(proposals: Proposals, camera: Camera, centre_px: Tensor) -> Candidates:
+    """Turn orientations from the view frame of each frame into the lab, the perspective removed (ERRATA A1).
+
+    Args:
+        proposals: of N frames.
+        camera: that saw them.
+        centre_px: (N, 2), the outline's centre.
+    """
+    direction_cam = camera.rays(centre_px).direction_lab @ camera.R_cam_lab.mT
+    R_lab_view = camera.R_cam_lab.mT @ R_cam_view(direction_cam)
+    frame = torch.repeat_interleave(torch.arange(len(centre_px)), proposals.offset.diff())
+    return Candidates(
+        offset=proposals.offset,
+        R_lab_body=R_lab_view[frame] @ proposals.R_view_body,
+        score=proposals.score,
+        reason=proposals.reason,
+    )

@@ -1,0 +1,84 @@
+"""Who proposes orientations: the one place that knows both the template searches and the trained network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from torch import Tensor
+
+from sphereorient.methods.settings import Settings
+from sphereorient.pose.defocus import defocus_radii
+from sphereorient.search import FallbackProposer, GreySearch, Proposer, TemplateSearch
+from sphereorient.search.settings import ProposeSettings
+
+DEFAULT = "default"  # the checkpoint that comes along
+
+
+def precise_proposer(texture: Tensor, settings: Settings, blur: float = 0.0) -> Proposer:
+    """Return who proposes for the precise method.
+
+    Args:
+        texture: (H, 2 H), the map, 0 black .. 1 white.
+        settings: branches `propose` and `search`.
+        blur: standard deviation of the pictures' own blur, radii, which templates then have as well; 0: sharp.
+
+    Raises:
+        CheckpointError: a checkpoint that cannot be used with this map.
+    """
+    return _proposer(texture, settings.propose, lambda: GreySearch(texture, settings.search, blur))
+
+
+class BlurMatchedSearch:
+    """Who proposes for pictures of some blur: one bank of templates for all that are sharp, others as they are asked.
+
+    Args:
+        texture: (H, 2 H), the map, 0 black .. 1 white.
+        settings: branches `propose` and `search`.
+        diameter_px: of the disks that blurs are compared with.
+    """
+
+    def __init__(self, texture: Tensor, settings: Settings, diameter_px: float) -> None:
+        self.diameter_px = diameter_px
+        self._texture, self._settings = texture, settings
+        self._made: dict[float, Proposer] = {}
+
+    def of(self, blur_px: float) -> Proposer:
+        """Return who proposes for pictures of a blur, px."""
+        blur = defocus_radii(blur_px, self.diameter_px)
+        if blur not in self._made:
+            self._made[blur] = precise_proposer(self._texture, self._settings, blur)
+        return self._made[blur]
+
+
+def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:
+    """Return who proposes for the paper's method; templates are made for disks of `size_px`."""
+    return _proposer(texture, settings.propose, lambda: TemplateSearch(texture, size_px, settings.orient))
+
+
+def _proposer(texture: Tensor, settings: ProposeSettings, templates: Callable[[], Proposer]) -> Proposer:
+    """Return the network, the templates, or both; a bank of templates is made only where it is asked."""
+    network = trained_network(texture, settings)
+    if network is not None and settings.when == "always":
+        return network
+    return templates() if network is None else FallbackProposer(templates(), network, settings.sure)
+
+
+def trained_network(texture: Tensor, settings: ProposeSettings) -> Proposer | None:
+    """Return the network of a checkpoint, None where none is asked for."""
+    if settings.checkpoint is None:
+        return None
+    # Not before it is wanted: most runs do without.
+    from sphereorient.learn.checkpoint import check_texture, correlator_of, load_checkpoint
+    from sphereorient.learn.proposer import LearnedProposer
+
+    checkpoint = load_checkpoint(checkpoint_path(settings.checkpoint))
+    check_texture(checkpoint, texture)
+    return LearnedProposer(correlator_of(checkpoint), texture, temperature=checkpoint.temperature)
+
+
+def checkpoint_path(named: str) -> Path:
+    """Return the file of a checkpoint, of the one that comes along for `default`."""
+    from sphereorient.learn.proposer import DEFAULT_CHECKPOINT
+
+    return DEFAULT_CHECKPOINT if named == DEFAULT else Path(named)

@@ -1,0 +1,274 @@
+"""From the rooms' records to the noun that comes out, one function a method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sphereorient.assemble import Chosen, Fused, Path
+from sphereorient.calibration import systematic_errors
+from sphereorient.cameras import Camera, ParameterCovariance
+from sphereorient.experiment import Experiment
+from sphereorient.follow import Appearance, PoseTable
+from sphereorient.locate import Positions, Sightings
+from sphereorient.mapping.record import LearntMap
+from sphereorient.motion import Motion, Smoothed
+from sphereorient.search import Candidates
+from sphereorient.so3 import exp, geodesic_distance
+from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
+
+
+def paper_camera(sightings: Sightings, candidates: Candidates, path: Path) -> CameraTrack:
+    """Collect what one camera saw."""
+    track = CameraTrack.empty(len(sightings))
+    lost = torch.isnan(path.score)
+    reason = [
+        Reason.LOW_SCORE if reason is Reason.OK and lost[k] else reason for k, reason in enumerate(candidates.reason)
+    ]
+    return replace(
+        track,
+        centre_px=sightings.centre_px.numpy(),
+        radius_px=sightings.radius_px.numpy(),
+        outline_rms_px=sightings.outline_rms_px.numpy(),
+        orientation=path.R_lab_body.numpy(),
+        score=path.score.numpy(),
+        xi=path.xi.numpy(),
+        reason=tuple(str(why) for why in reason),
+        candidate_offset=candidates.offset.numpy(),
+        candidate_orientation=candidates.R_lab_body.numpy(),
+        candidate_score=candidates.score.numpy(),
+    )
+
+
+def paper_track(
+    experiment: Experiment,
+    clock: Tensor,
+    positions: Positions,
+    fused: Fused,
+    moved: Motion,
+    tracks: Mapping[str, CameraTrack],
+) -> Trajectory:
+    """Put everything into the noun that comes out."""
+    empty = Trajectory.empty(
+        clock.numpy(), cameras=tuple(tracks), frame_rate=experiment.frame_rate_hz, experiment=experiment.name
+    )
+    oriented = torch.isfinite(fused.R_lab_body).all(-1).all(-1)
+    variance = fused.sigma_rad.square()[:, None, None] * torch.eye(3, dtype=torch.float64)
+    return replace(
+        empty,
+        valid=(oriented & positions.measured).numpy(),
+        position=positions.position_lab_mm.numpy(),
+        position_cov=positions.covariance_mm2.numpy(),
+        orientation=fused.R_lab_body.numpy(),
+        orientation_cov=variance.numpy(),
+        velocity=moved.velocity_m_s.numpy(),
+        velocity_sigma=moved.velocity_sigma_m_s.numpy(),
+        acceleration=moved.acceleration_m_s2.numpy(),
+        acceleration_sigma=moved.acceleration_sigma_m_s2.numpy(),
+        omega_lab=moved.omega_lab_rad_s.numpy(),
+        omega_lab_sigma=moved.omega_lab_sigma_rad_s.numpy(),
+        omega_body=moved.omega_body_rad_s.numpy(),
+        omega_body_sigma=moved.omega_body_sigma_rad_s.numpy(),
+        alpha_lab=moved.alpha_lab_rad_s2.numpy(),
+        alpha_lab_sigma=moved.alpha_lab_sigma_rad_s2.numpy(),
+        alpha_body=moved.alpha_body_rad_s2.numpy(),
+        alpha_body_sigma=moved.alpha_body_sigma_rad_s2.numpy(),
+        segment=fused.segment.numpy(),
+        flags=(fused.flags | positions.flags).numpy().astype(np.uint32),
+        cameras=dict(tracks),
+    )
+
+
+def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], learnt: Appearance) -> CameraTrack:
+    """Collect what one camera says at the poses chosen.
+
+    Args:
+        place: of the camera among those of the fit.
+        table: all poses.
+        picked: the parts of the chosen ones, see `PoseTable.rows`.
+        learnt: with the views.
+    """
+    view = learnt.fitter.views[place]
+    frames = len(table)
+    tells = torch.tensor([why[place] in (Reason.OK, Reason.CONTRADICTS) for why in table.reason], dtype=torch.bool)
+    position, R = picked["position_lab_mm"] + picked["own_move"][:, place], picked["R_lab_body"]
+    position = torch.where(tells[:, None], position, picked["position_lab_mm"])
+    centre_px = view.camera.project(position)
+    counts = table.mask.sum(-1)
+    shown = tells & torch.isfinite(position[:, 0])
+    where = shown[:, None, None]
+    reason = [
+        Reason.LOW_SCORE if why[place] is Reason.OK and not shown[k] else why[place]
+        for k, why in enumerate(table.reason)
+    ]
+    return replace(
+        CameraTrack.empty(frames),
+        centre_px=centre_px.numpy(),
+        radius_px=view.radius_px(position, learnt.fitter.radius_mm).numpy(),
+        orientation=torch.where(where, exp(picked["own_turn"][:, place]) @ R, torch.nan).numpy(),
+        orientation_cov=torch.where(where, picked["own_covariance"][:, place], torch.nan).numpy(),
+        score=picked["score"][:, place].numpy(),
+        reason=tuple(str(why) for why in reason),
+        candidate_offset=torch.nn.functional.pad(counts.cumsum(0), (1, 0)).numpy(),
+        candidate_orientation=table.R_lab_body[table.mask].numpy(),
+        candidate_score=table.score[..., place][table.mask].numpy(),
+    )
+
+
+def precise_track(
+    experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Chosen, smoothed: Smoothed, learnt: Appearance
+) -> Trajectory:
+    """Put everything into the noun that comes out."""
+    names = [view.name for view in learnt.fitter.views]
+    empty = Trajectory.empty(
+        clock.numpy(), cameras=tuple(names), frame_rate=experiment.frame_rate_hz, experiment=experiment.name
+    )
+    picked = table.rows(chosen.choice)
+    covariance = picked["covariance"]
+    margin, angle = _margin(table, chosen.choice)
+    flags = chosen.flags | _fit_flags(table, chosen, picked, learnt)
+    flags |= torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
+    return replace(
+        empty,
+        valid=(chosen.choice >= 0).numpy(),
+        position=picked["position_lab_mm"].numpy(),
+        position_cov=(covariance[:, 3:, 3:] * smoothed.position_scale**2).numpy(),
+        orientation=picked["R_lab_body"].numpy(),
+        orientation_cov=(covariance[:, :3, :3] * smoothed.orientation_scale**2).numpy(),
+        position_smooth=smoothed.position_lab_mm.numpy(),
+        position_smooth_cov=smoothed.position_cov_mm2.numpy(),
+        orientation_smooth=smoothed.R_lab_body.numpy(),
+        orientation_smooth_cov=smoothed.orientation_cov_rad2.numpy(),
+        velocity=smoothed.velocity_m_s.numpy(),
+        velocity_sigma=smoothed.velocity_sigma_m_s.numpy(),
+        acceleration=smoothed.acceleration_m_s2.numpy(),
+        acceleration_sigma=smoothed.acceleration_sigma_m_s2.numpy(),
+        omega_lab=smoothed.omega_lab_rad_s.numpy(),
+        omega_lab_sigma=smoothed.omega_lab_sigma_rad_s.numpy(),
+        omega_body=smoothed.omega_body_rad_s.numpy(),
+        omega_body_sigma=smoothed.omega_body_sigma_rad_s.numpy(),
+        alpha_lab=smoothed.alpha_lab_rad_s2.numpy(),
+        alpha_lab_sigma=smoothed.alpha_lab_sigma_rad_s2.numpy(),
+        alpha_body=smoothed.alpha_body_rad_s2.numpy(),
+        alpha_body_sigma=smoothed.alpha_body_sigma_rad_s2.numpy(),
+        segment=chosen.segment.numpy(),
+        flags=flags.numpy().astype(np.uint32),
+        confidence=chosen.probability.numpy(),
+        margin=margin.numpy(),
+        margin_angle=angle.numpy(),
+        cameras={name: precise_camera(k, table, picked, learnt) for k, name in enumerate(names)},
+    )
+
+
+def map_track(
+    experiment: Experiment, clock: Tensor, learnt: LearntMap, settings: str, provenance: Mapping[str, Any]
+) -> Trajectory:
+    """Put the attitudes that were learnt with a map into the noun that comes out; nothing tells their errors.
+
+    Args:
+        experiment: what was filmed.
+        clock: (N,), times of its frames, s.
+        learnt: with as many frames.
+        settings: YAML text of all settings.
+        provenance: where it comes from.
+    """
+    names = [view.name for view in learnt.views]
+    empty = Trajectory.empty(
+        clock.numpy(),
+        cameras=tuple(names),
+        frame_rate=experiment.frame_rate_hz,
+        method="map",
+        settings=settings,
+        experiment=experiment.name,
+        provenance=provenance,
+    )
+    radius_mm = 1.0 if experiment.diameter_mm is None else experiment.diameter_mm / 2
+    position, R = learnt.position_lab_mm, learnt.R_lab_body
+    placed = torch.isfinite(position).all(1)  # photographs that share no paint with the others have a place only
+    reasons = tuple(
+        str(Reason.OK if valid else Reason.LOW_SCORE if there else Reason.NOT_FOUND)
+        for valid, there in zip(learnt.valid.tolist(), placed.tolist(), strict=True)
+    )
+    cameras = {}
+    for c, view in enumerate(learnt.views):
+        used = learnt.valid & torch.isfinite(learnt.score[:, c])
+        centre_px = torch.where(learnt.valid[:, None], view.camera.project(position.nan_to_num()), torch.nan)
+        cameras[view.name] = replace(
+            empty.cameras[view.name],
+            centre_px=centre_px.numpy(),
+            radius_px=view.radius_px(position, radius_mm).numpy(),
+            orientation=torch.where(used[:, None, None], R, torch.nan).numpy(),
+            score=learnt.score[:, c].numpy(),
+            reason=reasons,
+        )
+    # Frames beyond those that the map was fitted to only follow these.
+    flags = torch.where(learnt.valid & ~learnt.fitted, int(Flag.EXTRAPOLATED), 0)
+    return replace(
+        empty,
+        valid=learnt.valid.numpy(),
+        position=position.numpy(),
+        orientation=R.numpy(),
+        segment=torch.where(learnt.valid, 0, -1).numpy(),
+        flags=flags.numpy().astype(np.uint32),
+        cameras=cameras,
+    )
+
+
+def _margin(table: PoseTable, choice: Tensor) -> tuple[Tensor, Tensor]:
+    """Return by how much the next distinct orientation is less likely, and its angle, (N,) each; NaN without one."""
+    frame, place = torch.arange(len(table)), choice.clamp_min(0)
+    others = table.mask.clone()
+    others[frame, place] = False
+    others &= (choice >= 0)[:, None]
+    nll = torch.where(others, table.nll, torch.inf)
+    best, which = nll.min(1)
+    there = torch.isfinite(best)
+    angle = geodesic_distance(table.R_lab_body[frame, which], table.R_lab_body[frame, place])
+    return torch.where(there, best - table.nll[frame, place], torch.nan), torch.where(there, angle, torch.nan)
+
+
+def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], learnt: Appearance) -> Tensor:
+    """Frames that one camera alone measured, and fits that explain their picture badly, (N,) int64."""
+    found = chosen.choice >= 0
+    one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)
+    # Halfway from the least score of a right pose to the usual one.
+    poor = 0.5 * (learnt.score_min + learnt.right_score)
+    best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
+    doubtful = found & (best < poor)
+    return torch.where(one, int(Flag.ONE_CAMERA), 0) | torch.where(doubtful, int(Flag.DOUBTFUL_FIT), 0)
+
+
+def with_systematic_errors(
+    track: Trajectory, cameras: Mapping[str, Camera], covariance: ParameterCovariance | None, radius_mm: float
+) -> Trajectory:
+    """Add what errors of the calibration do to the poses; nothing where the cameras' errors are not known.
+
+    Args:
+        track: with positions.
+        cameras: those that made it.
+        covariance: of their parameters, named camera.parameter.
+        radius_mm: of the sphere.
+    """
+    if covariance is None:
+        return track
+    position = torch.from_numpy(track.position)
+    place, turn = torch.from_numpy(track.position_cov * np.nan), torch.from_numpy(track.orientation_cov * np.nan)
+    saw = {name: np.array([why == Reason.OK for why in track.cameras[name].reason]) for name in cameras}
+    for some in _subsets(list(cameras)):
+        rows = torch.from_numpy(np.all([saw[name] == (name in some) for name in cameras], axis=0))
+        if bool(rows.any()):
+            left = systematic_errors({name: cameras[name] for name in some}, covariance, position[rows], radius_mm)
+            place[rows], turn[rows] = left.position_mm2, left.orientation_rad2
+    return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())
+
+
+def _subsets(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """Yield all choices of one name or more."""
+    for count in range(1, len(names) + 1):
+        yield from combinations(names, count)

@@ -1,0 +1,226 @@
+"""Refinement at three widths of detail, and what it needs of each camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient.cameras import Camera
+from sphereorient.locate import Background, Scene
+from sphereorient.pose.fit import FIRST, LATER, Fit, Shading, learn_light, refine
+from sphereorient.pose.light import Light
+from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
+from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
+
+Picture = NDArray[np.generic]
+
+RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
+SIZES = 1.06  # ratio of neighbouring sizes of disks for which there is a stencil
+CPU = torch.device("cpu")
+FINEST_PX = 0.4  # least blur of any picture, px: a pixel alone has 0.29
+COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraView:
+    """One calibrated camera and its movie's empty scene; made by the pipeline, read by the fits."""
+
+    name: str
+    camera: Camera
+    background: Background
+    diameter_px: float  # of the ball in the middle of the volume
+    sight: LinesOfSight
+
+    @classmethod
+    def of(cls, name: str, camera: Camera, scene: Scene) -> CameraView:
+        """Return the view of a camera whose scene is known."""
+        background, diameter_px = scene.background, scene.diameter_px
+        return cls(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
+
+    def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
+        """Half the width (...), px, of the ball's picture at places (..., 3), along the camera's own right."""
+        right = self.camera.R_cam_lab[0] * radius_mm
+        centre, rim = self.camera.project(torch.stack([position_lab_mm, position_lab_mm + right]))
+        radius_px: Tensor = (rim - centre).norm(dim=-1)
+        return radius_px
+
+
+def widest_px(views: Sequence[CameraView]) -> float:
+    """Return the expected diameter of the ball in the camera that sees it largest, px."""
+    return max(view.diameter_px for view in views)
+
+
+def unknown_light(views: Sequence[CameraView]) -> Light:
+    """Return the light that first fits begin with: flat, with the scene's noise and a little of a sensor's."""
+    noise = torch.tensor([[view.background.typical_noise**2, 0.02, 0.001, 0.0] for view in views])
+    return Light.unknown(len(views), noise)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PyramidLevel:
+    """One width of detail: what is laid over the picture, which pixels are looked at, the paint as blurred."""
+
+    extra_px: float
+    blur_px: float
+    paint: TextureTable
+
+    def stencil(self, radius_px: float) -> Stencil:
+        """Return the places of a disk of some radius."""
+        return _stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)))
+
+
+@lru_cache(maxsize=64)
+def _stencil(radius_px: float, step_px: int) -> Stencil:
+    return disk_stencil(radius_px, step_px, tile_px=max(6, step_px))
+
+
+class Optics:
+    """The paint at the widths of detail that fits go through, for one blur of the pictures.
+
+    Args:
+        base: finest table of the paint.
+        blur_px: of optics, pixel and exposure together, px.
+        diameter_px: typical diameter of the disk, px.
+    """
+
+    def __init__(self, base: TextureTable, blur_px: float, diameter_px: float) -> None:
+        radius_px = diameter_px / 2
+        self.blur_px = blur_px
+        # Each from the one before: the wider the blur, the smaller the table that it is made from.
+        self.fine = level_of(base, blur_px, 0.0, radius_px)
+        self.middle = level_of(self.fine.paint, blur_px, MIDDLE * radius_px, radius_px)
+        self.coarse = level_of(self.middle.paint, blur_px, COARSE * radius_px, radius_px)
+
+    def to(self, device: torch.device) -> Optics:
+        """Return the same with its tables on another device."""
+        moved = copy(self)
+        for name in ("fine", "middle", "coarse"):
+            level: PyramidLevel = getattr(self, name)
+            setattr(moved, name, replace(level, paint=level.paint.to(device)))
+        return moved
+
+
+def level_of(base: TextureTable, blur_px: float, extra_px: float, radius_px: float) -> PyramidLevel:
+    """Return the level at which `extra_px` of blur are laid over pictures of blur `blur_px`."""
+    whole = math.hypot(blur_px, extra_px)
+    return PyramidLevel(extra_px=extra_px, blur_px=whole, paint=base.blurred(whole / radius_px))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fitter:
+    """Fits poses to the pictures of all views; made by the pipeline once blur and light are known."""
+
+    views: Sequence[CameraView]
+    radius_mm: float
+    optics: Optics
+    light: Light
+    device: torch.device = CPU  # where the fits are computed; what goes in and comes out is on the CPU
+    widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
+
+    @property
+    def shading(self) -> Shading:
+        """Orders of each frame's own light: high while nothing is learnt."""
+        return LATER if self.light.known else FIRST
+
+    def with_light_of(self, pixels: Pixels, fit: Fit, use: Tensor) -> Fitter:
+        """Return a fitter that knows the light and the noise of fitted pictures; see `learn_light`."""
+        fine = self.optics.fine
+        light = learn_light(
+            pixels,
+            fit,
+            use,
+            radius_mm=self.radius_mm,
+            paint=fine.paint,
+            blur_px=fine.blur_px,
+            light=self.light,
+            shading=self.shading,
+        )
+        return replace(self, light=light)
+
+    def on(self, device: torch.device) -> Fitter:
+        """Return a fitter that computes on another device."""
+        return replace(self, optics=self.optics.to(device), light=self.light.to(device), device=device)
+
+    def of(self, camera: int) -> Fitter:
+        """Return the fitter of one camera by itself."""
+        return replace(self, views=[self.views[camera]], light=self.light.of(camera))
+
+    def largest_px(self, position_lab_mm: Tensor) -> Tensor:
+        """Radius (B,), px, of the largest disk that a ball at places (B, 3) shows in any picture."""
+        radii = torch.stack([view.radius_px(position_lab_mm, self.radius_mm) for view in self.views])
+        return radii.nan_to_num().amax(0)
+
+    def pixels(
+        self,
+        pictures: Sequence[Sequence[Picture]],
+        position_lab_mm: Tensor,
+        level: PyramidLevel,
+        radius_px: float | None = None,
+    ) -> Pixels:
+        """Cut the disks of B poses out of the pictures of C views.
+
+        Args:
+            pictures: B times C frames.
+            position_lab_mm: (B, 3), where the ball is, to a few pixels.
+            level: of detail.
+            radius_px: of the disks; None: that of the largest one, on which the others' last bits then depend.
+        """
+        middles = [torch.nan_to_num(view.camera.project(position_lab_mm)).tolist() for view in self.views]
+        if radius_px is None:
+            radius_px = max(1.0, float(self.largest_px(position_lab_mm).max()))
+            radius_px = SIZES ** math.ceil(math.log(radius_px) / math.log(SIZES))
+        stencil = level.stencil(min(radius_px, 0.5 * max(self.views[0].camera.image_size)))
+        return stacked(
+            [
+                cut_pixels(
+                    frame,
+                    view.background.mean,
+                    view.sight,
+                    tuple(middles[c][b]),
+                    stencil,
+                    level.extra_px,
+                    view.background.shown,
+                )
+                for b, frames in enumerate(pictures)
+                for c, (view, frame) in enumerate(zip(self.views, frames, strict=True))
+            ]
+        )
+
+    def fit(
+        self,
+        pixels: Pixels,
+        position_lab_mm: Tensor,
+        R_lab_body: Tensor,
+        use: Tensor,
+        level: PyramidLevel,
+        iterations: int,
+        place_precision: Tensor | None = None,
+    ) -> Fit:
+        """Refine B poses at one level; see `refine`."""
+        there = self.device
+        return refine(
+            pixels.to(there),
+            position_lab_mm.to(there),
+            R_lab_body.to(there),
+            use.to(there),
+            radius_mm=self.radius_mm,
+            paint=level.paint,
+            blur_px=level.blur_px,
+            light=self.light,
+            shading=self.shading if level.extra_px == 0 else LATER,
+            iterations=iterations,
+            place_precision=None if place_precision is None else place_precision.to(there),
+        ).to(CPU)
+
+
+def base_table(texture: Tensor, diameter_px: float) -> TextureTable:
+    """Return the finest table of a map that disks of some diameter can tell, from which all others are blurred."""
+    return texture_table(texture, max(BASE_RAD, FINEST_PX * 2 / diameter_px))

@@ -1,0 +1,151 @@
+"""How the painted sphere looks through real pixels, and how that changes with its pose: exact geometry, blurred."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sphereorient.pose.pixels import Pixels
+from sphereorient.sphere.texture_table import TextureTable
+
+SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself
+RIM_NODES = 4  # look-ups along the radius where the limb is near: there the paint is squeezed together
+DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of the paint is infinite on the limb
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """The sphere in the pixels of L disks at one pose each; made by `sphere_view`, read by refine and light."""
+
+    paint: Tensor  # (L, P), blurred paint seen, 0 .. 1
+    coverage: Tensor  # (L, P), share of the pixel's blurred aperture that the sphere fills
+    across: Tensor  # (L, 2, P), place on the disk along the camera's x and y, radii
+    paint_by_rotation: Tensor  # (L, 3, P), derivative by delta in exp([delta]x) R, 1/rad
+    paint_by_position: Tensor  # (L, 3, P), derivative by the centre, lab, 1/mm
+    coverage_by_position: Tensor  # (L, 3, P), 1/mm
+
+
+def sphere_view(
+    pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, radius_mm: float, paint: TextureTable, blur_px: float
+) -> View:
+    """Look at the sphere through pixels whose aperture is a Gaussian.
+
+    A pixel near the limb sees the paint about the middle of that part of its aperture which the sphere covers, and
+    along the radius the sphere's curvature stretches the aperture over more paint: two look-ups, one standard deviation
+    to both sides of the mean of a Gaussian cut off at the limb, make both right, the table's own blur does the rest.
+    Near the limb there are four, at the quantiles of what is left of the Gaussian.
+
+    Args:
+        pixels: of L disks, float32.
+        position_lab_mm: (L, 3), centre of the sphere.
+        R_lab_body: (L, 3, 3).
+        radius_mm: of the sphere.
+        paint: blurred by `blur_px` as seen at the disk's middle.
+        blur_px: standard deviation of the aperture, px.
+
+    Returns:
+        The view. In its derivatives the spread of the look-ups is held fixed.
+
+    Source: ERRATA A4 (the cap and the ellipse that a perspective camera sees); mean and variance of a cut-off
+    Gaussian, Johnson, Kotz and Balakrishnan 1994, section 13.10.
+    """
+    d = pixels.direction
+    R = R_lab_body.to(d.dtype)
+    # In double precision, once: half a metre less half a metre.
+    to_centre = (position_lab_mm[:, :, None] - pixels.origin.double()).to(d.dtype)
+    along = (to_centre * d).sum(1, keepdim=True)
+    aside = to_centre - along * d  # from the line of sight's nearest point to the centre
+    nearest = (aside * aside).sum(1).sqrt().clamp_min(1e-6 * radius_mm)
+    outward = aside / -nearest[:, None]  # unit, from the centre to the line of sight
+    q0 = nearest / radius_mm
+    distance = to_centre[..., 0].norm(dim=1, keepdim=True)
+    blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
+    # The Gaussian aperture, cut off at the limb: what share is left, where its middle lies, how wide it is.
+    # Half of an aperture on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
+    edge = (1.0 - 0.5 * blur * blur - q0) / blur
+    coverage = torch.special.ndtr(edge)
+    density = torch.exp(-0.5 * edge * edge) * (1.0 / math.sqrt(2.0 * math.pi))
+    pull = density / coverage.clamp_min(1e-4)
+    q = (q0 - blur * pull).clamp(0.0, 1.0)
+    inner = pixels.inner
+    variance = (1.0 - pull * (edge + pull)).clamp(SPREAD_MIN, 1.0)[:, :inner]
+    spread = blur * variance.sqrt() * q[:, :inner]
+    at = torch.stack([q[:, :inner] - spread, q[:, :inner] + spread], dim=1)
+    parts = [
+        _looked(at, variance[:, None], d[..., :inner], outward[..., :inner], nearest[:, :inner], R, paint, radius_mm)
+    ]
+    if inner < d.shape[-1]:
+        outer = slice(inner, None)
+        at, moves = _rim_nodes(q0[:, outer], blur, coverage[:, outer], density[:, outer], q[:, outer])
+        parts.append(_looked(at, moves, d[..., outer], outward[..., outer], nearest[:, outer], R, paint, radius_mm))
+    body, turn, shift = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
+    return View(
+        paint=body,
+        coverage=coverage,
+        across=q[:, None] * (pixels.axes @ outward),
+        paint_by_rotation=turn,
+        paint_by_position=shift,
+        coverage_by_position=(density / (blur * radius_mm))[:, None] * outward,
+    )
+
+
+def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
+    """Return look-ups along the radius where the limb is near, and how each moves with the pixel, (L, n, P) each.
+
+    They are quantiles of the cut-off Gaussian, drawn towards its middle by what the table's own blur adds.
+    """
+    share = ((torch.arange(RIM_NODES, dtype=q0.dtype, device=q0.device) + 0.5) / RIM_NODES)[:, None]
+    z = torch.special.ndtri((share * coverage[:, None]).clamp(1e-6, 1 - 1e-6))
+    # The limb holds back the more of a node the nearer to it the node is.
+    moves = 1.0 - share * density[:, None] / (torch.exp(-0.5 * z * z) * (1.0 / math.sqrt(2.0 * math.pi)))
+    middle = middle[:, None]
+    return middle + middle * (q0[:, None] + blur[:, None] * z - middle), moves.clamp(0.0, 1.0)
+
+
+def _looked(
+    at: Tensor,
+    moves: Tensor,
+    d: Tensor,
+    outward: Tensor,
+    nearest: Tensor,
+    R: Tensor,
+    paint: TextureTable,
+    radius_mm: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean paint of some look-ups (L, P) and its derivatives by rotation and place (L, 3, P).
+
+    Args:
+        at: (L, n, P), distance of each look-up from the disk's middle, radii.
+        moves: (L, n, P) or (L, 1, P), by how much it moves with the pixel.
+        d: (L, 3, P), lines of sight.
+        outward: (L, 3, P), unit, from the centre to them.
+        nearest: (L, P), their distance, mm.
+        R: (L, 3, 3).
+        paint: table.
+        radius_mm: of the sphere.
+    """
+    # In body components, where the paint is: the derivatives are turned back once, at the end.
+    sight_b, outward_b = (R.mT @ d)[:, :, None], (R.mT @ outward)[:, :, None]
+    qt = at.clamp(0.0, math.sqrt(1.0 - DEPTH_MIN**2))
+    depth = (1.0 - qt * qt).sqrt()
+    normal_b = qt[:, None] * outward_b - depth[:, None] * sight_b
+    value, slope = paint.sample(normal_b.flatten(2))
+    value, slope = value.reshape(qt.shape), slope.reshape(normal_b.shape)
+    # Moving the centre along -outward lets the look-up slide outwards over the sphere.
+    slide = (slope * outward_b).sum(1) + qt / depth * (slope * sight_b).sum(1)
+    radial = (moves * slide).mean(1)
+    flat_b = (qt[:, None] * slope).mean(2)
+    by_sight, by_outward = (flat_b * sight_b[:, :, 0]).sum(1), (flat_b * outward_b[:, :, 0]).sum(1)
+    # Across the radius a look-up stays at its share of it, q / q0.
+    flat = R @ flat_b - by_sight[:, None] * d - by_outward[:, None] * outward
+    shift = flat * (-1.0 / nearest)[:, None] - (radial / radius_mm)[:, None] * outward
+    return value.mean(1), R @ _cross(slope, normal_b).mean(2), shift
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Return a x b of (L, 3, ...); torch's own is several times slower along a middle axis."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=1)

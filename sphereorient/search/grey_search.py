@@ -1,0 +1,144 @@
+"""The search on grey values: a bank of normalised pictures over all rotations, distinct peaks, a climb from each."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from sphereorient import so3
+from sphereorient.errors import ShapeError, refusal
+from sphereorient.search.normalisation import LocalNormalisation
+from sphereorient.search.peaks import best_of_groups, compact_groups, distinct
+from sphereorient.search.proposer import Proposals
+from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
+from sphereorient.search.settings import GreySearchSettings
+from sphereorient.sphere import orthographic_view, perspective_view
+from sphereorient.sphere.texture_table import TextureTable, texture_table
+from sphereorient.trajectory import Reason
+
+# Disks normalised at once. Fixed and filled up with empty disks: the last bits of sums depend on how many there are,
+# and so would a disk's answer. Products of whole numbers are exact, and may be of any.
+BATCH = 32
+PRODUCT = 128  # disks in one product, at most: the scores of more leave the cache
+GROUP = 8  # neighbouring templates whose best one stands for them in the selection
+LOOKED_AT = 32  # best groups among which peaks are sought: a broad peak spans several
+TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest detail
+DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
+
+
+class GreySearch:
+    """Searches all of SO(3) for the views of a map that look like a disk, under any smooth light.
+
+    The bank covers SO(3): every rotation is within (1/2 + 1/sqrt 2) step of a template's (`so3.lattman_grid`), and
+    detail finer than `detail` is taken out of templates and pictures, so that the nearest template still resembles.
+
+    Args:
+        texture: (H, 2 H), the map, 0 black .. 1 white.
+        settings: of the search.
+        blur: standard deviation of the pictures' own blur, radii, where it is wider than `detail` or nearly so.
+    """
+
+    def __init__(self, texture: Tensor, settings: GreySearchSettings, blur: float = 0.0) -> None:
+        self._settings = settings
+        size, distance = settings.size_px, settings.distance_radii
+        self._view = orthographic_view(size) if distance is None else perspective_view(size, distance)
+        self._normalise = LocalNormalisation(size, detail=settings.detail, window=settings.window, clip=settings.clip)
+        pixel_rad = 2.0 / size
+        paint = texture_table(texture, max(blur, min(pixel_rad, settings.detail)), TABLE_SIDE)
+        self._rough = detail_level(self._view, paint, settings.detail, every=2, blur=blur)
+        self._fine = detail_level(self._view, paint, pixel_rad, every=1, blur=blur)
+        grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
+        # (GROUP, G): the members of a group lie one below the other, and their maximum is one of whole rows.
+        self._grid = grid[compact_groups(grid, GROUP).T]
+        self._bank = self._templates(paint)
+
+    @property
+    def size_px(self) -> int:
+        """Side of the disks, px."""
+        return self._settings.size_px
+
+    @property
+    def templates(self) -> Tensor:
+        """Rotations of the bank, (K, 3, 3) float32."""
+        return self._grid.flatten(0, 1)
+
+    def propose(self, disks: Tensor) -> Proposals:
+        """Propose the best orientations that a disk allows, at least `distinct_deg` apart.
+
+        Args:
+            disks: (F, S, S) float32, grey levels of any scale, the outline touching the borders.
+
+        Returns:
+            Proposals, best first. The score is the share of the disk's deviation from smooth light that the paint
+            explains, 0 .. 1 (the square of their correlation). A disk whose best score stays below `score_min` has
+            none (`LOW_SCORE`).
+
+        Raises:
+            ShapeError: the disks are of another size.
+        """
+        if disks.shape[1:] != (self.size_px, self.size_px):
+            size = f"(F, {self.size_px}, {self.size_px})"
+            raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
+        parts = [Proposals.none(())]
+        for some in torch.split(disks, PRODUCT):
+            for disk, place, peak in zip(some, *self.search(some), strict=True):
+                parts.append(self._climbed(disk, self.templates[place[peak][: self._settings.peaks]]))
+        return Proposals.joined(parts)
+
+    def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
+        """Compare disks with the whole bank.
+
+        Args:
+            disks: (F, S, S) float32; the scores of all are held at once, 36 kB each.
+
+        Returns:
+            Places of the best templates of the best groups, (F, M) int64 in `templates`, best first; and which of
+            them are peaks, (F, M) bool.
+        """
+        filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
+        steps = torch.cat([_steps(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
+        scores = torch._int_mm(steps, self._bank.T)
+        place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
+        apart = math.radians(self._settings.peak_deg)
+        looked_at = self.templates[F.pad(place, (0, 0, 0, -len(disks) % BATCH))]
+        peak = torch.cat([distinct(R, apart) for R in torch.split(looked_at, BATCH)])[: len(disks)]
+        return place, peak
+
+    def _templates(self, paint: TextureTable) -> Tensor:
+        """Evened views of all rotations, (K, P) int8."""
+        normal = self._view.normal_view.T.contiguous()
+        chunks = torch.split(self.templates, BATCH)
+        return torch.cat([_steps(self._normalise(self._view.picture(paint.sample(R.mT @ normal)[0]))) for R in chunks])
+
+    def _climbed(self, disk: Tensor, starts: Tensor) -> Proposals:
+        """Climb from the peaks of one disk: its proposals, best first."""
+        settings = self._settings
+        R, score = refine_rotation(self._rough, level_reference(self._rough, disk), starts, settings.rough_steps)
+        R = R[self._distinct(R, score)[: settings.finalists]]
+        R, score = refine_rotation(self._fine, level_reference(self._fine, disk), R, settings.fine_steps)
+        chosen = self._distinct(R, score)
+        chosen = chosen[score[chosen] >= settings.score_min]
+        if not len(chosen):
+            return Proposals.none([Reason.LOW_SCORE])
+        # The float32 products back to rotations of float64.
+        return Proposals(
+            offset=torch.tensor([0, len(chosen)]),
+            R_view_body=so3.nearest_rotation(R[chosen].double()),
+            score=score[chosen].double(),
+            reason=(Reason.OK,),
+        )
+
+    def _distinct(self, R: Tensor, score: Tensor) -> Tensor:
+        """Indices of the rotations that are not near a better one, best first."""
+        order = score.argsort(descending=True, stable=True)
+        return order[distinct(R[order], math.radians(self._settings.distinct_deg))]
+
+
+def _steps(even: Tensor) -> Tensor:
+    """Whole numbers -127 .. 127 in place of normalised pictures, (B, P) int8, filled up to a multiple of 8 pixels."""
+    scale = 127.0 / DEVIATIONS * math.sqrt(even.shape[1])
+    # One scale for all templates: as all are of length 1, products of whole numbers rank them as they are.
+    return F.pad((even * scale).round().clamp(-127, 127), (0, -even.shape[1] % 8)).to(torch.int8)

@@ -1,0 +1,154 @@
+"""The blurred paint and its slope over direction space: what refinement looks up, thousands of pixels at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from sphereorient.sphere.texture import reduced_texture, sample_texture
+
+# Nodes of the 5-point and 3-point Gauss-Hermite rules for a unit normal, and their weights.
+FIVE = (
+    (-2.8569700138728, -1.3556261799742659, 0.0, 1.3556261799742659, 2.8569700138728),
+    (0.011257411327721, 0.22207592200561264, 0.5333333333333333, 0.22207592200561264, 0.011257411327721),
+)
+THREE = ((-math.sqrt(3.0), 0.0, math.sqrt(3.0)), (1 / 6, 2 / 3, 1 / 6))
+BASE_RAD = 0.008  # blur of the finest table: below half a pixel of any disk that is resolved to 160 px
+CHUNK = 1 << 16  # directions looked up at once while a table is made
+SIDE = 512  # cells along each axis of the finest table: 0.4 degrees, 4 MB
+CELLS_A_BLUR = 3.0  # cells that a blur's standard deviation is wide at least, in tables coarser than the finest
+
+
+def octahedral_directions(side: int) -> Tensor:
+    """Return the unit direction at the middle of each cell of an octahedral map, (side^2, 3) float64, row by row.
+
+    Source: the octahedron |x| + |y| + |z| = 1 unfolded into a square (Praun and Hoppe 2003): no poles, no
+    trigonometry, cells of nearly equal size.
+    """
+    at = (torch.arange(side, dtype=torch.float64) + 0.5) * (2.0 / side) - 1.0
+    y, x = torch.meshgrid(at, at, indexing="ij")
+    z = 1.0 - x.abs() - y.abs()
+    folded_x, folded_y = (1.0 - y.abs()) * torch.sign(x), (1.0 - x.abs()) * torch.sign(y)
+    direction = torch.stack([torch.where(z < 0, folded_x, x), torch.where(z < 0, folded_y, y), z], dim=-1)
+    return torch.nn.functional.normalize(direction, dim=-1).reshape(-1, 3)
+
+
+def octahedral_cells(x: Tensor, y: Tensor, z: Tensor, side: int) -> Tensor:
+    """Return the cell (...) int64 that holds each direction; the components may have any common length."""
+    # The square's coordinates in cells, the middle at zero.
+    half = 0.5 * side
+    scale = half / (x.abs() + y.abs() + z.abs())
+    u, v = x * scale, y * scale
+    below = z < 0
+    u, v = (
+        torch.where(below, torch.copysign(half - v.abs(), u), u),
+        torch.where(below, torch.copysign(half - u.abs(), v), v),
+    )
+    column = (u + half).to(torch.int32).clamp_(0, side - 1)
+    row = (v + half).to(torch.int32).clamp_(0, side - 1)
+    cell: Tensor = row * side + column
+    return cell
+
+
+class TextureTable:
+    """The paint convolved with a Gaussian on the sphere, as value and slope in cells of direction space.
+
+    Within a cell the paint is its tangent plane, so value and slope belong together exactly (what autograd finds is
+    what `look` returns), and the error of the value is of second order in the cell's size over the blur.
+
+    Args:
+        rows: (side^2, 4) float32, from `texture_table`.
+        blur_rad: the Gaussian's standard deviation, rad.
+    """
+
+    def __init__(self, rows: Tensor, blur_rad: float) -> None:
+        self.rows = rows
+        self.side = math.isqrt(len(rows))
+        self.blur_rad = blur_rad
+
+    def sample(self, direction_body: Tensor) -> tuple[Tensor, Tensor]:
+        """Look up the paint.
+
+        Args:
+            direction_body: (L, 3, P) unit vectors, body frame; component by component, as products make them.
+
+        Returns:
+            Value (L, P), 0 black .. 1 white, and its gradient (L, 3, P) per rad, tangent to the sphere.
+        """
+        x, y, z = direction_body.unbind(1)
+        cell = octahedral_cells(x, y, z, self.side)
+        found = self.rows.index_select(0, cell.reshape(-1)).reshape(*cell.shape, 4)
+        slope = found[..., 1:].movedim(-1, 1)
+        value = found[..., 0] + slope[:, 0] * x + slope[:, 1] * y + slope[:, 2] * z
+        return value, slope
+
+    def to(self, device: torch.device) -> TextureTable:
+        """Return the same on another device, to look up there; `blurred` works on the CPU."""
+        return TextureTable(self.rows.to(device), self.blur_rad)
+
+    def blurred(self, blur_rad: float) -> TextureTable:
+        """Return the table of a wider blur, made from this one; itself where the blur is not wider.
+
+        Args:
+            blur_rad: standard deviation of the whole Gaussian, rad.
+        """
+        if blur_rad <= self.blur_rad:
+            return self
+        # Nine points are exact for what is smooth over the added width: go there in steps of 1.6 at most.
+        target = min(blur_rad, 1.6 * self.blur_rad)
+        added = math.sqrt(target**2 - self.blur_rad**2)
+        # A cell is 2.2 / side wide; what is blurred more needs fewer of them.
+        side = min(self.side, 1 << math.ceil(math.log2(2.2 * CELLS_A_BLUR / target)))
+        parts = [torch.zeros(0, 4)]
+        for centre in torch.split(octahedral_directions(side), CHUNK):
+            value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
+            for share, _, at in _disk_nodes(centre, added, THREE):
+                v, g = self.sample(at.T[None])
+                value, slope = value + share * v[0], slope + share * g[0].T
+            parts.append(_rows(value, slope, centre.float()))
+        return TextureTable(torch.cat(parts), target).blurred(blur_rad)
+
+
+def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE) -> TextureTable:
+    """Make the table of a map.
+
+    Args:
+        texture: (H, 2 H), the map, 0 black .. 1 white.
+        blur_rad: standard deviation of the Gaussian on the sphere, rad.
+        side: cells along each axis.
+    """
+    finest = min(blur_rad, BASE_RAD)
+    reduced = reduced_texture(texture.float(), 2.0 / finest)  # pixels as wide as the blur: the rule sees no steps
+    parts = [torch.zeros(0, 4)]
+    for centre in torch.split(octahedral_directions(side), CHUNK):
+        value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
+        for share, offset, at in _disk_nodes(centre, finest, FIVE):
+            v = sample_texture(reduced, at)
+            value = value + share * v
+            # The Gaussian's derivative: the slope is the mean of paint times offset, over the variance.
+            slope = slope + share * v[:, None] * offset / finest**2
+        parts.append(_rows(value, slope, centre.float()))
+    return TextureTable(torch.cat(parts), finest).blurred(blur_rad)
+
+
+def _disk_nodes(
+    centre: Tensor, width: float, rule: tuple[tuple[float, ...], tuple[float, ...]]
+) -> Iterator[tuple[float, Tensor, Tensor]]:
+    """Yield share, tangent offset (M, 3) and direction (M, 3) of the nodes of a Gaussian about directions (M, 3)."""
+    helper = torch.where(centre[:, 2:].abs() < 0.9, centre.new_tensor([0.0, 0, 1]), centre.new_tensor([1.0, 0, 0]))
+    right = torch.nn.functional.normalize(torch.linalg.cross(helper, centre), dim=-1)
+    up = torch.linalg.cross(centre, right)
+    for a, share_a in zip(*rule, strict=True):
+        for b, share_b in zip(*rule, strict=True):
+            offset = width * (a * right + b * up)
+            at = torch.nn.functional.normalize(centre + offset, dim=-1)
+            yield share_a * share_b, offset.float(), at.float()
+
+
+def _rows(value: Tensor, slope: Tensor, centre: Tensor) -> Tensor:
+    """Rows of a table: the tangent plane's value at the origin and its slope."""
+    slope = slope - (slope * centre).sum(-1, keepdim=True) * centre
+    return torch.cat([value[:, None] - (slope * centre).sum(-1, keepdim=True), slope], dim=-1)

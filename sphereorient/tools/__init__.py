@@ -1,0 +1,1 @@
+"""Tools beside tracking: paint to print, comparing maps, photographs of a spinning ball."""

@@ -1,0 +1,1 @@
+"""Paint to print: designs, gores, how well a design fixes the orientation."""

@@ -1,0 +1,1 @@
+"""Spin from photographs of a ball with dots."""

@@ -1,0 +1,1 @@
+"""How a texture map changes over a series of movies."""

@@ -1,0 +1,187 @@
+"""Maps of one ball, one a movie: where its paint wears off, the same places followed from map to map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from sphereorient.errors import PaintError, refusal
+from sphereorient.mapping.compare import (
+    CHANGED,
+    MapComparison,
+    compare_maps,
+    fit_levels,
+    paint_change,
+    turned_map,
+    without_changed,
+)
+from sphereorient.synth.textures import map_directions
+
+BEYOND = 5.0  # times the scatter of paint that did not wear: noise of two maps seldom is
+LEAST_DEG = 1.5  # radius of the smallest place that is told
+HALF = 0.5  # share of a place that a map must know to say how much of it is worn
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Wear:
+    """One map beside the first of its series, in that one's body frame and size; made by `wear_series`."""
+
+    comparison: MapComparison  # displacement included, but of patches whose paint changed
+    change: Tensor  # (H, 2 H), -1 .. 1, negative where paint became darker; NaN where either map is unknown
+    scatter: float  # standard deviation of grey between the two maps where nothing wore, black to white being 1
+    worn: Tensor  # (H, 2 H) bool: places whose change is beyond scatter
+
+    @property
+    def known(self) -> Tensor:
+        """Where both maps know the paint, (H, 2 H) bool."""
+        return torch.isfinite(self.change)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Growth:
+    """Wear of one map in figures; shares are of area, NaN where there is nothing to take a share of."""
+
+    known: float  # of the ball, by this map and the first
+    worn: float  # of what is known
+    grown: float  # worn now less worn in the map before, of what both know; against the first map: `worn`
+    stays: float  # of what was worn in the map before and is known now, what is worn still
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Place:
+    """A connected place that is worn in some map of a series."""
+
+    longitude_deg: float  # of its middle, in the first map's body frame
+    latitude_deg: float
+    share: tuple[float, ...]  # of the whole ball's area, worn in each map but the first; NaN where hardly seen
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WearSeries:
+    """How the paint of one ball wore from map to map; made by `wear_series`."""
+
+    wear: tuple[Wear, ...]  # of all maps but the first
+    number: Tensor  # (H, 2 H) int64, which place a texel is of, from 1 on; 0 where no map is worn
+    places: tuple[Place, ...]  # of these numbers, largest first
+
+    @property
+    def growth(self) -> tuple[Growth, ...]:
+        """The figures of all maps but the first."""
+        before = (None, *self.wear[:-1])
+        return tuple(_growth(now, last) for now, last in zip(self.wear, before, strict=True))
+
+
+def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
+    """Find what wore off a ball between movies.
+
+    Each map is turned into the first one's body frame and compared with it; so a place keeps its name, and errors do
+    not add up from map to map.
+
+    Args:
+        maps: two or more, (H, 2 H) each, 0 black .. 1 white, NaN where unknown; in the order of the movies, the first
+            one the reference.
+        turned: whether the body frames may differ by rotations, which are found first; else they are one.
+
+    Raises:
+        PaintError: fewer than two maps, or they do not show one ball.
+        ShapeError: not 2:1.
+    """
+    if len(maps) < 2:
+        do = "give the maps in the order of their movies"
+        raise PaintError(refusal("maps", expected="two or more", got=str(len(maps)), do=do))
+    wear = tuple(_wear(texture, maps[0], turned) for texture in maps[1:])
+    number = _places(torch.stack([one.worn for one in wear]).any(0))
+    area = texel_areas(len(number))
+    sizes = torch.zeros(int(number.max()) + 1, dtype=torch.float64).index_add(0, number.reshape(-1), area.reshape(-1))
+    order = sizes[1:].argsort(descending=True, stable=True)
+    rank = torch.zeros(len(sizes), dtype=torch.int64)
+    rank[order + 1] = torch.arange(1, len(sizes))
+    number = rank[number]
+    return WearSeries(
+        wear=wear, number=number, places=tuple(_place(number == k, wear, area) for k in range(1, len(sizes)))
+    )
+
+
+def texel_areas(height: int) -> Tensor:
+    """Return the texels' shares of the sphere's area, (height, 2 height) float64."""
+    edge = torch.linspace(0, math.pi, height + 1, dtype=torch.float64).cos()
+    return ((edge[:-1] - edge[1:]) / (4 * height))[:, None].repeat(1, 2 * height)
+
+
+def _wear(texture: Tensor, first: Tensor, turned: bool) -> Wear:
+    """Compare one map with the first."""
+    comparison = compare_maps(texture, first, turned)
+    there = turned_map(texture, comparison.R_other_reference, len(first))
+    change = paint_change(there, first)
+    gain, offset = fit_levels(first, there)
+    off = (there - (gain * first + offset)).abs()
+    known = torch.isfinite(off)
+    # The median does not see what wore, nor the rims of paint that is displaced.
+    scatter = 1.4826 * float(off[known].median()) if known.any() else math.nan
+    worn = _large_enough(change.abs() > max(CHANGED, BEYOND * scatter))  # what is unknown is not
+    return Wear(comparison=without_changed(comparison, change, CHANGED), change=change, scatter=scatter, worn=worn)
+
+
+def _growth(now: Wear, before: Wear | None) -> Growth:
+    area = texel_areas(len(now.change))
+
+    def share(part: Tensor, whole: Tensor) -> float:
+        total = float(area[whole].sum())
+        return float(area[part & whole].sum()) / total if total else math.nan
+
+    worn = share(now.worn, now.known)
+    known = float(area[now.known].sum())
+    if before is None:
+        return Growth(known=known, worn=worn, grown=worn, stays=math.nan)
+    both = now.known & before.known
+    grown = share(now.worn, both) - share(before.worn, both)
+    return Growth(known=known, worn=worn, grown=grown, stays=share(now.worn, before.worn & now.known))
+
+
+def _place(inside: Tensor, wear: Sequence[Wear], area: Tensor) -> Place:
+    """Return where a place (H, 2 H) bool is, and how much of it is worn in each map."""
+    direction = map_directions(len(inside))[inside].double()
+    x, y, z = (direction * area[inside][:, None]).sum(0).tolist()
+    shares = []
+    for one in wear:
+        seen = float(area[inside & one.known].sum()) >= HALF * float(area[inside].sum())
+        shares.append(float(area[inside & one.worn].sum()) if seen else math.nan)
+    return Place(
+        longitude_deg=math.degrees(math.atan2(y, x)),
+        latitude_deg=math.degrees(math.atan2(z, math.hypot(x, y))),
+        share=tuple(shares),
+    )
+
+
+def _large_enough(worn: Tensor) -> Tensor:
+    """Return those connected places of a mask (H, 2 H) that are no specks."""
+    number = _places(worn)
+    area = texel_areas(len(worn))
+    sizes = torch.zeros(int(number.max()) + 1, dtype=torch.float64).index_add(0, number.reshape(-1), area.reshape(-1))
+    told = sizes >= 0.5 * (1 - math.cos(math.radians(LEAST_DEG)))  # area of a cap over that of the sphere
+    told[0] = False
+    kept: Tensor = told[number]
+    return kept
+
+
+def _places(worn: Tensor) -> Tensor:
+    """Number the connected places of a mask (H, 2 H) from 1 on; across the map's edge and its poles as well."""
+    mask = worn.numpy()
+    node = np.arange(mask.size).reshape(mask.shape)
+    pairs = [(node, np.roll(node, -1, axis=1)), (node[:-1], node[1:])]
+    pairs += [(node[row], np.full_like(node[row], node[row][mask[row]].min())) for row in (0, -1) if mask[row].any()]
+    a, b = (np.concatenate([pair[k].reshape(-1) for pair in pairs]) for k in (0, 1))
+    joined = mask.reshape(-1)[a] & mask.reshape(-1)[b]
+    graph = coo_matrix((np.ones(int(joined.sum())), (a[joined], b[joined])), shape=(mask.size, mask.size))
+    label: NDArray[np.int32] = connected_components(graph, directed=False)[1]
+    number = np.zeros(mask.size, np.int64)
+    number[mask.reshape(-1)] = np.unique(label[mask.reshape(-1)], return_inverse=True)[1] + 1
+    return torch.from_numpy(number.reshape(mask.shape))

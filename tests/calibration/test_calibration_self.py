@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from calibration_examples import bumped, cameras, vector
+from conftest import assert_close
+
+from sphereorient import so3
+from sphereorient.calibration.self_calibration import MOVED, Told, self_calibrate
+from sphereorient.cameras import ParameterCovariance
+from sphereorient.errors import CameraError
+
+FRAMES = 160
+NOISE_PX, NOISE_DEG = 0.03, 0.08
+
+
+def told(calibrated, truly, rng, frames=FRAMES, noise=1.0, bias_deg=0.0):
+    """What cameras of a calibration say of a ball that cameras `truly` filmed: its picture's centre, its attitude."""
+    places = 45 * (2 * torch.rand(frames, 3, generator=rng, dtype=torch.float64) - 1)
+    R_lab_body = so3.exp(2 * torch.randn(frames, 3, generator=rng, dtype=torch.float64))
+    says = {}
+    for k, (name, camera) in enumerate(calibrated.items()):
+        true = truly[name]
+        centre = true.project(places) + noise * NOISE_PX * torch.randn(frames, 2, generator=rng, dtype=torch.float64)
+        # The picture fixes the ball before the camera; the calibration says what that is in the lab.
+        turn = frame(camera, centre) @ frame(true, true.project(places)).mT
+        wobble = torch.deg2rad(noise * NOISE_DEG * torch.randn(frames, 3, generator=rng, dtype=torch.float64))
+        bias = torch.deg2rad(bias_deg * k * vector(0.6, -0.3, 0.7))
+        says[name] = Told(centre_px=centre, R_lab_body=so3.exp(bias) @ so3.exp(wobble) @ turn @ R_lab_body)
+    return says
+
+
+def frame(camera, uv_px):
+    """Axes in the lab of what a camera sees at pixels: the line of sight, and two across it."""
+    forward = camera.rays(uv_px).direction_lab
+    down = camera.rays(uv_px + vector(0.0, 1.0)).direction_lab - camera.rays(uv_px - vector(0.0, 1.0)).direction_lab
+    down = torch.nn.functional.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
+    return torch.stack([torch.linalg.cross(down, forward), down, forward], dim=-1)
+
+
+def relative_deg(found, true):
+    """By how much the turn between the cameras is wrong, degrees."""
+    between = [rig["cam2"].R_cam_lab @ rig["cam1"].R_cam_lab.mT for rig in (found, true)]
+    return float(torch.rad2deg(so3.geodesic_distance(*between)))
+
+
+def bump(rng):
+    """0.3 degrees and 0.5 mm, in a direction of chance."""
+    turn, move = (torch.nn.functional.normalize(torch.randn(3, generator=rng).double(), dim=0) for _ in range(2))
+    return torch.deg2rad(torch.tensor(0.3)).double() * turn, 0.5 * move
+
+
+@pytest.mark.parametrize("walls", [False, True], ids=["air", "port"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bumped_camera_is_put_right(walls, seed):
+    rng = torch.Generator().manual_seed(seed)
+    calibrated = cameras(walls=walls)
+    truly = calibrated | {"cam2": bumped(calibrated["cam2"], *bump(rng))}
+    result = self_calibrate(calibrated, told(calibrated, truly, rng, bias_deg=0.03))
+    assert relative_deg(calibrated, truly) > 0.25
+    assert relative_deg(result.cameras, truly) < 0.05
+    assert result.gap_before_mm > 0.1
+    noise_alone = self_calibrate(truly, told(truly, truly, rng)).gap_before_mm
+    assert result.gap_after_mm < 1.5 * noise_alone
+    assert result.frames == FRAMES
+
+
+def test_the_first_camera_stays_and_the_change_is_as_with_parameters_has_it(rng):
+    calibrated = cameras()
+    turn, move = bump(rng)
+    truly = calibrated | {"cam2": bumped(calibrated["cam2"], turn, move)}
+    result = self_calibrate(calibrated, told(calibrated, truly, rng))
+    assert result.cameras["cam1"] is calibrated["cam1"]
+    assert list(result.moved) == ["cam2"]
+    applied = bumped(calibrated["cam2"], result.moved["cam2"][:3], result.moved["cam2"][3:])
+    assert_close(result.cameras["cam2"].R_cam_lab, applied.R_cam_lab)
+    assert float((result.moved["cam2"][:3] - turn).norm()) < 0.2 * float(turn.norm())
+
+
+def test_cameras_that_stand_right_stay(rng):
+    calibrated = cameras()
+    result = self_calibrate(calibrated, told(calibrated, calibrated, rng))
+    assert relative_deg(result.cameras, calibrated) < 0.03
+    assert result.gap_after_mm <= result.gap_before_mm * 1.01
+
+
+def test_what_the_sphere_does_not_determine_is_named(rng):
+    """How far the second camera stands away along its own axis: its lines of sight hardly move."""
+    calibrated = cameras()
+    truly = calibrated | {"cam2": bumped(calibrated["cam2"], *bump(rng))}
+    result = self_calibrate(calibrated, told(calibrated, truly, rng))
+    assert result.held[0].startswith("cam1: all")
+    named = set(result.held[1:])
+    assert "cam2.T_z" in named
+    assert not {"cam2.rotation_x", "cam2.rotation_y", "cam2.rotation_z"} & named
+    assert len(named) < 4
+
+
+def test_covariances_take_the_new_spread(rng):
+    calibrated = cameras()
+    names = ("f", *MOVED)
+    known = ParameterCovariance(names=names, matrix=1e-8 * torch.eye(7, dtype=torch.float64))
+    calibrated["cam2"] = replace(calibrated["cam2"], covariance=known)
+    result = self_calibrate(calibrated, told(calibrated, calibrated, rng))
+    sigmas = result.cameras["cam2"].covariance.sigmas
+    assert sigmas["f"] == pytest.approx(1e-4)
+    for part, sigma in zip(MOVED, result.sigma["cam2"].tolist(), strict=True):
+        assert sigmas[part] == pytest.approx(sigma)
+
+
+def test_frames_that_one_camera_missed_and_wild_ones_do_no_harm(rng):
+    calibrated = cameras()
+    truly = calibrated | {"cam2": bumped(calibrated["cam2"], *bump(rng))}
+    says = told(calibrated, truly, rng)
+    centre, turned = says["cam2"].centre_px.clone(), says["cam2"].R_lab_body.clone()
+    centre[:30] = torch.nan
+    centre[30:34] += 40.0
+    turned[40:44] = turned[60:64]
+    says["cam2"] = Told(centre_px=centre, R_lab_body=turned)
+    result = self_calibrate(calibrated, says)
+    assert result.frames == FRAMES - 30
+    assert relative_deg(result.cameras, truly) < 0.05
+
+
+def test_too_few_frames_and_one_camera_are_refused(rng):
+    calibrated = cameras()
+    says = told(calibrated, calibrated, rng, frames=12)
+    with pytest.raises(CameraError, match=r"20 frames or more.*got 12; pass a longer track"):
+        self_calibrate(calibrated, says)
+    with pytest.raises(CameraError, match="two or more"):
+        self_calibrate({"cam1": calibrated["cam1"]}, says)

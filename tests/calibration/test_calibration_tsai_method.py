@@ -1,0 +1,317 @@
+"""Tsai's calibration: planted cameras come back, OpenCV agrees, and what cannot be known is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from camera_examples import behind_port, f64, port, tsai, turned
+from conftest import assert_close
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.calibration.point_fit import fit_to_points, rms_px
+from sphereorient.calibration.tsai_method import calibrate_tsai, tsai_stages
+from sphereorient.cameras import PinholeCamera, TsaiCamera
+from sphereorient.cameras.parameters import ROTATION, TRANSLATION
+from sphereorient.errors import CameraError, ShapeError
+
+SIZE = (650, 650)
+PITCH = (0.02, 0.02)
+NOISE_PX = 0.05
+
+
+def planted(**changes: object) -> TsaiCamera:
+    """A camera as the linear stages assume it: axis in the picture's middle, s_x = 1."""
+    middle = {"image_size": SIZE, "centre_px": f64((324.5, 324.5)), "pixel_pitch_mm": f64(PITCH), "sx": f64(1.0)}
+    return tsai(**(middle | changes))
+
+
+def in_space(n: int = 60, seed: int = 1) -> Tensor:
+    return 120 * (torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 0.5)
+
+
+def in_plane() -> Tensor:
+    """A plate of 13 x 13 dots, somewhere in the lab, not along its axes."""
+    at = 8 * torch.arange(-6.0, 7.0, dtype=torch.float64)
+    flat = torch.cat([torch.cartesian_prod(at, at), torch.zeros(169, 1, dtype=torch.float64)], dim=-1)
+    return flat @ turned((0.1, 0.3, -0.4)).mT + f64((5.0, -8.0, 12.0))
+
+
+def square_on(tilt_rad: float) -> TsaiCamera:
+    """A camera whose sensor is that far from parallel to the plate of `in_plane`."""
+    R = so3.exp(f64((tilt_rad, 0.0, 0.0))) @ turned((0.1, 0.3, -0.4)).mT
+    return planted(R_cam_lab=R)
+
+
+def noisy(camera: TsaiCamera, points: Tensor, seed: int = 2, sigma_px: float = NOISE_PX) -> Tensor:
+    noise = torch.randn(len(points), 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return camera.project(points) + sigma_px * noise
+
+
+def assert_same_camera(found: TsaiCamera, true: TsaiCamera, tolerance: float = 1e-8) -> None:
+    assert float(so3.geodesic_distance(found.R_cam_lab, true.R_cam_lab)) < tolerance
+    assert_close(found.T_cam_lab_mm, true.T_cam_lab_mm, atol=1e3 * tolerance)
+    assert_close(found.f_mm, true.f_mm, atol=1e2 * tolerance)
+    assert_close(found.kappa1, true.kappa1, atol=tolerance)
+    assert_close(found.centre_px, true.centre_px, atol=1e3 * tolerance)
+    assert_close(found.sx, true.sx, atol=tolerance)
+
+
+PLACES = {"space": in_space, "plane": in_plane}
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("kappa1", [0.0, 2.2e-4, 2e-3, -2e-3])
+@pytest.mark.parametrize("method", [tsai_stages, calibrate_tsai])
+def test_a_planted_camera_comes_back(place, kappa1, method):
+    # Radial alignment does not see the distortion: also Tsai's own stages are exact, where the middle is the axis.
+    camera, points = planted(kappa1=kappa1), PLACES[place]()
+    assert_same_camera(method(points, camera.project(points), SIZE, PITCH), camera)
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("T_mm", [(0.0, 0.0, 520.0), (0.0, 25.0, 520.0), (25.0, 0.0, 520.0), (400.0, -9e3, 9e2)])
+def test_it_does_not_matter_where_the_labs_origin_appears(place, T_mm):
+    # Tsai divides by T_y: with the lab's origin on the picture's middle row his equations have no solution.
+    camera = planted(T_cam_lab_mm=f64((3.0, -4.0, 520.0)))
+    shift = camera.R_cam_lab.mT @ (camera.T_cam_lab_mm - f64(T_mm))  # the same scene in another lab
+    moved = replace(camera, T_cam_lab_mm=f64(T_mm))
+    points = PLACES[place]() + shift
+    assert_same_camera(tsai_stages(points, moved.project(points), SIZE, PITCH), moved, tolerance=1e-7)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    rotvec=st.tuples(*[st.floats(-1.8, 1.8)] * 3),
+    place=st.sampled_from(list(PLACES)),
+    kappa1=st.floats(-1e-3, 2e-3),
+    f_mm=st.floats(15.0, 60.0),
+)
+def test_cameras_of_any_attitude_come_back(rotvec, place, kappa1, f_mm):  # property
+    camera = planted(R_cam_lab=turned(rotvec), T_cam_lab_mm=f64((10.0, -13.0, 12 * f_mm)), f_mm=f_mm, kappa1=kappa1)
+    points = PLACES[place]()
+    slant = abs(float((camera.R_cam_lab @ turned((0.1, 0.3, -0.4)))[2, 2]))  # cosine of sensor to plate
+    if place == "plane" and not 0.15 < slant < 0.97:
+        return  # square on there is no answer, edge on there is no picture
+    assert_same_camera(tsai_stages(points, camera.project(points), SIZE, PITCH), camera, tolerance=1e-6)
+
+
+def test_without_distortion_the_pose_is_that_of_opencvs_solve_pnp():  # oracle
+    camera, points = planted(kappa1=0.0), in_space()
+    pixels = camera.project(points)
+    found = tsai_stages(points, pixels, SIZE, PITCH)
+    K = np.array([[2250.0, 0, 324.5], [0, 2250.0, 324.5], [0, 0, 1]])
+    _, rotvec, T = cv2.solvePnP(points.numpy(), pixels.numpy(), K, None)
+    assert_close(so3.log(found.R_cam_lab), torch.from_numpy(rotvec[:, 0]), atol=1e-6)
+    assert_close(found.T_cam_lab_mm, torch.from_numpy(T[:, 0]), atol=1e-3)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_with_noise_and_no_distortion_the_camera_is_that_of_opencvs_calibration(place):  # oracle
+    points = PLACES[place]()
+    pixels = noisy(planted(kappa1=0.0), points)
+    found = fit_to_points(as_pinhole(tsai_stages(points, pixels, SIZE, PITCH)), POSE_AND_F, points, pixels)
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
+    flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    guess = np.array([[2000.0, 0, 324.5], [0, 2000.0, 324.5], [0, 0, 1]])
+    lists = [points.numpy().astype(np.float32)], [pixels.numpy().astype(np.float32)]
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 500, 1e-15)
+    rms, K, _, rotvecs, Ts = cv2.calibrateCamera(*lists, SIZE, guess, None, flags=flags, criteria=criteria)
+    assert float(found.f_px) == pytest.approx(K[0, 0], rel=1e-5)
+    assert_close(so3.log(found.R_cam_lab), torch.from_numpy(rotvecs[0][:, 0]), atol=1e-5)
+    assert_close(found.T_cam_lab_mm, torch.from_numpy(Ts[0][:, 0]), atol=1e-2)
+    assert rms_px(found, points, pixels) == pytest.approx(rms, rel=1e-4)
+
+
+POSE_AND_F = ("f_px", *ROTATION, *TRANSLATION)
+
+
+def as_pinhole(camera: TsaiCamera) -> PinholeCamera:
+    return PinholeCamera(
+        image_size=camera.image_size,
+        R_cam_lab=camera.R_cam_lab,
+        T_cam_lab_mm=camera.T_cam_lab_mm,
+        centre_px=camera.centre_px,
+        f_px=camera.f_mm / camera.pixel_pitch_mm[0],
+    )
+
+
+def test_with_noise_errors_are_as_large_as_the_covariance_says():
+    camera, points = planted(), in_space()
+    squares = []
+    for seed in range(12):
+        found = calibrate_tsai(points, noisy(camera, points, seed, 0.1), SIZE, PITCH)
+        turn = so3.log(camera.R_cam_lab @ found.R_cam_lab.mT)
+        move = camera.T_cam_lab_mm - found.T_cam_lab_mm
+        lens = torch.stack([camera.f_mm - found.f_mm, camera.kappa1 - found.kappa1])
+        error = torch.cat([lens, turn, move])
+        squares.append(float(error @ torch.linalg.solve(found.covariance.matrix, error)))
+    # Chi squared with 8 degrees of freedom, mean of 12: 8 +- 1.2.
+    assert 4.5 < np.mean(squares) < 12.0
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_the_last_fit_is_the_least_sum_of_squares(place):
+    points = PLACES[place]()
+    pixels = noisy(planted(), points)
+    stages, found = (method(points, pixels, SIZE, PITCH) for method in (tsai_stages, calibrate_tsai))
+    least = rms_px(found, points, pixels)
+    assert least < rms_px(stages, points, pixels)
+    assert least == pytest.approx(NOISE_PX * math.sqrt(2), rel=0.15)
+    for change in (1.0, -1.0):  # small against the sigmas (f: 0.025 mm), and already worse
+        assert rms_px(replace(found, f_mm=found.f_mm + 0.01 * change), points, pixels) > least
+        assert rms_px(replace(found, kappa1=found.kappa1 + 1e-6 * change), points, pixels) > least
+
+
+def test_the_centre_and_sx_are_found_where_they_are_asked_for():
+    camera = planted(sx=1.01, centre_px=f64((331.0, 318.5)), f_mm=25.0, T_cam_lab_mm=f64((4.0, -3.0, 320.0)))
+    points = in_space()
+    pixels = camera.project(points)
+    assert_same_camera(calibrate_tsai(points, pixels, SIZE, PITCH, ("sx", "centre_u", "centre_v")), camera)
+    held = calibrate_tsai(points, pixels, SIZE, PITCH)
+    assert held.centre_px.tolist() == [324.5, 324.5]
+    assert rms_px(held, points, pixels) > 0.3
+
+
+def test_pixels_that_are_not_square_are_taken_into_account():
+    camera = planted(pixel_pitch_mm=f64((0.02, 0.025)))
+    points = in_space()
+    assert_same_camera(tsai_stages(points, camera.project(points), SIZE, (0.02, 0.025)), camera)
+
+
+@pytest.mark.parametrize("relief_mm", [0.02, 0.1, 0.3, 1.0])
+def test_a_plate_that_is_not_quite_flat_is_taken_as_it_is(relief_mm):
+    plane = in_plane()
+    heights = torch.randn(len(plane), 1, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    points, camera = plane + relief_mm * heights * turned((0.1, 0.3, -0.4))[:, 2], square_on(0.4)
+    assert_same_camera(calibrate_tsai(points, camera.project(points), SIZE, PITCH), camera)
+    found = calibrate_tsai(points, noisy(camera, points), SIZE, PITCH)
+    assert float(found.f_mm) == pytest.approx(45.0, abs=4 * found.covariance.sigmas["f"])
+
+
+def test_numbers_of_either_precision_and_their_gradients_are_taken():
+    camera, points = planted(), in_space()
+    found = tsai_stages(points.float().requires_grad_(), camera.project(points).float(), SIZE, PITCH)
+    assert found.f_mm.dtype == torch.float64
+    assert_same_camera(found, camera, tolerance=1e-4)
+
+
+def test_the_fit_to_points_works_for_a_camera_behind_a_port():
+    camera = behind_port(tsai())
+    points = in_space()
+    near = replace(camera, camera=tsai(T_cam_lab_mm=f64((4.5, -2.0, 524.0))), port=port(n_fluid=1.33))
+    names = ("n_fluid", *TRANSLATION)
+    with pytest.raises(CameraError, match="port_n_fluid"):
+        fit_to_points(near, names, points, camera.project(points))
+    found = fit_to_points(near, ("port_n_fluid", *TRANSLATION), points, camera.project(points))
+    assert float(found.port.n_fluid) == pytest.approx(1.36, abs=1e-9)
+    assert found.covariance.names == ("port_n_fluid", *TRANSLATION)
+
+
+# Bad input: one clear line each.
+
+
+@pytest.mark.parametrize("tilt_rad", [0.0, 1e-6, 0.005])
+@pytest.mark.parametrize("sigma_px", [0.0, 0.05])
+def test_a_plane_parallel_to_the_sensor_is_refused(tilt_rad, sigma_px):
+    points, camera = in_plane(), square_on(tilt_rad)
+    with pytest.raises(CameraError, match=r"tilt the plate|tell f from T_z") as refused:
+        calibrate_tsai(points, noisy(camera, points, sigma_px=sigma_px), SIZE, PITCH)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_plane_at_six_degrees_is_enough():
+    points, camera = in_plane(), square_on(0.1)
+    found = calibrate_tsai(points, noisy(camera, points), SIZE, PITCH)
+    assert float(found.f_mm) == pytest.approx(45.0, abs=4 * found.covariance.sigmas["f"])
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_mirrored_points_are_refused(axis):
+    points, camera = in_space(), planted()
+    mirror = torch.ones(3, dtype=torch.float64)
+    mirror[axis] = -1
+    with pytest.raises(CameraError, match="mirror image"):
+        calibrate_tsai(points * mirror, camera.project(points), SIZE, PITCH)
+
+
+def test_a_mirrored_picture_is_refused():
+    points = in_space()
+    pixels = planted().project(points)
+    with pytest.raises(CameraError, match="mirror image"):
+        calibrate_tsai(points, torch.stack([649 - pixels[:, 0], pixels[:, 1]], dim=-1), SIZE, PITCH)
+
+
+def test_pixels_of_other_points_are_refused():
+    points, camera = in_space(), planted()
+    for order in (torch.arange(60).roll(1), torch.arange(59, -1, -1)):
+        with pytest.raises(CameraError, match="order"):
+            calibrate_tsai(points, camera.project(points)[order], SIZE, PITCH)
+    far = camera.project(points)
+    far[5] += 100.0
+    with pytest.raises(CameraError, match=r"expected pixels of these points, to 9\.2 px, got rms"):
+        calibrate_tsai(points, far, SIZE, PITCH)
+
+
+def test_too_few_points_are_refused_and_just_enough_are_not():
+    camera, space, plane = planted(), in_space(), in_plane()[[0, 12, 84, 156, 30]]
+    for points, line in ((space[:6], "expected 7 or more in space, got 6"), (plane[:4], "expected 5 or more")):
+        with pytest.raises(CameraError, match=line):
+            calibrate_tsai(points, camera.project(points), SIZE, PITCH)
+    for points in (space[:7], plane):
+        assert_same_camera(calibrate_tsai(points, camera.project(points), SIZE, PITCH), camera, tolerance=1e-6)
+
+
+def test_points_on_a_line_and_points_at_one_place_are_refused():
+    camera = planted()
+    line = torch.linspace(-50, 50, 20, dtype=torch.float64)[:, None] * f64((1.0, 0.3, 0.2))
+    for points in (line, line[:1].expand(20, 3)):
+        with pytest.raises(CameraError, match="got points on a line"):
+            calibrate_tsai(points, camera.project(points), SIZE, PITCH)
+    with pytest.raises(CameraError, match="expected points all over the picture"):
+        calibrate_tsai(in_space(), camera.project(line[:1]).expand(60, 2), SIZE, PITCH)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_numbers_that_are_not_finite_are_refused_with_their_row(bad):
+    points = in_space()
+    pixels = planted().project(points)
+    for which, name in ((0, "x_lab_mm"), (1, "uv_px")):
+        arrays = [points.clone(), pixels.clone()]
+        arrays[which][3, 1] = bad
+        with pytest.raises(CameraError, match=f"{name}, row 3: expected finite numbers"):
+            calibrate_tsai(*arrays, SIZE, PITCH)
+
+
+def test_arrays_of_other_shapes_and_impossible_sensors_are_refused():
+    points = in_space()
+    pixels = planted().project(points)
+    with pytest.raises(ShapeError, match="60 points and 59 pixels"):
+        calibrate_tsai(points, pixels[1:], SIZE, PITCH)
+    with pytest.raises(ShapeError, match=r"x_lab_mm: expected shape \(n, 3\)"):
+        calibrate_tsai(points[None], pixels[None], SIZE, PITCH)
+    with pytest.raises(CameraError, match="pixel_pitch_mm: expected above zero"):
+        calibrate_tsai(points, pixels, SIZE, (0.02, 0.0))
+    with pytest.raises(CameraError, match="image_size"):
+        calibrate_tsai(points, pixels, (650, 0), PITCH)
+
+
+def test_parameters_that_cannot_be_fitted_are_refused():
+    camera, plane = planted(), in_plane()
+    with pytest.raises(CameraError, match="also, sx: expected points that fill space"):
+        calibrate_tsai(plane, camera.project(plane), SIZE, PITCH, ("sx",))
+    with pytest.raises(CameraError, match="also: expected some of sx, centre_u, centre_v, got 'pixel_pitch_u'"):
+        calibrate_tsai(plane, camera.project(plane), SIZE, PITCH, ("pixel_pitch_u",))
+    square, points = planted(kappa1=0.0), in_space()  # without distortion one scale of f and both pitches is open
+    names = ("f", "pixel_pitch_u", "pixel_pitch_v", *ROTATION, *TRANSLATION)
+    with pytest.raises(CameraError, match="expected a determined camera, got no hold on f, pixel_pitch_u, pixel_pit"):
+        fit_to_points(square, names, points, square.project(points))
+    with pytest.raises(CameraError, match="expected 5 or more for 9 parameters, got 4"):
+        fit_to_points(square, names, points[:4], square.project(points[:4]))

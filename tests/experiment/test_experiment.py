@@ -1,0 +1,184 @@
+"""experiment.yaml: what it says, what it refuses, and how movies, cameras and times come together."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SHARED
+from experiment_examples import FULL, HEIGHT, SHORT, WIDTH, make_folder, save_movie, written
+
+from sphereorient.errors import CameraError, ExperimentError, MovieError, OutputError
+from sphereorient.experiment import Experiment, load_experiment, open_movies, outside_paths, write_experiment
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return make_folder(tmp_path)
+
+
+def test_every_key_arrives_with_its_unit_and_paths_are_relative_to_the_file(folder):
+    experiment = load_experiment(written(folder, FULL))
+    assert experiment.name == "mixer-3Hz"
+    assert experiment.path == folder / "experiment.yaml"
+    assert experiment.folder == folder
+    assert experiment.frame_rate_hz == 600.0
+    assert experiment.exposure_s == 0.0004
+    assert experiment.diameter_mm == 18.0
+    assert experiment.texture_path == folder / "texture.png"
+    assert experiment.fixed is False
+    assert experiment.cameras_path == folder / "cameras.yaml"
+    assert list(experiment.cameras) == ["cam1", "cam2"]
+    assert experiment.movie_paths == {"cam1": folder / "cam1.npy", "cam2": folder / "films" / "cam2.npy"}
+    assert experiment.mask_paths == {"cam1": folder / "mask.png"}
+    assert experiment.start == {"cam1": 0, "cam2": 3}
+    assert experiment.frames == (2, 10)
+    assert experiment.flow == {"viscosity": 8e-6, "dissipation": 1.7}
+
+
+def test_what_is_left_out_has_its_default(folder):
+    experiment = load_experiment(str(written(folder, SHORT)))
+    assert experiment.name == "experiment"
+    assert experiment.diameter_mm is None
+    assert experiment.texture_path is None
+    assert experiment.exposure_s is None
+    assert experiment.frames is None
+    assert experiment.fixed is True
+    assert experiment.start == {"cam1": 0}
+    assert experiment.mask_paths == experiment.flow == {}
+    assert list(experiment.cameras) == ["cam1"]  # cameras.yaml has one more, which no movie needs
+
+
+@pytest.mark.parametrize("text", [FULL, SHORT], ids=["full", "short"])
+def test_a_written_experiment_is_read_back_the_same(folder, text):
+    experiment = load_experiment(written(folder, text))
+    path = write_experiment(dataclasses.replace(experiment, path=folder / "again.yaml"), comment="made by a test")
+    again = load_experiment(path)
+    for part in dataclasses.fields(Experiment):
+        if part.name not in ("path", "cameras"):
+            assert getattr(again, part.name) == getattr(experiment, part.name), part.name
+    assert path.read_text().startswith("# made by a test\nschema: sphereorient-experiment/1\n")
+    assert str(folder) not in path.read_text()
+
+
+def test_an_experiment_in_another_folder_finds_its_files(folder, tmp_path_factory):
+    experiment = load_experiment(written(folder, SHORT))
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    again = load_experiment(write_experiment(dataclasses.replace(experiment, path=elsewhere / "experiment.yaml")))
+    with open_movies(again)["cam1"] as movie:
+        assert len(movie) == 12
+
+
+def test_a_folder_that_is_not_there_cannot_be_written_to(folder):
+    experiment = load_experiment(written(folder, SHORT))
+    with pytest.raises(OutputError, match="can be written"):
+        write_experiment(dataclasses.replace(experiment, path=folder / "none" / "experiment.yaml"))
+
+
+FAULTS = {
+    "unknown key": (FULL.replace("exposure", "exposre"), "expected one of .* got 'exposre'; write 'exposure' instead"),
+    "unknown key inside": (FULL.replace("diameter", "diametre"), "sphere: .*got 'diametre'; write 'diameter' instead"),
+    "far from any key": (FULL + "zzz: 1\n", "got 'zzz'; remove it"),
+    "flow key": (FULL.replace("viscosity", "viscosty"), "flow: .*write 'viscosity' instead"),
+    "no sphere": (SHORT.replace("sphere: {diameter: null, fixed: true}", ""), "sphere: expected a value"),
+    "no diameter": (SHORT.replace("diameter: null, ", ""), r"sphere\.diameter: expected a value, got none"),
+    "frame rate of zero": (SHORT.replace("30", "0"), "frame_rate: expected greater than 0, got 0"),
+    "frame rate in words": (SHORT.replace("30", "fast"), "frame_rate: expected a valid number.* got 'fast'"),
+    "infinite frame rate": (SHORT.replace("30", ".inf"), "frame_rate: expected a finite number"),
+    "negative diameter": (FULL.replace("18.0", "-18.0"), r"sphere\.diameter: expected greater than 0, got -18.0"),
+    "exposure in ms": (FULL.replace("0.0004", "0.4"), "exposure: expected at most the time between frames, 0.001667 s"),
+    "frames backwards": (FULL.replace("[2, 10]", "[10, 2]"), "frames: expected first below last, got .10, 2."),
+    "frames below zero": (FULL.replace("[2, 10]", "[-2, 10]"), r"frames\.0: expected greater than or equal to 0"),
+    "start below zero": (FULL.replace("cam2: 3", "cam2: -3"), r"start\.cam2: expected greater than or equal to 0"),
+    "start of no movie": (FULL.replace("start: {cam2", "start: {cam3"), "start: .*got 'cam3'; write 'cam"),
+    "mask of no movie": (FULL.replace("masks: {cam1", "masks: {side"), "masks: expected one of cam1, cam2, got 'side'"),
+    "movie without camera": (SHORT.replace("{cam1:", "{cam9:"), "camera of movie cam9: expected one of cam1, cam2"),
+    "three cameras": (SHORT.replace("{cam1: cam1.npy}", "{a: a.mkv, b: b.mkv, c: c.mkv}"), "movies: .*at most 2"),
+    "no movies": (SHORT.replace("{cam1: cam1.npy}", "{}"), "movies: .*at least 1"),
+    "movies as a list": (SHORT.replace("{cam1: cam1.npy}", "[cam1.npy]"), "movies: expected a valid dictionary"),
+    "fixed as a word": (SHORT.replace("true", "maybe"), r"sphere\.fixed: expected a valid boolean, got 'maybe'"),
+    "times beside a rate": (SHORT + "times: times.csv\n", "expected either frame_rate or times, got both"),
+    "neither": (SHORT.replace("frame_rate: 30", "name: none"), "expected either frame_rate or times, got neither"),
+    "a flip that there is not": (SHORT + "flip: {cam1: upside}\n", "flip.cam1"),
+    "a flip of no camera": (SHORT + "flip: {cam7: both}\n", "got 'cam7'"),
+    "schema": (
+        SHORT.replace("experiment/1", "experiment/7"),
+        "schema: expected sphereorient-experiment/1, got 'sphere",
+    ),
+    "cameras file": (
+        "schema: sphereorient-cameras/1\ncameras: {}\n",
+        "expected sphereorient-experiment/1, got 'sphere",
+    ),
+    "a text": ("just words", "expected keys and values, got 'just words'"),
+    "empty": ("", "got an empty file"),
+    "no yaml": ("a: [", "expected YAML"),
+    "tabs": ("a:\n\t- b", "expected YAML"),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), FAULTS.values(), ids=FAULTS)
+def test_every_fault_is_one_line_that_names_the_file(folder, text, message):
+    path = written(folder, text)
+    with pytest.raises(ExperimentError, match=message) as refused:
+        load_experiment(path)
+    assert str(folder) in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert "pydantic" not in str(refused.value)
+
+
+def test_a_missing_file_and_a_folder_are_refused(folder):
+    with pytest.raises(ExperimentError, match="got no such file"):
+        load_experiment(folder / "none.yaml")
+    with pytest.raises(ExperimentError, match="got a folder"):
+        load_experiment(folder)
+
+
+def test_missing_cameras_are_a_camera_error(folder):
+    with pytest.raises(CameraError, match=r"other\.yaml: expected a YAML file, got no such file"):
+        load_experiment(written(folder, SHORT.replace("cameras.yaml", "other.yaml")))
+
+
+def test_a_movie_of_another_size_than_its_camera_is_refused(folder):
+    save_movie(folder / "cam1.npy", 12, (WIDTH, HEIGHT))  # rows and columns exchanged
+    with pytest.raises(MovieError, match=f"expected {WIDTH} x {HEIGHT} px as camera cam1 .* got {HEIGHT} x {WIDTH}"):
+        open_movies(load_experiment(written(folder, SHORT)))
+
+
+def test_a_camera_that_the_experiment_does_not_have_is_refused(folder):
+    with pytest.raises(ExperimentError, match="got 'cam7'"):
+        open_movies(load_experiment(written(folder, SHORT)), ["cam7"])
+
+
+def test_a_missing_movie_is_refused(folder):
+    (folder / "cam1.npy").unlink()
+    with pytest.raises(MovieError, match="got no such file"):
+        open_movies(load_experiment(written(folder, SHORT)))
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(("name", "count"), [("experiment", 240), ("fixed_ball", 250)])
+def test_the_shared_experiments_open(name, count):
+    experiment = load_experiment(SHARED / name / "experiment.yaml")
+    movies = open_movies(experiment)
+    assert {len(movie) for movie in movies.values()} == {count}
+    assert experiment.fixed == (name == "fixed_ball")
+
+
+def test_files_outside_of_the_experiments_folder_are_told(folder, tmp_path_factory):
+    assert outside_paths(load_experiment(written(folder, FULL))) == []
+    other = tmp_path_factory.mktemp("other") / "texture.png"
+    (folder / "link.png").symlink_to(other)
+    for name in ("../texture.png", str(other), "link.png"):
+        experiment = load_experiment(written(folder, FULL.replace("texture.png", name)))
+        assert [path.name for path in outside_paths(experiment)] == [Path(name).name]
+
+
+def test_a_flipped_movie_is_read_flipped(folder):
+    picture = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(1, HEIGHT, WIDTH)
+    np.save(folder / "cam1.npy", picture)
+    flips = {"none": picture, "vertical": picture[:, ::-1], "horizontal": picture[:, :, ::-1]}
+    for how, expected in (flips | {"both": picture[:, ::-1, ::-1]}).items():
+        movies = open_movies(load_experiment(written(folder, SHORT + f"flip: {{cam1: {how}}}\n")))
+        np.testing.assert_array_equal(movies["cam1"].sample([0]), expected)

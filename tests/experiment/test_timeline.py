@@ -1,0 +1,185 @@
+"""Which frame is when, and which picture of each movie shows it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from experiment_examples import BOTH, FULL, SHORT, make_folder, save_movie, written
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sphereorient.errors import ExperimentError, MovieError
+from sphereorient.experiment import load_experiment, open_movies
+from sphereorient.experiment.timeline import NONE, Timeline, _paired, load_times, timeline
+
+TABLE = BOTH.replace("frame_rate: 30", "times: times.csv") + "frames: [0, 12]\n"
+STAMPED = BOTH.replace("frame_rate: 30", "times: movies").replace(".npy", ".h5")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return make_folder(tmp_path)
+
+
+def line(folder: Path, text: str) -> Timeline:
+    experiment = load_experiment(written(folder, text))
+    return timeline(experiment, open_movies(experiment))
+
+
+def save_stamped(path: Path, time_s: list[float]) -> None:
+    """A movie whose frames say their own number, with stamps."""
+    with h5py.File(path, "w") as file:
+        file["frames"] = np.arange(len(time_s), dtype=np.uint8)[:, None, None] * np.ones((1, 6, 8), np.uint8)
+        file["time"] = np.asarray(time_s)
+
+
+def test_the_experiments_frame_0_is_frame_start_of_each_movie(folder):
+    experiment = load_experiment(written(folder, FULL))
+    movies = open_movies(experiment)
+    frames = timeline(experiment, movies)
+    assert frames.number.tolist() == list(range(2, 10))
+    read = {name: movie.sample(frames.rows[name])[:, 0, 0].tolist() for name, movie in movies.items()}
+    assert read == {"cam1": list(range(2, 10)), "cam2": list(range(5, 13))}
+    assert not frames.remarks
+
+
+def test_time_is_frame_number_over_frame_rate_and_does_not_restart_with_frames(folder):
+    time_s = line(folder, FULL).time_s
+    assert time_s.dtype == np.float64
+    assert time_s.tolist() == [k / 600.0 for k in range(2, 10)]
+    assert time_s[0] != 0  # not counted from the first frame that is used
+    assert time_s[0] != 5 / 600.0  # nor by the second movie's own frames
+
+
+def test_all_frames_are_used_unless_frames_says_otherwise(folder):
+    assert len(line(folder, BOTH + "start: {cam2: 3}\n")) == 12
+
+
+def test_a_movie_that_ends_early_has_no_pictures_of_the_last_frames_and_a_remark_says_so(folder):
+    frames = line(folder, BOTH)
+    assert frames.rows["cam1"].tolist() == [*range(12), NONE, NONE, NONE]
+    assert frames.rows["cam2"].tolist() == list(range(15))
+    assert len(frames.remarks) == 1
+    assert "cam1.npy: no pictures of frames 12 to 14" in frames.remarks[0]
+    assert not line(folder, BOTH + "frames: [0, 12]\n").remarks  # nothing asked for is lacking
+
+
+def test_frames_beyond_all_movies_are_refused(folder):
+    with pytest.raises(MovieError, match="expected 16 frames as frames: says, got 15"):
+        line(folder, BOTH + "frames: [0, 16]\n")
+
+
+def test_a_start_beyond_the_movie_is_refused(folder):
+    with pytest.raises(MovieError, match=r"expected frames after start, got 0 \(cam1\)"):
+        line(folder, SHORT + "start: {cam1: 12}\n")
+
+
+def test_a_table_of_times_is_taken_as_it_is(folder):
+    times = np.cumsum([0.1, *np.linspace(0.01, 0.03, 14)])
+    (folder / "times.csv").write_text("time (s)\n# uneven\n" + "\n".join(f"{t!r}," for t in times.tolist()))
+    frames = line(folder, TABLE)
+    assert frames.time_s.tolist() == times[:12].tolist()
+    assert not frames.even
+
+
+BAD_TABLES = {
+    "nan": ("0\n0.1\nnan\n", "expected finite times, got nan"),
+    "infinite": ("0\n0.1\ninf\n", "expected finite times, got inf"),
+    "standing": ("0\n0.1\n0.1\n", "expected times that increase, got 0.1 after 0.1"),
+    "back": ("0\n0.1\n0.05\n", "got 0.05 after 0.1"),
+    "words": ("0\n0.1\nzwei\n", "line 3: expected a number, got 'zwei'"),
+    "two columns": ("0 1\n0.1 2\n", "expected"),
+    "short": ("0\n0.1\n0.2\n", "expected 15 times, got 3"),
+    "empty": ("", "expected finite times, got none"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_TABLES)
+def test_a_table_that_is_none_is_refused(folder, name):
+    text, message = BAD_TABLES[name]
+    (folder / "times.csv").write_text(text)
+    with pytest.raises(ExperimentError, match=message) as refused:
+        line(folder, TABLE)
+    assert "times.csv" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_missing_table_is_refused(folder):
+    with pytest.raises(ExperimentError, match="got no such file"):
+        load_times(folder / "none.csv")
+
+
+def test_stamps_pair_the_cameras_whatever_either_lost(folder):
+    """cam1 lost picture 3, cam2 lost pictures 1 and 5, and is 0.2 ms late: stamps tell, counting would not."""
+    grid = np.arange(8) * 0.01
+    save_stamped(folder / "cam1.h5", np.delete(grid, 3).tolist())
+    save_stamped(folder / "films" / "cam2.h5", (np.delete(grid, [1, 5]) + 0.0002).tolist())
+    frames = line(folder, STAMPED)
+    assert frames.rows["cam1"].tolist() == [0, 1, 2, NONE, 3, 4, 5, 6]
+    assert frames.rows["cam2"].tolist() == [0, NONE, 1, 2, 3, NONE, 4, 5]
+    np.testing.assert_allclose(frames.time_s[0], 0.0001)
+    np.testing.assert_allclose(frames.time_s[3], 0.0302)  # of the camera that has it
+    assert [remark.split(": ")[1] for remark in frames.remarks] == [
+        "1 of 8 instants have no picture",
+        "2 of 8 instants have no picture",
+    ]
+
+
+def test_with_start_each_cameras_clock_begins_at_that_picture(folder):
+    grid = np.arange(8) * 0.01
+    save_stamped(folder / "cam1.h5", (grid + 5.0).tolist())
+    save_stamped(folder / "films" / "cam2.h5", (grid - 3.0).tolist())
+    frames = line(folder, STAMPED + "start: {cam1: 2, cam2: 1}\n")
+    assert frames.rows["cam1"].tolist() == [2, 3, 4, 5, 6, 7, NONE]
+    assert frames.rows["cam2"].tolist() == [1, 2, 3, 4, 5, 6, 7]
+    np.testing.assert_allclose(frames.time_s, 0.01 * np.arange(7), atol=1e-12)
+
+
+def test_cameras_that_are_late_on_each_other_are_told(folder):
+    grid = np.arange(8) * 0.01
+    save_stamped(folder / "cam1.h5", grid.tolist())
+    save_stamped(folder / "films" / "cam2.h5", (grid + 0.002).tolist())
+    assert "differ by 0.002 s" in line(folder, STAMPED).remarks[0]
+
+
+def test_a_movie_without_stamps_is_refused_where_they_are_asked_for(folder):
+    with pytest.raises(MovieError, match=r"cam1.npy: expected time stamps, got none in this file; write frame_rate"):
+        line(folder, BOTH.replace("frame_rate: 30", "times: movies"))
+
+
+@given(
+    st.lists(st.integers(0, 60), min_size=1, max_size=20, unique=True),
+    st.lists(st.integers(0, 60), min_size=1, max_size=20, unique=True),
+)
+def test_pairs_are_those_that_counting_on_a_grid_gives(one, other):
+    one, other = sorted(one), sorted(other)
+    pairs = _paired(np.array(one) + 0.2, np.array(other, float), 0.5)
+    instants = sorted({*one, *other})
+    expected = [[one.index(k) if k in one else NONE, other.index(k) if k in other else NONE] for k in instants]
+    assert pairs.tolist() == expected
+
+
+@given(st.lists(st.integers(1, 3), min_size=1, max_size=30), st.integers(1, 3))
+def test_dropped_frames_are_put_into_the_grid_and_found_again(steps, usual):
+    place = np.concatenate([[0], np.cumsum([usual] * (len(steps) + 1) + [usual * step for step in steps])])
+    frames = Timeline(number=np.arange(len(place)), time_s=0.3 + 0.01 * place, rows={"cam1": 7 + np.arange(len(place))})
+    grid, at = frames.gridded()
+    assert at.tolist() == (place / usual).tolist()
+    assert grid.even
+    np.testing.assert_allclose(grid.time_s[at], frames.time_s)
+    assert grid.rows["cam1"][at].tolist() == frames.rows["cam1"].tolist()
+    assert (np.delete(grid.rows["cam1"], at) == NONE).all()
+
+
+def test_times_off_any_grid_are_refused_for_methods_that_need_one():
+    time_s = np.array([0.0, 0.01, 0.024, 0.03, 0.04])
+    with pytest.raises(ExperimentError, match=r"expected frames on an even grid.*precise"):
+        Timeline(number=np.arange(5), time_s=time_s, rows={}).gridded()
+
+
+def test_movies_of_one_length_need_no_remark(folder):
+    save_movie(folder / "films" / "cam2.npy", 12)
+    assert not line(folder, BOTH).remarks

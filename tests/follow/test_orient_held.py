@@ -1,0 +1,158 @@
+"""A ball that turns in its place: one place for all frames, found from a few, held in all, its error not forgotten."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import h5py
+import pytest
+import torch
+from conftest import assert_close
+from refine_examples import f64
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.experiment import load_experiment
+from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.follow import BlockTracker, Poses
+from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre, mean_place
+from sphereorient.locate import Shot, screened_frames
+from sphereorient.methods.precise import learn, sample_frames
+from sphereorient.methods.settings import Settings
+from sphereorient.pose import Fitter
+from sphereorient.synth import SynthSettings, write_experiment
+
+
+def scattered(trials: int, count: int, seed: int = 4) -> tuple[Tensor, Tensor]:
+    """Measurements (trials, count, 3) of the origin and their covariances (count, 3, 3), all different."""
+    rng = torch.Generator().manual_seed(seed)
+    root = torch.randn(count, 3, 3, generator=rng, dtype=torch.float64) + torch.diag(f64([1.0, 1.0, 4.0]))
+    errors = torch.randn(trials, count, 3, 1, generator=rng, dtype=torch.float64)
+    return (root @ errors)[..., 0], root @ root.mT
+
+
+def test_the_mean_place_errs_as_its_covariance_says():
+    X, covariance = scattered(trials=400, count=12)
+    found = [mean_place(one, covariance) for one in X]
+    away = torch.stack([place @ torch.linalg.solve(C, place) for place, C in found])
+    assert float(away.mean()) == pytest.approx(3.0, rel=0.25), "chi squared of three coordinates"
+
+
+def test_frames_that_are_far_off_hardly_move_the_mean_place():
+    X, covariance = scattered(trials=1, count=12)
+    good, _ = mean_place(X[0], covariance)
+    spoilt = X[0].clone()
+    spoilt[:2] += 200.0
+    place, C = mean_place(spoilt, covariance)
+    plain = torch.linalg.solve(
+        torch.linalg.inv(covariance).sum(0), (torch.linalg.inv(covariance) @ spoilt[..., None]).sum(0)[:, 0]
+    )
+    sigma = C.diagonal().sqrt()
+    assert ((place - good).abs() < 2 * sigma).all()
+    assert ((plain - good).abs() > 4 * sigma).any(), "a mean that believes all is carried away"
+
+
+def test_measurements_that_scatter_by_more_than_they_say_tell_less():
+    X, covariance = scattered(trials=1, count=12)
+    _, said = mean_place(X[0], covariance)
+    _, wider = mean_place(5 * X[0], covariance)
+    assert float(wider.diagonal().sum() / said.diagonal().sum()) > 5
+
+
+def test_a_single_frame_tells_the_place_as_well_as_it_can():
+    X, covariance = scattered(trials=1, count=1)
+    place, C = mean_place(X[0], covariance)
+    assert_close(place, X[0, 0], 1e-9)
+    assert_close(C, covariance[0], 1e-9)
+
+
+@cache
+def in_its_place(folder: Path) -> Path:
+    """A ball that turns in one place before two cameras."""
+    settings = SynthSettings(
+        frames=40, image_size=(150, 150), diameter_px=56.0, volume_mm=8.0, velocity_rms=0.0, exposure=1e-4,
+        exposure_samples=1, omega_rms=40.0, seed=5,
+    )  # fmt: skip
+    return write_experiment(folder, settings)
+
+
+def truth(path: Path) -> tuple[Tensor, Tensor]:
+    """Places (N, 3), mm, and attitudes (N, 3, 3)."""
+    with h5py.File(path.parent / "truth.h5") as file:
+        return torch.from_numpy(file["position"][()]), torch.from_numpy(file["orientation"][()])
+
+
+def beside(fitter: Fitter, shots: Sequence[Shot], pose: Poses, place: FixedCentre, error_mm: Tensor) -> Tensor:
+    """Delta by which a frame's attitude is found to differ where the ball is held beside its place; brute force."""
+    fine, use = fitter.optics.fine, pose.use[None]
+    pixels = fitter.pixels([[shot.picture for shot in shots]], place.position_lab_mm[None], fine)
+    firm = 1e14 * torch.eye(3, dtype=torch.float64)[None]
+    R = [
+        fitter.fit(pixels, X[None], pose.R_lab_body[:1], use, fine, 6, firm).R_lab_body
+        for X in (place.position_lab_mm, place.position_lab_mm + error_mm)
+    ]
+    return so3.log(R[1] @ R[0].mT)[0]
+
+
+def followed_poses(
+    path: Path, cameras: list[str] | None
+) -> tuple[FixedCentre, list[Poses], list[Poses], Tensor, Tensor]:
+    """The place that a few frames tell, all frames' poses with each its own place, and held in that one.
+
+    And two errors of the place, (2, 3), mm, with the turns that they do to some frames, (frames, 2, 3).
+    """
+    settings = Settings()
+    with open_recording(load_experiment(path), cameras) as recording:
+        known, proposers = learn(recording, settings, silent)
+        views = known.fitter.views
+        shots = sample_frames(recording, views, settings.refine.study_frames)
+        place = find_fixed_centre(known, proposers, shots, settings.locate, settings.refine)
+        assert place is not None
+        movies = [
+            list(screened_frames(stream, view.background))
+            for stream, view in zip(recording.streams, views, strict=True)
+        ]
+        times = recording.timeline.time_s.tolist()
+        found = []
+        for where in (None, place):
+            tracker = BlockTracker(known, proposers, settings.locate, settings.refine, where)
+            poses: list[Poses] = []
+            for window in tracker.windows(recording.frames):
+                n = len(poses)
+                some = slice(n, n + sum(window))
+                poses += tracker.track([movie[some] for movie in movies], window, times[some])
+            found.append(poses)
+        errors = 0.01 * f64([[1.0, 0.0, 0.0], [0.3, 1.0, -0.6]])
+        turns = torch.stack(
+            [
+                torch.stack([beside(known.fitter, [m[k] for m in movies], found[1][k], place, by) for by in errors])
+                for k in range(2, 40, 9)
+            ]
+        )
+    return place, found[0], found[1], errors, turns
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cameras", [["cam1"], None], ids=["one camera", "two"])
+def test_all_frames_are_measured_in_one_place_and_better(tmp_path_factory, cameras):
+    path = in_its_place(tmp_path_factory.getbasetemp() / "in_its_place")
+    X, R = truth(path)
+    assert float((X - X[0]).norm(dim=1).max()) == 0.0
+    place, free, held, beside_mm, turns = followed_poses(path, cameras)
+    assert all(len(poses) for poses in held)
+    at = torch.stack([poses.position_lab_mm[0] for poses in held])
+    sigma = place.covariance_mm2.diagonal().sqrt()
+    assert ((at - place.position_lab_mm).abs() < 0.1 * sigma).all(), "one place"
+    off = place.position_lab_mm - X[0]
+    assert float(off @ torch.linalg.solve(place.covariance_mm2, off)) < 16, "where it is, as its error says"
+    errors = [so3.log(R @ torch.stack([poses.R_lab_body[0] for poses in some]).mT) for some in (free, held)]
+    steps = [torch.diff(error, dim=0).norm(dim=1).median() for error in errors]
+    assert float(errors[1].norm(dim=1).median()) < 0.92 * float(errors[0].norm(dim=1).median())
+    assert float(steps[1]) < 0.92 * float(steps[0])
+    expected = beside_mm @ place.follows_rad_mm.mT
+    assert float((turns.mean(0) - expected).norm(dim=1).max()) < 0.15 * float(expected.norm(dim=1).min())
+    covariance = torch.stack([poses.covariance[0, :3, :3] for poses in held])
+    away = (errors[1][:, None] @ torch.linalg.solve(covariance, errors[1][..., None]))[:, 0, 0]
+    assert 0.3 < float(away.mean()) / 3 < 4, "and the attitudes' errors are as their covariances say"

@@ -1,0 +1,116 @@
+"""Chains, loops, and movies that are refused."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from renders import disks_of_pictures, error_deg, pictures, turning
+
+from sphereorient import so3
+from sphereorient.errors import PaintError
+from sphereorient.mapping.chain import chained, close_loops, find_chain
+from sphereorient.mapping.graph import solve_graph
+from sphereorient.mapping.pairs import Turns, joined
+from sphereorient.mapping.settings import PaintSettings
+
+
+def turns_of(R, first, second, bias=None):
+    R_ji = R[second] @ R[first].mT
+    if bias is not None:
+        R_ji = so3.exp(torch.as_tensor(bias, dtype=torch.float64)) @ R_ji
+    count = len(first)
+    view = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
+    one = torch.ones(count, dtype=torch.float64)
+    return Turns(first=first, second=second, R_ji=R_ji, information=1e4 * view, score=one, overlap=one)
+
+
+def drifting(R, bias_deg):
+    """Neighbours' turns, each wrong by the same little turn."""
+    first = torch.arange(len(R) - 1)
+    return turns_of(R, first, first + 1, [0.0, math.radians(bias_deg), 0.0])
+
+
+def test_loops_break_a_planted_drift_and_wrong_ones_do_not():
+    R = turning(60, 6.0)
+    chain = drifting(R, 0.3)
+    drifted = chained(chain.R_ji)
+    assert error_deg(drifted, R).max() > 5
+    rng = torch.Generator().manual_seed(2)
+    first = torch.randint(0, 60, (120,), generator=rng)
+    second = torch.randint(0, 60, (120,), generator=rng)
+    apart = (first - second).abs() > 3
+    loops = turns_of(R, first[apart], second[apart])
+    wrong = loops.where(torch.arange(0, len(loops), 4))
+    wrong = turns_of(R, wrong.first, wrong.second, [0.0, 0.9, 0.4])
+    closed, left = solve_graph(drifted, joined([chain, loops, wrong]), math.radians(1))
+    assert error_deg(closed, R).max() < 0.6
+    assert torch.rad2deg(left[-len(wrong) :].norm(dim=-1)).min() > 30  # told apart from the right ones
+    alone, _ = solve_graph(drifted, chain, math.radians(1))
+    assert error_deg(alone, R).max() > 5
+
+
+def test_the_first_attitude_stays():
+    R = turning(10, 5.0)
+    closed, _ = solve_graph(R, drifting(R, 0.2), 0.02)
+    torch.testing.assert_close(closed[0], R[0])
+
+
+def test_pictures_close_the_loop_that_a_planted_drift_left_open():
+    R = turning(33, 12.0)  # once around, and a little more
+    disks = disks_of_pictures(pictures(R))
+    chain = drifting(R, 0.5)
+    drifted = chained(chain.R_ji)
+    open_deg = float(error_deg(drifted, R).max())
+    closed = close_loops(disks, drifted, chain, PaintSettings(keyframe_deg=11.0))
+    assert open_deg > 7
+    assert error_deg(closed.R_lab_body, R).max() < 0.4 * open_deg
+    assert closed.closure.closed > 20
+    assert closed.closure.drift_after_rad < 0.15 * closed.closure.drift_before_rad
+
+
+def test_a_movie_of_two_cameras_is_followed_without_a_map():
+    R = turning(12, 7.0)
+    chain = find_chain(disks_of_pictures(pictures(R, 2)), PaintSettings())
+    assert error_deg(chain.R_lab_body, R).max() < 0.8
+    torch.testing.assert_close(chain.R_lab_body[0], torch.eye(3, dtype=torch.float64))
+
+
+def test_the_same_pictures_give_the_same_bytes():
+    disks = disks_of_pictures(pictures(turning(6, 8.0)))
+    one, two = (find_chain(disks, PaintSettings()).R_lab_body for _ in range(2))
+    assert torch.equal(one, two)
+
+
+def refused(whole):
+    with pytest.raises(PaintError) as told:
+        find_chain(disks_of_pictures(whole), PaintSettings())
+    assert "\n" not in str(told.value)
+    return str(told.value)
+
+
+def test_a_ball_that_never_turns_is_refused():
+    assert "a ball that turns" in refused(pictures(turning(6, 0.0)))
+
+
+def test_one_frame_is_refused():
+    assert "2 frames" in refused(pictures(turning(1, 0.0)))
+
+
+def test_two_different_balls_are_refused():
+    one, other = turning(16, 8.0), turning(16, 8.0, (1.0, -0.2, 0.4))
+    both = torch.cat([pictures(one, 2)[:, :1], pictures(other, 2, seed=9)[:, 1:]], dim=1)
+    assert "one ball in both movies" in refused(both)
+
+
+def test_two_cameras_seen_through_mirrors_contradict_each_other():
+    assert "one ball in both movies" in refused(pictures(turning(16, 8.0, (0.4, 0.7, -0.5)), 2).flip(-1))
+
+
+def test_paint_that_is_never_seen_twice_is_refused():
+    R = turning(8, 12.0)
+    whole = torch.cat([pictures(R[k : k + 1], seed=20 + k) for k in range(8)])  # other paint in every frame
+    keys = turns_of(R, torch.arange(7), torch.arange(1, 8))
+    with pytest.raises(PaintError, match="seen twice"):
+        close_loops(disks_of_pictures(whole), R, keys, PaintSettings(keyframe_deg=11.0, score_min=0.8))

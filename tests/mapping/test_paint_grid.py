@@ -1,0 +1,145 @@
+"""The map as unknown of a least squares."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.sparse import csr_matrix
+
+from sphereorient.mapping.grid import (
+    SplinePaint,
+    look_up,
+    map_sums,
+    map_table,
+    solve_map,
+    stiffness,
+    texel_areas,
+    texel_weights,
+)
+from sphereorient.mapping.joint import Part, joint_step
+from sphereorient.mapping.sharpen import blur_matrix, sharpened
+from sphereorient.sphere.spline_texture import sample_spline
+from sphereorient.synth.textures import map_directions, random_directions, random_texture
+
+
+def test_a_look_up_is_the_spline_of_the_room_sphere(rng):
+    texture = torch.rand(16, 32, generator=rng, dtype=torch.float64)
+    poles = torch.tensor([[0.0, 1e-6, 1.0], [1e-6, 0.0, -1.0], [-1.0, -1e-9, 0.3]], dtype=torch.float64)
+    direction = torch.cat([random_directions(500, rng), torch.nn.functional.normalize(poles, dim=-1)])
+    torch.testing.assert_close(look_up(texture, direction), sample_spline(texture, direction))
+    place, weight = texel_weights(direction, 16)
+    torch.testing.assert_close(weight.sum(-1), torch.ones(len(direction), dtype=torch.float64))
+    assert place.min() >= 0
+    assert place.max() < 512
+
+
+def test_the_slope_of_a_look_up_is_its_derivative(rng):
+    texture = torch.rand(16, 32, generator=rng, dtype=torch.float64)
+    direction = random_directions(200, rng).requires_grad_()
+    sample_spline(texture, direction).sum().backward()
+    value, slope = SplinePaint(texture, 0.0).sample(direction.detach().T[None])
+    expected = direction.grad - (direction.grad * direction.detach()).sum(-1, keepdim=True) * direction.detach()
+    torch.testing.assert_close(slope[0].T, expected, atol=1e-8, rtol=1e-6)
+    torch.testing.assert_close(value[0], sample_spline(texture, direction.detach()))
+
+
+def test_a_table_of_a_map_is_its_spline(rng):
+    texture = random_texture("blobs", 1, 32)
+    table = map_table(texture, 0.05)
+    direction = random_directions(500, rng).float()
+    value, slope = table.sample(direction.T[None])
+    exact, exact_slope = SplinePaint(texture, 0.05).sample(direction.T[None])
+    assert (value - exact).abs().max() < 0.02
+    assert (slope - exact_slope).norm(dim=1).mean() < 0.05 * exact_slope.norm(dim=1).mean()
+
+
+def test_areas_make_the_whole_sphere():
+    assert math.isclose(float(texel_areas(12).sum()), 4 * math.pi, rel_tol=1e-12)
+
+
+def test_stiffness_is_the_integral_of_the_squared_slope():
+    height = 96
+    z = map_directions(height)[..., 2].reshape(-1).numpy()
+    matrix = stiffness(height)
+    # The slope of z = sin(latitude) is cos(latitude): its square's integral is 8 pi / 3.
+    assert math.isclose(z @ (matrix @ z), 8 * math.pi / 3, rel_tol=0.01)
+    assert np.abs(matrix @ np.ones(len(z))).max() < 1e-9
+
+
+def test_the_map_is_that_of_a_brute_force_least_squares(rng):
+    height, count, smooth = 6, 400, 0.7
+    direction = random_directions(count, rng)
+    value = torch.rand(count, generator=rng, dtype=torch.float64)
+    weight = torch.rand(count, generator=rng, dtype=torch.float64)
+    normal, right = map_sums(direction, value, weight, height)
+    got = solve_map(normal, right, height, smooth, 2000)
+    look = torch.stack([look_up(unit.reshape(height, -1), direction) for unit in torch.eye(72, dtype=torch.float64)], 1)
+    ties = torch.from_numpy(stiffness(height).toarray())
+    size, turned = torch.linalg.eigh(ties)
+    root = (smooth * size.clamp_min(0)).sqrt()[:, None] * turned.T
+    rows = torch.cat([weight.sqrt()[:, None] * look, root])
+    values = torch.cat([weight.sqrt() * value, torch.zeros(72, dtype=torch.float64)])
+    expected = torch.linalg.lstsq(rows, values[:, None], driver="gelsd").solution[:, 0]
+    torch.testing.assert_close(got.reshape(-1), expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_a_joint_step_is_that_of_a_brute_force_least_squares(rng, fixed):
+    height, instants, cameras, places, smooth = 4, 3, 2, 200, 0.5
+    texels, disks = 2 * height * height, instants * cameras
+    look = torch.randn(disks, places, texels, generator=rng)
+    look = look * (torch.rand(look.shape, generator=rng) < 0.2)
+    by_pose = torch.randn(disks, 6, places, generator=rng)
+    light, _ = torch.linalg.qr(torch.randn(disks, places, 2, generator=rng))
+    residual = torch.randn(disks, places, generator=rng)
+    texture = torch.rand(height, 2 * height, generator=rng)
+    part = Part(
+        look_up=csr_matrix(look.reshape(-1, texels).numpy()), by_pose=by_pose, by_light=light.mT, residual=residual
+    )
+    use = torch.ones(instants, cameras, dtype=torch.bool)
+    step = joint_step([part], use, texture, smooth, (1e3, 1e3), 4000, fixed)
+    # Dense: poses, then texels, then a light of each disk's own.
+    width = 6 * instants + texels + 2 * disks
+    rows = torch.zeros(disks, places, width, dtype=torch.float64)
+    for k in range(disks):
+        start = 6 * (k // cameras)
+        rows[k, :, start : start + 6] = by_pose[k].T.double()
+        rows[k, :, 6 * instants : 6 * instants + texels] = look[k].double()
+        at = 6 * instants + texels + 2 * k
+        rows[k, :, at : at + 2] = light[k].double()
+    rows = rows.reshape(-1, width)
+    if fixed:
+        share = torch.zeros(width, width - 3 * instants + 3, dtype=torch.float64)
+        for n in range(instants):
+            share[6 * n : 6 * n + 3, 3 * n : 3 * n + 3] = torch.eye(3)
+            share[6 * n + 3 : 6 * n + 6, 3 * instants : 3 * instants + 3] = torch.eye(3)
+        share[6 * instants :, 3 * instants + 3 :] = torch.eye(width - 6 * instants)
+    else:
+        share = torch.eye(width, dtype=torch.float64)
+    ties = torch.zeros(width, width, dtype=torch.float64)
+    paint = slice(6 * instants, 6 * instants + texels)
+    ties[paint, paint] = smooth * torch.from_numpy(stiffness(height).toarray())
+    pull = rows.T @ residual.double().reshape(-1)
+    pull[paint] -= ties[paint, paint] @ texture.double().reshape(-1)
+    solution = share @ torch.linalg.solve(share.T @ (rows.T @ rows + ties) @ share, share.T @ pull)
+    torch.testing.assert_close(step.pose.reshape(-1), solution[: 6 * instants], atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(step.map.reshape(-1), solution[paint], atol=2e-3, rtol=2e-3)
+
+
+def test_sharpening_undoes_a_blur():
+    height, blur_rad = 48, 0.08
+    paint = random_texture("blobs", 5, height).double()
+    direction = map_directions(height).reshape(-1, 3)
+    blurred = torch.from_numpy(blur_matrix(direction, blur_rad, height) @ paint.reshape(-1).numpy())
+    # Coefficients whose spline has the blurred values: a spline of its own blurs by half a texel only.
+    got = look_up(sharpened(blurred.reshape(height, -1), blur_rad, 1e-4), direction)
+    sharp = look_up(paint, direction)
+    assert (got - sharp).std() < 0.45 * (blurred - sharp).std()
+
+
+def test_a_blur_leaves_even_paint_as_it_is(rng):
+    rows = blur_matrix(random_directions(50, rng), 0.1, 12)
+    np.testing.assert_allclose(rows @ np.full(288, 0.7), 0.7, rtol=1e-6)

@@ -1,0 +1,166 @@
+"""Maps learnt from movies: the bundled excerpt, and the shared ones."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import torch
+from conftest import REPO, SHARED
+from renders import error_deg
+
+from sphereorient.errors import PaintError
+from sphereorient.experiment import load_experiment, open_movies
+from sphereorient.experiment.recording import Recording, silent
+from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.timeline import timeline
+from sphereorient.locate import LocateSettings
+from sphereorient.mapping import PaintSettings, learn_map, take_footage
+from sphereorient.mapping.compare import fibonacci
+from sphereorient.mapping.learn import SHOWN_MIN, _counts, followed
+from sphereorient.so3 import exp
+
+EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
+QUICK = PaintSettings(pixels=700, rounds=6)
+
+
+@contextmanager
+def opened(path, cameras=None, frames=None):
+    """A recording whose experiment names no texture."""
+    experiment = replace(load_experiment(path), texture_path=None)
+    experiment = experiment if frames is None else replace(experiment, frames=frames)
+    names = cameras or list(experiment.movie_paths)
+    movies = open_movies(experiment, names)
+    lines = timeline(experiment, movies)
+    streams = [
+        CameraStream(name=name, camera=experiment.cameras[name], movie=movies[name], rows=lines.rows[name])
+        for name in names
+    ]
+    grey = torch.full((8, 16), 0.5)
+    try:
+        yield Recording(experiment=experiment, streams=streams, timeline=lines, texture=grey, remarks=())
+    finally:
+        for movie in movies.values():
+            movie.close()
+
+
+def truth(path):
+    with h5py.File(path) as file:
+        return torch.from_numpy(file["orientation"][()])
+
+
+@pytest.mark.slow
+def test_one_camera_of_the_excerpt_teaches_attitudes_and_leaves_the_unseen_empty():
+    with opened(EXCERPT, ["cam1"]) as recording:
+        learnt = learn_map(recording, QUICK, LocateSettings(), silent)
+    assert bool(learnt.valid.all())
+    error = error_deg(learnt.R_lab_body, truth(EXCERPT.parent / "truth.h5")[: len(learnt.valid)])
+    assert error.median() < 0.5
+    assert learnt.rounds[-1].moved_rad < learnt.rounds[1].moved_rad
+    torch.testing.assert_close(learnt.R_lab_body[0], torch.eye(3, dtype=torch.float64))
+    # What never faced the camera is empty, not invented, and the share of it is told.
+    empty = learnt.seen == 0
+    assert 0.02 < float(empty.double().mean()) < 0.7
+    assert torch.equal(empty, learnt.texture.isnan())
+    assert torch.equal(empty, learnt.sigma.isinf())
+    assert learnt.seen_share < 0.98
+    assert learnt.score.nanmedian() > 0.85
+
+
+def test_one_frame_is_refused():
+    with opened(EXCERPT, frames=(3, 4)) as recording, pytest.raises(PaintError, match="2 frames"):
+        learn_map(recording, QUICK, LocateSettings(), silent)
+
+
+def test_footage_holds_the_ball_of_every_frame():
+    with opened(EXCERPT, ["cam2"], (0, 3)) as recording:
+        footage = take_footage(recording, QUICK, LocateSettings(), silent)
+        whole = next(iter(recording.streams[0].pictures()))[0]
+    assert bool(footage.seen.all())
+    window = footage.windows[0][0]
+    rows, columns = window.grey.shape
+    inside = np.s_[window.top : window.top + rows, window.left : window.left + columns]
+    np.testing.assert_array_equal(footage.picture(0, 0)[inside], whole[inside])
+
+
+def test_frames_between_the_fitted_ones_turn_as_they_do():
+    off = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)
+    chain = exp(torch.arange(9, dtype=torch.float64)[:, None] * torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64))
+    rows = torch.tensor([0, 4, 8])
+    told = torch.stack([chain[0], exp(off) @ chain[4], exp(2 * off) @ chain[8]])
+    R = followed(chain, rows, told)
+    torch.testing.assert_close(R[rows], told)
+    torch.testing.assert_close(R[2], exp(0.5 * off) @ chain[2])
+    torch.testing.assert_close(R[6], exp(1.5 * off) @ chain[6])
+
+
+def test_a_place_counts_in_the_pictures_that_do_not_show_it_too_slanted():
+    # Near cameras, so that the limb is far from 90 degrees; one picture of four is not used.
+    R = exp(torch.tensor([[0.3, -1.2, 0.4], [2.0, 0.5, -0.7]], dtype=torch.float64))
+    X = torch.tensor([[0.5, 0.2, -0.1], [-0.3, 0.4, 0.0]], dtype=torch.float64)
+    middles = torch.tensor([[0.0, 0.0, 5.0], [4.0, 1.0, 0.0]], dtype=torch.float64)
+    turns = exp(torch.tensor([[0.1, 0.2, 0.3], [1.0, -2.0, 0.4]], dtype=torch.float64))
+    cameras = [SimpleNamespace(R_cam_lab=C, T_cam_lab_mm=-C @ m) for C, m in zip(turns, middles, strict=True)]
+    stage = SimpleNamespace(
+        R_lab_body=R,
+        position_lab_mm=X,
+        use=torch.tensor([[True, True], [False, True]]),
+        fitter=SimpleNamespace(
+            radius_mm=1.5,
+            views=[SimpleNamespace(camera=camera, background=SimpleNamespace(shown=None)) for camera in cameras],
+        ),
+    )
+    direction = fibonacci(300)
+    expected = torch.zeros(300, dtype=torch.int64)
+    for k, c in ((0, 0), (0, 1), (1, 1)):
+        normal = direction @ R[k].mT
+        towards = middles[c] - (X[k] + 1.5 * normal)
+        expected += (normal * towards).sum(-1) / towards.norm(dim=-1) > SHOWN_MIN
+    assert len(expected.unique()) > 2
+    torch.testing.assert_close(_counts(stage, direction), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+def test_a_ball_fixed_in_its_place_is_learnt_from_one_camera():
+    path = SHARED / "fixed_ball" / "experiment.yaml"
+    with opened(path) as recording:
+        learnt = learn_map(recording, PaintSettings(), LocateSettings(), silent)
+    true = truth(path.parent / "truth.h5")
+    R, P = learnt.R_lab_body, torch.eye(3, dtype=torch.float64)
+    for _ in range(100):  # the best constant turns on both sides
+        Q = _nearest(((P @ R).mT @ true).mean(0))
+        P = _nearest((true @ (R @ Q).mT).mean(0))
+    assert error_deg(P @ R, true).median() < 0.05
+    step = torch.rad2deg(_angle(R[1:] @ R[:-1].mT, P.mT @ true[1:] @ true[:-1].mT @ P))
+    assert step.median() < 0.05
+    assert learnt.position_lab_mm.std(0).max() < 1e-9
+    assert learnt.blur_px == pytest.approx(12**-0.5, rel=0.15)  # of a pixel alone
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+def test_the_shared_experiment_is_learnt_without_its_texture(tmp_path):
+    path = SHARED / "experiment" / "experiment.yaml"
+    with opened(path) as recording:
+        learnt = learn_map(recording, PaintSettings(), LocateSettings(), silent)
+    error = error_deg(learnt.R_lab_body, truth(path.parent / "truth.h5"))
+    assert error.median() < 0.13
+    assert error.quantile(0.95) < 0.25
+    assert learnt.seen_share > 0.95
+    grey = (torch.nan_to_num(learnt.texture, nan=0.5) * 255).round().byte().numpy()
+    assert cv2.imwrite(str(tmp_path / "learnt.png"), grey)
+
+
+def _nearest(matrix):
+    U, _, Vt = torch.linalg.svd(matrix)
+    return U @ torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(U @ Vt))], dtype=matrix.dtype)) @ Vt
+
+
+def _angle(A, B):
+    return 2 * torch.asin(((A - B).flatten(1).norm(dim=1) / 8**0.5).clamp(max=1))

@@ -1,0 +1,294 @@
+"""Settings and provenance: defaults, files, overrides, and refusals of one line that name the nearest known key."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import REPO
+from pydantic import BaseModel, ValidationError
+
+from sphereorient.errors import SettingsError
+from sphereorient.experiment import input_files, load_experiment
+from sphereorient.files.provenance import provenance, sha256, versions
+from sphereorient.locate import LocateSettings
+from sphereorient.methods.settings import (
+    DEFAULT_METHOD,
+    METHODS,
+    Settings,
+    load_proposer_settings,
+    load_settings,
+    load_synth_settings,
+    settings_yaml,
+    synth_settings_yaml,
+)
+from sphereorient.synth.settings import SynthSettings
+
+ROOMS = [
+    *("locate", "propose", "search", "refine", "path", "smooth"),
+    *("orient", "assemble", "motion", "paint", "statistics"),
+]
+CHANGES = [
+    "locate.diameter_px=78.5",
+    "locate.gap_frames_max=0",
+    "orient.fine_step_deg=2.5",
+    "motion.separations=[1, 3]",
+    "motion.min_separations=1",
+]
+
+
+LOADERS = {"synth": load_synth_settings, "train": load_proposer_settings}
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "settings.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refused(*overrides: str, path: Path | None = None, load=load_settings) -> str:
+    """Return the refusal, which must be one line."""
+    with pytest.raises(SettingsError) as caught:
+        load(path, overrides)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.endswith(".")
+    return text
+
+
+def test_without_a_file_all_is_as_the_rooms_say():
+    assert load_settings() == Settings()
+    assert load_settings().locate == LocateSettings()
+    assert list(Settings.model_fields) == ROOMS
+    assert load_synth_settings() == SynthSettings()
+    assert DEFAULT_METHOD in METHODS
+
+
+def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
+    loaded = load_settings(write(tmp_path, "locate:\n  gap_frames_max: 2\n"))
+    assert loaded.locate == LocateSettings(gap_frames_max=2)
+    assert loaded.orient == Settings().orient
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n", "{}\n", "locate: {}\n"])
+def test_an_empty_file_is_the_defaults(tmp_path, text):
+    assert load_settings(write(tmp_path, text)) == Settings()
+
+
+def test_an_override_wins_over_the_file_and_a_later_one_over_an_earlier(tmp_path):
+    path = write(tmp_path, "locate:\n  gap_frames_max: 2\n  reduction: 3\n")
+    loaded = load_settings(path, ["locate.gap_frames_max=1", "locate.gap_frames_max=3"])
+    assert (loaded.locate.gap_frames_max, loaded.locate.reduction) == (3, 3)
+
+
+def test_values_are_read_as_yaml():
+    loaded = load_settings(None, ["locate.diameter_px=null", "motion.separations=[1, 2, 4]", " locate.reduction = 4"])
+    assert loaded.locate.diameter_px is None
+    assert loaded.motion.separations == (1, 2, 4)
+    assert loaded.locate.reduction == 4
+    assert load_synth_settings(None, ["image_size=[320, 240]", "name=a test"]).image_size == (320, 240)
+
+
+def test_an_override_may_hold_an_equals_sign():
+    assert load_synth_settings(None, ["name=a=b"]).name == "a=b"
+
+
+@pytest.mark.parametrize(
+    ("override", "near"),
+    [
+        ("locate.gap_frame_max=2", "did you mean locate.gap_frames_max"),
+        ("orient.fine_stp_deg=2", "did you mean orient.fine_step_deg"),
+        ("locat.reduction=2", "did you mean locate"),
+        ("motion.seperations=[1]", "did you mean motion.separations"),
+    ],
+)
+def test_an_unknown_key_is_refused_with_the_nearest_known_one(override, near):
+    text = refused(override)
+    assert near in text
+    assert override.partition("=")[0].partition(".")[0] in text
+
+
+def test_an_unknown_key_like_no_other_is_refused_with_all_there_are(tmp_path):
+    text = refused("zzz.q=1")
+    assert all(room in text for room in ROOMS)
+    assert "synth" not in text
+    assert "frame_rate" in refused("zzz=1", load=load_synth_settings)
+    assert "use one of" in refused(path=write(tmp_path, "locate: {zzz: 1}\n"))
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("locate.gap_frames_max=-1", ["locate.gap_frames_max", "-1", "greater than or equal to 0"]),
+        ("locate.gap_frames_max=2.5", ["locate.gap_frames_max", "2.5"]),
+        ("locate.reduction=two", ["locate.reduction", "'two'"]),
+        ("locate.coverage_min=1", ["locate.coverage_min", "less than 1"]),
+        ("locate.noise_factor=.nan", ["locate.noise_factor", "nan"]),
+        ("locate.diameter_px=[1, 2]", ["locate.diameter_px", "[1, 2]"]),
+        ("motion.separations=[1, x]", ["motion.separations.1", "'x'"]),
+        ("motion.separations=[]", ["motion.separations"]),
+    ],
+)
+def test_an_impossible_value_is_one_line_with_its_key(override, words):
+    text = refused(override)
+    for word in words:
+        assert word in text
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["motion.separations=[1, 1]"], ["motion.separations", "different numbers from 1 up", "got (1, 1)"]),
+        (["motion.separations=[1, 2]"], ["motion.min_separations", "at most 2", "got 3"]),
+    ],
+)
+def test_values_that_do_not_fit_each_other_are_refused_in_the_rooms_own_words(overrides, words):
+    text = refused(*overrides)
+    for word in words:
+        assert word in text
+    assert text.count("expected") == 1
+    assert "Value error" not in text
+
+
+@pytest.mark.parametrize("override", ["locate.reduction", "reduction=2", "a.b.c=1", "", "=", "locate.=3", "locate"])
+def test_an_override_of_another_form_is_refused(override):
+    refused(override)
+
+
+@pytest.mark.parametrize("override", ["locate.frames=3", "frames", ""])
+def test_overrides_of_a_synthetic_experiment_have_no_room(override):
+    refused(override, load=load_synth_settings)
+
+
+def test_an_override_that_is_no_yaml_is_refused():
+    assert "a YAML value" in refused("locate.reduction=[1, 2")
+
+
+def test_an_override_of_a_room_that_the_file_spoils_is_refused(tmp_path):
+    assert "locate" in refused("locate.reduction=2", path=write(tmp_path, "locate: 5\n"))
+
+
+@pytest.mark.parametrize("text", ["- 1\n- 2\n", "just words\n", "7\n", "a: [1\n", "a: b: c\n", "\tx: 1\n"])
+def test_a_file_that_is_no_tree_is_refused(tmp_path, text):
+    assert "settings.yaml" in refused(path=write(tmp_path, text))
+
+
+def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path):
+    assert "none.yaml" in refused(path=tmp_path / "none.yaml")
+    refused(path=tmp_path)
+    (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00locate")
+    assert "bytes.yaml" in refused(path=tmp_path / "bytes.yaml")
+
+
+def test_a_refused_value_of_a_file_names_the_file(tmp_path):
+    assert "settings.yaml, locate.reduction" in refused(path=write(tmp_path, "locate: {reduction: 99}\n"))
+
+
+@pytest.mark.parametrize("overrides", [[], CHANGES], ids=["defaults", "changed"])
+def test_settings_written_are_settings_read(tmp_path, overrides):
+    settings = load_settings(None, overrides)
+    assert load_settings(write(tmp_path, settings_yaml(settings))) == settings
+
+
+def test_small_and_large_numbers_are_read_back_as_numbers(tmp_path):
+    """The usual YAML reader takes 1e-3 for text."""
+    settings = load_settings(None, ["locate.outlier_px=1.0e-7", "locate.noise_factor=3.0e+20"])
+    again = load_settings(write(tmp_path, settings_yaml(settings)))
+    assert again.locate.outlier_px == 1e-7
+    assert again.locate.noise_factor == 3e20
+
+
+def test_synthetic_settings_written_are_settings_read(tmp_path):
+    assert load_synth_settings(write(tmp_path, synth_settings_yaml())) == SynthSettings()
+    assert yaml.safe_load(synth_settings_yaml()).keys() == SynthSettings.model_fields.keys()
+
+
+def test_the_file_names_and_explains_every_setting():
+    tree, text = yaml.safe_load(settings_yaml()), settings_yaml()
+    lines = [line.strip() for line in text.splitlines()]
+    assert list(tree) == ROOMS
+    for room in ROOMS:
+        model = Settings.model_fields[room].annotation
+        assert tree[room].keys() == model.model_fields.keys()
+        for key, field in model.model_fields.items():
+            first = next(k for k, line in enumerate(lines) if line.startswith(f"{room}:"))
+            before = lines[next(k for k, line in enumerate(lines) if k > first and line.startswith(f"{key}:")) - 1]
+            assert before.startswith("# ")
+            assert before.removeprefix("# ").split()[-1] == field.description.split()[-1]
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def models() -> list[type[BaseModel]]:
+    return [Settings, SynthSettings, *(Settings.model_fields[room].annotation for room in ROOMS)]
+
+
+@pytest.mark.parametrize("model", models(), ids=lambda model: model.__name__)
+def test_all_settings_have_a_default_and_a_description_and_are_frozen(model):
+    settings = model()
+    for name, field in model.model_fields.items():
+        assert field.description, name
+    with pytest.raises(ValidationError):
+        setattr(settings, next(iter(model.model_fields)), 1)
+
+
+def test_the_committed_settings_are_accepted():
+    for path in sorted((REPO / "configs").glob("*.yaml")):
+        LOADERS.get(path.stem.partition("_")[0], load_settings)(path)
+
+
+def two_folders(folder: Path):
+    """An experiment whose two movies share a name, as cameras write them."""
+    experiment = load_experiment(REPO / "synthetic_data" / "excerpt" / "experiment.yaml")
+    files = {"experiment.yaml": b"e", "cameras.yaml": b"c", "left/movie.mkv": b"left", "right/movie.mkv": b"right"}
+    files |= {"texture.png": b"t", "left/empty.png": b"empty left", "right/empty.png": b"empty right"}
+    for name, content in files.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(content)
+    sides = {"cam1": "left", "cam2": "right"}
+    return files, replace(
+        experiment,
+        path=folder / "experiment.yaml",
+        cameras_path=folder / "cameras.yaml",
+        texture_path=folder / "texture.png",
+        movie_paths={name: folder / side / "movie.mkv" for name, side in sides.items()},
+        background_paths={name: folder / side / "empty.png" for name, side in sides.items()},
+    )
+
+
+def test_every_input_has_its_fingerprint(tmp_path):
+    files, experiment = two_folders(tmp_path)
+    kept = provenance(input_files(experiment), tmp_path, "sphereorient track x")
+    assert kept["sha256"] == {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    assert kept["command"] == "sphereorient track x"
+    assert json.loads(json.dumps(kept)) == kept
+
+
+def test_only_the_cameras_that_were_used_have_fingerprints(tmp_path):
+    _, experiment = two_folders(tmp_path)
+    kept = provenance(input_files(replace(experiment, texture_path=None), ["cam2"]), tmp_path, "")
+    assert set(kept["sha256"]) == {"experiment.yaml", "cameras.yaml", "right/movie.mkv", "right/empty.png"}
+
+
+def test_inputs_elsewhere_are_named_by_the_way_to_them(tmp_path):
+    (tmp_path / "here").mkdir()
+    _, experiment = two_folders(tmp_path)
+    (tmp_path / "here" / "experiment.yaml").write_bytes(b"e")
+    there = replace(experiment, path=tmp_path / "here" / "experiment.yaml")
+    kept = provenance(input_files(there, ["cam1"]), there.folder, "")
+    assert "../left/movie.mkv" in kept["sha256"]
+    assert "experiment.yaml" in kept["sha256"]
+
+
+def test_a_fingerprint_is_the_usual_one(tmp_path):
+    path = write(tmp_path, "abc")
+    assert sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_versions_name_what_enters_the_numbers():
+    found = versions()
+    assert {"python", "sphereorient", "torch", "kornia", "numpy"} <= found.keys()
+    assert all(isinstance(number, str) and number for number in found.values())

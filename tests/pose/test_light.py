@@ -1,0 +1,281 @@
+"""Light and noise that were planted are found again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from conftest import assert_close
+from refine_examples import (
+    BEHIND,
+    BLUR_PX,
+    RADIUS_MM,
+    Rig,
+    balls,
+    cut,
+    fitted,
+    flat_light,
+    noisy,
+    rig_of,
+    share_pictures,
+)
+from torch import Tensor
+
+from sphereorient.pose.fit import FIRST, learn_light
+from sphereorient.pose.light import Light, light_basis, light_maps, light_sums, noise_curve, polynomials
+from sphereorient.pose.model import View, sphere_view
+from sphereorient.pose.pixels import Pixels
+
+KINDS = ("patches",)
+NOISE = torch.tensor([[4.0, 0.05, 0.001, 0.0]])  # grey levels^2 and so on
+
+
+def disk_places(count: int, radius: float = 1.0, seed: int = 1) -> Tensor:
+    """Places (1, 2, count), even over the disk."""
+    rng = torch.Generator().manual_seed(seed)
+    r = radius * torch.rand(count, generator=rng).sqrt()
+    angle = 2 * math.pi * torch.rand(count, generator=rng)
+    return torch.stack([r * angle.cos(), r * angle.sin()])[None]
+
+
+def lamp(across: Tensor, camera: int) -> tuple[Tensor, Tensor]:
+    """White less black paint and black paint (L, P) under a lamp from the side, another for each camera."""
+    x, y = across.unbind(-2)
+    depth = (1 - x * x - y * y).clamp_min(0).sqrt()
+    side = 0.4 if camera == 0 else -0.5
+    return 90 + 60 * depth + 50 * side * x - 20 * y, 12 + 18 * depth - 10 * side * y + 6 * x * y
+
+
+# --- the functions that maps are sums of
+
+
+def test_polynomials_are_all_monomials_up_to_their_order():
+    x, y = 2.0, 3.0
+    values = polynomials(torch.tensor([[[x], [y]]]), 3)[0, :, 0].tolist()
+    assert sorted(values) == sorted(x**i * y**j for i in range(4) for j in range(4) if i + j <= 3)
+    # A lower order's are the first of a higher one's: shading takes the first ones of a longer list.
+    assert values[:6] == polynomials(torch.tensor([[[x], [y]]]), 2)[0, :, 0].tolist()
+    assert values[0] == 1
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 1, 3)])
+def test_functions_at_any_leading_shape(shape):
+    across = disk_places(5 * math.prod(shape))[0].reshape(2, *shape, 5).movedim(0, -2)
+    whole = light_basis(across)
+    assert whole.shape == (*shape, 25, 5)
+    flat, one_by_one = across.reshape(-1, 2, 5), whole.reshape(-1, 25, 5)
+    for place, expected in zip(flat, one_by_one, strict=True):
+        assert_close(light_basis(place), expected, atol=1e-7)
+
+
+def test_beyond_the_limb_and_on_it_the_functions_are_finite_and_so_are_their_slopes():
+    across = torch.tensor([[[0.0, 0.6, 1.0, 1.2], [0.0, 0.8, 0.0, -0.4]]])
+    assert light_basis(across).isfinite().all()
+
+
+# --- looking up
+
+
+def test_maps_that_are_looked_up_are_the_sums_of_functions():
+    rng = torch.Generator().manual_seed(5)
+    light = Light(
+        difference=50 * torch.randn(2, 25, generator=rng),
+        black=20 * torch.randn(2, 25, generator=rng),
+        noise=NOISE.repeat(2, 1),
+        known=True,
+    )
+    across = torch.cat([disk_places(3000, 0.98, seed) for seed in range(4)])
+    basis = light_basis(across)
+    for got, coefficients in zip(light.at(across), (light.difference, light.black), strict=True):
+        expected = torch.stack([coefficients[k % 2] @ basis[k] for k in range(4)])
+        # A cell is 1/128 of a radius wide, and by the limb the depth changes over several of them.
+        error = (got - expected) / expected.std()
+        assert error.square().mean().sqrt() < 0.02
+        assert error.abs()[across.norm(dim=1) < 0.9].max() < 0.04
+        # The other camera's map is another.
+        assert (got[:1] - expected[1:2]).std() > 0.5 * expected.std()
+
+
+def test_a_lamp_is_looked_up_to_a_grey_level():
+    across = disk_places(5000, 0.98)
+    difference, black = maps_of(*lamp_coefficients())
+    light = Light(difference=difference[None], black=black[None], noise=NOISE, known=True)
+    for got, expected in zip(light.at(across), lamp(across, 0), strict=True):
+        assert (got - expected)[across.norm(dim=1) < 0.9].abs().max() < 1.0
+        assert (got - expected).square().mean().sqrt() < 0.4
+
+
+@cache
+def lamp_coefficients() -> tuple[Tensor, Tensor]:
+    across = disk_places(4000)
+    basis = light_basis(across)[0].double()
+    return tuple(torch.linalg.lstsq(basis.T, part[0, :, None].double()).solution[:, 0] for part in lamp(across, 0))
+
+
+def maps_of(*coefficients: Tensor) -> tuple[Tensor, ...]:
+    return tuple(part.float() for part in coefficients)
+
+
+def test_unknown_light_is_one_and_nothing_everywhere():
+    light = Light.unknown(3, NOISE.repeat(3, 1))
+    assert not light.known
+    difference, black = light.at(disk_places(500, 1.2).repeat(6, 1, 1))
+    assert (difference == 1).all()
+    assert (black == 0).all()
+    assert difference.shape == (6, 500)
+
+
+# --- learning maps
+
+
+@cache
+def views() -> tuple[Pixels, View]:
+    """Eight disks of one camera, at their poses."""
+    rig = rig_of(40.0, ("pinhole",))
+    X, R = balls(8, 2)
+    pixels = cut(rig, torch.zeros(8, 1, 100, 100), X)
+    return pixels, sphere_view(pixels, X, R, RADIUS_MM, rig.table("patches"), BLUR_PX)
+
+
+def lit(pixels: Pixels, view: View, camera: int = 0) -> Tensor:
+    difference, black = lamp(view.across, camera)
+    return view.coverage * (view.paint * difference + black) + (1 - view.coverage) * pixels.behind
+
+
+@pytest.mark.parametrize("sigma", [0.0, 4.0])
+def test_planted_maps_are_found_again(sigma):
+    pixels, view = views()
+    rng = torch.Generator().manual_seed(3)
+    grey = lit(pixels, view) + sigma * torch.randn(view.paint.shape, generator=rng)
+    precision = torch.full_like(grey, 1 / 16)
+    normal, right = light_sums(view, replace(pixels, grey=grey), precision)
+    assert normal.dtype == right.dtype == torch.float64
+    difference, black = light_maps(normal.sum(0)[None], right.sum(0)[None])
+    across = disk_places(3000, 0.95)
+    basis = light_basis(across)[0]
+    for got, expected in zip((difference, black), lamp(across, 0), strict=True):
+        error = (got[0] @ basis) - expected[0]
+        assert error.square().mean().sqrt() < 0.15 + 0.25 * sigma
+        assert error.abs().max() < 1.0 + 1.5 * sigma
+
+
+def test_pixels_without_weight_do_not_count():
+    pixels, view = views()
+    grey, precision = lit(pixels, view), torch.ones_like(view.paint)
+    spoilt = grey.clone()
+    spoilt[:, 5::7] = 1e4
+    precision[:, 5::7] = 0
+    one = light_sums(view, replace(pixels, grey=grey), precision)
+    other = light_sums(view, replace(pixels, grey=spoilt), precision)
+    for a, b in zip(one, other, strict=True):
+        assert a.equal(b)
+
+
+def test_a_disk_that_shows_white_paint_only_leaves_small_maps():
+    # Nothing tells difference from black: the ridge shares the light between them, and their sum is right.
+    pixels, view = views()
+    view = replace(view, paint=torch.ones_like(view.paint))
+    grey = lit(pixels, view)
+    normal, right = light_sums(view, replace(pixels, grey=grey), torch.ones_like(grey))
+    difference, black = light_maps(normal.sum(0)[None], right.sum(0)[None])
+    across = disk_places(2000, 0.9)
+    basis = light_basis(across)[0]
+    assert difference.isfinite().all()
+    error = (difference[0] + black[0]) @ basis - sum(lamp(across, 0))[0]
+    assert error.abs().max() < 1.0
+
+
+# --- noise
+
+
+@pytest.mark.parametrize(
+    "planted", [(9.0, 0.0, 0.0, 0.0), (4.0, 0.3, 0.0, 0.0), (2.0, 0.05, 0.002, 0.0), (3.0, 0.0, 0.0, 2e-5)]
+)
+def test_a_noise_curve_is_found_again(planted):
+    rng = torch.Generator().manual_seed(7)
+    model = 10 + 190 * torch.rand(200_000, generator=rng)
+    a, b, c, d = planted
+    variance = a + b * model + c * model**2 + d * model**3
+    residual = variance.sqrt() * torch.randn(model.shape, generator=rng)
+    found = noise_curve(model, residual, torch.ones(len(model), dtype=torch.bool))
+    assert found.shape == (4,)
+    assert (found >= 0).all()
+    at = torch.linspace(20, 190, 18)
+    got = found[0] + found[1] * at + found[2] * at**2 + found[3] * at**3
+    expected = a + b * at + c * at**2 + d * at**3
+    assert (got / expected - 1).abs().max() < 0.08
+
+
+def test_a_few_wild_residuals_do_not_change_the_curve():
+    rng = torch.Generator().manual_seed(7)
+    model, inside = 10 + 190 * torch.rand(50_000, generator=rng), torch.ones(50_000, dtype=torch.bool)
+    residual = 3 * torch.randn(model.shape, generator=rng)
+    residual[::40] = 200
+    found = noise_curve(model, residual, inside)
+    at_100 = float(found @ torch.tensor([1.0, 1e2, 1e4, 1e6]))
+    assert at_100 == pytest.approx(9, rel=0.12)
+
+
+def test_pixels_outside_do_not_count_for_noise():
+    rng = torch.Generator().manual_seed(7)
+    model, inside = 200 * torch.rand(20_000, generator=rng), torch.ones(20_000, dtype=torch.bool)
+    residual = 3 * torch.randn(model.shape, generator=rng)
+    expected = noise_curve(model[::2], residual[::2], inside[::2])
+    inside[1::2] = False
+    residual[1::2] = torch.nan
+    assert noise_curve(model, residual, inside).equal(expected)
+
+
+@pytest.mark.parametrize(("count", "expected"), [(0, 1.0), (100, 25.0)])
+def test_few_pixels_tell_one_variance_only(count, expected):
+    residual = 5 * torch.tensor([1.0, -1.0]).repeat(count // 2)
+    found = noise_curve(torch.linspace(10, 200, count), residual, torch.ones(count, dtype=torch.bool))
+    assert found.tolist() == [expected, 0, 0, 0]
+
+
+# --- all of it, from pictures
+
+
+def test_light_and_noise_of_two_cameras_are_learnt_from_fitted_pictures():
+    rig = rig_of(48.0)
+    X, R = balls(12, 4)
+    pixels = cut(rig, lamp_pictures(rig, X, R), X)
+    use = torch.ones(12, 2, dtype=torch.bool)
+    fit = fitted(rig, "patches", pixels, X, R, 5.0, shading=FIRST)
+    given = {"radius_mm": RADIUS_MM, "paint": rig.table("patches"), "blur_px": BLUR_PX}
+    light = learn_light(pixels, fit, use, **given, light=flat_light(2, 5.0), shading=FIRST)
+    assert light.known
+    across = disk_places(3000, 0.9).repeat(2, 1, 1)
+    for k, part in enumerate(light.at(across)):
+        for camera in range(2):
+            error = part[camera] - lamp(across[camera], camera)[k]
+            assert error.square().mean().sqrt() < 2.0
+            other = part[camera] - lamp(across[camera], 1 - camera)[k]
+            assert other.square().mean().sqrt() > 3.0
+    at = torch.tensor([1.0, 80.0, 80.0**2, 80.0**3])
+    for noise in light.noise:
+        assert float(noise @ at) == pytest.approx(25, rel=0.2)
+    # One camera's bad disks, not in use, change nothing of the other's light.
+    some = use.clone()
+    some[6:, 1] = False
+    fewer = learn_light(pixels, fit, some, **given, light=flat_light(2, 5.0), shading=FIRST)
+    assert fewer.noise[0].equal(light.noise[0])
+    assert_close(fewer.difference[0], light.difference[0], atol=1e-3)
+    assert not fewer.noise[1].equal(light.noise[1])
+
+
+def lamp_pictures(rig: Rig, X: Tensor, R: Tensor, sigma: float = 5.0) -> Tensor:
+    """Pictures under a lamp for each camera, (B, C, H, W)."""
+    paint, filled = share_pictures(rig, "patches", X, R)
+    pictures = []
+    for c, camera in enumerate(rig.cameras):
+        height, width = paint.shape[-2:]
+        v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        across = (torch.stack([u, v]) - camera.project(X)[:, :, None, None]) / (0.5 * rig.diameter_px)
+        across = across / across.norm(dim=1, keepdim=True).clamp_min(1.0)
+        difference, black = (part.reshape(-1, height, width) for part in lamp(across.flatten(2), c))
+        pictures.append(BEHIND * (1 - filled[:, c]) + black * filled[:, c] + difference * paint[:, c])
+    return noisy(torch.stack(pictures, dim=1).float(), sigma, 6)

@@ -1,0 +1,157 @@
+"""A run that was killed goes on where it was, and its track is that of a run that was not, to the last bit."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from jobs_examples import COMMAND, EXCERPT, SHORT_BLOCKS, datasets, run
+
+from sphereorient.errors import OutputError, TrackError
+from sphereorient.methods.settings import load_settings
+from sphereorient.run import Parts, Request, track_kept
+
+
+@pytest.fixture(scope="module")
+def request_of(tmp_path_factory):
+    settings = load_settings(None, ["refine.block_frames=2"])
+
+    def make(folder: Path, **changed: object) -> Request:
+        return Request(experiment=EXCERPT, out=folder / "track.h5", settings=settings, **changed)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, request_of) -> Path:
+    """A run that nothing disturbed, and what its parts were like halfway."""
+    folder = tmp_path_factory.mktemp("whole")
+    request = request_of(folder)
+
+    def keep(stage: str, done: int, total: int) -> None:
+        if stage == "track" and 0 < done < total and not (folder / "half").exists():
+            shutil.copytree(request.parts, folder / "half")
+
+    track_kept(request, progress=keep)
+    assert not request.parts.exists()
+    return folder
+
+
+def halfway(whole: Path, request: Request) -> Parts:
+    """Put parts where a run that was cut off has left them."""
+    shutil.copytree(whole / "half", request.parts)
+    return Parts(request.parts)
+
+
+def test_a_run_goes_on_with_what_is_there(whole, tmp_path, request_of):
+    request = request_of(tmp_path)
+    parts = halfway(whole, request)
+    before = {path.name: path.stat().st_mtime_ns for path in parts.folder.iterdir()}
+    assert any(name.startswith("poses") for name in before)
+    stages: list[tuple[str, int]] = []
+    track_kept(request, resume=True, progress=lambda stage, done, total: stages.append((stage, done)))
+    assert "study" not in dict(stages)  # known from before
+    assert stages[0] == ("track", 8 * sum(name.startswith("poses") for name in before))
+    assert datasets(request.out) == datasets(whole / "track.h5")
+    assert not request.parts.exists()
+
+
+def test_without_resume_it_starts_over(whole, tmp_path, request_of):
+    request = request_of(tmp_path)
+    halfway(whole, request)
+    stages: list[str] = []
+    track_kept(request, progress=lambda stage, done, total: stages.append(stage))
+    assert "study" in stages
+    assert datasets(request.out) == datasets(whole / "track.h5")
+
+
+def test_parts_cut_off_while_written_are_measured_again(whole, tmp_path, request_of):
+    request = request_of(tmp_path)
+    parts = halfway(whole, request)
+    (parts.folder / ".poses-00000016.h5.99.part").write_bytes(b"half of it")
+    (parts.folder / "learnt.h5").write_bytes((parts.folder / "learnt.h5").read_bytes()[:5000])
+    track_kept(request, resume=True)
+    assert datasets(request.out) == datasets(whole / "track.h5")
+
+
+def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_path, request_of):
+    request = request_of(tmp_path)
+    parts = halfway(whole, request)
+    (part,) = sorted(parts.folder.glob("poses-*"))[:1]
+    part.write_bytes(part.read_bytes()[:1000])
+    with pytest.raises(TrackError, match=r"got a damaged file; run again with --resume"):
+        track_kept(request, resume=True)
+    assert not request.out.exists()
+    track_kept(request, resume=True)
+    assert datasets(request.out) == datasets(whole / "track.h5")
+
+
+def test_parts_of_another_run_are_refused_with_what_differs(whole, tmp_path, request_of):
+    request = request_of(tmp_path, cameras=("cam1",))
+    parts = halfway(whole, request)
+    with pytest.raises(TrackError, match=r"parts of a run with another cam2\.mkv, cameras; run without --resume"):
+        track_kept(request, resume=True)
+    told = json.loads((parts.folder / "run.json").read_text())
+    told["cam1.mkv"] = "12 34"
+    (parts.folder / "run.json").write_text(json.dumps(told))
+    with pytest.raises(TrackError, match=r"with another cam1\.mkv;"):
+        track_kept(request_of(tmp_path), resume=True)
+
+
+def test_two_runs_do_not_write_one_track(whole, tmp_path, request_of):
+    request = request_of(tmp_path)
+    parts = halfway(whole, request)
+    with parts.held(request, resume=True), pytest.raises(OutputError, match="another run that is writing it"):
+        track_kept(request, resume=True)
+    assert list(parts.folder.glob("poses-*"))
+
+
+def test_what_was_learnt_measures_the_same_again(whole, tmp_path, request_of):
+    first = request_of(tmp_path / "a", save_learnt=tmp_path / "learnt.h5")
+    (tmp_path / "a").mkdir()
+    track_kept(first)
+    again = request_of(tmp_path, learnt=tmp_path / "learnt.h5")
+    track_kept(again)
+    assert datasets(again.out) == datasets(whole / "track.h5")
+
+
+def test_knowledge_of_other_cameras_is_refused(tmp_path, request_of):
+    one = request_of(tmp_path, cameras=("cam1",), save_learnt=tmp_path / "learnt.h5")
+    track_kept(one)
+    with pytest.raises(TrackError, match="expected what was learnt of cam2"):
+        track_kept(request_of(tmp_path, learnt=tmp_path / "learnt.h5"))
+
+
+@pytest.mark.slow
+def test_ten_kills_at_any_moment_leave_the_same_track(tmp_path):
+    """kill -9 from the first import to the last write; each run goes on with what the one before has left."""
+    clean = tmp_path / "clean.h5"
+    begin = time.monotonic()
+    assert run(EXCERPT, "--out", clean, "-q", *SHORT_BLOCKS).returncode == 0
+    lasts = time.monotonic() - begin
+    out, kills, draw = tmp_path / "track.h5", 0, random.Random(11)
+    command = [*COMMAND, str(EXCERPT), "--out", str(out), "-q", "--resume", *SHORT_BLOCKS]
+    expected = datasets(clean)
+    while kills < 10:
+        process = subprocess.Popen(command, stderr=subprocess.PIPE)
+        try:
+            process.wait(draw.uniform(0.2, 1.0) * lasts)
+        except subprocess.TimeoutExpired:
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait()
+            kills += 1
+            assert not out.exists() or datasets(out) == expected
+        else:
+            assert process.returncode == 0, process.stderr.read().decode()
+            assert datasets(out) == expected
+            out.unlink()
+    assert run(*command[len(COMMAND) :]).returncode == 0
+    assert datasets(out) == expected
+    assert {path.name for path in tmp_path.iterdir()} == {"clean.h5", "track.h5"}

@@ -1,0 +1,49 @@
+"""Disks that the tests of this room share: rendered, clean, with the attitude known."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.search import OrientSettings, Proposals, TemplateSearch
+from sphereorient.sphere import SphereRenderer, orthographic_view, reduced_texture
+from sphereorient.synth import random_texture
+
+SIZE = 48
+KINDS = {"blobs": 1, "patches": 2, "dots": 3}
+
+
+@cache
+def texture_of(kind: str) -> Tensor:
+    return random_texture(kind, KINDS[kind], 128)
+
+
+@cache
+def search_of(kind: str) -> TemplateSearch:
+    return TemplateSearch(texture_of(kind), SIZE, OrientSettings())
+
+
+def attitudes(count: int, seed: int = 1) -> Tensor:
+    return so3.random_rotations(count, generator=torch.Generator().manual_seed(seed))
+
+
+def clean_disks(kind: str, R_view_body: Tensor, size_px: int = SIZE) -> Tensor:
+    """Grey levels 20 (black paint) to 170 (white), orthographic."""
+    render = SphereRenderer(reduced_texture(texture_of(kind), size_px), orthographic_view(size_px))
+    return 20 + 150 * render(R_view_body.float())
+
+
+def of_disk(found: Proposals, disk: int) -> tuple[Tensor, Tensor]:
+    """Orientations and scores of one disk."""
+    rows = slice(int(found.offset[disk]), int(found.offset[disk + 1]))
+    return found.R_view_body[rows], found.score[rows]
+
+
+def best_errors_deg(found: Proposals, R_true: Tensor) -> Tensor:
+    """Angle of each disk's first proposal from the truth; every disk must have one."""
+    assert (found.offset.diff() > 0).all(), [why.value for why in found.reason]
+    return so3.geodesic_distance(found.R_view_body[found.offset[:-1]], R_true) * (180 / math.pi)
