@@ -19,7 +19,7 @@ import numpy as np
 from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.methods.settings import DEFAULT_METHOD
-from sphereorient.run.track import track_movies
+from sphereorient.run.stages import track_movies
 from sphereorient.synth import SynthSettings, write_experiment
 
 COLUMNS = (

@@ -20,7 +20,7 @@ from sphereorient import so3
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.locate import screened_frames
-from sphereorient.methods.precise import open_view
+from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import base_table
 from sphereorient.pose.fitter import widest_px

@@ -28,8 +28,9 @@ from sphereorient.experiment import Experiment, load_experiment, open_movies
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow import Appearance, BlockTracker, initialise
 from sphereorient.follow.appearance import estimate_appearance
+from sphereorient.follow.follower import sample_frames
 from sphereorient.locate import Shot, screened_frames
-from sphereorient.methods.precise import open_view, sample_frames
+from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
 from sphereorient.pose.fitter import widest_px
@@ -40,7 +41,7 @@ FOLLOWED = 48  # frames over which one prediction after the other is timed
 TOLD = """
 import json, sys, time
 begun = time.perf_counter()
-from sphereorient.pipeline import track_movies
+from sphereorient import track_movies
 told = []
 track = track_movies(sys.argv[1], progress=lambda *what: told.append((*what, time.perf_counter() - begun)))
 print(json.dumps({"told": told, "end": time.perf_counter() - begun, "cpu": time.process_time()}))
@@ -97,7 +98,7 @@ def prepared(folder: Path) -> Bench:
             list(screened_frames(reel, eye.background, 0, FOLLOWED))
             for reel, eye in zip(recording.streams, eyes, strict=True)
         ]
-        sampled = sample_frames(recording, eyes, settings.refine.study_frames)
+        sampled = sample_frames(recording, eyes, settings.refine.appearance_frames)
         for reel in recording.streams:
             decoding = cpu_s(lambda reel=reel: list(reel.pictures(0, 20)), 3) / 20
             say(f"decoding {reel.name}, CPU ms a frame (floor of a movie)", f"{1e3 * decoding:.2f}")
@@ -140,14 +141,14 @@ def stages(bench: Bench) -> float:
     say("frame without history, outlines to covariances, CPU ms a camera", f"{1e3 * found / cameras:.1f}")
     tracker = BlockTracker(bench.learnt, proposers, settings.locate, settings.refine)
     # As many blocks side by side as the tracker follows: first frames are searched for, second ones approached.
-    lanes = settings.refine.lanes
+    lanes = settings.refine.chunks
     begun, whole = [2] * lanes, [FOLLOWED // lanes] * lanes
     short = cpu_s(lambda: list(tracker.track([movie[: sum(begun)] for movie in bench.shots], begun, bench.times)), 3)
     long = cpu_s(lambda: list(tracker.track([movie[: sum(whole)] for movie in bench.shots], whole, bench.times)), 3)
     each = (long - short) / (sum(whole) - sum(begun)) / cameras
     say("predicted frame, decoded already, with covariance, CPU ms a camera; bar 3.7", f"{1e3 * each:.2f}")
     say("refinement, camera-frames per CPU second (two cores: twice); bar 300", f"{1 / each:.0f}")
-    block = settings.refine.block_frames
+    block = settings.refine.chunk_frames
     return (short / lanes / cameras + (block - 2) * each) / block
 
 
@@ -188,7 +189,7 @@ def literal(bench: Bench, mean_s: float) -> None:
     )
     say("the paper's literal search, full-size renderings, CPU s a camera and frame", f"{paper:.1f}")
     say("ratio to a frame without history, outline and refinement included", f"{paper / ours:.0f}")
-    block = Settings().refine.block_frames
+    block = Settings().refine.chunk_frames
     say(f"ratio to the mean frame of a block of {block}, refinement included; bar 100", f"{paper / mean_s:.0f}")
 
 

@@ -24,7 +24,7 @@ from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow import initialise
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.locate import Background, Shot
-from sphereorient.methods.precise import open_view
+from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, LinesOfSight, base_table
 from sphereorient.search import GreySearch
@@ -62,7 +62,7 @@ def errors_deg(
     """Find each frame by itself; infinite where nothing is found."""
     settings = Settings()
     search = {view.name: GreySearch(texture, settings.search)}
-    spread = locate.spread_frames(range(len(frames)), settings.refine.study_frames)
+    spread = locate.spread_frames(range(len(frames)), settings.refine.appearance_frames)
     base = base_table(texture, view.diameter_px)
     shots = [[Shot(picture=frames[k])] for k in spread]
     learnt = estimate_appearance([view], shots, base, search, radius_mm, settings.locate, settings.refine)

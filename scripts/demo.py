@@ -15,7 +15,7 @@ from sphereorient.cli.app import progress_bar
 from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.report import demo_figure
-from sphereorient.run.track import track_movies
+from sphereorient.run.stages import track_movies
 
 REPO = Path(__file__).resolve().parents[1]
 

@@ -26,12 +26,10 @@ import yaml
 from numpy.typing import NDArray
 
 from sphereorient import so3
-from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.methods.learnt import Learnt
-from sphereorient.methods.precise import track_precise
 from sphereorient.methods.settings import load_settings
 from sphereorient.movies import open_movie, write_ffv1
-from sphereorient.run.track import one_thread
+from sphereorient.run import MemoryStore, Request, run
 from sphereorient.synth import SynthSettings, write_experiment
 from sphereorient.trajectory import Trajectory
 
@@ -256,9 +254,10 @@ def tracked(
     document |= {key: value for key, value in spoilt.keys.items() if key != "there"}
     path = folder / "experiment.yaml"
     path.write_text(yaml.safe_dump({key: value for key, value in document.items() if value is not None}))
-    settings = load_settings(None, [f"refine.block_frames={BLOCK}"])
-    with open_recording(path) as recording, one_thread():
-        return *track_precise(recording, settings, torch.device("cpu"), given, silent), recording.remarks
+    settings = load_settings(None, [f"refine.chunk_frames={BLOCK}"])
+    known = folder / "learnt.h5"
+    track = run(Request(experiment=path, settings=settings, learnt=given, save_learnt=known), MemoryStore())
+    return track, Learnt.load(known), tuple(track.provenance["remarks"])
 
 
 def compared(clean: Trajectory, track: Trajectory, rows: NDArray[np.int64]) -> tuple[bool, float, float]:

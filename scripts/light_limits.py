@@ -23,7 +23,10 @@ from sphereorient.errors import ExperimentError
 from sphereorient.evaluate.robustness.scenes import CLEAN, Scene, write_scene
 from sphereorient.evaluate.robustness.settings import BenchSettings
 from sphereorient.experiment.recording import Recording, open_recording, silent
-from sphereorient.methods.precise import learn, sample_frames
+from sphereorient.follow.appearance import Appearance
+from sphereorient.follow.follower import sample_frames
+from sphereorient.methods.method import Job
+from sphereorient.methods.precise import learn
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import Fitter, Optics, base_table
 from sphereorient.pose.fitter import widest_px
@@ -43,14 +46,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary) if options.work is None else options.work
         with open_recording(scene(work, CLEAN, 0)) as recording:
-            clean, _ = learn(recording, Settings(), silent)
+            clean = appearance_of(recording)
         for name, level in (words.split(":") for words in options.scenes):
             path = scene(work, name, int(level))
             with open_recording(path) as recording:
                 known = with_map_of(clean.fitter, recording)
                 right = f"{error_deg(known, recording, path):.3f}"
                 try:
-                    own, _ = learn(recording, Settings(), silent)
+                    own = appearance_of(recording)
                     told = f"{error_deg(own.fitter, recording, path):.3f}", f"{own.fitter.optics.blur_px:.2f}"
                 except ExperimentError:
                     told = "refused", ""
@@ -65,6 +68,12 @@ def scene(work: Path, kind: str, level: int) -> Path:
         one = Scene(kind=kind, level=level, seed=0, number=0, degradations=degradations, frames=BenchSettings().frames)
         write_scene(path.parent, one)
     return path
+
+
+def appearance_of(recording: Recording) -> Appearance:
+    """Return what the precise method learns of a movie."""
+    job = Job(recording=recording, settings=Settings(), device=torch.device("cpu"))
+    return learn(job, silent).appearance
 
 
 def with_map_of(fitter: Fitter, recording: Recording) -> Fitter:

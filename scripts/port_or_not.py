@@ -24,7 +24,7 @@ from sphereorient.calibration import calibrate_cameras, load_calibration
 from sphereorient.cameras import Camera, triangulate
 from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
-from sphereorient.run.track import track_movies
+from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import Trajectory
 
 HALF_SIZE_MM = 50.0

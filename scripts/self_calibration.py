@@ -25,7 +25,7 @@ from sphereorient.calibration.sphere import told_by
 from sphereorient.cameras import Camera
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.experiment import load_experiment
-from sphereorient.run.track import track_movies
+from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import Trajectory
 
 

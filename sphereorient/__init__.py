@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sphereorient.experiment import Experiment, load_experiment
     from sphereorient.methods.settings import Settings, load_settings
-    from sphereorient.run.track import track_movies
+    from sphereorient.run.stages import track_movies
     from sphereorient.trajectory import Trajectory
 
 __version__ = "0.1.0"
@@ -19,7 +19,7 @@ _HOMES = {
     "Trajectory": "trajectory",
     "load_experiment": "experiment",
     "load_settings": "methods.settings",
-    "track_movies": "run.track",
+    "track_movies": "run.stages",
 }
 
 

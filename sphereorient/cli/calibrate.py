@@ -79,7 +79,7 @@ def check_cameras(
     from sphereorient.calibration import check_cameras as checked
     from sphereorient.calibration.table import check_lines, contradiction_lines
     from sphereorient.experiment import load_experiment
-    from sphereorient.run.track import track_movies
+    from sphereorient.run.stages import track_movies
     from sphereorient.trajectory import Trajectory
 
     known = load_experiment(experiment)

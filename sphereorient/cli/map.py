@@ -122,7 +122,7 @@ def _learn(path: Path, names: list[str] | None, settings: Settings, old: Tensor 
     from sphereorient.mapping.correct import corrected
     from sphereorient.methods.results import map_track
     from sphereorient.methods.settings import settings_yaml
-    from sphereorient.run.track import one_thread
+    from sphereorient.run.stages import one_thread
 
     with open_unpainted(path, names) as recording, one_thread():
         learnt = learn_map(recording, settings.paint, settings.locate, advance)

@@ -34,7 +34,7 @@ def track(
     ] = "precise",
     settings: Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set orient.fine_step_deg=2.")
+        list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set search.step_deg=10.")
     ] = None,
     cameras: Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")] = None,
     device: Annotated[str, typer.Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu",
@@ -64,12 +64,15 @@ def track(
     if save_learnt is not None:
         check_writable(save_learnt)
         _refuse_shared(save_learnt, many)
-    from sphereorient.methods.settings import load_settings
-    from sphereorient.run import Request, track_kept
-    from sphereorient.run.drive import tracks_of
-    from sphereorient.run.track import with_proposer
+    from sphereorient.methods.settings import read_settings
+    from sphereorient.run import FolderStore, Request, run
+    from sphereorient.run.many import tracks_of
+    from sphereorient.run.stages import METHODS, with_proposer
 
-    chosen = with_proposer(load_settings(settings, set_ or []), proposer)
+    loaded = read_settings(settings, set_ or [], method if method in METHODS else None)
+    for remark in loaded.remarks:
+        typer.echo(f"note: {remark}", err=True)
+    chosen = with_proposer(loaded.settings, proposer)
     names = camera_names(cameras)
     requests = [
         Request(
@@ -89,20 +92,22 @@ def track(
         _track_side_by_side(requests, jobs, cluster, resume, quiet)
         return
     with _kept(requests), progress_bar(quiet) as advance:
-        result = track_kept(requests[0], resume=resume, progress=advance)
+        result = run(requests[0], FolderStore(requests[0].parts), resume=resume, progress=advance)
     if not quiet:
         _print_summary(result, out)
 
 
 @contextmanager
 def _kept(requests: Sequence[Request]) -> Iterator[None]:
-    """Say, to who stops a run, what is kept of it."""
+    """Print what is kept when the user stops a run."""
     try:
         yield
     except (KeyboardInterrupt, SystemExit):
         for request in requests:
             if request.parts.is_dir():
-                typer.echo(f"sphereorient: what is done of {request.out} is kept; --resume goes on with it.", err=True)
+                typer.echo(
+                    f"sphereorient: the finished part of {request.out} is kept; continue with --resume.", err=True
+                )
         raise
 
 
@@ -113,13 +118,13 @@ def _refuse_shared(path: Path, many: bool) -> None:
 
 
 def _track_side_by_side(requests: Sequence[Request], jobs: int, cluster: str | None, resume: bool, quiet: bool) -> None:
-    """Track on worker processes or a cluster, and print what became of each experiment."""
-    from sphereorient.run import track_experiments
-    from sphereorient.run.crew import ProcessCrew, dask_crew
+    """Track on worker processes or a cluster, and print a table of the results."""
+    from sphereorient.run import run_many
+    from sphereorient.run.executors import ProcessExecutor, dask_executor
 
-    crew = ProcessCrew(jobs) if cluster is None else dask_crew(cluster, jobs if jobs > 1 else None)
+    executor = ProcessExecutor(jobs) if cluster is None else dask_executor(cluster, jobs if jobs > 1 else None)
     with _kept(requests), progress_bar(quiet) as advance:
-        outcomes = track_experiments(requests, crew, resume=resume, progress=advance)
+        outcomes = run_many(requests, executor, resume=resume, progress=advance)
     failed = [outcome for outcome in outcomes if outcome.error is not None]
     if len(outcomes) == 1 and failed:
         raise OutputError(str(failed[0].error))
@@ -132,7 +137,7 @@ def _track_side_by_side(requests: Sequence[Request], jobs: int, cluster: str | N
 
 
 def _print_table(outcomes: Sequence[Outcome]) -> None:
-    """Say what became of each experiment."""
+    """Print frames, valid frames and time of each experiment."""
     from rich.console import Console
     from rich.table import Table
 
@@ -148,7 +153,7 @@ def _print_table(outcomes: Sequence[Outcome]) -> None:
 
 
 def _print_summary(result: Trajectory, out: Path) -> None:
-    """Say what came out: frames valid, what each camera lost and why, what to do about cameras that moved."""
+    """Print the number of valid frames, the frames that each camera lost and why, and cameras that moved."""
     from sphereorient.calibration.table import contradiction_lines
 
     summary = result.summary()

@@ -16,12 +16,12 @@ from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.initialise import Poses, initialise
 from sphereorient.follow.light_and_blur import LEAST_LEFT, learn_light_and_blur
+from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import LocateSettings, Shot
 from sphereorient.pose.defocus import FIRST_BLUR_PX, defocus_radii
 from sphereorient.pose.fit import Fit
 from sphereorient.pose.fitter import CameraView, Fitter, Optics, Picture, unknown_light, widest_px
 from sphereorient.search.proposer import Proposer
-from sphereorient.search.settings import RefineSettings
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.trajectory import Reason
 

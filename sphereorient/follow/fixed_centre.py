@@ -13,12 +13,12 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.initialise import initialise
+from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import LocateSettings, Shot
 from sphereorient.pose.fit import EDGE_PX
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
 from sphereorient.search.proposer import Proposer
-from sphereorient.search.settings import RefineSettings
 
 ROUNDS = 10  # of robust weights
 USUAL = 2.366  # median of chi squared with three degrees of freedom

@@ -14,11 +14,11 @@ from sphereorient import so3
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.fixed_centre import FixedCentre
 from sphereorient.follow.initialise import Poses, explaining_first, initialise, poses_of
+from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import LocateSettings, Shot
 from sphereorient.pose.fit import Fit
 from sphereorient.pose.fitter import Fitter, Picture, PyramidLevel
 from sphereorient.search.proposer import Proposer
-from sphereorient.search.settings import RefineSettings
 from sphereorient.trajectory import Reason
 
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
@@ -144,10 +144,10 @@ class BlockTracker:
         Args:
             frames: the experiment's frame numbers; those that are multiples of the setting begin a block.
         """
-        length = self.settings.block_frames
+        length = self.settings.chunk_frames
         firsts = [frames.start, *range((frames.start // length + 1) * length, frames.stop, length)] if frames else []
         lengths = [last - first for first, last in pairwise([*firsts, frames.stop])]
-        return [lengths[k : k + self.settings.lanes] for k in range(0, len(lengths), self.settings.lanes)]
+        return [lengths[k : k + self.settings.chunks] for k in range(0, len(lengths), self.settings.chunks)]
 
     def track(self, shots: Sequence[Sequence[Shot]], window: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
         """Follow the blocks of one window.
@@ -191,7 +191,7 @@ class BlockTracker:
         """Fit expected poses, all in one batch of fixed size; None where the pictures do not bear one out."""
         if not expected:
             return []
-        asked, missing = len(expected), self.settings.lanes - len(expected)
+        asked, missing = len(expected), self.settings.chunks - len(expected)
         expected, shots = [*expected, *[expected[-1]] * missing], [*shots, *[shots[-1]] * missing]
         frames = [[shot.picture for shot in row] for row in shots]
         usable = torch.tensor([[shot.usable for shot in row] for row in shots])

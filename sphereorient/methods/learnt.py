@@ -56,8 +56,8 @@ class Learnt:
             together=study.together,
         )
 
-    def estimate_appearance(self, recording: Recording) -> Appearance:
-        """Return the same as `study` made it, for movies of the same cameras.
+    def appearance(self, recording: Recording) -> Appearance:
+        """Return the appearance as it was estimated, for movies of the same cameras.
 
         Raises:
             TrackError: other cameras, or pictures of another size.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -9,10 +11,15 @@ from torch import Tensor
 
 from sphereorient import assemble, locate, motion
 from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.errors import SettingsError, refusal
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream
+from sphereorient.follow import Poses
+from sphereorient.follow.follower import Follower
 from sphereorient.locate import Sightings
 from sphereorient.methods import results
+from sphereorient.methods.learnt import Learnt
+from sphereorient.methods.method import Job, Method
 from sphereorient.methods.proposers import paper_proposer
 from sphereorient.methods.settings import Settings
 from sphereorient.search import Candidates, Proposals, crop_disk
@@ -21,9 +28,23 @@ from sphereorient.trajectory import Reason, Trajectory
 CHUNK = 64  # frames held at once; a result does not depend on it
 
 
-def track_paper(recording: Recording, settings: Settings, progress: Progress) -> Trajectory:
-    """Measure the movies as the paper does; times that are uneven must keep to a grid."""
-    grid, place = recording.gridded()
+def learn(job: Job, progress: Progress) -> None:
+    """Learn nothing: the stages look at the whole movie."""
+
+
+def track(
+    job: Job, follower: Follower | None, measured: Iterable[list[Poses]], progress: Progress
+) -> tuple[Trajectory, None]:
+    """Measure the movies as the paper does; uneven times must keep to a grid.
+
+    Args:
+        job: what to measure.
+        follower: not used.
+        measured: not used.
+        progress: called with stage, frames done and frames in all.
+    """
+    settings = job.settings
+    grid, place = job.recording.gridded()
     cameras, clock = grid.cameras, grid.clock
     sightings = {stream.name: locate_sphere(grid, stream, settings, progress) for stream in grid.streams}
     locate.check_seen(sightings)
@@ -45,8 +66,8 @@ def track_paper(recording: Recording, settings: Settings, progress: Progress) ->
         orientation_sigma_rad=fused.sigma_rad,
     )
     tracks = {name: results.paper_camera(sightings[name], candidates[name], paths[name]) for name in cameras}
-    track = results.paper_track(grid.experiment, clock, positions, fused, moved, tracks)
-    return track if len(track) == len(place) else track.at(place)
+    whole = results.paper_track(grid.experiment, clock, positions, fused, moved, tracks)
+    return (whole if len(whole) == len(place) else whole.at(place)), None
 
 
 def locate_sphere(recording: Recording, stream: CameraStream, settings: Settings, progress: Progress) -> Sightings:
@@ -113,3 +134,12 @@ def in_the_lab(proposals: Proposals, camera: Camera, centre_px: Tensor) -> Candi
         score=proposals.score,
         reason=proposals.reason,
     )
+
+
+def resume(job: Job, learnt: Learnt) -> Follower:
+    """Refuse what another run learnt."""
+    do = "leave it out, or use method precise"
+    raise SettingsError(refusal("learnt", expected="method precise", got="method paper", do=do))
+
+
+PAPER = Method(learn=learn, resume=resume, join=track)

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
 
+from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.experiment.stream import CameraStream
+from sphereorient.locate import find_scene, known_diameter_px
 from sphereorient.methods.settings import Settings
+from sphereorient.pose import CameraView, base_table
 from sphereorient.pose.defocus import defocus_radii
 from sphereorient.search import FallbackProposer, GreySearch, Proposer, TemplateSearch
 from sphereorient.search.settings import ProposeSettings
+from sphereorient.sphere.texture_table import TextureTable
 
 DEFAULT = "default"  # the checkpoint that comes along
 
@@ -49,6 +56,42 @@ class BlurMatchedSearch:
         if blur not in self._made:
             self._made[blur] = precise_proposer(self._texture, self._settings, blur)
         return self._made[blur]
+
+    def by_camera(self, views: Sequence[CameraView], blur_px: float) -> dict[str, Proposer]:
+        """Return the proposer of each camera, by name, for pictures of a blur, px."""
+        return dict.fromkeys((view.name for view in views), self.of(blur_px))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Opened:
+    """What a movie is first measured with; made by `open_views`."""
+
+    views: list[CameraView]
+    base: TextureTable  # the finest
+    search: BlurMatchedSearch
+
+
+def open_views(recording: Recording, settings: Settings, progress: Progress) -> Opened:
+    """Estimate the cameras' backgrounds, and build texture table and template bank meanwhile."""
+    with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products leave the interpreter free
+        opening = [pool.submit(open_view, recording, stream, settings, progress) for stream in recording.streams]
+        known = [known_diameter_px(recording, stream.name, settings.locate) for stream in recording.streams]
+        widest = max(px or view.result().diameter_px for px, view in zip(known, opening, strict=True))
+        search = BlurMatchedSearch(recording.texture, settings, widest)
+        base = pool.submit(base_table, recording.texture, widest)
+        sharp = pool.submit(search.of, settings.refine.blur_px or 0.0)
+        views = [view.result() for view in opening]
+        sharp.result()
+        return Opened(views=views, base=base.result(), search=search)
+
+
+def open_view(recording: Recording, stream: CameraStream, settings: Settings, progress: Progress) -> CameraView:
+    """Estimate one camera's background."""
+    stage = f"{stream.name}: background"
+    progress(stage, 0, 1)
+    scene = find_scene(recording, stream, settings.refine.background_frames, settings.locate)
+    progress(stage, 1, 1)
+    return CameraView.of(stream.name, stream.camera, scene)
 
 
 def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:

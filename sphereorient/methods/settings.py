@@ -5,7 +5,9 @@ from __future__ import annotations
 import difflib
 import math
 import textwrap
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,21 +18,36 @@ from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.bounded_yaml import FAULTS, parse_yaml
 from sphereorient.files.yaml_file import read_yaml, short
+from sphereorient.follow.settings import RefineSettings
 from sphereorient.learn.settings import ProposerSettings
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.mapping.settings import PaintSettings
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
-from sphereorient.search.settings import GreySearchSettings, OrientSettings, ProposeSettings, RefineSettings
+from sphereorient.search.settings import GreySearchSettings, OrientSettings, ProposeSettings
 from sphereorient.statistics.settings import StatisticsSettings
 from sphereorient.synth.settings import SynthSettings
 
 Model = TypeVar("Model", bound=BaseModel)
-METHODS = ("precise", "paper")
 DEFAULT_METHOD = "precise"
+# What each method reads: branches, and single keys of a branch that it does not read.
+BRANCHES: dict[str, tuple[str, ...]] = {
+    "precise": ("locate", "propose", "search", "refine", "path", "smooth"),
+    "paper": ("locate", "propose", "orient", "assemble", "motion"),
+    "map": ("locate", "paint"),
+    "report": ("statistics",),
+}
+_OF_GAPS = ("locate.gap_frames_max", "locate.spline_knot_frames", "locate.outlier_px", "locate.outlier_factor")
+NOT_READ: dict[str, tuple[str, ...]] = {"precise": _OF_GAPS}
+# Keys of the version before; accepted with a remark.
+RENAMED: dict[str, str] = {
+    "refine.block_frames": "refine.chunk_frames",
+    "refine.lanes": "refine.chunks",
+    "refine.study_frames": "refine.appearance_frames",
+}
 
 
 class Settings(BaseModel):
-    """All settings, one branch a stage; those of stages that a method does not have are not read by it."""
+    """All settings, one branch a stage; `BRANCHES` holds which a method reads."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -53,34 +70,134 @@ class Settings(BaseModel):
 DEPTHS: dict[type[BaseModel], tuple[int, ...]] = {Settings: (2,), SynthSettings: (1,), ProposerSettings: (2, 3)}
 
 
-def load_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> Settings:
+@dataclass(frozen=True)
+class Loaded:
+    """Settings as read, and what the user should know of them."""
+
+    settings: Settings
+    remarks: tuple[str, ...]
+
+
+def load_settings(path: Path | None = None, overrides: Iterable[str] = (), method: str | None = None) -> Settings:
+    """Read settings from a file and single overrides; see `read_settings`, whose remarks become warnings."""
+    loaded = read_settings(path, overrides, method)
+    for remark in loaded.remarks:
+        warnings.warn(remark, stacklevel=2)
+    return loaded.settings
+
+
+def read_settings(path: Path | None = None, overrides: Iterable[str] = (), method: str | None = None) -> Loaded:
     """Read settings from a file and single overrides.
 
     Args:
         path: YAML as `sphereorient settings` writes it, any keys left out; None: the defaults.
         overrides: texts `room.key=value`, value in YAML; later ones win.
+        method: refuse keys that this method does not read; None: accept the keys of all.
 
     Raises:
-        SettingsError: no such file, unknown key (the nearest known one is named), impossible value.
+        SettingsError: no such file, an unknown key (the nearest known one is named), an impossible value, or a key that
+            the method does not read: as an override, or in a file with another value than the default.
     """
-    return _load(Settings, path, overrides)
+    remarks: list[str] = []
+    overrides = [_renamed(text, remarks) for text in overrides]
+    for text in overrides if method is not None else ():
+        key = text.partition("=")[0].strip()
+        if _known(key) and not is_read(key, str(method)):
+            raise SettingsError(_not_read(f"--set {key}", key, str(method)))
+    tree = {} if path is None else _read(path)
+    _rename(tree, path, remarks)
+    settings = _load(Settings, tree, str(path) if path else "settings", overrides)
+    if method is not None and path is not None:
+        check_settings(settings, method, str(path))
+        aside = [key for key in _keys(tree) if _known(key) and not is_read(key, method)]
+        if aside:
+            branches = sorted({key.partition(".")[0] for key in aside})
+            remarks.append(f"{path}: method {method} does not read {', '.join(branches)}: left aside")
+    return Loaded(settings, tuple(remarks))
+
+
+def is_read(key: str, method: str) -> bool:
+    """Return whether a method reads the key `branch.name`."""
+    return key.partition(".")[0] in BRANCHES[method] and key not in NOT_READ.get(method, ())
+
+
+def check_settings(settings: Settings, method: str, source: str = "settings") -> None:
+    """Refuse settings that differ from the default in a key that the method does not read.
+
+    Raises:
+        SettingsError: names the key, and the nearest one that is read.
+    """
+    default = Settings()
+    for branch in Settings.model_fields:
+        for name in type(getattr(settings, branch)).model_fields:
+            key = f"{branch}.{name}"
+            if is_read(key, method) or getattr(getattr(settings, branch), name) == getattr(
+                getattr(default, branch), name
+            ):
+                continue
+            raise SettingsError(_not_read(f"{source}, {key}", key, method))
+
+
+def _not_read(name: str, key: str, method: str) -> str:
+    """Word the refusal of a key that a method does not read; name the nearest one that it reads."""
+    known = [
+        f"{branch}.{name}"
+        for branch in BRANCHES[method]
+        for name in _known_keys(Settings, [branch])
+        if is_read(f"{branch}.{name}", method)
+    ]
+    leaves = {each: each.partition(".")[2] for each in known}
+    leaf = difflib.get_close_matches(key.partition(".")[2], leaves.values(), 1, 0.5)
+    near = next((each for each, end in leaves.items() if leaf and end == leaf[0]), None)
+    others = [other for other in BRANCHES if is_read(key, other)]
+    do = f"leave it out, use {near}, " if near else "leave it out, "
+    do += f"or use it with {' or '.join(others)}"
+    return refusal(name, expected=f"a key that method {method} reads", got=f"one of {' and '.join(others)}", do=do)
+
+
+def _known(key: str) -> bool:
+    branch, _, name = key.partition(".")
+    return branch in Settings.model_fields and name in _known_keys(Settings, [branch])
+
+
+def _keys(tree: Mapping[str, Any]) -> list[str]:
+    return [f"{branch}.{name}" for branch, part in tree.items() if isinstance(part, dict) for name in part]
+
+
+def _renamed(text: str, remarks: list[str]) -> str:
+    """Return an override under the key's new name."""
+    key, equals, value = text.partition("=")
+    new = RENAMED.get(key.strip())
+    if new is None:
+        return text
+    remarks.append(f"--set {key.strip()} is now {new}; the old name goes with the next version")
+    return f"{new}{equals}{value}"
+
+
+def _rename(tree: dict[str, Any], path: Path | None, remarks: list[str]) -> None:
+    """Give the old keys of a file their new names."""
+    for old, new in RENAMED.items():
+        branch, _, name = old.partition(".")
+        part = tree.get(branch)
+        if isinstance(part, dict) and name in part:
+            part.setdefault(new.partition(".")[2], part.pop(name))
+            remarks.append(f"{path}: {old} is now {new}; the old name goes with the next version")
 
 
 def load_synth_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> SynthSettings:
     """Read the settings of a synthetic experiment from a file and from overrides `key=value`; as `load_settings`."""
-    return _load(SynthSettings, path, overrides)
+    return _load(SynthSettings, {} if path is None else _read(path), str(path) if path else "settings", overrides)
 
 
 def load_proposer_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> ProposerSettings:
     """Read the settings of a proposer's training from a file and from overrides; as `load_settings`."""
-    return _load(ProposerSettings, path, overrides)
+    return _load(ProposerSettings, {} if path is None else _read(path), str(path) if path else "settings", overrides)
 
 
-def _load(model: type[Model], path: Path | None, overrides: Iterable[str]) -> Model:
-    tree = {} if path is None else _read(path)
+def _load(model: type[Model], tree: dict[str, Any], source: str, overrides: Iterable[str]) -> Model:
+    """Put overrides into a tree, and check it."""
     for text in overrides:
         _override(tree, text, DEPTHS[model])
-    source = str(path) if path else "settings"
     try:
         settings = model.model_validate(tree)
     except ValidationError as error:

@@ -1,14 +1,8 @@
-"""One way through: run(method, store), parts that outlive a kill, workers, clusters."""
+"""One way through: run(request, store), stores that outlive a kill, executors of workers, many experiments."""
 
-from sphereorient.run.drive import Outcome, track_experiments
-from sphereorient.run.parts import Parts
+from sphereorient.run.many import Outcome, run_many
 from sphereorient.run.request import Request
-from sphereorient.run.run import track_kept
+from sphereorient.run.stages import run, track_movies
+from sphereorient.run.store import FolderStore, MemoryStore
 
-__all__ = [
-    "Outcome",
-    "Parts",
-    "Request",
-    "track_experiments",
-    "track_kept",
-]
+__all__ = ["FolderStore", "MemoryStore", "Outcome", "Request", "run", "run_many", "track_movies"]

@@ -1,74 +1,82 @@
-"""What a run is asked to do, and how it is told from another one."""
+"""What a run is asked to do, and the fingerprint that distinguishes it from others."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sphereorient import __version__
+from sphereorient.errors import OutputError, refusal
 from sphereorient.experiment import Experiment, input_files, load_experiment
+from sphereorient.methods.learnt import Learnt
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, settings_yaml
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """One experiment to be tracked; made by the command line, sent to workers."""
+    """One experiment to be tracked; sent to workers."""
 
-    experiment: Path
-    out: Path  # the track
+    experiment: Path | Experiment
+    out: Path | None = None  # the track; None: it is not written
     method: str = DEFAULT_METHOD
     settings: Settings = field(default_factory=Settings)
     cameras: tuple[str, ...] | None = None
     device: str = "cpu"
-    learnt: Path | None = None  # what another run learnt, to measure with
+    learnt: Path | Learnt | None = None  # what another run learnt, to measure with
     save_learnt: Path | None = None
-    command: str = "sphereorient.jobs"
+    command: str = "sphereorient.run"
+
+    @property
+    def track(self) -> Path:
+        """The path of the track.
+
+        Raises:
+            OutputError: the request has none.
+        """
+        if self.out is None:
+            raise OutputError(refusal("out", expected="the path of a track", got="none", do="pass out="))
+        return self.out
 
     @property
     def parts(self) -> Path:
-        """The folder of what is done, beside the track, until the track is whole."""
-        return self.out.with_name(self.out.name + ".parts")
+        """The folder beside the track that keeps what is done until the track is whole."""
+        return self.track.with_name(self.track.name + ".parts")
 
 
 def fingerprint(request: Request) -> dict[str, str]:
-    """Tell a run from all others by what goes into it; files by their size and time, experiment.yaml by its text.
+    """Return what distinguishes a run: its inputs by size and time, experiment.yaml by its text, settings, version.
 
     Raises:
         SphereOrientError: the experiment or its cameras cannot be read.
     """
-    experiment = load_experiment(request.experiment)
-    told = {
+    given = request.experiment
+    experiment = given if isinstance(given, Experiment) else load_experiment(given)
+    found = {
         "version": __version__,
         "method": request.method,
         "settings": _digest(settings_yaml(request.settings)),
         "cameras": "all" if request.cameras is None else ",".join(request.cameras),
         "device": request.device,
-        "experiment": _digest(request.experiment.read_text(encoding="utf-8")),
+        "experiment": _digest(experiment.path.read_text(encoding="utf-8")),
     }
-    return told | {
+    return found | {
         path.name if n == 0 else f"{path.name} ({n})": _stamp(path) for (path, n) in _files(request, experiment)
     }
 
 
 def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
-    """Return the names of what tells two runs apart."""
+    """Return the names of what differs between two fingerprints."""
     return sorted(name for name in {*one, *other} if one.get(name) != other.get(name))
-
-
-def run_id(told: Mapping[str, str]) -> str:
-    """Return one word for a fingerprint."""
-    return _digest(json.dumps(dict(told), sort_keys=True))
 
 
 def _files(request: Request, experiment: Experiment) -> list[tuple[Path, int]]:
     """Return the input files, each with the number of others of its name before it."""
     named = [path for paths in input_files(experiment, request.cameras).values() for path in paths]
     named = [path for path in named if path != experiment.path]  # compared by its text
-    if request.learnt is not None:
+    if isinstance(request.learnt, Path):
         named.append(request.learnt)
     if request.settings.propose.checkpoint is not None:
         named.append(checkpoint_path(request.settings.propose.checkpoint))

@@ -1,4 +1,4 @@
-"""Settings of the room orient."""
+"""Settings of the room search."""
 
 from __future__ import annotations
 
@@ -104,27 +104,4 @@ class ProposeSettings(BaseModel):
     )
     sure: float = Field(
         0.75, ge=0, le=1, description="in_doubt: templates of a score above this need no second opinion"
-    )
-
-
-class RefineSettings(BaseModel):
-    """How poses are fitted to pictures (method precise)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    background_frames: int = Field(
-        32, ge=1, description="evenly spread frames whose mean is the background; fewer than paper's: starts sooner"
-    )
-    study_frames: int = Field(
-        16, ge=1, description="evenly spread frames from which blur, light and noise of the pictures are learnt"
-    )
-    blur_px: float | None = Field(
-        None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null learns it"
-    )
-    candidates: int = Field(4, ge=1, description="proposals of each camera that are fitted where nothing is known")
-    block_frames: int = Field(
-        32, ge=2, description="frames between full searches; blocks begin at multiples of it and know nothing of others"
-    )
-    lanes: int = Field(
-        4, ge=1, description="blocks followed side by side, in one batch; more suit a GPU; their frames are all held"
     )

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sphereorient import so3
 from sphereorient.methods.settings import Settings, load_settings
 from sphereorient.movies import open_movie
-from sphereorient.run.track import track_movies
+from sphereorient.run.stages import track_movies
 from sphereorient.synth import SynthSettings, write_experiment
 from sphereorient.trajectory import Trajectory
 

@@ -35,7 +35,7 @@ from sphereorient.evaluate import score_track
 from sphereorient.follow import BlockTracker, Poses
 from sphereorient.locate import Shot
 from sphereorient.methods import precise
-from sphereorient.run.track import track_movies
+from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
 EXCERPT = REPO / "synthetic_data" / "excerpt"
@@ -361,7 +361,7 @@ def test_one_camera_alone_loses_no_frame_and_knows_what_it_does_not_see(brisk, t
 @pytest.mark.parametrize("name", CAMERAS)
 def test_one_camera_finds_every_frame_without_history(brisk, tmp_path, name):
     """Where half of the rim is dark, an outline's distance is centimetres off: the fit must come all the way back."""
-    track = tracked(brisk, tmp_path, "refine.block_frames=2", cameras=(name,))
+    track = tracked(brisk, tmp_path, "refine.chunk_frames=2", cameras=(name,))
     report(f"{name} alone, every frame searched", track, brisk)
     check_right(track, brisk, np.arange(len(brisk)))
 
@@ -398,7 +398,7 @@ def test_one_frame_with_the_ball_among_many_without(short, tmp_path):
 @pytest.mark.parametrize("frames", [(0, 1), (15, 17), (16, 18), (10, 40), (47, 48)], ids=str)
 def test_a_part_of_the_movie_keeps_the_clock(short, tmp_path, frames):
     experiment = write(short, tmp_path, frames=list(frames))
-    track = track_movies(experiment, settings=settings("refine.block_frames=16"))
+    track = track_movies(experiment, settings=settings("refine.chunk_frames=16"))
     assert np.allclose(track.time * 600, np.arange(*frames))
     check_right(track, short.frames(slice(*frames)), np.arange(frames[1] - frames[0]))
 
@@ -409,7 +409,7 @@ FINGERPRINT = """
 import hashlib, sys
 import h5py
 from sphereorient.locate import Shot
-from sphereorient.pipeline import track_movies
+from sphereorient import track_movies
 track_movies(sys.argv[1]).save(sys.argv[2])
 digest = hashlib.sha256()
 def add(name, item):
@@ -446,7 +446,7 @@ def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tm
 
     monkeypatch.setattr(precise, "BlockTracker", Kept)
     experiment = write(short.without_ball(np.arange(37, 39), ("cam1",)), tmp_path)
-    track_movies(experiment, settings=settings("refine.block_frames=16"))
+    track_movies(experiment, settings=settings("refine.chunk_frames=16"))
     (tracker,) = made
     pictures = [np.load(tmp_path / f"{name}.npy") for name in CAMERAS]
 

@@ -20,7 +20,7 @@ from conftest import REPO
 from sphereorient.evaluate import score_track
 from sphereorient.methods.settings import load_settings
 from sphereorient.movies import open_movie, write_ffv1
-from sphereorient.run.track import track_movies
+from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import Flag, Trajectory
 
 EXCERPT = REPO / "synthetic_data" / "excerpt"

@@ -10,7 +10,7 @@ import pytest
 from precise_examples import Movies, mean_turn, render, turned_off, write
 
 from sphereorient.errors import ExperimentError
-from sphereorient.run.track import track_movies
+from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import Trajectory
 
 RATE = 2400.0  # of the rendered movie, from which frames are taken at uneven steps

@@ -18,8 +18,10 @@ from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow import BlockTracker, Poses
 from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre, mean_place
+from sphereorient.follow.follower import sample_frames
 from sphereorient.locate import Shot, screened_frames
-from sphereorient.methods.precise import learn, sample_frames
+from sphereorient.methods.method import Job
+from sphereorient.methods.precise import learn
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import Fitter
 from sphereorient.synth import SynthSettings, write_experiment
@@ -105,9 +107,10 @@ def followed_poses(
     """
     settings = Settings()
     with open_recording(load_experiment(path), cameras) as recording:
-        known, proposers = learn(recording, settings, silent)
+        begun = learn(Job(recording=recording, settings=settings, device=torch.device("cpu")), silent)
+        known, proposers = begun.appearance, begun.tracker.proposers
         views = known.fitter.views
-        shots = sample_frames(recording, views, settings.refine.study_frames)
+        shots = sample_frames(recording, views, settings.refine.appearance_frames)
         place = find_fixed_centre(known, proposers, shots, settings.locate, settings.refine)
         assert place is not None
         movies = [

@@ -9,9 +9,8 @@ import pytest
 import yaml
 from test_orient_held import in_its_place
 
-from sphereorient.run.request import Request
-from sphereorient.run.run import track_kept
-from sphereorient.run.track import track_movies
+from sphereorient.run import MemoryStore, Request, run
+from sphereorient.run.stages import track_movies
 
 
 def declared(folder: Path) -> tuple[Path, Path]:
@@ -38,7 +37,7 @@ def test_a_ball_declared_fixed_has_one_place_in_its_track(tmp_path_factory):
 def test_what_another_run_learnt_measures_in_the_same_place_to_the_last_bit(tmp_path_factory, tmp_path):
     _, fixed = declared(tmp_path_factory.getbasetemp() / "in_its_place")
     known = tmp_path / "learnt.h5"
-    first = track_kept(Request(experiment=fixed, out=tmp_path / "a.h5", cameras=("cam1",), save_learnt=known))
-    again = track_kept(Request(experiment=fixed, out=tmp_path / "b.h5", cameras=("cam1",), learnt=known))
+    first = run(Request(experiment=fixed, cameras=("cam1",), save_learnt=known), MemoryStore())
+    again = run(Request(experiment=fixed, cameras=("cam1",), learnt=known), MemoryStore())
     for name in ("position", "orientation"):
         assert np.array_equal(getattr(first, name), getattr(again, name)), name

@@ -17,7 +17,7 @@ from sphereorient import so3
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.movies import write_ffv1
-from sphereorient.run.track import track_movies
+from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import Trajectory
 
 FIRST, COUNT = 40, 60

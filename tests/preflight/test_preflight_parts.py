@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from sphereorient.cameras import PinholeCamera, Port, PortCamera, triangulate
 from sphereorient.cameras.telecentric import TelecentricCamera
 from sphereorient.experiment.stream import pictures_of
+from sphereorient.follow.follower import sample_frames
 from sphereorient.locate import Background
 from sphereorient.locate.outline import Outline
 from sphereorient.preflight import Finding, Severity
@@ -24,7 +25,7 @@ from sphereorient.preflight.diameter import expected_outline_px
 from sphereorient.preflight.exposure import limb_blur_px
 from sphereorient.preflight.finding import worst
 from sphereorient.preflight.gap import gaps_between
-from sphereorient.preflight.look import pair_starts, sample_frames
+from sphereorient.preflight.look import pair_starts
 from sphereorient.preflight.offset import REACH, Steps, gap_by_offset, started
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from conftest import REPO
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
-SHORT_BLOCKS = ["--set", "refine.block_frames=2"]  # windows of eight frames: five in the excerpt
+SHORT_BLOCKS = ["--set", "refine.chunk_frames=2"]  # windows of eight frames: five in the excerpt
 COMMAND = [sys.executable, "-m", "sphereorient.cli", "track"]
 
 

@@ -14,14 +14,14 @@ from jobs_examples import EXCERPT, SHORT_BLOCKS, datasets, run
 
 from sphereorient.errors import SettingsError
 from sphereorient.methods.settings import Settings, load_settings
-from sphereorient.run import Request, track_experiments
-from sphereorient.run.crew import ProcessCrew, dask_crew
-from sphereorient.run.drive import tracks_of
+from sphereorient.run import Request, run_many
+from sphereorient.run.executors import ProcessExecutor, dask_executor
+from sphereorient.run.many import tracks_of
 
 
 @pytest.fixture(scope="module")
 def settings() -> Settings:
-    return load_settings(None, ["refine.block_frames=2"])
+    return load_settings(None, ["refine.chunk_frames=2"])
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_tracks_of_several_experiments_have_the_names_of_their_folders(tmp_path)
 def test_one_track_for_two_experiments_is_refused(tmp_path, settings):
     request = Request(experiment=EXCERPT, out=tmp_path / "track.h5", settings=settings)
     with pytest.raises(SettingsError, match="expected a track for each experiment"):
-        track_experiments([request, request], ProcessCrew(1))
+        run_many([request, request], ProcessExecutor(1))
 
 
 @pytest.mark.slow
@@ -84,7 +84,7 @@ def test_an_experiment_that_fails_does_not_stop_the_others(tmp_path, alone):
 def test_a_worker_that_dies_is_replaced_and_its_experiment_goes_on(tmp_path, settings, alone):
     """Killed when the first window is there: what it had done is not done again."""
     request = Request(experiment=EXCERPT, out=tmp_path / "track.h5", settings=settings)
-    crew = ProcessCrew(1)
+    executor = ProcessExecutor(1)
     killed: list[tuple[int, set[str]]] = []
 
     def kill() -> None:
@@ -92,7 +92,7 @@ def test_a_worker_that_dies_is_replaced_and_its_experiment_goes_on(tmp_path, set
         while time.monotonic() < deadline:
             there = {path.name for path in request.parts.glob("poses-*")} if request.parts.exists() else set()
             if there:
-                (pid,) = crew._workers[0]._processes
+                (pid,) = executor._workers[0]._processes
                 os.kill(pid, signal.SIGKILL)
                 killed.append((pid, there))
                 return
@@ -100,7 +100,7 @@ def test_a_worker_that_dies_is_replaced_and_its_experiment_goes_on(tmp_path, set
 
     killer = threading.Thread(target=kill)
     killer.start()
-    (outcome,) = track_experiments([request], crew)
+    (outcome,) = run_many([request], executor)
     killer.join()
     assert len(killed) == 1
     assert outcome.error is None
@@ -111,21 +111,21 @@ def test_a_worker_that_dies_is_replaced_and_its_experiment_goes_on(tmp_path, set
 @pytest.mark.slow
 def test_an_experiment_that_kills_every_worker_is_given_up(tmp_path, settings):
     request = Request(experiment=EXCERPT, out=tmp_path / "track.h5", settings=settings)
-    crew = ProcessCrew(1)
+    executor = ProcessExecutor(1)
     stop = threading.Event()
 
     def kill() -> None:
         while not stop.wait(0.05):
-            for pid in list(crew._workers[0]._processes or {}):
+            for pid in list(executor._workers[0]._processes or {}):
                 os.kill(pid, signal.SIGKILL)
 
     killer = threading.Thread(target=kill)
     killer.start()
-    (outcome,) = track_experiments([request], crew)
+    (outcome,) = run_many([request], executor)
     stop.set()
     killer.join()
     assert outcome.error is not None
-    assert "expected a worker that lives" in outcome.error
+    assert "worker 0 died 3 times" in outcome.error
     assert "\n" not in outcome.error
     assert not request.out.exists()
 
@@ -138,22 +138,22 @@ def test_a_dask_cluster_gives_the_same_bytes_and_survives_a_dead_worker(tmp_path
         Request(experiment=experiment, out=tmp_path / f"{name}.h5", settings=settings)
         for name, experiment in (("good", EXCERPT), ("bad", bad))
     ]
-    crew = dask_crew("local", 2)
-    assert crew.size == 2
+    executor = dask_executor("local", 2)
+    assert executor.size == 2
     killed: list[int] = []
 
     def kill() -> None:
         deadline = time.monotonic() + 100
         while time.monotonic() < deadline and not killed:
             if requests[0].parts.exists() and list(requests[0].parts.glob("poses-*")):
-                nanny = next(iter(crew._cluster.workers.values()))
+                nanny = next(iter(executor._cluster.workers.values()))
                 os.kill(nanny.pid, signal.SIGKILL)
                 killed.append(nanny.pid)
             time.sleep(0.005)
 
     killer = threading.Thread(target=kill)
     killer.start()
-    good, failed = track_experiments(requests, crew)
+    good, failed = run_many(requests, executor)
     killer.join()
     assert killed
     assert good.error is None
@@ -165,5 +165,5 @@ def test_a_dask_cluster_gives_the_same_bytes_and_survives_a_dead_worker(tmp_path
 def test_a_cluster_that_is_not_there_is_one_line():
     pytest.importorskip("distributed")
     with pytest.raises(SettingsError, match=r"expected a Dask scheduler, got .*docs/long-runs\.md") as refused:
-        dask_crew("nonsense://nowhere")
+        dask_executor("nonsense://nowhere")
     assert "\n" not in str(refused.value)

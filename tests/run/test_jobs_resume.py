@@ -16,12 +16,13 @@ from jobs_examples import COMMAND, EXCERPT, SHORT_BLOCKS, datasets, run
 
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.methods.settings import load_settings
-from sphereorient.run import Parts, Request, track_kept
+from sphereorient.run import FolderStore, Request
+from sphereorient.run import run as run_request
 
 
 @pytest.fixture(scope="module")
 def request_of(tmp_path_factory):
-    settings = load_settings(None, ["refine.block_frames=2"])
+    settings = load_settings(None, ["refine.chunk_frames=2"])
 
     def make(folder: Path, **changed: object) -> Request:
         return Request(experiment=EXCERPT, out=folder / "track.h5", settings=settings, **changed)
@@ -39,15 +40,20 @@ def whole(tmp_path_factory, request_of) -> Path:
         if stage == "track" and 0 < done < total and not (folder / "half").exists():
             shutil.copytree(request.parts, folder / "half")
 
-    track_kept(request, progress=keep)
+    tracked(request, progress=keep)
     assert not request.parts.exists()
     return folder
 
 
-def halfway(whole: Path, request: Request) -> Parts:
+def tracked(request: Request, **more: object) -> None:
+    """Track as the command does."""
+    run_request(request, FolderStore(request.parts), **more)
+
+
+def halfway(whole: Path, request: Request) -> FolderStore:
     """Put parts where a run that was cut off has left them."""
     shutil.copytree(whole / "half", request.parts)
-    return Parts(request.parts)
+    return FolderStore(request.parts)
 
 
 def test_a_run_goes_on_with_what_is_there(whole, tmp_path, request_of):
@@ -56,7 +62,7 @@ def test_a_run_goes_on_with_what_is_there(whole, tmp_path, request_of):
     before = {path.name: path.stat().st_mtime_ns for path in parts.folder.iterdir()}
     assert any(name.startswith("poses") for name in before)
     stages: list[tuple[str, int]] = []
-    track_kept(request, resume=True, progress=lambda stage, done, total: stages.append((stage, done)))
+    tracked(request, resume=True, progress=lambda stage, done, total: stages.append((stage, done)))
     assert "study" not in dict(stages)  # known from before
     assert stages[0] == ("track", 8 * sum(name.startswith("poses") for name in before))
     assert datasets(request.out) == datasets(whole / "track.h5")
@@ -67,7 +73,7 @@ def test_without_resume_it_starts_over(whole, tmp_path, request_of):
     request = request_of(tmp_path)
     halfway(whole, request)
     stages: list[str] = []
-    track_kept(request, progress=lambda stage, done, total: stages.append(stage))
+    tracked(request, progress=lambda stage, done, total: stages.append(stage))
     assert "study" in stages
     assert datasets(request.out) == datasets(whole / "track.h5")
 
@@ -77,7 +83,7 @@ def test_parts_cut_off_while_written_are_measured_again(whole, tmp_path, request
     parts = halfway(whole, request)
     (parts.folder / ".poses-00000016.h5.99.part").write_bytes(b"half of it")
     (parts.folder / "learnt.h5").write_bytes((parts.folder / "learnt.h5").read_bytes()[:5000])
-    track_kept(request, resume=True)
+    tracked(request, resume=True)
     assert datasets(request.out) == datasets(whole / "track.h5")
 
 
@@ -87,9 +93,9 @@ def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_pa
     (part,) = sorted(parts.folder.glob("poses-*"))[:1]
     part.write_bytes(part.read_bytes()[:1000])
     with pytest.raises(TrackError, match=r"got a damaged file; run again with --resume"):
-        track_kept(request, resume=True)
+        tracked(request, resume=True)
     assert not request.out.exists()
-    track_kept(request, resume=True)
+    tracked(request, resume=True)
     assert datasets(request.out) == datasets(whole / "track.h5")
 
 
@@ -97,36 +103,36 @@ def test_parts_of_another_run_are_refused_with_what_differs(whole, tmp_path, req
     request = request_of(tmp_path, cameras=("cam1",))
     parts = halfway(whole, request)
     with pytest.raises(TrackError, match=r"parts of a run with another cam2\.mkv, cameras; run without --resume"):
-        track_kept(request, resume=True)
+        tracked(request, resume=True)
     told = json.loads((parts.folder / "run.json").read_text())
     told["cam1.mkv"] = "12 34"
     (parts.folder / "run.json").write_text(json.dumps(told))
     with pytest.raises(TrackError, match=r"with another cam1\.mkv;"):
-        track_kept(request_of(tmp_path), resume=True)
+        tracked(request_of(tmp_path), resume=True)
 
 
 def test_two_runs_do_not_write_one_track(whole, tmp_path, request_of):
     request = request_of(tmp_path)
     parts = halfway(whole, request)
-    with parts.held(request, resume=True), pytest.raises(OutputError, match="another run that is writing it"):
-        track_kept(request, resume=True)
+    with parts.held(request, resume=True), pytest.raises(OutputError, match="is being written by another run"):
+        tracked(request, resume=True)
     assert list(parts.folder.glob("poses-*"))
 
 
 def test_what_was_learnt_measures_the_same_again(whole, tmp_path, request_of):
     first = request_of(tmp_path / "a", save_learnt=tmp_path / "learnt.h5")
     (tmp_path / "a").mkdir()
-    track_kept(first)
+    tracked(first)
     again = request_of(tmp_path, learnt=tmp_path / "learnt.h5")
-    track_kept(again)
+    tracked(again)
     assert datasets(again.out) == datasets(whole / "track.h5")
 
 
 def test_knowledge_of_other_cameras_is_refused(tmp_path, request_of):
     one = request_of(tmp_path, cameras=("cam1",), save_learnt=tmp_path / "learnt.h5")
-    track_kept(one)
+    tracked(one)
     with pytest.raises(TrackError, match="expected what was learnt of cam2"):
-        track_kept(request_of(tmp_path, learnt=tmp_path / "learnt.h5"))
+        tracked(request_of(tmp_path, learnt=tmp_path / "learnt.h5"))
 
 
 @pytest.mark.slow

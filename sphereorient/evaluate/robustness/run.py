@@ -29,21 +29,21 @@ PLAN, RESULTS, KEPT = "plan.json", "results.json", "scenes"
 
 def precise(experiment: Path) -> Trajectory:
     """Track with `--method precise`."""
-    from sphereorient.run.track import track_movies
+    from sphereorient.run.stages import track_movies
 
     return track_movies(experiment, method="precise", settings=Settings())
 
 
 def paper(experiment: Path) -> Trajectory:
     """Track with `--method paper`."""
-    from sphereorient.run.track import track_movies
+    from sphereorient.run.stages import track_movies
 
     return track_movies(experiment, method="paper", settings=Settings())
 
 
 def precise_network(experiment: Path) -> Trajectory:
     """Track with `--method precise --proposer default`."""
-    from sphereorient.run.track import track_movies
+    from sphereorient.run.stages import track_movies
 
     return track_movies(experiment, method="precise", settings=Settings(), proposer="default")
 

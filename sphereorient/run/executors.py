@@ -1,4 +1,4 @@
-"""Those who do the work, one task at a time at each place: processes of this machine, or a Dask cluster."""
+"""Executors: workers that do one task at a time, processes of this machine or of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from typing import Any, Protocol
 from sphereorient.errors import SettingsError, refusal
 
 
-class Crew(Protocol):
-    """Places that work side by side."""
+class Executor(Protocol):
+    """Workers that run side by side."""
 
     @property
     def size(self) -> int:
-        """How many places there are."""
+        """Number of workers."""
 
-    def submit(self, place: int, task: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Begin a task at a place that has none."""
+    def submit(self, worker: int, task: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Start a task on an idle worker."""
 
-    def renew(self, place: int) -> None:
-        """Put a new worker where one died."""
+    def renew(self, worker: int) -> None:
+        """Replace a worker that died."""
 
     def close(self) -> None:
-        """Stop all work."""
+        """Stop all workers."""
 
 
-class ProcessCrew:
-    """Worker processes, each by itself: one that dies takes nobody along.
+class ProcessExecutor:
+    """Worker processes, each in a pool of its own: one that dies does not stop the others.
 
     Args:
-        size: how many.
+        size: number of workers.
     """
 
     def __init__(self, size: int) -> None:
@@ -42,20 +42,20 @@ class ProcessCrew:
 
     @property
     def size(self) -> int:
-        """How many workers there are."""
+        """Number of workers."""
         return len(self._workers)
 
-    def submit(self, place: int, task: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Begin a task at a place that has none."""
-        return self._workers[place].submit(task, *arguments)
+    def submit(self, worker: int, task: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Start a task on an idle worker."""
+        return self._workers[worker].submit(task, *arguments)
 
-    def renew(self, place: int) -> None:
-        """Put a new worker where one died."""
-        self._workers[place].shutdown(wait=False, cancel_futures=True)
-        self._workers[place] = _worker()
+    def renew(self, worker: int) -> None:
+        """Replace a worker that died."""
+        self._workers[worker].shutdown(wait=False, cancel_futures=True)
+        self._workers[worker] = _worker()
 
     def close(self) -> None:
-        """Stop the workers, whatever they do: what is done is in the parts."""
+        """Terminate the workers; what is done is in the stores."""
         for worker in self._workers:
             processes = list((getattr(worker, "_processes", None) or {}).values())
             worker.shutdown(wait=False, cancel_futures=True)
@@ -70,21 +70,21 @@ def _worker() -> ProcessPoolExecutor:
 
 
 def _prepare() -> None:
-    """Let a worker not outlive its master: killed, that one can tell nobody."""
+    """Exit when the parent process dies; a killed parent cannot signal its workers."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    master = multiprocessing.parent_process()
-    if master is None:
+    parent = multiprocessing.parent_process()
+    if parent is None:
         return
 
     def watch() -> None:
-        wait([master.sentinel])
+        wait([parent.sentinel])
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
 
-class DaskCrew:
-    """The workers of a Dask cluster; a place is a task at a time that the scheduler sends where it likes.
+class DaskExecutor:
+    """The workers of a Dask cluster; the scheduler chooses which of them does a task.
 
     Args:
         client: `distributed.Client` of a running cluster; its workers see the same files under the same names.
@@ -96,31 +96,31 @@ class DaskCrew:
 
     @property
     def size(self) -> int:
-        """How many tasks the cluster's workers do side by side, at least one."""
+        """Number of tasks that the cluster does side by side, at least one."""
         threads: dict[str, int] = self._client.nthreads()
         return max(1, sum(threads.values()))
 
-    def submit(self, place: int, task: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Begin a task."""
+    def submit(self, worker: int, task: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Start a task."""
         future: Future[Any] = self._executor.submit(task, *arguments)
         return future
 
-    def renew(self, place: int) -> None:
-        """Do nothing: a cluster renews its workers itself."""
+    def renew(self, worker: int) -> None:
+        """Do nothing: a cluster replaces its workers itself."""
 
     def close(self) -> None:
-        """Let go of the cluster; it goes on for others."""
+        """Disconnect; the cluster goes on for others."""
         self._executor.shutdown(wait=False)
         self._client.close()
 
 
-def dask_crew(cluster: str, workers: int | None = None) -> DaskCrew:
+def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
     """Join a Dask cluster.
 
     Args:
         cluster: address of a scheduler (tcp://host:8786), path of a scheduler file (.json), or `local`: workers of this
-            machine, as many as `workers` says.
-        workers: of a local cluster; None: one a core.
+            machine.
+        workers: of a local cluster; None: one per core.
 
     Raises:
         SettingsError: Dask is not installed, or nobody answers.
@@ -138,16 +138,16 @@ def dask_crew(cluster: str, workers: int | None = None) -> DaskCrew:
             here: Any = local(n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
             return _Owning(join(here), here)
         if cluster.endswith(".json"):
-            return DaskCrew(join(scheduler_file=cluster, timeout=20))
-        return DaskCrew(join(cluster, timeout=20))
+            return DaskExecutor(join(scheduler_file=cluster, timeout=20))
+        return DaskExecutor(join(cluster, timeout=20))
     except (OSError, TimeoutError, ValueError) as error:
         do = "start one (docs/long-runs.md), and name its scheduler's address"
         got = f"'{str(error).splitlines()[0] if str(error) else type(error).__name__}'"
         raise SettingsError(refusal(f"--cluster {cluster}", expected="a Dask scheduler", got=got, do=do)) from error
 
 
-class _Owning(DaskCrew):
-    """A cluster of our own, stopped at the end."""
+class _Owning(DaskExecutor):
+    """A cluster that is stopped at the end."""
 
     def __init__(self, client: Any, cluster: Any) -> None:
         super().__init__(client)

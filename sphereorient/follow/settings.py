@@ -1,0 +1,32 @@
+"""Settings of the room follow."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class RefineSettings(BaseModel):
+    """How poses are fitted to pictures (method precise)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    background_frames: int = Field(
+        32, ge=1, description="evenly spread frames whose mean is the background; fewer than paper's: starts sooner"
+    )
+    appearance_frames: int = Field(
+        16, ge=1, description="evenly spread frames from which blur, light and noise of the pictures are learnt"
+    )
+    blur_px: float | None = Field(
+        None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null learns it"
+    )
+    candidates: int = Field(4, ge=1, description="proposals of each camera that are fitted where nothing is known")
+    chunk_frames: int = Field(
+        32,
+        ge=2,
+        description="frames between full searches; chunks begin at its multiples, each independent",
+    )
+    chunks: int = Field(
+        4,
+        ge=1,
+        description="chunks followed side by side, one batch; more suit a GPU; memory holds all frames",
+    )

@@ -1,0 +1,37 @@
+"""What `run` asks of a method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import torch
+
+from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.follow.follower import Follower
+from sphereorient.follow.initialise import Poses
+from sphereorient.methods.learnt import Learnt
+from sphereorient.methods.settings import Settings
+from sphereorient.trajectory import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Job:
+    """An experiment opened for a method; made by `run.opened`, read by the methods."""
+
+    recording: Recording
+    settings: Settings
+    device: torch.device
+    given: Learnt | None = None  # what another run learnt
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Method:
+    """The stages of a method, in the order in which `run` calls them.
+
+    A method that looks at the whole movie at once returns no follower; its `join` then does all.
+    """
+
+    learn: Callable[[Job, Progress], Follower | None]
+    resume: Callable[[Job, Learnt], Follower]  # instead of learn, with what is known
+    join: Callable[[Job, Follower | None, Iterable[list[Poses]], Progress], tuple[Trajectory, Learnt | None]]

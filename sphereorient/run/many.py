@@ -1,0 +1,234 @@
+"""Many experiments, or one long movie, on many workers: which task comes next, and what to do when a worker dies."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections import deque
+from collections.abc import Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sphereorient.errors import SettingsError, SphereOrientError, refusal
+from sphereorient.experiment.recording import Progress, silent
+from sphereorient.follow.follower import Batch
+from sphereorient.run.executors import Executor
+from sphereorient.run.request import Request
+from sphereorient.run.stages import Task, Work, check_method, check_out, one_thread, opened, stages
+from sphereorient.run.store import FolderStore
+from sphereorient.trajectory import Trajectory
+
+POLL_S = 0.5  # between looks at what the workers have written
+DEATHS = 3  # of workers on one experiment without anything new being done
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """The result of one experiment."""
+
+    request: Request
+    seconds: float
+    frames: int = 0
+    valid: int = 0
+    error: str | None = None  # None: tracked
+
+    @property
+    def name(self) -> str:
+        """Name of the track."""
+        return self.request.track.stem
+
+
+@dataclass(eq=False)
+class _Job:
+    """One experiment in progress."""
+
+    request: Request
+    run_id: str
+    began: float
+    held: ExitStack
+    todo: Generator[list[Task], list[Any], Any] | None = None
+    waiting: deque[Task] = field(default_factory=deque)
+    results: list[Any] = field(default_factory=list)
+    running: int = 0
+    batches: list[Batch] | None = None
+    deaths: int = 0
+    done_at_death: int = -1
+    counts: tuple[int, int] | None = None  # frames and valid frames of the finished track
+    error: str | None = None
+
+    @property
+    def over(self) -> bool:
+        return self.error is not None or self.counts is not None
+
+    def done(self) -> tuple[int, int]:
+        """Frames measured and frames in all."""
+        if self.batches is None:
+            return 0, 1
+        left = FolderStore(self.request.parts).missing(self.batches) if self.counts is None else []
+        total = self.batches[-1].last if self.batches else 0
+        return total - sum(map(len, left)), total
+
+    def advance(self) -> None:
+        """Go to the next stage where all tasks of this one are done."""
+        while self.todo is not None and not (self.waiting or self.running or self.over):
+            results, self.results = self.results, []
+            try:
+                self.waiting.extend(self.todo.send(results))
+            except StopIteration as end:
+                self.counts = end.value
+
+
+# A worker gets many tasks of one run: opening it costs as much as hundreds of frames. `run_id` is new for each call of
+# `run_many`, so that no later run is measured with what an earlier one learnt.
+@lru_cache(maxsize=1)
+def _work(request: Request, run_id: str) -> tuple[Work, ExitStack]:
+    stack = ExitStack()
+    return stack.enter_context(opened(request, FolderStore(request.parts))), stack
+
+
+def do_task(request: Request, run_id: str, task: Task) -> Any:
+    """Do one task in a worker; a track is returned as its numbers of frames and of valid frames."""
+    with one_thread():
+        result = _work(request, run_id)[0].do(task)
+    return (len(result), int(np.sum(result.valid))) if isinstance(result, Trajectory) else result
+
+
+def run_many(
+    requests: Sequence[Request], executor: Executor, *, resume: bool = False, progress: Progress = silent
+) -> list[Outcome]:
+    """Track experiments on the workers of an executor: stages of several, batches of one movie, side by side.
+
+    Every track is the same as that of a single process, to the last bit. An experiment that fails does not stop the
+    others. A worker that dies is replaced, and its experiment goes on from what is done.
+
+    Args:
+        requests: with different tracks.
+        executor: closed at the end.
+        resume: go on with the stores of runs that were cut off.
+        progress: called with the name of a track, its frames done and its frames in all.
+
+    Returns:
+        The result of each, in the order of the requests.
+
+    Raises:
+        SettingsError: two requests with one track.
+    """
+    _refuse_same(requests)
+    todo = deque(range(len(requests)))
+    jobs: dict[int, _Job] = {}
+    busy: dict[Future[Any], tuple[int, _Job, Task]] = {}  # worker, job, task
+    outcomes: dict[int, Outcome] = {}
+    try:
+        while len(outcomes) < len(requests):
+            free = [worker for worker in range(executor.size) if worker not in {one for one, _, _ in busy.values()}]
+            for worker in free:
+                picked = _next(todo, jobs, requests, resume, executor.size)
+                if picked is None:
+                    break
+                job, task = picked
+                job.running += 1
+                busy[executor.submit(worker, do_task, job.request, job.run_id, task)] = worker, job, task
+            for future in wait(list(busy), POLL_S, FIRST_COMPLETED).done:
+                worker, job, task = busy.pop(future)
+                job.running -= 1
+                _take(future, job, task, executor, worker)
+                job.advance()
+            for number, job in list(jobs.items()):
+                progress(job.request.track.stem, *job.done())
+                if job.over and not job.running:
+                    outcomes[number] = _outcome(jobs.pop(number))
+    finally:
+        executor.close()
+        for job in jobs.values():
+            job.held.close()
+    return [outcomes[number] for number in range(len(requests))]
+
+
+def _refuse_same(requests: Sequence[Request]) -> None:
+    outs = [request.track.resolve() for request in requests]
+    twice = next((out for k, out in enumerate(outs) if out in outs[:k]), None)
+    if twice is not None:
+        do = "give the experiments different names, or track them one by one"
+        raise SettingsError(refusal("--out", expected="a track for each experiment", got=f"{twice} twice", do=do))
+
+
+def _next(
+    todo: deque[int], jobs: dict[int, _Job], requests: Sequence[Request], resume: bool, workers: int
+) -> tuple[_Job, Task] | None:
+    """Return the next task: of the experiment that was begun first, else of a new one."""
+    for job in jobs.values():
+        if job.waiting and not job.over:
+            return job, job.waiting.popleft()
+    while todo and sum(not job.over for job in jobs.values()) < workers:
+        number = todo.popleft()
+        job = jobs[number] = _begun(requests[number], resume, workers)
+        if job.waiting:
+            return job, job.waiting.popleft()
+    return None
+
+
+def _begun(request: Request, resume: bool, workers: int) -> _Job:
+    """Prepare the store of an experiment; a refusal becomes the job's error."""
+    job = _Job(request=request, run_id=uuid.uuid4().hex, began=time.monotonic(), held=ExitStack())
+    store = FolderStore(request.parts)
+    try:
+        check_out(request)
+        check_method(request)
+        job.held.enter_context(store.held(request, resume=resume))
+        job.todo = stages(store, workers)
+        job.waiting.extend(next(job.todo))
+    except SphereOrientError as error:
+        job.error = str(error)
+    return job
+
+
+def _take(future: Future[Any], job: _Job, task: Task, executor: Executor, worker: int) -> None:
+    """Take the result of a task: a value, a refusal, or the death of its worker."""
+    try:
+        result = future.result()
+    except SphereOrientError as error:
+        job.error = job.error or str(error)
+        return
+    except Exception as error:  # whatever stops a worker must not stop the other experiments
+        executor.renew(worker)
+        done = job.done()[0]
+        job.deaths = 1 if done > job.done_at_death else job.deaths + 1
+        job.done_at_death = done
+        if job.deaths >= DEATHS:
+            why = str(error).splitlines()[0] if str(error) else type(error).__name__
+            job.error = f"{job.request.experiment}: worker {worker} died {DEATHS} times ({why}); "
+            job.error += "check its memory, then run again with --resume."
+        else:
+            job.waiting.appendleft(task)
+        return
+    if task.stage == "learn":
+        job.batches = result
+    job.results.append(result)
+
+
+def _outcome(job: _Job) -> Outcome:
+    job.held.close()
+    seconds = time.monotonic() - job.began
+    if job.counts is None:
+        return Outcome(request=job.request, seconds=seconds, error=job.error)
+    frames, valid = job.counts
+    return Outcome(request=job.request, seconds=seconds, frames=frames, valid=valid)
+
+
+def tracks_of(experiments: Sequence[Path], out: Path) -> list[Path]:
+    """Return the paths of the tracks of experiments: the file itself for one, files in a folder for several.
+
+    In a folder each track has the name of its experiment's folder; of its file, where two share that.
+    """
+    if len(experiments) == 1 and not out.is_dir():
+        return [out]
+    names = [path.resolve().parent.name for path in experiments]
+    if len(set(names)) < len(names):
+        names = [f"{path.resolve().parent.name}-{path.stem}" for path in experiments]
+    return [out / f"{name}.h5" for name in names]

@@ -1,0 +1,279 @@
+"""One way through: learn, follow, join. Every command, the Python API and the workers come through here.
+
+movies -> locate -> search -> pose -> follow -> assemble -> motion -> Trajectory
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from sphereorient.errors import OutputError, SettingsError, refusal
+from sphereorient.experiment import Experiment, input_files
+from sphereorient.experiment.recording import Progress, open_recording, silent
+from sphereorient.files.provenance import provenance, sha256
+from sphereorient.follow.follower import Batch, Follower
+from sphereorient.methods import results
+from sphereorient.methods.learnt import Learnt
+from sphereorient.methods.method import Job, Method
+from sphereorient.methods.paper import PAPER
+from sphereorient.methods.precise import PRECISE
+from sphereorient.methods.proposers import checkpoint_path
+from sphereorient.methods.settings import DEFAULT_METHOD, Settings, check_settings, settings_yaml
+from sphereorient.run.request import Request
+from sphereorient.run.store import MemoryStore, Store
+from sphereorient.trajectory import Trajectory
+
+METHODS: dict[str, Method] = {"precise": PRECISE, "paper": PAPER}
+TASK_BATCHES = 16  # at most in one task of a worker; a worker that dies loses less than one batch
+TASKS_A_WORKER = 2  # of a short movie: so that no worker waits long for the last one
+
+
+@dataclass(frozen=True)
+class Task:
+    """A piece of a run that one worker does."""
+
+    stage: str  # learn, follow or join
+    batches: tuple[Batch, ...] = ()  # to follow
+
+
+def run(request: Request, store: Store, *, resume: bool = False, progress: Progress = silent) -> Trajectory:
+    """Track one experiment in this process.
+
+    A run that was cut off at any moment can be resumed from a folder store: the track is the same to the last bit.
+
+    Args:
+        request: what to do.
+        store: keeps what is done until the track is whole.
+        resume: go on with what the store holds.
+        progress: called with stage, frames done and frames in all.
+
+    Raises:
+        SphereOrientError: inputs that are missing, unreadable or do not fit together; a store of another run; a track
+            that cannot be written, and then the store keeps what is done.
+    """
+    check_out(request)
+    with opened(request, store) as work, store.held(request, resume=resume):
+        todo = stages(store)
+        tasks = next(todo)
+        while True:
+            try:
+                tasks = todo.send([work.do(task, progress) for task in tasks])
+            except StopIteration as end:
+                track: Trajectory = end.value
+                return track
+
+
+def stages(store: Store, workers: int | None = None) -> Generator[list[Task], list[Any], Any]:
+    """Yield the tasks of a run, stage by stage; those of one stage may be done side by side.
+
+    Send the results of all tasks of a stage to get the next stage.
+
+    Args:
+        store: of the run.
+        workers: that share the frames; None: one task follows all.
+    """
+    (batches,) = yield [Task("learn")]
+    left = store.missing(batches)
+    size = max(1, len(left))
+    if workers is not None:
+        size = min(TASK_BATCHES, max(1, -(-len(left) // (TASKS_A_WORKER * workers))))
+    yield [Task("follow", tuple(left[k : k + size])) for k in range(0, len(left), size)]
+    (track,) = yield [Task("join")]
+    return track
+
+
+@dataclass(eq=False)
+class Work:
+    """A run whose inputs are open; made by `opened`."""
+
+    request: Request
+    method: Method
+    job: Job
+    store: Store
+    _follower: Follower | None = None
+    _learnt: bool = False
+
+    def do(self, task: Task, progress: Progress = silent) -> Any:
+        """Do one task: learn returns the batches, follow the number of batches, join the track."""
+        if task.stage == "learn":
+            return self.learn(progress)
+        return self.follow(task.batches, progress) if task.stage == "follow" else self.join(progress)
+
+    def learn(self, progress: Progress) -> list[Batch]:
+        """Learn what frames are measured with, unless it is known, keep it, and return the batches to follow."""
+        if not self._learnt:
+            known = self.job.given or self.store.known
+            if known is not None:
+                self._follower = self.method.resume(self.job, known)
+            else:
+                self._follower = self.method.learn(self.job, progress)
+                if self._follower is not None:
+                    self.store.keep(Learnt.of(self._follower.appearance))
+            self._learnt = True
+        return [] if self._follower is None else self._follower.batches
+
+    def follow(self, batches: Sequence[Batch], progress: Progress) -> int:
+        """Measure some batches, keep their poses, and return how many batches were measured."""
+        every = self.learn(progress)
+        assert self._follower is not None  # only a follower has batches
+        total = sum(map(len, every))
+        done = total - sum(map(len, self.store.missing(every)))
+        progress("track", done, total)
+        count = 0
+        for batch, poses in self._follower.follow(batches):
+            self.store.write(batch, poses)
+            done, count = done + len(batch), count + 1
+            progress("track", done, total)
+        return count
+
+    def join(self, progress: Progress) -> Trajectory:
+        """Make the track of the measured batches, write it, and empty the store."""
+        batches = self.learn(progress)
+        progress("join", 0, 1)
+        measured = (self.store.read(batch) for batch in batches)
+        track, learnt = self.method.join(self.job, self._follower, measured, progress)
+        track = finished(track, self.job, self.request)
+        if learnt is not None and self.request.save_learnt is not None:
+            learnt.save(self.request.save_learnt)
+        if self.request.out is not None:
+            track.save(self.request.out)
+        self.store.remove()
+        progress("join", 1, 1)
+        return track
+
+
+@contextmanager
+def opened(request: Request, store: Store) -> Iterator[Work]:
+    """Open the inputs of a request.
+
+    Raises:
+        SphereOrientError: inputs or settings that are missing, unreadable or do not fit together.
+    """
+    method = check_method(request)
+    given = Learnt.load(request.learnt) if isinstance(request.learnt, Path) else request.learnt
+    device = torch_device(request.device)
+    with open_recording(request.experiment, request.cameras) as recording, one_thread():
+        job = Job(recording=recording, settings=request.settings, device=device, given=given)
+        yield Work(request=request, method=method, job=job, store=store)
+
+
+def track_movies(
+    experiment: Experiment | str | Path,
+    *,
+    method: str = DEFAULT_METHOD,
+    settings: Settings | None = None,
+    cameras: Sequence[str] | None = None,
+    device: str = "cpu",
+    learnt: Learnt | None = None,
+    proposer: str | Path | None = None,
+    progress: Progress = silent,
+    command: str = "sphereorient.track_movies",
+) -> Trajectory:
+    """Measure position and absolute orientation of the sphere in every frame.
+
+    Args:
+        experiment: as loaded, or the path of its experiment.yaml.
+        method: "precise", fitted poses with covariances; "paper", Zimmermann et al. 2011, corrected (docs/errata.md).
+        settings: None: the defaults.
+        cameras: names of the cameras to use; None: all.
+        device: where fits are computed, as torch names it: cpu, cuda, cuda:1.
+        learnt: what another run learnt of background, light and motion; None: learn it (method precise).
+        proposer: checkpoint of a network that proposes orientations, "default" for the bundled one
+            (docs/proposer.md); None: as the settings say.
+        progress: called with stage, frames done and frames in all.
+        command: recorded as the origin in the track's provenance.
+
+    Returns:
+        The trajectory, frame by frame; lengths in mm, angles in rad, see docs/data-format.md.
+
+    Raises:
+        SphereOrientError: inputs that are missing, unreadable or do not fit together.
+    """
+    request = Request(
+        experiment=experiment if isinstance(experiment, Experiment) else Path(experiment),
+        method=method,
+        settings=with_proposer(settings or Settings(), proposer),
+        cameras=None if cameras is None else tuple(cameras),
+        device=device,
+        learnt=learnt,
+        command=command,
+    )
+    return run(request, MemoryStore(), progress=progress)
+
+
+def finished(track: Trajectory, job: Job, request: Request) -> Trajectory:
+    """Add the effect of the calibration's errors, and the origin, to a track."""
+    recording, settings = job.recording, job.settings
+    track = results.with_systematic_errors(track, recording.cameras, recording.covariance, recording.radius_mm)
+    inputs = input_files(recording.experiment, list(recording.cameras))
+    origin = provenance(inputs, recording.experiment.folder, request.command)
+    origin["remarks"] = list(recording.remarks)
+    if settings.propose.checkpoint is not None:
+        origin["proposer_sha256"] = sha256(checkpoint_path(settings.propose.checkpoint))
+    return replace(track, method=request.method, settings=settings_yaml(settings), provenance=origin)
+
+
+def with_proposer(settings: Settings, proposer: str | Path | None) -> Settings:
+    """Return settings with a checkpoint that proposes; unchanged for None."""
+    if proposer is None:
+        return settings
+    return settings.model_copy(update={"propose": settings.propose.model_copy(update={"checkpoint": str(proposer)})})
+
+
+def check_method(request: Request) -> Method:
+    """Return the method of a request.
+
+    Raises:
+        SettingsError: an unknown method, or settings or knowledge that the method does not read.
+    """
+    if request.method not in METHODS:
+        got, do = repr(request.method), "name one of these"
+        raise SettingsError(refusal("method", expected=" or ".join(METHODS), got=got, do=do))
+    if request.learnt is not None and request.method != "precise":
+        do = "leave it out, or use method precise"
+        raise SettingsError(refusal("learnt", expected="method precise", got=f"method {request.method}", do=do))
+    check_settings(request.settings, request.method)
+    return METHODS[request.method]
+
+
+def check_out(request: Request) -> None:
+    """Check that the output folder exists before starting.
+
+    Raises:
+        OutputError: it does not.
+    """
+    if request.out is not None and not request.out.parent.is_dir():
+        expected, do = f"an existing folder {request.out.parent}", "make it first"
+        raise OutputError(refusal(str(request.out), expected=expected, got="none", do=do))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep torch to one thread for a while: its tensors here are small, and idle threads that spin starve decoding."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def torch_device(name: str) -> torch.device:
+    """Return a device that torch can use.
+
+    Raises:
+        SettingsError: torch cannot use it.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        got, do = f"'{name}': {str(error).splitlines()[0]}", "name cpu, or install torch for your GPU"
+        raise SettingsError(refusal("device", expected="a device that torch can use", got=got, do=do)) from None
+    return device

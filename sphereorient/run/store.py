@@ -1,0 +1,219 @@
+"""Where a run keeps what is done: in memory, or in a folder beside the track from which it can be resumed."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+
+from sphereorient.errors import OutputError, TrackError, refusal
+from sphereorient.files.hdf5 import whole_hdf5
+from sphereorient.follow import POSE_PARTS, Poses
+from sphereorient.follow.follower import Batch
+from sphereorient.methods.learnt import Learnt
+from sphereorient.run.request import Request, differing, fingerprint
+from sphereorient.trajectory import Reason
+
+SCHEMA = "sphereorient-poses/1"
+
+
+@dataclass(eq=False)
+class MemoryStore:
+    """Keeps a run in this process."""
+
+    known: Learnt | None = None  # what was learnt before the first frame
+    _poses: dict[int, list[Poses]] = field(default_factory=dict)
+
+    @contextmanager
+    def held(self, request: Request, *, resume: bool) -> Iterator[None]:
+        """Do nothing: nobody else sees this store."""
+        yield
+
+    def keep(self, learnt: Learnt) -> None:
+        """Keep what was learnt."""
+        self.known = learnt
+
+    def write(self, batch: Batch, poses: list[Poses]) -> None:
+        """Keep the poses of one batch."""
+        self._poses[batch.first] = poses
+
+    def read(self, batch: Batch) -> list[Poses]:
+        """Return the poses of one batch."""
+        return self._poses.pop(batch.first)
+
+    def missing(self, batches: Sequence[Batch]) -> list[Batch]:
+        """Return the batches that are still to be measured."""
+        return [batch for batch in batches if batch.first not in self._poses]
+
+    def remove(self) -> None:
+        """Forget the poses."""
+        self._poses.clear()
+
+
+@dataclass(frozen=True)
+class FolderStore:
+    """Keeps a run in a folder; every file appears whole or not at all."""
+
+    folder: Path
+
+    @property
+    def learnt(self) -> Path:
+        """The file of what was learnt before the first frame."""
+        return self.folder / "learnt.h5"
+
+    def poses(self, batch: Batch) -> Path:
+        """Return the file of the poses of one batch."""
+        return self.folder / f"poses-{batch.first:08d}.h5"
+
+    @contextmanager
+    def held(self, request: Request, *, resume: bool) -> Iterator[None]:
+        """Make the folder, or go on with what it holds, and lock it against other runs.
+
+        Raises:
+            TrackError: to be resumed, but of a run on other inputs or settings.
+            OutputError: it cannot be written, or another run is writing it.
+        """
+        with ExitStack() as locks:
+            if self._run.is_file():
+                self._lock(locks)
+            now, before = fingerprint(request), self._fingerprint()
+            if before is None or not resume:
+                self._make(now)
+                self._lock(locks)
+            elif others := differing(before, now):
+                do = "run without --resume to start over"
+                got = f"parts of a run with another {', '.join(others)}"
+                raise TrackError(refusal(str(self.folder), expected="parts of this run", got=got, do=do))
+            try:
+                yield
+            finally:
+                if self.folder.is_dir() and not any(self.folder.glob("*.h5")):
+                    self.remove()  # a run that came to nothing leaves nothing
+
+    def _make(self, now: Mapping[str, str]) -> None:
+        try:
+            self.remove()
+            self.folder.mkdir()
+            aside = self.folder / ".run.json.part"
+            with aside.open("w", encoding="utf-8") as file:
+                json.dump(dict(now), file, indent=1)
+                file.flush()
+                os.fsync(file.fileno())
+            aside.replace(self._run)
+        except OSError as error:
+            do = "check the space left and the permissions of the folder"
+            raise OutputError(refusal(str(self.folder), expected="a folder to write", got=str(error), do=do)) from error
+
+    def _lock(self, locks: ExitStack) -> None:
+        file = locks.enter_context(self._run.open("rb"))
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            do = "wait for it, or stop it"
+            writer = self._writer()
+            raise OutputError(f"{self.folder} is being written by another run{writer}; {do}.") from None
+        except OSError:  # file systems without locks
+            return
+        (self.folder / "process").write_text(str(os.getpid()), encoding="utf-8")
+
+    def _writer(self) -> str:
+        try:
+            return f" (process {int((self.folder / 'process').read_text(encoding='utf-8'))})"
+        except (OSError, ValueError):
+            return ""
+
+    @property
+    def _run(self) -> Path:
+        return self.folder / "run.json"
+
+    def _fingerprint(self) -> dict[str, str] | None:
+        """Return the fingerprint of the run that made the folder; None without one."""
+        try:
+            known = json.loads(self._run.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        return {str(name): str(value) for name, value in known.items()} if isinstance(known, dict) else None
+
+    @property
+    def known(self) -> Learnt | None:
+        """What was learnt before the first frame; None where the file is missing or damaged."""
+        try:
+            return Learnt.load(self.learnt)
+        except TrackError:
+            return None
+
+    def keep(self, learnt: Learnt) -> None:
+        """Write what was learnt."""
+        learnt.save(self.learnt)
+
+    def write(self, batch: Batch, poses: list[Poses]) -> None:
+        """Write the poses of one batch."""
+        write_poses(self.poses(batch), poses)
+
+    def read(self, batch: Batch) -> list[Poses]:
+        """Return the poses of one batch.
+
+        Raises:
+            TrackError: the file is damaged; it is removed, so that the next run measures the batch again.
+        """
+        path = self.poses(batch)
+        poses = read_poses(path) if path.is_file() else None
+        if poses is None or len(poses) != len(batch):
+            path.unlink(missing_ok=True)
+            do = "run again with --resume; only this part is measured again"
+            raise TrackError(refusal(str(path), expected="the poses of a batch", got="a damaged file", do=do))
+        return poses
+
+    def missing(self, batches: Sequence[Batch]) -> list[Batch]:
+        """Return the batches that are still to be measured."""
+        return [batch for batch in batches if not self.poses(batch).is_file()]
+
+    def remove(self) -> None:
+        """Remove the folder."""
+        if self.folder.exists():
+            shutil.rmtree(self.folder)
+
+
+Store = MemoryStore | FolderStore
+
+
+def write_poses(path: Path, poses: Sequence[Poses]) -> None:
+    """Write the poses of consecutive frames: aside, onto the disk, and then under their name.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with whole_hdf5(path, "check the space left, then run again with --resume") as file:
+        file.attrs["schema"] = SCHEMA
+        file["count"] = np.array([len(one) for one in poses])
+        file["use"] = np.stack([one.use.numpy() for one in poses])
+        file["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
+        for name in POSE_PARTS:
+            file[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
+
+
+def read_poses(path: Path) -> list[Poses] | None:
+    """Return what `write_poses` wrote; None where the file is not whole."""
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("schema") != SCHEMA:
+                return None
+            count, use = file["count"][()].tolist(), torch.from_numpy(file["use"][()])
+            reason = [[Reason(why.decode()) for why in row] for row in file["reason"][()].tolist()]
+            parts = {name: torch.split(torch.from_numpy(file[name][()]), count) for name in POSE_PARTS}
+    except (OSError, KeyError, ValueError, RuntimeError):
+        return None
+    return [
+        # Copies: rows of one array would keep the whole of it.
+        Poses(**{name: parts[name][k].clone() for name in POSE_PARTS}, use=use[k].clone(), reason=tuple(reason[k]))
+        for k in range(len(count))
+    ]
