@@ -146,9 +146,18 @@ def _not_read(name: str, key: str, method: str) -> str:
         for name in _known_keys(Settings, [branch])
         if is_read(f"{branch}.{name}", method)
     ]
-    leaves = {each: each.partition(".")[2] for each in known}
-    leaf = difflib.get_close_matches(key.partition(".")[2], leaves.values(), 1, 0.5)
-    near = next((each for each, end in leaves.items() if leaf and end == leaf[0]), None)
+    leaf = key.partition(".")[2]
+    unit = [each for each in known if each.rpartition("_")[2] == leaf.rpartition("_")[2]]
+    near = next(
+        (
+            each
+            for some in (unit, known)
+            for name in difflib.get_close_matches(leaf, [each.partition(".")[2] for each in some], 1, 0.6)
+            for each in some
+            if each.endswith(f".{name}")
+        ),
+        None,
+    )
     others = [other for other in BRANCHES if is_read(key, other)]
     do = f"leave it out, use {near}, " if near else "leave it out, "
     do += f"or use it with {' or '.join(others)}"
