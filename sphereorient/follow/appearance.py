@@ -14,12 +14,13 @@ from torch import Tensor
 
 from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
-from sphereorient.follow.initialise import Poses, initialise
+from sphereorient.follow.initialise import initialise
 from sphereorient.follow.light_and_blur import LEAST_LEFT, learn_light_and_blur
+from sphereorient.follow.poses import Poses
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import LocateSettings, Shot
 from sphereorient.pose.defocus import FIRST_BLUR_PX, defocus_radii
-from sphereorient.pose.fit import Fit
+from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import CameraView, Fitter, Optics, Picture, unknown_light, widest_px
 from sphereorient.search.proposer import Proposer
 from sphereorient.sphere.texture_table import TextureTable
@@ -142,7 +143,7 @@ def estimate_appearance(
     )
 
 
-def _usual_apart(fit: Fit, use: Tensor) -> float:
+def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
     """Return the median angle between the turns of two cameras that see the ball together; infinite without any."""
     angles = [
         (fit.own_turn[:, k] - fit.own_turn[:, m]).norm(dim=-1)[use[:, k] & use[:, m]]

@@ -10,8 +10,8 @@ from itertools import accumulate, islice
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import spread_frames
 from sphereorient.follow.appearance import Appearance
-from sphereorient.follow.initialise import Poses
 from sphereorient.follow.per_camera import PerCameraTracker
+from sphereorient.follow.poses import Poses
 from sphereorient.follow.tracker import BlockTracker
 from sphereorient.locate import Shot, screened_frames
 from sphereorient.pose import CameraView

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -11,10 +11,10 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import R_cam_view
+from sphereorient.follow.poses import Poses, no_pose, poses_of
 from sphereorient.follow.scan import relocalise
 from sphereorient.locate import LocateSettings, Shot, find_ball, find_positions, sightings_of
 from sphereorient.locate.find import Found
-from sphereorient.pose.fit import Fit
 from sphereorient.pose.fitter import Fitter, Picture
 from sphereorient.search.crop import crop_disk
 from sphereorient.search.proposer import Proposer
@@ -27,49 +27,6 @@ NARROWER = (0.15, 0.06)  # deviations from the usual diameter with which outline
 CLEARLY_LESS = 0.1  # of a picture's variance: who explains so much less than another pose is wrong, likely or not
 SURE_NLL = 20.0  # by so much less likely
 GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance see different things
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Poses:
-    """Distinct poses that one frame's pictures allow, most likely first; made by orient, read by the tracker.
-
-    M poses, C cameras; M = 0 where there is none, and then `reason` says why.
-    """
-
-    position_lab_mm: Tensor  # (M, 3)
-    R_lab_body: Tensor  # (M, 3, 3)
-    covariance: Tensor  # (M, 6, 6), of delta (rad) and position (mm), lab
-    own_turn: Tensor  # (M, C, 3), rad, see Fit
-    own_covariance: Tensor  # (M, C, 3, 3)
-    own_move: Tensor  # (M, C, 3), mm, see Fit
-    deviation: Tensor  # (M, C)
-    score: Tensor  # (M, C)
-    nll: Tensor  # (M,)
-    use: Tensor  # (C,) bool, cameras whose pictures count
-    reason: tuple[Reason, ...]  # C
-
-    def __len__(self) -> int:
-        """Return the number of poses."""
-        return len(self.nll)
-
-
-POSE_PARTS: tuple[str, ...] = ("position_lab_mm", "R_lab_body", "covariance", "own_turn", "own_covariance", "own_move")
-POSE_PARTS += ("deviation", "score", "nll")
-
-
-def poses_of(fit: Fit, chosen: Tensor, use: Tensor, reason: Sequence[Reason]) -> Poses:
-    """Return some rows of a fit as the poses of one frame."""
-    return Poses(**{name: getattr(fit, name)[chosen] for name in POSE_PARTS}, use=use, reason=tuple(reason))
-
-
-def no_pose(cameras: int, reason: Sequence[Reason]) -> Poses:
-    """Return a frame without any pose."""
-    tails = {"position_lab_mm": (3,), "R_lab_body": (3, 3), "covariance": (6, 6), "own_turn": (cameras, 3)}
-    tails |= {"own_covariance": (cameras, 3, 3), "own_move": (cameras, 3), "deviation": (cameras,)}
-    tails |= {"score": (cameras,), "nll": ()}
-    none = torch.zeros(cameras, dtype=torch.bool)
-    parts = {name: torch.zeros(0, *tail, dtype=torch.float64) for name, tail in tails.items()}
-    return Poses(**parts, use=none, reason=tuple(reason))
 
 
 def initialise(

@@ -8,7 +8,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from sphereorient.pose.defocus import defocus_radii
-from sphereorient.pose.fit import Fit
+from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import FINEST_PX, Fitter, Optics, level_of, widest_px
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture_table import TextureTable
@@ -20,8 +20,8 @@ LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 
 
 def learn_light_and_blur(
-    fitter: Fitter, base: TextureTable, pixels: Pixels, fit: Fit, use: Tensor, *, given: bool
-) -> tuple[Fitter, Fit]:
+    fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor, *, given: bool
+) -> tuple[Fitter, FittedPoses]:
     """Learn light, then blur, then light again.
 
     Light that was learnt with a wrong blur speaks for that blur: of soft pictures they take turns, some times.
@@ -48,7 +48,9 @@ def learn_light_and_blur(
     return fitter, fit
 
 
-def _with_light(fitter: Fitter, pixels: Pixels, fit: Fit, use: Tensor, rounds: int) -> tuple[Fitter, Fit]:
+def _with_light(
+    fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor, rounds: int
+) -> tuple[Fitter, FittedPoses]:
     """Learn the light and fit again, some times."""
     for _ in range(rounds):
         fitter = fitter.with_light_of(pixels, fit, use)
@@ -56,7 +58,7 @@ def _with_light(fitter: Fitter, pixels: Pixels, fit: Fit, use: Tensor, rounds: i
     return fitter, fit
 
 
-def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: Fit, use: Tensor) -> float:
+def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor) -> float:
     """Return the blur that leaves the least of the pictures unexplained, between the tried ones by a parabola."""
     radius_px = widest_px(fitter.views) / 2
     left: dict[int, float] = {}

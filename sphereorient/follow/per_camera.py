@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.follow.appearance import Appearance
-from sphereorient.follow.initialise import Poses, no_pose
+from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.follow.tracker import BlockTracker
 from sphereorient.locate import LocateSettings, Shot

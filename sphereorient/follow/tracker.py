@@ -13,10 +13,11 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.fixed_centre import FixedCentre
-from sphereorient.follow.initialise import Poses, explaining_first, initialise, poses_of
+from sphereorient.follow.initialise import explaining_first, initialise
+from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import LocateSettings, Shot
-from sphereorient.pose.fit import Fit
+from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Fitter, Picture, PyramidLevel
 from sphereorient.search.proposer import Proposer
 from sphereorient.trajectory import Reason
@@ -206,7 +207,7 @@ class BlockTracker:
         good = first = self._borne_out(fit, use)
         within = self.fitter.largest_px(X) <= self.fitter.widest_px  # others are searched for, frame by frame
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
-        alone: list[Fit] = []
+        alone: list[FittedPoses] = []
         if not bool((good | ~within).all()):
             # One picture without the ball spoils what all say together: each camera by itself; of two that say
             # different things the one that the frames before bear out counts.
@@ -219,7 +220,7 @@ class BlockTracker:
             nearest, which = torch.stack(astray).min(0)
             for k, one in enumerate(alone):
                 chosen = ~good & torch.isfinite(nearest) & (which == k)
-                fit, use = _chosen(chosen, one, fit), torch.where(chosen[:, None], _only(usable, k), use)
+                fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, k), use)
             good = good | torch.isfinite(nearest)
         # What is told of another camera only where this frame itself asks: it must not depend on those beside it.
         doubtful = ~first | before.any(1)
@@ -231,7 +232,7 @@ class BlockTracker:
             contradicts = self._contradictory(both, usable, limit)
             back = unused & self._borne_out(both, usable) & ~contradicts
             doubtful = doubtful | (unused & contradicts)
-            fit, use = _chosen(back, both, fit), torch.where(back[:, None], usable, use)
+            fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
         others = (good & doubtful)[:, None] & usable & ~use
         for k in range(use.shape[1] if bool(others.any()) else 0):
             one = alone[k] if alone else self._fitted(frames, X, R, _only(usable, k), precision)
@@ -261,7 +262,9 @@ class BlockTracker:
             R = torch.where(rough[:, None, None], fit.R_lab_body, R)
         return X, R
 
-    def _fitted(self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor) -> Fit:
+    def _fitted(
+        self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor
+    ) -> FittedPoses:
         """Fit poses that are about right: to some of the pixels, longer where that moves them, and then to all."""
         if self.place is None:
             # With all cameras the pictures tell the place; with one of two its distance is better known from before.
@@ -273,14 +276,14 @@ class BlockTracker:
         far = self._far(fit, use)
         if bool(far.any()):
             more = self.fitter.fit(some, self._from(fit.position_lab_mm), fit.R_lab_body, use, fine, 2, precision)
-            fit = _chosen(far, more, fit)
+            fit = more.where(far, fit)
             begin = torch.where(far[:, None], self._from(fit.position_lab_mm), X)
             pixels = self.fitter.pixels(frames, begin, fine, widest)
         fit = self.fitter.fit(pixels, self._from(fit.position_lab_mm), fit.R_lab_body, use, fine, 1, precision)
         far = self._far(fit, use)
         if bool(far.any()):
             more = self.fitter.fit(pixels, self._from(fit.position_lab_mm), fit.R_lab_body, use, fine, 3, precision)
-            fit = _chosen(far, more, fit)
+            fit = more.where(far, fit)
         return fit
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
@@ -290,21 +293,21 @@ class BlockTracker:
         """
         return position_lab_mm if self.place is None else self.place.position_lab_mm.expand_as(position_lab_mm)
 
-    def _far(self, fit: Fit, use: Tensor) -> Tensor:
+    def _far(self, fit: FittedPoses, use: Tensor) -> Tensor:
         """Fits whose last step was so long that another one is wanted, (B,) bool."""
         turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
         # One camera's distances scatter; what shows in its picture shows in the turn as well.
         far: Tensor = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * self.fitter.radius_mm))
         return far
 
-    def _borne_out(self, fit: Fit, use: Tensor) -> Tensor:
+    def _borne_out(self, fit: FittedPoses, use: Tensor) -> Tensor:
         """Poses that have arrived and that all pictures in use explain well, (B,) bool."""
         explained = (fit.score >= self.score_min) | ~use
         arrived = fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD
         good: Tensor = use.any(1) & explained.all(1) & arrived & ~self._contradictory(fit, use)
         return good
 
-    def _contradictory(self, said: Fit | Poses, use: Tensor, limit: Tensor | float = 1.0) -> Tensor:
+    def _contradictory(self, said: FittedPoses | Poses, use: Tensor, limit: Tensor | float = 1.0) -> Tensor:
         """Poses of which two cameras say different things, (B,) bool: their pictures are not of one instant."""
         wrong = torch.zeros(len(use), dtype=torch.bool)
         for k, m in combinations(range(use.shape[1]), 2):
@@ -344,7 +347,7 @@ class BlockTracker:
 
     def _looked_at(
         self, frames: Sequence[Picture], X: Tensor, R: Tensor, use: Tensor, level: PyramidLevel, iterations: int
-    ) -> Fit:
+    ) -> FittedPoses:
         """Fit poses to one frame, of which no other frame tells but where the ball is in all of them."""
         X = self._from(X)
         pixels = self.fitter.pixels([frames] * len(X), X, level)
@@ -400,7 +403,7 @@ def _only(usable: Tensor, camera: int) -> Tensor:
     return only
 
 
-def _beside(fit: Fit, other: Fit, rows: Tensor, camera: int) -> Fit:
+def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> FittedPoses:
     """Put what a camera says by itself beside poses (B,) that it has no part in."""
     if not bool(rows.any()):
         return fit
@@ -424,12 +427,3 @@ def _reason(used: bool, contradicts: bool, shot: Shot, before: Reason) -> Reason
     if not shot.usable:
         return shot.reason
     return before if before in (Reason.NOT_FOUND, Reason.OUTLINE) else Reason.LOW_SCORE
-
-
-def _chosen(rows: Tensor, one: Fit, other: Fit) -> Fit:
-    """Return one fit where the mask (B,) holds and the other elsewhere."""
-    parts = {}
-    for name in one.__dataclass_fields__:
-        a, b = getattr(one, name), getattr(other, name)
-        parts[name] = torch.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-    return Fit(**parts)

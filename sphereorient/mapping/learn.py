@@ -18,7 +18,7 @@ from sphereorient.mapping.record import LearntMap, Round
 from sphereorient.mapping.rounds import LIGHT_ROUNDS, Stage, fitted, map_weight, measured, next_round
 from sphereorient.mapping.settings import PaintSettings
 from sphereorient.mapping.sharpen import sharpened
-from sphereorient.pose.fit import Fit
+from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import CameraView, widest_px
 from sphereorient.synth.textures import map_directions
 
@@ -154,7 +154,7 @@ def recovered(footage: Footage, stage: Stage, chain: Tensor) -> Stage:
     return replace(stage, R_lab_body=new_R, position_lab_mm=new_X)
 
 
-def _scores(fit: Fit, use: Tensor) -> Tensor:
+def _scores(fit: FittedPoses, use: Tensor) -> Tensor:
     """Mean score of the cameras that see each instant, (n,)."""
     return torch.where(use, fit.score, torch.nan).nanmean(1)
 

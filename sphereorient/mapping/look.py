@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 from sphereorient.mapping.grid import READS, SplinePaint
 from sphereorient.pose.fit import grey_by_pose, residuals
 from sphereorient.pose.fitter import Fitter
-from sphereorient.pose.model import View
+from sphereorient.pose.model import SphereView
 from sphereorient.pose.pixels import Pixels
 
 DEPTH_MIN = 0.2  # cosine of the slant beyond which a pixel tells nothing of the map
@@ -23,7 +23,7 @@ POSE = 6  # rows of the pose in a linear problem
 class Look:
     """L disks at one pose each, compared with a map, P pixels each; made by `look`."""
 
-    view: View
+    view: SphereView
     reads: list[tuple[Tensor, Tensor]]  # of the inner and the outer pixels: texels and weights, (L, n * P', 16) each
     inner: int  # so many first pixels read `reads[0]`
     depth: Tensor  # (L, P), cosine of the slant under which it is seen
@@ -79,18 +79,8 @@ def look(
         blur_px: of the pictures.
     """
     paint = SplinePaint(texture, 0.0)
-    at = residuals(
-        pixels,
-        position_lab_mm,
-        R_lab_body,
-        None,
-        fitter.radius_mm,
-        paint,
-        blur_px,
-        fitter.light,
-        len(fitter.views),
-        fitter.shading,
-    )
+    model = replace(fitter.model(fitter.optics.fine), paint=paint, blur_px=blur_px)
+    at = residuals(pixels, position_lab_mm, R_lab_body, None, model, len(fitter.views))
     depth = (1 - at.view.across.square().sum(1)).clamp_min(0).sqrt()
     return Look(
         view=at.view,

@@ -19,9 +19,10 @@ from sphereorient.mapping.joint import joint_step, part_of
 from sphereorient.mapping.look import DEPTH_MIN, Look, look, look_ups
 from sphereorient.mapping.record import Round
 from sphereorient.mapping.settings import PaintSettings
-from sphereorient.pose.fit import Fit
+from sphereorient.pose.fit import POSE_PARTS, FittedPoses
 from sphereorient.pose.fitter import CameraView, Fitter, Optics, widest_px
-from sphereorient.pose.light import Light, light_maps, light_sums, noise_curve
+from sphereorient.pose.learn_light import light_maps, light_sums, noise_curve
+from sphereorient.pose.light import Light
 from sphereorient.pose.pixels import Pixels
 
 FIRST_ROUNDS = 2  # with each instant by itself: as long as the map is blurred, a joint step would believe it
@@ -110,7 +111,7 @@ def optics_of(blurred: Tensor, views: Sequence[CameraView], blur_px: float) -> O
     return Optics(map_table(blurred, 2 * blur_px / widest), blur_px, widest)
 
 
-def fitted(stage: Stage, steps: int) -> tuple[Stage, Fit]:
+def fitted(stage: Stage, steps: int) -> tuple[Stage, FittedPoses]:
     """Fit each instant's pose to the map as it is."""
     fitter = stage.map_fitter()
     fine = fitter.optics.fine
@@ -124,12 +125,12 @@ def fitted(stage: Stage, steps: int) -> tuple[Stage, Fit]:
     return replace(stage, position_lab_mm=X, R_lab_body=fit.R_lab_body), fit
 
 
-def _joined(parts: Sequence[Fit]) -> Fit:
+def _joined(parts: Sequence[FittedPoses]) -> FittedPoses:
     """Return the rows of all parts, one after the other."""
-    return Fit(**{name: torch.cat([getattr(part, name) for part in parts]) for name in Fit.__dataclass_fields__})
+    return FittedPoses(**{name: torch.cat([getattr(part, name) for part in parts]) for name in POSE_PARTS})
 
 
-def measured(footage: Footage, stage: Stage) -> tuple[Stage, Fit]:
+def measured(footage: Footage, stage: Stage) -> tuple[Stage, FittedPoses]:
     """Fit each instant's pose to the map as it is, by all pixels: the map needs few of each picture, a pose all of its.
 
     Args:

@@ -9,7 +9,7 @@ import torch
 
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.follow.follower import Follower
-from sphereorient.follow.initialise import Poses
+from sphereorient.follow.poses import Poses
 from sphereorient.methods.learnt import Learnt
 from sphereorient.methods.settings import Settings
 from sphereorient.trajectory import Trajectory

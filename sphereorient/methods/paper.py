@@ -14,8 +14,8 @@ from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream
-from sphereorient.follow import Poses
 from sphereorient.follow.follower import Follower
+from sphereorient.follow.poses import Poses
 from sphereorient.locate import Sightings
 from sphereorient.methods import results
 from sphereorient.methods.learnt import Learnt

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from sphereorient import assemble, motion
 from sphereorient.assemble import Hypotheses
 from sphereorient.experiment.recording import Progress
-from sphereorient.follow import Poses, joined_tables, pose_table
 from sphereorient.follow.appearance import Appearance, estimate_appearance
 from sphereorient.follow.fixed_centre import find_fixed_centre
 from sphereorient.follow.follower import Follower, sample_frames
 from sphereorient.follow.per_camera import PerCameraTracker
+from sphereorient.follow.poses import Poses, joined_tables, pose_table
 from sphereorient.follow.tracker import BlockTracker
 from sphereorient.methods import results
 from sphereorient.methods.learnt import Learnt, with_motion

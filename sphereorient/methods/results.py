@@ -15,7 +15,8 @@ from sphereorient.assemble import Chosen, Fused, Path
 from sphereorient.calibration import systematic_errors
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.experiment import Experiment
-from sphereorient.follow import Appearance, PoseTable
+from sphereorient.follow import Appearance
+from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping.record import LearntMap
 from sphereorient.motion import Motion, Smoothed

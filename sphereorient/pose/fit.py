@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.light import Light, light_maps, light_sums, noise_curve, polynomials
-from sphereorient.pose.model import View, sphere_view
+from sphereorient.pose.light import polynomials
+from sphereorient.pose.model import SphereModel, SphereView, light_columns, sphere_view
 from sphereorient.pose.pixels import Pixels
-from sphereorient.sphere.texture_table import TextureTable
+from sphereorient.so3.linalg import inverse_damped, solve_damped
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
 EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
@@ -19,42 +19,56 @@ NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Shading:
-    """Orders of the polynomials by which a frame's light may differ from the learnt; made by settings."""
+class FittedPoses:
+    """Poses fitted to the pictures of C cameras, with covariance; of any leading shape L."""
 
-    difference: int
-    black: int
+    position_lab_mm: Tensor  # (L, 3) float64
+    R_lab_body: Tensor  # (L, 3, 3) float64
+    covariance: Tensor  # (L, 6, 6) float64, of delta (rad) and position (mm), lab
+    own_turn: Tensor  # (L, C, 3), rad: how each camera alone would turn the pose, its place held
+    own_covariance: Tensor  # (L, C, 3, 3), rad^2
+    own_move: Tensor  # (L, C, 3), mm, lab: how each camera alone would move the sphere, distance by size included
+    deviation: Tensor  # (L, C), robust standard deviation of the residuals over the noise expected
+    score: Tensor  # (L, C), 1 less the share of the picture's variance that is left
+    nll: Tensor  # (L), negative log-likelihood of all pixels, as if they were independent
+    step: Tensor  # (L, 6), the last one of the fit
 
+    def parts(self) -> dict[str, Tensor]:
+        """Return the arrays by name."""
+        return {name: getattr(self, name) for name in POSE_PARTS}
 
-FIRST = Shading(difference=4, black=2)  # nothing is known of the light yet
-LATER = Shading(difference=2, black=1)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Fit:
-    """B poses fitted to the pictures of C cameras; made by `refine`, read by the tracker."""
-
-    position_lab_mm: Tensor  # (B, 3) float64
-    R_lab_body: Tensor  # (B, 3, 3) float64
-    covariance: Tensor  # (B, 6, 6) float64, of delta (rad) and position (mm), lab
-    own_turn: Tensor  # (B, C, 3), rad: how each camera alone would turn the pose, its place held
-    own_covariance: Tensor  # (B, C, 3, 3), rad^2
-    own_move: Tensor  # (B, C, 3), mm, lab: how each camera alone would move the sphere, distance by size included
-    deviation: Tensor  # (B, C), robust standard deviation of the residuals over the noise expected
-    score: Tensor  # (B, C), 1 less the share of the picture's variance that is left
-    nll: Tensor  # (B,), negative log-likelihood of all pixels, as if they were independent
-    step: Tensor  # (B, 6), the last one
-
-    def to(self, device: torch.device) -> Fit:
+    def to(self, device: torch.device) -> FittedPoses:
         """Return the same on another device."""
-        return Fit(**{name: getattr(self, name).to(device) for name in self.__dataclass_fields__})
+        return FittedPoses(**{name: part.to(device) for name, part in self.parts().items()})
+
+    def where(self, mask: Tensor, other: FittedPoses) -> FittedPoses:
+        """Return these poses where the mask (B,) holds, the others elsewhere."""
+        own, others = self.parts(), other.parts()
+        return FittedPoses(
+            **{
+                name: torch.where(mask.reshape(-1, *[1] * (part.ndim - 1)), part, others[name])
+                for name, part in own.items()
+            }
+        )
+
+
+POSE_PARTS = tuple(field.name for field in fields(FittedPoses))
+
+
+def blank_parts(cameras: int, *shape: int) -> dict[str, Tensor]:
+    """Return arrays of `FittedPoses` of a leading shape: zeros, and the unit rotation."""
+    tails = {"position_lab_mm": (3,), "R_lab_body": (3, 3), "covariance": (6, 6), "own_turn": (cameras, 3)}
+    tails |= {"own_covariance": (cameras, 3, 3), "own_move": (cameras, 3), "deviation": (cameras,)}
+    tails |= {"score": (cameras,), "nll": (), "step": (6,)}
+    parts = {name: torch.zeros(*shape, *tails[name], dtype=torch.float64) for name in POSE_PARTS}
+    return parts | {"R_lab_body": parts["R_lab_body"] + torch.eye(3, dtype=torch.float64)}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Residuals:
-    """The linear problem at one pose; L disks. Made by `residuals`."""
+    """The linear problem at one pose, of L disks; made by `residuals`."""
 
-    view: View
+    view: SphereView
     design: Tensor  # (L, 6 + K, P), derivatives by pose and by the light's coefficients
     residual: Tensor  # (L, P), grey levels
     model: Tensor  # (L, P), grey levels
@@ -65,44 +79,24 @@ class Residuals:
     over: Tensor  # (L, P), grey levels by which the ball is brighter than what is behind it
 
 
-def light_columns(view: View, light: Light, shading: Shading) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what the light's coefficients multiply, (L, K, P), and the learnt maps of difference and black (L, P)."""
-    difference, black = light.at(view.across)
-    tints = polynomials(view.across, max(shading.difference, shading.black))
-    n_difference, n_black = ((order + 1) * (order + 2) // 2 for order in (shading.difference, shading.black))
-    lit = (view.coverage * (view.paint * difference + black))[:, None]
-    columns = torch.cat([lit * tints[:, :n_difference], view.coverage[:, None] * tints[:, :n_black]], dim=1)
-    return columns, difference, black
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseStart:
+    """Where the fit of B poses begins."""
+
+    position_lab_mm: Tensor  # (B, 3)
+    R_lab_body: Tensor  # (B, 3, 3)
+    use: Tensor  # (B, C) bool, the cameras that see the ball; a pose without any stays where it is
+    place_precision: Tensor | None = None  # (B, 3, 3), 1/mm^2, of `position_lab_mm` as known beforehand
 
 
-def refine(
-    pixels: Pixels,
-    position_lab_mm: Tensor,
-    R_lab_body: Tensor,
-    use: Tensor,
-    *,
-    radius_mm: float,
-    paint: TextureTable,
-    blur_px: float,
-    light: Light,
-    shading: Shading = LATER,
-    iterations: int = 4,
-    place_precision: Tensor | None = None,
-) -> Fit:
+def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4) -> FittedPoses:
     """Fit poses to pictures: robust Gauss-Newton, the light's coefficients eliminated in every step.
 
     Args:
         pixels: of B * C disks, the cameras of a pose next to each other.
-        position_lab_mm: (B, 3), start.
-        R_lab_body: (B, 3, 3), start.
-        use: (B, C) bool, the cameras that see the ball; a pose without any stays where it is.
-        radius_mm: of the sphere.
-        paint: blurred by `blur_px`.
-        blur_px: standard deviation of optics, pixel and whatever was laid over the frame, px.
-        light: of the C cameras.
-        shading: how far a frame's light may differ from it.
+        begin: start of the B poses.
+        model: of the sphere's pictures.
         iterations: steps, at least 1, the same for all poses, so that none depends on its neighbours in the batch.
-        place_precision: (B, 3, 3), 1/mm^2: what is known of the place, `position_lab_mm`, beforehand.
 
     Returns:
         The fit, its covariance that of the robust estimate with errors shared within tiles of the picture. All but
@@ -111,71 +105,64 @@ def refine(
     Source: variable projection, Golub and Pereyra 1973; covariance of an M-estimate from clustered scores, Liang and
     Zeger 1986.
     """
+    use, place_precision, radius_mm = begin.use, begin.place_precision, model.radius_mm
     cameras = use.shape[1]
-    start, X, R = position_lab_mm.double(), position_lab_mm.double(), R_lab_body.double()
-    origin = _by_pose(pixels.origin[..., 0].double(), cameras)
+    start = begin.position_lab_mm.double()
+    X, R = start, begin.R_lab_body.double()
+    origin = by_pose(pixels.origin[..., 0].double(), cameras)
     seen = use.to(X.dtype)
     state: tuple[Tensor, Tensor] | None = None
     for _ in range(iterations):
-        at = residuals(pixels, X, R, state, radius_mm, paint, blur_px, light, cameras, shading)
+        at = residuals(pixels, X, R, state, model, cameras)
         state = at.model, at.weight
         precision = at.weight / at.variance
         weighted = at.design * precision[:, None]
         normal = (weighted @ at.design.mT).double()
         gradient = (weighted @ at.residual[..., None])[..., 0].double()
         information, pull, mixed = _without_light(normal, gradient)
-        information, pull = (_by_pose(part, cameras) for part in (information, pull))
+        information, pull = (by_pose(part, cameras) for part in (information, pull))
         whole = (information * seen[..., None, None]).sum(1)
         force = (pull * seen[..., None]).sum(1)
         if place_precision is not None:
             whole[:, 3:, 3:] += place_precision
             force[:, 3:] -= (place_precision @ (X - start)[..., None])[..., 0]
-        step = _bounded(_solved(whole, force), X[:, None] - origin, seen, radius_mm)
+        step = _bounded(solve_damped(whole, force), X[:, None] - origin, seen, radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
     # Where each camera would go from where the last step began, less that step.
-    own = _solved(
+    own = solve_damped(
         information[..., :3, :3], pull[..., :3] - (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
     )
     own = own - step[:, None, :3]
-    freed = _solved(information, pull) - step[:, None]
-    shared = _by_pose(_shared_scores(at, precision, mixed, pixels.tile), cameras)
+    freed = solve_damped(information, pull) - step[:, None]
+    shared = by_pose(_shared_scores(at, precision, mixed, pixels.tile), cameras)
     meat = (shared * seen[..., None, None]).sum(1)
     if place_precision is not None:  # what was known before has an error of its own
         meat[:, 3:, 3:] += place_precision
-    bread = _inverse(whole)
-    own_bread = _inverse(information[..., :3, :3])
+    bread = inverse_damped(whole)
+    own_bread = inverse_damped(information[..., :3, :3])
     edge = _edge_errors(pixels, X[:, None] - origin, cameras, radius_mm) * seen[..., None]
     lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
     covariance = bread @ meat @ bread + lured.mT @ lured
     told = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # no picture, no knowledge: the inverse of nothing is huge
     covariance = torch.where(told[:, None, None], 0.5 * (covariance + covariance.mT), bread)
-    loss = _by_pose(_loss(at, pixels.inside), cameras)
-    return Fit(
+    loss = by_pose(_loss(at, pixels.inside), cameras)
+    return FittedPoses(
         position_lab_mm=X,
         R_lab_body=R,
         covariance=covariance,
         own_turn=own,
         own_move=_bounded_alone(freed, X[:, None] - origin, radius_mm),
         own_covariance=own_bread @ shared[..., :3, :3] @ own_bread,
-        deviation=_by_pose(at.deviation.double(), cameras),
-        score=_by_pose(_score(at, pixels.inside).double(), cameras),
+        deviation=by_pose(at.deviation.double(), cameras),
+        score=by_pose(_score(at, pixels.inside).double(), cameras),
         nll=(loss * seen).sum(1),
         step=step,
     )
 
 
 def residuals(
-    pixels: Pixels,
-    X: Tensor,
-    R: Tensor,
-    state: tuple[Tensor, Tensor] | None,
-    radius_mm: float,
-    paint: TextureTable,
-    blur_px: float,
-    light: Light,
-    cameras: int,
-    shading: Shading,
+    pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel, cameras: int
 ) -> Residuals:
     """Linearise the pictures about poses, the light's coefficients at their best.
 
@@ -183,36 +170,31 @@ def residuals(
         pixels: of B * C disks.
         X: (B, 3), places of the centre in the lab, mm.
         R: (B, 3, 3), R_lab_body.
-        state: model and weights of an earlier look, (L, P) each; None: from the picture itself.
-        radius_mm: of the sphere.
-        paint: blurred by `blur_px`.
-        blur_px: as in `refine`.
-        light: of the C cameras.
+        state: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
+        model: of the sphere's pictures.
         cameras: C.
-        shading: how far a frame's light may differ from it.
     """
-    view = sphere_view(
-        pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), radius_mm, paint, blur_px
-    )
-    columns, difference, black = light_columns(view, light, shading)
+    view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
+    columns, difference, black = light_columns(view, model)
     beyond = (1.0 - view.coverage) * pixels.behind
-    noise = light.noise.repeat(len(X), 1)
+    noise = model.light.noise.repeat(len(X), 1)
     target = pixels.grey - beyond
     # The first weights come from the picture itself, which a bubble is part of: a second round does without it.
     rounds = (pixels.grey, pixels.inside.to(columns.dtype)) if state is None else state
     for _ in range(1 if state is not None else 2):
         expected, weight = rounds
         weighted = columns * (weight / _variance(expected, noise))[:, None]
-        coefficients = _solved(
+        coefficients = solve_damped(
             (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double(), ridge=1e-7
         ).to(columns.dtype)
         painted = (coefficients[:, None] @ columns)[:, 0]
-        model, residual = painted + beyond, target - painted
-        variance = _variance(model, noise)
+        grey, residual = painted + beyond, target - painted
+        variance = _variance(grey, noise)
         deviation = _deviation(residual, variance, pixels.inside)
         variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
         weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * pixels.inside
-        rounds = model, weight
+        rounds = grey, weight
+    shading = model.shading
     tints = polynomials(view.across, max(shading.difference, shading.black))
     n = (shading.difference + 1) * (shading.difference + 2) // 2
     gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
@@ -224,7 +206,7 @@ def residuals(
         view=view,
         design=torch.cat([grey_by_pose(view, lit, over), columns], dim=1),
         residual=residual,
-        model=model,
+        model=grey,
         variance=variance,
         weight=weight,
         deviation=deviation,
@@ -233,7 +215,7 @@ def residuals(
     )
 
 
-def grey_by_pose(view: View, lit: Tensor, over: Tensor) -> Tensor:
+def grey_by_pose(view: SphereView, lit: Tensor, over: Tensor) -> Tensor:
     """Return how grey changes with delta (rad) and place (mm), (L, 6, P); `lit` and `over` as in `Residuals`."""
     paint, limb = lit[:, None], over[:, None]
     return torch.cat(
@@ -241,7 +223,7 @@ def grey_by_pose(view: View, lit: Tensor, over: Tensor) -> Tensor:
     )
 
 
-def _by_pose(disks: Tensor, cameras: int) -> Tensor:
+def by_pose(disks: Tensor, cameras: int) -> Tensor:
     """Return (B * C, ...) as (B, C, ...)."""
     return disks.reshape(-1, cameras, *disks.shape[1:])
 
@@ -271,20 +253,6 @@ def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Te
     return information, gradient[:, :6] - (mixed.mT @ gradient[:, 6:, None])[..., 0], mixed
 
 
-def _solved(matrix: Tensor, right: Tensor, ridge: float = 1e-9) -> Tensor:
-    """Solve small symmetric systems; a direction that nothing determines gets no step."""
-    size = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(0)
-    floor = ridge * size + 1e-12
-    solution: Tensor = torch.linalg.solve_ex(matrix + torch.diag_embed(floor), right[..., None]).result
-    return solution[..., 0]
-
-
-def _inverse(matrix: Tensor) -> Tensor:
-    size = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(0)
-    inverse: Tensor = torch.linalg.inv_ex(matrix + torch.diag_embed(1e-9 * size + 1e-12)).inverse
-    return inverse
-
-
 def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) -> Tensor:
     """Shorten steps that change a picture by over 0.1 radii, pose by pose: beyond, the slopes say nothing.
 
@@ -308,7 +276,7 @@ def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) ->
 def _edge_errors(pixels: Pixels, to_centre: Tensor, cameras: int, radius_mm: float) -> Tensor:
     """Return by how much (B, C, 3), mm, an edge that is EDGE_PX off moves the sphere along each line of sight."""
     distance = to_centre.norm(dim=-1, keepdim=True)
-    px_mm = _by_pose(pixels.pitch_mm, cameras)[..., None] + _by_pose(pixels.pitch_rad, cameras)[..., None] * distance
+    px_mm = by_pose(pixels.pitch_mm, cameras)[..., None] + by_pose(pixels.pitch_rad, cameras)[..., None] * distance
     off: Tensor = to_centre * (EDGE_PX * px_mm / radius_mm)
     return off
 
@@ -354,39 +322,3 @@ def _score(at: Residuals, inside: Tensor) -> Tensor:
     explained = 1.0 - left / spread.clamp_min(1e-9)
     # Where no pixel is ball, nothing is explained.
     return torch.where(spread > 1e-6, explained, torch.zeros_like(explained))
-
-
-def learn_light(
-    pixels: Pixels,
-    fit: Fit,
-    use: Tensor,
-    *,
-    radius_mm: float,
-    paint: TextureTable,
-    blur_px: float,
-    light: Light,
-    shading: Shading,
-) -> Light:
-    """Learn the light and the noise of a movie from fitted poses.
-
-    Args:
-        pixels: of B * C disks.
-        fit: of them.
-        use: (B, C) bool, disks to learn from.
-        radius_mm: as in `refine`, like the following ones.
-        paint: as there.
-        blur_px: as there.
-        light: with which the poses were fitted.
-        shading: with which the poses were fitted.
-    """
-    cameras = use.shape[1]
-    X, R = fit.position_lab_mm, fit.R_lab_body
-    at = residuals(pixels, X, R, None, radius_mm, paint, blur_px, light, cameras, shading)
-    at = residuals(pixels, X, R, (at.model, at.weight), radius_mm, paint, blur_px, light, cameras, shading)
-    normal, right = light_sums(at.view, pixels, at.weight / at.variance * use.reshape(-1, 1))
-    difference, black = light_maps(_by_pose(normal, cameras).sum(0), _by_pose(right, cameras).sum(0))
-    counted = pixels.inside & use.reshape(-1, 1)
-    noise = torch.stack(
-        [noise_curve(at.model[c::cameras], at.residual[c::cameras], counted[c::cameras]) for c in range(cameras)]
-    )
-    return Light(difference=difference, black=black, noise=noise, known=True)

@@ -15,8 +15,10 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera
 from sphereorient.locate import Background, Scene
-from sphereorient.pose.fit import FIRST, LATER, Fit, Shading, learn_light, refine
-from sphereorient.pose.light import Light
+from sphereorient.pose.fit import FittedPoses, PoseStart, refine
+from sphereorient.pose.learn_light import learn_light
+from sphereorient.pose.light import FIRST, LATER, Light, Shading
+from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
 from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
 
@@ -130,20 +132,16 @@ class Fitter:
         """Orders of each frame's own light: high while nothing is learnt."""
         return LATER if self.light.known else FIRST
 
-    def with_light_of(self, pixels: Pixels, fit: Fit, use: Tensor) -> Fitter:
-        """Return a fitter that knows the light and the noise of fitted pictures; see `learn_light`."""
-        fine = self.optics.fine
-        light = learn_light(
-            pixels,
-            fit,
-            use,
-            radius_mm=self.radius_mm,
-            paint=fine.paint,
-            blur_px=fine.blur_px,
-            light=self.light,
-            shading=self.shading,
+    def model(self, level: PyramidLevel) -> SphereModel:
+        """Return what the pictures of a level depend on."""
+        shading = self.shading if level.extra_px == 0 else LATER
+        return SphereModel(
+            radius_mm=self.radius_mm, paint=level.paint, blur_px=level.blur_px, light=self.light, shading=shading
         )
-        return replace(self, light=light)
+
+    def with_light_of(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> Fitter:
+        """Return a fitter with the light and the noise of fitted pictures; see `learn_light`."""
+        return replace(self, light=learn_light(pixels, fit, use, self.model(self.optics.fine)))
 
     def on(self, device: torch.device) -> Fitter:
         """Return a fitter that computes on another device."""
@@ -203,22 +201,16 @@ class Fitter:
         level: PyramidLevel,
         iterations: int,
         place_precision: Tensor | None = None,
-    ) -> Fit:
+    ) -> FittedPoses:
         """Refine B poses at one level; see `refine`."""
         there = self.device
-        return refine(
-            pixels.to(there),
-            position_lab_mm.to(there),
-            R_lab_body.to(there),
-            use.to(there),
-            radius_mm=self.radius_mm,
-            paint=level.paint,
-            blur_px=level.blur_px,
-            light=self.light,
-            shading=self.shading if level.extra_px == 0 else LATER,
-            iterations=iterations,
+        begin = PoseStart(
+            position_lab_mm=position_lab_mm.to(there),
+            R_lab_body=R_lab_body.to(there),
+            use=use.to(there),
             place_precision=None if place_precision is None else place_precision.to(there),
-        ).to(CPU)
+        )
+        return refine(pixels.to(there), begin, self.model(level), iterations).to(CPU)
 
 
 def base_table(texture: Tensor, diameter_px: float) -> TextureTable:

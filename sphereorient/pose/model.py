@@ -1,14 +1,17 @@
-"""How the painted sphere looks through real pixels, and how that changes with its pose: exact geometry, blurred."""
+"""The measuring model: the painted sphere in the pixels of a camera, blurred, and its derivatives by the pose."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from sphereorient.pose.light import LATER, Light, Shading, polynomials
 from sphereorient.pose.pixels import Pixels
+from sphereorient.so3.linalg import cross_first_axis
 from sphereorient.sphere.texture_table import TextureTable
 
 SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself
@@ -17,8 +20,19 @@ DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class View:
-    """The sphere in the pixels of L disks at one pose each; made by `sphere_view`, read by refine and light."""
+class SphereModel:
+    """What a picture of the sphere depends on, its pose aside."""
+
+    radius_mm: float
+    paint: TextureTable  # blurred by `blur_px` as seen at the disk's middle
+    blur_px: float  # standard deviation of optics, pixel and whatever was laid over the frame, px
+    light: Light  # of the C cameras
+    shading: Shading = LATER  # how far a frame's light may differ from it
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SphereView:
+    """The sphere in the pixels of L disks at one pose each; made by `sphere_view`."""
 
     paint: Tensor  # (L, P), blurred paint seen, 0 .. 1
     coverage: Tensor  # (L, P), share of the pixel's blurred aperture that the sphere fills
@@ -28,30 +42,27 @@ class View:
     coverage_by_position: Tensor  # (L, 3, P), 1/mm
 
 
-def sphere_view(
-    pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, radius_mm: float, paint: TextureTable, blur_px: float
-) -> View:
-    """Look at the sphere through pixels whose aperture is a Gaussian.
+def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model: SphereModel) -> SphereView:
+    """Render the sphere through pixels whose aperture is a Gaussian.
 
     A pixel near the limb sees the paint about the middle of that part of its aperture which the sphere covers, and
     along the radius the sphere's curvature stretches the aperture over more paint: two look-ups, one standard deviation
-    to both sides of the mean of a Gaussian cut off at the limb, make both right, the table's own blur does the rest.
+    to both sides of the mean of a Gaussian cut off at the limb, make both right; the table's own blur does the rest.
     Near the limb there are four, at the quantiles of what is left of the Gaussian.
 
     Args:
         pixels: of L disks, float32.
         position_lab_mm: (L, 3), centre of the sphere.
         R_lab_body: (L, 3, 3).
-        radius_mm: of the sphere.
-        paint: blurred by `blur_px` as seen at the disk's middle.
-        blur_px: standard deviation of the aperture, px.
+        model: radius, paint and blur; light is not used.
 
     Returns:
         The view. In its derivatives the spread of the look-ups is held fixed.
 
-    Source: ERRATA A4 (the cap and the ellipse that a perspective camera sees); mean and variance of a cut-off
+    Source: docs/errata.md A4 (the cap and the ellipse that a perspective camera sees); mean and variance of a cut-off
     Gaussian, Johnson, Kotz and Balakrishnan 1994, section 13.10.
     """
+    radius_mm, blur_px = model.radius_mm, model.blur_px
     d = pixels.direction
     R = R_lab_body.to(d.dtype)
     # In double precision, once: half a metre less half a metre.
@@ -74,15 +85,15 @@ def sphere_view(
     variance = (1.0 - pull * (edge + pull)).clamp(SPREAD_MIN, 1.0)[:, :inner]
     spread = blur * variance.sqrt() * q[:, :inner]
     at = torch.stack([q[:, :inner] - spread, q[:, :inner] + spread], dim=1)
-    parts = [
-        _looked(at, variance[:, None], d[..., :inner], outward[..., :inner], nearest[:, :inner], R, paint, radius_mm)
-    ]
+    middle = _LineOfSight(d[..., :inner], outward[..., :inner], nearest[:, :inner])
+    parts = [_sample(at, variance[:, None], middle, R, model)]
     if inner < d.shape[-1]:
         outer = slice(inner, None)
         at, moves = _rim_nodes(q0[:, outer], blur, coverage[:, outer], density[:, outer], q[:, outer])
-        parts.append(_looked(at, moves, d[..., outer], outward[..., outer], nearest[:, outer], R, paint, radius_mm))
+        rim = _LineOfSight(d[..., outer], outward[..., outer], nearest[:, outer])
+        parts.append(_sample(at, moves, rim, R, model))
     body, turn, shift = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
-    return View(
+    return SphereView(
         paint=body,
         coverage=coverage,
         across=q[:, None] * (pixels.axes @ outward),
@@ -105,34 +116,33 @@ def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, midd
     return middle + middle * (q0[:, None] + blur[:, None] * z - middle), moves.clamp(0.0, 1.0)
 
 
-def _looked(
-    at: Tensor,
-    moves: Tensor,
-    d: Tensor,
-    outward: Tensor,
-    nearest: Tensor,
-    R: Tensor,
-    paint: TextureTable,
-    radius_mm: float,
+class _LineOfSight(NamedTuple):
+    """Lines of sight past the sphere's centre."""
+
+    direction: Tensor  # (L, 3, P), unit
+    outward: Tensor  # (L, 3, P), unit, from the centre to the line
+    nearest: Tensor  # (L, P), distance of the centre from the line, mm
+
+
+def _sample(
+    at: Tensor, moves: Tensor, line: _LineOfSight, R: Tensor, model: SphereModel
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean paint of some look-ups (L, P) and its derivatives by rotation and place (L, 3, P).
 
     Args:
         at: (L, n, P), distance of each look-up from the disk's middle, radii.
         moves: (L, n, P) or (L, 1, P), by how much it moves with the pixel.
-        d: (L, 3, P), lines of sight.
-        outward: (L, 3, P), unit, from the centre to them.
-        nearest: (L, P), their distance, mm.
+        line: of the pixels.
         R: (L, 3, 3).
-        paint: table.
-        radius_mm: of the sphere.
+        model: radius and paint.
     """
+    d, outward, nearest = line
     # In body components, where the paint is: the derivatives are turned back once, at the end.
     sight_b, outward_b = (R.mT @ d)[:, :, None], (R.mT @ outward)[:, :, None]
     qt = at.clamp(0.0, math.sqrt(1.0 - DEPTH_MIN**2))
     depth = (1.0 - qt * qt).sqrt()
     normal_b = qt[:, None] * outward_b - depth[:, None] * sight_b
-    value, slope = paint.sample(normal_b.flatten(2))
+    value, slope = model.paint.sample(normal_b.flatten(2))
     value, slope = value.reshape(qt.shape), slope.reshape(normal_b.shape)
     # Moving the centre along -outward lets the look-up slide outwards over the sphere.
     slide = (slope * outward_b).sum(1) + qt / depth * (slope * sight_b).sum(1)
@@ -141,11 +151,16 @@ def _looked(
     by_sight, by_outward = (flat_b * sight_b[:, :, 0]).sum(1), (flat_b * outward_b[:, :, 0]).sum(1)
     # Across the radius a look-up stays at its share of it, q / q0.
     flat = R @ flat_b - by_sight[:, None] * d - by_outward[:, None] * outward
-    shift = flat * (-1.0 / nearest)[:, None] - (radial / radius_mm)[:, None] * outward
-    return value.mean(1), R @ _cross(slope, normal_b).mean(2), shift
+    shift = flat * (-1.0 / nearest)[:, None] - (radial / model.radius_mm)[:, None] * outward
+    return value.mean(1), R @ cross_first_axis(slope, normal_b).mean(2), shift
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """Return a x b of (L, 3, ...); torch's own is several times slower along a middle axis."""
-    (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
-    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=1)
+def light_columns(view: SphereView, model: SphereModel) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the light coefficients' columns, (L, K, P), and the learnt maps of difference and black, (L, P)."""
+    shading = model.shading
+    difference, black = model.light.at(view.across)
+    tints = polynomials(view.across, max(shading.difference, shading.black))
+    n_difference, n_black = ((order + 1) * (order + 2) // 2 for order in (shading.difference, shading.black))
+    lit = (view.coverage * (view.paint * difference + black))[:, None]
+    columns = torch.cat([lit * tints[:, :n_difference], view.coverage[:, None] * tints[:, :n_black]], dim=1)
+    return columns, difference, black

@@ -17,9 +17,10 @@ import torch
 
 from sphereorient.errors import OutputError, TrackError, refusal
 from sphereorient.files.hdf5 import whole_hdf5
-from sphereorient.follow import POSE_PARTS, Poses
 from sphereorient.follow.follower import Batch
+from sphereorient.follow.poses import Poses
 from sphereorient.methods.learnt import Learnt
+from sphereorient.pose.fit import POSE_PARTS
 from sphereorient.run.request import Request, differing, fingerprint
 from sphereorient.trajectory import Reason
 

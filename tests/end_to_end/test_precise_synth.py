@@ -32,7 +32,8 @@ from precise_examples import (
 from sphereorient import so3
 from sphereorient.errors import ExperimentError
 from sphereorient.evaluate import score_track
-from sphereorient.follow import BlockTracker, Poses
+from sphereorient.follow import BlockTracker
+from sphereorient.follow.poses import Poses
 from sphereorient.locate import Shot
 from sphereorient.methods import precise
 from sphereorient.run.stages import track_movies

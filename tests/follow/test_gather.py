@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from sphereorient import so3
-from sphereorient.follow.initialise import POSE_PARTS, Poses, no_pose
-from sphereorient.follow.pose_table import pose_table
+from sphereorient.follow.poses import Poses, no_pose, pose_table
+from sphereorient.pose.fit import POSE_PARTS
 from sphereorient.trajectory import Reason
 
 CAMERAS = 2

@@ -16,9 +16,10 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.follow import BlockTracker, Poses
+from sphereorient.follow import BlockTracker
 from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre, mean_place
 from sphereorient.follow.follower import sample_frames
+from sphereorient.follow.poses import Poses
 from sphereorient.locate import Shot, screened_frames
 from sphereorient.methods.method import Job
 from sphereorient.methods.precise import learn

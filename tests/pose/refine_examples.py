@@ -13,8 +13,9 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, PinholeCamera, TsaiCamera
-from sphereorient.pose.fit import Fit, refine
-from sphereorient.pose.light import Light
+from sphereorient.pose.fit import FittedPoses, PoseStart, refine
+from sphereorient.pose.light import LATER, Light, Shading
+from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
 from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
 from sphereorient.synth import random_texture
@@ -132,19 +133,19 @@ def flat_light(cameras: int, sigma: float) -> Light:
     return Light.unknown(cameras, torch.tensor([[sigma**2, 0.0, 0.0, 0.0]] * cameras))
 
 
-def fitted(rig: Rig, kind: str, pixels: Pixels, X: Tensor, R: Tensor, sigma: float, **changes: object) -> Fit:
+def model_of(paint: TextureTable, sigma: float = 1.0, shading: Shading = LATER) -> SphereModel:
+    """What the pictures of two cameras depend on, before any light is learnt."""
+    light = flat_light(2, sigma)
+    return SphereModel(radius_mm=RADIUS_MM, paint=paint, blur_px=BLUR_PX, light=light, shading=shading)
+
+
+def fitted(rig: Rig, kind: str, pixels: Pixels, X: Tensor, R: Tensor, sigma: float, **changes: object) -> FittedPoses:
     """Refine with all cameras, unless the changes say otherwise."""
-    given = {
-        "use": torch.ones(len(X), len(rig.cameras), dtype=torch.bool),
-        "radius_mm": RADIUS_MM,
-        "paint": rig.table(kind),
-        "blur_px": BLUR_PX,
-        "light": flat_light(len(rig.cameras), sigma),
-        "iterations": 6,
-    }
-    given |= changes
-    use = given.pop("use")
-    return refine(pixels, X, R, use, **given)
+    use = changes.pop("use", torch.ones(len(X), len(rig.cameras), dtype=torch.bool))
+    iterations, known = changes.pop("iterations", 6), changes.pop("place_precision", None)
+    given = {"radius_mm": RADIUS_MM, "paint": rig.table(kind), "blur_px": BLUR_PX}
+    model = SphereModel(**given | {"light": flat_light(len(rig.cameras), sigma)} | changes)
+    return refine(pixels, PoseStart(position_lab_mm=X, R_lab_body=R, use=use, place_precision=known), model, iterations)
 
 
 def turned(R: Tensor, angle_deg: float, seed: int) -> Tensor:
@@ -159,6 +160,6 @@ def moved(X: Tensor, distance_mm: float, seed: int) -> Tensor:
     return X + distance_mm * torch.nn.functional.normalize(axis, dim=1)
 
 
-def turn_errors(fit: Fit, R: Tensor) -> Tensor:
+def turn_errors(fit: FittedPoses, R: Tensor) -> Tensor:
     """delta of R = exp(delta) R_fitted, (B, 3), rad, lab."""
     return so3.log(R @ fit.R_lab_body.mT)

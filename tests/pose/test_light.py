@@ -11,22 +11,20 @@ import torch
 from conftest import assert_close
 from refine_examples import (
     BEHIND,
-    BLUR_PX,
-    RADIUS_MM,
     Rig,
     balls,
     cut,
     fitted,
-    flat_light,
+    model_of,
     noisy,
     rig_of,
     share_pictures,
 )
 from torch import Tensor
 
-from sphereorient.pose.fit import FIRST, learn_light
-from sphereorient.pose.light import Light, light_basis, light_maps, light_sums, noise_curve, polynomials
-from sphereorient.pose.model import View, sphere_view
+from sphereorient.pose.learn_light import learn_light, light_maps, light_sums, noise_curve
+from sphereorient.pose.light import FIRST, Light, light_basis, polynomials
+from sphereorient.pose.model import SphereView, sphere_view
 from sphereorient.pose.pixels import Pixels
 
 KINDS = ("patches",)
@@ -132,15 +130,15 @@ def test_unknown_light_is_one_and_nothing_everywhere():
 
 
 @cache
-def views() -> tuple[Pixels, View]:
+def views() -> tuple[Pixels, SphereView]:
     """Eight disks of one camera, at their poses."""
     rig = rig_of(40.0, ("pinhole",))
     X, R = balls(8, 2)
     pixels = cut(rig, torch.zeros(8, 1, 100, 100), X)
-    return pixels, sphere_view(pixels, X, R, RADIUS_MM, rig.table("patches"), BLUR_PX)
+    return pixels, sphere_view(pixels, X, R, model_of(rig.table("patches")))
 
 
-def lit(pixels: Pixels, view: View, camera: int = 0) -> Tensor:
+def lit(pixels: Pixels, view: SphereView, camera: int = 0) -> Tensor:
     difference, black = lamp(view.across, camera)
     return view.coverage * (view.paint * difference + black) + (1 - view.coverage) * pixels.behind
 
@@ -245,8 +243,8 @@ def test_light_and_noise_of_two_cameras_are_learnt_from_fitted_pictures():
     pixels = cut(rig, lamp_pictures(rig, X, R), X)
     use = torch.ones(12, 2, dtype=torch.bool)
     fit = fitted(rig, "patches", pixels, X, R, 5.0, shading=FIRST)
-    given = {"radius_mm": RADIUS_MM, "paint": rig.table("patches"), "blur_px": BLUR_PX}
-    light = learn_light(pixels, fit, use, **given, light=flat_light(2, 5.0), shading=FIRST)
+    model = model_of(rig.table("patches"), 5.0, FIRST)
+    light = learn_light(pixels, fit, use, model)
     assert light.known
     across = disk_places(3000, 0.9).repeat(2, 1, 1)
     for k, part in enumerate(light.at(across)):
@@ -261,7 +259,7 @@ def test_light_and_noise_of_two_cameras_are_learnt_from_fitted_pictures():
     # One camera's bad disks, not in use, change nothing of the other's light.
     some = use.clone()
     some[6:, 1] = False
-    fewer = learn_light(pixels, fit, some, **given, light=flat_light(2, 5.0), shading=FIRST)
+    fewer = learn_light(pixels, fit, some, model)
     assert fewer.noise[0].equal(light.noise[0])
     assert_close(fewer.difference[0], light.difference[0], atol=1e-3)
     assert not fewer.noise[1].equal(light.noise[1])

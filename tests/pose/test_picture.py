@@ -18,6 +18,7 @@ from refine_examples import (
     Rig,
     balls,
     f64,
+    model_of,
     paint_of,
     rig_of,
     table_of,
@@ -27,7 +28,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import Camera
 from sphereorient.cameras.telecentric import TelecentricCamera
-from sphereorient.pose.model import View, sphere_view
+from sphereorient.pose.model import SphereView, sphere_view
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
 from sphereorient.sphere import sample_texture
 from sphereorient.sphere.texture_table import TextureTable, texture_table
@@ -98,7 +99,7 @@ def seen_by_force(camera: Camera, paint: Tensor, uv: Tensor, X: Tensor, R: Tenso
     return torch.cat(filled) / share.sum(), torch.cat(white) / share.sum()
 
 
-def regions(view: View) -> dict[str, Tensor]:
+def regions(view: SphereView) -> dict[str, Tensor]:
     """Places far from the limb, near it, and on it."""
     coverage, inner = view.coverage[0], view.across[0].norm(dim=0) < 0.75
     on = (coverage > 0.01) & (coverage < 0.99)
@@ -113,7 +114,7 @@ def regions(view: View) -> dict[str, Tensor]:
 def test_pixels_see_what_a_render_by_force_shows(model, kind):
     one, (X, R) = rig(model, 40.0), ball()
     pixels, uv = empty(one, X), places(one, X)
-    view = sphere_view(pixels, X, R, RADIUS_MM, one.table(kind), BLUR_PX)
+    view = sphere_view(pixels, X, R, model_of(one.table(kind)))
     filled, white = seen_by_force(one.cameras[0], paint_of(kind).double(), uv, X[0], R[0])
     error = view.coverage[0].double() - filled
     assert error.square().mean().sqrt() < 0.003
@@ -125,7 +126,7 @@ def test_pixels_see_what_a_render_by_force_shows(model, kind):
         assert error[where].square().mean().sqrt() < rms
         assert error[where].abs().max() < most
     # A tenth of a pixel aside is another picture.
-    beside = sphere_view(pixels, X + 0.1 * one.px_mm * f64([1, 0, 0]), R, RADIUS_MM, one.table(kind), BLUR_PX)
+    beside = sphere_view(pixels, X + 0.1 * one.px_mm * f64([1, 0, 0]), R, model_of(one.table(kind)))
     assert (beside.coverage[0].double() - filled).square().mean().sqrt() > 0.008
 
 
@@ -137,7 +138,7 @@ def test_a_ball_that_looks_to_the_camera_shows_the_maps_middle_in_the_middle_wit
     row = torch.arange(256.0)[:, None].expand(256, 512) / 255
     pixels = empty(one, X)
     for texture, axis, sign in ((column, 0, 1), (row, 1, 1)):
-        view = sphere_view(pixels, X, R, RADIUS_MM, texture_table(texture, 0.05, 128), BLUR_PX)
+        view = sphere_view(pixels, X, R, model_of(texture_table(texture, 0.05, 128)))
         within = view.across[0].norm(dim=0) < 0.5
         assert view.paint[0][within].mean().item() == pytest.approx(0.5, abs=0.01)
         ahead = sign * view.across[0, axis] > 0.3
@@ -146,7 +147,7 @@ def test_a_ball_that_looks_to_the_camera_shows_the_maps_middle_in_the_middle_wit
 
 def test_places_on_the_disk_are_those_of_the_picture_in_radii():
     one, X = rig("telecentric", 40.0), torch.zeros(1, 3, dtype=torch.float64)
-    view = sphere_view(empty(one, X), X, torch.eye(3, dtype=torch.float64)[None], RADIUS_MM, table(), BLUR_PX)
+    view = sphere_view(empty(one, X), X, torch.eye(3, dtype=torch.float64)[None], model_of(table()))
     expected = (places(one, X) - one.cameras[0].project(X[0])) / 20.0
     within = regions(view)["inner"]
     assert_close(view.across[0].T[within].double(), expected[within], atol=1e-4)
@@ -158,7 +159,7 @@ def test_a_nearer_ball_is_larger_as_the_cone_about_it_says():
     camera = one.cameras[0]
     for y in (-60.0, 0.0, 80.0):
         X = f64([[0.0, y, 0.0]])
-        view = sphere_view(empty(one, X), X, torch.eye(3, dtype=torch.float64)[None], RADIUS_MM, table(), BLUR_PX)
+        view = sphere_view(empty(one, X), X, torch.eye(3, dtype=torch.float64)[None], model_of(table()))
         distance = DISTANCE_MM + y
         # The limb is seen at the angle asin(r / distance), not atan.
         radius_px = float(camera.f_px) * RADIUS_MM / math.sqrt(distance**2 - RADIUS_MM**2)
@@ -187,11 +188,11 @@ def smooth_table() -> TextureTable:
     return texture_table(0.5 + 0.2 * x * y + 0.15 * z - 0.1 * x * x * z, 2 * BLUR_PX / 40)
 
 
-def looked(pixels: Pixels, X: Tensor, R: Tensor) -> View:
-    return sphere_view(pixels, X, R, RADIUS_MM, smooth_table(), BLUR_PX)
+def looked(pixels: Pixels, X: Tensor, R: Tensor) -> SphereView:
+    return sphere_view(pixels, X, R, model_of(smooth_table()))
 
 
-def difference(one: View, other: View, name: str) -> Tensor:
+def difference(one: SphereView, other: SphereView, name: str) -> Tensor:
     return (getattr(one, name)[0] - getattr(other, name)[0]).double()
 
 
@@ -248,7 +249,7 @@ def test_sharp_paint_changes_as_its_derivatives_say_on_the_whole(model):
     # What Gauss-Newton needs: the projection of a finite change on the derivatives gives the change's size back.
     one, (X, R) = rig(model, 40.0), ball()
     pixels = empty(one, X)
-    view = sphere_view(pixels, X, R, RADIUS_MM, table(), BLUR_PX)
+    view = sphere_view(pixels, X, R, model_of(table()))
     seen = view.coverage[0] * view.paint[0]
     by_place = view.coverage * view.paint_by_position[0] + view.paint * view.coverage_by_position[0]
     by_pose = torch.cat([view.coverage * view.paint_by_rotation[0], by_place])
@@ -259,8 +260,7 @@ def test_sharp_paint_changes_as_its_derivatives_say_on_the_whole(model):
         step = torch.zeros(6, dtype=torch.float64)
         step[i] = 0.5 * size
         both = [
-            sphere_view(pixels, X + s * step[3:], so3.exp(s * step[:3])[None] @ R, RADIUS_MM, table(), BLUR_PX)
-            for s in (1, -1)
+            sphere_view(pixels, X + s * step[3:], so3.exp(s * step[:3])[None] @ R, model_of(table())) for s in (1, -1)
         ]
         change = (both[0].coverage * both[0].paint - both[1].coverage * both[1].paint)[0]
         got = float((change @ by_pose[i]) / (by_pose[i] @ by_pose[i]))
@@ -300,10 +300,10 @@ def test_a_disk_is_seen_as_if_it_were_alone(count):
     one, (X, R) = rig("tsai", 40.0), balls(3, 7)
     pixels = empty(one, X)
     chosen = torch.arange(count)
-    some = sphere_view(pixels.where(chosen), X[:count], R[:count], RADIUS_MM, table(), BLUR_PX)
+    some = sphere_view(pixels.where(chosen), X[:count], R[:count], model_of(table()))
     assert some.paint.shape == (count, pixels.grey.shape[1])
     for k in range(count):
-        alone = sphere_view(pixels.where(chosen[k : k + 1]), X[k : k + 1], R[k : k + 1], RADIUS_MM, table(), BLUR_PX)
+        alone = sphere_view(pixels.where(chosen[k : k + 1]), X[k : k + 1], R[k : k + 1], model_of(table()))
         for name in ("paint", "coverage", "across", "paint_by_rotation", "paint_by_position", "coverage_by_position"):
             assert getattr(alone, name)[0].equal(getattr(some, name)[k])
 
@@ -313,8 +313,8 @@ def test_all_places_in_the_manner_of_the_rim_are_nearly_the_same():
     one, (X, R) = rig("pinhole", 64.0), ball()
     pixels = empty(one, X)
     paint = one.table("blobs")
-    mixed = sphere_view(pixels, X, R, RADIUS_MM, paint, BLUR_PX)
-    rim = sphere_view(replace(pixels, inner=0), X, R, RADIUS_MM, paint, BLUR_PX)
+    mixed = sphere_view(pixels, X, R, model_of(paint))
+    rim = sphere_view(replace(pixels, inner=0), X, R, model_of(paint))
     assert (mixed.paint - rim.paint).square().mean().sqrt() < 0.01
     assert (mixed.paint_by_rotation - rim.paint_by_rotation).square().mean().sqrt() < 0.25
     assert mixed.coverage.equal(rim.coverage)

@@ -35,8 +35,9 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.fit import FIRST, Fit
+from sphereorient.pose.fit import POSE_PARTS, FittedPoses
 from sphereorient.pose.fitter import Optics, PyramidLevel
+from sphereorient.pose.light import FIRST
 from sphereorient.pose.pixels import Pixels, cut_pixels, stacked
 from sphereorient.sphere.texture_table import texture_table
 
@@ -75,24 +76,24 @@ def disks(cameras: str = "two", kind: str = "patches") -> Pixels:
 
 
 @cache
-def from_truth(cameras: str = "two", kind: str = "patches") -> Fit:
+def from_truth(cameras: str = "two", kind: str = "patches") -> FittedPoses:
     return fitted(rig(cameras), kind, disks(cameras, kind), *truth(), SIGMA)
 
 
-def apart_deg(one: Fit, other: Fit) -> float:
+def apart_deg(one: FittedPoses, other: FittedPoses) -> float:
     return float(so3.geodesic_distance(one.R_lab_body, other.R_lab_body).rad2deg().max())
 
 
-def apart_mm(one: Fit, other: Fit) -> float:
+def apart_mm(one: FittedPoses, other: FittedPoses) -> float:
     return float((one.position_lab_mm - other.position_lab_mm).norm(dim=1).max())
 
 
-def errors(fit: Fit, X: Tensor, R: Tensor) -> Tensor:
+def errors(fit: FittedPoses, X: Tensor, R: Tensor) -> Tensor:
     """(B, 6): rotation in rad, place in mm; what the covariance is of."""
     return torch.cat([turn_errors(fit, R), X - fit.position_lab_mm], dim=1)
 
 
-def whitened(fit: Fit, error: Tensor) -> Tensor:
+def whitened(fit: FittedPoses, error: Tensor) -> Tensor:
     root = torch.linalg.cholesky(fit.covariance)
     return torch.linalg.solve_triangular(root, error[..., None], upper=False)[..., 0]
 
@@ -293,7 +294,7 @@ def test_what_the_cameras_would_do_alone_adds_up_to_nothing():
     assert 0.7 < rms(torch.linalg.solve_triangular(root, apart, upper=False)) < 1.5
 
 
-def second_shows(X: Tensor, R: Tensor, **changes: object) -> Fit:
+def second_shows(X: Tensor, R: Tensor, **changes: object) -> FittedPoses:
     """The fit to a ball of which the second camera shows another pose."""
     paint, ball = share_pictures(rig(), "patches", X, R)
     frames = pictures().clone()
@@ -379,7 +380,7 @@ def test_a_pose_whose_start_is_not_a_number_leaves_the_others_alone():
 # --- what is known of the place
 
 
-def prior_pull(precision: float) -> tuple[Tensor, Fit]:
+def prior_pull(precision: float) -> tuple[Tensor, FittedPoses]:
     """By what share of 0.2 mm along the line of sight a prior on the place moves one camera's fit, (B,)."""
     free = from_truth("one")
     start = free.position_lab_mm + f64([0, 0.2, 0])
@@ -466,13 +467,13 @@ def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(chosen):
     index = torch.tensor(chosen)
     pixels = disks().where(torch.stack([2 * index, 2 * index + 1], dim=1).reshape(-1))
     some = fitted(rig(), "patches", pixels, X[index], R[index], SIGMA)
-    for name in Fit.__dataclass_fields__:
+    for name in POSE_PARTS:
         assert getattr(some, name).equal(getattr(whole, name)[index]), name
 
 
 def test_the_same_pictures_give_the_same_bytes():
     one, other = (fitted(rig(), "patches", disks(), *truth(), SIGMA) for _ in range(2))
-    for name in Fit.__dataclass_fields__:
+    for name in POSE_PARTS:
         assert getattr(one, name).equal(getattr(other, name)), name
 
 

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch
 from refine_examples import (
-    BLUR_PX,
-    RADIUS_MM,
     balls,
     cut,
     fitted,
     flat_light,
+    model_of,
     moved,
     noisy,
     pictures_of,
@@ -25,13 +24,13 @@ from refine_examples import (
 from scipy.stats import chi2
 
 from sphereorient import so3
-from sphereorient.pose.fit import Fit
+from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.model import sphere_view
 
 SIGMA = 4.0  # grey levels; 2.5 % of the step from black to white paint
 
 
-def degrees(fit: Fit, R: torch.Tensor) -> np.ndarray:
+def degrees(fit: FittedPoses, R: torch.Tensor) -> np.ndarray:
     return np.rad2deg(turn_errors(fit, R).norm(dim=-1).numpy())
 
 
@@ -75,9 +74,7 @@ def test_the_slopes_are_those_of_the_view(seen):
     table = rig.table("blobs")
 
     def view(X_at: torch.Tensor, R_at: torch.Tensor):
-        return sphere_view(
-            pixels, X_at.repeat_interleave(2, 0), R_at.repeat_interleave(2, 0), RADIUS_MM, table, BLUR_PX
-        )
+        return sphere_view(pixels, X_at.repeat_interleave(2, 0), R_at.repeat_interleave(2, 0), model_of(table))
 
     at, h = view(X[:4], R[:4]), 2e-3
     for k, axis in enumerate(torch.eye(3, dtype=torch.float64)):
@@ -156,7 +153,7 @@ def test_a_pose_does_not_depend_on_its_neighbours(seen):
     rig, X, R, pictures = seen
     start = turned(R, 1.0, 13)
 
-    def poses(rows: list[int]) -> Fit:
+    def poses(rows: list[int]) -> FittedPoses:
         pixels = cut(rig, pictures[rows], X[rows])
         whole = pixels.thinned(1)  # whole vectors, as the tracker cuts them
         return fitted(rig, "blobs", whole, X[rows], start[rows], SIGMA)
