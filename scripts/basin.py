@@ -19,11 +19,13 @@ import torch
 from sphereorient import so3
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow.appearance import estimate_appearance
+from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import screened_frames
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import base_table
-from sphereorient.pose.fitter import widest_px
+from sphereorient.pose.defocus import FIRST_BLUR_PX
+from sphereorient.pose.fitter import first_fitter, widest_px
 from sphereorient.search import GreySearch
 
 REPO = Path(__file__).resolve().parents[1]
@@ -52,7 +54,13 @@ def main() -> None:
     proposers = {view.name: GreySearch(texture, settings.search) for view in views}
     base = base_table(texture, widest_px(views))
     taken = list(zip(*shots, strict=True))
-    fitter = estimate_appearance(views, taken[:16], base, proposers, radius_mm, settings.locate, settings.refine).fitter
+    first = Initialiser(
+        fitter=first_fitter(views, radius_mm, base, FIRST_BLUR_PX),
+        proposers=proposers,
+        locating=settings.locate,
+        candidates=settings.refine.candidates,
+    )
+    fitter = estimate_appearance(first, taken[:16], base, settings.refine).fitter
     frames = [[shot.picture for shot in row] for row in taken]
     use = torch.ones(len(frames), len(views), dtype=torch.bool)
     optics = fitter.optics

@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,14 +26,16 @@ import yaml
 from sphereorient import locate, so3
 from sphereorient.experiment import Experiment, load_experiment, open_movies
 from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.follow import Appearance, BlockTracker, initialise
+from sphereorient.follow import Appearance, ChunkTracker, 
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.follower import sample_frames
+from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Shot, screened_frames
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
-from sphereorient.pose.fitter import widest_px
+from sphereorient.pose.defocus import FIRST_BLUR_PX
+from sphereorient.pose.fitter import first_fitter, widest_px
 from sphereorient.search import GreySearch, crop_disk, extract_paint
 from sphereorient.sphere import SphereRenderer, load_texture, orthographic_view, reduced_texture
 
@@ -109,7 +111,13 @@ def prepared(folder: Path) -> Bench:
     base = base_table(texture, widest_px(eyes))
     proposers = {eye.name: search for eye in eyes}
     begin = time.process_time()
-    learnt = estimate_appearance(eyes, sampled, base, proposers, radius_mm, settings.locate, settings.refine)
+    first = Initialiser(
+        fitter=first_fitter(eyes, radius_mm, base, FIRST_BLUR_PX),
+        proposers=proposers,
+        locating=settings.locate,
+        candidates=settings.refine.candidates,
+    )
+    learnt = estimate_appearance(first, sampled, base, settings.refine)
     say("study (light, blur, noise), CPU s", f"{time.process_time() - begin:.2f}")
     return Bench(experiment=experiment, eyes=eyes, shots=shots, times=times, search=search, learnt=learnt)
 
@@ -133,13 +141,10 @@ def stages(bench: Bench) -> float:
         return bench.search.propose(torch.from_numpy(disk)[None])
 
     say("first pose of a disk without history (crop, search, climb), CPU ms; bar 20", f"{1e3 * cpu_s(first_pose):.1f}")
-    found = cpu_s(
-        lambda: initialise(
-            bench.learnt.fitter, proposers, first, settings.locate, candidates=settings.refine.candidates
-        )
-    )
+    search = bench.learnt.search(proposers, settings.locate, settings.refine.candidates)
+    found = cpu_s(lambda: replace(search, score_min=0.0).poses(first))
     say("frame without history, outlines to covariances, CPU ms a camera", f"{1e3 * found / cameras:.1f}")
-    tracker = BlockTracker(bench.learnt, proposers, settings.locate, settings.refine)
+    tracker = ChunkTracker(bench.learnt, search, settings.refine)
     # As many blocks side by side as the tracker follows: first frames are searched for, second ones approached.
     lanes = settings.refine.chunks
     begun, whole = [2] * lanes, [FOLLOWED // lanes] * lanes
@@ -184,9 +189,8 @@ def literal(bench: Bench, mean_s: float) -> None:
     paper = cpu_s(once, 1)
     proposers = {each.name: bench.search for each in bench.eyes}
     frames = [movie[0] for movie in bench.shots]
-    ours = cpu_s(lambda: initialise(bench.learnt.fitter, proposers, frames, Settings().locate, candidates=4)) / len(
-        bench.eyes
-    )
+    search = replace(bench.learnt.search(proposers, Settings().locate, 4), score_min=0.0)
+    ours = cpu_s(lambda: search.poses(frames)) / len(bench.eyes)
     say("the paper's literal search, full-size renderings, CPU s a camera and frame", f"{paper:.1f}")
     say("ratio to a frame without history, outline and refinement included", f"{paper / ours:.0f}")
     block = Settings().refine.chunk_frames

@@ -21,12 +21,14 @@ from torch import Tensor
 from sphereorient import locate, so3
 from sphereorient.cameras import Camera
 from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.follow import initialise
 from sphereorient.follow.appearance import estimate_appearance
+from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Background, Shot
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, LinesOfSight, base_table
+from sphereorient.pose.defocus import FIRST_BLUR_PX
+from sphereorient.pose.fitter import first_fitter
 from sphereorient.search import GreySearch
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
@@ -65,17 +67,16 @@ def errors_deg(
     spread = locate.spread_frames(range(len(frames)), settings.refine.appearance_frames)
     base = base_table(texture, view.diameter_px)
     shots = [[Shot(picture=frames[k])] for k in spread]
-    learnt = estimate_appearance([view], shots, base, search, radius_mm, settings.locate, settings.refine)
+    first = Initialiser(
+        fitter=first_fitter([view], radius_mm, base, FIRST_BLUR_PX),
+        proposers=search,
+        locating=settings.locate,
+        candidates=settings.refine.candidates,
+    )
+    learnt = estimate_appearance(first, shots, base, settings.refine)
     errors = []
     for frame, R in zip(frames, R_lab_body, strict=True):
-        poses = initialise(
-            learnt.fitter,
-            search,
-            [Shot(picture=frame)],
-            settings.locate,
-            candidates=settings.refine.candidates,
-            score_min=learnt.clear_score,
-        )
+        poses = learnt.search(search, settings.locate, settings.refine.candidates).poses([Shot(picture=frame)])
         error = float(so3.geodesic_distance(poses.R_lab_body[0], R)) if len(poses) else math.inf
         errors.append(math.degrees(error))
     return errors

@@ -1,20 +1,20 @@
 """Along time: appearance, initialisation, tracking block by block, one tracker per camera."""
 
 from sphereorient.follow.appearance import Appearance
-from sphereorient.follow.initialise import initialise
+from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.per_camera import PerCameraTracker
 from sphereorient.follow.poses import Poses, PoseTable, joined_tables, pose_table
-from sphereorient.follow.tracker import BlockTracker
+from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.pose.fit import POSE_PARTS
 
 __all__ = [
     "POSE_PARTS",
     "Appearance",
-    "BlockTracker",
+    "ChunkTracker",
+    "Initialiser",
     "PerCameraTracker",
     "PoseTable",
     "Poses",
-    "initialise",
     "joined_tables",
     "pose_table",
 ]

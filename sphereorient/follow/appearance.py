@@ -1,4 +1,4 @@
-"""What a movie's pictures are like, learnt from a few of its frames before the others are measured."""
+"""Appearance of a movie (light, blur, noise), estimated from a few of its frames before the others are measured."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations
 
 import torch
@@ -14,108 +13,104 @@ from torch import Tensor
 
 from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
-from sphereorient.follow.initialise import initialise
-from sphereorient.follow.light_and_blur import LEAST_LEFT, learn_light_and_blur
+from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import LocateSettings, Shot
-from sphereorient.pose.defocus import FIRST_BLUR_PX, defocus_radii
+from sphereorient.pose.defocus import defocus_radii
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import CameraView, Fitter, Optics, Picture, unknown_light, widest_px
+from sphereorient.pose.fitter import FINEST_PX, Fitter, Optics, Picture, level_of, widest_px
+from sphereorient.pose.pixels import Pixels
 from sphereorient.search.proposer import Proposer
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.trajectory import Reason
 
 TRIED = 6  # frames
-APART_GAIN = 1.5  # cameras that leave so many times more unexplained together than alone are followed one by one
+APART_GAIN = 1.5  # cameras that leave this many times more unexplained together than alone are followed one by one
 APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
-FAR_APART_PX = 1.5  # and by more than this, one pose for all cameras is none
-FEWEST_BOTH = 4  # frames that tell what is usual between two cameras
+FAR_APART_PX = 1.5  # and by more than this, no pose fits all cameras
+FEWEST_BOTH = 4  # frames of two cameras from which their usual disagreement is measured
 TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees a ball, but not where the other does
-NO_BETTER = 0.05  # poses that explain the pictures by less more than wrong ones do are wrong as well
-TELLING = 2.0  # unless wrong ones leave so many times more unexplained, picture by picture; other maps: 1.6 at most
-ENOUGH = 1400  # pixels of each disk that are looked at: more of them have told no more
+NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses by less than this
+TELLING = 2.0  # unless wrong poses leave this many times more unexplained, picture by picture; other maps: 1.6 at most
+ENOUGH = 1400  # pixels of each disk that are used: more of them changed nothing
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
-ALWAYS = 1.0  # score from which on outlines of blurred pictures are believed: the paint is asked where the ball is
+ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the texture locates the ball
+
+FINER = 1.25  # ratio of the blurs that are tried, from FINEST_PX on
+WIDEST = 0.3  # of the radius: wider ones leave nothing of a paint that a ball can carry
+LIGHT_ROUNDS, SOFT_ROUNDS = 2, 4
+LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Appearance:
-    """Blur and light of the movies, and how well right and wrong poses explain them; made by `study`."""
+    """Light, blur and noise of movies, and how well right and wrong poses explain them."""
 
     fitter: Fitter
     score_min: float  # between right and wrong poses
     right_score: float  # typical of right poses
-    usual_apart_rad: float = math.inf  # typical angle between what two cameras by themselves say of one pose
+    usual_apart_rad: float = math.inf  # typical angle between the orientations that two cameras alone give
     together: bool = True  # whether the cameras see one ball in one place, as they do unless they were bumped
 
     def of(self, camera: int) -> Appearance:
-        """Return what was learnt of one camera."""
+        """Return the appearance in one camera."""
         return replace(self, fitter=self.fitter.of(camera))
 
     def on(self, device: torch.device) -> Appearance:
-        """Return the same with fits that are computed on another device."""
+        """Return the same, computing fits on another device."""
         return replace(self, fitter=self.fitter.on(device))
+
+    def search(self, proposers: Mapping[str, Proposer], locating: LocateSettings, candidates: int) -> Initialiser:
+        """Return what finds poses in frames of this appearance without history."""
+        return Initialiser(
+            fitter=self.fitter,
+            proposers=proposers,
+            locating=locating,
+            candidates=candidates,
+            score_min=self.clear_score,
+        )
 
     @property
     def clear_score(self) -> float:
-        """Score of a pose that explains its pictures about as well as is typical; none does of soft ones."""
+        """Score of a typical right pose; out of reach for blurred pictures."""
         optics = self.fitter.optics
         soft = defocus_radii(optics.blur_px, widest_px(self.fitter.views))
         return ALWAYS if soft else max(self.score_min, _clear_of(self.right_score))
 
 
 def estimate_appearance(
-    views: Sequence[CameraView],
-    shots: Sequence[Sequence[Shot]],
-    base: TextureTable,
-    proposers: Mapping[str, Proposer],
-    radius_mm: float,
-    locating: LocateSettings,
-    settings: RefineSettings,
-    blur_px: float = FIRST_BLUR_PX,
+    first: Initialiser, frames: Sequence[Sequence[Shot]], base: TextureTable, settings: RefineSettings
 ) -> Appearance:
-    """Learn blur and light.
+    """Estimate light, blur and noise of movies.
 
     Args:
-        views: C of them.
-        shots: n times C frames, spread over the movie.
-        base: finest table of the paint.
-        proposers: by name of view.
-        radius_mm: of the sphere.
-        locating: how outlines are found.
+        first: finds poses with the blur and the light that are assumed at first.
+        frames: n times C, spread over the movies.
+        base: finest table of the texture.
         settings: blur, if given.
-        blur_px: that is begun with otherwise.
 
     Raises:
-        ExperimentError: no frame has a pose, or none that is better than wrong ones.
+        ExperimentError: no frame has a pose, or none is better than wrong poses.
     """
-    diameter_px = widest_px(views)
-    blur_px = settings.blur_px or blur_px
-    score_min = ALWAYS if defocus_radii(blur_px, diameter_px) else 0.0
-    fitter = Fitter(
-        views=views,
-        radius_mm=radius_mm,
-        optics=Optics(base, blur_px, diameter_px),
-        light=unknown_light(views),
-    )
+    fitter = first.fitter
+    diameter_px = widest_px(fitter.views)
+    if defocus_radii(fitter.optics.blur_px, diameter_px):
+        first = replace(first, score_min=ALWAYS)
 
-    def search(seeing: Fitter, frames: Sequence[Sequence[Shot]]) -> list[Poses]:
-        ask = partial(
-            initialise, seeing, proposers, locating=locating, candidates=settings.candidates, score_min=score_min
-        )
+    def search(fitter: Fitter, frames: Sequence[Sequence[Shot]]) -> list[Poses]:
         with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
-            return list(pool.map(ask, frames))
+            return list(pool.map(replace(first, fitter=fitter).poses, frames))
 
-    found = search(fitter, shots)
-    pictures = [[shot.picture for shot in frame] for frame in shots]
+    found = search(fitter, frames)
+    pictures = [[shot.picture for shot in frame] for frame in frames]
     if not _clear(found):
         raise _nothing(found)
     gain, gap_px = _apart(fitter, pictures, found)
     looked = found
     if gain > APART_GAIN or gap_px > APART_PX:
         # A pose between what the cameras see would teach a light that is nowhere.
-        each = [search(fitter.of(k), [[frames[k]] for frames in shots]) for k in range(len(views))]
+        each = [search(fitter.of(k), [[frame[k]] for frame in frames]) for k in range(len(fitter.views))]
         frame, X, R, use = _seen_by_each(each)
         looked = [poses for of_camera in each for poses in of_camera]
     else:
@@ -123,7 +118,7 @@ def estimate_appearance(
     pixels = fitter.pixels([pictures[k] for k in frame], X, fitter.optics.fine)
     pixels = pixels.thinned(max(1, round(pixels.grey.shape[1] / ENOUGH)))
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
-    fitter, fit = learn_light_and_blur(fitter, base, pixels, fit, use, given=settings.blur_px is not None)
+    fitter, fit = _light_and_blur(fitter, base, pixels, fit, use, given=settings.blur_px is not None)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
     best, highest = _scores(looked)
@@ -154,12 +149,12 @@ def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
 
 
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
-    """Tell from a few frames whether the cameras see one ball in one place, as they do unless they were bumped.
+    """Measure on a few frames whether the cameras see one ball in one place, as they do unless one was moved.
 
     Returns:
-        By how much more is left unexplained with all cameras than by each alone, and by how many pixels the lines of
-        sight to what each sees alone miss each other; both in the worst quarter of the frames, for a bump may leave
-        the cameras in accord in one part of the volume.
+        The ratio of the variance left unexplained by all cameras together to that by each alone, and the distance
+        between the lines of sight, px; both in the worst quarter of the frames, as cameras may agree in one part of
+        the volume.
     """
     cameras = len(fitter.views)
     whole = [k for k, poses in enumerate(found) if len(poses) and bool(poses.use.all())]
@@ -193,7 +188,7 @@ Rows = tuple[list[int], Tensor, Tensor, Tensor]  # frames, places (n, 3), rotati
 
 
 def _seen_by_all(found: Sequence[Poses]) -> Rows:
-    """Return the clear poses that all cameras tell together."""
+    """Return the clear poses of all cameras together."""
     chosen = _clear(found)
     X = torch.cat([found[k].position_lab_mm[:1] for k in chosen])
     R = torch.cat([found[k].R_lab_body[:1] for k in chosen])
@@ -201,7 +196,7 @@ def _seen_by_all(found: Sequence[Poses]) -> Rows:
 
 
 def _seen_by_each(each: Sequence[Sequence[Poses]]) -> Rows:
-    """Return the clear poses that each camera tells for itself."""
+    """Return the clear poses of each camera alone."""
     rows = [(k, camera) for camera, found in enumerate(each) for k in _clear(found)]
     X = torch.stack([each[camera][k].position_lab_mm[0] for k, camera in rows])
     R = torch.stack([each[camera][k].R_lab_body[0] for k, camera in rows])
@@ -210,7 +205,7 @@ def _seen_by_each(each: Sequence[Sequence[Poses]]) -> Rows:
 
 
 def _scores(found: Sequence[Poses]) -> tuple[float, float]:
-    """Return how well the best poses typically explain clear frames, and how well wrong ones do at their best."""
+    """Return the median score of the best poses of clear frames, and the highest typical score of wrong ones."""
     clear = _clear(found)
     best = torch.cat([found[k].score[0][found[k].use] for k in clear])
     wrong = torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in clear])
@@ -218,9 +213,9 @@ def _scores(found: Sequence[Poses]) -> tuple[float, float]:
 
 
 def _times_better(found: Sequence[Poses]) -> float:
-    """Return how many times more of its pictures the second best pose of a clear frame typically leaves unexplained.
+    """Return the median ratio of the variances that the second and the best pose of a clear frame leave unexplained.
 
-    Blurred pictures are mostly disk, and any pose explains most of one; nothing but the ratio then tells.
+    Blurred pictures are mostly disk, and any pose explains most of one; only the ratio separates them.
     """
     rows = [(found[k].score[:2], found[k].use) for k in _clear(found) if len(found[k]) > 1]
     if not rows:
@@ -230,7 +225,7 @@ def _times_better(found: Sequence[Poses]) -> float:
 
 
 def _nothing(found: Sequence[Poses]) -> ExperimentError:
-    """Say what was missing in all frames: the ball, or a pose of the map that looks like it."""
+    """Word what was missing in all frames: the ball, or a pose that looks like it."""
     reasons = {str(why) for poses in found for why in poses.reason}
     got = f"none ({', '.join(sorted(reasons))})"
     if Reason.LOW_SCORE in reasons:
@@ -241,14 +236,14 @@ def _nothing(found: Sequence[Poses]) -> ExperimentError:
 
 
 def _unexplained(score: float) -> ExperimentError:
-    """Say that the best poses are no better than wrong ones: the pictures are not of this map."""
+    """Word that the best poses are no better than wrong ones: the pictures do not show this map."""
     do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
     got = f"poses that explain {100 * score:.0f} % of the pictures, as wrong ones do"
     return ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
 
 
 def _clear(found: Sequence[Poses]) -> list[int]:
-    """Frames whose best pose explains the picture about as well as in the typical frame."""
+    """Return the frames whose best pose explains the picture about as well as in the typical frame."""
     best = torch.tensor([float(poses.score[0, poses.use].min()) if len(poses) else torch.nan for poses in found])
     if torch.isnan(best).all():
         return []
@@ -258,3 +253,66 @@ def _clear(found: Sequence[Poses]) -> list[int]:
 def _clear_of(typical: float) -> float:
     """Return the score that leaves three times as much unexplained as a typical one."""
     return 1 - 3 * (1 - typical)
+
+
+def _light_and_blur(
+    fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor, *, given: bool
+) -> tuple[Fitter, FittedPoses]:
+    """Learn light, then blur, then light again; return the fitter that knows both, and its fit.
+
+    Light that was learnt with a wrong blur favours that blur: for blurred pictures they alternate several times.
+    """
+    diameter_px = widest_px(fitter.views)
+    fitter, fit = _with_light(fitter, pixels, fit, use, LIGHT_ROUNDS)
+    soft = not given and defocus_radii(fitter.optics.blur_px, diameter_px) > 0
+    for _ in range(SOFT_ROUNDS if soft else 1):
+        if not given:
+            blur_px = best_blur_px(fitter, base, pixels, fit, use)
+            fitter = replace(fitter, optics=Optics(base, blur_px, diameter_px))
+        fitter, fit = _with_light(fitter, pixels, fit, use, LIGHT_ROUNDS)
+    return fitter, fit
+
+
+def _with_light(
+    fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor, rounds: int
+) -> tuple[Fitter, FittedPoses]:
+    """Learn the light and fit again, several times."""
+    for _ in range(rounds):
+        fitter = fitter.with_light_of(pixels, fit, use)
+        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
+    return fitter, fit
+
+
+def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor) -> float:
+    """Return the blur that leaves the least variance unexplained, interpolated between the tried ones."""
+    radius_px = widest_px(fitter.views) / 2
+    left: dict[int, float] = {}
+    blurs = _blurs_tried(radius_px)
+
+    def unexplained(k: int) -> float:
+        if k not in left:
+            level = level_of(base, blurs[k], 0.0, radius_px)
+            tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 2)
+            # Of all pictures together: their curves differ in height by much and in shape by little.
+            left[k] = float((1.0 - tried.score)[use].clamp_min(LEAST_LEFT).log().mean())
+        return left[k]
+
+    # Downhill from the first guess: each table of the paint costs a tenth of a second.
+    k = min(range(len(blurs)), key=lambda k: abs(blurs[k] - fitter.optics.blur_px))
+    while True:
+        near = [n for n in (k - 1, k, k + 1) if 0 <= n < len(blurs)]
+        best = min(near, key=unexplained)
+        if best == k:
+            break
+        k = best
+    if k in (0, len(blurs) - 1):
+        return blurs[k]
+    bend = left[k - 1] - 2 * left[k] + left[k + 1]
+    shift = 0.5 * (left[k - 1] - left[k + 1]) / bend if bend > 0 else 0.0
+    return float(blurs[k] * FINER**shift)
+
+
+def _blurs_tried(radius_px: float) -> tuple[float, ...]:
+    """Return the blurs that are tried, px."""
+    steps = math.log(max(WIDEST * radius_px / FINEST_PX, FINER**7)) / math.log(FINER)
+    return tuple(FINEST_PX * FINER**k for k in range(math.ceil(steps) + 1))

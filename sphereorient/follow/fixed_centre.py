@@ -1,24 +1,20 @@
-"""The one place of a ball that turns in it, told by a few frames: all frames are then measured there."""
+"""The fixed centre of a ball that turns in one place, from a few frames; all frames are then measured there."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.follow.appearance import Appearance
-from sphereorient.follow.initialise import initialise
-from sphereorient.follow.settings import RefineSettings
-from sphereorient.locate import LocateSettings, Shot
+from sphereorient.follow.initialise import Initialiser
+from sphereorient.locate import Shot
 from sphereorient.pose.fit import EDGE_PX
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
-from sphereorient.search.proposer import Proposer
 
 ROUNDS = 10  # of robust weights
 USUAL = 2.366  # median of chi squared with three degrees of freedom
@@ -31,61 +27,47 @@ ITERATIONS = 3  # of the fits that tell the place: they begin where a search has
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FixedCentre:
-    """Where a ball is in all frames; made by `find_fixed_centre`, read by the tracker."""
+    """Centre of a ball in all frames; made by `find_fixed_centre`."""
 
     position_lab_mm: Tensor  # (3,) float64
     covariance_mm2: Tensor  # (3, 3), of its error, which is one and the same in all frames
-    follows_rad_mm: Tensor  # (3, 3), by what delta, lab, attitudes err where the place does: the mean over frames
+    follows_rad_mm: Tensor  # (3, 3), error of the orientation, delta lab, per error of the centre: mean over frames
 
     @property
     def precision(self) -> Tensor:
-        """What holds fits there, (3, 3), 1/mm^2: they may not go to FIRM of the error, whatever a frame says."""
+        """Precision (3, 3), 1/mm^2, that holds fits at the centre to FIRM of its error."""
         inverse: Tensor = torch.linalg.inv(FIRM**2 * self.covariance_mm2)
         return inverse
 
     def with_error(self, covariance: Tensor) -> Tensor:
-        """Return covariances (..., 6, 6) of poses held here, of delta (rad) and place (mm), with the place's own error.
-
-        A fit with `precision` takes the place for known.
-        """
+        """Add the centre's own error to covariances (..., 6, 6) of delta (rad) and position (mm) of poses held here."""
         follows = torch.cat([self.follows_rad_mm, torch.eye(3, dtype=self.follows_rad_mm.dtype)])
         whole: Tensor = covariance + follows @ self.covariance_mm2 @ follows.mT
         return whole
 
 
-def find_fixed_centre(
-    learnt: Appearance,
-    proposers: Mapping[str, Proposer],
-    shots: Sequence[Sequence[Shot]],
-    locating: LocateSettings,
-    settings: RefineSettings,
-) -> FixedCentre | None:
-    """Find the place of a ball that turns in it.
+def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Shot]], score_min: float) -> FixedCentre | None:
+    """Find the centre of a ball that turns in one place.
 
     Args:
-        learnt: blur, light and scores of the movies.
-        proposers: by name of view.
-        shots: n times C frames, spread over the movie.
-        locating: how outlines are found.
-        settings: candidates.
+        search: finds poses of single frames.
+        frames: n times C, spread over the movie.
+        score_min: of poses that are used.
 
     Returns:
-        The place; None where no frame has a pose that all of its pictures bear out.
+        The centre; None where no frame has a pose that all of its pictures support.
     """
-    fitter = learnt.fitter
-    ask = partial(
-        initialise, fitter, proposers, locating=locating, candidates=settings.candidates, score_min=learnt.clear_score
-    )
+    fitter = search.fitter
     with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
-        found = list(pool.map(ask, shots))
-    rows = [k for k, one in enumerate(found) if len(one) and bool((one.score[0, one.use] >= learnt.score_min).all())]
+        found = list(pool.map(search.poses, frames))
+    rows = [k for k, one in enumerate(found) if len(one) and bool((one.score[0, one.use] >= score_min).all())]
     if not rows:
         return None
     X = torch.cat([found[k].position_lab_mm[:1] for k in rows])
     R = torch.cat([found[k].R_lab_body[:1] for k in rows])
     use = torch.stack([found[k].use for k in rows])
     fine = fitter.optics.fine
-    pixels = fitter.pixels([[shot.picture for shot in shots[k]] for k in rows], X, fine)
+    pixels = fitter.pixels([[shot.picture for shot in frames[k]] for k in rows], X, fine)
     fit = fitter.fit(pixels, X, R, use, fine, ITERATIONS)
     place, covariance = mean_place(fit.position_lab_mm, fit.covariance[:, 3:, 3:])
     return FixedCentre(
@@ -96,10 +78,7 @@ def find_fixed_centre(
 
 
 def _follows(fitter: Fitter, pixels: Pixels, place: Tensor, R: Tensor, use: Tensor) -> Tensor:
-    """Return how attitudes (n, 3, 3) follow the place where they are held, (3, 3), rad/mm: by trying.
-
-    If the ball is beside the place where it is held, the true attitude is the one that is found there.
-    """
+    """Return the derivative (3, 3), rad/mm, of held orientations (n, 3, 3) by the centre, by finite differences."""
     aside = ASIDE * fitter.radius_mm * torch.eye(3, dtype=torch.float64)
     beyond_doubt = torch.eye(3, dtype=torch.float64).expand(len(R), 3, 3) / (FIRM**2 * ASIDE * fitter.radius_mm) ** 2
 
@@ -112,15 +91,14 @@ def _follows(fitter: Fitter, pixels: Pixels, place: Tensor, R: Tensor, use: Tens
 
 
 def mean_place(position_lab_mm: Tensor, covariance_mm2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the place that all of some measurements mean; those far off the others hardly count.
+    """Return the robust mean of positions; outliers hardly count.
 
     Args:
-        position_lab_mm: (n, 3), each measured by itself, n >= 1.
+        position_lab_mm: (n, 3), independent, n >= 1.
         covariance_mm2: (n, 3, 3), of them.
 
     Returns:
-        The place (3,) and its covariance (3, 3): that of the weighted mean, wider where the measurements scatter by
-        more than theirs say.
+        The mean (3,) and its covariance (3, 3), wider where the measurements scatter more than their covariances.
     """
     X, precision = position_lab_mm.double(), torch.linalg.inv(covariance_mm2.double())
     place, weight, away = X.median(0).values, X.new_ones(len(X)), X.new_zeros(len(X))
@@ -137,10 +115,9 @@ def mean_place(position_lab_mm: Tensor, covariance_mm2: Tensor) -> tuple[Tensor,
 
 
 def _edge(fitter: Fitter, position_lab_mm: Tensor) -> Tensor:
-    """Return the covariance (3, 3), mm^2, of what moves the ball in all frames alike, however many there are.
+    """Return the covariance (3, 3), mm^2, of errors that all frames share.
 
-    The limb that light and blur make may lie EDGE_PX off to a side; and all around, which is distance where one camera
-    tells that by the disk's size alone.
+    The modelled limb may lie EDGE_PX off to one side, or all around; with one camera the latter is a distance.
     """
     radius_px = torch.stack([view.radius_px(position_lab_mm, fitter.radius_mm) for view in fitter.views])
     aside = EDGE_PX * fitter.radius_mm / float(radius_px.min())

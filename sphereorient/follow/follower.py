@@ -12,7 +12,7 @@ from sphereorient.experiment.stream import spread_frames
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.per_camera import PerCameraTracker
 from sphereorient.follow.poses import Poses
-from sphereorient.follow.tracker import BlockTracker
+from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.locate import Shot, screened_frames
 from sphereorient.pose import CameraView
 
@@ -36,12 +36,12 @@ class Follower:
 
     recording: Recording
     appearance: Appearance
-    tracker: BlockTracker | PerCameraTracker
+    tracker: ChunkTracker | PerCameraTracker
 
     @property
     def batches(self) -> list[Batch]:
         """The batches of the whole recording; frame numbers alone decide which frames they hold."""
-        lengths = self.tracker.windows(self.recording.frames)
+        lengths = self.tracker.batches(self.recording.frames)
         ends = list(accumulate(sum(batch) for batch in lengths))
         return [
             Batch(first=end - sum(batch), last=end, lengths=tuple(batch))

@@ -1,53 +1,51 @@
-"""Cameras that do not fit together, bumped ones say: each follows the ball by itself, and all that they say is kept."""
+"""Cameras that disagree, say after one was moved: each follows the ball alone, and the results of all are kept."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.follow.appearance import Appearance
+from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.follow.settings import RefineSettings
-from sphereorient.follow.tracker import BlockTracker
-from sphereorient.locate import LocateSettings, Shot
-from sphereorient.search.proposer import Proposer
+from sphereorient.follow.tracker import ChunkTracker
+from sphereorient.locate import Shot
 from sphereorient.trajectory import Reason
 
 
 class PerCameraTracker:
-    """Follows the ball as each camera sees it; the first that sees it gives the pose, the others contradict.
+    """Follows the ball in each camera alone; the first that sees it gives the pose, the others contradict.
 
     Args:
-        learnt: blur, light and scores of the movies.
-        proposers: by name of view.
-        locating: how outlines are found.
-        settings: blocks and lanes.
+        appearance: of the movies.
+        search: finds poses without history.
+        settings: lengths of chunks and batches.
     """
 
-    def __init__(
-        self, learnt: Appearance, proposers: Mapping[str, Proposer], locating: LocateSettings, settings: RefineSettings
-    ) -> None:
-        count = len(learnt.fitter.views)
-        self.trackers = [BlockTracker(learnt.of(k), proposers, locating, settings) for k in range(count)]
+    def __init__(self, appearance: Appearance, search: Initialiser, settings: RefineSettings) -> None:
+        self.search = search
+        count = len(appearance.fitter.views)
+        self.trackers = [ChunkTracker(appearance.of(k), search, settings) for k in range(count)]
 
-    def windows(self, frames: range) -> list[list[int]]:
-        """Return the lengths of the blocks that are followed side by side; see `BlockTracker`."""
-        return self.trackers[0].windows(frames)
+    def batches(self, frames: range) -> list[list[int]]:
+        """Return the lengths of the chunks of each batch; see `ChunkTracker`."""
+        return self.trackers[0].batches(frames)
 
-    def track(self, shots: Sequence[Sequence[Shot]], window: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
-        """Follow the blocks of one window; see `BlockTracker`."""
-        each = [tracker.track([movie], window, time_s) for tracker, movie in zip(self.trackers, shots, strict=True)]
+    def track(self, shots: Sequence[Sequence[Shot]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
+        """Follow the chunks of one batch; see `ChunkTracker`."""
+        each = [tracker.track([movie], batch, time_s) for tracker, movie in zip(self.trackers, shots, strict=True)]
         yield from (cameras_disagree(poses) for poses in zip(*each, strict=True))
 
 
 def cameras_disagree(alone: Sequence[Poses]) -> Poses:
-    """Return one frame's poses of the first camera that sees the ball, with what the others say for themselves.
+    """Return one frame's poses of the first camera that sees the ball, with what the others alone give.
 
     Args:
-        alone: C records, each of one camera by itself.
+        alone: C records, each of one camera.
     """
     reasons = [poses.reason[0] for poses in alone]
     seeing = [k for k, poses in enumerate(alone) if len(poses) and bool(poses.use.any())]
@@ -65,9 +63,16 @@ def cameras_disagree(alone: Sequence[Poses]) -> Poses:
         own[name][:, seeing[0]] = getattr(main, name)[:, 0]
     use = torch.zeros(len(alone), dtype=torch.bool)
     use[seeing[0]] = True
-    told = [Reason.CONTRADICTS if k in seeing[1:] else why for k, why in enumerate(reasons)]
+    reasons = [Reason.CONTRADICTS if k in seeing[1:] else why for k, why in enumerate(reasons)]
     return Poses(
-        position_lab_mm=X, R_lab_body=R, covariance=main.covariance, nll=main.nll, use=use, reason=tuple(told), **own
+        position_lab_mm=X,
+        R_lab_body=R,
+        covariance=main.covariance,
+        nll=main.nll,
+        step=main.step,
+        use=use,
+        reason=tuple(reasons),
+        **own,
     )
 
 

@@ -29,9 +29,9 @@ def poses_of(fit: FittedPoses, chosen: Tensor, use: Tensor, reason: Sequence[Rea
     return Poses(**{name: part[chosen] for name, part in fit.parts().items()}, use=use, reason=tuple(reason))
 
 
-def no_pose(cameras: int, reason: Sequence[Reason]) -> Poses:
+def no_pose(cameras: int, reason: Sequence[Reason], use: Tensor | None = None) -> Poses:
     """Return a frame without any pose."""
-    use = torch.zeros(cameras, dtype=torch.bool)
+    use = torch.zeros(cameras, dtype=torch.bool) if use is None else use
     return Poses(**blank_parts(cameras, 0), use=use, reason=tuple(reason))
 
 

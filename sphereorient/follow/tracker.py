@@ -1,4 +1,4 @@
-"""Poses of all frames: a full search where a block of frames begins, then each frame from the one before it."""
+"""Poses of all frames: a full search at the first frame of a chunk, then each frame from the ones before it."""
 
 from __future__ import annotations
 
@@ -13,49 +13,48 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.fixed_centre import FixedCentre
-from sphereorient.follow.initialise import explaining_first, initialise
+from sphereorient.follow.initialise import Initialiser, explaining_first
 from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.follow.settings import RefineSettings
-from sphereorient.locate import LocateSettings, Shot
+from sphereorient.locate import Shot
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Fitter, Picture, PyramidLevel
-from sphereorient.search.proposer import Proposer
 from sphereorient.trajectory import Reason
 
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
 NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
 FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
 LONG_STEP = 3.0  # times the step before: after a longer one the motion before says little
-CONTRADICTS_USUAL = 4.0  # times as far apart as the cameras' own turns usually are, and
-CONTRADICTS_SIGMAS = 2.8  # of these turns, wider where a bubble hides much: then they look at different instants
+CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
+CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
 AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
-MOVE_SHARE = 0.3  # of the radius: how far the ball may have moved where nothing is known of its motion
-ASTRAY_SHARE = 0.01  # of the radius: how far a place may be from where three frames say it is
+MOVE_SHARE = 0.3  # of the radius: how far the ball may have moved where its motion is unknown
+ASTRAY_SHARE = 0.01  # of the radius: how far a place may be from the extrapolation of three frames
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Expected:
-    """What a frame's predecessors say of it."""
+    """What a frame's predecessors predict."""
 
     position_lab_mm: Tensor  # (3,)
     R_lab_body: Tensor  # (3, 3)
     use: Tensor  # (C,) bool, cameras that saw the ball
     reason: tuple[Reason, ...]  # C, why the others did not
     place_precision: Tensor  # (3, 3), 1/mm^2
-    rough: bool = False  # from one predecessor alone: nothing is known of the motion
+    rough: bool = False  # from one predecessor alone: the motion is unknown
 
 
 @dataclass(eq=False)
-class _Lane:
-    """One block on its way: the last poses, in the order of their frames."""
+class _Chunk:
+    """One chunk in progress, with its last poses."""
 
     first: int
     last: int  # + 1
-    time_s: Sequence[float]  # of the window's frames
+    time_s: Sequence[float]  # of the batch's frames
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
 
     def expected(self, frame: int, radius_mm: float) -> _Expected | None:
-        """Place and turn go on, their change too where three frames tell it."""
+        """Extrapolate position and rotation, to second order where three frames are known."""
         rows = [poses for number, poses in self.past if number >= frame - len(self.past)]
         numbers = [number for number, _ in self.past]
         if not rows or numbers[-1] != frame - 1:
@@ -91,7 +90,7 @@ class _Lane:
         )
 
     def _beside(self, last: Poses, reason: tuple[Reason, ...], radius_mm: float) -> _Expected:
-        """Near the last pose, the motion being unknown."""
+        """Predict the last pose, the motion being unknown."""
         spread = last.covariance[0, 3:, 3:] + (MOVE_SHARE * radius_mm) ** 2 * torch.eye(3, dtype=torch.float64)
         return _Expected(
             position_lab_mm=last.position_lab_mm[0],
@@ -103,93 +102,87 @@ class _Lane:
         )
 
     def saw(self, frame: int, poses: Poses) -> None:
-        """Remember the best pose of a frame, if a picture bears it out."""
+        """Remember the best pose of a frame, if a picture supports it."""
         if len(poses) and bool(poses.use.any()):
             self.past.append((frame, poses))
 
 
-class BlockTracker:
-    """Follows the ball through blocks of frames, each block by itself.
+class ChunkTracker:
+    """Follows the ball through chunks of frames, each chunk by itself.
 
-    A block begins with a search that knows nothing, and ends with its last frame: where blocks begin is a matter of
-    frame numbers alone, so no chunk, worker or restart can change a result, and a pose gone wrong ends there at last.
+    A chunk begins with a search without history. Frame numbers alone decide where chunks begin: no batch, worker or
+    restart can change a result, and a pose gone wrong is lost with its chunk.
 
     Args:
-        learnt: blur, light and scores of the movies.
-        proposers: by name of view.
-        locating: how outlines are found.
-        settings: blocks and lanes.
-        place: of a ball that turns in it, with its error; None: each frame tells its own.
+        appearance: of the movies.
+        search: finds poses without history.
+        settings: lengths of chunks and batches.
+        centre: of a ball that turns in one place; None: each frame gives its own.
     """
 
     def __init__(
-        self,
-        learnt: Appearance,
-        proposers: Mapping[str, Proposer],
-        locating: LocateSettings,
-        settings: RefineSettings,
-        place: FixedCentre | None = None,
+        self, appearance: Appearance, search: Initialiser, settings: RefineSettings, centre: FixedCentre | None = None
     ) -> None:
-        self.fitter: Fitter = learnt.fitter
-        self.score_min = learnt.score_min
-        self.clear_score = learnt.clear_score
-        self.usual_apart_rad = learnt.usual_apart_rad
-        self.proposers = proposers
-        self.locating = locating
+        self.fitter: Fitter = appearance.fitter
+        self.search = replace(search, fitter=appearance.fitter, score_min=appearance.clear_score)
+        self.score_min = appearance.score_min
+        self.usual_apart_rad = appearance.usual_apart_rad
         self.settings = settings
-        self.place = place
+        self.centre = centre
 
-    def windows(self, frames: range) -> list[list[int]]:
-        """Return the lengths of the blocks that are followed side by side, window by window.
+    def batches(self, frames: range) -> list[list[int]]:
+        """Return the lengths of the chunks of each batch; multiples of the setting `chunk_frames` begin a chunk.
 
         Args:
-            frames: the experiment's frame numbers; those that are multiples of the setting begin a block.
+            frames: the experiment's frame numbers.
         """
         length = self.settings.chunk_frames
         firsts = [frames.start, *range((frames.start // length + 1) * length, frames.stop, length)] if frames else []
         lengths = [last - first for first, last in pairwise([*firsts, frames.stop])]
         return [lengths[k : k + self.settings.chunks] for k in range(0, len(lengths), self.settings.chunks)]
 
-    def track(self, shots: Sequence[Sequence[Shot]], window: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
-        """Follow the blocks of one window.
+    def track(self, shots: Sequence[Sequence[Shot]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
+        """Follow the chunks of one batch.
 
         Args:
-            shots: of each view, the frames of these blocks in order.
-            window: lengths of the blocks.
+            shots: of each view, the frames of these chunks in order.
+            batch: lengths of the chunks.
             time_s: of the same frames.
 
         Yields:
             The poses of each frame, in order.
         """
-        firsts = list(accumulate([0, *window[:-1]]))
-        lanes = [_Lane(first, first + length, time_s) for first, length in zip(firsts, window, strict=True)]
+        firsts = list(accumulate([0, *batch[:-1]]))
+        chunks = [_Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
         found: dict[int, Poses] = {}
-        for k in range(max(window)):
-            now = [lane for lane in lanes if lane.first + k < lane.last]
-            frames = {lane.first: [movie[lane.first + k] for movie in shots] for lane in now}
-            for lane, poses in zip(now, self._step(now, k, frames), strict=True):
-                lane.saw(lane.first + k, poses)
-                found[lane.first + k] = poses
-        yield from (found[k] for k in range(sum(window)))
+        for k in range(max(batch)):
+            now = [chunk for chunk in chunks if chunk.first + k < chunk.last]
+            frames = {chunk.first: [movie[chunk.first + k] for movie in shots] for chunk in now}
+            for chunk, poses in zip(now, self._step(now, k, frames), strict=True):
+                chunk.saw(chunk.first + k, poses)
+                found[chunk.first + k] = poses
+        yield from (found[k] for k in range(sum(batch)))
 
-    def _step(self, lanes: Sequence[_Lane], k: int, frames: Mapping[int, Sequence[Shot]]) -> Iterator[Poses]:
-        """Measure one frame of each lane: predicted where that holds, searched for where not."""
-        expected = {lane.first: self._in_place(lane.expected(lane.first + k, self.fitter.radius_mm)) for lane in lanes}
+    def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Shot]]) -> Iterator[Poses]:
+        """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
+        expected = {
+            chunk.first: self._in_place(chunk.expected(chunk.first + k, self.fitter.radius_mm)) for chunk in chunks
+        }
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
         followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
-        for lane in lanes:
-            poses = followed.get(lane.first)
-            poses = self._search(frames[lane.first]) if poses is None else poses
-            yield poses if self.place is None else replace(poses, covariance=self.place.with_error(poses.covariance))
+        for chunk in chunks:
+            poses = followed.get(chunk.first)
+            poses = self._search(frames[chunk.first]) if poses is None else poses
+            yield poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
 
     def _in_place(self, expected: _Expected | None) -> _Expected | None:
-        """Return what is expected, the place as it is known of all frames where it is."""
-        if expected is None or self.place is None:
+        """Return the prediction, at the fixed centre where there is one."""
+        if expected is None or self.centre is None:
             return expected
-        return replace(expected, position_lab_mm=self.place.position_lab_mm, place_precision=self.place.precision)
+        return replace(expected, position_lab_mm=self.centre.position_lab_mm, place_precision=self.centre.precision)
 
     def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Shot]]) -> list[Poses | None]:
-        """Fit expected poses, all in one batch of fixed size; None where the pictures do not bear one out."""
+        """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
         if not expected:
             return []
         asked, missing = len(expected), self.settings.chunks - len(expected)
@@ -204,43 +197,43 @@ class BlockTracker:
         if any(one.rough for one in expected):
             X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
         fit = self._fitted(frames, X, R, use, precision)
-        good = first = self._borne_out(fit, use)
+        good = first = self._supported(fit, use)
         within = self.fitter.largest_px(X) <= self.fitter.widest_px  # others are searched for, frame by frame
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
         alone: list[FittedPoses] = []
         if not bool((good | ~within).all()):
-            # One picture without the ball spoils what all say together: each camera by itself; of two that say
-            # different things the one that the frames before bear out counts.
+            # One picture without the ball spoils the joint fit: try each camera alone; of two that disagree the one
+            # nearer to the prediction counts.
             alone = [self._fitted(frames, X, R, _only(usable, k), precision) for k in range(use.shape[1])]
-            told = [self._borne_out(one, _only(usable, k)) for k, one in enumerate(alone)]
+            supported = [self._supported(one, _only(usable, k)) for k, one in enumerate(alone)]
             astray = [
                 torch.where(right, so3.geodesic_distance(one.R_lab_body, R), torch.inf)
-                for one, right in zip(alone, told, strict=True)
+                for one, right in zip(alone, supported, strict=True)
             ]
             nearest, which = torch.stack(astray).min(0)
             for k, one in enumerate(alone):
                 chosen = ~good & torch.isfinite(nearest) & (which == k)
                 fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, k), use)
             good = good | torch.isfinite(nearest)
-        # What is told of another camera only where this frame itself asks: it must not depend on those beside it.
+        # Another camera is judged only where this frame itself asks: results must not depend on the batch.
         doubtful = ~first | before.any(1)
         if bool((usable & ~use).any()):
-            # A camera that was blind may see again: that shows at the pose which all of them give together.
+            # A camera that was blind may see again: that shows at the joint pose.
             both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, usable, precision)
             unused = good & (usable & ~use).any(1)
             limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
             contradicts = self._contradictory(both, usable, limit)
-            back = unused & self._borne_out(both, usable) & ~contradicts
+            back = unused & self._supported(both, usable) & ~contradicts
             doubtful = doubtful | (unused & contradicts)
             fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
         others = (good & doubtful)[:, None] & usable & ~use
         for k in range(use.shape[1] if bool(others.any()) else 0):
             one = alone[k] if alone else self._fitted(frames, X, R, _only(usable, k), precision)
-            others[:, k] &= self._borne_out(one, _only(usable, k))
+            others[:, k] &= self._supported(one, _only(usable, k))
             fit = _beside(fit, one, others[:, k], k)
         reasons = [
-            [_reason(*of_camera) for of_camera in zip(used, told_too, row, one.reason, strict=True)]
-            for used, told_too, row, one in zip(use.tolist(), others.tolist(), shots, expected, strict=True)
+            [_reason(*of_camera) for of_camera in zip(used, contradicts, row, one.reason, strict=True)]
+            for used, contradicts, row, one in zip(use.tolist(), others.tolist(), shots, expected, strict=True)
         ]
         good = good & within
         return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if good[n] else None for n in range(asked)]
@@ -265,9 +258,9 @@ class BlockTracker:
     def _fitted(
         self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor
     ) -> FittedPoses:
-        """Fit poses that are about right: to some of the pixels, longer where that moves them, and then to all."""
-        if self.place is None:
-            # With all cameras the pictures tell the place; with one of two its distance is better known from before.
+        """Fit poses that are about right: to some pixels, longer where that moves them, then to all."""
+        if self.centre is None:
+            # All cameras together give the place; one of two gives a distance that is known better from before.
             precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
         fine, widest = self.fitter.optics.fine, self.fitter.widest_px
         pixels = self.fitter.pixels(frames, X, fine, widest)
@@ -287,28 +280,25 @@ class BlockTracker:
         return fit
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
-        """Return where a further fit begins: where the last one ended (B, 3), or where the ball is in all frames.
-
-        What is known beforehand is of that one place: a fit that began beside it would take that for known.
-        """
-        return position_lab_mm if self.place is None else self.place.position_lab_mm.expand_as(position_lab_mm)
+        """Return where a further fit begins, (B, 3): where the last one ended, or at the fixed centre."""
+        return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
 
     def _far(self, fit: FittedPoses, use: Tensor) -> Tensor:
-        """Fits whose last step was so long that another one is wanted, (B,) bool."""
+        """Return which fits need another step, (B,) bool."""
         turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
-        # One camera's distances scatter; what shows in its picture shows in the turn as well.
+        # One camera's distances scatter; a change of its picture shows in the rotation as well.
         far: Tensor = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * self.fitter.radius_mm))
         return far
 
-    def _borne_out(self, fit: FittedPoses, use: Tensor) -> Tensor:
-        """Poses that have arrived and that all pictures in use explain well, (B,) bool."""
+    def _supported(self, fit: FittedPoses, use: Tensor) -> Tensor:
+        """Return which poses have converged and explain all pictures in use well, (B,) bool."""
         explained = (fit.score >= self.score_min) | ~use
         arrived = fit.step[:, :3].norm(dim=-1) < ARRIVED_RAD
         good: Tensor = use.any(1) & explained.all(1) & arrived & ~self._contradictory(fit, use)
         return good
 
     def _contradictory(self, said: FittedPoses | Poses, use: Tensor, limit: Tensor | float = 1.0) -> Tensor:
-        """Poses of which two cameras say different things, (B,) bool: their pictures are not of one instant."""
+        """Return for which poses two cameras disagree, (B,) bool: their pictures are not of one instant."""
         wrong = torch.zeros(len(use), dtype=torch.bool)
         for k, m in combinations(range(use.shape[1]), 2):
             apart = said.own_turn[:, k] - said.own_turn[:, m]
@@ -319,16 +309,13 @@ class BlockTracker:
         return wrong
 
     def _search(self, shots: Sequence[Shot]) -> Poses:
-        """Find the poses of a frame of which nothing is known, by those cameras whose pictures bear them out."""
-        count = self.settings.candidates
-        poses = initialise(
-            self.fitter, self.proposers, shots, self.locating, candidates=count, score_min=self.clear_score
-        )
+        """Find the poses of a frame without history, with those cameras whose pictures support them."""
+        poses = self.search.poses(shots)
         if not len(poses):
             return poses
         frames, usable = [shot.picture for shot in shots], torch.tensor([shot.usable for shot in shots])
-        if self.place is not None:
-            poses = self._moved_there(poses, frames)
+        if self.centre is not None:
+            poses = self._at_centre(poses, frames)
         if bool((usable & ~poses.use).any()):
             poses = self._all_seeing(poses, frames, usable)
         seen = poses.use & (poses.score[0] >= self.score_min)
@@ -339,7 +326,7 @@ class BlockTracker:
         if bool(self._contradictory(poses, seen.expand(len(poses), -1))[0]):
             return self._by_each(poses, frames, seen)
         if bool((seen == poses.use).all()) or not bool(seen.any()):
-            # Nothing is thrown away where no camera is sure: the path decides.
+            # Keep all where no camera is sure: the path decides.
             return replace(poses, use=seen, reason=tuple(reason))
         X, R = poses.position_lab_mm, poses.R_lab_body
         fit = self._looked_at(frames, X, R, seen.expand(len(poses), -1), self.fitter.optics.fine, 4)
@@ -348,14 +335,14 @@ class BlockTracker:
     def _looked_at(
         self, frames: Sequence[Picture], X: Tensor, R: Tensor, use: Tensor, level: PyramidLevel, iterations: int
     ) -> FittedPoses:
-        """Fit poses to one frame, of which no other frame tells but where the ball is in all of them."""
+        """Fit poses to one frame, at the fixed centre where there is one."""
         X = self._from(X)
         pixels = self.fitter.pixels([frames] * len(X), X, level)
-        known = None if self.place is None else self.place.precision.expand(len(X), 3, 3)
+        known = None if self.centre is None else self.centre.precision.expand(len(X), 3, 3)
         return self.fitter.fit(pixels, X, R, use, level, iterations, known)
 
-    def _moved_there(self, poses: Poses, frames: Sequence[Picture]) -> Poses:
-        """Fit poses again where the ball is in all frames."""
+    def _at_centre(self, poses: Poses, frames: Sequence[Picture]) -> Poses:
+        """Fit poses again at the fixed centre."""
         R, optics = poses.R_lab_body, self.fitter.optics
         for level, iterations in ((optics.middle, 3), (optics.fine, 4)):
             fit = self._looked_at(frames, poses.position_lab_mm, R, poses.use.expand(len(R), -1), level, iterations)
@@ -364,11 +351,11 @@ class BlockTracker:
         return poses_of(fit, order, poses.use, poses.reason)
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
-        """Fit poses to each camera's picture alone; the first that bears one out counts, the others contradict."""
+        """Fit poses to each camera's picture alone; the first that supports one counts, the others contradict."""
         X, R, fine = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics.fine
         each = seen.expand(len(poses), -1)
         alone = [self._looked_at(frames, X, R, _only(each, k), fine, 4) for k in range(len(seen))]
-        right = [bool(seen[k]) and bool(self._borne_out(one, _only(each, k))[0]) for k, one in enumerate(alone)]
+        right = [bool(seen[k]) and bool(self._supported(one, _only(each, k))[0]) for k, one in enumerate(alone)]
         if not any(right):
             return poses
         main = right.index(True)
@@ -382,14 +369,14 @@ class BlockTracker:
         return poses_of(fit, fit.nll.argsort(stable=True), _only(each, main)[0], reason)
 
     def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
-        """Fit poses to all pictures, where that explains all: a disk without an outline may still be there."""
+        """Fit poses to all pictures, kept if that explains all: a disk without an outline may still be there."""
         X, R, optics = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics
         every = usable.expand(len(poses), -1)
         for level, iterations in ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)):
             fit = self._looked_at(frames, X, R, every, level, iterations)
             X, R = fit.position_lab_mm, fit.R_lab_body
         order = fit.nll.argsort(stable=True)
-        if not bool(self._borne_out(fit, every)[order[0]]):
+        if not bool(self._supported(fit, every)[order[0]]):
             return poses
         return poses_of(
             fit, order, usable, [Reason.OK if ok else why for ok, why in zip(usable, poses.reason, strict=True)]
@@ -397,14 +384,14 @@ class BlockTracker:
 
 
 def _only(usable: Tensor, camera: int) -> Tensor:
-    """Leave one camera of those usable (B, C)."""
+    """Return the mask (B, C) of one usable camera."""
     only = torch.zeros_like(usable)
     only[:, camera] = usable[:, camera]
     return only
 
 
 def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> FittedPoses:
-    """Put what a camera says by itself beside poses (B,) that it has no part in."""
+    """Record what a camera alone gives beside poses (B,) that it did not contribute to."""
     if not bool(rows.any()):
         return fit
     own = {
@@ -419,7 +406,7 @@ def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> 
 
 
 def _reason(used: bool, contradicts: bool, shot: Shot, before: Reason) -> Reason:
-    """Say why a camera does not count: its picture is none, it says something else, or it was blind before."""
+    """Return why a camera does not count: no picture, it contradicts, or it was blind before."""
     if used:
         return Reason.OK
     if contradicts:

@@ -118,7 +118,7 @@ BLIND = (Reason.UNDECODABLE, Reason.MISSING, Reason.REPEATED, Reason.DARK, Reaso
 
 
 def in_the_lab(proposals: Proposals, camera: Camera, centre_px: Tensor) -> Candidates:
-    """Turn orientations from the view frame of each frame into the lab, the perspective removed (ERRATA A1).
+    """Turn orientations from the view frame of each frame into the lab, the perspective removed (docs/errata.md A1).
 
     Args:
         proposals: of N frames.

@@ -10,15 +10,16 @@ from sphereorient.experiment.recording import Progress
 from sphereorient.follow.appearance import Appearance, estimate_appearance
 from sphereorient.follow.fixed_centre import find_fixed_centre
 from sphereorient.follow.follower import Follower, sample_frames
+from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.per_camera import PerCameraTracker
 from sphereorient.follow.poses import Poses, joined_tables, pose_table
-from sphereorient.follow.tracker import BlockTracker
+from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.methods import results
 from sphereorient.methods.learnt import Learnt, with_motion
 from sphereorient.methods.method import Job, Method
 from sphereorient.methods.proposers import BlurMatchedSearch, open_views
 from sphereorient.pose.defocus import FIRST_BLUR_PX, defocus_radii, estimate_blur_px
-from sphereorient.pose.fitter import widest_px
+from sphereorient.pose.fitter import first_fitter, widest_px
 from sphereorient.trajectory import Trajectory
 
 
@@ -26,22 +27,19 @@ def learn(job: Job, progress: Progress) -> Follower:
     """Estimate backgrounds, blur, light and noise from frames spread over the movies."""
     recording, settings = job.recording, job.settings
     opened = open_views(recording, settings, progress)
-    progress("study", 0, 1)
+    progress("appearance", 0, 1)
     frames = sample_frames(recording, opened.views, settings.refine.appearance_frames)
     # Only blurred pictures need templates that are blurred as well; sharp ones share one first guess.
     seen_px = settings.refine.blur_px or estimate_blur_px(opened.views, frames, settings.locate)
     blur_px = seen_px if defocus_radii(seen_px, opened.search.diameter_px) else FIRST_BLUR_PX
-    appearance = estimate_appearance(
-        opened.views,
-        frames,
-        opened.base,
-        opened.search.by_camera(opened.views, blur_px),
-        recording.radius_mm,
-        settings.locate,
-        settings.refine,
-        blur_px,
+    first = Initialiser(
+        fitter=first_fitter(opened.views, recording.radius_mm, opened.base, blur_px),
+        proposers=opened.search.by_camera(opened.views, blur_px),
+        locating=settings.locate,
+        candidates=settings.refine.candidates,
     )
-    progress("study", 1, 1)
+    appearance = estimate_appearance(first, frames, opened.base, settings.refine)
+    progress("appearance", 1, 1)
     return follower(job, appearance, opened.search)
 
 
@@ -56,15 +54,16 @@ def follower(job: Job, appearance: Appearance, search: BlurMatchedSearch) -> Fol
     """Choose how frames are followed: all cameras together, or one by one where they disagree."""
     settings, views = job.settings, appearance.fitter.views
     proposers = search.by_camera(views, appearance.fitter.optics.blur_px)
-    tracker: BlockTracker | PerCameraTracker
+    begin = appearance.search(proposers, settings.locate, settings.refine.candidates)
+    tracker: ChunkTracker | PerCameraTracker
     if appearance.together:
         centre = None
         if job.recording.experiment.fixed:
             frames = sample_frames(job.recording, views, settings.refine.appearance_frames)
-            centre = find_fixed_centre(appearance, proposers, frames, settings.locate, settings.refine)
-        tracker = BlockTracker(appearance.on(job.device), proposers, settings.locate, settings.refine, centre)
+            centre = find_fixed_centre(begin, frames, appearance.score_min)
+        tracker = ChunkTracker(appearance.on(job.device), begin, settings.refine, centre)
     else:
-        tracker = PerCameraTracker(appearance.on(job.device), proposers, settings.locate, settings.refine)
+        tracker = PerCameraTracker(appearance.on(job.device), begin, settings.refine)
     return Follower(recording=job.recording, appearance=appearance, tracker=tracker)
 
 

@@ -216,3 +216,9 @@ class Fitter:
 def base_table(texture: Tensor, diameter_px: float) -> TextureTable:
     """Return the finest table of a map that disks of some diameter can tell, from which all others are blurred."""
     return texture_table(texture, max(BASE_RAD, FINEST_PX * 2 / diameter_px))
+
+
+def first_fitter(views: Sequence[CameraView], radius_mm: float, base: TextureTable, blur_px: float) -> Fitter:
+    """Return a fitter with an assumed blur, and flat light."""
+    optics = Optics(base, blur_px, widest_px(views))
+    return Fitter(views=views, radius_mm=radius_mm, optics=optics, light=unknown_light(views))

@@ -25,7 +25,7 @@ def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_sh
         (..., S, S) in 0 .. 1, 0.5 outside the disk and in a disk of one grey. Where one grey fills so much that no
         stretch gives both shares, darkest to brightest become 0 .. 1.
 
-    Source: paper section III B; ERRATA A2 for what the forced shares cost.
+    Source: paper section III B; docs/errata.md A2 for what the forced shares cost.
     """
     values = disks[..., inside]
     ordered = values.sort(dim=-1).values

@@ -1,11 +1,13 @@
-"""The search on grey values: a bank of normalised pictures over all rotations, distinct peaks, a climb from each."""
+"""The template bank: normalised views over all rotations, distinct peaks, a coarse-to-fine fit from each."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sphereorient import so3
@@ -29,19 +31,25 @@ TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest
 DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
 
 
-class GreySearch:
-    """Searches all of SO(3) for the views of a map that look like a disk, under any smooth light.
+class GreySearch(nn.Module):
+    """Searches all of SO(3) for the views of a texture map that look like a disk, under any smooth light.
 
-    The bank covers SO(3): every rotation is within (1/2 + 1/sqrt 2) step of a template's (`so3.lattman_grid`), and
-    detail finer than `detail` is taken out of templates and pictures, so that the nearest template still resembles.
+    The bank covers SO(3): every rotation is within (1/2 + 1/sqrt 2) step of a template (`so3.lattman_grid`), and
+    detail finer than `detail` is removed from templates and pictures, so that the nearest template still correlates.
+    It computes on the CPU.
 
     Args:
-        texture: (H, 2 H), the map, 0 black .. 1 white.
-        settings: of the search.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white.
+        settings: of the search; None: the defaults.
         blur: standard deviation of the pictures' own blur, radii, where it is wider than `detail` or nearly so.
     """
 
-    def __init__(self, texture: Tensor, settings: GreySearchSettings, blur: float = 0.0) -> None:
+    def __init__(
+        self, texture: Tensor | NDArray[np.generic], settings: GreySearchSettings | None = None, blur: float = 0.0
+    ) -> None:
+        super().__init__()
+        settings = settings or GreySearchSettings()
+        texture = torch.as_tensor(texture)
         self._settings = settings
         size, distance = settings.size_px, settings.distance_radii
         self._view = orthographic_view(size) if distance is None else perspective_view(size, distance)
@@ -53,6 +61,7 @@ class GreySearch:
         grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
         # (GROUP, G): the members of a group lie one below the other, and their maximum is one of whole rows.
         self._grid = grid[compact_groups(grid, GROUP).T]
+        self._pixels = int(self._view.inside.sum())
         self._bank = self._templates(paint)
 
     @property
@@ -64,6 +73,34 @@ class GreySearch:
     def templates(self) -> Tensor:
         """Rotations of the bank, (K, 3, 3) float32."""
         return self._grid.flatten(0, 1)
+
+    def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
+        """Return the best orientations of each disk, padded.
+
+        Args:
+            disks: (..., S, S), grey levels of any scale, the outline touching the borders.
+
+        Returns:
+            R_view_body (..., K, 3, 3) and score (..., K) float64, best first; NaN beyond a disk's last candidate.
+
+        Raises:
+            ShapeError: the disks are of another size.
+        """
+        grey = torch.as_tensor(disks).float()
+        found = self.propose(grey.reshape(-1, *grey.shape[-2:]))
+        counts = found.offset.diff()
+        mask = torch.arange(max([*counts.tolist(), 1])) < counts[:, None]
+        R = torch.full((*mask.shape, 3, 3), torch.nan, dtype=torch.float64)
+        score = torch.full(mask.shape, torch.nan, dtype=torch.float64)
+        R[mask], score[mask] = found.R_view_body, found.score
+        return R.reshape(*grey.shape[:-2], -1, 3, 3), score.reshape(*grey.shape[:-2], -1)
+
+    def score(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
+        """Return the correlation of disks (..., S, S) with all `templates`, (..., K) float32, -1 .. 1."""
+        grey = torch.as_tensor(disks).float()
+        steps = self._normalised(grey.reshape(-1, *grey.shape[-2:]))
+        scale = 127.0 / DEVIATIONS * math.sqrt(self._pixels)
+        return (torch._int_mm(steps, self._bank.T) / scale**2).reshape(*grey.shape[:-2], -1)
 
     def propose(self, disks: Tensor) -> Proposals:
         """Propose the best orientations that a disk allows, at least `distinct_deg` apart.
@@ -85,7 +122,7 @@ class GreySearch:
         parts = [Proposals.none(())]
         for some in torch.split(disks, PRODUCT):
             for disk, place, peak in zip(some, *self.search(some), strict=True):
-                parts.append(self._climbed(disk, self.templates[place[peak][: self._settings.peaks]]))
+                parts.append(self._refined(disk, self.templates[place[peak][: self._settings.peaks]]))
         return Proposals.joined(parts)
 
     def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,23 +135,26 @@ class GreySearch:
             Places of the best templates of the best groups, (F, M) int64 in `templates`, best first; and which of
             them are peaks, (F, M) bool.
         """
-        filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
-        steps = torch.cat([_steps(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
-        scores = torch._int_mm(steps, self._bank.T)
+        scores = torch._int_mm(self._normalised(disks), self._bank.T)
         place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
         apart = math.radians(self._settings.peak_deg)
         looked_at = self.templates[F.pad(place, (0, 0, 0, -len(disks) % BATCH))]
         peak = torch.cat([distinct(R, apart) for R in torch.split(looked_at, BATCH)])[: len(disks)]
         return place, peak
 
+    def _normalised(self, disks: Tensor) -> Tensor:
+        """Return normalised disks, (F, P) int8."""
+        filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
+        return torch.cat([_steps(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
+
     def _templates(self, paint: TextureTable) -> Tensor:
-        """Evened views of all rotations, (K, P) int8."""
+        """Return normalised views of all rotations, (K, P) int8."""
         normal = self._view.normal_view.T.contiguous()
         chunks = torch.split(self.templates, BATCH)
         return torch.cat([_steps(self._normalise(self._view.picture(paint.sample(R.mT @ normal)[0]))) for R in chunks])
 
-    def _climbed(self, disk: Tensor, starts: Tensor) -> Proposals:
-        """Climb from the peaks of one disk: its proposals, best first."""
+    def _refined(self, disk: Tensor, starts: Tensor) -> Proposals:
+        """Refine the peaks of one disk: its proposals, best first."""
         settings = self._settings
         R, score = refine_rotation(self._rough, level_reference(self._rough, disk), starts, settings.rough_steps)
         R = R[self._distinct(R, score)[: settings.finalists]]
@@ -132,13 +172,13 @@ class GreySearch:
         )
 
     def _distinct(self, R: Tensor, score: Tensor) -> Tensor:
-        """Indices of the rotations that are not near a better one, best first."""
+        """Return the indices of the rotations that are not near a better one, best first."""
         order = score.argsort(descending=True, stable=True)
         return order[distinct(R[order], math.radians(self._settings.distinct_deg))]
 
 
 def _steps(even: Tensor) -> Tensor:
-    """Whole numbers -127 .. 127 in place of normalised pictures, (B, P) int8, filled up to a multiple of 8 pixels."""
+    """Quantise normalised pictures to -127 .. 127, (B, P) int8, padded to a multiple of 8 pixels."""
     scale = 127.0 / DEVIATIONS * math.sqrt(even.shape[1])
     # One scale for all templates: as all are of length 1, products of whole numbers rank them as they are.
     return F.pad((even * scale).round().clamp(-127, 127), (0, -even.shape[1] % 8)).to(torch.int8)

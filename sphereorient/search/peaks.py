@@ -1,4 +1,4 @@
-"""The tops of many scores over SO(3), found without sorting them."""
+"""Peaks of many scores over SO(3), found without sorting them."""
 
 from __future__ import annotations
 
@@ -54,15 +54,14 @@ def best_of_groups(scores: Tensor, count: int) -> Tensor:
 
 
 def distinct(R: Tensor, apart_rad: float) -> Tensor:
-    """Return which rotations of lists, best first, are not near a better one.
+    """Suppress non-maxima: a rotation is suppressed by any better neighbour, even a suppressed one.
 
     Args:
-        R: (..., M, 3, 3).
-        apart_rad: how near, rad.
+        R: (..., M, 3, 3), best first.
+        apart_rad: distance below which rotations are neighbours, rad.
 
     Returns:
-        (..., M) bool; the first is always one. One that is near a better one is none even where that is none itself:
-        what remains are the tops.
+        (..., M) bool, which are peaks; the first always is.
     """
     flat = R.flatten(-2)
     return ~torch.tril(flat @ flat.mT > 1 + 2 * math.cos(apart_rad), -1).any(-1)  # the product is the trace of A^T B

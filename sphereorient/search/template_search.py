@@ -66,7 +66,7 @@ class TemplateSearch:
         return Proposals.joined(parts) if parts else Proposals.none(())
 
     def _coarse_scores(self, paint: Tensor) -> Tensor:
-        """T of every coarse template, (F, K): 1/2 + sum of products / (2 pixels counted) (ERRATA A2)."""
+        """T of every coarse template, (F, K): 1/2 + sum of products / (2 pixels counted) (docs/errata.md A2)."""
         half = torch.nn.functional.avg_pool2d(paint[:, None], 2)[:, 0]
         seen = half[:, self._coarse.inside][:, self._coarse_used]
         return 0.5 + seen @ self._bank.T / (2 * seen.shape[1])

@@ -32,7 +32,7 @@ from precise_examples import (
 from sphereorient import so3
 from sphereorient.errors import ExperimentError
 from sphereorient.evaluate import score_track
-from sphereorient.follow import BlockTracker
+from sphereorient.follow import ChunkTracker
 from sphereorient.follow.poses import Poses
 from sphereorient.locate import Shot
 from sphereorient.methods import precise
@@ -438,14 +438,14 @@ def test_two_runs_give_the_same_bytes_with_one_thread_or_two(short, tmp_path):
 @pytest.mark.slow
 def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tmp_path, monkeypatch):
     """Chunks, workers and a run begun again at a block are all this: windows of other blocks."""
-    made: list[BlockTracker] = []
+    made: list[ChunkTracker] = []
 
-    class Kept(BlockTracker):
+    class Kept(ChunkTracker):
         def __init__(self, *parts: object) -> None:
             super().__init__(*parts)
             made.append(self)
 
-    monkeypatch.setattr(precise, "BlockTracker", Kept)
+    monkeypatch.setattr(precise, "ChunkTracker", Kept)
     experiment = write(short.without_ball(np.arange(37, 39), ("cam1",)), tmp_path)
     track_movies(experiment, settings=settings("refine.chunk_frames=16"))
     (tracker,) = made

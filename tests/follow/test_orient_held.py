@@ -16,7 +16,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.follow import BlockTracker
+from sphereorient.follow import ChunkTracker
 from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre, mean_place
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.poses import Poses
@@ -109,10 +109,10 @@ def followed_poses(
     settings = Settings()
     with open_recording(load_experiment(path), cameras) as recording:
         begun = learn(Job(recording=recording, settings=settings, device=torch.device("cpu")), silent)
-        known, proposers = begun.appearance, begun.tracker.proposers
+        known, search = begun.appearance, begun.tracker.search
         views = known.fitter.views
         shots = sample_frames(recording, views, settings.refine.appearance_frames)
-        place = find_fixed_centre(known, proposers, shots, settings.locate, settings.refine)
+        place = find_fixed_centre(search, shots, known.score_min)
         assert place is not None
         movies = [
             list(screened_frames(stream, view.background))
@@ -121,9 +121,9 @@ def followed_poses(
         times = recording.timeline.time_s.tolist()
         found = []
         for where in (None, place):
-            tracker = BlockTracker(known, proposers, settings.locate, settings.refine, where)
+            tracker = ChunkTracker(known, search, settings.refine, where)
             poses: list[Poses] = []
-            for window in tracker.windows(recording.frames):
+            for window in tracker.batches(recording.frames):
                 n = len(poses)
                 some = slice(n, n + sum(window))
                 poses += tracker.track([movie[some] for movie in movies], window, times[some])
