@@ -26,7 +26,7 @@ import yaml
 from sphereorient import locate, so3
 from sphereorient.experiment import Experiment, load_experiment, open_movies
 from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.follow import Appearance, ChunkTracker, 
+from sphereorient.follow import Appearance, ChunkTracker
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
