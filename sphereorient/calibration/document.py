@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sphereorient.calibration.entry import Target, plate_from_entry
 from sphereorient.cameras import Port
-from sphereorient.cameras.io.entries import PortEntry
+from sphereorient.cameras.io.cameras_yaml import PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
 from sphereorient.errors import CameraError, refusal
 from sphereorient.files.yaml_file import read_document, refuse_unknown, short, validated

@@ -12,7 +12,7 @@ from sphereorient.calibration.slopes import slopes_along
 from sphereorient.cameras.camera import Camera
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.parameters import with_parameters
-from sphereorient.cameras.view import R_cam_view
+from sphereorient.cameras.sight import R_cam_view
 
 CAP_RINGS = (0.35, 0.75)  # of the radius: where paint is looked at
 PER_RING = 6

@@ -106,7 +106,7 @@ def _values(camera: Camera) -> dict[str, float]:
     """Numbers of the lens and the place; the rotation is told by its sigmas alone."""
     inner = getattr(camera, "camera", camera)
     found: dict[str, float] = {}
-    for name, (field, place) in getattr(inner, "PARAMETERS", {}).items():
+    for name, (field, place) in inner.parameter_fields().items():
         value = getattr(inner, field)
         found[name] = float(value if place is None else value[place])
     known = () if camera.covariance is None else camera.covariance.names

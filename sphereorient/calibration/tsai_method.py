@@ -15,8 +15,8 @@ from torch import Tensor
 
 from sphereorient.calibration.point_fit import checked_points, fit_to_points, rms_px
 from sphereorient.cameras.checks import check_image_size, check_positive
+from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION
-from sphereorient.cameras.pinhole import middle_of_picture
 from sphereorient.cameras.tsai import TsaiCamera
 from sphereorient.errors import CameraError, refusal
 

@@ -133,7 +133,7 @@ def change_of(found: Camera, true: Camera, names: tuple[str, ...]) -> Tensor:
     turn = so3.log(true.R_cam_lab @ found.R_cam_lab.mT)
     values = {f"rotation_{axis}": turn[k] for k, axis in enumerate("xyz")}
     values |= {f"T_{axis}": (true.T_cam_lab_mm - found.T_cam_lab_mm)[k] for k, axis in enumerate("xyz")}
-    for name, (field, place) in type(inner_true).PARAMETERS.items():
+    for name, (field, place) in inner_true.parameter_fields().items():
         away = getattr(inner_true, field) - getattr(inner_found, field)
         values[name] = away if place is None else away[place]
     return torch.stack([values[name] for name in names])

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras.camera import Camera
+from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.openptv_camera import OpenPTVCamera
-from sphereorient.cameras.pinhole import middle_of_picture
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.errors import CameraError, OutputError, refusal
 from sphereorient.files.whole_file import TEXT_BYTES, read_whole

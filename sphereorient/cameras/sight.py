@@ -1,0 +1,67 @@
+"""Geometry of lines of sight: triangulation, and the view frame."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sphereorient.cameras.camera import Rays
+from sphereorient.cameras.checks import check_points
+
+
+def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
+    """Return the middle of the shortest segment between two rays, and its length.
+
+    Args:
+        rays_a: origin (..., 3) mm and unit direction (..., 3), lab.
+        rays_b: rays of the other camera; broadcasts against `rays_a`.
+
+    Returns:
+        Points (..., 3), lab, mm, and gaps (...), mm, not negative. Both NaN, with gradient 0, for parallel rays.
+
+    Raises:
+        ShapeError: a last axis is not 3.
+
+    Source: the common perpendicular of two skew lines (textbook).
+    """
+    for name, rays in (("rays_a", rays_a), ("rays_b", rays_b)):
+        check_points(f"{name}.origin_lab_mm", rays.origin_lab_mm, 3)
+        check_points(f"{name}.direction_lab", rays.direction_lab, 3)
+    a, b = rays_a.direction_lab, rays_b.direction_lab
+    baseline = rays_b.origin_lab_mm - rays_a.origin_lab_mm
+    normal = torch.linalg.cross(a, b)  # its length is the sine of the angle: no cancellation at small angles
+    sine2 = normal.square().sum(-1, keepdim=True)
+    crossing = sine2 > (16 * torch.finfo(sine2.dtype).eps) ** 2  # below it the sine is rounding only
+    sine2 = torch.where(crossing, sine2, torch.ones_like(sine2))
+    along_a = (torch.linalg.cross(baseline, b) * normal).sum(-1, keepdim=True) / sine2
+    along_b = (torch.linalg.cross(baseline, a) * normal).sum(-1, keepdim=True) / sine2
+    point = 0.5 * (rays_a.origin_lab_mm + along_a * a + rays_b.origin_lab_mm + along_b * b)
+    gap = ((baseline * normal).sum(-1, keepdim=True) / sine2.sqrt()).abs()
+    nan = torch.full_like(gap, torch.nan)
+    return torch.where(crossing, point, nan), torch.where(crossing, gap, nan)[..., 0]
+
+
+def R_cam_view(direction_cam: Tensor) -> Tensor:
+    """Return the smallest rotation that takes the camera's z axis to a direction.
+
+    Args:
+        direction_cam: (..., 3), camera frame, any length above zero.
+
+    Returns:
+        (..., 3, 3), takes view components to camera components; its last column is the unit direction.
+        NaN, with gradient 0, for the backward direction, where the rotation is not defined.
+
+    Raises:
+        ShapeError: the last axis is not 3.
+
+    Source: docs/errata.md A1 (the paper's R_persp has the axis of OpenGL's camera); Rodrigues' formula with
+    z x direction.
+    """
+    check_points("direction_cam", direction_cam, 3)
+    unit = direction_cam / direction_cam.norm(dim=-1, keepdim=True)
+    x, y, z = unit.unbind(-1)
+    defined = 1 + z > 4 * torch.finfo(z.dtype).eps
+    share = 1 / torch.where(defined, 1 + z, torch.ones_like(z))  # (1 - cos) / sin^2: exact also at direction = z
+    rows = [1 - x * x * share, -x * y * share, x, -x * y * share, 1 - y * y * share, y, -x, -y, z]
+    R = torch.stack(rows, dim=-1).reshape(*x.shape, 3, 3)
+    return torch.where(defined[..., None, None], R, torch.full_like(R, torch.nan))
