@@ -59,7 +59,7 @@ class PolynomialCamera(CentralCamera):
         """Invert `_plane`."""
 
     def undistort(self, uv_px: Tensor) -> Tensor:
-        """Undistort pixels (..., 2) to the last digits (Newton); NaN beyond the fold, which lies outside the picture."""
+        """Undistort pixels (..., 2) to the last digits; NaN beyond the fold, which lies outside the picture."""
         check_points("uv_px", uv_px, 2)
         return self._pixel(straightened(self._plane(uv_px, True), self.k, self._p_opencv), False)
 

@@ -29,12 +29,12 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
         check_points(f"{name}.direction_lab", rays.direction_lab, 3)
     a, b = rays_a.direction_lab, rays_b.direction_lab
     baseline = rays_b.origin_lab_mm - rays_a.origin_lab_mm
-    normal = torch.linalg.cross(a, b)  # its length is the sine of the angle: no cancellation at small angles
+    normal = _cross(a, b)  # its length is the sine of the angle: no cancellation at small angles
     sine2 = normal.square().sum(-1, keepdim=True)
     crossing = sine2 > (16 * torch.finfo(sine2.dtype).eps) ** 2  # below it the sine is rounding only
     sine2 = torch.where(crossing, sine2, torch.ones_like(sine2))
-    along_a = (torch.linalg.cross(baseline, b) * normal).sum(-1, keepdim=True) / sine2
-    along_b = (torch.linalg.cross(baseline, a) * normal).sum(-1, keepdim=True) / sine2
+    along_a = (_cross(baseline, b) * normal).sum(-1, keepdim=True) / sine2
+    along_b = (_cross(baseline, a) * normal).sum(-1, keepdim=True) / sine2
     point = 0.5 * (rays_a.origin_lab_mm + along_a * a + rays_b.origin_lab_mm + along_b * b)
     gap = ((baseline * normal).sum(-1, keepdim=True) / sine2.sqrt()).abs()
     nan = torch.full_like(gap, torch.nan)
@@ -65,3 +65,8 @@ def R_cam_view(direction_cam: Tensor) -> Tensor:
     rows = [1 - x * x * share, -x * y * share, x, -x * y * share, 1 - y * y * share, y, -x, -y, z]
     R = torch.stack(rows, dim=-1).reshape(*x.shape, 3, 3)
     return torch.where(defined[..., None, None], R, torch.full_like(R, torch.nan))
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    product: Tensor = torch.linalg.cross(*torch.broadcast_tensors(a, b))  # type: ignore[no-untyped-call]
+    return product

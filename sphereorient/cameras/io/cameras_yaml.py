@@ -27,6 +27,7 @@ SCHEMA = "sphereorient-cameras/1"
 KEYS = ("cameras", "covariance")
 MOST = 100  # cameras of a file
 Triple = tuple[float, float, float]
+HOLDS: dict[int, Any] = {0: float, 2: tuple[float, float], 3: Triple}  # by the number of a key's parts
 
 # A further model: one file with the camera, one name here.
 MODELS: dict[str, type[CameraModel]] = {
@@ -85,7 +86,7 @@ def _entry(kind: type[CameraModel]) -> type[CameraEntry]:
     """Return the pydantic model of a camera model's keys."""
     fields: dict[str, Any] = dict.fromkeys(kind.ALSO, (float | None, None))
     for key in kind.KEYS:
-        holds: Any = tuple[(float,) * len(key.parts)] if key.parts else float  # type: ignore[misc]
+        holds = HOLDS[len(key.parts)]
         if key.optional:
             fields[key.name] = (holds | None, None)
         elif key.default is None:
@@ -190,13 +191,13 @@ def _build(entry: object, where: str) -> Camera:
 
 def _in_air(kind: type[CameraModel], entry: CameraEntry) -> CameraModel:
     values = kind.completed(dict(entry))
-    fields: dict[str, Any] = {}
+    fields: dict[str, Any] = {"image_size": entry.image_size, "R_cam_lab": entry.R, "T_cam_lab_mm": entry.T}
     for key in kind.KEYS:
         if key.place is None:
             fields[key.field] = values[key.name]
         else:
             fields.setdefault(key.field, []).append(values[key.name])
-    return kind(image_size=entry.image_size, R_cam_lab=entry.R, T_cam_lab_mm=entry.T, **fields)  # type: ignore[arg-type]
+    return kind(**fields)
 
 
 def _with_port_and_covariance(camera: CameraModel, entry: CameraEntry) -> Camera:
