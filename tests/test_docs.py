@@ -17,7 +17,7 @@ from conftest import REPO
 
 from sphereorient.calibration import load_calibration
 from sphereorient.calibration.document import CalibrationKeys
-from sphereorient.calibration.entry import KEYS as PLATE_KEYS
+from sphereorient.calibration.targets import KINDS, target_keys
 from sphereorient.cameras import load_cameras
 from sphereorient.cameras.io.cameras_yaml import ENTRIES, MODELS, PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT, parameter_names
@@ -64,8 +64,8 @@ def test_the_calibration_file_of_the_page_loads_and_all_its_keys_are_there(tmp_p
     path.write_text(blocks("calibration.md", "yaml")[0])
     assert load_calibration(path).cameras == ("cam1", "cam2")
     text = (REPO / "docs" / "calibration.md").read_text()
-    plates = {key.rstrip("?") for _, keys in PLATE_KEYS.values() for key in keys}
-    for key in {*CalibrationKeys.model_fields, *plates, *PLATE_KEYS, *PORT_NUMBERS, *PORT_TILT}:
+    plates = {key for kind in KINDS.values() for key in target_keys(kind)}
+    for key in {*CalibrationKeys.model_fields, *plates, *KINDS, *PORT_NUMBERS, *PORT_TILT}:
         assert f"`{key}`" in text, key
 
 

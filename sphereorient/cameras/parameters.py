@@ -2,9 +2,9 @@
 
 All models have `rotation_x`, `rotation_y`, `rotation_z` (rad, camera frame: R_true = exp([delta]x) R, T unchanged)
 and `T_x`, `T_y`, `T_z` (mm). The others have the names of cameras.yaml, with pairs as `centre_u` and `centre_v` and
-lists as `k1`, `k2`, `k3`. A port has `port_offset`, `port_thickness` (mm), `port_n_glass`, `port_n_fluid`, and `port_tilt_x`,
-`port_tilt_y`, `port_tilt_z` (rad, lab frame: normal_true = exp([delta]x) normal, offset unchanged; a rotation about the
-normal itself changes nothing).
+lists as `k1`, `k2`, `k3`. A port has `port_offset`, `port_thickness` (mm), `port_n_glass`, `port_n_fluid`, and
+`port_tilt_x`, `port_tilt_y`, `port_tilt_z` (rad, lab frame: normal_true = exp([delta]x) normal, offset unchanged; a
+rotation about the normal itself changes nothing).
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from pydantic import BaseModel, ConfigDict, create_model
+from scipy.linalg import block_diag
 
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.cameras.camera import Camera
@@ -242,4 +243,5 @@ def _independent(cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
     if not parts or len(parts) < len(cameras):
         return None
     names = tuple(f"{name}.{parameter}" for name, covariance in parts.items() for parameter in covariance.names)
-    return ParameterCovariance(names=names, matrix=torch.block_diag(*(part.matrix for part in parts.values())))
+    whole = block_diag(*(covariance.matrix.numpy() for covariance in parts.values()))
+    return ParameterCovariance(names=names, matrix=torch.from_numpy(whole))
