@@ -125,12 +125,7 @@ class _Windows:
 
     @classmethod
     def cut(
-        cls,
-        grey: NDArray[np.float32],
-        owner: NDArray[np.int32],
-        which: NDArray[np.int64],
-        centre_px: Floats,
-        shape: Floats,
+        cls, grey: NDArray[np.float32], owner: NDArray[np.int32], which: Ints, centre_px: Floats, shape: Floats
     ) -> _Windows:
         """Cut the windows of the dots `which`; a pixel of another dot has no weight."""
         height, width = grey.shape
