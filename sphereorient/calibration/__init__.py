@@ -1,7 +1,7 @@
 """Cameras from pictures of a plate, from points, and from the sphere itself."""
 
 from sphereorient.calibration.boards import see_plate
-from sphereorient.calibration.disk_shift import disk_centre_shift
+from sphereorient.calibration.bundle import disk_centre_shift
 from sphereorient.calibration.document import load_calibration
 from sphereorient.calibration.plate_view import PlateView, placed
 from sphereorient.calibration.plates import Calibrated, PictureReport, calibrate_cameras

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, StrictInt
 from torch import Tensor
 
 from sphereorient.calibration.targets import CalibrationTarget, plate_from_entry
@@ -44,6 +44,14 @@ class SurveyedKeys(BaseModel):
     T_lab_plate: Triple
 
 
+class PictureKeys(BaseModel):
+    """One pose: its number, and the picture of each camera."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+    __pydantic_extra__: dict[str, str]
+    pose: StrictInt
+
+
 class CalibrationKeys(BaseModel):
     """Keys of calibration.yaml (docs/calibration.md)."""
 
@@ -53,7 +61,7 @@ class CalibrationKeys(BaseModel):
     plate: Any = None
     surveyed: SurveyedKeys | None = None
     ports: dict[str, PortEntry] = {}
-    pictures: list[dict[str, Any]] = []
+    pictures: list[PictureKeys] = []
     points: dict[str, str] = {}
     model: Model = "tsai"
     fit_ports: tuple[str, ...] = ()
@@ -101,7 +109,7 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
     if bool(keys.pictures) == bool(keys.points):
         got, do = ("both" if keys.points else "neither"), "name pictures of a plate, or tables of points"
         raise _refused(f"{path}, pictures, points", "one of them", got, do)
-    numbers = _pose_numbers(keys, path) if keys.pictures else (0,)
+    numbers = tuple(sorted({one.pose for one in keys.pictures})) or (0,)
     pictures = _pictures(keys, path, numbers)
     if keys.pictures and keys.plate is None:
         raise _refused(f"{path}, plate", "a plate", "none", "write what the plate is: type, columns, rows, pitch")
@@ -177,34 +185,19 @@ def _check_ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) ->
         raise _refused(f"{path}, fit_ports", "different names", ", ".join(keys.fit_ports), "name each once")
 
 
-def _pose_numbers(keys: CalibrationKeys, path: Path) -> tuple[int, ...]:
-    numbers = []
-    for k, entry in enumerate(keys.pictures):
-        pose = entry.get("pose")
-        if isinstance(pose, bool) or not isinstance(pose, int):
-            raise _refused(f"{path}, pictures, {k}, pose", "a whole number", short(pose), "number the plate's poses")
-        numbers.append(pose)
-    return tuple(sorted(set(numbers)))
-
-
 def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> tuple[Picture, ...]:
     pictures, seen = [], set()
     for k, entry in enumerate(keys.pictures):
-        row = numbers.index(entry["pose"])
-        if len(entry) == 1:
+        row, files = numbers.index(entry.pose), entry.model_extra or {}
+        if not files:
             do = "name a picture, such as cam1: cam1_00.png, or leave the entry out"
             raise _refused(f"{path}, pictures, {k}", "a picture", "none", do)
-        for name, file in entry.items():
-            if name == "pose":
-                continue
-            where = f"{path}, pictures, {k}, {name}"
-            if not isinstance(file, str):
-                raise _refused(where, "a file", short(file), "name a picture")
+        for name, file in files.items():
             if (row, name) in seen:
-                got, do = f"a second one of pose {entry['pose']}", "give every pose its own number"
-                raise _refused(where, "one picture of a pose", got, do)
+                got, do = f"a second one of pose {entry.pose}", "give every pose its own number"
+                raise _refused(f"{path}, pictures, {k}, {name}", "one picture of a pose", got, do)
             seen.add((row, name))
-            pictures.append(Picture(camera=str(name), row=row, path=path.parent / file))
+            pictures.append(Picture(camera=name, row=row, path=path.parent / file))
     return tuple(pictures)
 
 

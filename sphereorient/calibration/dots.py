@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -13,6 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from sphereorient.calibration.ellipse import Dots, fit_ellipses, half_box
 from sphereorient.calibration.targets import Floats
 from sphereorient.errors import CameraError, refusal
+
+_Chain = list[tuple[Floats, Floats, float]]  # centre, shape and area of a blob, one for each grey level
 
 
 class DotSettings(BaseModel):
@@ -93,15 +94,6 @@ def _first_of_equals(uv_px: Floats, shape: Floats, good: NDArray[np.bool_]) -> N
     return kept
 
 
-@dataclass
-class _Chain:
-    """A blob over the grey levels at which it is an ellipse."""
-
-    centres: list[Floats]
-    shapes: list[Floats]
-    area: float
-
-
 def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Floats]:
     """Return centres (n, 2), px, and shapes (n, 2, 2) of dark blobs that are ellipses over three grey levels or more.
 
@@ -110,34 +102,21 @@ def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Fl
     smooth = cv2.GaussianBlur(grey, (0, 0), settings.smooth_px) if settings.smooth_px > 0 else grey
     low, high = np.percentile(smooth, [0.1, 99.9])
     done: list[_Chain] = []
-    open_chains: list[_Chain] = []
+    going: list[_Chain] = []
     for level in np.linspace(low, high, settings.levels + 2)[1:-1]:
         labels, number, area, centre, shape = _ellipses_at(smooth < level, settings)
-        going: dict[int, _Chain] = {}
-        for chain in open_chains:
-            u, v = np.rint(chain.centres[-1]).astype(int)
+        followed: dict[int, _Chain] = {}
+        for chain in sorted(going, key=len, reverse=True):  # a blob continues the longest chain that leads to it
+            u, v = np.rint(chain[-1][0]).astype(int)
             k = number.get(int(labels[v, u]), -1)
-            if k < 0 or area[k] > 1.6 * chain.area + 4:
+            if k < 0 or k in followed or area[k] > 1.6 * chain[-1][2] + 4:
                 done.append(chain)
-                continue
-            rival = going.get(k)
-            if rival is None or len(rival.centres) < len(chain.centres):
-                if rival is not None:
-                    done.append(rival)
-                going[k] = chain
             else:
-                done.append(chain)
-        open_chains = []
-        for k in range(len(area)):
-            chain = going.get(k) or _Chain([], [], 0.0)
-            chain.centres.append(centre[k])
-            chain.shapes.append(shape[k])
-            chain.area = float(area[k])
-            open_chains.append(chain)
-    chains = [c for c in done + open_chains if len(c.centres) >= 3]
-    chains.sort(key=lambda c: -len(c.centres))
-    centres = np.array([c.centres[len(c.centres) // 2] for c in chains]).reshape(-1, 2)
-    shapes = np.array([c.shapes[len(c.shapes) // 2] for c in chains]).reshape(-1, 2, 2)
+                followed[k] = chain
+        going = [[*followed.get(k, []), (centre[k], shape[k], float(area[k]))] for k in range(len(area))]
+    chains = sorted((chain for chain in done + going if len(chain) >= 3), key=len, reverse=True)
+    centres = np.array([chain[len(chain) // 2][0] for chain in chains]).reshape(-1, 2)
+    shapes = np.array([chain[len(chain) // 2][1] for chain in chains]).reshape(-1, 2, 2)
     kept = _first_of_equals(centres, shapes, np.ones(len(chains), dtype=bool))
     return centres[kept], shapes[kept]
 

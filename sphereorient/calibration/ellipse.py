@@ -41,12 +41,6 @@ class Dots:
         area: Floats = np.pi / np.sqrt(np.maximum(np.linalg.det(self.shape), 1e-12))
         return area
 
-    @property
-    def axes_px(self) -> Floats:
-        """(n, 2), half axes, px, longer first."""
-        half: Floats = 1.0 / np.sqrt(np.linalg.eigvalsh(self.shape))
-        return half
-
     def __getitem__(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> Dots:
         """Return some of the dots."""
         return Dots(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})

@@ -174,14 +174,10 @@ class _Map:
         x, y = ((index - self.middle) / self.size).T
         return np.stack([x**a * y**b for a in range(4) for b in range(4 - a)], axis=1)
 
-    def straight(self, index: Floats | Ints) -> Floats:
+    def __call__(self, index: Floats | Ints) -> Floats:
         near = (index - self.middle) / self.size
         h = np.column_stack([near, np.ones(len(near))]) @ self.homography.T
-        uv_px: Floats = h[:, :2] / h[:, 2:]
-        return uv_px
-
-    def __call__(self, index: Floats | Ints) -> Floats:
-        uv_px: Floats = self.straight(index) + self._terms(index) @ self.bend
+        uv_px: Floats = h[:, :2] / h[:, 2:] + self._terms(index) @ self.bend
         return uv_px
 
     def nearest(self, uv_px: Floats) -> Ints:
@@ -204,8 +200,7 @@ class _Map:
 
 def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
     """Drop dots that do not fit the smooth map, and add dots that steps did not reach."""
-    which, index = _agreeing(dots, which, index)
-    lattice_map = _usable_map(dots, which, index)
+    which, index, lattice_map = _agreeing(dots, which, index)
     if lattice_map is None:
         return None
     rest = np.setdiff1d(np.arange(len(dots)), which)
@@ -218,8 +213,7 @@ def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
     fits = np.flatnonzero(free)
     fits = fits[lattice_map.misses(there[fits], dots.uv_px[rest[fits]]) < MODEL_MISS]
     which, index = np.concatenate([which, rest[fits]]), np.concatenate([index, there[fits]])
-    which, index = _agreeing(dots, which, index)
-    lattice_map = _usable_map(dots, which, index)
+    which, index, lattice_map = _agreeing(dots, which, index)
     if lattice_map is None:
         return None
     cell = np.abs(np.linalg.det(lattice_map.steps(index)))
@@ -227,22 +221,17 @@ def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
     return Lattice(which=which, index=index, width=width)
 
 
-def _usable_map(dots: Dots, which: Ints, index: Ints) -> _Map | None:
-    if len(which) < 9 or (np.ptp(index, axis=0) < 1).any():
-        return None
-    return _Map.fitted(index, dots.uv_px[which])
-
-
-def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints]:
+def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints, _Map | None]:
     """Drop the worst dots, a few at a time, until all are within MODEL_MISS of the map of the remaining ones."""
     while True:
-        lattice_map = _usable_map(dots, which, index)
+        enough = len(which) >= 9 and (np.ptp(index, axis=0) >= 1).all()
+        lattice_map = _Map.fitted(index, dots.uv_px[which]) if enough else None
         if lattice_map is None:
-            return which[:0], index[:0]
+            return which[:0], index[:0], None
         miss = lattice_map.misses(index, dots.uv_px[which])
         kept: NDArray[np.bool_] = miss <= max(MODEL_MISS, 0.5 * float(miss.max()))
         if kept.all():
-            return which, index
+            return which, index, lattice_map
         which, index = which[kept], index[kept]
 
 

@@ -210,7 +210,9 @@ def tie_floating(
         candidates = [placed(view, document.plate, placement) for placement in view.placements]
         missed = [_missed(rig, picture, candidate) for candidate in candidates]
         order = np.argsort(missed)
-        step = _step_px(view)
+        apart = np.linalg.norm(view.uv_px[:, None] - view.uv_px[None], axis=-1)
+        np.fill_diagonal(apart, np.inf)
+        step = float(np.median(apart.min(1)))  # typical distance of neighbouring points
         if missed[order[0]] < CLEARLY * step and (len(order) == 1 or missed[order[1]] > 2 * CLEARLY * step):
             tied[picture] = candidates[order[0]]
     return tied
@@ -220,13 +222,6 @@ def _missed(rig: Rig, picture: Picture, view: PlateView) -> float:
     R, T = rig.R_lab_plate[picture.row], rig.T_lab_plate_mm[picture.row]
     expected = rig.cameras[picture.camera].project(torch.from_numpy(view.points_plate_mm) @ R.mT + T)
     return float(np.nan_to_num(np.median(np.linalg.norm(view.uv_px - expected.numpy(), axis=1)), nan=np.inf))
-
-
-def _step_px(view: PlateView) -> float:
-    """Return the typical distance of neighbouring points in the picture."""
-    apart = np.linalg.norm(view.uv_px[:, None] - view.uv_px[None], axis=-1)
-    np.fill_diagonal(apart, np.inf)
-    return float(np.median(apart.min(1)))
 
 
 def _check_determined(document: CalibrationDocument, fitted: Fitted) -> None:

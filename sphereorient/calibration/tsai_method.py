@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from sphereorient.calibration.point_fit import checked_points, fit_to_points, rms_px
+from sphereorient.calibration.solve import checked_points, fit_to_points, rms_px
 from sphereorient.cameras.checks import check_image_size, check_positive
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION
@@ -242,16 +243,9 @@ def _best(starts: Sequence[TsaiCamera], points: Tensor, pixels: Tensor) -> TsaiC
 
 
 def _camera(start: _Start, image_size: tuple[int, int], pitch: Tensor) -> TsaiCamera:
-    return TsaiCamera(
-        image_size=image_size,
-        R_cam_lab=start.R_cam_lab,
-        T_cam_lab_mm=start.T_cam_lab_mm,
-        centre_px=middle_of_picture(image_size),
-        f_mm=torch.tensor(start.f_mm, dtype=torch.float64),
-        pixel_pitch_mm=pitch,
-        sx=torch.ones((), dtype=torch.float64),
-        kappa1=torch.zeros((), dtype=torch.float64),
-    )
+    fields: dict[str, Any] = TsaiCamera.ideal_lens(start.f_mm / float(pitch[1]), pitch.tolist())
+    fields |= {"R_cam_lab": start.R_cam_lab, "T_cam_lab_mm": start.T_cam_lab_mm}
+    return TsaiCamera(image_size=image_size, centre_px=middle_of_picture(image_size), **fields)
 
 
 def _check_count(points: Tensor, least: int, where: str) -> None:
