@@ -20,8 +20,7 @@ import torch
 
 from sphereorient import so3
 from sphereorient.calibration import check_cameras
-from sphereorient.calibration.self_calibration import self_calibrate
-from sphereorient.calibration.sphere import told_by
+from sphereorient.calibration.self_calibration import observations_of, self_calibrate
 from sphereorient.cameras import Camera
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.experiment import load_experiment
@@ -44,7 +43,7 @@ def main() -> None:
     for case in range(arguments.cases):
         bumped = bump(exact, math.radians(arguments.turn), arguments.move, case)
         track = track_movies(replace(experiment, cameras=bumped, camera_covariance=None))
-        repaired = self_calibrate(bumped, told_by(track, bumped)).cameras
+        repaired = self_calibrate(bumped, observations_of(track, bumped)).cameras
         before, after, own = (gap_mm(cameras, track) for cameras in (bumped, repaired, exact))
         off = [math.degrees(apart_rad(cameras, exact)) for cameras in (bumped, repaired)]
         print(

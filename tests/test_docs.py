@@ -17,10 +17,9 @@ from conftest import REPO
 
 from sphereorient.calibration import load_calibration
 from sphereorient.calibration.document import CalibrationKeys
-from sphereorient.calibration.entry import KEYS as PLATE_KEYS
+from sphereorient.calibration.targets import KINDS, target_keys
 from sphereorient.cameras import load_cameras
-from sphereorient.cameras.io.entries import PortEntry
-from sphereorient.cameras.io.registry import MODELS
+from sphereorient.cameras.io.cameras_yaml import ENTRIES, MODELS, PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT, parameter_names
 from sphereorient.experiment import ExperimentKeys, load_experiment
 from sphereorient.trajectory import Flag, Reason, Trajectory
@@ -45,11 +44,9 @@ def test_the_examples_of_a_page_run(page):
 def test_the_cameras_of_the_page_load_and_no_key_of_any_model_is_missing(tmp_path):
     (tmp_path / "cameras.yaml").write_text(blocks("cameras.md", "yaml")[0])
     cameras = load_cameras(tmp_path / "cameras.yaml")
-    assert {type(getattr(camera, "camera", camera)) for camera in cameras.values()} == {
-        model.kind for model in MODELS.values()
-    }
+    assert {type(getattr(camera, "camera", camera)) for camera in cameras.values()} == set(MODELS.values())
     text = (REPO / "docs" / "cameras.md").read_text()
-    entries = [PortEntry, *(model.entry for model in MODELS.values())]
+    entries = [PortEntry, *ENTRIES.values()]
     for key in {key for entry in entries for key in entry.model_fields}:
         assert f"`{key}`" in text, key
 
@@ -67,8 +64,8 @@ def test_the_calibration_file_of_the_page_loads_and_all_its_keys_are_there(tmp_p
     path.write_text(blocks("calibration.md", "yaml")[0])
     assert load_calibration(path).cameras == ("cam1", "cam2")
     text = (REPO / "docs" / "calibration.md").read_text()
-    plates = {key.rstrip("?") for _, keys in PLATE_KEYS.values() for key in keys}
-    for key in {*CalibrationKeys.model_fields, *plates, *PLATE_KEYS, *PORT_NUMBERS, *PORT_TILT}:
+    plates = {key for kind in KINDS.values() for key in target_keys(kind)}
+    for key in {*CalibrationKeys.model_fields, *plates, *KINDS, *PORT_NUMBERS, *PORT_TILT}:
         assert f"`{key}`" in text, key
 
 

@@ -1,15 +1,13 @@
 """Cameras from pictures of a plate, from points, and from the sphere itself."""
 
-from sphereorient.calibration.bias import disk_centre_shift
+from sphereorient.calibration.boards import see_plate
+from sphereorient.calibration.bundle import disk_centre_shift
 from sphereorient.calibration.document import load_calibration
-from sphereorient.calibration.entry import plate_from_entry
-from sphereorient.calibration.placing import placed
-from sphereorient.calibration.plate import DotPlate
+from sphereorient.calibration.plate_view import PlateView, placed
 from sphereorient.calibration.plates import Calibrated, PictureReport, calibrate_cameras
-from sphereorient.calibration.see import see_plate
-from sphereorient.calibration.sphere import check_cameras, refine_with_track
+from sphereorient.calibration.self_calibration import check_cameras, refine_with_track
 from sphereorient.calibration.systematic import systematic_errors
-from sphereorient.calibration.view import PlateView
+from sphereorient.calibration.targets import DotPlate, plate_from_entry
 
 __all__ = [
     "Calibrated",

@@ -1,60 +1,80 @@
-"""Chessboards, ChArUco boards and circle grids in a picture, through OpenCV."""
+"""Targets in a picture: dot plates, and through OpenCV chessboards, ChArUco boards and circle grids."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.calibration.dots import Dots, as_grey, find_dots
-from sphereorient.calibration.placing import placed, turned
-from sphereorient.calibration.plate import Floats, Ints
-from sphereorient.calibration.targets import CharucoBoard, Chessboard, CircleGrid
-from sphereorient.calibration.view import PlateView, nothing_seen
+from sphereorient.calibration.dots import DotSettings, as_grey, find_dots
+from sphereorient.calibration.ellipse import Dots
+from sphereorient.calibration.lattice import index_dots
+from sphereorient.calibration.plate_view import PlateView, placed, quarter_turned, refused_view
+from sphereorient.calibration.targets import (
+    CalibrationTarget,
+    CharucoBoard,
+    Chessboard,
+    CircleGrid,
+    DotPlate,
+    Floats,
+    Ints,
+)
 from sphereorient.errors import refusal
 
-CORNER_SIGMA_PX = 0.05  # of a corner as OpenCV finds it: it does not say; tests measure 0.03 to 0.07 on drawn boards
-LEAST_CORNERS = 6  # of a ChArUco board: fewer hardly make a homography
-WINDOW = 0.3  # half a window of the sub-pixel step, in steps to the nearest corner: its rims hold no other corner
+CORNER_SIGMA_PX = 0.05  # of a corner; tests measure 0.03 to 0.07 on drawn boards
+LEAST_CORNERS = 6  # of a ChArUco board: fewer hardly determine a homography
+WINDOW = 0.3  # half a window of the sub-pixel step, in distances to the nearest corner: it holds no other corner
 SHARP = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 
 
-def see_chessboard(picture: NDArray[np.generic], board: Chessboard, name: str = "plate picture") -> PlateView:
-    """Find the inner corners of a chessboard that is wholly in the picture.
+def see_plate(
+    picture: NDArray[np.generic],
+    plate: CalibrationTarget,
+    name: str = "plate picture",
+    settings: DotSettings | None = None,
+) -> PlateView:
+    """Find a target in one picture; a picture that shows nothing usable gives a `refused` view with the reason.
 
     Args:
-        picture: (H, W), grey.
-        board: what is known of it.
-        name: the picture's name, for the reason.
+        picture: (H, W), grey, any number type.
+        plate: the target, from `plate_from_entry`.
+        name: of the picture, for the reason.
+        settings: of the detection of dots.
 
-    Returns:
-        PlateView; floating where the board looks the same after a turn.
+    Raises:
+        CameraError: not a grey picture.
     """
+    if isinstance(plate, Chessboard):
+        return _chessboard(picture, plate, name)
+    if isinstance(plate, CharucoBoard):
+        return _charuco(picture, plate, name)
+    if isinstance(plate, CircleGrid):
+        return _circles(picture, plate, name)
+    assert isinstance(plate, DotPlate)
+    return index_dots(find_dots(picture, dark=plate.dark, settings=settings), plate, name)
+
+
+def _chessboard(picture: NDArray[np.generic], board: Chessboard, name: str) -> PlateView:
+    """Find the inner corners of a whole chessboard; floating where the board is the same after a rotation."""
     grey = _eight_bits(picture)
     found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=SHARP)
     if not found:
-        expected, got = f"a chessboard with {board.columns} x {board.rows} inner corners", "none"
+        expected = f"a chessboard with {board.columns} x {board.rows} inner corners"
         do = "show the whole board, or correct columns and rows (corners between squares are counted)"
-        return nothing_seen(refusal(name, expected=expected, got=got, do=do))
+        return refused_view(name, expected=expected, got="none", do=do)
     uv_px = _refined(grey, corners.reshape(-1, 2).astype(np.float64))
     index = _seen_from_front(_row_by_row(board.columns, board.rows), uv_px)
-    standard = [p for p in _turns(board.extent) if _lower_left_is_dark(grey, turned(index, int(p[0])) + p[1:], uv_px)]
-    return _settled(board, index, uv_px, np.full(len(uv_px), CORNER_SIGMA_PX), standard or _turns(board.extent), name)
+    turns = _turns(board.extent)
+    standard = [p for p in turns if _lower_left_is_dark(grey, quarter_turned(index, int(p[0])) + p[1:], uv_px)]
+    view = _view(board, index, uv_px, np.full(len(uv_px), CORNER_SIGMA_PX))
+    return _settled(view, board, standard or turns, name)
 
 
-def see_charuco(picture: NDArray[np.generic], board: CharucoBoard, name: str = "plate picture") -> PlateView:
-    """Find the corners of a ChArUco board, also of a part of it.
-
-    Args:
-        picture: (H, W), grey.
-        board: what is known of it.
-        name: the picture's name, for the reason.
-
-    Returns:
-        PlateView, tied: the markers tell every corner.
-    """
+def _charuco(picture: NDArray[np.generic], board: CharucoBoard, name: str) -> PlateView:
+    """Find the corners of a ChArUco board or a part of it; its markers identify every corner."""
     detector = cv2.aruco.CharucoDetector(board.opencv())
     corners, ids, _, markers = detector.detectBoard(_eight_bits(picture))
     count = 0 if ids is None else len(ids)
@@ -67,24 +87,15 @@ def see_charuco(picture: NDArray[np.generic], board: CharucoBoard, name: str = "
         expected = f"{LEAST_CORNERS} corners or more of a {board.columns} x {board.rows} ChArUco board"
         got = f"{count} corners, {0 if markers is None else len(markers)} markers of {board.dictionary}"
         do = "show more of the board, or correct columns, rows, dictionary or legacy_pattern"
-        return nothing_seen(refusal(name, expected=expected, got=got, do=do))
+        return refused_view(name, expected=expected, got=got, do=do)
     # OpenCV has refined these already, in windows that keep clear of the markers.
-    uv_px = np.asarray(corners).reshape(-1, 2).astype(np.float64)
-    return _settled(board, index, uv_px, np.full(count, CORNER_SIGMA_PX), [np.zeros(3, dtype=np.int64)], name)
+    return _view(board, index, np.asarray(corners).reshape(-1, 2).astype(np.float64), np.full(count, CORNER_SIGMA_PX))
 
 
-def see_circles(picture: NDArray[np.generic], grid: CircleGrid, name: str = "plate picture") -> PlateView:
-    """Find the circles of a grid that is wholly in the picture.
+def _circles(picture: NDArray[np.generic], grid: CircleGrid, name: str) -> PlateView:
+    """Find the circles of a whole grid; floating where the grid is the same after a rotation.
 
-    The circles are found and measured by `find_dots`; OpenCV only says which of them is which.
-
-    Args:
-        picture: (H, W), grey.
-        grid: what is known of it.
-        name: the picture's name, for the reason.
-
-    Returns:
-        PlateView; floating where the grid looks the same after a turn.
+    `find_dots` finds and measures the circles; OpenCV only orders them.
     """
     dots = find_dots(picture, dark=grid.dark)
     order = _circles_in_order(dots, grid)
@@ -92,15 +103,29 @@ def see_circles(picture: NDArray[np.generic], grid: CircleGrid, name: str = "pla
         kind = "an asymmetric grid" if grid.asymmetric else "a grid"
         expected, got = f"{kind} of {grid.columns} x {grid.rows} circles", f"none among {len(dots)} dots"
         do = "show the whole grid, or correct columns, rows, asymmetric or dots of the plate"
-        return nothing_seen(refusal(name, expected=expected, got=got, do=do))
+        return refused_view(name, expected=expected, got=got, do=do)
     uv_px = dots.uv_px[order]
     index = _row_by_row(grid.columns, grid.rows)
-    if grid.asymmetric:
-        # OpenCV's own points: the highest row is not shifted.
+    if grid.asymmetric:  # OpenCV's own points: the top row is not shifted
         index[:, 0] = 2 * index[:, 0] + (grid.rows - 1 - index[:, 1]) % 2
-    index = _seen_from_front(index, uv_px)
     turns = _turns(grid.extent)[:1] if grid.asymmetric else _turns(grid.extent)
-    return _settled(grid, index, uv_px, dots.sigma_px[order], turns, name)
+    view = _view(grid, _seen_from_front(index, uv_px), uv_px, dots.sigma_px[order])
+    return _settled(view, grid, turns, name)
+
+
+def _view(plate: CalibrationTarget, index: Ints, uv_px: Floats, sigma_px: Floats) -> PlateView:
+    points, diameters = plate.points(index), plate.diameters(index)
+    return PlateView(points_plate_mm=points, uv_px=uv_px, sigma_px=sigma_px, diameter_mm=diameters, index=index)
+
+
+def _settled(view: PlateView, plate: CalibrationTarget, placements: list[Ints], name: str) -> PlateView:
+    """Return the view tied if one placement is left, else floating."""
+    if len(placements) == 1:
+        return placed(view, plate, placements[0])
+    expected, got = "a plate that looks the same from one side only", f"{len(placements)} possible rotations"
+    do = "tie it through the other camera, or use a plate with marks"
+    reason = refusal(name, expected=expected, got=got, do=do)
+    return replace(view, state="floating", reason=reason, placements=np.stack(placements))
 
 
 def _eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
@@ -113,7 +138,7 @@ def _eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
 
 
 def _refined(grey: NDArray[np.uint8], uv_px: Floats) -> Floats:
-    """Return corners after OpenCV's sub-pixel step, in windows that hold one corner each."""
+    """Refine corners by OpenCV's sub-pixel step, in windows that hold one corner each."""
     away = np.linalg.norm(uv_px[:, None] - uv_px[None], axis=-1) + np.diag(np.full(len(uv_px), np.inf))
     half = int(np.clip(WINDOW * away.min(), 2, 15))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
@@ -133,9 +158,9 @@ def _homography(index: Floats | Ints, uv_px: Floats) -> Floats:
 
 
 def _seen_from_front(index: Ints, uv_px: Floats) -> Ints:
-    """Return the indices, rows reversed where OpenCV counts as if from behind: most patterns have no handedness."""
+    """Return the indices, with rows reversed where OpenCV counts as if seen from behind."""
     h = _homography(index - index.mean(axis=0), uv_px)
-    # Slope of the picture at the middle of the board; v runs down, so from the front its determinant is negative.
+    # Jacobian at the middle of the board; v runs down, so from the front its determinant is negative.
     slope = h[:2, :2] / h[2, 2] - np.outer(h[:2, 2], h[2, :2]) / h[2, 2] ** 2
     if np.linalg.det(slope) < 0:
         return index
@@ -143,7 +168,7 @@ def _seen_from_front(index: Ints, uv_px: Floats) -> Ints:
 
 
 def _turns(extent: tuple[int, int]) -> list[Ints]:
-    """Return the placements (3,) that put a grid with indices 0 .. extent back onto itself."""
+    """Return the placements (3,) that map a grid with indices 0 .. extent onto itself."""
     across, up = extent
     turns = [(0, 0, 0), (2, across, up)]
     if across == up:
@@ -158,7 +183,7 @@ def _lower_left_is_dark(grey: NDArray[np.uint8], index: Ints, uv_px: Floats) -> 
     middle = np.column_stack([i + 0.5, j + 0.5, np.ones(len(i))]) @ homography.T
     u, v = np.rint(middle[:, :2] / middle[:, 2:]).astype(int).T
     value = grey[v.clip(0, grey.shape[0] - 1), u.clip(0, grey.shape[1] - 1)].astype(np.float64)
-    like_corner = (i + j) % 2 == 0  # the square above and right of corner (0, 0) is as the one below and left of it
+    like_corner = (i + j) % 2 == 0  # the colour of the square to the upper right of corner (0, 0)
     return bool(value[like_corner].mean() < value[~like_corner].mean())
 
 
@@ -177,28 +202,3 @@ def _circles_in_order(dots: Dots, grid: CircleGrid) -> Ints | None:
             if len(set(order.tolist())) == len(order) and float(away.min(axis=1).max()) < 0.5:
                 return np.asarray(order, dtype=np.int64)
     return None
-
-
-def _settled(
-    plate: Chessboard | CharucoBoard | CircleGrid,
-    index: Ints,
-    uv_px: Floats,
-    sigma_px: Floats,
-    placements: list[Ints],
-    name: str,
-) -> PlateView:
-    """Return the view, tied where one placement is left."""
-    expected, got = "a plate that looks the same from one side only", f"{len(placements)} readings of its turn"
-    do = "tie it through the other camera, or use a plate with marks"
-    view = PlateView(
-        points_plate_mm=plate.points(index),
-        uv_px=uv_px,
-        sigma_px=sigma_px,
-        diameter_mm=plate.diameters(index),
-        index=index,
-        state="floating",
-        reason=refusal(name, expected=expected, got=got, do=do),
-        placements=np.stack(placements),
-    )
-    chosen = placed(view, plate, placements[0])
-    return chosen if len(placements) == 1 else view

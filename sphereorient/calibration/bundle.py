@@ -1,67 +1,221 @@
-"""All cameras and all plate poses fitted at once to all points seen: bundle adjustment with covariances."""
+"""Bundle adjustment: all cameras and all plate poses fitted together to all points seen, with covariances."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.calibration.descent import robust_least_squares
-from sphereorient.calibration.problem import Problem, Rig
-from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient import so3
+from sphereorient.calibration.plate_view import PlateView
+from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
+from sphereorient.cameras import Camera, ParameterCovariance, PortCamera
+from sphereorient.cameras.checks import check_points
+from sphereorient.cameras.parameters import ROTATION, TRANSLATION, parameter_names, with_parameters
 
-SOFT = 2.0  # sigmas beyond which a residual pulls less than by its square
+POSE_PARTS = 6  # rotation (rad, lab) and translation (mm) of a plate pose
+HELD = ("pixel_pitch_u", "pixel_pitch_v", "sx", "k3")  # scales that f already has, and a term that few lenses need
+SOFT = 2.0  # sigmas beyond which the loss of a residual grows linearly
 OUTLIER = 6.0  # robust standard deviations beyond which a point is left out
+RIM_POINTS = 8  # of each disk; terms beyond the second order of the rim are negligible
 ROUNDS = 3  # of fit, perspective bias and outliers
 STEPS = 60  # at most, a round
-TOLERANCE = (1e-5, 1e-8)  # relative gain of the cost at which a round ends: those whose weights change, and the last
+GAIN = (1e-5, 1e-8)  # relative gain of the cost at which a round ends: all rounds but the last, and the last
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rig:
+    """Cameras and the plate's P poses; made by the guess, improved by the fit."""
+
+    cameras: Mapping[str, Camera]
+    R_lab_plate: Tensor  # (P, 3, 3)
+    T_lab_plate_mm: Tensor  # (P, 3)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SeenPoints:
+    """All n points that one camera saw of the plate, over all pictures."""
+
+    pose: Tensor  # (n,) int64, row of the rig's poses
+    points_plate_mm: Tensor  # (n, 3)
+    diameter_mm: Tensor  # (n,), of the dot; 0 for corners
+    uv_px: Tensor  # (n, 2), measured
+    sigma_px: Tensor  # (n,)
+
+
+def gathered(views: Mapping[int, PlateView]) -> SeenPoints:
+    """Join the views of one camera, keyed by the row of the rig's poses."""
+    rows = sorted(views)
+    names = ("points_plate_mm", "diameter_mm", "uv_px", "sigma_px")
+    joined = {name: torch.from_numpy(np.concatenate([getattr(views[row], name) for row in rows])) for name in names}
+    pose = torch.cat([torch.full((len(views[row]),), row, dtype=torch.int64) for row in rows])
+    return SeenPoints(pose=pose, **joined)
+
+
+def fitted_parameters(camera: Camera, of_port: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the names of the fitted parameters: lens, pose, and of the port those in `of_port`."""
+    inner = camera.camera if isinstance(camera, PortCamera) else camera
+    return (*(name for name in parameter_names(inner) if name not in HELD), *of_port)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Problem:
+    """Residuals and their slopes as functions of one vector: the cameras' changes, then those of the free poses."""
+
+    rig: Rig
+    seen: Mapping[str, SeenPoints]
+    names: Mapping[str, tuple[str, ...]]  # of each camera's fitted parameters
+    fixed: frozenset[int]  # rows of poses that define the lab
+
+    @property
+    def free(self) -> list[int]:
+        """Rows of the poses that are fitted: those that a camera saw and that do not define the lab."""
+        rows = {row for seen in self.seen.values() for row in seen.pose.tolist()}
+        return sorted(rows - self.fixed)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return sum(len(names) for names in self.names.values()) + POSE_PARTS * len(self.free)
+
+    @property
+    def labels(self) -> list[str]:
+        """Names of the unknowns, such as cam1.f and pose 3, T_x."""
+        of_cameras = [f"{camera}.{name}" for camera, names in self.names.items() for name in names]
+        return [*of_cameras, *(f"pose {row}, {part}" for row in self.free for part in (*ROTATION, *TRANSLATION))]
+
+    def applied(self, change: Tensor) -> Rig:
+        """Return the rig with a vector of changes (size,) applied."""
+        shares, poses = self._split(change)
+        return Rig(
+            cameras={name: self._camera(name, share) for name, share in shares.items()},
+            R_lab_plate=so3.exp(poses[:, :3]) @ self.rig.R_lab_plate,
+            T_lab_plate_mm=self.rig.T_lab_plate_mm + poses[:, 3:],
+        )
+
+    def shifts(self, rig: Rig) -> dict[str, Tensor]:
+        """Return the perspective bias of each dot, (n, 2) px of every camera."""
+        return {
+            name: torch.nan_to_num(
+                disk_centre_shift(
+                    rig.cameras[name],
+                    rig.R_lab_plate[seen.pose],
+                    rig.T_lab_plate_mm[seen.pose],
+                    seen.points_plate_mm[:, None],
+                    seen.diameter_mm[:, None],
+                )[:, 0]
+            )
+            for name, seen in self.seen.items()
+        }
+
+    def residuals(self, change: Tensor, shifts: Mapping[str, Tensor]) -> Tensor:
+        """Return measured minus expected pixels over their sigmas, (2 n,), one camera after the other."""
+        shares, poses = self._split(change)
+        parts = []
+        for name, seen in self.seen.items():
+            missed = seen.uv_px - shifts[name] - self._expected(name, shares[name], poses)
+            parts.append((missed / seen.sigma_px[:, None]).reshape(-1))
+        return torch.cat(parts)
+
+    def slopes(self, change: Tensor) -> Tensor:
+        """Return the derivatives of the residuals (2 n, size).
+
+        A point's image depends on its own camera and its own pose, so all poses are differentiated in one pass.
+        """
+        shares, poses = self._split(change)
+        free, first_pose, offset, parts = self.free, self.size - POSE_PARTS * len(self.free), 0, []
+        for name, seen in self.seen.items():
+            share, count = shares[name], len(shares[name])
+            block = change.new_zeros(len(seen.pose), 2, self.size)
+            units = torch.eye(count, dtype=torch.float64)
+            block[:, :, offset : offset + count] = slopes_along(partial(self._of_share, name, poses), share, units)
+            units = torch.eye(POSE_PARTS, dtype=torch.float64)[:, None].expand(-1, len(poses), -1)
+            by_pose = slopes_along(partial(self._expected, name, share), poses, units)
+            for k, row in enumerate(free):
+                begin = first_pose + POSE_PARTS * k
+                block[seen.pose == row, :, begin : begin + POSE_PARTS] = by_pose[seen.pose == row]
+            parts.append((-block / seen.sigma_px[:, None, None]).flatten(0, 1))
+            offset += count
+        return torch.cat(parts)
+
+    def _split(self, change: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+        """Split a vector of changes into those of each camera and those of all poses (P, 6)."""
+        lengths = [len(names) for names in self.names.values()]
+        *shares, poses = torch.split(change, [*lengths, POSE_PARTS * len(self.free)])
+        whole = change.new_zeros(len(self.rig.R_lab_plate), POSE_PARTS)
+        whole[self.free] = poses.view(-1, POSE_PARTS)
+        return dict(zip(self.names, shares, strict=True)), whole
+
+    def _camera(self, name: str, share: Tensor) -> Camera:
+        camera = self.rig.cameras[name]
+        return with_parameters(camera, self.names[name], share) if self.names[name] else camera
+
+    def _of_share(self, name: str, poses: Tensor, share: Tensor) -> Tensor:
+        return self._expected(name, share, poses)
+
+    def _expected(self, name: str, share: Tensor, poses: Tensor) -> Tensor:
+        """Return the expected pixels of one camera's points, (n, 2)."""
+        seen = self.seen[name]
+        R = (so3.exp(poses[:, :3]) @ self.rig.R_lab_plate)[seen.pose]
+        T = (self.rig.T_lab_plate_mm + poses[:, 3:])[seen.pose]
+        return self._camera(name, share).project((R @ seen.points_plate_mm[..., None])[..., 0] + T)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fitted:
-    """What a fit found; made by `adjust`."""
+    """The result of `adjust`."""
 
     rig: Rig  # cameras with covariances
-    residual_px: Mapping[str, Tensor]  # (n, 2) of each camera, measured less expected
+    residual_px: Mapping[str, Tensor]  # (n, 2) of each camera, measured minus expected
     used: Mapping[str, Tensor]  # (n,) bool: False for outliers
-    scale: float  # standard deviation of the residuals over the sigmas given
+    scale: float  # standard deviation of the residuals over the given sigmas
     labels: tuple[str, ...]  # K unknowns, in the order of the covariance
     covariance: Tensor  # (K, K) float64, of cameras and poses together
 
 
 def adjust(problem: Problem) -> Fitted:
-    """Fit cameras and poses.
+    """Fit cameras and poses; the covariance is the inverse information times the residuals' variance.
 
     Args:
-        problem: with a rig near enough: dots must fall nearer to their own pictures than to their neighbours'.
-
-    Returns:
-        The fit; its covariance is the inverse information times the residuals' variance.
+        problem: its rig must be near enough: dots fall nearer to their own images than to their neighbours'.
 
     Source: Triggs et al. 2000 (bundle adjustment); soft L1 loss, Huber 1981.
     """
-    used = {name: torch.ones(len(seen.pose), dtype=torch.bool) for name, seen in problem.seen.items()}
     change = torch.zeros(problem.size, dtype=torch.float64)
+    lengths = [len(seen.pose) for seen in problem.seen.values()]
+    good = torch.ones(sum(lengths), dtype=torch.bool)
     for k in range(ROUNDS):
-        shifts = problem.shifts(problem.applied(change))
-        change = _solved(problem, change, shifts, _rows(used), TOLERANCE[k == ROUNDS - 1])
-        residuals = problem.residuals(change, shifts)
-        used = _inliers(problem, residuals)
-    shifts = problem.shifts(problem.applied(change))
-    residuals = problem.residuals(change, shifts)
-    rows = _rows(used)
-    slopes = problem.slopes(change)[rows]
-    spare = max(len(slopes) - problem.size, 1)
-    scale = float((residuals[rows].square().sum() / spare).sqrt())
-    covariance = scale**2 * _inverse(slopes.mT @ slopes)
+        shifts, rows = problem.shifts(problem.applied(change)), good.repeat_interleave(2)  # rows: u and v of points
+        change = _solved(problem, change, shifts, rows, GAIN[k == ROUNDS - 1])
+        size = problem.residuals(change, shifts).view(-1, 2).norm(dim=1)
+        usual = float(size.nanmedian()) / 1.1774  # the median length of a two-dimensional Gaussian is 1.1774 sigma
+        good = size <= OUTLIER * max(usual, 1e-12)
     rig = problem.applied(change)
+    residuals, rows = problem.residuals(change, problem.shifts(rig)), good.repeat_interleave(2)
+    slopes = problem.slopes(change)[rows]
+    scale = float((residuals[rows].square().sum() / max(len(slopes) - problem.size, 1)).sqrt())
+    covariance = scale**2 * inverse_information(slopes.mT @ slopes)
+    cameras, begin = {}, 0
+    for name, camera in rig.cameras.items():
+        names = problem.names[name]
+        block = covariance[begin : begin + len(names), begin : begin + len(names)]
+        begin += len(names)
+        known: Any = camera
+        cameras[name] = replace(known, covariance=ParameterCovariance(names=names, matrix=block)) if names else camera
+    parts = torch.split(residuals.view(-1, 2), lengths)
+    residual_px = {
+        name: part * seen.sigma_px[:, None] for part, (name, seen) in zip(parts, problem.seen.items(), strict=True)
+    }
     return Fitted(
-        rig=replace(rig, cameras=_with_covariances(problem, rig, covariance)),
-        residual_px=_in_px(problem, residuals),
-        used=used,
+        rig=replace(rig, cameras=cameras),
+        residual_px=residual_px,
+        used=dict(zip(problem.seen, torch.split(good, lengths), strict=True)),
         scale=scale,
         labels=tuple(problem.labels),
         covariance=covariance,
@@ -69,7 +223,7 @@ def adjust(problem: Problem) -> Fitted:
 
 
 def _solved(problem: Problem, start: Tensor, shifts: Mapping[str, Tensor], rows: Tensor, gain: float) -> Tensor:
-    return robust_least_squares(
+    return least_squares(
         lambda change: problem.residuals(change, shifts)[rows],
         lambda change: problem.slopes(change)[rows],
         start,
@@ -79,42 +233,54 @@ def _solved(problem: Problem, start: Tensor, shifts: Mapping[str, Tensor], rows:
     )
 
 
-def _rows(used: Mapping[str, Tensor]) -> Tensor:
-    """Rows of the residuals, u and v of each point, that belong to points in use."""
-    return torch.cat([mask.repeat_interleave(2) for mask in used.values()])
+def disk_centre_shift(
+    camera: Camera, R_lab_plate: Tensor, T_lab_plate: Tensor, points_plate: Tensor, dot_diameter: Tensor
+) -> Tensor:
+    """Return the centroids of the images of disks minus the images of their centres.
+
+    A measured centroid minus this shift is the image of the dot's centre. The centroid is an integral along the rim
+    (Green), the rim a trigonometric polynomial through RIM_POINTS points; image blur does not move it.
+
+    Args:
+        camera: any camera, also behind a port.
+        R_lab_plate: (..., 3, 3), takes plate components to lab components.
+        T_lab_plate: (..., 3), lab, mm: X_lab = R_lab_plate X_plate + T_lab_plate.
+        points_plate: (..., n, 3), the disks' centres, plate frame, mm; the disks lie in the plane z = const.
+        dot_diameter: (..., n), mm; 0 for a corner, whose shift is 0.
+
+    Returns:
+        (..., n, 2), px; NaN where a part of the disk is not imaged. Differentiable in everything.
+
+    Raises:
+        ShapeError: the last axis of points_plate is not 3.
+
+    Source: Green's theorem, area = 1/2 loop(u dv - v du), area times centroid_u = 1/2 loop(u^2 dv), likewise v.
+    """
+    check_points("points_plate", points_plate, 3)
+    angle = torch.arange(RIM_POINTS, dtype=torch.float64, device=points_plate.device) * (2 * math.pi / RIM_POINTS)
+    circle = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1).to(points_plate)
+    # A corner has no rim and would give 0/0: it gets a rim here, and its shift is set to 0 below.
+    is_disk = dot_diameter > 0
+    radius = torch.where(is_disk, dot_diameter, torch.ones_like(dot_diameter)) / 2
+    centres = points_plate[..., None, :]
+    around = torch.cat([centres, centres + radius[..., None, None] * circle], dim=-2)
+    uv_px = camera.project(around @ R_lab_plate[..., None, :, :].mT + T_lab_plate[..., None, None, :])
+    rim = uv_px[..., 1:, :] - uv_px[..., :1, :]
+    along = _slope_matrix(rim) @ rim  # d/d angle
+    u, v = rim.unbind(-1)
+    du, dv = along.unbind(-1)
+    twice_area = (u * dv - v * du).sum(-1)
+    shift = torch.stack([(u * u * dv).sum(-1), -(v * v * du).sum(-1)], dim=-1) / twice_area[..., None]
+    return torch.where(is_disk[..., None], shift, torch.zeros_like(shift))
 
 
-def _inliers(problem: Problem, residuals: Tensor) -> dict[str, Tensor]:
-    size = residuals.reshape(-1, 2).norm(dim=1)
-    # The median length of a two-dimensional Gaussian is 1.1774 sigma.
-    usual = float(size.nanmedian()) / 1.1774
-    good = size <= OUTLIER * max(usual, 1e-12)
-    lengths = [len(seen.pose) for seen in problem.seen.values()]
-    return dict(zip(problem.seen, torch.split(good, lengths), strict=True))
+def _slope_matrix(like: Tensor) -> Tensor:
+    """Return the (RIM_POINTS, RIM_POINTS) matrix of d/d angle of the trigonometric polynomial through the points.
 
-
-def _in_px(problem: Problem, residuals: Tensor) -> dict[str, Tensor]:
-    lengths = [len(seen.pose) for seen in problem.seen.values()]
-    parts = torch.split(residuals.reshape(-1, 2), lengths)
-    return {name: part * seen.sigma_px[:, None] for part, (name, seen) in zip(parts, problem.seen.items(), strict=True)}
-
-
-def _inverse(information: Tensor) -> Tensor:
-    """Invert an information matrix of parameters in different units; what nothing determines gets a huge variance."""
-    known = information.diagonal()
-    scale = torch.where(known > 0, known, torch.ones_like(known)).rsqrt()
-    values, vectors = torch.linalg.eigh(scale[:, None] * information * scale)
-    inverse: Tensor = (vectors / values.clamp_min(1e-14)) @ vectors.mT
-    whole: Tensor = scale[:, None] * inverse * scale
-    return (whole + whole.mT) / 2
-
-
-def _with_covariances(problem: Problem, rig: Rig, covariance: Tensor) -> dict[str, Any]:
-    cameras, begin = {}, 0
-    for name, camera in rig.cameras.items():
-        names = problem.names[name]
-        block = covariance[begin : begin + len(names), begin : begin + len(names)]
-        begin += len(names)
-        known: Any = camera
-        cameras[name] = replace(known, covariance=ParameterCovariance(names=names, matrix=block)) if names else camera
-    return cameras
+    Source: Trefethen, Spectral Methods in MATLAB, eq. (3.10), even number of points.
+    """
+    k = torch.arange(RIM_POINTS, device=like.device)
+    apart = (k[:, None] - k[None, :]).to(torch.float64) * (math.pi / RIM_POINTS)
+    sign = 1.0 - 2.0 * ((k[:, None] - k[None, :]) % 2)
+    slope = 0.5 * sign / torch.tan(torch.where(apart == 0, torch.ones_like(apart), apart))
+    return torch.where(apart == 0, torch.zeros_like(slope), slope).to(like)

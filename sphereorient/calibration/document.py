@@ -1,36 +1,42 @@
-"""calibration.yaml: what was filmed, and what is known of it."""
+"""calibration.yaml: the pictures or point tables, the plate, and what is known in advance."""
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, StrictInt
 from torch import Tensor
 
-from sphereorient.calibration.entry import Target, plate_from_entry
+from sphereorient.calibration.targets import CalibrationTarget, plate_from_entry
 from sphereorient.cameras import Port
-from sphereorient.cameras.io.entries import PortEntry
+from sphereorient.cameras.io.cameras_yaml import PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
 from sphereorient.errors import CameraError, refusal
+from sphereorient.files.whole_file import TABLE_BYTES, read_whole
 from sphereorient.files.yaml_file import read_document, refuse_unknown, short, validated
 
 SCHEMA = "sphereorient-calibration/1"
-ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: what four digits after the point leave
+ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: rounding to four digits after the point
+COLUMNS = ("x", "y", "z", "u", "v")  # mm, mm, mm, px, px
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(gt=0)]
 Triple = tuple[Number, Number, Number]
 Model = Literal["tsai", "pinhole", "brown"]
-# Points of tables are in the lab already: a plate that lies in the lab's own axes.
+# Points of tables are lab points: a plate whose frame is the lab's.
 IN_THE_LAB = {0: (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))}
 
 
 class SurveyedKeys(BaseModel):
-    """Where the plate stood in the lab in one pose; this defines the lab frame."""
+    """The plate's pose in the lab in one picture; it defines the lab frame."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     pose: int
@@ -38,8 +44,16 @@ class SurveyedKeys(BaseModel):
     T_lab_plate: Triple
 
 
+class PictureKeys(BaseModel):
+    """One pose: its number, and the picture of each camera."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+    __pydantic_extra__: dict[str, str]
+    pose: StrictInt
+
+
 class CalibrationKeys(BaseModel):
-    """Keys of calibration.yaml (DESIGN section 2)."""
+    """Keys of calibration.yaml (docs/calibration.md)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     image_size: tuple[Pixels, Pixels]
@@ -47,7 +61,7 @@ class CalibrationKeys(BaseModel):
     plate: Any = None
     surveyed: SurveyedKeys | None = None
     ports: dict[str, PortEntry] = {}
-    pictures: list[dict[str, Any]] = []
+    pictures: list[PictureKeys] = []
     points: dict[str, str] = {}
     model: Model = "tsai"
     fit_ports: tuple[str, ...] = ()
@@ -64,42 +78,41 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CalibrationDocument:
-    """A calibration.yaml, checked; made by `load_calibration`."""
+    """A checked calibration.yaml; made by `load_calibration`."""
 
     path: Path
     image_size: tuple[int, int]  # W, H px
     pixel_pitch_mm: tuple[float, float]
     model: Model
-    plate: Target | None
+    plate: CalibrationTarget | None
     poses: tuple[int, ...]  # numbers of the poses, by row
     surveyed: Mapping[int, tuple[Tensor, Tensor]]  # row of the pose -> R_lab_plate, T_lab_plate (mm)
     pictures: tuple[Picture, ...]
-    points: Mapping[str, Path]  # camera -> table of points in the lab and their pixels
+    points: Mapping[str, Path]  # camera -> table of lab points and their pixels
     ports: Mapping[str, Port]
     fit_ports: tuple[str, ...]  # names of the ports' parameters that are fitted too
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras, in the order in which the file names them."""
+        """Names of the cameras, in the file's order."""
         return tuple(dict.fromkeys([*(picture.camera for picture in self.pictures), *self.points]))
 
 
 def load_calibration(path: Path | str) -> CalibrationDocument:
-    """Read calibration.yaml; pictures and tables are opened by who needs them.
+    """Read calibration.yaml, without its pictures and tables.
 
     Raises:
-        CameraError: missing, malformed, or without what a calibration needs.
+        CameraError: missing, malformed, or incomplete.
     """
     path = Path(path)
     keys = validated(CalibrationKeys, read_document(path, SCHEMA, CameraError), str(path), CameraError)
     if bool(keys.pictures) == bool(keys.points):
         got, do = ("both" if keys.points else "neither"), "name pictures of a plate, or tables of points"
-        raise CameraError(refusal(f"{path}, pictures, points", expected="one of them", got=got, do=do))
-    numbers = _pose_numbers(keys, path) if keys.pictures else (0,)
+        raise _refused(f"{path}, pictures, points", "one of them", got, do)
+    numbers = tuple(sorted({one.pose for one in keys.pictures})) or (0,)
     pictures = _pictures(keys, path, numbers)
     if keys.pictures and keys.plate is None:
-        do = "say what the plate is: type, columns, rows, pitch"
-        raise CameraError(refusal(f"{path}, plate", expected="a plate", got="none", do=do))
+        raise _refused(f"{path}, plate", "a plate", "none", "write what the plate is: type, columns, rows, pitch")
     document = CalibrationDocument(
         path=path,
         image_size=keys.image_size,
@@ -117,6 +130,37 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
     return document
 
 
+def read_points(path: Path) -> NDArray[np.float64]:
+    """Read a CSV table with the columns x, y, z (lab, mm), u, v (px), in any order, as (n, 5).
+
+    Raises:
+        CameraError: unreadable, a missing column, or something that is not a number.
+    """
+    content = read_whole(path, TABLE_BYTES, "a table", CameraError, "correct the path")
+    try:
+        text = content.decode("utf-8-sig")
+        rows = list(csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True))
+    except (UnicodeDecodeError, csv.Error) as fault:
+        raise _refused(str(path), "a table", "a file that is not CSV", "save the table as CSV") from fault
+    known = [name.strip() for name in rows[0] if name is not None] if rows else []
+    missing = [name for name in COLUMNS if name not in known]
+    if missing:
+        expected, do = f"a first line {','.join(COLUMNS)} and one row a point", "write mm in the lab, and px"
+        raise _refused(str(path), expected, f"no {', '.join(missing)}" if rows else "no rows", do)
+    return np.array([[_number(path, k, row, name) for name in COLUMNS] for k, row in enumerate(rows)])
+
+
+def _number(path: Path, k: int, row: dict[str, str], name: str) -> float:
+    try:
+        value = float(row.get(name) or "")
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        do = "correct the number, or leave the point out"
+        raise _refused(f"{path}, row {k + 1}, {name}", "a number", short(row.get(name)), do)
+    return value
+
+
 def _ports(keys: CalibrationKeys, path: Path) -> dict[str, Port]:
     ports = {}
     for name, entry in keys.ports.items():
@@ -130,64 +174,50 @@ def _ports(keys: CalibrationKeys, path: Path) -> dict[str, Port]:
 def _check_ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> None:
     for name in keys.ports:
         if name not in cameras:
-            do = f"name one of {', '.join(cameras)}"
-            raise CameraError(refusal(f"{path}, ports", expected="a camera with pictures", got=f"'{name}'", do=do))
+            raise _refused(f"{path}, ports", "a camera with pictures", f"'{name}'", f"name one of {', '.join(cameras)}")
     for name in keys.fit_ports:
         if name not in (*PORT_NUMBERS, *PORT_TILT):
             raise CameraError(refuse_unknown(name, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports"))
     if keys.fit_ports and not keys.ports:
-        do = "say under `ports` where the walls are, as well as you know"
-        raise CameraError(refusal(f"{path}, fit_ports", expected="ports to fit", got="none", do=do))
+        do = "write under `ports` where the walls are, as well as you know"
+        raise _refused(f"{path}, fit_ports", "ports to fit", "none", do)
     if len(set(keys.fit_ports)) < len(keys.fit_ports):
-        got, do = ", ".join(keys.fit_ports), "name each once"
-        raise CameraError(refusal(f"{path}, fit_ports", expected="different names", got=got, do=do))
-
-
-def _pose_numbers(keys: CalibrationKeys, path: Path) -> tuple[int, ...]:
-    numbers = []
-    for k, entry in enumerate(keys.pictures):
-        pose = entry.get("pose")
-        if isinstance(pose, bool) or not isinstance(pose, int):
-            expected, do = "a whole number", "number the plate's poses"
-            raise CameraError(refusal(f"{path}, pictures, {k}, pose", expected=expected, got=short(pose), do=do))
-        numbers.append(pose)
-    return tuple(sorted(set(numbers)))
+        raise _refused(f"{path}, fit_ports", "different names", ", ".join(keys.fit_ports), "name each once")
 
 
 def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> tuple[Picture, ...]:
     pictures, seen = [], set()
     for k, entry in enumerate(keys.pictures):
-        row = numbers.index(entry["pose"])
-        if len(entry) == 1:
+        row, files = numbers.index(entry.pose), entry.model_extra or {}
+        if not files:
             do = "name a picture, such as cam1: cam1_00.png, or leave the entry out"
-            raise CameraError(refusal(f"{path}, pictures, {k}", expected="a picture", got="none", do=do))
-        for name, file in entry.items():
-            if name == "pose":
-                continue
-            where = f"{path}, pictures, {k}, {name}"
-            if not isinstance(file, str):
-                raise CameraError(refusal(where, expected="a file", got=short(file), do="name a picture"))
+            raise _refused(f"{path}, pictures, {k}", "a picture", "none", do)
+        for name, file in files.items():
             if (row, name) in seen:
-                got, do = f"a second one of pose {entry['pose']}", "give every pose its own number"
-                raise CameraError(refusal(where, expected="one picture of a pose", got=got, do=do))
+                got, do = f"a second one of pose {entry.pose}", "give every pose its own number"
+                raise _refused(f"{path}, pictures, {k}, {name}", "one picture of a pose", got, do)
             seen.add((row, name))
-            pictures.append(Picture(camera=str(name), row=row, path=path.parent / file))
+            pictures.append(Picture(camera=name, row=row, path=path.parent / file))
     return tuple(pictures)
 
 
 def _surveyed(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> dict[int, tuple[Tensor, Tensor]]:
     where = f"{path}, surveyed"
     if keys.surveyed is None:
-        do = "say where the plate stood in the lab in one pose: pose, R_lab_plate, T_lab_plate"
-        raise CameraError(refusal(where, expected="a pose that defines the lab frame", got="none", do=do))
+        do = "write the plate's pose in the lab in one picture: pose, R_lab_plate, T_lab_plate"
+        raise _refused(where, "a pose that defines the lab frame", "none", do)
     if keys.surveyed.pose not in numbers:
-        got, do = f"pose {keys.surveyed.pose}, without a picture", "name a pose that was filmed"
-        raise CameraError(refusal(where, expected="a pose with a picture", got=got, do=do))
+        got = f"pose {keys.surveyed.pose}, without a picture"
+        raise _refused(where, "a pose with a picture", got, "name a pose that was filmed")
     R = torch.tensor(keys.surveyed.R_lab_plate, dtype=torch.float64)
     off = float((R @ R.mT - torch.eye(3, dtype=torch.float64)).abs().max())
     if off > ROTATION_TOLERANCE or float(torch.linalg.det(R)) < 0:
         got = "a reflection" if off <= ROTATION_TOLERANCE else f"rows that are {off:.2g} from it"
         do = "write the plate's x, y and z axis in the lab as its columns"
-        raise CameraError(refusal(f"{where}, R_lab_plate", expected="a rotation", got=got, do=do))
+        raise _refused(f"{where}, R_lab_plate", "a rotation", got, do)
     U, _, Vh = torch.linalg.svd(R)
     return {numbers.index(keys.surveyed.pose): (U @ Vh, torch.tensor(keys.surveyed.T_lab_plate, dtype=torch.float64))}
+
+
+def _refused(name: str, expected: str, got: str, do: str) -> CameraError:
+    return CameraError(refusal(name, expected=expected, got=got, do=do))

@@ -1,8 +1,7 @@
-"""Dots of a calibration plate in a picture: found at many grey levels, measured by fitting a blurred ellipse."""
+"""Dots of a calibration plate: found at many grey levels, measured by fitting blurred ellipses."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -10,20 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from sphereorient.calibration.ellipse import fit_ellipses
-from sphereorient.calibration.plate import Floats
+from sphereorient.calibration.ellipse import Dots, fit_ellipses, half_box
+from sphereorient.calibration.targets import Floats
 from sphereorient.errors import CameraError, refusal
+
+_Chain = list[tuple[Floats, Floats, float]]  # centre, shape and area of a blob, one for each grey level
 
 
 class DotSettings(BaseModel):
-    """How dots are found."""
+    """Settings of the dot detection."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     levels: int = Field(
-        32, ge=8, le=255, description="grey levels at which blobs are looked for; a dot must stand out over three"
+        32, ge=8, le=255, description="thresholds at which blobs are searched; a dot must be seen at three or more"
     )
-    smooth_px: float = Field(0.8, ge=0, description="sigma, px, of the smoothing before blobs are looked for (noise)")
+    smooth_px: float = Field(0.8, ge=0, description="sigma, px, of the smoothing before the search (noise)")
     smallest_area_px: float = Field(8.0, gt=0, description="px^2; below it a dot has too few pixels for its ellipse")
     largest_part: float = Field(
         0.2, gt=0, le=1, description="longest side of a dot, as part of the picture's shorter side"
@@ -32,58 +33,23 @@ class DotSettings(BaseModel):
         0.4, ge=0, lt=1, description="least contrast of a dot, as part of that of the strongest ones in the picture"
     )
     worst_misfit: float = Field(
-        0.12, gt=0, description="rms of the picture about the fitted dot, as part of its contrast; noise included"
+        0.12, gt=0, description="rms of the picture around the fitted dot, noise included, as part of its contrast"
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Dots:
-    """Dots that lie wholly in a picture; made by `find_dots`, read by `index_dots`."""
-
-    uv_px: Floats  # (n, 2), centres of the ellipses
-    shape: Floats  # (n, 2, 2), 1/px^2: x^T shape x = 1 on the rim, x from the centre
-    sigma_px: Floats  # (n,), standard deviation of each of u and v, from the fit
-    contrast: Floats  # (n,), share of the light that is missing in the dark part, 0 .. 1
-    blur_px: Floats  # (n,), sigma of the rim
-    misfit: Floats  # (n,), rms of the picture about the fitted dot, as part of its contrast
-
-    def __len__(self) -> int:
-        """Return the number of dots."""
-        return len(self.uv_px)
-
-    @property
-    def area_px(self) -> Floats:
-        """(n,), px^2, within the fitted rims."""
-        area: Floats = np.pi / np.sqrt(np.linalg.det(self.shape))
-        return area
-
-    @property
-    def axes_px(self) -> Floats:
-        """(n, 2), half axes, px, longer first."""
-        half: Floats = 1.0 / np.sqrt(np.linalg.eigvalsh(self.shape))
-        return half
-
-    def __getitem__(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> Dots:
-        """Return some of the dots."""
-        return Dots(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
-
-
 def find_dots(picture: NDArray[np.generic], *, dark: bool = True, settings: DotSettings | None = None) -> Dots:
-    """Find all dots that lie wholly in a picture, and measure their centres.
+    """Find all dots that lie wholly in a picture, and measure their centres, from top to bottom.
 
-    Blobs are taken from many grey levels, so uneven light needs no setting; each is then described by the rim, the
-    blur and the light of a blurred ellipse (`fit_ellipses`). Whether the dots belong to a plate is not asked here.
+    Blobs are taken from many grey levels, so uneven light needs no setting. A blurred ellipse is then fitted to each
+    (`fit_ellipses`). Whether the dots belong to a plate is decided later.
 
     Args:
         picture: (H, W), grey, any number type.
-        dark: dark dots on a bright ground; False: bright dots on a dark ground.
-        settings: how dots are found.
-
-    Returns:
-        Dots, from top to bottom; none where there are none.
+        dark: dark dots on a bright background; False: the reverse.
+        settings: of the detection.
 
     Raises:
-        CameraError: no grey picture, or NaN in it.
+        CameraError: not a grey picture, or NaN in it.
     """
     settings = settings or DotSettings()
     grey = as_grey(picture)
@@ -91,32 +57,24 @@ def find_dots(picture: NDArray[np.generic], *, dark: bool = True, settings: DotS
     fit = fit_ellipses(grey, centre, shape, dark=dark)
     height, width = grey.shape
     moved = np.einsum("na,nab,nb->n", fit.uv_px - centre, shape, fit.uv_px - centre)
-    reach = _reach(fit.shape)
+    reach = half_box(fit.shape)
     with np.errstate(invalid="ignore"):
         inside = ((fit.uv_px - reach >= -0.5) & (fit.uv_px + reach <= [width - 0.5, height - 0.5])).all(axis=1)
         good = inside & (fit.misfit < settings.worst_misfit) & (fit.contrast > 0.1) & (moved < 0.5)
-        good &= np.isfinite(fit.sigma_px) & (_area(fit.shape) >= settings.smallest_area_px)
+        good &= np.isfinite(fit.sigma_px) & (fit.area_px >= settings.smallest_area_px)
     if good.any():
-        # Grain of the noise can look like faint dots; the contrast of a plate's own dots is the same in any light.
+        # Noise can look like faint dots; the contrast of a plate's own dots is the same in any light.
         good &= fit.contrast > settings.faintest * np.percentile(fit.contrast[good], 95)
     good &= _first_of_equals(fit.uv_px, fit.shape, good)
-    dots = Dots(
-        uv_px=fit.uv_px,
-        shape=fit.shape,
-        sigma_px=fit.sigma_px,
-        contrast=fit.contrast,
-        blur_px=fit.blur_px,
-        misfit=fit.misfit,
-    )
     kept = np.flatnonzero(good)
-    return dots[kept[np.lexsort((fit.uv_px[kept, 0], fit.uv_px[kept, 1]))]]
+    return fit[kept[np.lexsort((fit.uv_px[kept, 0], fit.uv_px[kept, 1]))]]
 
 
 def as_grey(picture: NDArray[np.generic]) -> NDArray[np.float32]:
     """Return a picture (H, W) of any number type as grey values.
 
     Raises:
-        CameraError: no grey picture of 16 x 16 px or more, or NaN in it.
+        CameraError: not a grey picture of 16 x 16 px or more, or NaN in it.
     """
     if picture.ndim != 2 or min(picture.shape) < 16:
         do = "convert it to one grey picture"
@@ -127,20 +85,8 @@ def as_grey(picture: NDArray[np.generic]) -> NDArray[np.float32]:
     return grey
 
 
-def _area(shape: Floats) -> Floats:
-    area: Floats = np.pi / np.sqrt(np.maximum(np.linalg.det(shape), 1e-12))
-    return area
-
-
-def _reach(shape: Floats) -> Floats:
-    # Half width and half height of the ellipse's bounding box: roots of the diagonal of the inverse.
-    det = np.maximum(np.linalg.det(shape), 1e-12)
-    reach: Floats = np.sqrt(np.stack([shape[:, 1, 1], shape[:, 0, 0]], axis=1) / det[:, None])
-    return reach
-
-
 def _first_of_equals(uv_px: Floats, shape: Floats, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    # Two blobs can run into the same dot; candidates come in the order of their trust.
+    # Two blobs can converge to the same dot; candidates are sorted by confidence.
     kept = np.zeros_like(good)
     for k in np.flatnonzero(good):
         away = uv_px[kept] - uv_px[k]
@@ -148,52 +94,29 @@ def _first_of_equals(uv_px: Floats, shape: Floats, good: NDArray[np.bool_]) -> N
     return kept
 
 
-@dataclass
-class _Chain:
-    """A blob through the grey levels in which it keeps being an ellipse."""
-
-    centres: list[Floats]
-    shapes: list[Floats]
-    area: float
-
-
 def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Floats]:
     """Return centres (n, 2), px, and shapes (n, 2, 2) of dark blobs that are ellipses over three grey levels or more.
 
-    The picture is cut at many levels. A dot is an ellipse at every level between its own grey and that of its ground,
-    whatever the light there; a fragment of noise is one at one or two.
+    A dot is an ellipse at every threshold between its own grey and that of its background; noise at one or two.
     """
     smooth = cv2.GaussianBlur(grey, (0, 0), settings.smooth_px) if settings.smooth_px > 0 else grey
     low, high = np.percentile(smooth, [0.1, 99.9])
     done: list[_Chain] = []
-    open_chains: list[_Chain] = []
+    going: list[_Chain] = []
     for level in np.linspace(low, high, settings.levels + 2)[1:-1]:
         labels, number, area, centre, shape = _ellipses_at(smooth < level, settings)
-        going: dict[int, _Chain] = {}
-        for chain in open_chains:
-            u, v = np.rint(chain.centres[-1]).astype(int)
+        followed: dict[int, _Chain] = {}
+        for chain in sorted(going, key=len, reverse=True):  # a blob continues the longest chain that leads to it
+            u, v = np.rint(chain[-1][0]).astype(int)
             k = number.get(int(labels[v, u]), -1)
-            if k < 0 or area[k] > 1.6 * chain.area + 4:
+            if k < 0 or k in followed or area[k] > 1.6 * chain[-1][2] + 4:
                 done.append(chain)
-                continue
-            rival = going.get(k)
-            if rival is None or len(rival.centres) < len(chain.centres):
-                if rival is not None:
-                    done.append(rival)
-                going[k] = chain
             else:
-                done.append(chain)
-        open_chains = []
-        for k in range(len(area)):
-            chain = going.get(k) or _Chain([], [], 0.0)
-            chain.centres.append(centre[k])
-            chain.shapes.append(shape[k])
-            chain.area = float(area[k])
-            open_chains.append(chain)
-    chains = [c for c in done + open_chains if len(c.centres) >= 3]
-    chains.sort(key=lambda c: -len(c.centres))
-    centres = np.array([c.centres[len(c.centres) // 2] for c in chains]).reshape(-1, 2)
-    shapes = np.array([c.shapes[len(c.shapes) // 2] for c in chains]).reshape(-1, 2, 2)
+                followed[k] = chain
+        going = [[*followed.get(k, []), (centre[k], shape[k], float(area[k]))] for k in range(len(area))]
+    chains = sorted((chain for chain in done + going if len(chain) >= 3), key=len, reverse=True)
+    centres = np.array([chain[len(chain) // 2][0] for chain in chains]).reshape(-1, 2)
+    shapes = np.array([chain[len(chain) // 2][1] for chain in chains]).reshape(-1, 2, 2)
     kept = _first_of_equals(centres, shapes, np.ones(len(chains), dtype=bool))
     return centres[kept], shapes[kept]
 
@@ -201,7 +124,7 @@ def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Fl
 def _ellipses_at(
     mask: NDArray[np.bool_], settings: DotSettings
 ) -> tuple[NDArray[np.int32], dict[int, int], Floats, Floats, Floats]:
-    """Return the labels of the mask's pieces, and number, area, centre and shape of those that are ellipses."""
+    """Return the labels of the mask's components, and number, area, centre and shape of those that are ellipses."""
     height, width = mask.shape
     pieces: Any = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     labels, stats = pieces[1], pieces[2]

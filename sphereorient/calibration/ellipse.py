@@ -1,4 +1,4 @@
-"""A blurred ellipse fitted to the grey values about each dot."""
+"""Blurred ellipses fitted to the grey values around dots."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from sphereorient.calibration.plate import Floats
+from sphereorient.calibration.targets import Floats, Ints
 
-RING = 1.8  # the ground is looked at up to this many radii: less than half way to the next dot on usual plates
-LEAST_RING_PX = 2.5  # but at least so far beyond the rim, for dots of few pixels
+RING = 1.8  # radii up to which the background is fitted: less than half way to the next dot on usual plates
+LEAST_RING_PX = 2.5  # beyond the rim at least, for dots of few pixels
 OTHERS = 1.5  # radii within which pixels belong to another dot
 STEPS = 12  # of Levenberg and Marquardt, before and again after robust weights
 SETTLED = 1e-7  # part of the cost below which a further gain moves a centre by less than 0.001 of its sigma
@@ -21,46 +21,57 @@ LEAST_BLUR_PX = 0.2  # a rim is never sharper than its pixels make it (0.29)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EllipseFits:
-    """Fitted ellipses; what did not converge to an ellipse is NaN."""
+class Dots:
+    """Dots in a picture; made by `find_dots`, read by `index_dots`. What did not converge to an ellipse is NaN."""
 
-    uv_px: Floats  # (n, 2)
-    shape: Floats  # (n, 2, 2), 1/px^2
-    sigma_px: Floats  # (n,)
-    contrast: Floats  # (n,)
-    blur_px: Floats  # (n,)
-    misfit: Floats  # (n,)
+    uv_px: Floats  # (n, 2), centres of the ellipses
+    shape: Floats  # (n, 2, 2), 1/px^2: x^T shape x = 1 on the rim, x from the centre
+    sigma_px: Floats  # (n,), standard deviation of each of u and v, from the fit
+    contrast: Floats  # (n,), share of the light that is missing in the dark part, 0 .. 1
+    blur_px: Floats  # (n,), sigma of the rim
+    misfit: Floats  # (n,), rms of the picture around the fitted dot, relative to its contrast
+
+    def __len__(self) -> int:
+        """Return the number of dots."""
+        return len(self.uv_px)
+
+    @property
+    def area_px(self) -> Floats:
+        """(n,), px^2, within the fitted rims."""
+        area: Floats = np.pi / np.sqrt(np.maximum(np.linalg.det(self.shape), 1e-12))
+        return area
+
+    def __getitem__(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> Dots:
+        """Return some of the dots."""
+        return Dots(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
 
 
-def fit_ellipses(grey: NDArray[np.float32], centre_px: Floats, shape: Floats, *, dark: bool) -> EllipseFits:
-    """Fit rim, blur, light and contrast of dots to the grey values about them.
+def fit_ellipses(grey: NDArray[np.float32], centre_px: Floats, shape: Floats, *, dark: bool) -> Dots:
+    """Fit rim, blur, light and contrast of dots to the grey values around them.
 
-    The model is light(u, v) (1 - contrast cover(u, v)): the light a plane, the cover of the dark part an error
-    function of the distance from an ellipse. It is symmetric about the centre except for the light, so neither blur
-    nor a wrong profile of the rim moves the centre; truncation at the picture's edge does not either.
+    The model is light(u, v) (1 - contrast cover(u, v)): the light is a plane, the cover of the dark part an error
+    function of the distance from an ellipse. It is symmetric about the centre except for the light, so blur, a wrong
+    profile of the rim and truncation at the picture's edge do not move the centre.
 
     Args:
         grey: (H, W).
         centre_px: (n, 2), first guess.
         shape: (n, 2, 2), first guess, 1/px^2: x^T shape x = 1 on the rim.
-        dark: dark dots on a bright ground, or the other way round.
-
-    Returns:
-        EllipseFits, (n, ...).
+        dark: dark dots on a bright background; False: the reverse.
     """
     n = len(centre_px)
     values = np.full((n, PARAMETERS), np.nan)
     sigma, misfit = np.full(n, np.nan), np.full(n, np.nan)
     owner = _owners(grey.shape, centre_px, shape)
-    half = np.ceil(RING * _half_box(shape) + LEAST_RING_PX).astype(int).max(axis=1, initial=0)
+    half = _window(shape)
     # Windows of similar size are fitted together; one large blob must not pad all others.
     bucket = np.ceil(np.log(np.maximum(half, 1)) / np.log(1.35)).astype(int)
     for size in np.unique(bucket):
         some = np.flatnonzero(bucket == size)
-        windows = _Windows.cut(grey, owner, some, centre_px[some], shape[some], int(half[some].max()))
+        windows = _Windows.cut(grey, owner, some, centre_px[some], shape[some])
         values[some], sigma[some], misfit[some] = windows.fit(shape[some], dark)
     fitted = values[:, 2:5]
-    return EllipseFits(
+    return Dots(
         uv_px=centre_px + values[:, :2],
         shape=np.stack([fitted[:, [0, 1]], fitted[:, [1, 2]]], axis=1),
         sigma_px=sigma,
@@ -70,15 +81,22 @@ def fit_ellipses(grey: NDArray[np.float32], centre_px: Floats, shape: Floats, *,
     )
 
 
-def _half_box(shape: Floats) -> Floats:
-    box: Floats = np.sqrt(np.stack([shape[:, 1, 1], shape[:, 0, 0]], axis=1) / np.linalg.det(shape)[:, None])
+def _window(shape: Floats) -> Ints:
+    """Return half the sides (n,) of the windows, px."""
+    return np.asarray(np.ceil(RING * half_box(shape) + LEAST_RING_PX).astype(int).max(axis=1, initial=0))
+
+
+def half_box(shape: Floats) -> Floats:
+    """Return half width and half height (n, 2) of the bounding boxes of ellipses, px."""
+    det = np.maximum(np.linalg.det(shape), 1e-12)
+    box: Floats = np.sqrt(np.stack([shape[:, 1, 1], shape[:, 0, 0]], axis=1) / det[:, None])
     return box
 
 
 def _owners(size: tuple[int, ...], centre_px: Floats, shape: Floats) -> NDArray[np.int32]:
-    """Return (H, W): the dot whose pixels these are, -1 for the ground; the more trusted dots come first and win."""
+    """Return (H, W): the dot of each pixel, -1 for the background; where dots overlap, the first wins."""
     owner = np.full(size, -1, dtype=np.int32)
-    box = OTHERS * _half_box(shape)
+    box = OTHERS * half_box(shape)
     for k in range(len(centre_px) - 1, -1, -1):
         u0, v0 = np.maximum(np.floor(centre_px[k] - box[k]), 0).astype(int)
         u1, v1 = np.ceil(centre_px[k] + box[k]).astype(int) + 1
@@ -92,7 +110,7 @@ def _owners(size: tuple[int, ...], centre_px: Floats, shape: Floats) -> NDArray[
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Pixels about some dots, (n, K): place from the first guess of the centre, grey value, weight."""
+    """Pixels around some dots, (n, K): position relative to the first guess of the centre, grey value, weight."""
 
     x: Floats
     y: Floats
@@ -101,15 +119,11 @@ class _Windows:
 
     @classmethod
     def cut(
-        cls,
-        grey: NDArray[np.float32],
-        owner: NDArray[np.int32],
-        which: NDArray[np.int64],
-        centre_px: Floats,
-        shape: Floats,
-        half: int,
+        cls, grey: NDArray[np.float32], owner: NDArray[np.int32], which: Ints, centre_px: Floats, shape: Floats
     ) -> _Windows:
+        """Cut the windows of the dots `which`; a pixel of another dot has no weight."""
         height, width = grey.shape
+        half = int(_window(shape).max())
         steps = np.arange(-half, half + 1)
         middle = np.rint(centre_px).astype(int)
         u = (middle[:, 0, None, None] + steps[None, None, :] + 0 * steps[None, :, None]).reshape(len(which), -1)
@@ -120,7 +134,7 @@ class _Windows:
         rim = _distance(x, y, shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1])
         owned = owner[v_in, u_in]
         used = seen & ((rim.q < RING) | (rim.distance < LEAST_RING_PX)) & ((owned < 0) | (owned == which[:, None]))
-        # Used pixels first, then cut to the longest row: half of a window's box is never looked at.
+        # Used pixels first, then cut to the longest row: half of a window's box is never used.
         first = np.argsort(~used, axis=1, kind="stable")[:, : max(int(used.sum(1).max()), 1)]
         parts = (x, y, grey[v_in, u_in].astype(np.float64), used.astype(np.float64))
         return cls(*(np.take_along_axis(part, first, axis=1) for part in parts))
@@ -129,18 +143,14 @@ class _Windows:
         """Return some of the windows."""
         return _Windows(self.x[some], self.y[some], self.grey[some], self.weight[some])
 
-    def weighted(self, weight: Floats) -> _Windows:
-        """Return the windows with other weights."""
-        return replace(self, weight=weight)
-
     def fit(self, shape: Floats, dark: bool) -> tuple[Floats, Floats, Floats]:
         """Return the parameters (n, 10), the sigma of the centre (n,), px, and the misfit (n,)."""
         values = self._descend(self._first_guess(shape, dark), dark)
-        # Dirt and glare within a window: pixels far beyond the window's own scatter lose their say.
+        # Dirt and glare: pixels far beyond the window's own scatter get little weight.
         residual = self.grey - self._model(values, dark)[0]
         scatter = np.sqrt((self.weight * residual**2).sum(1) / np.maximum(self.weight.sum(1), 1))
         robust = self.weight / (1 + (residual / (3 * scatter[:, None] + 1e-9)) ** 2) ** 2
-        values = self.weighted(robust)._descend(values, dark)
+        values = replace(self, weight=robust)._descend(values, dark)
         model, slope = self._model(values, dark)
         freedom = np.maximum(self.weight.sum(1) - PARAMETERS, 1)
         scatter = np.sqrt((self.weight * (self.grey - model) ** 2).sum(1) / freedom)
@@ -163,7 +173,7 @@ class _Windows:
         return np.stack(start, axis=1)
 
     def _model(self, values: Floats, dark: bool) -> tuple[Floats, Callable[[], Floats]]:
-        """Return the modelled grey values (n, K), and what gives their slopes (n, 10, K)."""
+        """Return the modelled grey values (n, K), and a function that returns their slopes (n, 10, K)."""
         x, y = self.x - values[:, :1], self.y - values[:, 1:2]
         geometry = _distance(x, y, values[:, 2], values[:, 3], values[:, 4])
         distance, blur, contrast = geometry.distance, values[:, 5, None], values[:, 9, None]
@@ -191,7 +201,7 @@ class _Windows:
         return np.where(ellipse & (values[:, 5] > LEAST_BLUR_PX) & np.isfinite(cost), cost, np.inf)
 
     def _descend(self, start: Floats, dark: bool) -> Floats:
-        """Return the parameters (n, 10) after Levenberg and Marquardt; windows leave as they settle."""
+        """Return the parameters (n, 10) after Levenberg-Marquardt; windows that have converged are dropped."""
         values = start.copy()
         moving, windows, damping = np.arange(len(start)), self, np.full(len(start), 1e-3)
         model, slope = windows._model(start, dark)
@@ -218,7 +228,7 @@ class _Windows:
 
 
 def _normal(jacobian: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return J^T W J (n, P, P) with ones on its diagonal, and what each parameter was scaled by (n, P)."""
+    """Return J^T W J (n, P, P) scaled to a diagonal of ones, and the scale of each parameter (n, P)."""
     normal = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
     scale = np.sqrt(np.maximum(np.einsum("npp->np", normal), 1e-12))
     return normal / scale[:, :, None] / scale[:, None, :], scale
@@ -226,7 +236,7 @@ def _normal(jacobian: Floats, weight: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class _Rim:
-    """How far pixels are from the rim of an ellipse, (n, K), to first order in q - 1, exactly for circles."""
+    """Distances of pixels from the rim of an ellipse, (n, K), to first order in q - 1; exact for circles."""
 
     x: Floats  # from the centre, px
     y: Floats
@@ -250,7 +260,7 @@ class _Rim:
 
 
 def _distance(x: Floats, y: Floats, a: Floats, b: Floats, c: Floats) -> _Rim:
-    """Return how far pixels are from the rim x^T A x = 1, A = [[a, b], [b, c]]; x, y (n, K) px, a, b, c (n,)."""
+    """Return the distances from the rim x^T A x = 1, A = [[a, b], [b, c]]; x, y (n, K) px, a, b, c (n,)."""
     a, b, c = a[:, None], b[:, None], c[:, None]
     along_u, along_v = a * x + b * y, b * x + c * y
     h = np.maximum(np.sqrt(along_u**2 + along_v**2), 1e-9)

@@ -1,4 +1,4 @@
-"""A square lattice found among dots: grid indices up to a turn and a shift, whatever the tilt."""
+"""Dots of a plate: a square lattice among them, and its place on the plate from the fiducials."""
 
 from __future__ import annotations
 
@@ -11,40 +11,37 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sphereorient.calibration.dots import Dots
-from sphereorient.calibration.plate import Floats, Ints
+from sphereorient.calibration.ellipse import Dots
+from sphereorient.calibration.plate_view import PlateView, placed, quarter_turned, refused_view
+from sphereorient.calibration.targets import DotPlate, Floats, Ints
+from sphereorient.errors import refusal
 
-NEIGHBOURS = 24  # dots looked at about each dot: under 75 degrees of tilt the next column is the 12th nearest or so
-STEP_MISS = 0.28  # pitches by which a step may miss its dot; half a pitch would reach the wrong one
-MODEL_MISS = 0.06  # pitches by which a dot may miss the smooth map of the whole lattice
-CUBIC_FROM = 40  # dots from which the map has cubic terms, for lenses and walls; fewer cannot hold them
-SEEDS = 12  # growths tried, from the most regular dots
-
+NEIGHBOURS = 24  # of each dot: at 75 degrees of tilt the next column is about the 12th nearest
+STEP_MISS = 0.28  # pitches by which a step may miss its dot
+MODEL_MISS = 0.06  # pitches by which a dot may miss the smooth map of the lattice
+CUBIC_FROM = 40  # dots from which the map has cubic terms, for lenses and walls
+SEEDS = 12  # starting dots tried
+LEAST_DOTS = 12  # fewer hardly test a homography (8 numbers)
+WIDTH_MISS = 0.25  # relative difference between a dot's width and that of calibration.yaml
+MIRROR = np.array([1, -1])
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lattice:
-    """Dots with their places in a lattice whose axes, as seen by the camera, are right-handed about the viewer."""
+    """Dots with grid indices; the axes are right-handed about the viewer."""
 
-    which: Ints  # (n,), places of these dots in the `Dots` they were taken from
-    index: Ints  # (n, 2), grid indices up to a turn by quarters and a shift
+    which: Ints  # (n,), indices of these dots in `Dots`
+    index: Ints  # (n, 2), grid indices up to quarter turns and a shift
     width: Floats  # (n,), diameters of the dots, in pitches
 
 
 def find_lattice(dots: Dots) -> Lattice | None:
-    """Find the largest square lattice among dots.
+    """Find the largest square lattice among dots; None for fewer than 9 dots, or a single row.
 
-    The shape of a dot tells how the plate is foreshortened there: measured in radii of the dots about it, the four
-    neighbours of a dot are equally far and at right angles under any tilt. Steps from dot to dot follow that; a
-    smooth map from grid to picture (homography, with cubic terms where enough dots are seen) then has to agree with
-    every dot.
-
-    Args:
-        dots: as of `find_dots`; may hold others than the plate's.
-
-    Returns:
-        The lattice, or None where no 9 dots in 2 or more rows and columns make one.
+    The shape of a dot shows the local foreshortening of the plate: measured in radii of the dots around it, the four
+    neighbours of a dot are equally far and at right angles under any tilt. Steps from dot to dot use that. Then a
+    smooth map from grid to picture (homography, with cubic terms for many dots) has to agree with every dot.
     """
     if len(dots) < 9:
         return None
@@ -65,7 +62,7 @@ def find_lattice(dots: Dots) -> Lattice | None:
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """Dots with the foreshortening about each, and the dots near it."""
+    """Dots with the local foreshortening and the nearest dots of each."""
 
     uv_px: Floats  # (n, 2)
     metric: Floats  # (n, 2, 2): v^T metric v = 1 for v one pitch long
@@ -77,7 +74,7 @@ class _Field:
         tree: cKDTree[None] = cKDTree(dots.uv_px)
         k = min(NEIGHBOURS, len(dots) - 1)
         near = np.asarray(tree.query(dots.uv_px, k=k + 1)[1], dtype=np.int64)
-        # The median over neighbours keeps a fiducial's or a stray blob's own size out.
+        # The median over neighbours removes the size of a fiducial or a stray blob.
         shape = np.median(dots.shape[near[:, : min(k, 8) + 1]], axis=1)
         away = dots.uv_px[near[:, 1:]] - dots.uv_px[:, None]
         radii = np.sqrt(np.einsum("nka,nab,nkb->nk", away, shape, away))
@@ -89,7 +86,7 @@ class _Field:
         return length
 
     def steps_from(self, k: int) -> tuple[Floats, Floats] | None:
-        """Return the two steps, px, to neighbours of dot k, if it has four in a right-angled cross."""
+        """Return the two steps, px, to the neighbours of dot k, if four of them form a right-angled cross."""
         away = self.uv_px[self.near[k]] - self.uv_px[k]
         length = self._pitches(k, away)
         away = away[(length > 0.7) & (length < 1.25)]
@@ -101,18 +98,18 @@ class _Field:
         cosine = first @ self.metric[k] @ second / (self._pitches(k, first) * self._pitches(k, second))
         if abs(cosine) > 0.35:
             return None
-        # The plate's x and y, seen from its front: v runs down, so the determinant of the steps is negative.
+        # Seen from the front of the plate; v runs down, so the determinant of the steps is negative.
         turned = first[0] * second[1] - first[1] * second[0]
         return (first, second) if turned < 0 else (first, -second)
 
     def seeds(self) -> list[int]:
-        """Return the dots in a cross of neighbours, the middle of the crowd first."""
+        """Return the dots that have a cross of neighbours, the central ones first."""
         crosses = [k for k in range(len(self.uv_px)) if self.steps_from(k) is not None]
         middle = np.median(self.uv_px, axis=0)
         return sorted(crosses, key=lambda k: float(np.hypot(*(self.uv_px[k] - middle))))
 
     def grow(self, seed: int) -> dict[int, tuple[int, int]]:
-        """Return the grid indices of all dots that steps of one pitch reach from the seed, which is (0, 0)."""
+        """Return the grid indices of all dots reached from the seed, (0, 0), by steps of one pitch."""
         steps = self.steps_from(seed)
         assert steps is not None
         place, dot_at = {seed: (0, 0)}, {(0, 0): seed}
@@ -136,7 +133,7 @@ class _Field:
     def _local_basis(
         self, k: int, at: tuple[int, int], dot_at: dict[tuple[int, int], int], guess: tuple[Floats, Floats]
     ) -> tuple[Floats, Floats]:
-        # Steps to neighbours already placed follow the perspective; the parent's step stands in where there are none.
+        # Steps to neighbours already placed follow the perspective; without one the parent's step is used.
         found: list[Floats] = []
         for axis in (0, 1):
             seen = []
@@ -177,18 +174,14 @@ class _Map:
         x, y = ((index - self.middle) / self.size).T
         return np.stack([x**a * y**b for a in range(4) for b in range(4 - a)], axis=1)
 
-    def straight(self, index: Floats | Ints) -> Floats:
+    def __call__(self, index: Floats | Ints) -> Floats:
         near = (index - self.middle) / self.size
         h = np.column_stack([near, np.ones(len(near))]) @ self.homography.T
-        uv_px: Floats = h[:, :2] / h[:, 2:]
-        return uv_px
-
-    def __call__(self, index: Floats | Ints) -> Floats:
-        uv_px: Floats = self.straight(index) + self._terms(index) @ self.bend
+        uv_px: Floats = h[:, :2] / h[:, 2:] + self._terms(index) @ self.bend
         return uv_px
 
     def nearest(self, uv_px: Floats) -> Ints:
-        """Return the grid indices (n, 2) next to pixels, by the homography alone: cubic terms do not extrapolate."""
+        """Return the nearest grid indices (n, 2) of pixels, by the homography: cubic terms do not extrapolate."""
         h = np.column_stack([uv_px, np.ones(len(uv_px))]) @ np.linalg.inv(self.homography).T
         nearest: Ints = np.rint(h[:, :2] / h[:, 2:] * self.size + self.middle).astype(np.int64)
         return nearest
@@ -199,16 +192,15 @@ class _Map:
         return np.stack([self(index + e[a]) - self(index - e[a]) for a in (0, 1)], axis=-1)
 
     def misses(self, index: Ints, uv_px: Floats) -> Floats:
-        """Return (n,), how far from their places pixels are, in pitches."""
+        """Return the distances (n,) of pixels from their expected positions, in pitches."""
         away = np.linalg.solve(self.steps(index), (uv_px - self(index))[..., None])[..., 0]
         miss: Floats = np.hypot(away[:, 0], away[:, 1])
         return miss
 
 
 def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
-    """Drop dots that the smooth map of all others does not explain, and add those that steps could not reach."""
-    which, index = _agreeing(dots, which, index)
-    lattice_map = _usable_map(dots, which, index)
+    """Drop dots that do not fit the smooth map, and add dots that steps did not reach."""
+    which, index, lattice_map = _agreeing(dots, which, index)
     if lattice_map is None:
         return None
     rest = np.setdiff1d(np.arange(len(dots)), which)
@@ -216,13 +208,12 @@ def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
     taken = {tuple(at) for at in index.tolist()}
     low, high = index.min(axis=0), index.max(axis=0)
     free = np.array([tuple(at) not in taken for at in there.tolist()], dtype=bool) if len(rest) else np.zeros(0, bool)
-    # Only gaps are filled: beyond the rim of what steps have reached a stray blob is more likely than a dot.
+    # Only gaps are filled: outside the reached area a stray blob is more likely than a dot.
     free &= ((there >= low) & (there <= high)).all(axis=1)
     fits = np.flatnonzero(free)
     fits = fits[lattice_map.misses(there[fits], dots.uv_px[rest[fits]]) < MODEL_MISS]
     which, index = np.concatenate([which, rest[fits]]), np.concatenate([index, there[fits]])
-    which, index = _agreeing(dots, which, index)
-    lattice_map = _usable_map(dots, which, index)
+    which, index, lattice_map = _agreeing(dots, which, index)
     if lattice_map is None:
         return None
     cell = np.abs(np.linalg.det(lattice_map.steps(index)))
@@ -230,20 +221,103 @@ def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
     return Lattice(which=which, index=index, width=width)
 
 
-def _usable_map(dots: Dots, which: Ints, index: Ints) -> _Map | None:
-    if len(which) < 9 or (np.ptp(index, axis=0) < 1).any():
-        return None
-    return _Map.fitted(index, dots.uv_px[which])
-
-
-def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints]:
-    """Drop the worst dots, a few at a time, until all lie within MODEL_MISS of the map of those left."""
+def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints, _Map | None]:
+    """Drop the worst dots, a few at a time, until all are within MODEL_MISS of the map of the remaining ones."""
     while True:
-        lattice_map = _usable_map(dots, which, index)
+        enough = len(which) >= 9 and (np.ptp(index, axis=0) >= 1).all()
+        lattice_map = _Map.fitted(index, dots.uv_px[which]) if enough else None
         if lattice_map is None:
-            return which[:0], index[:0]
+            return which[:0], index[:0], None
         miss = lattice_map.misses(index, dots.uv_px[which])
         kept: NDArray[np.bool_] = miss <= max(MODEL_MISS, 0.5 * float(miss.max()))
         if kept.all():
-            return which, index
+            return which, index, lattice_map
         which, index = which[kept], index[kept]
+
+
+def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> PlateView:
+    """Identify the dots of a picture on the plate.
+
+    All placements of the lattice (`find_lattice`) on the plate are tried, by quarter turns and shifts: dots must lie on
+    the plate, and the larger ones must be exactly the visible fiducials. One placement is left: `tied`. Several:
+    `floating`. None: `refused`.
+
+    Args:
+        dots: from `find_dots`.
+        plate: the target.
+        name: of the picture, for the reason.
+    """
+    lattice = find_lattice(dots)
+    if lattice is None or len(lattice.index) < LEAST_DOTS:
+        got = f"{len(dots)} dots" + ("" if lattice is None else f", {len(lattice.index)} of them in a lattice")
+        expected = f"a lattice of {LEAST_DOTS} dots or more, 3 x 3 of them whole"
+        do = "look at the picture: is the plate in it, sharp, and dark or bright as stated"
+        return refused_view(name, expected=expected, got=got, do=do)
+    large, odd = _sizes(lattice, plate)
+    if odd.mean() > 0.2:
+        pitches = float(np.median(lattice.width))
+        expected = f"dots {plate.dot_diameter_mm / plate.pitch_mm:.2f} pitches wide"
+        do = "correct pitch and dot_diameter of the plate"
+        return refused_view(name, expected=expected, got=f"{pitches:.2f} pitches", do=do)
+    which, index, large = lattice.which[~odd], lattice.index[~odd], large[~odd]
+    seen = np.ptp(index, axis=0) + 1
+    if (np.sort(seen) > np.sort([plate.columns, plate.rows])).any():
+        expected, got = f"at most {plate.columns} x {plate.rows} dots", f"a lattice of {seen[0]} x {seen[1]}"
+        do = "correct columns and rows of the plate"
+        return refused_view(name, expected=expected, got=got, do=do)
+    placements = _placements(index, large, plate)
+    if len(placements) == 0:
+        return _misplaced(index, large, plate, name)
+    got = f"{int(large.sum())}, which leave {len(placements)} places of its dots on the plate"
+    do = "show the fiducials, or have the other camera see them at the same instant"
+    view = PlateView(
+        points_plate_mm=plate.points(index),
+        uv_px=dots.uv_px[which],
+        sigma_px=dots.sigma_px[which],
+        diameter_mm=np.where(large, plate.fiducial_diameter_mm, plate.dot_diameter_mm),
+        index=index,
+        state="floating",
+        reason=refusal(name, expected="3 larger dots in view", got=got, do=do),
+        placements=placements,
+    )
+    return placed(view, plate, placements[0]) if len(placements) == 1 else view
+
+
+def _placements(index: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
+    """Return all placements (m, 3), as in `placed`, of a lattice on the plate that its larger dots allow."""
+    found: list[tuple[int, int, int]] = []
+    for quarters in range(4):
+        at = quarter_turned(index, quarters)
+        for shift in _shifts(at, large, plate):
+            there = at + shift
+            if plate.holds(there).all() and (plate.is_fiducial(there) == large).all():
+                found.append((quarters, int(shift[0]), int(shift[1])))
+    return np.array(found, dtype=np.int64).reshape(-1, 3)
+
+
+def _shifts(at: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
+    if large.any():
+        # The first larger dot must be one of the three fiducials.
+        onto: Ints = np.array(plate.fiducials, dtype=np.int64) - at[large][0]
+        return onto
+    low, high = np.array(plate.first) - at.min(axis=0), np.array(plate.last) - at.max(axis=0)
+    i, j = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
+    return np.stack([i.ravel(), j.ravel()], axis=1).astype(np.int64)
+
+
+def _sizes(lattice: Lattice, plate: DotPlate) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which dots are as large as fiducials, and which are as large as neither."""
+    dot, fiducial = plate.dot_diameter_mm / plate.pitch_mm, plate.fiducial_diameter_mm / plate.pitch_mm
+    large = lattice.width > np.sqrt(dot * fiducial)
+    stated = np.where(large, fiducial, dot)
+    return large, np.abs(lattice.width / stated - 1) > WIDTH_MISS
+
+
+def _misplaced(index: Ints, large: NDArray[np.bool_], plate: DotPlate, name: str) -> PlateView:
+    if len(_placements(index * MIRROR, large, plate)):
+        expected, got = "the plate from its front, z towards the camera", "its mirror image"
+        do = "mirror the picture back, or correct the fiducials: x to the right of the origin, y above it"
+        return refused_view(name, expected=expected, got=got, do=do)
+    expected = f"larger dots at the grid indices {[list(f) for f in plate.fiducials]}"
+    got = f"{int(large.sum())} larger dots that fit there nowhere on {plate.columns} x {plate.rows}"
+    return refused_view(name, expected=expected, got=got, do="correct columns, rows and fiducials of the plate")

@@ -13,49 +13,46 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.calibration.bundle import Fitted, adjust
-from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration
+from sphereorient.calibration.boards import see_plate
+from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
+from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
 from sphereorient.calibration.guess import guess_from_points, guess_rig
-from sphereorient.calibration.placing import placed
-from sphereorient.calibration.points import read_tables
-from sphereorient.calibration.problem import Problem, Rig, fitted_parameters, gathered
-from sphereorient.calibration.see import see_plate
-from sphereorient.calibration.view import PlateView
-from sphereorient.cameras import Camera
-from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.calibration.plate_view import PlateView, placed
+from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.errors import CameraError, refusal
 from sphereorient.files.picture_claim import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 
 LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a plate
 Progress = Callable[[str, int, int], None]
-CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tied where one reading fits this well
-# Standard deviations of what counts as undetermined: of focal length, distance, picture's width; rad
+SIGMA_PX = 0.05  # of points in tables; only ratios matter, because the residuals give the scale
+CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tied where one placement fits this well
+# Standard deviations that count as undetermined: of focal length, distance, picture's width; rad
 LOOSE = {"f": 0.01, "T": 0.01, "centre": 0.02, "rotation": 0.01}
 LOOSE_PORT = {"port_offset": 5.0, "port_thickness": 5.0, "port_n_glass": 0.1, "port_n_fluid": 0.05, "port_tilt": 0.05}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureReport:
-    """What became of one picture; made by `calibrate_cameras`, read by table and figure."""
+    """The result of one picture; made by `calibrate_cameras`, read by table and figure."""
 
     picture: Picture
     pose: int
     view: PlateView
-    residual_px: NDArray[np.float64]  # (n, 2), measured less expected
+    residual_px: NDArray[np.float64]  # (n, 2), measured minus expected
     used: NDArray[np.bool_]  # (n,), False for outliers
-    reason: str  # why nothing of it was used; empty where it was
+    reason: str  # why it was not used; empty where it was
 
     @property
     def rms_px(self) -> float:
-        """Root of the mean squared distance of measured from expected points, outliers left out; NaN without any."""
+        """Rms distance between measured and expected points without outliers; NaN without points."""
         missed = self.residual_px[self.used]
         return float(np.sqrt((missed**2).sum(1).mean())) if len(missed) else float("nan")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibrated:
-    """Cameras with what is known of their errors; made by `calibrate_cameras`."""
+    """Cameras with covariances; made by `calibrate_cameras`."""
 
     cameras: Mapping[str, Camera]  # each with its own covariance
     covariance: ParameterCovariance  # of all cameras together, names such as cam1.f
@@ -65,36 +62,33 @@ class Calibrated:
     scale: float  # residuals over their expected standard deviations
 
     def rms_px(self, camera: str) -> float:
-        """Root of the mean squared distance of one camera's measured from expected points."""
+        """Rms distance between one camera's measured and expected points."""
         missed = [one.residual_px[one.used] for one in self.pictures if one.picture.camera == camera]
         return float(np.sqrt((np.concatenate(missed) ** 2).sum(1).mean()))
 
 
-def silent(stage: str, done: int, total: int) -> None:
-    """Tell nobody."""
-
-
-def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: Progress = silent) -> Calibrated:
-    """Find the cameras of a calibration.yaml.
+def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: Progress | None = None) -> Calibrated:
+    """Calibrate the cameras of a calibration.yaml.
 
     Args:
-        calibration: as loaded, or the path of its file.
-        progress: told how far each stage is.
+        calibration: loaded, or the path of its file.
+        progress: called with stage, done and total.
 
     Returns:
-        Cameras in the lab that the surveyed pose defines, with covariances, and what became of each picture.
+        Cameras in the lab that the surveyed pose defines, with covariances, and a report of each picture.
 
     Raises:
-        CameraError: a picture that cannot be read or is of another size, no picture that shows the plate, poses that
-            leave a parameter undetermined.
+        CameraError: an unreadable picture or one of another size, no picture that shows the plate, or poses that leave
+            a parameter undetermined.
     """
+    progress = progress or (lambda stage, done, total: None)
     document = calibration if isinstance(calibration, CalibrationDocument) else load_calibration(calibration)
-    views = read_tables(document) if document.points else see_pictures(document, progress)
+    views = _read_tables(document) if document.points else see_pictures(document, progress)
     tied = {picture: view for picture, view in views.items() if view.state == "tied"}
     _check_seen(document, views, tied)
     progress("fit", 0, 1)
     rig = _first_rig(document, tied)
-    tied = {picture: view for picture, view in tied.items() if _placed(rig, picture)}
+    tied = {picture: view for picture, view in tied.items() if _has_pose(rig, picture)}
     fitted = adjust(_problem(document, rig, tied))
     found = {} if document.points else tie_floating(document, fitted.rig, views)
     if found:
@@ -105,39 +99,31 @@ def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: P
     return _collected(document, views, tied, fitted)
 
 
-def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView]) -> Rig:
-    size, pitch, model = document.image_size, document.pixel_pitch_mm, document.model
-    if not document.points:
-        views = _by_camera(document, tied)
-        return guess_rig(views, size, pitch, document.surveyed, document.ports, len(document.poses), model)
-    cameras = {}
-    for picture, view in tied.items():
-        name = picture.camera
-        arrays = torch.from_numpy(view.points_plate_mm), torch.from_numpy(view.uv_px)
-        try:
-            cameras[name] = guess_from_points(*arrays, size, pitch, document.ports.get(name), model)
-        except CameraError as error:
-            raise CameraError(f"{picture.path}, {error}") from None
-    (R, T) = document.surveyed[0]
-    return Rig(cameras=cameras, R_lab_plate=R[None], T_lab_plate_mm=T[None])
-
-
-def _placed(rig: Rig, picture: Picture) -> bool:
-    """Tell whether the guess knows where the plate is: of a picture with a handful of points it does not."""
-    return bool(torch.isfinite(rig.T_lab_plate_mm[picture.row]).all())
+def _read_tables(document: CalibrationDocument) -> dict[Picture, PlateView]:
+    views = {}
+    for name, path in document.points.items():
+        table = read_points(path)
+        n = len(table)
+        views[Picture(camera=name, row=0, path=path)] = PlateView(
+            points_plate_mm=table[:, :3],
+            uv_px=table[:, 3:],
+            sigma_px=np.full(n, SIGMA_PX),
+            diameter_mm=np.zeros(n),
+            index=np.stack([np.arange(n), np.zeros(n, dtype=np.int64)], axis=1),
+        )
+    return views
 
 
 def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Picture, PlateView]:
     """Read all pictures and find the plate in them."""
     assert document.plate is not None
     plate = document.plate
-    # All are read first: what is wrong with a file is said before anything is computed.
-    grey = [read_grey(picture.path, document.image_size) for picture in document.pictures]
+    # All files are read first, so that a faulty one is reported before the long computation.
+    grey = [_read_grey(picture.path, document.image_size) for picture in document.pictures]
     views = {}
     with ThreadPoolExecutor(2) as pool:
-        seen = pool.map(
-            lambda pair: see_plate(pair[1], plate, pair[0].path.name), zip(document.pictures, grey, strict=True)
-        )
+        names = [picture.path.name for picture in document.pictures]
+        seen = pool.map(lambda one, name: see_plate(one, plate, name), grey, names)
         progress("pictures", 0, len(grey))
         for picture, view in zip(document.pictures, seen, strict=True):
             views[picture] = view
@@ -145,18 +131,15 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
     return views
 
 
-def read_grey(path: Path, image_size: tuple[int, int]) -> NDArray[Any]:
-    """Read a picture, (H, W).
-
-    Raises:
-        CameraError: no such file, no picture, or one of another size.
-    """
+def _read_grey(path: Path, image_size: tuple[int, int]) -> NDArray[Any]:
+    """Read a grey picture (H, W) of a given size, or refuse it."""
     content = read_whole(path, LARGEST_BYTES, "a picture", CameraError, "correct the path")
     pixels = claimed_pixels(content)
-    # A file that claims more than any camera has is not decoded to find out.
+    # A file that claims more pixels than any camera has is not decoded.
     picture = decoded_grey(content) if pixels is not None and pixels <= LARGEST_PIXELS else None
     if picture is None:
-        raise CameraError(refusal(str(path), expected="a picture", got="a file that is none", do="save it as PNG"))
+        got = "a file that is no picture or too large"
+        raise CameraError(refusal(str(path), expected="a picture", got=got, do="save it as PNG"))
     if picture.shape != image_size[::-1]:
         expected, got = (f"{w} x {h} px" for w, h in (image_size, picture.shape[::-1]))
         do = "correct image_size, or leave the picture out"
@@ -170,10 +153,28 @@ def _check_seen(
     for name in document.cameras:
         of_camera = [picture for picture in views if picture.camera == name]
         if not any(picture in tied for picture in of_camera):
-            reasons = [views[picture].reason for picture in of_camera]
             do = "check plate: in the file, and the pictures"
-            got = f"none of {len(of_camera)}; the first: {reasons[0]}"
+            got = f"none of {len(of_camera)}; the first: {views[of_camera[0]].reason}"
             raise CameraError(refusal(f"{document.path}, {name}", expected="pictures of the plate", got=got, do=do))
+
+
+def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView]) -> Rig:
+    if not document.points:
+        return guess_rig(document, _by_camera(document, tied))
+    cameras = {}
+    for picture, view in tied.items():
+        arrays = torch.from_numpy(view.points_plate_mm), torch.from_numpy(view.uv_px)
+        try:
+            cameras[picture.camera] = guess_from_points(document, picture.camera, *arrays)
+        except CameraError as error:
+            raise CameraError(f"{picture.path}, {error}") from None
+    R, T = document.surveyed[0]
+    return Rig(cameras=cameras, R_lab_plate=R[None], T_lab_plate_mm=T[None])
+
+
+def _has_pose(rig: Rig, picture: Picture) -> bool:
+    """Return whether the guess has the plate's pose; of a picture with few points it has not."""
+    return bool(torch.isfinite(rig.T_lab_plate_mm[picture.row]).all())
 
 
 def _by_camera(document: CalibrationDocument, tied: Mapping[Picture, PlateView]) -> dict[str, dict[int, PlateView]]:
@@ -184,14 +185,11 @@ def _by_camera(document: CalibrationDocument, tied: Mapping[Picture, PlateView])
 
 
 def _problem(document: CalibrationDocument, rig: Rig, tied: Mapping[Picture, PlateView]) -> Problem:
-    views = _by_camera(document, tied)
+    of_port = {name: document.fit_ports if name in document.ports else () for name in rig.cameras}
     return Problem(
         rig=rig,
-        seen={name: gathered(seen) for name, seen in views.items()},
-        names={
-            name: fitted_parameters(camera, document.fit_ports if name in document.ports else ())
-            for name, camera in rig.cameras.items()
-        },
+        seen={name: gathered(seen) for name, seen in _by_camera(document, tied).items()},
+        names={name: fitted_parameters(camera, of_port[name]) for name, camera in rig.cameras.items()},
         fixed=frozenset(document.surveyed),
     )
 
@@ -199,22 +197,24 @@ def _problem(document: CalibrationDocument, rig: Rig, tied: Mapping[Picture, Pla
 def tie_floating(
     document: CalibrationDocument, rig: Rig, views: Mapping[Picture, PlateView]
 ) -> dict[Picture, PlateView]:
-    """Tie views that do not show the fiducials through cameras that saw the same pose with them.
+    """Tie views without fiducials through cameras that saw the same pose with them.
 
-    A view stays floating where its pose is not known, or no reading of it, or more than one, fits.
+    A view stays floating where its pose is not known, or not exactly one placement of it fits.
     """
     assert document.plate is not None
-    known = {picture.row for picture, view in views.items() if view.state == "tied" and _placed(rig, picture)}
+    known = {picture.row for picture, view in views.items() if view.state == "tied" and _has_pose(rig, picture)}
     tied = {}
     for picture, view in views.items():
         if view.state != "floating" or picture.row not in known:
             continue
-        readings = [placed(view, document.plate, placement) for placement in view.placements]
-        missed = [_missed(rig, picture, reading) for reading in readings]
+        candidates = [placed(view, document.plate, placement) for placement in view.placements]
+        missed = [_missed(rig, picture, candidate) for candidate in candidates]
         order = np.argsort(missed)
-        step = _step_px(view)
+        apart = np.linalg.norm(view.uv_px[:, None] - view.uv_px[None], axis=-1)
+        np.fill_diagonal(apart, np.inf)
+        step = float(np.median(apart.min(1)))  # typical distance of neighbouring points
         if missed[order[0]] < CLEARLY * step and (len(order) == 1 or missed[order[1]] > 2 * CLEARLY * step):
-            tied[picture] = readings[order[0]]
+            tied[picture] = candidates[order[0]]
     return tied
 
 
@@ -224,19 +224,12 @@ def _missed(rig: Rig, picture: Picture, view: PlateView) -> float:
     return float(np.nan_to_num(np.median(np.linalg.norm(view.uv_px - expected.numpy(), axis=1)), nan=np.inf))
 
 
-def _step_px(view: PlateView) -> float:
-    """Typical distance of neighbouring points in the picture."""
-    apart = np.linalg.norm(view.uv_px[:, None] - view.uv_px[None], axis=-1)
-    np.fill_diagonal(apart, np.inf)
-    return float(np.median(apart.min(1)))
-
-
 def _check_determined(document: CalibrationDocument, fitted: Fitted) -> None:
-    """Refuse a fit in which a camera's parameter is hardly determined, and name the loosest."""
+    """Refuse a fit with a hardly determined camera parameter; name the worst."""
     loose = []
     for name, camera in fitted.rig.cameras.items():
         for parameter, sigma in _sigmas(camera).items():
-            share = sigma / _size_of(camera, parameter, document)
+            share = sigma / _loose_sigma(camera, parameter, document)
             if not share < 1:
                 loose.append((share, f"{name}.{parameter} (sigma {sigma:.3g})"))
     if loose:
@@ -250,7 +243,7 @@ def _sigmas(camera: Camera) -> dict[str, float]:
     return {} if camera.covariance is None else camera.covariance.sigmas
 
 
-def _size_of(camera: Camera, parameter: str, document: CalibrationDocument) -> float:
+def _loose_sigma(camera: Camera, parameter: str, document: CalibrationDocument) -> float:
     """Return the standard deviation at which a parameter counts as undetermined."""
     if parameter.startswith("T_"):
         return LOOSE["T"] * float(camera.T_cam_lab_mm.norm())
@@ -265,7 +258,7 @@ def _size_of(camera: Camera, parameter: str, document: CalibrationDocument) -> f
     for name, size in LOOSE_PORT.items():
         if parameter.startswith(name):
             return size
-    return float("inf")  # distortion: the others tell
+    return float("inf")  # distortion: the other parameters show it
 
 
 def _collected(
@@ -274,22 +267,28 @@ def _collected(
     tied: Mapping[Picture, PlateView],
     fitted: Fitted,
 ) -> Calibrated:
-    reports = []
     begin = dict.fromkeys(document.cameras, 0)
     shares = {}
     for picture in sorted(tied, key=lambda picture: picture.row):
         first = begin[picture.camera]
         begin[picture.camera] = first + len(tied[picture])
         shares[picture] = slice(first, begin[picture.camera])
+    reports = []
     for picture, view in views.items():
+        residual, used = np.zeros((0, 2)), np.zeros(0, dtype=bool)
+        reason = view.reason or f"{picture.path.name}: {len(view)} points, too few to determine the pose"
         if picture in tied:
-            share, name = shares[picture], picture.camera
+            share, name, reason = shares[picture], picture.camera, ""
             residual, used = fitted.residual_px[name][share].numpy(), fitted.used[name][share].numpy()
-            report = (tied[picture], residual, used, "")
-        else:
-            few = f"{picture.path.name}: {len(view)} points, too few to tell the pose"
-            report = (view, np.zeros((0, 2)), np.zeros(0, bool), view.reason or few)
-        reports.append(_report(document, picture, *report))
+        report = PictureReport(
+            picture=picture,
+            pose=document.poses[picture.row],
+            view=tied.get(picture, view),
+            residual_px=residual,
+            used=used,
+            reason=reason,
+        )
+        reports.append(report)
     count = sum(len(_sigmas(camera)) for camera in fitted.rig.cameras.values())
     return Calibrated(
         cameras=fitted.rig.cameras,
@@ -298,22 +297,4 @@ def _collected(
         T_lab_plate_mm=fitted.rig.T_lab_plate_mm,
         pictures=tuple(reports),
         scale=fitted.scale,
-    )
-
-
-def _report(
-    document: CalibrationDocument,
-    picture: Picture,
-    view: PlateView,
-    residual: NDArray[np.float64],
-    used: NDArray[np.bool_],
-    reason: str,
-) -> PictureReport:
-    return PictureReport(
-        picture=picture,
-        pose=document.poses[picture.row],
-        view=view,
-        residual_px=residual,
-        used=used,
-        reason=reason,
     )

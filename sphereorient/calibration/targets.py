@@ -1,31 +1,135 @@
-"""Targets that OpenCV finds: chessboards, ChArUco boards, plain circle grids."""
+"""Calibration targets: dot plates, chessboards, ChArUco boards and circle grids, as `plate` of calibration.yaml."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from sphereorient.calibration.plate import Floats, Ints, check_lattice, check_length, lattice_points
 from sphereorient.errors import CameraError, refusal
+from sphereorient.files.yaml_file import short
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+MOST = 1000  # columns or rows: arrays of all points are made, and no camera resolves more
+LONGEST_MM = 1e5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Chessboard:
-    """A chessboard; its points are the corners between squares.
+class CalibrationTarget:
+    """A plane target whose points have grid indices: x along columns, y along rows, z towards the viewer."""
 
-    Grid index (0, 0) is the corner at the lower left, whose own lower left square is dark; x runs to the right along
-    columns, y upwards along rows, z towards the viewer. Where the board looks the same after a turn, the view floats.
-    """
-
-    columns: int  # of inner corners
+    columns: int
     rows: int
-    pitch_mm: float  # side of a square
+    pitch_mm: float
 
     def __post_init__(self) -> None:
-        """Refuse a board that nobody can have made."""
-        check_lattice("plate", self.columns, self.rows, self.pitch_mm)
+        """Refuse impossible counts and lengths."""
+        for name in ("columns", "rows"):
+            count = getattr(self, name)
+            if not _is_whole(count) or not 2 <= count <= MOST:
+                expected, do = f"a whole number, 2 or more, at most {MOST}", "count them on the plate"
+                raise _refused(f"plate, {name}", expected, count, do)
+        for field in fields(self):
+            length = getattr(self, field.name)
+            number = isinstance(length, int | float) and not isinstance(length, bool)
+            if field.name.endswith("_mm") and not (number and 0 < length <= LONGEST_MM):
+                expected = f"a length above zero, mm, at most {LONGEST_MM:g}"
+                raise _refused(f"plate, {_key(field.name)}", expected, length, "measure the plate")
+            if field.type == "bool" and not isinstance(length, bool):
+                raise _refused(f"plate, {_key(field.name)}", "true or false", length)
+
+    def points(self, index: Ints) -> Floats:
+        """Return the points (n, 3), plate frame, mm, with grid indices (n, 2)."""
+        flat = index.astype(np.float64) * self.pitch_mm
+        return np.column_stack([flat, np.zeros(len(flat))])
+
+    def diameters(self, index: Ints) -> Floats:
+        """Return the diameters (n,), mm, of the dots with grid indices (n, 2); 0 for corners."""
+        return np.zeros(len(index))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DotPlate(CalibrationTarget):
+    """A square lattice of dots; three larger ones, the fiducials, define the axes.
+
+    Grid index (0, 0) is the origin dot, in the middle of the grid (with an even number: the first after the middle).
+    """
+
+    dot_diameter_mm: float
+    fiducial_diameter_mm: float
+    fiducials: tuple[tuple[int, int], ...]  # grid indices: origin, on +x, on +y
+    dark: bool = True  # dark dots on a bright plate; False: bright dots on a dark plate
+
+    def __post_init__(self) -> None:
+        """Refuse dots that touch, fiducials that are not larger, and fiducials that do not define the axes."""
+        super().__post_init__()
+        largest = 2 * self.pitch_mm - self.dot_diameter_mm
+        if not self.dot_diameter_mm < self.pitch_mm or not self.fiducial_diameter_mm < largest:
+            got = f"diameters {self.dot_diameter_mm:g} and {self.fiducial_diameter_mm:g} at pitch {self.pitch_mm:g}"
+            raise CameraError(refusal("plate", expected="dots that do not touch", got=got, do="measure the plate"))
+        if self.fiducial_diameter_mm < 1.15 * self.dot_diameter_mm:
+            got = f"fiducials {self.fiducial_diameter_mm:g} mm, dots {self.dot_diameter_mm:g} mm"
+            expected = "fiducials larger than the dots by 15 % or more"
+            raise CameraError(refusal("plate", expected=expected, got=got, do="measure the plate"))
+        marks = self.fiducials
+        pairs = isinstance(marks, list | tuple) and all(isinstance(at, list | tuple) and len(at) == 2 for at in marks)
+        axes = pairs and len(marks) == 3 and all(_is_whole(i) and abs(i) <= MOST for at in marks for i in at)
+        if axes:
+            origin, on_x, on_y = (tuple(at) for at in marks)
+            axes = origin == (0, 0) and on_x[0] > 0 and on_x[1] == 0 and on_y[0] == 0 and on_y[1] > 0
+            object.__setattr__(self, "fiducials", (origin, on_x, on_y))
+        if not axes or not self.holds(np.array(marks)).all():
+            expected = "three grid indices of this plate: [0, 0], one on +x, one on +y"
+            raise _refused("plate, fiducials", expected, marks, "count columns and rows from the origin dot")
+
+    @property
+    def first(self) -> tuple[int, int]:
+        """The smallest grid index along columns and along rows."""
+        return -(self.columns // 2), -(self.rows // 2)
+
+    @property
+    def last(self) -> tuple[int, int]:
+        """The largest grid index along columns and along rows."""
+        return self.first[0] + self.columns - 1, self.first[1] + self.rows - 1
+
+    @property
+    def indices(self) -> Ints:
+        """(columns * rows, 2), all grid indices, row after row."""
+        (i0, j0), (i1, j1) = self.first, self.last
+        i, j = np.meshgrid(np.arange(i0, i1 + 1), np.arange(j0, j1 + 1))
+        return np.stack([i.ravel(), j.ravel()], axis=1).astype(np.int64)
+
+    def holds(self, index: Ints) -> NDArray[np.bool_]:
+        """Return (n,), whether grid indices (n, 2) are on the plate."""
+        inside = (index >= np.array(self.first)) & (index <= np.array(self.last))
+        return np.asarray(inside.all(axis=1), dtype=np.bool_)
+
+    def is_fiducial(self, index: Ints) -> NDArray[np.bool_]:
+        """Return (n,), whether grid indices (n, 2) are fiducials."""
+        same = (index[:, None, :] == np.array(self.fiducials)[None]).all(axis=2)
+        return np.asarray(same.any(axis=1), dtype=np.bool_)
+
+    def diameters(self, index: Ints) -> Floats:
+        """Return the diameters (n,), mm, of the dots with grid indices (n, 2)."""
+        return np.where(self.is_fiducial(index), self.fiducial_diameter_mm, self.dot_diameter_mm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chessboard(CalibrationTarget):
+    """A chessboard; its points are the inner corners, columns x rows of them; the pitch is the side of a square.
+
+    Grid index (0, 0) is the lower left corner; the square to its lower left is dark. A view of a board that is the same
+    after a rotation is floating.
+    """
+
+    def __post_init__(self) -> None:
+        """Refuse fewer than 3 x 3 corners."""
+        super().__post_init__()
         if min(self.columns, self.rows) < 3:
             got, do = f"{self.columns} x {self.rows}", "count the corners between squares, without the border"
             raise CameraError(refusal("plate", expected="3 x 3 inner corners or more", got=got, do=do))
@@ -35,45 +139,31 @@ class Chessboard:
         """The largest grid indices."""
         return self.columns - 1, self.rows - 1
 
-    def points(self, index: Ints) -> Floats:
-        """Return the corners (n, 3), plate frame, mm, with grid indices (n, 2)."""
-        return lattice_points(index, self.pitch_mm)
-
-    def diameters(self, index: Ints) -> Floats:
-        """Return zeros (n,): a corner has no perspective bias."""
-        return np.zeros(len(index))
-
 
 @dataclass(frozen=True, kw_only=True)
-class CharucoBoard:
-    """A chessboard with markers in its bright squares, so that parts of it can be told.
+class CharucoBoard(CalibrationTarget):
+    """A chessboard of columns x rows squares with markers in the bright ones, so that a part of it is enough.
 
-    Grid index (0, 0) is the inner corner at the lower left of the board as OpenCV draws it; x to the right, y upwards,
-    z towards the viewer.
+    Grid index (0, 0) is the lower left inner corner of the board as OpenCV draws it.
     """
 
-    columns: int  # of squares
-    rows: int
-    pitch_mm: float  # side of a square
     marker_mm: float  # side of a marker
     dictionary: str = "DICT_4X4_50"  # OpenCV's name
-    legacy_pattern: bool = False  # drawn by OpenCV before 4.6, or by a program that follows it
+    legacy_pattern: bool = False  # as OpenCV before 4.6 draws it
 
     def __post_init__(self) -> None:
-        """Refuse a board that nobody can have made."""
-        check_lattice("plate", self.columns, self.rows, self.pitch_mm)
-        check_length("plate, marker", self.marker_mm)
+        """Refuse markers larger than squares, and a dictionary that is unknown or too small."""
+        super().__post_init__()
         if self.marker_mm >= self.pitch_mm:
             got, do = f"{self.marker_mm:g} mm in {self.pitch_mm:g} mm", "measure the board"
             raise CameraError(refusal("plate, marker", expected="smaller than its square", got=got, do=do))
-        if not self.dictionary.startswith("DICT_") or not hasattr(cv2.aruco, self.dictionary):
-            expected, do = "a name of OpenCV's, such as DICT_4X4_50", "look up what the board was drawn with"
-            raise CameraError(refusal("plate, dictionary", expected=expected, got=self.dictionary, do=do))
-        held = len(self._markers().bytesList)
-        if held < self.columns * self.rows // 2:
-            expected, got = f"{self.columns * self.rows // 2} markers or more", f"{held} in {self.dictionary}"
-            do = "look up what the board was drawn with"
-            raise CameraError(refusal("plate, dictionary", expected=expected, got=got, do=do))
+        name, do = self.dictionary, "look up the dictionary that the board was drawn with"
+        if not isinstance(name, str) or not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
+            raise _refused("plate, dictionary", "a name of OpenCV's, such as DICT_4X4_50", name, do)
+        held, least = len(self._markers().bytesList), self.columns * self.rows // 2
+        if held < least:
+            got = f"{held} in {name}"
+            raise CameraError(refusal("plate, dictionary", expected=f"{least} markers or more", got=got, do=do))
 
     def _markers(self) -> cv2.aruco.Dictionary:
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
@@ -84,37 +174,24 @@ class CharucoBoard:
         board.setLegacyPattern(self.legacy_pattern)
         return board
 
-    def points(self, index: Ints) -> Floats:
-        """Return the corners (n, 3), plate frame, mm, with grid indices (n, 2)."""
-        return lattice_points(index, self.pitch_mm)
-
-    def diameters(self, index: Ints) -> Floats:
-        """Return zeros (n,): a corner has no perspective bias."""
-        return np.zeros(len(index))
-
 
 @dataclass(frozen=True, kw_only=True)
-class CircleGrid:
-    """Equal circles, in a square lattice or (asymmetric) in one whose every other row is shifted by half a step.
+class CircleGrid(CalibrationTarget):
+    """Equal circles, in a square lattice or (asymmetric) with every other row shifted by half a step.
 
-    Grid index (0, 0) is the circle at the lower left; x to the right, y upwards, z towards the viewer. Asymmetric:
-    `pitch_mm` is the distance of rows, circles of one row are two of it apart, the highest row is not shifted, and the
-    one below it is, to the right (as OpenCV draws it). Where the grid looks the same after a turn, the view floats.
+    Grid index (0, 0) is the lower left circle. Asymmetric: `columns` circles in a row, `pitch_mm` between rows and
+    twice that between circles of a row; the top row is not shifted, the one below it is, to the right (as OpenCV draws
+    it). A view of a grid that is the same after a rotation is floating.
     """
 
-    columns: int  # circles in a row
-    rows: int
-    pitch_mm: float
     dot_diameter_mm: float
     asymmetric: bool = False
     dark: bool = True  # dark circles on a bright plate
 
     def __post_init__(self) -> None:
-        """Refuse a grid that nobody can have made."""
-        check_lattice("plate", self.columns, self.rows, self.pitch_mm)
-        check_length("plate, dot_diameter", self.dot_diameter_mm)
-        if self.asymmetric and self.rows % 2 == 0:
-            # Such a grid looks the same upside down, and OpenCV does not find it.
+        """Refuse circles that touch, and an asymmetric grid with an even number of rows."""
+        super().__post_init__()
+        if self.asymmetric and self.rows % 2 == 0:  # the same upside down, and OpenCV does not find it
             do = "count the rows, or cover one of them"
             raise CameraError(refusal("plate, rows", expected="an odd number", got=f"{self.rows}", do=do))
         nearest = self.pitch_mm * (np.sqrt(2) if self.asymmetric else 1)
@@ -127,10 +204,63 @@ class CircleGrid:
         """The largest grid indices."""
         return (2 * self.columns - 1 if self.asymmetric else self.columns - 1), self.rows - 1
 
-    def points(self, index: Ints) -> Floats:
-        """Return the centres (n, 3), plate frame, mm, with grid indices (n, 2)."""
-        return lattice_points(index, self.pitch_mm)
-
     def diameters(self, index: Ints) -> Floats:
         """Return the diameters (n,), mm."""
         return np.full(len(index), self.dot_diameter_mm)
+
+
+KINDS: Mapping[str, type[CalibrationTarget]] = {
+    "dots": DotPlate,
+    "chessboard": Chessboard,
+    "charuco": CharucoBoard,
+    "circles": CircleGrid,
+}
+
+
+def target_keys(kind: type[CalibrationTarget]) -> dict[str, tuple[str, bool]]:
+    """Return the field of each key of calibration.yaml, and whether the key must be there."""
+    return {_key(one.name): (one.name, one.default is MISSING) for one in fields(kind)}
+
+
+def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> CalibrationTarget:
+    """Build the target from `plate` of calibration.yaml.
+
+    Args:
+        entry: the parsed YAML.
+        name: file and key, for the message.
+
+    Raises:
+        CameraError: not a mapping, an unknown type or key, a missing key, or an impossible value.
+    """
+    kind = entry.get("type") if isinstance(entry, Mapping) else None
+    if not isinstance(kind, str) or kind not in KINDS:
+        expected = f"a mapping with `type` one of {', '.join(KINDS)}"
+        raise _refused(name, expected, kind if kind is not None else entry, "write the type of the plate")
+    keys = target_keys(KINDS[kind])
+    missing = [key for key, (_, needed) in keys.items() if needed and key not in entry]
+    unknown = [str(key)[:40] for key in entry if key != "type" and key not in keys][:5]
+    if missing or unknown:
+        faults = {"no": missing, "unknown": unknown}
+        got = "; ".join(f"{what} {', '.join(which)}" for what, which in faults.items() if which)
+        raise CameraError(refusal(name, expected=f"the keys {', '.join(keys)}", got=got, do="correct the plate"))
+    values = {keys[key][0]: value for key, value in entry.items() if key != "type"}
+    if "dots" in entry:
+        if entry["dots"] not in ("dark", "bright"):
+            raise _refused(f"{name}, dots", "dark or bright", entry["dots"], "write the brightness of the dots")
+        values["dark"] = entry["dots"] == "dark"
+    try:
+        return KINDS[kind](**values)
+    except CameraError as error:
+        raise CameraError(f"{name.removesuffix('plate')}{error}") from None
+
+
+def _key(field: str) -> str:
+    return "dots" if field == "dark" else field.removesuffix("_mm")
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _refused(name: str, expected: str, got: object, do: str = "correct the plate") -> CameraError:
+    return CameraError(refusal(name, expected=expected, got=short(got), do=do))

@@ -1,66 +1,65 @@
-"""Tsai's calibration of one camera: what does not depend on the lens' distortion first, by linear equations.
+"""Tsai's calibration of one camera.
 
-Along radii the lens moves points, across them it does not: the direction of a pixel from the picture's middle is that
-of the point from the optical axis. This gives R, T_x and T_y (radial alignment); f and T_z follow linearly, and a
-search for f, T_z and kappa1 begins there. The middle of the picture is taken for the axis meanwhile.
+Distortion moves points along radii only: the direction of a pixel from the picture's middle is that of the point from
+the optical axis. This radial alignment gives R, T_x and T_y by linear equations; f and T_z follow linearly, and a
+search for f, T_z and kappa1 starts there. The optical axis is taken to meet the middle of the picture.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from sphereorient.calibration.point_fit import checked_points, fit_to_points, rms_px
+from sphereorient.calibration.solve import checked_points, fit_to_points, rms_px
 from sphereorient.cameras.checks import check_image_size, check_positive
+from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION
-from sphereorient.cameras.pinhole import middle_of_picture
 from sphereorient.cameras.tsai import TsaiCamera
 from sphereorient.errors import CameraError, refusal
 
-FLAT = 3e-3  # relief over width below which points begin as a plane; the search then takes them as they are
-LINE = 1e-6  # width over length of what is no plane either
-POINTS_OF_PLANE = 5  # that the radial alignment of a plane takes; Tsai's numbers
+FLAT = 3e-3  # relief over width below which the linear stage takes points as a plane
+LINE = 1e-6  # width over length below which points are on a line
+POINTS_OF_PLANE = 5  # that the radial alignment of a plane needs; Tsai's numbers
 POINTS_OF_SPACE = 7
-BLURRED_F = 0.1  # sigma of f over f beyond which f and T_z are not told apart
-MISFIT = 0.01  # rms over the picture's diagonal: no lens that is left with one kappa misses by so much
+UNCERTAIN_F = 0.1  # sigma of f over f beyond which f and T_z cannot be separated
+MISFIT = 0.01  # rms over the picture's diagonal: no lens with one fitted kappa misses by so much
 ALSO = ("sx", "centre_u", "centre_v")
 FREE = ("f", "kappa1", *ROTATION, *TRANSLATION)
 
 
 def tsai_stages(
-    x_lab_mm: Tensor,
-    uv_px: Tensor,
-    image_size: tuple[int, int],
-    pixel_pitch_mm: tuple[float, float],
+    x_lab_mm: Tensor, uv_px: Tensor, image_size: tuple[int, int], pixel_pitch_mm: tuple[float, float]
 ) -> TsaiCamera:
-    """Calibrate a camera as Tsai's paper does: R, T_x, T_y from radial alignment, then f, T_z and kappa1.
+    """Calibrate a camera by Tsai's two stages: R, T_x, T_y from radial alignment, then f, T_z and kappa1.
 
-    The search at the end holds R, T_x and T_y; with noise, `calibrate_tsai` is the better one.
+    The last search holds R, T_x and T_y; with noise, `calibrate_tsai` is more accurate.
 
     Args:
-        x_lab_mm: (n, 3), lab, mm; right-handed. Of points in one plane the mirror image fits as well: give the
-            plane's side that the camera sees.
-        uv_px: (n, 2), px, where they appear.
-        image_size: (W, H), px; the optical axis is taken to meet its middle.
-        pixel_pitch_mm: of the sensor, along u and v; s_x is 1.
+        x_lab_mm: (n, 3), lab, mm; right-handed. Points in one plane also fit as their mirror image: give the side of
+            the plane that the camera sees.
+        uv_px: (n, 2), their pixels.
+        image_size: (W, H), px.
+        pixel_pitch_mm: along u and v; s_x is 1.
 
     Returns:
-        The camera, with the covariance of f, T_z and kappa1 as if the rest were exact.
+        The camera, with the covariance of f, T_z and kappa1 as if the other parameters were exact.
 
     Raises:
-        CameraError: too few points, on a line, in a plane parallel to the sensor (f and T_z are not told apart),
-            mirrored, not finite, or not the points of these pixels.
+        CameraError: points that are too few, on a line, in a plane parallel to the sensor, mirrored, not finite, or
+            not those of the pixels.
         ShapeError: arrays of another shape.
 
-    Source: Tsai 1987, stages 1 and 2, which the paper uses; ERRATA has no correction of it. The scale of a plane and
-    the case T_y = 0 are solved as `_aligned_plane` and `_null_vector` say.
+    Source: Tsai 1987, stages 1 and 2, which the paper uses without error.
     """
     points, pixels = checked_points(x_lab_mm, uv_px)
     _check_count(points, POINTS_OF_PLANE, "in one plane")
-    pitch = _pitch(image_size, pixel_pitch_mm)
+    check_image_size("image_size", image_size)
+    pitch = torch.tensor(pixel_pitch_mm, dtype=torch.float64)
+    check_positive("pixel_pitch_mm", pitch)
     centre = middle_of_picture(image_size)
     sensor_mm = (pixels - centre) * pitch
     starts = [
@@ -82,24 +81,17 @@ def calibrate_tsai(
     pixel_pitch_mm: tuple[float, float],
     also: Sequence[str] = (),
 ) -> TsaiCamera:
-    """Calibrate a camera by Tsai's stages, then fit all of its parameters at once in the picture.
+    """Calibrate a camera by `tsai_stages`, then fit all parameters together by least squares in the picture.
 
-    Args:
-        x_lab_mm: as of `tsai_stages`.
-        uv_px: as of `tsai_stages`.
-        image_size: (W, H), px.
-        pixel_pitch_mm: of the sensor, along u and v.
-        also: which of sx, centre_u, centre_v are fitted beside f, kappa1, R and T. sx takes points that are not in one
-            plane; the centre is known well only where the perspective is strong.
+    `also` names which of sx, centre_u, centre_v are fitted in addition to f, kappa1, R and T. sx needs points outside
+    one plane; the centre is well determined only where the perspective is strong. Other arguments as in `tsai_stages`.
 
     Returns:
-        The camera with the covariance of what was fitted.
+        The camera with the covariance of the fitted parameters.
 
     Raises:
-        CameraError: as `tsai_stages`; or a name that is not among these three, or sx from a plane.
+        CameraError: as `tsai_stages`; or another name in `also`, or sx from points in a plane.
         ShapeError: arrays of another shape.
-
-    Source: Tsai 1987, and the least squares of all parameters that is common since.
     """
     for name in also:
         if name not in ALSO:
@@ -117,7 +109,7 @@ def calibrate_tsai(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Frame:
-    """Axes of the points' own spread: two along the plane that fits them best, the third across it."""
+    """Principal axes of the points: two along the best plane, the third normal to it."""
 
     middle_lab_mm: Tensor  # (3,)
     R_own_lab: Tensor  # (3, 3)
@@ -128,26 +120,26 @@ class _Frame:
     def of(points: Tensor) -> _Frame:
         middle = points.mean(0)
         _, size, axes = torch.linalg.svd(points - middle, full_matrices=False)
-        axes = axes * torch.linalg.det(axes).sign()  # three rows: all signs together turn the hand
+        axes = axes * torch.linalg.det(axes).sign()  # right-handed
         size = size / size[0].clamp_min(torch.finfo(size.dtype).tiny)
         return _Frame(middle_lab_mm=middle, R_own_lab=axes, narrow=float(size[1]), relief=float(size[2]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Start:
-    """A pose and a focal length to begin with; T_z and f may still be missing (0)."""
+    """A first pose and focal length; T_z and f may still be missing (0)."""
 
     R_cam_lab: Tensor  # (3, 3)
     T_cam_lab_mm: Tensor  # (3,)
     f_mm: float = 0.0
 
     def before(self, points: Tensor) -> bool:
-        """Whether all points lie before the camera."""
+        """Whether all points are in front of the camera."""
         return bool((points @ self.R_cam_lab[2] + self.T_cam_lab_mm[2] > 0).all())
 
 
 def _aligned(points: Tensor, sensor_mm: Tensor) -> list[_Start]:
-    """Return the poses without T_z that put each point in the direction in which its pixel lies."""
+    """Return the poses without T_z that put each point in the direction of its pixel."""
     frame = _Frame.of(points)
     if frame.narrow < LINE:
         raise CameraError(
@@ -155,7 +147,7 @@ def _aligned(points: Tensor, sensor_mm: Tensor) -> list[_Start]:
         )
     flat = frame.relief < FLAT
     _check_count(points, POINTS_OF_PLANE if flat else POINTS_OF_SPACE, "in one plane" if flat else "in space")
-    own = (points - frame.middle_lab_mm) @ frame.R_own_lab.mT  # own axes: the equations then are well scaled
+    own = (points - frame.middle_lab_mm) @ frame.R_own_lab.mT  # own axes: well scaled equations
     width = float(own.abs().max())
     poses = _aligned_plane(own / width, sensor_mm) if flat else [_aligned_space(own / width, sensor_mm)]
     found = []
@@ -178,10 +170,10 @@ def _aligned_space(own: Tensor, sensor_mm: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _aligned_plane(own: Tensor, sensor_mm: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Solve the same for points with z = 0: two rotations, mirror images in depth of each other.
+    """Solve the same for points with z = 0: two rotations, mirror images of each other in depth.
 
-    Two columns of two rows are the corner of a rotation where their larger singular value is 1 (the smaller is the
-    cosine of the tilt): Tsai's formula for T_y^2, without its division by T_y.
+    A 2 x 2 matrix is the corner of a rotation if its larger singular value is 1 (the smaller is the cosine of the
+    tilt): Tsai's formula for T_y^2, without its division by T_y.
     """
     x, y, flat = sensor_mm[:, :1], sensor_mm[:, 1:], own[:, :2]
     a = _null_vector(torch.cat([y * flat, y, -x * flat, -x], dim=-1)).reshape(2, 3)
@@ -197,31 +189,30 @@ def _aligned_plane(own: Tensor, sensor_mm: Tensor) -> list[tuple[Tensor, Tensor]
 
 
 def _missing_column(corner: Tensor) -> Tensor:
-    """Return (2,) such that the rows of (2, 3) are orthonormal: I - C C^T has rank one, as the larger value is 1."""
+    """Return (2,) that makes the rows of (2, 3) orthonormal: I - C C^T has rank one."""
     values, vectors = torch.linalg.eigh(torch.eye(2, dtype=corner.dtype) - corner @ corner.mT)
     missing: Tensor = vectors[:, 1] * values[1].clamp_min(0).sqrt()
     return missing
 
 
 def _facing(rows: Tensor, T_xy: Tensor, own: Tensor, sensor_mm: Tensor) -> tuple[Tensor, Tensor]:
-    """Return rows and T with the sign that puts points on the side of the axis on which they appear (Tsai's T_y)."""
+    """Return rows and T with the sign that puts points on the same side of the axis as their pixels (Tsai's T_y)."""
     sign = ((own @ rows.mT + T_xy) * sensor_mm).sum().sign()
     return rows * sign, T_xy * sign
 
 
 def _null_vector(equations: Tensor) -> Tensor:
-    """Return the unit vector that homogeneous equations (n, k) determine.
+    """Return the null vector of homogeneous equations (n, k).
 
-    Tsai divides by T_y and has no solution where the lab's origin appears on the picture's middle row; up to a common
-    factor there always is one.
+    Tsai divides by T_y instead, which fails where the lab's origin appears on the picture's middle row.
     """
-    # Sensor coordinates and those of the points have their own units; columns of length 1 make them comparable.
+    # Sensor and point coordinates have different units; columns of length 1 make them comparable.
     scale = equations.norm(dim=0).clamp_min(torch.finfo(equations.dtype).tiny)
     n, k = equations.shape
-    # Of one equation less than unknowns (the fewest points) only the full V has the vector; else U would be n x n.
+    # With fewer equations than unknowns only the full V holds the vector.
     _, size, right = torch.linalg.svd(equations / scale, full_matrices=n < k)
     if float(size[k - 2]) < 1e-9 * float(size[0]):
-        got = "points whose directions in the picture leave the pose open"
+        got = "points whose directions in the picture do not determine the pose"
         raise CameraError(refusal("points", expected="points all over the picture", got=got, do=_ADD))
     solution: Tensor = right[k - 1] / scale
     return solution
@@ -239,7 +230,7 @@ def _with_depth(pose: _Start, points: Tensor, sensor_mm: Tensor) -> _Start:
 
 
 def _best(starts: Sequence[TsaiCamera], points: Tensor, pixels: Tensor) -> TsaiCamera:
-    """Fit f, T_z and kappa1 from each start; of a plane the wrong one of two may leave them open, and drops out."""
+    """Fit f, T_z and kappa1 from each start; return the best, leaving out starts that do not determine them."""
     fitted, refused = [], CameraError("")
     for start in starts:
         try:
@@ -252,23 +243,9 @@ def _best(starts: Sequence[TsaiCamera], points: Tensor, pixels: Tensor) -> TsaiC
 
 
 def _camera(start: _Start, image_size: tuple[int, int], pitch: Tensor) -> TsaiCamera:
-    return TsaiCamera(
-        image_size=image_size,
-        R_cam_lab=start.R_cam_lab,
-        T_cam_lab_mm=start.T_cam_lab_mm,
-        centre_px=middle_of_picture(image_size),
-        f_mm=torch.tensor(start.f_mm, dtype=torch.float64),
-        pixel_pitch_mm=pitch,
-        sx=torch.tensor(1.0, dtype=torch.float64),
-        kappa1=torch.tensor(0.0, dtype=torch.float64),
-    )
-
-
-def _pitch(image_size: tuple[int, int], pixel_pitch_mm: tuple[float, float]) -> Tensor:
-    check_image_size("image_size", image_size)
-    pitch = torch.tensor(pixel_pitch_mm, dtype=torch.float64)
-    check_positive("pixel_pitch_mm", pitch)
-    return pitch
+    fields: dict[str, Any] = TsaiCamera.ideal_lens(start.f_mm / float(pitch[1]), pitch.tolist())
+    fields |= {"R_cam_lab": start.R_cam_lab, "T_cam_lab_mm": start.T_cam_lab_mm}
+    return TsaiCamera(image_size=image_size, centre_px=middle_of_picture(image_size), **fields)
 
 
 def _check_count(points: Tensor, least: int, where: str) -> None:
@@ -277,7 +254,7 @@ def _check_count(points: Tensor, least: int, where: str) -> None:
 
 
 def _no_start(points: Tensor) -> str:
-    """Word why no pose puts the points before the camera."""
+    """Word why no pose puts the points in front of the camera."""
     if _Frame.of(points).relief < FLAT:
         return _parallel("none")
     do = "check the points' order and the axes' signs (lab right-handed, u to the right, v downwards)"
@@ -292,13 +269,13 @@ def _check_fit(camera: TsaiCamera, points: Tensor, pixels: Tensor) -> None:
         raise CameraError(refusal("points", expected=expected, got=got, do=do))
     covariance = camera.covariance
     sigma_mm = 0.0 if covariance is None else covariance.sigmas["f"]
-    if not sigma_mm <= BLURRED_F * float(camera.f_mm):
+    if not sigma_mm <= UNCERTAIN_F * float(camera.f_mm):
         raise CameraError(_parallel(f"{float(camera.f_mm):.3g} mm, sigma {sigma_mm:.2g}"))
 
 
 def _parallel(got: str) -> str:
     do = "tilt the plate by 20 degrees or more, or add points at other depths"
-    return refusal("f", expected="points at different depths, which tell f from T_z", got=got, do=do)
+    return refusal("f", expected="points at different depths, to separate f from T_z", got=got, do=do)
 
 
 _ADD = "add points"

@@ -1,13 +1,12 @@
-"""Cameras: one file per model; pictures of points, lines of sight, triangulation."""
+"""Cameras: one file per model; projection, lines of sight, triangulation."""
 
 from sphereorient.cameras.camera import Camera, Rays
 from sphereorient.cameras.covariance import ParameterCovariance
-from sphereorient.cameras.io.files import load_cameras, load_covariance, save_cameras
+from sphereorient.cameras.io.cameras_yaml import load_cameras, load_covariance, save_cameras
 from sphereorient.cameras.pinhole import PinholeCamera
 from sphereorient.cameras.port import Port, PortCamera
-from sphereorient.cameras.triangulate import triangulate
+from sphereorient.cameras.sight import R_cam_view, triangulate
 from sphereorient.cameras.tsai import TsaiCamera
-from sphereorient.cameras.view import R_cam_view
 
 __all__ = [
     "Camera",

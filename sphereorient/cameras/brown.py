@@ -1,81 +1,221 @@
-"""OpenCV's camera: Brown's polynomial acts on the undistorted point."""
+"""Brown's radial and tangential polynomial, its inverse, and OpenCV's camera, which applies it to slopes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import numpy as np
+import torch
 from torch import Tensor
 
-from sphereorient.cameras.brown_polynomial import bent, straightened
-from sphereorient.cameras.central import CentralCamera
-from sphereorient.cameras.checks import check_points, check_positive, check_unfolded
+from sphereorient.cameras.checks import check_points
+from sphereorient.cameras.model import CentralCamera, Key
+from sphereorient.errors import CameraError, refusal
+
+RADIAL_STEPS = 30  # of Newton held in a bracket; at a fold, where Newton stalls, halving alone leaves 1e-9
+PLANE_STEPS = 8  # of Newton, from the radial solution: what is left is as small as the tangential part
+RIM_STEPS = 33  # points per side of the picture where the distortion is tried; both corners are among them
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class BrownCamera(CentralCamera):
-    """Perspective with Brown-Conrady distortion of the slopes X/Z and Y/Z (DESIGN section 2, `brown`).
+class PolynomialCamera(CentralCamera):
+    """Perspective with Brown's polynomial on a plane that the model defines."""
+
+    k: Tensor  # (3,), radial k1, k2, k3
+    p: Tensor  # (2,), tangential p1, p2
+
+    def __post_init__(self) -> None:
+        """Refuse impossible parameters, and a distortion that folds inside the picture (its rim is enough)."""
+        super().__post_init__()
+        width, height = self.image_size
+        across = torch.linspace(-0.5, width - 0.5, RIM_STEPS, dtype=torch.float64)
+        down = torch.linspace(-0.5, height - 0.5, RIM_STEPS, dtype=torch.float64)
+        sides = [torch.stack([across, torch.full_like(across, v)], dim=-1) for v in (-0.5, height - 0.5)]
+        sides += [torch.stack([torch.full_like(down, u), down], dim=-1) for u in (-0.5, width - 0.5)]
+        rim_px = torch.cat(sides)
+        lost = torch.isnan(self.undistort(rim_px).detach()).any(-1)
+        if bool(lost.any()):
+            u, v = rim_px[lost][0].tolist()
+            expected, do = (
+                "a distortion that can be undone in the whole picture",
+                "correct the camera or calibrate again",
+            )
+            raise CameraError(refusal("k, p", expected=expected, got=f"one that folds before ({u:g}, {v:g})", do=do))
+
+    @property
+    def _p_opencv(self) -> Tensor:
+        return self.p
+
+    @abstractmethod
+    def _plane(self, uv_px: Tensor, distorted: bool) -> Tensor:
+        """Return where pixels lie on the plane of the polynomial."""
+
+    @abstractmethod
+    def _pixel(self, xy: Tensor, distorted: bool) -> Tensor:
+        """Invert `_plane`."""
+
+    def undistort(self, uv_px: Tensor) -> Tensor:
+        """Undistort pixels (..., 2) to the last digits; NaN beyond the fold, which lies outside the picture."""
+        check_points("uv_px", uv_px, 2)
+        return self._pixel(straightened(self._plane(uv_px, True), self.k, self._p_opencv), False)
+
+    def distort(self, uv_px: Tensor) -> Tensor:
+        """Distort pixels (..., 2); NaN beyond the fold of the polynomial."""
+        check_points("uv_px", uv_px, 2)
+        return self._pixel(bent(self._plane(uv_px, False), self.k, self._p_opencv), True)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BrownCamera(PolynomialCamera):
+    """Perspective with Brown-Conrady distortion of the slopes X/Z and Y/Z; k and p have no unit.
 
     Source: OpenCV's pinhole model with the coefficients k1, k2, p1, p2, k3.
     """
 
     f_px: Tensor  # (2,), fx and fy
-    k: Tensor  # (3,), radial k1, k2, k3, no unit
-    p: Tensor  # (2,), tangential p1, p2, no unit
 
-    PARAMETERS: ClassVar[Mapping[str, tuple[str, int | None]]] = {
-        "fx": ("f_px", 0),
-        "fy": ("f_px", 1),
-        "cx": ("centre_px", 0),
-        "cy": ("centre_px", 1),
-        "k1": ("k", 0),
-        "k2": ("k", 1),
-        "k3": ("k", 2),
-        "p1": ("p", 0),
-        "p2": ("p", 1),
-    }
+    MODEL: ClassVar[str] = "brown"
+    KEYS: ClassVar[tuple[Key, ...]] = (
+        Key("fx", "f_px", place=0, positive=True),
+        Key("fy", "f_px", place=1),
+        Key("cx", "centre_px", place=0),
+        Key("cy", "centre_px", place=1),
+        Key("k", "k", ("k1", "k2", "k3"), default=0.0),
+        Key("p", "p", ("p1", "p2"), default=0.0),
+    )
 
-    def __post_init__(self) -> None:
-        """Refuse what is no camera, and a distortion that folds the picture."""
-        super().__post_init__()
-        for name, size in (("f_px", 2), ("k", 3), ("p", 2)):
-            self._set_parameter(name, size)
-        check_positive("f_px", self.f_px)
-        check_unfolded("k, p", self)
+    @classmethod
+    def ideal_lens(cls, f_px: float, pitch_mm: Sequence[float]) -> dict[str, Any]:
+        """Return the fields of a lens without distortion."""
+        return {"f_px": (f_px * pitch_mm[1] / pitch_mm[0], f_px), "k": (0.0,) * 3, "p": (0.0,) * 2}
 
     @property
     def focal_px(self) -> Tensor:
         """(2,), pixels per unit of slope."""
         return self.f_px
 
-    def _slope(self, uv_px: Tensor) -> Tensor:
+    def _plane(self, uv_px: Tensor, distorted: bool) -> Tensor:
         return (uv_px - self.centre_px.to(uv_px)) / self.f_px.to(uv_px)
 
-    def _pixel(self, slope: Tensor) -> Tensor:
-        return slope * self.f_px.to(slope) + self.centre_px.to(slope)
+    def _pixel(self, xy: Tensor, distorted: bool) -> Tensor:
+        return xy * self.f_px.to(xy) + self.centre_px.to(xy)
 
-    def undistort(self, uv_px: Tensor) -> Tensor:
-        """Return where the same camera without lens distortion would show what a pixel shows.
 
-        Args:
-            uv_px: (..., 2), px.
+def bent(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
+    """Apply the polynomial to points.
 
-        Returns:
-            (..., 2), px, to the last digits (Newton); NaN where no point before the fold of the polynomial goes, which
-            lies outside the picture.
-        """
-        check_points("uv_px", uv_px, 2)
-        return self._pixel(straightened(self._slope(uv_px), self.k, self.p))
+    Args:
+        xy: (..., 2), any unit, from the centre of the distortion.
+        k: (3,), radial k1, k2, k3, in the unit to the powers -2, -4, -6.
+        p: (2,), tangential p1, p2 in OpenCV's order, in the inverse unit.
 
-    def distort(self, uv_px: Tensor) -> Tensor:
-        """Return the pixel that `undistort` takes to `uv_px`.
+    Returns:
+        (..., 2), unit of `xy`; NaN, with gradient 0, at and beyond the fold.
 
-        Args:
-            uv_px: (..., 2), px.
+    Source: Brown 1966 as OpenCV writes it: x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2).
+    """
+    ahead = _before_fold(xy, k, p)
+    moved, _ = _bent(torch.where(ahead, xy, torch.zeros_like(xy)), k.to(xy), p.to(xy))
+    return torch.where(ahead, moved, torch.full_like(moved, torch.nan))
 
-        Returns:
-            (..., 2), px; NaN beyond the fold of the polynomial.
-        """
-        check_points("uv_px", uv_px, 2)
-        return self._pixel(bent(self._slope(uv_px), self.k, self.p))
+
+def straightened(xy_bent: Tensor, k: Tensor, p: Tensor) -> Tensor:
+    """Return the points that `bent` takes to `xy_bent`.
+
+    Args:
+        xy_bent: (..., 2), any unit, from the centre of the distortion.
+        k: as in `bent`.
+        p: as in `bent`.
+
+    Returns:
+        (..., 2), unit of `xy_bent`; NaN, with gradient 0, where no point before the fold is the source.
+    """
+    goal, kk, pp = xy_bent, k.to(xy_bent), p.to(xy_bent)
+    with torch.no_grad():
+        radius = goal.norm(dim=-1, keepdim=True)
+        safe = torch.where(radius > 0, radius, torch.ones_like(radius))
+        xy = goal * (_radius_before(radius, kk, math.sqrt(fold2(k))) / safe)
+        for _ in range(PLANE_STEPS):
+            xy = _newton(xy, goal, kk, pp)
+        missed = (_bent(xy, kk, pp)[0] - goal).norm(dim=-1, keepdim=True)
+        close = missed <= 1e4 * torch.finfo(goal.dtype).eps * radius  # rounding, times what a near fold magnifies
+        exists = close & _before_fold(xy, k, p)
+        xy = torch.where(exists, xy, torch.zeros_like(xy))
+    goal = torch.where(exists, goal, torch.zeros_like(goal))
+    # Two more steps carry the implicit derivative: one makes the first right, two also the second.
+    xy = _newton(_newton(xy, goal, kk, pp), goal, kk, pp)
+    return torch.where(exists, xy, torch.full_like(xy, torch.nan))
+
+
+def fold2(k: Tensor) -> float:
+    """Return the squared radius at which the radial polynomial folds, infinite where it never does."""
+    k1, k2, k3 = k.detach().tolist()
+    # 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 = 0 in 1/s: the leading coefficient is then 1, whatever the others are.
+    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+    inverse = float(roots.real[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].max(initial=0.0))
+    return 1.0 / inverse if inverse > 1e-300 else math.inf
+
+
+def _bent(xy: Tensor, k: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    """Return moved points and the three different entries of the (symmetric) Jacobian: xx, xy, yy."""
+    x, y = xy.unbind(-1)
+    k1, k2, k3 = k.unbind()
+    p1, p2 = p.unbind()
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    rise = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # twice d radial / d r^2
+    moved = torch.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        dim=-1,
+    )
+    jacobian = torch.stack(
+        [
+            radial + rise * x * x + 2 * p1 * y + 6 * p2 * x,
+            rise * x * y + 2 * p1 * x + 2 * p2 * y,
+            radial + rise * y * y + 6 * p1 * y + 2 * p2 * x,
+        ],
+        dim=-1,
+    )
+    return moved, jacobian
+
+
+def _newton(xy: Tensor, goal: Tensor, k: Tensor, p: Tensor) -> Tensor:
+    moved, jacobian = _bent(xy, k, p)
+    dx, dy = (moved - goal).unbind(-1)
+    a, b, c = jacobian.unbind(-1)
+    step = torch.stack([c * dx - b * dy, a * dy - b * dx], dim=-1)
+    return xy - step / (a * c - b * b)[..., None]
+
+
+def _before_fold(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
+    with torch.no_grad():
+        a, b, c = _bent(xy, k.to(xy), p.to(xy))[1].unbind(-1)
+        return ((xy.square().sum(-1) < fold2(k)) & (a * c - b * b > 0))[..., None]
+
+
+def _radius_before(goal: Tensor, k: Tensor, fold: float) -> Tensor:
+    """Return the radius that the radial part alone takes to `goal`, at most `fold`."""
+    k1, k2, k3 = k.unbind()
+
+    def value_and_slope(r: Tensor) -> tuple[Tensor, Tensor]:
+        r2 = r * r
+        return r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) - goal, 1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3))
+
+    low, high = torch.zeros_like(goal), goal.clamp_max(fold)
+    for _ in range(10):  # until the root lies in the upper half of the bracket, or 1000 times away from the goal
+        half_is_beyond, is_below = value_and_slope(high / 2)[0] > 0, value_and_slope(high)[0] < 0
+        high = torch.where(is_below, 2 * high, torch.where(half_is_beyond, high / 2, high)).clamp_max(fold)
+    r = high
+    for _ in range(RADIAL_STEPS):
+        value, slope = value_and_slope(r)
+        low, high = torch.where(value < 0, r, low), torch.where(value < 0, high, r)
+        better = r - value / slope
+        r = torch.where((better >= low) & (better <= high), better, (low + high) / 2)
+    return r

@@ -1,4 +1,4 @@
-"""What a camera is to the rest of the package: points to pixels, pixels to rays."""
+"""The camera interface: lab points to pixels, pixels to rays."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from sphereorient.cameras.covariance import ParameterCovariance
 class Rays:
     """Half lines in the lab along which pixels see; made by cameras, read by triangulation and renderers."""
 
-    origin_lab_mm: Tensor  # (..., 3), a point of the ray: the projection centre, unless something bends the ray
+    origin_lab_mm: Tensor  # (..., 3), a point of the ray: the projection centre, or the refracting wall's liquid side
     direction_lab: Tensor  # (..., 3), unit length, away from the camera
 
 
 class Camera(Protocol):
-    """A calibrated camera. Later models may bend rays, so ask only for pictures of points and for rays.
+    """A calibrated camera.
 
-    All methods take any leading shape, compute in the dtype of the argument, and are differentiable in the argument
-    and in those parameters of the camera that require gradients. What has no picture is NaN, with gradient 0.
+    All methods take any leading shape and compute in the dtype of the argument. They are differentiable in the argument
+    and in those camera parameters that require gradients. A point without an image is NaN, with gradient 0.
     """
 
     @property
@@ -39,16 +39,16 @@ class Camera(Protocol):
 
     @property
     def covariance(self) -> ParameterCovariance | None:
-        """How wrong the parameters may be, where a calibration has said so."""
+        """Covariance of the parameters, where a calibration has estimated it."""
 
     def project(self, x_lab_mm: Tensor) -> Tensor:
-        """Return the pixels (..., 2) as (u, v), px, where lab points (..., 3), mm, appear; NaN behind the camera."""
+        """Project lab points (..., 3), mm, to pixels (..., 2) as (u, v), px; NaN behind the camera."""
 
     def rays(self, uv_px: Tensor) -> Rays:
-        """Return the lines of sight of pixels (..., 2); behind a wall they begin on its liquid side."""
+        """Return the rays of pixels (..., 2); behind a wall they start on its liquid side."""
 
     def undistort(self, uv_px: Tensor) -> Tensor:
-        """Return where the same camera without lens distortion would show what pixels (..., 2) show, (..., 2) px."""
+        """Return the pixels (..., 2) at which the same camera without distortion images what `uv_px` images."""
 
     def distort(self, uv_px: Tensor) -> Tensor:
-        """Return the pixels (..., 2) that `undistort` takes to `uv_px`, px."""
+        """Return the pixels (..., 2) that `undistort` takes to `uv_px`."""

@@ -1,4 +1,4 @@
-"""What a calibration knows about how wrong a camera's parameters are."""
+"""Covariance of camera parameters."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ParameterCovariance:
     matrix: Tensor  # (P, P) float64, in the products of the parameters' units
 
     def __post_init__(self) -> None:
-        """Refuse what is no covariance."""
+        """Refuse repeated names, a wrong shape, or a matrix that is not positive semidefinite."""
         object.__setattr__(self, "names", tuple(self.names))
         matrix = torch.as_tensor(self.matrix, dtype=torch.float64).detach()
         object.__setattr__(self, "matrix", matrix)
@@ -41,7 +41,7 @@ class ParameterCovariance:
         return dict(zip(self.names, self.matrix.diagonal().sqrt().tolist(), strict=True))
 
     def of(self, cameras: Iterable[str]) -> ParameterCovariance | None:
-        """Return the share of some cameras where names are such as cam1.f; None where nothing is known of them."""
+        """Return the block of some cameras, where names are such as cam1.f; None where it has no parameter of them."""
         wanted = set(cameras)
         kept = [k for k, name in enumerate(self.names) if name.partition(".")[0] in wanted]
         if not kept:

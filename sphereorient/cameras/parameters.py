@@ -1,10 +1,10 @@
-"""The names of a camera's parameters, and cameras with small changes applied to them.
+"""The names of a camera's parameters, and cameras with small changes of them.
 
-All models have `rotation_x`, `rotation_y`, `rotation_z` (rad, camera frame: R_true = exp([delta]x) R, with T as it is)
-and `T_x`, `T_y`, `T_z` (mm). The others carry the names of cameras.yaml, pairs as `centre_u` and `centre_v`, lists as
-`k1`, `k2`, `k3`; a port's are `port_offset`, `port_thickness` (mm), `port_n_glass`, `port_n_fluid`, and `port_tilt_x`,
-`port_tilt_y`, `port_tilt_z` (rad, lab frame: normal_true = exp([delta]x) normal, with the offset as it is; the turn
-about the normal itself moves nothing).
+All models have `rotation_x`, `rotation_y`, `rotation_z` (rad, camera frame: R_true = exp([delta]x) R, T unchanged)
+and `T_x`, `T_y`, `T_z` (mm). The others have the names of cameras.yaml, with pairs as `centre_u` and `centre_v` and
+lists as `k1`, `k2`, `k3`. A port has `port_offset`, `port_thickness` (mm), `port_n_glass`, `port_n_fluid`, and
+`port_tilt_x`, `port_tilt_y`, `port_tilt_z` (rad, lab frame: normal_true = exp([delta]x) normal, offset unchanged; a
+rotation about the normal itself changes nothing).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras.camera import Camera
+from sphereorient.cameras.model import CameraModel
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.errors import CameraError, check_tail, refusal
 from sphereorient.files.yaml_file import refuse_unknown
@@ -26,38 +27,33 @@ AnyCamera = TypeVar("AnyCamera", bound=Camera)
 ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 TRANSLATION = ("T_x", "T_y", "T_z")
 PORT_TILT = ("port_tilt_x", "port_tilt_y", "port_tilt_z")
-PORT_NUMBERS = {
-    "port_offset": "offset_mm",
-    "port_thickness": "thickness_mm",
-    "port_n_glass": "n_glass",
-    "port_n_fluid": "n_fluid",
-}
+PORT_NUMBERS = {f"port_{key.name}": key.field for key in Port.KEYS if not key.parts}
 
 
 def parameter_names(camera: Camera) -> tuple[str, ...]:
     """Return the names of all parameters that `with_parameters` can change.
 
     Raises:
-        CameraError: a camera of a model that does not name its parameters.
+        CameraError: not a `CameraModel`.
     """
     if isinstance(camera, PortCamera):
         return (*parameter_names(camera.camera), *PORT_NUMBERS, *PORT_TILT)
-    return (*_slots(camera), *ROTATION, *TRANSLATION)
+    if not isinstance(camera, CameraModel):
+        got, do = type(camera).__name__, "derive the model from CameraModel"
+        raise CameraError(refusal("camera", expected="a model that names its parameters", got=got, do=do))
+    return (*camera.parameter_fields(), *ROTATION, *TRANSLATION)
 
 
 def with_parameters(camera: AnyCamera, names: Sequence[str], delta: Tensor) -> AnyCamera:
-    """Return the camera with small changes applied to some of its parameters.
+    """Return the camera, of the same model and with the same covariance, with small changes of some parameters.
 
     Args:
         camera: of any model, also behind a port.
         names: P different names out of `parameter_names(camera)`.
-        delta: (P,), one change each, in the parameter's unit; the camera is differentiable in it.
-
-    Returns:
-        A camera of the same model with the same covariance.
+        delta: (P,), changes in the parameters' units; the camera is differentiable in them.
 
     Raises:
-        CameraError: an unknown name, a name twice, or changes that leave no camera.
+        CameraError: an unknown name, a name twice, or changes that make the camera impossible.
         ShapeError: `delta` has another shape.
     """
     check_tail("delta", delta, len(names))
@@ -75,16 +71,19 @@ def with_parameters(camera: AnyCamera, names: Sequence[str], delta: Tensor) -> A
 def _changed(camera: Camera, change: Mapping[str, Tensor]) -> Camera:
     if isinstance(camera, PortCamera):
         return replace(camera, camera=_changed(camera.camera, change), port=_changed_port(camera.port, change))
-    fields: dict[str, Tensor] = {}
-    for name, (field, place) in _slots(camera).items():
+    assert isinstance(camera, CameraModel)
+    fields: dict[str, Any] = {}
+    for name, (field, place) in camera.parameter_fields().items():
         if name in change:
             value: Tensor = fields.get(field, getattr(camera, field))
-            fields[field] = value + change[name] * _unit(value, place)
+            unit = torch.zeros_like(value)
+            unit[() if place is None else place] = 1.0
+            fields[field] = value + change[name] * unit
     if any(name in change for name in ROTATION):
         fields["R_cam_lab"] = so3.exp(_vector(change, ROTATION)) @ camera.R_cam_lab
     if any(name in change for name in TRANSLATION):
         fields["T_cam_lab_mm"] = camera.T_cam_lab_mm + _vector(change, TRANSLATION)
-    return cast(Camera, replace(cast(Any, camera), **fields))
+    return replace(camera, **fields)
 
 
 def _changed_port(port: Port, change: Mapping[str, Tensor]) -> Port:
@@ -94,20 +93,6 @@ def _changed_port(port: Port, change: Mapping[str, Tensor]) -> Port:
     return replace(port, **fields)
 
 
-def _slots(camera: Camera) -> Mapping[str, tuple[str, int | None]]:
-    slots: Mapping[str, tuple[str, int | None]] | None = getattr(camera, "PARAMETERS", None)
-    if slots is None:
-        got, do = type(camera).__name__, "give the model its PARAMETERS"
-        raise CameraError(refusal("camera", expected="a model that names its parameters", got=got, do=do))
-    return slots
-
-
 def _vector(change: Mapping[str, Tensor], names: tuple[str, str, str]) -> Tensor:
     zero = torch.zeros_like(next(iter(change.values())))
     return torch.stack([change.get(name, zero) for name in names])
-
-
-def _unit(value: Tensor, place: int | None) -> Tensor:
-    unit = torch.zeros_like(value)
-    unit[() if place is None else place] = 1.0
-    return unit

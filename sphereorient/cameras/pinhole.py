@@ -1,56 +1,61 @@
-"""The camera without lens: straight perspective."""
+"""The pinhole camera: perspective without distortion."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import torch
 from torch import Tensor
 
-from sphereorient.cameras.central import CentralCamera
-from sphereorient.cameras.checks import check_points, check_positive
+from sphereorient.cameras.model import CentralCamera, Key
 from sphereorient.errors import CameraError, refusal
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PinholeCamera(CentralCamera):
-    """Perspective without distortion and with square pixels (DESIGN section 2, `pinhole`)."""
+    """Perspective without distortion and with square pixels."""
 
     f_px: Tensor  # (), focal length, px
 
-    PARAMETERS: ClassVar[Mapping[str, tuple[str, int | None]]] = {
-        "f_px": ("f_px", None),
-        "centre_u": ("centre_px", 0),
-        "centre_v": ("centre_px", 1),
-    }
+    MODEL: ClassVar[str] = "pinhole"
+    KEYS: ClassVar[tuple[Key, ...]] = (
+        Key("f_px", "f_px", optional=True, positive=True),
+        Key("centre", "centre_px", ("centre_u", "centre_v"), optional=True),
+    )
+    ALSO: ClassVar[tuple[str, ...]] = ("vfov_deg",)
 
-    def __post_init__(self) -> None:
-        """Refuse what is no camera."""
-        super().__post_init__()
-        self._set_parameter("f_px")
-        check_positive("f_px", self.f_px)
+    @classmethod
+    def completed(cls, values: dict[str, Any]) -> dict[str, Any]:
+        """Return the keys with f_px from vfov_deg, and the centre from the picture's size.
+
+        Raises:
+            CameraError: both or none of vfov_deg and f_px, or an impossible angle.
+        """
+        f_px, vfov_deg = values["f_px"], values["vfov_deg"]
+        if (f_px is None) == (vfov_deg is None):
+            got, do = "none" if f_px is None else "both", "write one of the two"
+            raise CameraError(refusal("vfov_deg, f_px", expected="exactly one", got=got, do=do))
+        values = super().completed(values)
+        return values if vfov_deg is None else values | {"f_px": focal_of_field(values["image_size"][1], vfov_deg)}
+
+    @classmethod
+    def ideal_lens(cls, f_px: float, pitch_mm: Sequence[float]) -> dict[str, Any]:
+        """Return the fields of a lens; refuse pixels that are not square."""
+        if pitch_mm[0] != pitch_mm[1]:
+            got, do = f"pixel_pitch {pitch_mm[0]:g}, {pitch_mm[1]:g}", "choose model: tsai or brown"
+            raise CameraError(refusal("model: pinhole", expected="square pixels", got=got, do=do))
+        return {"f_px": f_px}
 
     @property
     def focal_px(self) -> Tensor:
         """(2,), pixels per unit of slope."""
         return self.f_px.expand(2)
 
-    def undistort(self, uv_px: Tensor) -> Tensor:
-        """Return the pixels (..., 2) unchanged."""
-        check_points("uv_px", uv_px, 2)
-        return uv_px
-
-    def distort(self, uv_px: Tensor) -> Tensor:
-        """Return the pixels (..., 2) unchanged."""
-        check_points("uv_px", uv_px, 2)
-        return uv_px
-
 
 def focal_of_field(height_px: int, vfov_deg: float) -> float:
-    """Return the focal length, px, that spans `vfov_deg` degrees over the full height of the picture.
+    """Return the focal length, px, for a field of `vfov_deg` degrees over the full height of the picture.
 
     Raises:
         CameraError: the angle is not between 0 and 180 degrees.
@@ -59,8 +64,3 @@ def focal_of_field(height_px: int, vfov_deg: float) -> float:
         got = f"{vfov_deg:g}"
         raise CameraError(refusal("vfov_deg", expected="an angle between 0 and 180", got=got, do="correct the camera"))
     return 0.5 * height_px / math.tan(math.radians(vfov_deg) / 2)
-
-
-def middle_of_picture(image_size: tuple[int, int]) -> Tensor:
-    """Return the middle of a W x H picture, (2,) float64 px; whole numbers are pixel centres."""
-    return (torch.tensor(image_size, dtype=torch.float64) - 1) / 2

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from sphereorient.cameras.camera import Camera, Rays
-from sphereorient.cameras.central import CentralCamera
 from sphereorient.cameras.checks import as_parameter, check_points
 from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.cameras.model import CentralCamera, Key
 from sphereorient.errors import CameraError, refusal
 
 UNIT_TOLERANCE = 1e-3  # of |normal| - 1: three digits are enough to write a normal; its length is not used
@@ -28,18 +29,31 @@ class Port:
     n_glass: Tensor  # (), index of the wall, relative to the air's
     n_fluid: Tensor  # (), index of the liquid, relative to the air's
 
+    KEYS: ClassVar[tuple[Key, ...]] = (
+        Key("normal", "normal", ("normal_x", "normal_y", "normal_z")),
+        Key("offset", "offset_mm"),
+        Key("thickness", "thickness_mm"),
+        Key("n_glass", "n_glass"),
+        Key("n_fluid", "n_fluid"),
+    )
+
     def __post_init__(self) -> None:
-        """Refuse what is no wall."""
-        object.__setattr__(self, "normal", as_parameter("port, normal", self.normal, 3))
-        for name in ("offset_mm", "thickness_mm", "n_glass", "n_fluid"):
-            object.__setattr__(self, name, as_parameter(f"port, {name}", getattr(self, name)))
+        """Refuse numbers that describe no wall."""
+        for key in self.KEYS:
+            shape = (len(key.parts),) if key.parts else ()
+            value = as_parameter(f"port, {key.field}", getattr(self, key.field), *shape)
+            object.__setattr__(self, key.field, value)
         length = float(self.normal.detach().norm())
         if abs(length - 1) > UNIT_TOLERANCE:
             do = "write the wall's normal in lab axes, towards the camera"
             raise CameraError(refusal("port, normal", expected="a vector of length 1", got=f"{length:.6g}", do=do))
-        _check_least("port, thickness_mm", self.thickness_mm, 0.0, "write the wall's thickness in mm")
-        for name in ("n_glass", "n_fluid"):
-            _check_least(f"port, {name}", getattr(self, name), 1.0, "write the index relative to the air's")
+        index_do = "write the index relative to the air's"
+        least = {"thickness_mm": (0.0, "write the wall's thickness in mm"), "n_glass": (1.0, index_do)}
+        for name, (smallest, do) in (least | {"n_fluid": (1.0, index_do)}).items():
+            number = float(getattr(self, name).detach())
+            if number < smallest:
+                expected = f"{smallest:g} or more"
+                raise CameraError(refusal(f"port, {name}", expected=expected, got=f"{number:.6g}", do=do))
 
     @property
     def normal_lab(self) -> Tensor:
@@ -49,20 +63,17 @@ class Port:
 
     @property
     def air_side_mm(self) -> Tensor:
-        """(), normal . X of the wall's side towards the camera, lab."""
+        """(), normal . X of the wall's air side, lab."""
         return self.offset_mm + self.thickness_mm
 
     def refract(self, air: Rays) -> Rays:
-        """Return what becomes of rays in air when they pass the wall.
-
-        Args:
-            air: rays on the camera's side, lab; each is taken for a whole line.
+        """Refract rays in air (lab; each is taken as a whole line) into the liquid.
 
         Returns:
-            Rays in the liquid: origin (..., 3) on the wall's liquid side, mm, and direction (..., 3); NaN, with
-            gradient 0, for rays that do not go towards the wall.
+            Rays with origin (..., 3) on the wall's liquid side, mm, and direction (..., 3); NaN, with gradient 0, for
+            rays that do not go towards the wall.
 
-        Source: Snell's law: the direction's part along the wall is divided by the index (DESIGN section 2, Port).
+        Source: Snell's law: the direction's part along the wall is divided by the index (docs/conventions.md).
         """
         d = air.direction_lab
         normal = self.normal_lab.to(d)
@@ -81,12 +92,12 @@ class Port:
         nan = torch.full_like(direction, torch.nan)
         return Rays(origin_lab_mm=torch.where(passes, origin, nan), direction_lab=torch.where(passes, direction, nan))
 
-    def entry_point(self, x_lab_mm: Tensor, eye_lab_mm: Tensor) -> Tensor:
-        """Return where light from points in the liquid leaves the wall on its way to an view in the air.
+    def entry_point(self, x_lab_mm: Tensor, centre_lab_mm: Tensor) -> Tensor:
+        """Return where light from points in the liquid leaves the wall on its way to the camera's centre in air.
 
         Args:
             x_lab_mm: (..., 3), lab, mm, in the liquid.
-            eye_lab_mm: (3,), lab, mm, in the air.
+            centre_lab_mm: (3,), lab, mm, in the air.
 
         Returns:
             (..., 3), lab, mm, on the wall's air side; NaN, with gradient 0, for points that are not in the liquid.
@@ -94,23 +105,23 @@ class Port:
         Source: Snell's law in the plane of normal and point (textbook), solved for the share of the way along the wall.
         """
         normal = self.normal_lab.to(x_lab_mm)
-        view = eye_lab_mm.to(x_lab_mm)
-        height = view @ normal - self.air_side_mm.to(x_lab_mm)
+        centre = centre_lab_mm.to(x_lab_mm)
+        height = centre @ normal - self.air_side_mm.to(x_lab_mm)
         depth = self.offset_mm.to(x_lab_mm) - x_lab_mm @ normal
         inside = depth >= 0
-        way = torch.where(inside[..., None], x_lab_mm, view) - view
+        way = torch.where(inside[..., None], x_lab_mm, centre) - centre
         along_wall = way - (way @ normal)[..., None] * normal
         share = self._share_in_air(along_wall.square().sum(-1), height, torch.where(inside, depth, height))
-        point = view - height * normal + share[..., None] * along_wall
+        point = centre - height * normal + share[..., None] * along_wall
         return torch.where(inside[..., None], point, torch.full_like(point, torch.nan))
 
     def _share_in_air(self, across2: Tensor, height: Tensor, depth: Tensor) -> Tensor:
-        """Return which share of the way along the wall is made in air, in (0, 1].
+        """Return the fraction of the distance along the wall that light covers in air, in (0, 1].
 
-        With s the sine in air the way is height tan + thickness s / sqrt(n_g^2 - s^2) + depth s / sqrt(n_f^2 - s^2).
-        Divided by the whole way it is g(share) = 1 below, which needs no square root of the way and so has gradients
-        straight below the view as well. g rises and is concave: Newton from the share of steep rays, which is too
-        small, climbs to the root without ever passing it.
+        With s the sine in air the distance is height tan + thickness s / sqrt(n_g^2 - s^2) + depth s /
+        sqrt(n_f^2 - s^2). Divided by the whole distance it is g(share) = 1 below; it needs no square root of the
+        distance, so gradients exist also straight below the camera. g rises and is concave: Newton starts at the share
+        of steep rays, which is too small, and converges from below.
         """
         layers = [(self.thickness_mm.to(depth), self.n_glass.to(depth)), (depth, self.n_fluid.to(depth))]
 
@@ -128,16 +139,15 @@ class Port:
             share = newton(torch.zeros_like(depth))  # steep rays: 1 / (1 + thickness / (n_g H) + depth / (n_f H))
             for _ in range(STEPS):
                 share = newton(share)
-        # Two more steps carry the implicit derivative: one makes the first right, two also the second.
+        # The first further step carries the first derivative of the root, the second step its second derivative.
         return newton(newton(share))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PortCamera:
-    """Any camera model behind a flat wall; its R, T and picture are those of the camera in air.
+    """Any camera model behind a flat wall; R, T and image_size are those of the camera in air.
 
-    `undistort` and `distort` are the inner camera's: they mend the lens and leave the bend of the wall, which depends
-    on how far the point is.
+    `undistort` and `distort` are the inner camera's: they correct the lens, not the refraction, which depends on depth.
     """
 
     camera: Camera  # as it would be in air
@@ -145,7 +155,7 @@ class PortCamera:
     covariance: ParameterCovariance | None = None  # of the camera's and the port's parameters together
 
     def __post_init__(self) -> None:
-        """Refuse a camera that stands in its wall or looks away from it."""
+        """Refuse a camera whose centre is not in front of the wall, or that looks away from it."""
         if self.covariance is None:
             object.__setattr__(self, "covariance", self.camera.covariance)
         normal, wall = self.port.normal_lab.detach(), float(self.port.air_side_mm.detach())
@@ -176,7 +186,7 @@ class PortCamera:
         return self.camera.T_cam_lab_mm
 
     def undistort(self, uv_px: Tensor) -> Tensor:
-        """Return where the camera in air, without lens distortion, would show what pixels (..., 2) show there."""
+        """Undistort pixels (..., 2) of the camera in air."""
         return self.camera.undistort(uv_px)
 
     def distort(self, uv_px: Tensor) -> Tensor:
@@ -184,14 +194,9 @@ class PortCamera:
         return self.camera.distort(uv_px)
 
     def rays(self, uv_px: Tensor) -> Rays:
-        """Return the lines of sight of pixels in the liquid.
+        """Return the rays in the liquid of pixels (..., 2); they start on the wall's liquid side.
 
-        Args:
-            uv_px: (..., 2) as (u, v), px.
-
-        Returns:
-            Rays with origin (..., 3) on the wall's liquid side, mm, and direction (..., 3), lab; NaN where the pixel
-            does not look at the wall.
+        NaN where the pixel does not look at the wall.
 
         Raises:
             ShapeError: the last axis is not 2.
@@ -199,13 +204,9 @@ class PortCamera:
         return self.port.refract(self.camera.rays(uv_px))
 
     def project(self, x_lab_mm: Tensor) -> Tensor:
-        """Return where points in the liquid appear.
+        """Project points in the liquid (..., 3), lab, mm, to pixels (..., 2), also outside the picture.
 
-        Args:
-            x_lab_mm: (..., 3), lab, mm.
-
-        Returns:
-            (..., 2) as (u, v), px, also outside the picture; NaN for points that are not in the liquid.
+        NaN for points that are not in the liquid.
 
         Raises:
             ShapeError: the last axis is not 3.
@@ -216,10 +217,10 @@ class PortCamera:
         return self.camera.project(self._apparent_point(x_lab_mm))
 
     def _apparent_point(self, x_lab_mm: Tensor) -> Tensor:
-        """Return points that a camera without one centre would see in air where it sees `x_lab_mm` in the liquid.
+        """Return the points in air whose image is that of `x_lab_mm` in the liquid, for cameras without one centre.
 
-        The apparent point moves along the wall by what its own ray misses the true point; what is missed shrinks by
-        1 - 1/n and more per round for rays that meet the wall steeply, and is 0 after the first for parallel rays.
+        Each iteration shifts the apparent point along the wall by the miss of its own ray. The miss shrinks by 1 - 1/n
+        or more for steep rays, and is 0 after the first iteration for parallel rays.
         """
         normal = self.port.normal_lab.to(x_lab_mm)
         inside = (x_lab_mm @ normal <= self.port.offset_mm.to(x_lab_mm))[..., None]
@@ -234,9 +235,3 @@ class PortCamera:
             1 + x_lab_mm.norm(dim=-1, keepdim=True)
         )
         return torch.where(inside & found, apparent, torch.full_like(apparent, torch.nan))
-
-
-def _check_least(name: str, value: Tensor, least: float, do: str) -> None:
-    number = float(value.detach())
-    if number < least:
-        raise CameraError(refusal(name, expected=f"{least:g} or more", got=f"{number:.6g}", do=do))

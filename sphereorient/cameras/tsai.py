@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.central import CentralCamera
-from sphereorient.cameras.checks import check_points, check_positive
+from sphereorient.cameras.checks import check_points
+from sphereorient.cameras.model import CentralCamera, Key
 from sphereorient.errors import CameraError, refusal
 
 FOLD = -4.0 / 27.0  # below this value of kappa1 r_u^2 the cubic has no root on the branch that holds the picture
@@ -20,43 +20,39 @@ FOLD = -4.0 / 27.0  # below this value of kappa1 r_u^2 the cubic has no root on 
 class TsaiCamera(CentralCamera):
     """Perspective with x_u = x_d (1 + kappa1 r_d^2), r_d the distorted radius on the sensor, mm.
 
-    Source: DESIGN section 2 (Tsai). OpenCV's polynomial acts on the undistorted point instead.
+    Source: docs/conventions.md (Tsai). OpenCV's polynomial acts on the undistorted point instead.
     """
 
     f_mm: Tensor  # (), effective focal length
     pixel_pitch_mm: Tensor  # (2,)
     sx: Tensor  # (), horizontal scale
-    kappa1: Tensor  # (), 1/mm^2; DESIGN's symbol
+    kappa1: Tensor  # (), 1/mm^2
 
-    PARAMETERS: ClassVar[Mapping[str, tuple[str, int | None]]] = {
-        "f": ("f_mm", None),
-        "pixel_pitch_u": ("pixel_pitch_mm", 0),
-        "pixel_pitch_v": ("pixel_pitch_mm", 1),
-        "sx": ("sx", None),
-        "centre_u": ("centre_px", 0),
-        "centre_v": ("centre_px", 1),
-        "kappa1": ("kappa1", None),
-    }
+    MODEL: ClassVar[str] = "tsai"
+    KEYS: ClassVar[tuple[Key, ...]] = (
+        Key("f", "f_mm", positive=True),
+        Key("pixel_pitch", "pixel_pitch_mm", ("pixel_pitch_u", "pixel_pitch_v"), positive=True),
+        Key("sx", "sx", default=1.0, positive=True),
+        Key("centre", "centre_px", ("centre_u", "centre_v")),
+        Key("kappa1", "kappa1", default=0.0),
+    )
 
     def __post_init__(self) -> None:
-        """Refuse what is no camera, and a distortion that folds the picture."""
+        """Refuse impossible parameters, and a distortion that folds inside the picture."""
         super().__post_init__()
-        for name, shape in (("f_mm", ()), ("pixel_pitch_mm", (2,)), ("sx", ()), ("kappa1", ())):
-            self._set_parameter(name, *shape)
-        for name in ("f_mm", "pixel_pitch_mm", "sx"):
-            check_positive(name, getattr(self, name))
-        self._check_invertible()
-
-    def _check_invertible(self) -> None:
         width, height = self.image_size
         corners = self.centre_px.new_tensor([(u, v) for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])
         r2 = float(self._sensor_mm(corners).detach().square().sum(-1).max())
         kappa1 = float(self.kappa1.detach())
-        slope = 1.0 + 3.0 * kappa1 * r2  # d r_u / d r_d at the farthest corner
-        if slope <= 0:
+        if 1.0 + 3.0 * kappa1 * r2 <= 0:  # d r_u / d r_d at the farthest corner
             expected = f"above {-1.0 / (3.0 * r2):.4g} 1/mm^2, where the picture's farthest corner folds over"
-            got = f"{kappa1:.4g}"
-            raise CameraError(refusal("kappa1", expected=expected, got=got, do="correct the camera or calibrate again"))
+            do = "correct the camera or calibrate again"
+            raise CameraError(refusal("kappa1", expected=expected, got=f"{kappa1:.4g}", do=do))
+
+    @classmethod
+    def ideal_lens(cls, f_px: float, pitch_mm: Sequence[float]) -> dict[str, Any]:
+        """Return the fields of a lens without distortion."""
+        return {"f_mm": f_px * pitch_mm[1], "pixel_pitch_mm": tuple(pitch_mm), "sx": 1.0, "kappa1": 0.0}
 
     @property
     def focal_px(self) -> Tensor:
@@ -77,28 +73,14 @@ class TsaiCamera(CentralCamera):
         return torch.where(exists, moved, torch.full_like(moved, torch.nan))
 
     def undistort(self, uv_px: Tensor) -> Tensor:
-        """Return where the same camera without lens distortion would show what a pixel shows.
-
-        Args:
-            uv_px: (..., 2), px.
-
-        Returns:
-            (..., 2), px; NaN beyond the fold of the polynomial, which lies outside the picture.
-        """
+        """Undistort pixels (..., 2); NaN beyond the fold of the polynomial, which lies outside the picture."""
         check_points("uv_px", uv_px, 2)
         bend = self.kappa1.to(uv_px) * self._sensor_mm(uv_px).square().sum(-1)
         unfolded = 1.0 + 3.0 * bend > 0
         return self._scaled_about_centre(uv_px, torch.where(unfolded, 1.0 + bend, torch.full_like(bend, torch.nan)))
 
     def distort(self, uv_px: Tensor) -> Tensor:
-        """Return the pixel that `undistort` takes to `uv_px`.
-
-        Args:
-            uv_px: (..., 2), px.
-
-        Returns:
-            (..., 2), px; NaN where no pixel does (only with kappa1 < 0, outside the picture).
-        """
+        """Distort pixels (..., 2); NaN where there is no solution (kappa1 < 0, outside the picture)."""
         check_points("uv_px", uv_px, 2)
         bend = self.kappa1.to(uv_px) * self._sensor_mm(uv_px).square().sum(-1)
         return self._scaled_about_centre(uv_px, shrinkage(bend))
@@ -118,11 +100,11 @@ def shrinkage(bend: Tensor) -> Tensor:
     exists = bend > FOLD
     bend = torch.where(exists, bend, torch.zeros_like(bend))
     with torch.no_grad():
-        # The floor avoids 0/0; what it changes (1e-9) the Newton steps mend.
+        # The floor avoids 0/0; the Newton steps remove its error (1e-9).
         z = (27.0 / 4.0 * bend.abs()).sqrt().clamp_min(1e-4)
         s = torch.where(bend < 0, (z.clamp_max(1.0).asin() / 3).sin(), (z.asinh() / 3).sinh()) * 3 / z
-    # The root itself has no gradient at bend = 0 (sqrt); Newton steps from it carry the implicit derivative:
-    # one makes the first derivative right, two also the second.
+    # The root has no gradient at bend = 0 (sqrt). The first Newton step carries its first derivative, the second
+    # step its second derivative.
     for _ in range(2):
         s = s - (s * (1 + bend * s * s) - 1) / (1 + 3 * bend * s * s)
     return torch.where(exists, s, torch.full_like(s, torch.nan))

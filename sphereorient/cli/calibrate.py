@@ -24,9 +24,9 @@ def calibrate(
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no tables.")] = False,
 ) -> None:
-    """Find cameras from pictures of a plate, or repair bumped ones from a track of both."""
+    """Calibrate cameras from pictures of a plate, or repair cameras that moved, from a track of both."""
     check_writable(out)
-    _check_other_yaml(out, source)
+    check_other_yaml(out, source)
     command = " ".join(["sphereorient", *sys.argv[1:]])
     if refine_with is not None:
         _repair(source, refine_with, out, command, quiet)
@@ -55,7 +55,6 @@ def calibrate(
 
 
 def _repair(cameras: Path, track: Path, out: Path, command: str, quiet: bool) -> None:
-    """Repair cameras by the sphere."""
     from sphereorient.calibration import refine_with_track
     from sphereorient.calibration.table import repair_lines
     from sphereorient.cameras import load_cameras, save_cameras
@@ -68,15 +67,15 @@ def _repair(cameras: Path, track: Path, out: Path, command: str, quiet: bool) ->
 
 
 @app.command("check-cameras")
-def check_cameras(
+def check_cameras_command(
     experiment: ExperimentPath,
     track: Annotated[
         Path | None, typer.Option(help="track.h5 of this experiment; without it the movies are tracked first.")
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
-    """Tell by how much the lines of sight of the cameras miss each other at the sphere, over a movie."""
-    from sphereorient.calibration import check_cameras as checked
+    """Report how far the cameras' lines of sight to the sphere miss each other, over a movie."""
+    from sphereorient.calibration import check_cameras
     from sphereorient.calibration.table import check_lines, contradiction_lines
     from sphereorient.experiment import load_experiment
     from sphereorient.run.stages import track_movies
@@ -84,20 +83,20 @@ def check_cameras(
 
     known = load_experiment(experiment)
     if len(known.cameras) < 2:
-        do = "check an experiment of two cameras"
+        do = "name an experiment of two cameras"
         raise ExperimentError(refusal(str(experiment), expected="two cameras or more", got="one", do=do))
     if track is not None:
         result = Trajectory.load(track)
     else:
         with progress_bar(quiet) as advance:
             result = track_movies(known, progress=advance)
-    lines = check_lines(checked(known.cameras, result))
+    lines = check_lines(check_cameras(known.cameras, result))
     for line in [*(lines or ["no frame in which two cameras see the sphere"]), *contradiction_lines(result)]:
         typer.echo(line)
 
 
-def _check_other_yaml(out: Path, source: Path) -> None:
-    """Refuse to write cameras over what they are made of, or to a file whose picture would have its own name."""
+def check_other_yaml(out: Path, source: Path) -> None:
+    """Refuse to write cameras over their source, or to a name that does not end in .yaml."""
     do = "choose another --out, such as cameras.yaml"
     if out.suffix not in (".yaml", ".yml"):
         raise OutputError(refusal(f"--out {out}", expected="a name that ends in .yaml", got=f"'{out.name}'", do=do))

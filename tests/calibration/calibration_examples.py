@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,9 +11,9 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.calibration import DotPlate, PlateView, disk_centre_shift
-from sphereorient.calibration.bundle import Fitted, adjust
+from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
+from sphereorient.calibration.document import CalibrationDocument
 from sphereorient.calibration.guess import guess_rig
-from sphereorient.calibration.problem import Problem, Rig, fitted_parameters, gathered
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.cameras.parameters import with_parameters
@@ -106,8 +107,23 @@ def views(rig: Rig, rng: torch.Generator, noise_px: float = 0.03) -> Views:
     return {name: {row: view(rig, name, row, rng, noise_px) for row in rows} for name in rig.cameras}
 
 
-def surveyed(rig: Rig) -> dict[int, tuple[Tensor, Tensor]]:
-    return {0: (rig.R_lab_plate[0], rig.T_lab_plate_mm[0])}
+def document(
+    rig: Rig, model: str = "tsai", ports: Mapping[str, Port] | None = None, pitch: tuple[float, float] = PITCH
+) -> CalibrationDocument:
+    """What a calibration.yaml would say of the rig."""
+    return CalibrationDocument(
+        path=Path("calibration.yaml"),
+        image_size=SIZE,
+        pixel_pitch_mm=pitch,
+        model=model,
+        plate=PLATE,
+        poses=tuple(range(len(rig.R_lab_plate))),
+        surveyed={0: (rig.R_lab_plate[0], rig.T_lab_plate_mm[0])},
+        pictures=(),
+        points={},
+        ports=ports or {},
+        fit_ports=(),
+    )
 
 
 def problem(rig: Rig, seen: Views, of_port: tuple[str, ...] = ()) -> Problem:
@@ -119,7 +135,7 @@ def problem(rig: Rig, seen: Views, of_port: tuple[str, ...] = ()) -> Problem:
 
 def calibrated(rig: Rig, seen: Views, model: str = "tsai", ports: Mapping[str, Port] | None = None) -> Fitted:
     """Guess and fit, as from pictures."""
-    return adjust(problem(guess_rig(seen, SIZE, PITCH, surveyed(rig), ports or {}, len(rig.R_lab_plate), model), seen))
+    return adjust(problem(guess_rig(document(rig, model, ports), seen), seen))
 
 
 def bumped(camera: Camera, turn_rad: Tensor, move_mm: Tensor) -> Camera:
@@ -133,7 +149,7 @@ def change_of(found: Camera, true: Camera, names: tuple[str, ...]) -> Tensor:
     turn = so3.log(true.R_cam_lab @ found.R_cam_lab.mT)
     values = {f"rotation_{axis}": turn[k] for k, axis in enumerate("xyz")}
     values |= {f"T_{axis}": (true.T_cam_lab_mm - found.T_cam_lab_mm)[k] for k, axis in enumerate("xyz")}
-    for name, (field, place) in type(inner_true).PARAMETERS.items():
+    for name, (field, place) in inner_true.parameter_fields().items():
         away = getattr(inner_true, field) - getattr(inner_found, field)
         values[name] = away if place is None else away[place]
     return torch.stack([values[name] for name in names])

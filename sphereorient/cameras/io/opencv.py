@@ -17,11 +17,11 @@ from sphereorient.errors import CameraError, OutputError, refusal
 from sphereorient.files.whole_file import TEXT_BYTES, read_whole
 from sphereorient.files.yaml_file import short
 
-SUFFIXES = (".yml", ".yaml", ".xml", ".json")  # by them OpenCV chooses the format
-MOST = 64  # numbers of a matrix that is read: OpenCV makes room for what the file claims before it counts
-# OpenCV's parser calls itself for each level, down to a crash. No level without one of these; its files have dozens.
+SUFFIXES = (".yml", ".yaml", ".xml", ".json")  # OpenCV chooses the format by them
+MOST = 64  # numbers of a matrix: OpenCV allocates what the file claims before it counts
+# OpenCV's parser recurses at each level and can crash. Each level needs one of these; OpenCV's files have dozens.
 OPENER = re.compile(rb"[\[{]|-\s|<[^/?!]")
-MOST_OPENERS, MOST_BLANKS = 3000, 200  # the second: levels that indentation makes
+MOST_OPENERS, MOST_BLANKS = 3000, 200  # the second: levels by indentation
 LENGTHS = (4, 5, 8, 12, 14)  # of distortion_coefficients, in OpenCV's order k1 k2 p1 p2 k3 ...
 
 Array = NDArray[np.float64]
@@ -33,32 +33,35 @@ def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> 
     Args:
         path: with `camera_matrix` and `distortion_coefficients`, and optionally `R` or `rvec`, `T` or `tvec` (taken as
             mm; without them the lab is the camera frame), `image_width` and `image_height`.
-        image_size: (W, H), px, for files that do not say it.
+        image_size: (W, H), px, for files without it.
 
     Raises:
-        CameraError: missing or not of OpenCV's making, a key that is missing or no camera's, a camera matrix with
-            shear, or a distortion beyond k1, k2, p1, p2, k3.
+        CameraError: missing, not OpenCV's, a key that is missing or impossible, a camera matrix with shear, or a
+            distortion beyond k1, k2, p1, p2, k3.
 
-    Source: the sample programs' keys; pixels count as ours do, the first one's centre is (0, 0).
+    Source: the sample programs' keys; the first pixel's centre is (0, 0), as here.
     """
     path = Path(path)
     storage = _opened(path)
     try:
-        K = _matrix(storage, path, "camera_matrix", (3, 3))
+        K = _required(storage, path, "camera_matrix")
         coefficients = _coefficients(storage, path)
         R = _rotation(storage, path)
-        T = _optional(storage, ("T", "tvec"), path, 3)
+        T = _translation(storage, path)
         size = _size(storage, path, image_size)
     finally:
         storage.release()
+    if K.shape != (3, 3):
+        raise _refused(f"{path}, camera_matrix", "3 x 3 numbers", str(K.shape), "correct the file")
     if K[0, 1] != 0 or K[1, 0] != 0 or not np.allclose(K[2], (0, 0, 1)):
         expected = "fx and fy on the diagonal, cx and cy in the last column, zeros and a one elsewhere"
-        raise _refused(path, "camera_matrix", expected, short(K.round(6).tolist()), "calibrate without shear")
+        got = short(K.round(6).tolist())
+        raise _refused(f"{path}, camera_matrix", expected, got, "calibrate without shear")
     try:
         return BrownCamera(
             image_size=size,
             R_cam_lab=_tensor(R),
-            T_cam_lab_mm=_tensor(np.zeros(3) if T is None else T),
+            T_cam_lab_mm=_tensor(T),
             centre_px=_tensor(K[:2, 2]),
             f_px=_tensor(K[[0, 1], [0, 1]]),
             k=_tensor(coefficients[[0, 1, 4]]),
@@ -69,26 +72,27 @@ def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> 
 
 
 def save_opencv(path: Path | str, camera: BrownCamera) -> None:
-    """Write a camera as OpenCV's calibration does, to the last bit.
+    """Write a camera as OpenCV's calibration does, to the last bit; OpenCV has no key for the covariance.
 
     Args:
         path: ending in .yml, .yaml, .xml or .json, which chooses the format.
-        camera: its T is written in mm. What OpenCV has no key for, the covariance, stays out.
+        camera: its T is written in mm.
 
     Raises:
         OutputError: another ending, or a file that cannot be written.
     """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise OutputError(_line(path, f"a name ending in {', '.join(SUFFIXES)}", f"'{path.suffix}'", "rename it"))
+    expected, got, do = f"a name ending in {', '.join(SUFFIXES)}", f"'{path.suffix}'", "rename it"
+    storage = None
+    if path.suffix in SUFFIXES:
+        expected, got, do = "a file in a folder that exists", f"'{path.parent}'", "make the folder first"
+        if path.parent.is_dir():  # checked first: OpenCV prints to the terminal when it fails
+            expected, got, do = "a file that can be written", "one that cannot", "choose a folder that may be written"
+            storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    if storage is None or not storage.isOpened():
+        raise OutputError(refusal(str(path), expected=expected, got=got, do=do))
     (fx, fy), (cx, cy) = camera.f_px.tolist(), camera.centre_px.tolist()
     (k1, k2, k3), (p1, p2) = camera.k.tolist(), camera.p.tolist()
-    if not path.parent.is_dir():  # asked first: OpenCV prints to the terminal when it fails
-        raise OutputError(_line(path, "a file in a folder that exists", f"'{path.parent}'", "make the folder first"))
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    if not storage.isOpened():
-        do = "choose a folder that may be written"
-        raise OutputError(_line(path, "a file that can be written", "one that cannot", do))
     storage.write("image_width", camera.image_size[0])
     storage.write("image_height", camera.image_size[1])
     storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
@@ -103,21 +107,20 @@ def _opened(path: Path) -> cv2.FileStorage:
     content = read_whole(path, TEXT_BYTES, expected, CameraError, "correct the path")
     if len(OPENER.findall(content)) > MOST_OPENERS or re.search(rb"[ \t]{%d}" % MOST_BLANKS, content):
         got, do = "one with thousands of lists, tags or levels", "name the file of one camera"
-        raise CameraError(_line(path, expected, got, do))
+        raise _refused(str(path), expected, got, do)
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError):  # SystemError: how a parser's fault comes out of the constructor
+    except (cv2.error, SystemError):  # SystemError: a fault of the parser inside the constructor
         storage = None
     if storage is None or not storage.isOpened() or not storage.root().isMap():
-        raise CameraError(_line(path, expected, "another", "write it with cv2.FileStorage"))
+        raise _refused(str(path), expected, "another", "write it with cv2.FileStorage")
     return storage
 
 
 def _node(storage: cv2.FileStorage, key: str) -> Array | None:
+    """Return a matrix of at most MOST numbers; None for anything else."""
     node = storage.getNode(key)
-    if node.empty() or not node.isMap():
-        return None
-    if not _claims_few(node):
+    if node.empty() or not node.isMap() or not _claims_few(node):
         return None
     try:
         matrix = node.mat()
@@ -127,7 +130,7 @@ def _node(storage: cv2.FileStorage, key: str) -> Array | None:
 
 
 def _claims_few(node: cv2.FileNode) -> bool:
-    """Tell whether a matrix claims no more than MOST numbers, by its rows and columns or by the sizes of its axes."""
+    """Return whether a matrix claims at most MOST numbers, by its rows and columns or by the sizes of its axes."""
     axes = node.getNode("sizes")
     if axes.empty():
         sides = [_whole(node.getNode(side)) for side in ("rows", "cols")]
@@ -145,31 +148,27 @@ def _whole(node: cv2.FileNode) -> int | None:
     return int(number) if number.is_integer() else None
 
 
-def _matrix(storage: cv2.FileStorage, path: Path, key: str, shape: tuple[int, int]) -> Array:
+def _required(storage: cv2.FileStorage, path: Path, key: str) -> Array:
     matrix = _node(storage, key)
-    if matrix is None:
-        if _node(storage, "K1") is not None:
-            do = "split the stereo file into one file per camera"
-            raise _refused(path, key, "the matrix of one camera", "a stereo pair (K1, D1, ...)", do)
-        raise _refused(path, key, "an OpenCV matrix", "none", "calibrate with OpenCV, or name the file it wrote")
-    if matrix.shape != shape:
-        raise _refused(path, key, f"{shape[0]} x {shape[1]} numbers", str(matrix.shape), "correct the file")
-    return matrix
+    if matrix is not None:
+        return matrix
+    if key == "camera_matrix" and _node(storage, "K1") is not None:
+        expected, got = "the matrix of one camera", "a stereo pair (K1, D1, ...)"
+        raise _refused(f"{path}, {key}", expected, got, "split the stereo file into one file per camera")
+    do = "calibrate with OpenCV, or name the file it wrote; write five zeros where there is no distortion"
+    raise _refused(f"{path}, {key}", "an OpenCV matrix", "none", do)
 
 
 def _coefficients(storage: cv2.FileStorage, path: Path) -> Array:
-    key = "distortion_coefficients"
-    found = _node(storage, key)
-    if found is None:
-        raise _refused(path, key, "an OpenCV matrix", "none", "write five zeros where there is no distortion")
-    flat = found.reshape(-1)
+    where = f"{path}, distortion_coefficients"
+    flat = _required(storage, path, "distortion_coefficients").reshape(-1)
     if len(flat) not in LENGTHS:
         expected = f"{', '.join(map(str, LENGTHS[:-1]))} or {LENGTHS[-1]} numbers"
-        raise _refused(path, key, expected, str(len(flat)), "correct the file")
+        raise _refused(where, expected, str(len(flat)), "correct the file")
     if np.any(flat[5:] != 0):
         do = "calibrate without CALIB_RATIONAL_MODEL, CALIB_THIN_PRISM_MODEL and CALIB_TILTED_MODEL"
-        raise _refused(path, key, "k1, k2, p1, p2, k3 and nothing else", "further ones that are not 0", do)
-    return np.pad(flat, (0, 1))[:5] if len(flat) == 4 else flat[:5]
+        raise _refused(where, "k1, k2, p1, p2, k3 and nothing else", "further ones that are not 0", do)
+    return np.pad(flat, (0, 1))[:5]
 
 
 def _rotation(storage: cv2.FileStorage, path: Path) -> Array:
@@ -179,31 +178,32 @@ def _rotation(storage: cv2.FileStorage, path: Path) -> Array:
             continue
         if found.size == 3:
             return np.asarray(cv2.Rodrigues(found.reshape(3, 1))[0], np.float64)
-        if found.shape == (3, 3):
-            return found
-        raise _refused(path, key, "a matrix of 3 x 3 or a vector of 3 numbers", str(found.shape), "correct the file")
+        if found.shape != (3, 3):
+            expected = "a matrix of 3 x 3 or a vector of 3 numbers"
+            raise _refused(f"{path}, {key}", expected, str(found.shape), "correct the file")
+        return found
     return np.eye(3)
 
 
-def _optional(storage: cv2.FileStorage, keys: tuple[str, ...], path: Path, size: int) -> Array | None:
-    for key in keys:
+def _translation(storage: cv2.FileStorage, path: Path) -> Array:
+    for key in ("T", "tvec"):
         found = _node(storage, key)
-        if found is not None and found.size != size:
-            raise _refused(path, key, f"{size} numbers", str(found.shape), "correct the file")
+        if found is not None and found.size != 3:
+            raise _refused(f"{path}, {key}", "3 numbers", str(found.shape), "correct the file")
         if found is not None:
-            return found.reshape(size)
-    return None
+            return found.reshape(3)
+    return np.zeros(3)
 
 
 def _size(storage: cv2.FileStorage, path: Path, image_size: tuple[int, int] | None) -> tuple[int, int]:
+    where = f"{path}, image_width, image_height"
     width, height = (_whole(storage.getNode(key)) or 0 for key in ("image_width", "image_height"))
     if width > 0 and height > 0:
         if image_size not in (None, (width, height)):
-            got = short((width, height))
-            raise _refused(path, "image_width, image_height", str(image_size), got, "correct one")
+            raise _refused(where, str(image_size), short((width, height)), "correct one")
         return width, height
     if image_size is None:
-        raise _refused(path, "image_width, image_height", "two whole numbers", "none", "give image_size")
+        raise _refused(where, "two whole numbers", "none", "give image_size (--image-size W,H)")
     return image_size
 
 
@@ -211,9 +211,5 @@ def _tensor(array: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float64))
 
 
-def _refused(path: Path, key: str, expected: str, got: str, do: str) -> CameraError:
-    return CameraError(refusal(f"{path}, {key}", expected=expected, got=got, do=do))
-
-
-def _line(path: Path, expected: str, got: str, do: str) -> str:
-    return refusal(str(path), expected=expected, got=got, do=do)
+def _refused(name: str, expected: str, got: str, do: str) -> CameraError:
+    return CameraError(refusal(name, expected=expected, got=got, do=do))

@@ -1,7 +1,7 @@
-"""OpenPTV's calibration files: .ori and .addpar of a camera, ptv.par of all; read and written.
+"""OpenPTV's calibration files: .ori and .addpar of each camera, ptv.par of all; read and written.
 
-Their pixels count from the picture's corner, so that the middle of the sensor is (W/2, H/2) and the first pixel's
-centre (0.5, 0.5), as OpenPTV's target detection has it; ours is (0, 0). Their camera looks along its -z with y up.
+OpenPTV counts pixels from the picture's corner: the first pixel's centre is (0.5, 0.5), ours is (0, 0). Its camera
+looks along its -z with y up.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras.camera import Camera
+from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.openptv_camera import OpenPTVCamera
-from sphereorient.cameras.pinhole import middle_of_picture
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.errors import CameraError, OutputError, refusal
 from sphereorient.files.whole_file import TEXT_BYTES, read_whole
@@ -30,12 +30,13 @@ ADDPAR_PARTS = "k1 k2 k3 p1 p2 scx she"
 ADDPAR_NUMBERS = 7
 PAR_PARTS = "hp_flag allCam_flag tiff_flag imx imy pix_x pix_y chfield n1 n2 n3 d after the cameras' names"
 PAR_NUMBERS = 12
-NO_ADDPAR = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # what OpenPTV takes where there is no file
+NO_ADDPAR = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]  # OpenPTV's defaults where there is no file
+AXES = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # OpenPTV's camera components to ours
 
 
 @dataclass(frozen=True, kw_only=True)
 class PtvPar:
-    """What ptv.par says of all cameras together: the sensor, and the media between camera and liquid."""
+    """Content of ptv.par: the sensor, and the media between camera and liquid."""
 
     image_size: tuple[int, int]  # W, H px
     pixel_pitch_mm: tuple[float, float]
@@ -46,33 +47,31 @@ class PtvPar:
 
     @property
     def refracts(self) -> bool:
-        """Whether there is a wall; all indices equal to one switch it off in OpenPTV."""
+        """Whether there is a wall; equal indices switch it off."""
         return not self.n_air == self.n_glass == self.n_fluid
 
 
 def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None) -> Camera:
-    """Read a camera of OpenPTV.
+    """Read a camera of OpenPTV, behind a port where the media refract; the lab is OpenPTV's world, mm.
 
     Args:
-        ori: .ori file. Its matrix is not used: as in OpenPTV the angles count.
+        ori: .ori file; as in OpenPTV, the angles are used and the matrix is not.
         par: from `load_ptv_par`.
         addpar: .addpar file; None: no distortion.
 
-    Returns:
-        An OpenPTVCamera, lab = OpenPTV's world, mm; behind a port where the media refract.
-
     Raises:
-        CameraError: a file that is missing, truncated or not of numbers, or numbers that make no camera.
+        CameraError: a missing, truncated or malformed file, or impossible parameters.
 
     Source: OpenPTV's read_ori; dm = Rx(omega) Ry(phi) Rz(kappa), R_cam_lab = diag(1, -1, -1) dm^T.
     """
     ori = Path(ori)
-    v = _numbers(ori, _words(ori), ORI_NUMBERS, ORI_PARTS)
+    v = _numbers(ori, None, ORI_NUMBERS, ORI_PARTS)
     centre, angles, (xh, yh, cc), glass = v[:3], v[3:6], v[15:18], v[18:21]
-    k1, k2, k3, p1, p2, scx, she = NO_ADDPAR if addpar is None else _addpar(Path(addpar))
+    distortion = NO_ADDPAR if addpar is None else _numbers(Path(addpar), None, ADDPAR_NUMBERS, ADDPAR_PARTS)
+    k1, k2, k3, p1, p2, scx, she = distortion
     if scx != 1.0:
         warnings.warn(f"{addpar}: scx = {scx:g} is read as x' = scx x, y' = y, OpenPTV's classic form.", stacklevel=2)
-    R_cam_lab = _axes() @ so3.from_tait_bryan(_tensor(angles)).mT
+    R_cam_lab = AXES @ so3.from_tait_bryan(_tensor(angles)).mT
     shift_px = _tensor((xh / par.pixel_pitch_mm[0], -yh / par.pixel_pitch_mm[1]))
     try:
         camera = OpenPTVCamera(
@@ -93,19 +92,14 @@ def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None)
 
 
 def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
-    """Write a camera as OpenPTV's .ori and .addpar, to the last digits.
-
-    Args:
-        ori: .ori file; an old one is replaced.
-        addpar: .addpar file; an old one is replaced.
-        camera: an OpenPTVCamera, behind a port or not. The port's indices and thickness go into ptv.par, see `par_of`.
+    """Write an OpenPTVCamera, behind a port or not, as .ori and .addpar; `par_of` gives its part of ptv.par.
 
     Raises:
-        CameraError: another model, or a wall on whose liquid side the lab's origin does not lie.
+        CameraError: another model, or the lab's origin is not on the liquid side of the wall.
         OutputError: a file that cannot be written.
     """
     inner, glass = _openptv_of(camera), _glass_vector(camera)
-    dm = inner.R_cam_lab.detach().mT @ _axes()
+    dm = inner.R_cam_lab.detach().mT @ AXES
     angles = so3.to_tait_bryan(dm)
     shift_mm = (inner.centre_px.detach() - middle_of_picture(inner.image_size)) * inner.pixel_pitch_mm.detach()
     xh, yh = shift_mm[0], -shift_mm[1]
@@ -119,7 +113,7 @@ def load_ptv_par(path: Path | str) -> PtvPar:
     """Read the sensor and the media from ptv.par.
 
     Raises:
-        CameraError: a file that is missing, truncated, not of numbers, or of interlaced cameras.
+        CameraError: a missing, truncated or malformed file, or interlaced cameras.
     """
     path = Path(path)
     words = _words(path, "\n")
@@ -146,12 +140,7 @@ def load_ptv_par(path: Path | str) -> PtvPar:
 
 
 def save_ptv_par(path: Path | str, par: PtvPar, names: Sequence[str]) -> None:
-    """Write ptv.par for cameras that share sensor and media.
-
-    Args:
-        path: the file; an old one is replaced.
-        par: from `par_of`.
-        names: of the cameras; their pictures are img/NAME. and cal/NAME.tif, as in OpenPTV's examples.
+    """Write ptv.par for cameras that share sensor and media; their pictures are img/NAME. and cal/NAME.tif.
 
     Raises:
         OutputError: a file that cannot be written.
@@ -165,10 +154,10 @@ def save_ptv_par(path: Path | str, par: PtvPar, names: Sequence[str]) -> None:
 
 
 def par_of(camera: Camera) -> PtvPar:
-    """Return what ptv.par has to say of a camera.
+    """Return the content of ptv.par for a camera.
 
     Raises:
-        CameraError: a camera of another model than OpenPTV's.
+        CameraError: another model than OpenPTV's.
     """
     inner = _openptv_of(camera)
     pitch_u, pitch_v = inner.pixel_pitch_mm.tolist()
@@ -213,15 +202,6 @@ def _openptv_of(camera: Camera) -> OpenPTVCamera:
     return inner
 
 
-def _addpar(path: Path) -> list[float]:
-    return _numbers(path, _words(path), ADDPAR_NUMBERS, ADDPAR_PARTS)
-
-
-def _axes() -> Tensor:
-    """Take OpenPTV's camera components (y up, looking along -z) to ours, and back."""
-    return torch.diag(_tensor((1.0, -1.0, -1.0)))
-
-
 def _words(path: Path, separator: str | None = None) -> list[str]:
     content = read_whole(path, TEXT_BYTES, "a text file of OpenPTV", CameraError, "correct the path")
     try:
@@ -231,7 +211,8 @@ def _words(path: Path, separator: str | None = None) -> list[str]:
         raise CameraError(refusal(str(path), expected=expected, got=got, do=do)) from None
 
 
-def _numbers(path: Path, words: Sequence[str], count: int, parts: str) -> list[float]:
+def _numbers(path: Path, words: Sequence[str] | None, count: int, parts: str) -> list[float]:
+    words = _words(path) if words is None else words
     if len(words) != count:
         do = "copy the file again, it is cut off" if len(words) < count else "name a file of this kind"
         raise CameraError(refusal(str(path), expected=f"{count} numbers ({parts})", got=str(len(words)), do=do))

@@ -8,7 +8,7 @@ from calibration_examples import bumped, cameras, vector
 from conftest import assert_close
 
 from sphereorient import so3
-from sphereorient.calibration.self_calibration import MOVED, Told, self_calibrate
+from sphereorient.calibration.self_calibration import MOVED, CameraObservations, self_calibrate
 from sphereorient.cameras import ParameterCovariance
 from sphereorient.errors import CameraError
 
@@ -28,7 +28,9 @@ def told(calibrated, truly, rng, frames=FRAMES, noise=1.0, bias_deg=0.0):
         turn = frame(camera, centre) @ frame(true, true.project(places)).mT
         wobble = torch.deg2rad(noise * NOISE_DEG * torch.randn(frames, 3, generator=rng, dtype=torch.float64))
         bias = torch.deg2rad(bias_deg * k * vector(0.6, -0.3, 0.7))
-        says[name] = Told(centre_px=centre, R_lab_body=so3.exp(bias) @ so3.exp(wobble) @ turn @ R_lab_body)
+        says[name] = CameraObservations(
+            centre_px=centre, R_lab_body=so3.exp(bias) @ so3.exp(wobble) @ turn @ R_lab_body
+        )
     return says
 
 
@@ -118,7 +120,7 @@ def test_frames_that_one_camera_missed_and_wild_ones_do_no_harm(rng):
     centre[:30] = torch.nan
     centre[30:34] += 40.0
     turned[40:44] = turned[60:64]
-    says["cam2"] = Told(centre_px=centre, R_lab_body=turned)
+    says["cam2"] = CameraObservations(centre_px=centre, R_lab_body=turned)
     result = self_calibrate(calibrated, says)
     assert result.frames == FRAMES - 30
     assert relative_deg(result.cameras, truly) < 0.05

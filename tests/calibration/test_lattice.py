@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from plate_drawing import PLATE, Scene
 
 from sphereorient.calibration import DotPlate, PlateView, placed, plate_from_entry, see_plate
-from sphereorient.calibration.dots import Dots
-from sphereorient.calibration.grid import index_dots
-from sphereorient.calibration.placing import turned
+from sphereorient.calibration.ellipse import Dots
+from sphereorient.calibration.lattice import index_dots
+from sphereorient.calibration.plate_view import quarter_turned
 from sphereorient.errors import CameraError
 
 
@@ -187,8 +187,8 @@ def test_a_picture_without_a_plate_is_refused_in_one_line(picture: np.ndarray) -
 
 def test_four_quarter_turns_are_none_and_one_takes_x_to_y() -> None:
     index = np.array([[1, 0], [2, -3]])
-    assert np.array_equal(turned(index, 4), index)
-    assert np.array_equal(turned(index, 1), [[0, 1], [3, 2]])
+    assert np.array_equal(quarter_turned(index, 4), index)
+    assert np.array_equal(quarter_turned(index, 1), [[0, 1], [3, 2]])
 
 
 ENTRY = {

@@ -11,8 +11,7 @@ from conftest import assert_close
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from sphereorient.cameras.brown import BrownCamera
-from sphereorient.cameras.brown_polynomial import bent, fold2, straightened
+from sphereorient.cameras.brown import BrownCamera, bent, fold2, straightened
 from sphereorient.errors import CameraError
 
 NAMES = ("centre_px", "f_px", "k", "p", "R_cam_lab", "T_cam_lab_mm")

@@ -1,4 +1,4 @@
-"""From two lines of sight to a point."""
+"""Geometry of lines of sight: triangulation, and the view frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
 
     Args:
         rays_a: origin (..., 3) mm and unit direction (..., 3), lab.
-        rays_b: the same of the other camera; broadcasts against `rays_a`.
+        rays_b: rays of the other camera; broadcasts against `rays_a`.
 
     Returns:
         Points (..., 3), lab, mm, and gaps (...), mm, not negative. Both NaN, with gradient 0, for parallel rays.
@@ -39,6 +39,32 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
     gap = ((baseline * normal).sum(-1, keepdim=True) / sine2.sqrt()).abs()
     nan = torch.full_like(gap, torch.nan)
     return torch.where(crossing, point, nan), torch.where(crossing, gap, nan)[..., 0]
+
+
+def R_cam_view(direction_cam: Tensor) -> Tensor:
+    """Return the smallest rotation that takes the camera's z axis to a direction.
+
+    Args:
+        direction_cam: (..., 3), camera frame, any length above zero.
+
+    Returns:
+        (..., 3, 3), takes view components to camera components; its last column is the unit direction.
+        NaN, with gradient 0, for the backward direction, where the rotation is not defined.
+
+    Raises:
+        ShapeError: the last axis is not 3.
+
+    Source: docs/errata.md A1 (the paper's R_persp has the axis of OpenGL's camera); Rodrigues' formula with
+    z x direction.
+    """
+    check_points("direction_cam", direction_cam, 3)
+    unit = direction_cam / direction_cam.norm(dim=-1, keepdim=True)
+    x, y, z = unit.unbind(-1)
+    defined = 1 + z > 4 * torch.finfo(z.dtype).eps
+    share = 1 / torch.where(defined, 1 + z, torch.ones_like(z))  # (1 - cos) / sin^2: exact also at direction = z
+    rows = [1 - x * x * share, -x * y * share, x, -x * y * share, 1 - y * y * share, y, -x, -y, z]
+    R = torch.stack(rows, dim=-1).reshape(*x.shape, 3, 3)
+    return torch.where(defined[..., None, None], R, torch.full_like(R, torch.nan))
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

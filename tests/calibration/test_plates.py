@@ -14,7 +14,7 @@ from rich.console import Console
 
 from sphereorient import so3
 from sphereorient.calibration import calibrate_cameras, load_calibration
-from sphereorient.calibration.plates import see_pictures, silent, tie_floating
+from sphereorient.calibration.plates import see_pictures, tie_floating
 from sphereorient.calibration.table import parameters_table, pictures_table, summary
 from sphereorient.cameras import load_cameras, load_covariance, save_cameras, triangulate
 from sphereorient.errors import CameraError, SphereOrientError
@@ -129,7 +129,7 @@ def test_a_picture_without_fiducials_is_tied_through_the_other_camera(tmp_path):
     path = write(tmp_path)
     redrawn(tmp_path, "cam2_02.png", without=HIDDEN)
     document = load_calibration(path)
-    views = see_pictures(document, silent)
+    views = see_pictures(document, lambda stage, done, total: None)
     floating = next(picture for picture in views if picture.path.name == "cam2_02.png")
     assert views[floating].state == "floating"
     result = calibrate_cameras(document)
@@ -255,12 +255,12 @@ def test_a_wall_that_does_not_stand_before_the_camera_is_refused(tmp_path):
 
 def test_a_tie_needs_a_pose_that_somebody_knows(source, result):
     document = load_calibration(source)
-    views = see_pictures(document, silent)
+    views = see_pictures(document, lambda stage, done, total: None)
     assert tie_floating(document, _rig(result), views) == {}
 
 
 def _rig(result):
-    from sphereorient.calibration.problem import Rig
+    from sphereorient.calibration.bundle import Rig
 
     return Rig(cameras=result.cameras, R_lab_plate=result.R_lab_plate, T_lab_plate_mm=result.T_lab_plate_mm)
 

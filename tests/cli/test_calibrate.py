@@ -12,7 +12,7 @@ from conftest import REPO
 
 from sphereorient import cli, so3
 from sphereorient.calibration import check_cameras, refine_with_track
-from sphereorient.calibration.sphere import told_by
+from sphereorient.calibration.self_calibration import observations_of
 from sphereorient.calibration.table import check_lines, contradiction_lines, repair_lines
 from sphereorient.cameras import TsaiCamera, load_cameras, save_cameras
 from sphereorient.cameras.parameters import with_parameters
@@ -168,7 +168,7 @@ def test_a_track_of_other_cameras_or_of_one_is_refused(tmp_path):
     calibrated = exact_cameras()
     track = track_of(calibrated, calibrated)
     with pytest.raises(TrackError, match="cam3"):
-        told_by(track, {"cam3": calibrated["cam1"]})
+        observations_of(track, {"cam3": calibrated["cam1"]})
     save_cameras(tmp_path / "cameras.yaml", calibrated)
     replace(track, cameras={"cam1": track.cameras["cam1"]}).save(tmp_path / "one.h5")
     with pytest.raises(CameraError, match="two or more"):

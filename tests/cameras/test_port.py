@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, Rays
-from sphereorient.cameras.parameters import with_parameters
+from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.errors import CameraError, ShapeError
 
 PORT_NAMES = ("port_offset", "port_thickness", "port_n_glass", "port_n_fluid", "port_tilt_x", "port_tilt_y")
@@ -219,7 +219,7 @@ def test_second_derivatives_are_right_too(rng):
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_gradients_with_respect_to_all_parameters_are_right(model, rng):
     camera, x_lab_mm, uv_px = behind_port(model()), in_liquid(rng, 3), whole_picture(steps=2)
-    names = (*camera.camera.PARAMETERS, "rotation_x", "rotation_y", "rotation_z", "T_x", "T_y", "T_z", *PORT_NAMES)
+    names = (*camera.camera.parameter_fields(), *ROTATION, *TRANSLATION, *PORT_NAMES)
     scale = f64([1e-3 if "pixel_pitch" in name or name.startswith("k") else 1.0 for name in names])
 
     def seen(delta: torch.Tensor) -> tuple[torch.Tensor, ...]:

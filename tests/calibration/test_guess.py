@@ -5,13 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 from calibration_examples import (
-    PITCH,
-    SIZE,
     calibrated,
     cameras,
+    document,
     planted,
     port,
-    surveyed,
     vector,
     view,
     views,
@@ -27,7 +25,7 @@ WALLS = {name: port(name) for name in ("cam1", "cam2")}
 
 
 def guessed(rig, seen, model="tsai", ports=None):
-    return guess_rig(seen, SIZE, PITCH, surveyed(rig), ports or {}, len(rig.R_lab_plate), model)
+    return guess_rig(document(rig, model, ports), seen)
 
 
 def missed_px(found, rig, seen):
@@ -68,17 +66,17 @@ def test_a_camera_that_looks_aslant_through_its_wall_looks_more_aslant_in_air(rn
     R = aslant @ true.camera.R_cam_lab
     true = replace(true, camera=replace(true.camera, R_cam_lab=R, T_cam_lab_mm=vector(0.0, 108.0, 510.0)))
     points = 30 * (2 * torch.rand(80, 3, generator=rng, dtype=torch.float64) - 1)
-    found = guess_from_points(points, true.project(points), SIZE, PITCH, port("cam1"))
+    found = guess_from_points(document(planted(rng), ports=WALLS), "cam1", points, true.project(points))
     assert float(torch.rad2deg(so3.geodesic_distance(found.R_cam_lab, R))) < 1.2
 
 
 def test_pixels_that_are_not_square_are_of_the_sensor(rng):
     rig = planted(rng, "brown")
-    found = guess_rig(views(rig, rng), SIZE, (0.01, 0.02), surveyed(rig), {}, len(rig.R_lab_plate), "brown")
+    found = guess_rig(document(rig, "brown", pitch=(0.01, 0.02)), views(rig, rng))
     f_u, f_v = found.cameras["cam1"].f_px.tolist()
     assert abs(f_u / f_v - 2) < 1e-6
     with pytest.raises(CameraError, match="square pixels"):
-        guess_rig(views(rig, rng), SIZE, (0.01, 0.02), surveyed(rig), {}, len(rig.R_lab_plate), "pinhole")
+        guess_rig(document(rig, "pinhole", pitch=(0.01, 0.02)), views(rig, rng))
 
 
 def test_two_pictures_are_too_few_and_it_says_so(rng):
@@ -125,7 +123,9 @@ def test_the_pose_of_a_picture_with_too_few_points_is_not_known(rng):
 def test_a_guess_from_points_in_the_lab_is_near_the_camera(walls, rng):
     true = cameras(walls=walls)["cam1"]
     points = 40 * (2 * torch.rand(60, 3, generator=rng, dtype=torch.float64) - 1)
-    found = guess_from_points(points, true.project(points), SIZE, PITCH, port("cam1") if walls else None)
+    found = guess_from_points(
+        document(planted(rng), ports=WALLS if walls else None), "cam1", points, true.project(points)
+    )
     missed = (found.project(points) - true.project(points)).norm(dim=-1)
     assert float(missed.max()) < 15
 

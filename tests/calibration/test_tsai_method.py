@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.point_fit import fit_to_points, rms_px
+from sphereorient.calibration.solve import fit_to_points, rms_px
 from sphereorient.calibration.tsai_method import calibrate_tsai, tsai_stages
 from sphereorient.cameras import PinholeCamera, TsaiCamera
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION

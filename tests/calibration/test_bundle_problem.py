@@ -6,9 +6,8 @@ from calibration_examples import bumped, planted, problem, vector, view, views
 from conftest import assert_close
 
 from sphereorient import so3
-from sphereorient.calibration.problem import fitted_parameters, gathered
-from sphereorient.calibration.slopes import slopes_along
-from sphereorient.pose.fit import POSE_PARTS
+from sphereorient.calibration.bundle import POSE_PARTS, fitted_parameters, gathered
+from sphereorient.calibration.solve import slopes_along
 
 OF_PORT = ("port_offset", "port_thickness", "port_n_glass", "port_n_fluid", "port_tilt_x", "port_tilt_z")
 

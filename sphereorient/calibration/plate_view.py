@@ -1,0 +1,82 @@
+"""What one picture shows of a calibration target: points of the plate and their pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from sphereorient.calibration.targets import CalibrationTarget, Floats, Ints
+from sphereorient.errors import refusal
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlateView:
+    """Points of the plate and their pixels in one picture; made by `see_plate`, read by the fit of cameras.
+
+    `tied`: every point is identified. `floating`: the lattice is found but not its place on the plate; each row of
+    `placements` is one possibility, and `points_plate_mm` are those before any placement. `refused`: nothing is usable,
+    all arrays are empty.
+    """
+
+    points_plate_mm: Floats  # (n, 3), plate frame
+    uv_px: Floats  # (n, 2)
+    sigma_px: Floats  # (n,), standard deviation of each of u and v
+    diameter_mm: Floats  # (n,), of the dot whose centroid was measured; 0 for corners, which have no perspective bias
+    index: Ints  # (n, 2), grid indices
+    state: Literal["tied", "floating", "refused"] = "tied"
+    reason: str = ""  # one line, why the state is not `tied`
+    placements: Ints = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))  # (m, 3): see `placed`
+
+    def __post_init__(self) -> None:
+        """Check the lengths."""
+        n = len(self.index)
+        shapes = (self.points_plate_mm.shape, self.uv_px.shape, self.sigma_px.shape, self.diameter_mm.shape)
+        assert shapes == ((n, 3), (n, 2), (n,), (n,)), shapes
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.index)
+
+
+def refused_view(name: str, *, expected: str, got: str, do: str) -> PlateView:
+    """Return the view of a picture that shows nothing usable, with the reason worded by `refusal`."""
+    return PlateView(
+        points_plate_mm=np.zeros((0, 3)),
+        uv_px=np.zeros((0, 2)),
+        sigma_px=np.zeros(0),
+        diameter_mm=np.zeros(0),
+        index=np.zeros((0, 2), dtype=np.int64),
+        state="refused",
+        reason=refusal(name, expected=expected, got=got, do=do),
+    )
+
+
+def quarter_turned(index: Ints, quarters: int) -> Ints:
+    """Rotate grid indices (n, 2) by quarter turns, each of which takes (i, j) to (-j, i)."""
+    for _ in range(quarters % 4):
+        index = np.stack([-index[:, 1], index[:, 0]], axis=1)
+    return index
+
+
+def placed(view: PlateView, plate: CalibrationTarget, placement: Ints | Sequence[int]) -> PlateView:
+    """Return a floating view as `tied`, with one of its placements applied.
+
+    Args:
+        view: from `see_plate`; its `index` is the one before any placement.
+        plate: the target.
+        placement: (3,), a row of `view.placements`: quarter turns, shift along columns and along rows.
+    """
+    quarters, shift_i, shift_j = (int(p) for p in placement)
+    index = quarter_turned(view.index, quarters) + np.array([shift_i, shift_j])
+    return replace(
+        view,
+        index=index,
+        points_plate_mm=plate.points(index),
+        diameter_mm=plate.diameters(index),
+        state="tied",
+        reason="",
+        placements=np.zeros((0, 3), dtype=np.int64),
+    )

@@ -1,0 +1,195 @@
+"""Least squares of the calibration: derivatives, damped steps, covariances, and the fit of one camera to points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar, cast
+
+import torch
+from torch import Tensor
+
+from sphereorient.cameras import Camera, ParameterCovariance
+from sphereorient.cameras.checks import check_points
+from sphereorient.cameras.parameters import with_parameters
+from sphereorient.errors import CameraError, ShapeError, refusal
+
+AnyCamera = TypeVar("AnyCamera", bound=Camera)
+
+DAMPING = 1e-4  # at the start, relative to the information's diagonal
+LEAST, MOST = 1e-12, 1e10  # of the damping; beyond the upper one no step helps
+FAR = 1e6  # residual of a point that a trial camera does not see
+SIGMA_PX = 0.05  # of good centroids: points without noise would make every parameter look certain
+UNDETERMINED = 1e-9  # smallest eigenvalue of the scaled information: float64 cannot tell less from zero
+
+
+def slopes_along(function: Callable[[Tensor], Tensor], at: Tensor, directions: Sequence[Tensor] | Tensor) -> Tensor:
+    """Return the derivatives of a function at a point along K directions, (..., K) where the function returns (...).
+
+    The backward pass is linear in the weights of the outputs; its derivative by them is the slope. The function is
+    called once for all directions; forward differentiation calls it for each and takes ten times as long.
+
+    The directions have the shape of `at`.
+
+    Source: the double-vjp trick (Townsend 2017).
+    """
+    with torch.enable_grad():
+        point = at.detach().requires_grad_()
+        value = function(point)
+        if not value.requires_grad:
+            return value.new_zeros(*value.shape, len(directions))
+        weight = torch.zeros_like(value, requires_grad=True)
+        (pulled,) = torch.autograd.grad(value, point, weight, create_graph=True, materialize_grads=True)
+    if not pulled.requires_grad:
+        return torch.zeros_like(value)[..., None].expand(*value.shape, len(directions))
+    columns = [torch.autograd.grad(pulled, weight, direction, retain_graph=True)[0] for direction in directions]
+    return torch.stack(columns, dim=-1) if columns else value.detach().new_zeros(*value.shape, 0)
+
+
+def least_squares(
+    residuals: Callable[[Tensor], Tensor],
+    slopes: Callable[[Tensor], Tensor],
+    start: Tensor,
+    *,
+    soft: float = torch.inf,
+    gain: float = 1e-14,
+    steps: int = 100,
+) -> Tensor:
+    """Return the unknowns (K,) that minimise the sum of squared residuals, or of their soft L1 losses.
+
+    Normal equations: scipy's least_squares decomposes the whole Jacobian at each step, and its trust region starts at
+    one sigma; it takes three times as many slopes of a whole calibration.
+
+    Args:
+        residuals: of unknowns (K,), (n,); NaN counts as FAR. A step whose residuals raise CameraError is rejected.
+        slopes: of unknowns, (n, K).
+        start: (K,).
+        soft: residual beyond which the loss grows linearly.
+        gain: relative decrease of the cost at which the iteration ends.
+        steps: maximum number.
+
+    Source: Marquardt 1963; weights of the soft L1 loss, Triggs et al. 2000 (appendix).
+    """
+
+    def tried(at: Tensor) -> tuple[Tensor, float]:
+        try:
+            missed = torch.nan_to_num(residuals(at), nan=FAR)
+        except CameraError:
+            return at, torch.inf
+        share = (missed / soft).square()
+        return missed, float((missed.square() / (1 + (1 + share).sqrt())).sum())
+
+    at, damping = start, DAMPING
+    missed, cost = tried(start)
+    for _ in range(steps):
+        slope = torch.nan_to_num(slopes(at))
+        weight = (1 + (missed / soft).square()).rsqrt()
+        information = slope.mT @ (weight[:, None] * slope)
+        pull = slope.mT @ (weight * missed)
+        scale = _scale(information)
+        scaled = scale[:, None] * information * scale
+        before = cost
+        while damping < MOST:
+            damped = scaled + damping * torch.eye(len(at), dtype=at.dtype)
+            trial = at - scale * torch.linalg.solve(damped, scale * pull)
+            missed_there, cost_there = tried(trial)
+            if cost_there <= cost:
+                at, missed, cost = trial, missed_there, cost_there
+                damping = max(damping / 10, LEAST)
+                break
+            damping *= 10
+        if before - cost <= gain * before:
+            break
+    return at
+
+
+def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tensor:
+    """Invert an information matrix of parameters in different units.
+
+    A direction without information gets a huge variance; with `names` it is refused instead.
+
+    Raises:
+        CameraError: an undetermined direction; its parameters are named.
+    """
+    scale = _scale(information)
+    values, vectors = torch.linalg.eigh(scale[:, None] * information * scale)
+    if names and float(values[0]) < UNDETERMINED:
+        part = vectors[:, 0].abs()
+        loose = [name for name, share in zip(names, part.tolist(), strict=True) if share > 0.3 * float(part.max())]
+        do = "add points at other depths, tilt the plate, or hold some of these parameters"
+        got = f"no information on {', '.join(loose)}"
+        raise CameraError(refusal("points", expected="a determined camera", got=got, do=do))
+    inverse: Tensor = (vectors / values.clamp_min(1e-14)) @ vectors.mT
+    whole: Tensor = scale[:, None] * inverse * scale
+    return (whole + whole.mT) / 2
+
+
+def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_px: Tensor) -> AnyCamera:
+    """Fit some parameters of a camera to points and their pixels.
+
+    Args:
+        camera: near enough, of any model, also behind a port.
+        names: of the fitted parameters, as in `parameter_names`.
+        x_lab_mm: (n, 3), lab, mm.
+        uv_px: (n, 2), px, all equally certain.
+
+    Returns:
+        The camera with the covariance of the fitted parameters, from the residuals or at least from 0.05 px.
+
+    Raises:
+        CameraError: too few points, numbers that are not finite, or undetermined parameters, named.
+        ShapeError: arrays of another shape.
+    """
+    x_lab_mm, uv_px = checked_points(x_lab_mm, uv_px)
+    size, least = len(names), -(-len(names) // 2)
+    if len(x_lab_mm) < least:
+        expected, got = f"{least} or more for {size} parameters", f"{len(x_lab_mm)}"
+        raise CameraError(refusal("points", expected=expected, got=got, do="add points, or hold some parameters"))
+    start = cast(AnyCamera, replace(cast(Any, camera), covariance=None))
+
+    def expected_px(change: Tensor) -> Tensor:
+        return with_parameters(start, names, change).project(x_lab_mm).reshape(-1)
+
+    def slopes(change: Tensor) -> Tensor:
+        return slopes_along(expected_px, change, torch.eye(size, dtype=torch.float64))
+
+    zero = torch.zeros(size, dtype=torch.float64)
+    change = least_squares(lambda change: expected_px(change).detach() - uv_px.reshape(-1), slopes, zero)
+    slope, missed = torch.nan_to_num(slopes(change)), expected_px(change).detach() - uv_px.reshape(-1)
+    spare = max(uv_px.numel() - size, 1)
+    sigma_px = max(float(torch.nan_to_num(missed, nan=1e6).square().sum() / spare) ** 0.5, SIGMA_PX)
+    matrix = sigma_px**2 * inverse_information(slope.mT @ slope, names)
+    covariance = ParameterCovariance(names=tuple(names), matrix=matrix)
+    return cast(AnyCamera, replace(cast(Any, with_parameters(start, names, change)), covariance=covariance))
+
+
+def checked_points(x_lab_mm: Tensor, uv_px: Tensor) -> tuple[Tensor, Tensor]:
+    """Return points (n, 3) and their pixels (n, 2) as float64 on the CPU.
+
+    Raises:
+        CameraError: a row that is not finite, named.
+        ShapeError: another shape, or unequal numbers of rows.
+    """
+    for name, numbers, size in (("x_lab_mm", x_lab_mm, 3), ("uv_px", uv_px, 2)):
+        check_points(name, numbers, size)
+        if numbers.dim() != 2:
+            got, do = str(tuple(numbers.shape)), "pass one row per point"
+            raise ShapeError(refusal(name, expected=f"shape (n, {size})", got=got, do=do))
+        bad = (~torch.isfinite(numbers)).any(-1).nonzero()[:, 0].tolist()
+        if bad:
+            do = "leave such points out"
+            raise CameraError(refusal(f"{name}, row {bad[0]}", expected="finite numbers", got="others", do=do))
+    if len(x_lab_mm) != len(uv_px):
+        got, do = f"{len(x_lab_mm)} points and {len(uv_px)} pixels", "pass one pixel per point"
+        raise ShapeError(refusal("uv_px", expected="as many rows as x_lab_mm", got=got, do=do))
+    return x_lab_mm.detach().double().cpu(), uv_px.detach().double().cpu()
+
+
+def rms_px(camera: Camera, x_lab_mm: Tensor, uv_px: Tensor) -> float:
+    """Return the rms distance, px, between the images of points and their pixels; NaN where a point has no image."""
+    return float((camera.project(x_lab_mm).detach() - uv_px).square().sum(-1).mean().sqrt())
+
+
+def _scale(information: Tensor) -> Tensor:
+    known = information.diagonal()
+    return torch.where(known > 0, known, torch.ones_like(known)).rsqrt()

@@ -1,0 +1,247 @@
+"""cameras.yaml: camera models by name, read and written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import BaseModel, ConfigDict, create_model
+from scipy.linalg import block_diag
+
+from sphereorient.cameras.brown import BrownCamera
+from sphereorient.cameras.camera import Camera
+from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.cameras.model import CameraModel, Key
+from sphereorient.cameras.openptv_camera import OpenPTVCamera
+from sphereorient.cameras.parameters import parameter_names
+from sphereorient.cameras.pinhole import PinholeCamera
+from sphereorient.cameras.port import Port, PortCamera
+from sphereorient.cameras.telecentric import TelecentricCamera
+from sphereorient.cameras.tsai import TsaiCamera
+from sphereorient.errors import CameraError, refusal
+from sphereorient.files.yaml_file import read_document, refuse_unknown, short, validated, write_document
+
+SCHEMA = "sphereorient-cameras/1"
+KEYS = ("cameras", "covariance")
+MOST = 100  # cameras of a file
+Triple = tuple[float, float, float]
+HOLDS: dict[int, Any] = {0: float, 2: tuple[float, float], 3: Triple}  # by the number of a key's parts
+
+# A further model: one file with the camera, one name here.
+MODELS: dict[str, type[CameraModel]] = {
+    kind.MODEL: kind for kind in (TsaiCamera, PinholeCamera, BrownCamera, TelecentricCamera, OpenPTVCamera)
+}
+
+
+class Entry(BaseModel):
+    """A mapping of cameras.yaml; unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class PortEntry(Entry):
+    """Keys of `port`."""
+
+    normal: Triple
+    offset: float
+    thickness: float
+    n_glass: float
+    n_fluid: float
+
+    def port(self) -> Port:
+        """Build the port."""
+        return Port(**{key.field: getattr(self, key.name) for key in Port.KEYS})
+
+
+class CovarianceEntry(Entry):
+    """Keys of `covariance`, which a calibration adds."""
+
+    parameters: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+    def covariance(self) -> ParameterCovariance:
+        """Build the covariance."""
+        lengths = {len(row) for row in self.matrix}
+        if lengths != {len(self.parameters)}:
+            expected, got = f"rows of {len(self.parameters)} numbers", f"lengths {sorted(lengths)}"
+            do = "write one row and one column for each parameter"
+            raise CameraError(refusal("covariance, matrix", expected=expected, got=got, do=do))
+        return ParameterCovariance(names=self.parameters, matrix=torch.tensor(self.matrix, dtype=torch.float64))
+
+
+class CameraEntry(Entry):
+    """The keys that all models share."""
+
+    model: str
+    image_size: tuple[int, int]
+    R: tuple[Triple, Triple, Triple]
+    T: Triple
+    port: PortEntry | None = None
+    covariance: CovarianceEntry | None = None
+
+
+def _entry(kind: type[CameraModel]) -> type[CameraEntry]:
+    """Return the pydantic model of a camera model's keys."""
+    fields: dict[str, Any] = dict.fromkeys(kind.ALSO, (float | None, None))
+    for key in kind.KEYS:
+        holds = HOLDS[len(key.parts)]
+        if key.optional:
+            fields[key.name] = (holds | None, None)
+        elif key.default is None:
+            fields[key.name] = (holds, ...)
+        else:
+            fields[key.name] = (holds, (key.default,) * len(key.parts) if key.parts else key.default)
+    return create_model(f"{kind.__name__}Entry", __base__=CameraEntry, **fields)
+
+
+ENTRIES = {name: _entry(kind) for name, kind in MODELS.items()}
+
+
+def load_cameras(path: Path | str) -> dict[str, Camera]:
+    """Read all cameras of a cameras.yaml, in the file's order; a camera with a `port` comes as PortCamera.
+
+    Raises:
+        CameraError: missing, not YAML, another schema, an unknown key or model, or an impossible parameter.
+
+    Source: docs/cameras.md.
+    """
+    path = Path(path)
+    document = read_document(path, SCHEMA, CameraError)
+    for key in document:
+        if key not in KEYS:
+            raise CameraError(refuse_unknown(key, KEYS, str(path)))
+    entries = document.get("cameras")
+    if not isinstance(entries, dict) or not entries:
+        do = "write one camera or more below 'cameras:'"
+        raise CameraError(refusal(f"{path}, cameras", expected="named cameras", got=short(entries), do=do))
+    if len(entries) > MOST:
+        got, do = f"{len(entries)}", "write those of one experiment"
+        raise CameraError(refusal(f"{path}, cameras", expected=f"at most {MOST} cameras", got=got, do=do))
+    return {str(name): _build(entry, f"{path}, {name}") for name, entry in entries.items()}
+
+
+def load_covariance(path: Path | str, cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
+    """Read the joint covariance of the cameras in use, with parameters named camera.parameter.
+
+    Args:
+        path: cameras.yaml.
+        cameras: those of the file that are in use.
+
+    Returns:
+        The covariance. Where the file has no joint one: the cameras' own covariances as blocks, taken as independent;
+        None where a camera has no covariance.
+
+    Raises:
+        CameraError: an impossible covariance, or an unknown parameter.
+    """
+    path = Path(path)
+    entry = read_document(path, SCHEMA, CameraError).get("covariance")
+    if entry is None:
+        return _independent(cameras)
+    where = f"{path}, covariance"
+    try:
+        whole = validated(CovarianceEntry, entry, where, CameraError).covariance()
+    except CameraError as error:
+        raise CameraError(str(error) if str(error).startswith(where) else f"{path}, {error}") from None
+    for name in whole.names:
+        camera, _, parameter = name.partition(".")
+        if camera in cameras and parameter not in parameter_names(cameras[camera]):
+            known = [f"{camera}.{one}" for one in parameter_names(cameras[camera])]
+            raise CameraError(refuse_unknown(name, known, f"{where}, parameters"))
+    return whole.of(cameras)
+
+
+def save_cameras(
+    path: Path | str,
+    cameras: Mapping[str, Camera],
+    comment: str = "",
+    covariance: ParameterCovariance | None = None,
+) -> None:
+    """Write cameras to a file that `load_cameras` reads back to the last bit, with ports and covariances.
+
+    Args:
+        path: the file; an existing one is replaced atomically.
+        cameras: name -> camera.
+        comment: lines for the top of the file.
+        covariance: of all cameras together, from a joint fit.
+
+    Raises:
+        CameraError: a camera of a model that is not in MODELS.
+        OutputError: the file cannot be written.
+    """
+    document: dict[str, Any] = {"cameras": {name: _described(camera) for name, camera in cameras.items()}}
+    write_document(Path(path), SCHEMA, document | _covariance_keys(covariance), comment)
+
+
+def _build(entry: object, where: str) -> Camera:
+    if not isinstance(entry, Mapping):
+        raise CameraError(refusal(where, expected="the keys of a camera", got=short(entry), do="indent them below it"))
+    if "model" not in entry:
+        raise CameraError(refusal(f"{where}, model", expected=f"one of {', '.join(MODELS)}", got="none", do="add it"))
+    if not isinstance(entry["model"], str) or entry["model"] not in MODELS:
+        raise CameraError(refuse_unknown(entry["model"], MODELS, f"{where}, model"))
+    checked = validated(ENTRIES[entry["model"]], entry, where, CameraError)
+    try:
+        return _with_port_and_covariance(_in_air(MODELS[checked.model], checked), checked)
+    except CameraError as error:
+        raise CameraError(f"{where}, {error}") from None
+
+
+def _in_air(kind: type[CameraModel], entry: CameraEntry) -> CameraModel:
+    values = kind.completed(dict(entry))
+    fields: dict[str, Any] = {"image_size": entry.image_size, "R_cam_lab": entry.R, "T_cam_lab_mm": entry.T}
+    for key in kind.KEYS:
+        if key.place is None:
+            fields[key.field] = values[key.name]
+        else:
+            fields.setdefault(key.field, []).append(values[key.name])
+    return kind(**fields)
+
+
+def _with_port_and_covariance(camera: CameraModel, entry: CameraEntry) -> Camera:
+    whole = camera if entry.port is None else PortCamera(camera=camera, port=entry.port.port())
+    if entry.covariance is None:
+        return whole
+    covariance = entry.covariance.covariance()
+    known = parameter_names(whole)
+    for name in covariance.names:
+        if name not in known:
+            raise CameraError(refuse_unknown(name, known, "covariance, parameters"))
+    return replace(whole, covariance=covariance)
+
+
+def _described(camera: Camera) -> dict[str, Any]:
+    """Return the keys of a camera in cameras.yaml: the inverse of `_build`."""
+    if isinstance(camera, PortCamera):
+        inner = {key: value for key, value in _described(camera.camera).items() if key != "covariance"}
+        return inner | {"port": _values(Port.KEYS, camera.port)} | _covariance_keys(camera.covariance)
+    if not isinstance(camera, CameraModel) or camera.MODEL not in MODELS:
+        got, do = type(camera).__name__, "register the model in cameras/io/cameras_yaml.py"
+        raise CameraError(refusal("camera", expected=f"a camera of model {', '.join(MODELS)}", got=got, do=do))
+    pose = {"R": camera.R_cam_lab.detach().tolist(), "T": camera.T_cam_lab_mm.detach().tolist()}
+    first: dict[str, Any] = {"model": camera.MODEL, "image_size": list(camera.image_size)}
+    return first | _values(camera.KEYS, camera) | pose | _covariance_keys(camera.covariance)
+
+
+def _values(keys: tuple[Key, ...], owner: CameraModel | Port) -> dict[str, Any]:
+    fields = {key.name: getattr(owner, key.field).detach() for key in keys}
+    return {key.name: fields[key.name][... if key.place is None else key.place].tolist() for key in keys}
+
+
+def _covariance_keys(covariance: ParameterCovariance | None) -> dict[str, Any]:
+    if covariance is None:
+        return {}
+    return {"covariance": {"parameters": list(covariance.names), "matrix": covariance.matrix.tolist()}}
+
+
+def _independent(cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
+    """Return the cameras' own covariances as blocks of one; None where a camera has none."""
+    parts = {name: camera.covariance for name, camera in cameras.items() if camera.covariance is not None}
+    if not parts or len(parts) < len(cameras):
+        return None
+    names = tuple(f"{name}.{parameter}" for name, covariance in parts.items() for parameter in covariance.names)
+    whole = block_diag(*(covariance.matrix.numpy() for covariance in parts.values()))
+    return ParameterCovariance(names=names, matrix=torch.from_numpy(whole))

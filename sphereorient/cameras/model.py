@@ -1,0 +1,170 @@
+"""What all camera models share: pose, principal point, and one table of keys that defines the file and the parameters.
+
+A new model is one file: a dataclass that derives from `CentralCamera` (one projection centre) or `CameraModel`, with
+its `MODEL` and `KEYS`. Add the class to `MODELS` in io/cameras_yaml.py; reading, writing, parameter names, covariances
+and checks follow from `KEYS`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from sphereorient.cameras.camera import Rays
+from sphereorient.cameras.checks import as_parameter, check_image_size, check_points, check_positive, check_rotation
+from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.errors import CameraError, refusal
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of a model in cameras.yaml, the field that stores it, and its parameters."""
+
+    name: str
+    field: str
+    parts: tuple[str, ...] = ()  # parameter names of a list; empty: one number, whose parameter has the key's name
+    place: int | None = None  # index in the field, where several keys share one field
+    default: float | None = None  # of each number, where the key may be left out
+    optional: bool = False  # `completed` fills in the value
+    positive: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraModel(ABC):
+    """A camera whose parameters are float64 tensors; those that require gradients receive them."""
+
+    image_size: tuple[int, int]  # W, H px
+    R_cam_lab: Tensor  # (3, 3)
+    T_cam_lab_mm: Tensor  # (3,), X_cam = R_cam_lab X_lab + T
+    centre_px: Tensor  # (2,), pixel of the optical axis
+    covariance: ParameterCovariance | None = None  # from a calibration
+
+    MODEL: ClassVar[str]
+    KEYS: ClassVar[tuple[Key, ...]]  # in the order of the file
+    ALSO: ClassVar[tuple[str, ...]] = ()  # further keys of the file, which `completed` converts
+
+    def __post_init__(self) -> None:
+        """Refuse parameters of wrong shape, not finite or out of range."""
+        check_image_size("image_size", self.image_size)
+        object.__setattr__(self, "image_size", tuple(self.image_size))
+        shapes: dict[str, tuple[int, ...]] = {"R_cam_lab": (3, 3), "T_cam_lab_mm": (3,)}
+        for key in self.KEYS:  # of keys that share a field the last one has the highest index
+            size = len(key.parts) if key.place is None else key.place + 1
+            shapes[key.field] = (size,) if size else ()
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, as_parameter(name, getattr(self, name), *shape))
+        check_rotation("R_cam_lab", self.R_cam_lab)
+        for key in self.KEYS:
+            if key.positive:
+                check_positive(key.field, getattr(self, key.field))
+
+    @classmethod
+    def parameter_fields(cls) -> dict[str, tuple[str, int | None]]:
+        """Return the field and the index in it of each parameter but rotation and translation, by parameter name."""
+        found: dict[str, tuple[str, int | None]] = {}
+        for key in cls.KEYS:
+            found |= {part: (key.field, k) for k, part in enumerate(key.parts)}
+            if not key.parts:
+                found[key.name] = (key.field, key.place)
+        return found
+
+    @classmethod
+    def completed(cls, values: dict[str, Any]) -> dict[str, Any]:
+        """Return the keys of cameras.yaml with optional values filled in; the centre defaults to the picture's middle.
+
+        Raises:
+            CameraError: contradicting or impossible values.
+        """
+        return (
+            values | {"centre": middle_of_picture(values["image_size"])} if values.get("centre", 0) is None else values
+        )
+
+    @classmethod
+    def ideal_lens(cls, f_px: float, pitch_mm: Sequence[float]) -> dict[str, Any]:
+        """Return the model's own fields for a lens without distortion; a calibration starts from them.
+
+        Args:
+            f_px: focal length in pixels along v.
+            pitch_mm: (2,), pixel pitch along u and v.
+        """
+        got, do = cls.MODEL, "calibrate model tsai, pinhole or brown"
+        raise CameraError(refusal("model", expected="one that a calibration can start from", got=got, do=do))
+
+    @abstractmethod
+    def project(self, x_lab_mm: Tensor) -> Tensor:
+        """Project lab points (..., 3), mm, to pixels (..., 2)."""
+
+    @abstractmethod
+    def rays(self, uv_px: Tensor) -> Rays:
+        """Return the rays of pixels (..., 2)."""
+
+    def undistort(self, uv_px: Tensor) -> Tensor:
+        """Return the pixels (..., 2) that the camera without distortion would show; this default changes nothing."""
+        check_points("uv_px", uv_px, 2)
+        return uv_px
+
+    def distort(self, uv_px: Tensor) -> Tensor:
+        """Return the pixels (..., 2) that `undistort` takes to `uv_px`; this default changes nothing."""
+        check_points("uv_px", uv_px, 2)
+        return uv_px
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CentralCamera(CameraModel):
+    """A camera whose rays all meet in one point; a model adds its focal length and its distortion."""
+
+    @property
+    def centre_lab_mm(self) -> Tensor:
+        """(3,), lab, mm: the projection centre."""
+        return -(self.R_cam_lab.mT @ self.T_cam_lab_mm)
+
+    @property
+    @abstractmethod
+    def focal_px(self) -> Tensor:
+        """(2,), pixels per unit of slope X/Z and Y/Z on the axis."""
+
+    def project(self, x_lab_mm: Tensor) -> Tensor:
+        """Project lab points to pixels, also outside the picture.
+
+        Args:
+            x_lab_mm: (..., 3), lab, mm.
+
+        Returns:
+            (..., 2) as (u, v), px; NaN for points that are not in front of the camera.
+
+        Raises:
+            ShapeError: the last axis is not 3.
+
+        Source: docs/conventions.md (X_cam = R X_lab + T, x_u = f X/Z).
+        """
+        check_points("x_lab_mm", x_lab_mm, 3)
+        x_cam_mm = x_lab_mm @ self.R_cam_lab.to(x_lab_mm).mT + self.T_cam_lab_mm.to(x_lab_mm)
+        depth = x_cam_mm[..., 2:]
+        before = depth > 0
+        # Both branches of where need a finite argument, or the gradient of the unused one is NaN.
+        slope = x_cam_mm[..., :2] / torch.where(before, depth, torch.ones_like(depth))
+        uv_px = self.distort(slope * self.focal_px.to(slope) + self.centre_px.to(slope))
+        return torch.where(before, uv_px, torch.full_like(uv_px, torch.nan))
+
+    def rays(self, uv_px: Tensor) -> Rays:
+        """Return the rays (..., 3) of pixels (..., 2), which start at the projection centre.
+
+        Raises:
+            ShapeError: the last axis is not 2.
+        """
+        check_points("uv_px", uv_px, 2)
+        slope = (self.undistort(uv_px) - self.centre_px.to(uv_px)) / self.focal_px.to(uv_px)
+        direction_cam = torch.cat([slope, torch.ones_like(slope[..., :1])], dim=-1)
+        direction_cam = direction_cam / direction_cam.norm(dim=-1, keepdim=True)
+        direction_lab = direction_cam @ self.R_cam_lab.to(uv_px)  # rows: R_lab_cam applied to every direction
+        return Rays(origin_lab_mm=self.centre_lab_mm.to(uv_px).expand_as(direction_lab), direction_lab=direction_lab)
+
+
+def middle_of_picture(image_size: tuple[int, int]) -> Tensor:
+    """Return the middle of a W x H picture, (2,) float64 px; whole numbers are pixel centres."""
+    return (torch.tensor(image_size, dtype=torch.float64) - 1) / 2
