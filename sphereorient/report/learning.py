@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from sphereorient.files.outputs import put_aside
-from sphereorient.learn.examples import Example
-from sphereorient.learn.judge import WITHIN_DEG
+from sphereorient.learn.benchmark import Example
+from sphereorient.learn.metrics import WITHIN_DEG
 from sphereorient.report.plots.marks import note
 from sphereorient.report.plots.style import ALL, DPI, GREY, SECOND, SHADE, WIDTH_IN, X, in_style, new_figure
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from sphereorient.evaluate.robustness.results import Line, Results, lines_of
+from sphereorient.evaluate.robustness.results import Results, Summary, summaries
 from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
 from sphereorient.files.outputs import put_aside
 from sphereorient.report.plots.style import new_figure
@@ -34,7 +34,7 @@ def robustness_figure(results: Results) -> Figure:
     Args:
         results: of `run_benchmark`.
     """
-    lines = list(lines_of(results))
+    lines = list(summaries(results))
     kinds = worst_first(lines, results.methods)
     rows = math.ceil(len(kinds) / COLUMNS)
     figure = new_figure(COLUMNS * PANEL[0], rows * PANEL[1] + 0.6)
@@ -46,7 +46,7 @@ def robustness_figure(results: Results) -> Figure:
     return figure
 
 
-def worst_first(lines: Sequence[Line], methods: Sequence[str]) -> list[str]:
+def worst_first(lines: Sequence[Summary], methods: Sequence[str]) -> list[str]:
     """Return the kinds of scenes, without the clean ones, those first that are hardest for the first method."""
 
     def hardness(kind: str) -> tuple[float, float]:
@@ -58,7 +58,7 @@ def worst_first(lines: Sequence[Line], methods: Sequence[str]) -> list[str]:
     return sorted(dict.fromkeys(line.kind for line in lines if line.kind != CLEAN), key=hardness)
 
 
-def _panel(part: Any, kind: str, lines: Sequence[Line], methods: Sequence[str], first: bool) -> None:
+def _panel(part: Any, kind: str, lines: Sequence[Summary], methods: Sequence[str], first: bool) -> None:
     above, below = part.subplots(2, 1, sharex=True, height_ratios=(2.2, 1), gridspec_kw={"hspace": 0.08})
     levels = sorted({line.level for line in lines})
     for k, method in enumerate(methods):
@@ -98,7 +98,7 @@ def _unit(kind: str) -> str:
 def write_table(results: Results, path: Path) -> None:
     """Write the rows of the table as CSV, aside first."""
     rows = []
-    for line in lines_of(results):
+    for line in summaries(results):
         row = asdict(line)
         recall = row.pop("recall")
         rows.append(row | {f"recall_{first}": share for first, share in recall.items()})
@@ -111,7 +111,7 @@ def write_table(results: Results, path: Path) -> None:
 def markdown(results: Results) -> str:
     """Return the table as a page of the docs has it: by degradation and level, each method's error and bad frames."""
     methods = results.methods
-    lines = {(line.kind, line.level, line.method): line for line in lines_of(results)}
+    lines = {(line.kind, line.level, line.method): line for line in summaries(results)}
     head = ["", "value", *(f"{m}: median, 95 % (degrees); wrong, lost (%)" for m in methods)]
     text = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for kind, level in dict.fromkeys((line.kind, line.level) for line in lines.values()):
@@ -121,7 +121,7 @@ def markdown(results: Results) -> str:
     return "\n".join(text) + "\n"
 
 
-def _cell(line: Line) -> str:
+def _cell(line: Summary) -> str:
     if not math.isfinite(line.p50_deg):
         return "refused" if line.refused else "nothing"
     return f"{line.p50_deg:.3g}, {line.p95_deg:.3g}; {100 * line.wrong_after:.0f}, {100 * line.lost:.0f}"
