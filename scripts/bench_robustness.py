@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from sphereorient.cli.app import progress_bar
-from sphereorient.evaluate.robustness import BenchSettings, Results, SceneResult, run_benchmark, save_results
-from sphereorient.evaluate.robustness.results import WRONG_DEG, Summary, summaries
+from sphereorient.evaluate.robustness import BenchSettings, Results, SceneResult, run_benchmark
+from sphereorient.evaluate.robustness.results import WRONG_DEG, Summary, save_results, summaries
 from sphereorient.evaluate.robustness.scenes import CLEAN, FULL, TOGETHER
 from sphereorient.report.plots.style import write_figure
 from sphereorient.report.robustness import markdown, robustness_figure, write_table
@@ -47,11 +47,11 @@ def main() -> None:
     text = page.read_text("utf-8")
     head, tail = text.split(BEGIN)[0], text.split(END)[1]
     page.write_text(f"{head}{BEGIN}\n{markdown(found)}{END}{tail}", "utf-8")
-    tell_methods(found)
-    tell_confidence([one for one in found.outcomes if one.method == "precise"])
+    print_methods(found)
+    print_confidence([one for one in found.outcomes if one.method == "precise"])
 
 
-def tell_methods(found: Results) -> None:
+def print_methods(found: Results) -> None:
     """Print in how many degradations and levels `precise` is better than `paper`."""
     lines = {(line.kind, line.level, line.method): line for line in summaries(found) if line.kind != CLEAN}
     places = [key[:2] for key in lines if key[2] == "precise"]
@@ -70,17 +70,17 @@ def tell_methods(found: Results) -> None:
 
 
 def is_nearer(precise: Summary, paper: Summary) -> bool:
-    """Say whether the first has the smaller median error; where neither has any, nothing is better."""
+    """Return whether `precise` has the smaller median error, or the only one."""
     return bool(precise.p50_deg < paper.p50_deg or (np.isfinite(precise.p50_deg) and np.isnan(paper.p50_deg)))
 
 
 def bad(line: Summary) -> float:
-    """Return the share of frames that are wrong or lost."""
+    """Return the share of frames wrong or lost."""
     return line.wrong_after + line.lost
 
 
-def tell_confidence(outcomes: Sequence[SceneResult]) -> None:
-    """Print how often orientations are right that claim to be so with a probability."""
+def print_confidence(outcomes: Sequence[SceneResult]) -> None:
+    """Print the calibration of the confidence."""
     for name, chosen in (("mixed scenes", [one for one in outcomes if one.kind == TOGETHER]), ("all", outcomes)):
         pairs = [
             (claimed, error <= WRONG_DEG)

@@ -16,7 +16,7 @@ from sphereorient.experiment.recording import Progress, silent
 from sphereorient.experiment.timeline import Timeline, timeline
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.settings import Settings
-from sphereorient.preflight import cameras, movies, offset, texture
+from sphereorient.preflight import cameras, movies, offset, texture_map
 from sphereorient.preflight.finding import Finding, Severity, fault, warning, worst
 from sphereorient.preflight.sample import MovieSample, sample_more, sample_movie
 from sphereorient.search import GreySearch
@@ -33,9 +33,9 @@ class Preflight:
     closer: tuple[tuple[MovieSample, ...], ...]  # consecutive frames: by stretch, then by camera
     scan: offset.OffsetScan | None  # None with one camera
     texture: Tensor | None  # (H, 2 H)
-    measures: texture.TextureMeasures | None
-    similar: texture.ViewPair | None
-    matches: tuple[texture.TextureMatch, ...]
+    measures: texture_map.TextureMeasures | None
+    similar: texture_map.ViewPair | None
+    matches: tuple[texture_map.TextureMatch, ...]
     findings: tuple[Finding, ...] = ()
 
     @property
@@ -71,8 +71,8 @@ def preflight(
                 pool.submit(sample_movie, name, experiment, movie, when, sizes[name], settings.locate)
                 for name, movie in opened.items()
             ]
-            measures = image is not None and pool.submit(texture.measure_texture, image)
-            similar = image is not None and pool.submit(texture.most_similar_views, image, settings.search)
+            measures = image is not None and pool.submit(texture_map.measure_texture, image)
+            similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
             search = image is not None and pool.submit(GreySearch, image, settings.search)
             samples = tuple(one.result() for one in sampling)
             progress("frames", len(samples), len(samples))
@@ -85,7 +85,7 @@ def preflight(
                 closer=closer,
                 scan=scan,
                 texture=image,
-                matches=tuple(texture.match_texture(search.result(), samples) if search else ()),
+                matches=tuple(texture_map.match_texture(search.result(), samples) if search else ()),
                 measures=measures.result() if measures else None,
                 similar=similar.result() if similar else None,
             )
@@ -126,15 +126,15 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
         return
     radii = [float(sample.sightings.radius_px.nanmedian()) for sample in seen.samples]
     default = seen.samples[0].diameter_px / 2
-    yield (paint := texture.contrast(seen.measures, min((r for r in radii if not math.isnan(r)), default=default)))
+    yield (paint := texture_map.contrast(seen.measures, min((r for r in radii if not math.isnan(r)), default=default)))
     if paint.severity is Severity.FAULT:  # other checks of a map of one colour mean nothing
         return
-    yield (similar := texture.look_alikes(seen.similar))
-    yield from (texture.map_fits(match, seen.matches) for match in seen.matches)
+    yield (similar := texture_map.look_alikes(seen.similar))
+    yield from (texture_map.map_fits(match, seen.matches) for match in seen.matches)
     # Movies out of step, or ambiguous views, would be reported as errors of the cameras.
     in_step = seen.scan is None or seen.scan.shift == 0
     if len(seen.matches) == 2 and in_step and similar.severity is not Severity.FAULT:
-        yield texture.one_orientation(seen.matches)
+        yield texture_map.one_orientation(seen.matches)
 
 
 def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[str, float | None], list[Finding]]:

@@ -145,7 +145,8 @@ def sample_more(
 
 def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:
     """Screen the pictures as the tracker does, and find the ball in the usable ones."""
-    screen, found = [], []
+    screen: list[Reason] = []
+    found: list[Found] = []
     for k, (row, picture) in enumerate(zip(sample.row, sample.picture, strict=True)):
         if picture is None:
             reason = Reason.MISSING if row == NONE else Reason.UNDECODABLE

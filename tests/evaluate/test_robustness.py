@@ -17,10 +17,9 @@ from sphereorient.evaluate.robustness import (
     SceneResult,
     compare_runs,
     load_results,
-    save_results,
     scenes_of,
 )
-from sphereorient.evaluate.robustness.results import summaries, summarised
+from sphereorient.evaluate.robustness.results import save_results, summaries, summarised
 from sphereorient.evaluate.robustness.run import (
     measure,
     no_track,

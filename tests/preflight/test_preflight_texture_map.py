@@ -15,7 +15,7 @@ from sphereorient import so3
 from sphereorient.errors import TextureError
 from sphereorient.mapping.compare import fibonacci
 from sphereorient.preflight import Severity
-from sphereorient.preflight.texture import (
+from sphereorient.preflight.texture_map import (
     ViewPair,
     contrast,
     facing,

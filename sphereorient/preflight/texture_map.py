@@ -94,7 +94,8 @@ def measure_texture(texture: Tensor) -> TextureMeasures:
 
 def _cos_latitude(height: int) -> Tensor:
     """Return the area of each texel, (H, 2 H), any unit."""
-    return map_directions(height)[..., :2].norm(dim=-1)
+    cosine: Tensor = map_directions(height)[..., :2].norm(dim=-1)
+    return cosine
 
 
 def _patch_rad(texture: Tensor, mean: float) -> float:
