@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import MISSING, fields
 from functools import wraps
-from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, cast, get_type_hints
 
 import typer
 from typer.core import TyperGroup
@@ -87,25 +86,12 @@ def frame_range(text: str) -> tuple[int | None, int | None] | None:
 
 def with_options(command: Callable[[Any], None]) -> Callable[..., None]:
     """Let a command take one record: each field of the dataclass becomes an option."""
-    (record,) = (hint for name, hint in get_type_hints(command).items() if name != "return")
-    hints = get_type_hints(record, include_extras=True)
-
-    @wraps(command)
-    def with_values(**values: Any) -> None:
-        command(record(**values))
-
-    parameters = [
-        Parameter(
-            field.name,
-            Parameter.KEYWORD_ONLY,
-            default=Parameter.empty if field.default is MISSING else field.default,
-            annotation=hints[field.name],
-        )
-        for field in fields(record)
-    ]
-    with_values.__signature__ = Signature(parameters)
-    with_values.__annotations__ = {field.name: hints[field.name] for field in fields(record)}
-    return with_values
+    record = next(iter(get_type_hints(command).values()))
+    signature = inspect.signature(record, eval_str=True)
+    with_fields: Any = wraps(command)(lambda **values: command(record(**values)))
+    with_fields.__signature__ = signature
+    with_fields.__annotations__ = {name: one.annotation for name, one in signature.parameters.items()}
+    return cast(Callable[..., None], with_fields)
 
 
 Advance = Callable[[str, int, int], None]

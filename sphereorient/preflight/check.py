@@ -90,10 +90,10 @@ def preflight(
                 similar=similar.result() if similar else None,
             )
             progress("paint", 1, 1)
+        return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))
     finally:
         for movie in opened.values():
             movie.close()
-    return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))
 
 
 def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Finding]:
