@@ -17,7 +17,7 @@ import numpy as np
 
 from sphereorient.cli.app import progress_bar
 from sphereorient.evaluate.robustness import BenchSettings, Results, SceneResult, run_benchmark
-from sphereorient.evaluate.robustness.results import WRONG_DEG, Summary, save_results, summaries
+from sphereorient.evaluate.robustness.results import WRONG_DEG, ResultSummary, save_results, summaries
 from sphereorient.evaluate.robustness.scenes import CLEAN, FULL, TOGETHER
 from sphereorient.report.plots.style import write_figure
 from sphereorient.report.robustness import markdown, robustness_figure, write_table
@@ -69,12 +69,12 @@ def print_methods(found: Results) -> None:
     print(f"and fewer frames wrong or lost, or none, in {sum(steadier)} of {len(places)}")
 
 
-def is_nearer(precise: Summary, paper: Summary) -> bool:
+def is_nearer(precise: ResultSummary, paper: ResultSummary) -> bool:
     """Return whether `precise` has the smaller median error, or the only one."""
     return bool(precise.p50_deg < paper.p50_deg or (np.isfinite(precise.p50_deg) and np.isnan(paper.p50_deg)))
 
 
-def bad(line: Summary) -> float:
+def bad(line: ResultSummary) -> float:
     """Return the share of frames wrong or lost."""
     return line.wrong_after + line.lost
 

@@ -54,7 +54,7 @@ def liveliest_stretches(samples: Sequence[MovieSample], count: int) -> list[rang
     in both, a late movie does not.
 
     Args:
-        samples: of two cameras at `sample_frames(count)`.
+        samples: of two cameras at `frames_to_sample(count)`.
         count: frames of the experiment.
     """
     starts = pair_starts(count)

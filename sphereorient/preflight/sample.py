@@ -70,11 +70,11 @@ class MovieSample:
 
 
 def pair_starts(count: int) -> list[int]:
-    """Return the frames of `sample_frames` that are read with the next frame."""
+    """Return the frames of `frames_to_sample` that are read with the next frame."""
     return [k for k in spread_frames(range(count), SPREAD)[::EVERY] if k + 1 < count]
 
 
-def sample_frames(count: int) -> list[int]:
+def frames_to_sample(count: int) -> list[int]:
     """Return the frames of a timeline to read first: evenly spread ones, some with their next frame."""
     return sorted({*spread_frames(range(count), SPREAD), *(k + 1 for k in pair_starts(count))})
 
@@ -95,7 +95,7 @@ def sample_movie(
         MovieError: no sampled frame can be decoded.
         ExperimentError: a background picture cannot be used.
     """
-    frame = np.asarray(sample_frames(len(timeline)), np.int64)
+    frame = np.asarray(frames_to_sample(len(timeline)), np.int64)
     row = timeline.rows[name][frame]
     picture = tuple(pictures_of(movie, row))
     shown = [one for one in picture if one is not None and not uniform(one)]

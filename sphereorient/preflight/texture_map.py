@@ -162,7 +162,7 @@ def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPai
     def normalised(R: Tensor) -> Tensor:
         return torch.cat([normalisation(pictures(some)) for some in torch.split(R, BATCH)])
 
-    seen = facing(fibonacci(VIEWS)).float()
+    seen = views_towards(fibonacci(VIEWS)).float()
     grid = so3.lattman_grid(math.radians(STEP_DEG)).float()
     cosine = (seen.reshape(-1, 9) @ grid.reshape(-1, 9).T - 1) / 2
     likeness = normalised(seen) @ normalised(grid).T
@@ -181,7 +181,7 @@ def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPai
     return found
 
 
-def facing(direction_body: Tensor) -> Tensor:
+def views_towards(direction_body: Tensor) -> Tensor:
     """Return orientations R_view_body, (n, 3, 3), with body directions (n, 3) towards the viewer, against z of V."""
     back = -direction_body
     helper = torch.eye(3, dtype=back.dtype)[back.abs().argmin(-1)]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from sphereorient.evaluate.robustness.results import Results, Summary, summaries
+from sphereorient.evaluate.robustness.results import Results, ResultSummary, summaries
 from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
 from sphereorient.files.outputs import put_aside
 from sphereorient.report.plots.style import new_figure
@@ -42,7 +42,7 @@ def robustness_figure(results: Results) -> Figure:
     return figure
 
 
-def worst_first(lines: Sequence[Summary], methods: Sequence[str]) -> list[str]:
+def worst_first(lines: Sequence[ResultSummary], methods: Sequence[str]) -> list[str]:
     """Return the kinds of scenes except clean ones, sorted by bad frames, then by error, of the first method."""
 
     def hardness(kind: str) -> tuple[float, float]:
@@ -54,7 +54,7 @@ def worst_first(lines: Sequence[Summary], methods: Sequence[str]) -> list[str]:
     return sorted(dict.fromkeys(line.kind for line in lines if line.kind != CLEAN), key=hardness)
 
 
-def _panel(part: Any, kind: str, lines: Sequence[Summary], methods: Sequence[str], first: bool) -> None:
+def _panel(part: Any, kind: str, lines: Sequence[ResultSummary], methods: Sequence[str], first: bool) -> None:
     above, below = part.subplots(2, 1, sharex=True, height_ratios=(2.2, 1), gridspec_kw={"hspace": 0.08})
     levels = sorted({line.level for line in lines})
     for k, method in enumerate(methods):
@@ -113,7 +113,7 @@ def markdown(results: Results) -> str:
     return "\n".join(text) + "\n"
 
 
-def _cell(line: Summary) -> str:
+def _cell(line: ResultSummary) -> str:
     if not math.isfinite(line.p50_deg):
         return "refused" if line.refused else "nothing"
     return f"{line.p50_deg:.3g}, {line.p95_deg:.3g}; {100 * line.wrong_after:.0f}, {100 * line.lost:.0f}"

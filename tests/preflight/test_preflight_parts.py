@@ -24,7 +24,7 @@ from sphereorient.preflight.cameras import expected_outline_px, gaps_between
 from sphereorient.preflight.finding import worst
 from sphereorient.preflight.movies import limb_blur_px
 from sphereorient.preflight.offset import REACH, OffsetScan, scan_offsets, starts_in_step
-from sphereorient.preflight.sample import pair_starts, sample_frames
+from sphereorient.preflight.sample import frames_to_sample, pair_starts
 
 
 def f64(value: object) -> torch.Tensor:
@@ -144,7 +144,7 @@ def test_the_blur_of_the_limb_is_that_of_the_lens(blur_px):
 
 @given(st.integers(0, 5000))
 def test_the_frames_looked_at_are_few_in_order_and_have_their_neighbours(count):
-    frames = sample_frames(count)
+    frames = frames_to_sample(count)
     assert frames == sorted(set(frames))
     assert len(frames) <= 40
     assert all(0 <= k < count for k in frames)

@@ -18,10 +18,10 @@ from sphereorient.preflight import Severity
 from sphereorient.preflight.texture_map import (
     ViewPair,
     contrast,
-    facing,
     look_alikes,
     measure_texture,
     most_similar_views,
+    views_towards,
 )
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.synth.textures import map_directions, random_texture
@@ -118,7 +118,7 @@ def test_a_paint_in_bands_looks_alike_however_it_spins():
 
 def test_a_view_towards_a_direction_has_it_in_the_middle_facing_the_viewer():
     directions = fibonacci(50)
-    R_view_body = facing(directions)
+    R_view_body = views_towards(directions)
     assert_close((R_view_body @ directions[..., None])[..., 0], torch.tensor([0.0, 0, -1]).double().expand(50, 3))
     assert_close(torch.linalg.det(R_view_body), torch.ones(50).double())
     assert_close(R_view_body @ R_view_body.mT, torch.eye(3).double().expand(50, 3, 3))

@@ -92,7 +92,7 @@ class Results:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Summary:
+class ResultSummary:
     """All scenes of one kind and level, one method; made by `summarised`, a row of the table."""
 
     kind: str
@@ -113,7 +113,7 @@ class Summary:
     refused: str  # message of the first scene that the method refused
 
 
-def summaries(results: Results) -> list[Summary]:
+def summaries(results: Results) -> list[ResultSummary]:
     """Return the rows of the table, in the order of the scenes."""
     groups: dict[Key, list[SceneResult]] = {}
     for one in results.outcomes:
@@ -121,7 +121,7 @@ def summaries(results: Results) -> list[Summary]:
     return [summarised(group) for group in groups.values()]
 
 
-def summarised(group: Sequence[SceneResult]) -> Summary:
+def summarised(group: Sequence[SceneResult]) -> ResultSummary:
     """Sum up the scenes of one kind, level and method."""
     errors = np.concatenate([one.errors_deg for one in group])
     distances_mm = np.array([x for one in group for x in one.position_mm if x is not None])
@@ -129,7 +129,7 @@ def summarised(group: Sequence[SceneResult]) -> Summary:
     seen = errors[np.isfinite(errors)]
     p50, p95, largest = np.percentile(seen, (50, 95, 100)) if len(seen) else (np.nan,) * 3
     kind, level, method = group[0].key
-    return Summary(
+    return ResultSummary(
         kind=kind,
         level=level,
         method=method,

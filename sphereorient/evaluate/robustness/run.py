@@ -85,7 +85,7 @@ def run_benchmark(
     progress(len(scenes) - len(missing), len(scenes))
     context = multiprocessing.get_context("spawn")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # workers inherit it, and read it when they import torch
-    with ProcessPoolExecutor(jobs, context, one_thread) as pool:
+    with ProcessPoolExecutor(jobs, context, limit_threads) as pool:
         tasks = [pool.submit(run_scene, folder, scene, _missing(folder, scene, chosen)) for scene in missing]
         try:
             for done, task in enumerate(as_completed(tasks), start=len(scenes) - len(missing) + 1):
@@ -100,7 +100,7 @@ def run_benchmark(
     return results
 
 
-def one_thread() -> None:
+def limit_threads() -> None:
     """Limit a worker to one thread."""
     torch.set_num_threads(1)
 
