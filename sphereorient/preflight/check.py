@@ -11,9 +11,9 @@ from pathlib import Path
 from torch import Tensor
 
 from sphereorient.errors import SettingsError
-from sphereorient.experiment import Experiment, load_experiment, open_movies
-from sphereorient.experiment.recording import Progress, silent
-from sphereorient.experiment.timeline import Timeline, timeline
+from sphereorient.experiment import Experiment
+from sphereorient.experiment.recording import Progress, open_unpainted, silent
+from sphereorient.experiment.timeline import Timeline
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.settings import Settings
 from sphereorient.preflight import cameras, movies, offset, texture_map
@@ -57,43 +57,37 @@ def preflight(
     Raises:
         SphereOrientError: a file is missing, unreadable, or does not fit the others at all.
     """
-    if not isinstance(experiment, Experiment):
-        experiment = load_experiment(Path(experiment))
     settings = settings or Settings()
-    opened = open_movies(experiment)
-    try:
-        when = timeline(experiment, opened)
+    with open_unpainted(experiment) as recording, ThreadPoolExecutor(3) as pool:
+        # Threads: decoding, outlines and products release the interpreter.
+        experiment = recording.experiment
         image = None if experiment.texture_path is None else load_texture(experiment.texture_path)
         sizes, wrong_sizes = _expected_sizes(experiment, settings)
-        with ThreadPoolExecutor(3) as pool:  # decoding, outlines and products release the interpreter
-            progress("frames", 0, len(opened))
-            sampling = [
-                pool.submit(sample_movie, name, experiment, movie, when, sizes[name], settings.locate)
-                for name, movie in opened.items()
-            ]
-            measures = image is not None and pool.submit(texture_map.measure_texture, image)
-            similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
-            search = image is not None and pool.submit(GreySearch, image, settings.search)
-            samples = tuple(one.result() for one in sampling)
-            progress("frames", len(samples), len(samples))
-            closer, scan = _offsets(samples, when, settings, pool)
-            progress("paint", 0, 1)
-            checked = Preflight(
-                experiment=experiment,
-                timeline=when,
-                samples=samples,
-                closer=closer,
-                scan=scan,
-                texture=image,
-                matches=tuple(texture_map.match_texture(search.result(), samples) if search else ()),
-                measures=measures.result() if measures else None,
-                similar=similar.result() if similar else None,
-            )
-            progress("paint", 1, 1)
+        progress("frames", 0, len(recording.streams))
+        sampling = [
+            pool.submit(sample_movie, stream, experiment, sizes[stream.name], settings.locate)
+            for stream in recording.streams
+        ]
+        measures = image is not None and pool.submit(texture_map.measure_texture, image)
+        similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
+        search = image is not None and pool.submit(GreySearch, image, settings.search)
+        samples = tuple(one.result() for one in sampling)
+        progress("frames", len(samples), len(samples))
+        closer, scan = _offsets(samples, settings, pool)
+        progress("paint", 0, 1)
+        checked = Preflight(
+            experiment=experiment,
+            timeline=recording.timeline,
+            samples=samples,
+            closer=closer,
+            scan=scan,
+            texture=image,
+            matches=tuple(texture_map.match_texture(search.result(), samples) if search else ()),
+            measures=measures.result() if measures else None,
+            similar=similar.result() if similar else None,
+        )
+        progress("paint", 1, 1)
         return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))
-    finally:
-        for movie in opened.values():
-            movie.close()
 
 
 def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Finding]:
@@ -152,14 +146,14 @@ def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[st
 
 
 def _offsets(
-    samples: Sequence[MovieSample], when: Timeline, settings: Settings, pool: ThreadPoolExecutor
+    samples: Sequence[MovieSample], settings: Settings, pool: ThreadPoolExecutor
 ) -> tuple[tuple[tuple[MovieSample, ...], ...], offset.OffsetScan | None]:
     """Sample the stretches in which the ball moves most, and scan the offset between two movies."""
     if len(samples) != 2:
         return (), None
     parts = [
-        [pool.submit(sample_more, sample, when, frames, settings.locate) for sample in samples]
-        for frames in offset.liveliest_stretches(samples, len(when))
+        [pool.submit(sample_more, sample, frames, settings.locate) for sample in samples]
+        for frames in offset.liveliest_stretches(samples)
     ]
     closer = tuple(tuple(one.result() for one in part) for part in parts)
     centres = [(first.sightings.centre_px, second.sightings.centre_px) for first, second in closer]

@@ -64,10 +64,10 @@ def outside(experiment: Experiment) -> list[Finding]:
 
 def movie_file(sample: MovieSample) -> Finding:
     """Report the contents of a movie file, and the remarks of its reader."""
-    height, width = sample.movie.frame_shape
+    movie = sample.stream.movie
+    title, remarks, (height, width) = f"movie {sample.name}", movie.remarks, movie.frame_shape
     brightest = f"brightest level {sample.background.full_scale:.0f}"
-    measured = f"{sample.movie.path.name}: {len(sample.movie)} pictures of {width} x {height} px, {brightest}"
-    title, remarks = f"movie {sample.name}", sample.movie.remarks
+    measured = f"{movie.path.name}: {len(movie)} pictures of {width} x {height} px, {brightest}"
     if not remarks:
         return ok(title, measured)
     return warning(title, "; ".join([measured, *remarks]), "record or export the movie again if this is not meant")

@@ -47,16 +47,13 @@ class OffsetScan:
         return float(self.gap_px[REACH + self.shift])
 
 
-def liveliest_stretches(samples: Sequence[MovieSample], count: int) -> list[range]:
+def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
     """Choose stretches of consecutive frames in which the ball moves most across the lines of sight.
 
     The second stretch has the motion that differs most from that of the first: a rotated camera shifts the gap alike
     in both, a late movie does not.
-
-    Args:
-        samples: of two cameras at `frames_to_sample(count)`.
-        count: frames of the experiment.
     """
+    count = len(samples[0].stream)
     starts = pair_starts(count)
     if not starts:
         return []

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from sphereorient.cameras import Camera
 from sphereorient.errors import MovieError, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.given import given_mask, given_scene
-from sphereorient.experiment.stream import pictures_of, spread_frames, uniform
-from sphereorient.experiment.timeline import NONE, Timeline
+from sphereorient.experiment.given import given_scene
+from sphereorient.experiment.stream import CameraStream, pictures_of, spread_frames, uniform
+from sphereorient.experiment.timeline import NONE
 from sphereorient.locate import (
     Background,
     LocateSettings,
@@ -28,7 +28,6 @@ from sphereorient.locate import (
 from sphereorient.locate.background import measure_background
 from sphereorient.locate.find import Found
 from sphereorient.locate.outline import Outline
-from sphereorient.movies import Movie
 from sphereorient.trajectory import Reason
 
 SPREAD = 25  # frames all over the movie: enough for a background
@@ -45,17 +44,29 @@ Grey = NDArray[Any]
 class MovieSample:
     """n frames of one camera and the ball in them; made by `sample_movie`, read by the checks."""
 
-    name: str
-    camera: Camera
-    movie: Movie
+    stream: CameraStream
     frame: NDArray[np.int64]  # (n,), index in the timeline, increasing
-    row: NDArray[np.int64]  # (n,), index in the movie; NONE where there is no picture
     picture: tuple[Grey | None, ...]  # n; None where missing or undecodable
     background: Background
     diameter_px: float  # searched
     expected_px: float | None  # by cameras and diameter; None: unknown
     screen: tuple[Reason, ...] = ()  # n, whether the picture as a whole can show a ball
     found: tuple[Found, ...] = ()  # n
+
+    @property
+    def name(self) -> str:
+        """Name of the camera."""
+        return self.stream.name
+
+    @property
+    def camera(self) -> Camera:
+        """The camera."""
+        return self.stream.camera
+
+    @property
+    def row(self) -> NDArray[np.int64]:
+        """(n,), index in the movie; NONE where there is no picture."""
+        return self.stream.rows[self.frame]
 
     @cached_property
     def sightings(self) -> Sightings:
@@ -80,12 +91,7 @@ def frames_to_sample(count: int) -> list[int]:
 
 
 def sample_movie(
-    name: str,
-    experiment: Experiment,
-    movie: Movie,
-    timeline: Timeline,
-    diameter_px: float | None,
-    settings: LocateSettings,
+    stream: CameraStream, experiment: Experiment, diameter_px: float | None, settings: LocateSettings
 ) -> MovieSample:
     """Read a spread sample of one camera's frames, learn the background, and find the ball.
 
@@ -95,28 +101,24 @@ def sample_movie(
         MovieError: no sampled frame can be decoded.
         ExperimentError: a background picture cannot be used.
     """
-    frame = np.asarray(frames_to_sample(len(timeline)), np.int64)
-    row = timeline.rows[name][frame]
-    picture = tuple(pictures_of(movie, row))
+    frame = np.asarray(frames_to_sample(len(stream)), np.int64)
+    picture = tuple(pictures_of(stream.movie, stream.rows[frame]))
     shown = [one for one in picture if one is not None and not uniform(one)]
     shown = shown or [one for one in picture if one is not None]
     if not shown:
         do = "check that it plays; export it again if not"
-        raise MovieError(refusal(str(movie.path), expected="pictures", got="none that can be decoded", do=do))
+        raise MovieError(refusal(str(stream.movie.path), expected="pictures", got="none that can be decoded", do=do))
     some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
-    empty, mask = given_scene(experiment, name, movie.frame_shape), given_mask(experiment, name, movie.frame_shape)
+    empty = given_scene(experiment, stream.name, stream.movie.frame_shape)
 
     def at_size(size_px: float) -> MovieSample:
         if empty is None and experiment.fixed:
-            background = replace(_surroundings(some), shown=mask)
+            background = replace(_surroundings(some), shown=stream.shown)
         else:
-            background = learn_background(some, size_px, settings, empty, mask)
+            background = learn_background(some, size_px, settings, empty, stream.shown)
         sample = MovieSample(
-            name=name,
-            camera=experiment.cameras[name],
-            movie=movie,
+            stream=stream,
             frame=frame,
-            row=row,
             picture=picture,
             background=background,
             diameter_px=size_px,
@@ -124,7 +126,7 @@ def sample_movie(
         )
         return _searched(sample, settings)
 
-    largest_px = 0.9 * min(movie.frame_shape)
+    largest_px = 0.9 * min(stream.movie.frame_shape)
     first = at_size(diameter_px if diameter_px is not None and diameter_px >= SMALLEST_PX else largest_px / 4)
     if diameter_px is not None and len(first.balls) > FEW * len(shown):
         return first
@@ -133,25 +135,23 @@ def sample_movie(
     return first if size_px is None else at_size(size_px)
 
 
-def sample_more(
-    sample: MovieSample, timeline: Timeline, frames: Sequence[int], settings: LocateSettings
-) -> MovieSample:
+def sample_more(sample: MovieSample, frames: Sequence[int], settings: LocateSettings) -> MovieSample:
     """Read other frames of the same camera, with the same background and size of the ball."""
     frame = np.asarray(frames, np.int64)
-    row = timeline.rows[sample.name][frame]
-    picture = tuple(pictures_of(sample.movie, row))
-    return _searched(replace(sample, frame=frame, row=row, picture=picture), settings)
+    picture = tuple(pictures_of(sample.stream.movie, sample.stream.rows[frame]))
+    return _searched(replace(sample, frame=frame, picture=picture), settings)
 
 
 def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:
     """Screen the pictures as the tracker does, and find the ball in the usable ones."""
     screen: list[Reason] = []
     found: list[Found] = []
-    for k, (row, picture) in enumerate(zip(sample.row, sample.picture, strict=True)):
+    rows = sample.row
+    for k, (row, picture) in enumerate(zip(rows, sample.picture, strict=True)):
         if picture is None:
             reason = Reason.MISSING if row == NONE else Reason.UNDECODABLE
         else:  # a repeated picture is known only if its neighbour was read
-            neighbour = sample.picture[k - 1] if k > 0 and row == sample.row[k - 1] + 1 else None
+            neighbour = sample.picture[k - 1] if k > 0 and row == rows[k - 1] + 1 else None
             reason = screened(picture, neighbour, sample.background).reason
         screen.append(reason)
         if picture is None or reason not in (Reason.OK, Reason.REPEATED):

@@ -78,7 +78,7 @@ def _draw_frame(ax: Any, sample: MovieSample, k: int, expected: NDArray[np.float
     picture, (outline, reason) = sample.picture[k], sample.found[k]
     ax.set(xticks=[], yticks=[])
     if picture is None:
-        picture = np.zeros(sample.movie.frame_shape)
+        picture = np.zeros(sample.stream.movie.frame_shape)
     ax.imshow(picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(picture, 99.8))))
     if outline is not None:
         angle = np.linspace(0, 2 * np.pi, 181)

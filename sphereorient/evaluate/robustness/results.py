@@ -73,8 +73,8 @@ class SceneResult:
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> SceneResult:
         """Return the result of which a JSON file holds `asdict`."""
-        known = {entry.name: tree[entry.name] for entry in fields(cls)}
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in known.items()})
+        values: dict[str, Any] = {entry.name: tree[entry.name] for entry in fields(cls)}
+        return cls(**values | {name: tuple(value) for name, value in values.items() if isinstance(value, list)})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
