@@ -16,11 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from sphereorient.cli.app import progress_bar
-from sphereorient.evaluate.robustness import BenchSettings, Outcome, Results, run_benchmark, save_results
-from sphereorient.evaluate.robustness.measure import WRONG_DEG
-from sphereorient.evaluate.robustness.results import Line, lines_of
-from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
-from sphereorient.evaluate.robustness.settings import FULL
+from sphereorient.evaluate.robustness import BenchSettings, Results, SceneResult, run_benchmark
+from sphereorient.evaluate.robustness.results import WRONG_DEG, ResultSummary, save_results, summaries
+from sphereorient.evaluate.robustness.scenes import CLEAN, FULL, TOGETHER
 from sphereorient.report.plots.style import write_figure
 from sphereorient.report.robustness import markdown, robustness_figure, write_table
 from sphereorient.statistics.reliability import reliability
@@ -49,13 +47,13 @@ def main() -> None:
     text = page.read_text("utf-8")
     head, tail = text.split(BEGIN)[0], text.split(END)[1]
     page.write_text(f"{head}{BEGIN}\n{markdown(found)}{END}{tail}", "utf-8")
-    tell_methods(found)
-    tell_confidence([one for one in found.outcomes if one.method == "precise"])
+    print_methods(found)
+    print_confidence([one for one in found.outcomes if one.method == "precise"])
 
 
-def tell_methods(found: Results) -> None:
+def print_methods(found: Results) -> None:
     """Print in how many degradations and levels `precise` is better than `paper`."""
-    lines = {(line.kind, line.level, line.method): line for line in lines_of(found) if line.kind != CLEAN}
+    lines = {(line.kind, line.level, line.method): line for line in summaries(found) if line.kind != CLEAN}
     places = [key[:2] for key in lines if key[2] == "precise"]
     nearer, steadier = [], []
     for place in places:
@@ -71,18 +69,18 @@ def tell_methods(found: Results) -> None:
     print(f"and fewer frames wrong or lost, or none, in {sum(steadier)} of {len(places)}")
 
 
-def is_nearer(precise: Line, paper: Line) -> bool:
-    """Say whether the first has the smaller median error; where neither has any, nothing is better."""
+def is_nearer(precise: ResultSummary, paper: ResultSummary) -> bool:
+    """Return whether `precise` has the smaller median error, or the only one."""
     return bool(precise.p50_deg < paper.p50_deg or (np.isfinite(precise.p50_deg) and np.isnan(paper.p50_deg)))
 
 
-def bad(line: Line) -> float:
-    """Return the share of frames that are wrong or lost."""
+def bad(line: ResultSummary) -> float:
+    """Return the share of frames wrong or lost."""
     return line.wrong_after + line.lost
 
 
-def tell_confidence(outcomes: Sequence[Outcome]) -> None:
-    """Print how often orientations are right that claim to be so with a probability."""
+def print_confidence(outcomes: Sequence[SceneResult]) -> None:
+    """Print the calibration of the confidence."""
     for name, chosen in (("mixed scenes", [one for one in outcomes if one.kind == TOGETHER]), ("all", outcomes)):
         pairs = [
             (claimed, error <= WRONG_DEG)

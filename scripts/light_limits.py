@@ -20,8 +20,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import ExperimentError
-from sphereorient.evaluate.robustness.scenes import CLEAN, Scene, write_scene
-from sphereorient.evaluate.robustness.settings import BenchSettings
+from sphereorient.evaluate.robustness.scenes import CLEAN, BenchmarkScene, BenchSettings, write_scene
 from sphereorient.experiment.recording import Recording, open_recording, silent
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.follower import sample_frames
@@ -65,7 +64,9 @@ def scene(work: Path, kind: str, level: int) -> Path:
     path = work / f"{kind}-{level}" / "experiment.yaml"
     if not path.is_file():
         degradations = {} if kind == CLEAN else {kind: level}
-        one = Scene(kind=kind, level=level, seed=0, number=0, degradations=degradations, frames=BenchSettings().frames)
+        one = BenchmarkScene(
+            kind=kind, level=level, seed=0, number=0, degradations=degradations, frames=BenchSettings().frames
+        )
         write_scene(path.parent, one)
     return path
 

@@ -21,9 +21,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.learn.density import first_right, spread_answer, tops_of
+from sphereorient.learn.density import find_modes, first_right, smoothed_target
 from sphereorient.learn.network import Correlator, PictureNetwork
-from sphereorient.learn.pictures import VALIDATION_SEED, Balls, Lesson, draw_lesson, make_balls
+from sphereorient.learn.pictures import VALIDATION_SEED, RandomTextures, TrainingBatch, draw_batch, make_textures
 from sphereorient.learn.settings import NetworkSettings, PictureSettings
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
 
@@ -120,14 +120,14 @@ def main() -> None:
     torch.set_num_threads(1)
     settings = PictureSettings()
     nodes = NetworkSettings().nodes
-    trained = make_balls(settings, nodes, count=144, first_seed=0)
-    unseen = make_balls(settings, nodes, count=24, first_seed=VALIDATION_SEED)
+    trained = make_textures(settings, nodes, count=144, first_seed=0)
+    unseen = make_textures(settings, nodes, count=24, first_seed=VALIDATION_SEED)
     print("| design | parameters | steps of 256 pictures | recall, first | recall, first five | ms per picture |")
     print("|---|---|---|---|---|---|")
     for name in options.designs.split(","):
         torch.manual_seed(0)
         design = DESIGNS[name]()
-        one = Balls(textures=trained.textures[:1], blurs=trained.blurs[:1])
+        one = RandomTextures(textures=trained.textures[:1], blurs=trained.blurs[:1])
         own = PictureSettings(texture="one ball")  # no negatives
         chosen, kind = (one, own) if name == "classifier" else (trained, settings)
         steps = train(design, chosen, kind, 60 * options.minutes)
@@ -136,13 +136,13 @@ def main() -> None:
         print(f"| {name} | {count:,} | {steps} | {first:.3f} | {five:.3f} | {1e3 * seconds:.2f} |", flush=True)
 
 
-def train(design: Design, balls: Balls, settings: PictureSettings, seconds: float) -> int:
+def train(design: Design, balls: RandomTextures, settings: PictureSettings, seconds: float) -> int:
     """Train for some CPU seconds, the making of pictures included; return the steps."""
     rng = torch.Generator().manual_seed(1)
     optimiser = torch.optim.AdamW(design.parameters(), lr=RATE, weight_decay=1e-4)
     begin, step = time.process_time(), 0
     while (spent := (time.process_time() - begin) / seconds) < 1:
-        lesson = draw_lesson(balls, settings, rng, maps=2, groups=8, group=16)
+        lesson = draw_batch(balls, settings, rng, (2, 8, 16))
         for group in optimiser.param_groups:
             group["lr"] = RATE * min(1, step / 100) * 0.5 * (1 + math.cos(math.pi * spent))
         loss = torch.stack([loss_of(design, balls, lesson, m, rng) for m in range(2)]).mean()
@@ -154,7 +154,7 @@ def train(design: Design, balls: Balls, settings: PictureSettings, seconds: floa
     return step
 
 
-def loss_of(design: Design, balls: Balls, lesson: Lesson, m: int, rng: torch.Generator) -> Tensor:
+def loss_of(design: Design, balls: RandomTextures, lesson: TrainingBatch, m: int, rng: torch.Generator) -> Tensor:
     """Cross entropy with what is right, spread over the grid."""
     some = None
     if isinstance(design, DescriptorDesign):  # a bank of all views takes ten times the time of the rest
@@ -164,21 +164,21 @@ def loss_of(design: Design, balls: Balls, lesson: Lesson, m: int, rng: torch.Gen
         some = torch.cat([turn @ near, others])
     logits = design.logits(lesson.disks[m], lesson.textures[m], lesson.blurs[m], some)
     grid = design.grid if some is None else some
-    right = spread_answer(lesson.R_view_body[m], grid, math.radians(SPREAD_DEG))
+    right = smoothed_target(lesson.R_view_body[m], grid, math.radians(SPREAD_DEG))
     return (torch.logsumexp(logits, 1) - (right * logits).sum(1)).mean()
 
 
 @torch.inference_mode()
-def judge(design: Design, balls: Balls, settings: PictureSettings) -> tuple[float, float, float]:
+def judge(design: Design, balls: RandomTextures, settings: PictureSettings) -> tuple[float, float, float]:
     """Return recall of the first and the first five, and CPU seconds per picture beyond the map's own work."""
     rng = torch.Generator().manual_seed(2)
     ranks, seconds, count = [], 0.0, 0
     for _ in range(12):
-        lesson = draw_lesson(balls, settings, rng, maps=1, groups=16, group=8)
+        lesson = draw_batch(balls, settings, rng, (1, 16, 8))
         logits = design.logits(lesson.disks[0], lesson.textures[0], lesson.blurs[0], None)
-        ranks.append(first_right(tops_of(logits, design.grid, 8), lesson.R_view_body[0], 10.0))
+        ranks.append(first_right(find_modes(logits, design.grid, 8), lesson.R_view_body[0], 10.0))
         begin = time.process_time()
-        tops_of(design.logits(lesson.disks[0], lesson.textures[0], lesson.blurs[0], design.grid[:1]), design.grid, 8)
+        find_modes(design.logits(lesson.disks[0], lesson.textures[0], lesson.blurs[0], design.grid[:1]), design.grid, 8)
         seconds += time.process_time() - begin
         count += len(lesson.disks[0])
     rank = torch.cat(ranks)

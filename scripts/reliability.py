@@ -10,7 +10,6 @@ whether it is within 10 degrees of the truth. A run that was cut off goes on. A 
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -18,11 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from sphereorient.cli.app import progress_bar
-from sphereorient.evaluate.robustness import BenchSettings, Outcome
-from sphereorient.evaluate.robustness.measure import WRONG_DEG
-from sphereorient.evaluate.robustness.results import from_tree
-from sphereorient.evaluate.robustness.run import KEPT, run_scene, trackers_of
-from sphereorient.evaluate.robustness.scenes import TOGETHER, Scene, scenes_of
+from sphereorient.evaluate.robustness import BenchSettings, SceneResult
+from sphereorient.evaluate.robustness.results import WRONG_DEG
+from sphereorient.evaluate.robustness.run import KEPT, kept_result, limit_threads, run_scene, trackers_of
+from sphereorient.evaluate.robustness.scenes import TOGETHER, BenchmarkScene, scenes_of
 from sphereorient.statistics.reliability import reliability
 from sphereorient.synth.severities import LEVELS
 
@@ -44,26 +42,19 @@ def main() -> None:
     missing = [scene for scene, place in zip(scenes, places, strict=True) if not place.exists()]
     with (
         progress_bar(unit="") as advance,
-        ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn"), one_thread) as pool,
+        ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn"), limit_threads) as pool,
     ):
         tasks = [pool.submit(run_scene, options.out, scene, trackers_of([METHOD])) for scene in missing]
         for done, task in enumerate(as_completed(tasks), start=len(scenes) - len(missing) + 1):
             task.result()
             advance("scenes", done, len(scenes))
-    outcomes = [from_tree(json.loads(place.read_text("utf-8"))) for place in places]
+    outcomes = [kept_result(place) for place in places]
     tell(outcomes)
 
 
-def one_thread() -> None:
-    """Keep a worker to one core."""
-    import torch
-
-    torch.set_num_threads(1)
-
-
-def mixed_scenes(count: int) -> list[Scene]:
+def mixed_scenes(count: int) -> list[BenchmarkScene]:
     """Return scenes of three degradations each, levels in turn."""
-    found: list[Scene] = []
+    found: list[BenchmarkScene] = []
     seed = FIRST_SEED
     while len(found) < count:
         found += [scene for scene in scenes_of(BenchSettings(levels=LEVELS, seeds=(seed,))) if scene.kind == TOGETHER]
@@ -71,7 +62,7 @@ def mixed_scenes(count: int) -> list[Scene]:
     return found[:count]
 
 
-def tell(outcomes: list[Outcome]) -> None:
+def tell(outcomes: list[SceneResult]) -> None:
     """Print the reliability and draw its curve."""
     refused = [one for one in outcomes if one.refused]
     claimed, right = [], []

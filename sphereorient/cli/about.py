@@ -16,7 +16,7 @@ from sphereorient.files.outputs import put_aside
 def settings(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write; the screen without it.")] = None,
 ) -> None:
-    """Write all settings of the method with their defaults, each one explained."""
+    """Write all settings of the methods with defaults and explanations."""
     from sphereorient.methods.settings import settings_yaml
 
     if out is None:

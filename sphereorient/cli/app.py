@@ -1,15 +1,17 @@
-"""The command line's frame: the application, what all commands share, and how errors end."""
+"""The application of the command line, the helpers of its commands, and the end of errors."""
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast, get_type_hints
 
 import typer
 from typer.core import TyperGroup
@@ -19,17 +21,17 @@ from sphereorient.errors import OutputError, SphereOrientError, refusal
 
 
 class InOrder(TyperGroup):
-    """Commands in the order in which a user meets them, not in that of their files."""
+    """Commands in the order of use, not of their files."""
 
     ORDER = (
         *("track", "report", "overlay", "export", "view"),
         *("check", "movie", "convert", "calibrate", "check-cameras", "convert-cameras"),
-        *("map", "compare-maps", "synth", "texture"),
-        *("bench", "train", "evaluate", "settings", "info"),
+        *("map", "compare-maps", "spin", "synth", "texture"),
+        *("score", "bench", "train", "evaluate", "settings", "info"),
     )
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names, those that are not in the order last."""
+        """Return the names, unknown ones last."""
         known = {name: place for place, name in enumerate(self.ORDER)}
         return sorted(super().list_commands(ctx), key=lambda name: known.get(name, len(known)))
 
@@ -44,8 +46,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-EXIT_REFUSED = 2  # something that the user can mend
-EXIT_INTERRUPTED = 130  # Ctrl-C, as shells have it
+EXIT_REFUSED = 2  # an error that the user can correct
+EXIT_INTERRUPTED = 130  # Ctrl-C, as in shells
 
 ExperimentPath = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="experiment.yaml (docs/data-format.md)")]
 
@@ -61,28 +63,36 @@ def common(
 
 
 def check_writable(out: Path) -> None:
-    """Refuse an output place before hours of work, not after."""
-    folder = out.parent
-    do = "choose another --out"
+    """Check that the output folder exists and can be written, before hours of work."""
+    folder, name = out.parent, f"--out {out}"
     if not folder.is_dir():
-        raise OutputError(
-            refusal(f"--out {out}", expected=f"an existing folder {folder}", got="none", do="make it first")
-        )
+        raise OutputError(refusal(name, expected=f"an existing folder {folder}", got="none", do="make it first"))
     if not os.access(folder, os.W_OK):
-        raise OutputError(refusal(f"--out {out}", expected="a writable folder", got=f"{folder}, which is not", do=do))
+        do = "choose another --out"
+        raise OutputError(refusal(name, expected="a writable folder", got=f"{folder}, which is not", do=do))
 
 
 def camera_names(text: str | None) -> list[str] | None:
-    """Return the names in cam1,cam2; None where nothing was said."""
+    """Return the names in cam1,cam2; None without a text."""
     return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
 
 
 def frame_range(text: str) -> tuple[int | None, int | None] | None:
-    """Return first and last + 1 of A:B, None where left out; None for anything else."""
+    """Return first and last + 1 of A:B, None for an omitted end; None for another text."""
     found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", text.strip())
     if not found:
         return None
     return (int(found[1]) if found[1] else None, int(found[2]) if found[2] else None)
+
+
+def with_options(command: Callable[[Any], None]) -> Callable[..., None]:
+    """Let a command take one record: each field of the dataclass becomes an option."""
+    record = next(iter(get_type_hints(command).values()))
+    signature = inspect.signature(record, eval_str=True)
+    with_fields: Any = wraps(command)(lambda **values: command(record(**values)))
+    with_fields.__signature__ = signature
+    with_fields.__annotations__ = {name: one.annotation for name, one in signature.parameters.items()}
+    return cast(Callable[..., None], with_fields)
 
 
 Advance = Callable[[str, int, int], None]
@@ -90,7 +100,7 @@ Advance = Callable[[str, int, int], None]
 
 @contextmanager
 def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]:
-    """Show one line of progress a stage, with units per second, if any, and time left; nothing where `quiet`."""
+    """Show a line of progress for each stage, with units per second and remaining time; nothing if `quiet`."""
     if quiet:
         yield lambda stage, done, total: None
         return
@@ -119,7 +129,7 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
 
         def advance(stage: str, done: int, total: int) -> None:
             if not tasks:
-                shown.enter_context(bar)  # not before: a command that is refused at once prints one line
+                shown.enter_context(bar)  # not earlier: a refusal prints one line only
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=total, rate="")
             elapsed = bar.tasks[bar.task_ids.index(tasks[stage])].elapsed
@@ -130,13 +140,13 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
 
 
 def main() -> None:
-    """Run the command line; errors that a user can mend become one line and a non-zero exit code."""
-    # On a busy machine torch's threads spin while they wait for a core that another program has: 136 s instead of 9 s
-    # for the excerpt beside two busy processes. Read by OpenMP when torch is imported, so before any command.
+    """Run the command line; errors that a user can correct become one line and a non-zero exit code."""
+    # Without it torch's threads spin while another program has their core: 136 s instead of 9 s for the excerpt beside
+    # two busy processes. OpenMP reads it when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(EXIT_INTERRUPTED))
     try:
-        # Without its standalone mode the parser hands exit codes back, that of Ctrl-C among them.
+        # Without its standalone mode the parser returns exit codes, also that of Ctrl-C.
         code = app(standalone_mode=False) or 0
     except SphereOrientError as error:
         typer.echo(f"sphereorient: {error}", err=True)
@@ -151,7 +161,7 @@ def main() -> None:
 
 
 def _usage_error(error: Exception) -> int:
-    """Print a mistake in the arguments as the parser words it; let faults of the program through."""
+    """Print an error of the arguments in the parser's words; raise any other error again."""
     show = getattr(error, "show", None)
     if show is None:
         raise error

@@ -16,7 +16,7 @@ from sphereorient.files.outputs import put_aside
 if TYPE_CHECKING:
     from sphereorient.preflight import Finding
 
-EXIT_FAULT = 1  # a run would fail, or its numbers would be wrong
+EXIT_FAULT = 1  # a run fails, or its numbers are wrong
 COLOURS = {"ok": typer.colors.GREEN, "warning": typer.colors.YELLOW, "fault": typer.colors.RED}
 MARK, TITLE = 9, 25  # columns of the list
 
@@ -34,7 +34,7 @@ def check(
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and only warnings and faults.")] = False,
 ) -> None:
-    """Check an experiment in seconds before it is tracked: what was found, and what to do. Exit code 1: some fault."""
+    """Check an experiment in seconds before tracking: findings, and what to do. Exit code 1: there is a fault."""
     picture = Path(f"{experiment.stem}.check.png") if out is None else out
     check_writable(picture)
     from sphereorient.methods.settings import load_settings
@@ -57,7 +57,7 @@ def check(
 
 
 def _print(findings: Sequence[Finding], quiet: bool) -> None:
-    """Print findings, one a paragraph: mark, title, what was measured; below it what to do."""
+    """Print a paragraph for each finding: mark, title, measurement; below it the advice."""
     width = max(60, shutil.get_terminal_size().columns)
     margin = " " * (MARK + TITLE)
     for finding in findings:

@@ -17,7 +17,7 @@ def synth(
     set_: Annotated[list[str] | None, typer.Option("--set", help="Override one key, e.g. --set frames=60.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
 ) -> None:
-    """Render a two-camera experiment with exact truth, to try the tracker or to test another."""
+    """Render an experiment of two cameras with exact truth."""
     check_writable(out)
     from sphereorient.methods.settings import load_synth_settings
     from sphereorient.synth import write_experiment

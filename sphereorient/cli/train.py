@@ -12,8 +12,7 @@ import typer
 from sphereorient.cli.app import app, check_writable, progress_bar
 
 if TYPE_CHECKING:
-    from sphereorient.learn.train import Trained
-    from sphereorient.learn.trial import Trial
+    from sphereorient.learn.benchmark import ProposerBenchmark
 
 EXAMPLES = 8  # rows of the sheet
 
@@ -27,7 +26,7 @@ def train(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Override one key, e.g. --set training.minutes=30.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from last.ckpt in the folder.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from last.ckpt in the folder.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
 ) -> None:
     """Train a network that proposes orientations (docs/proposer.md)."""
@@ -36,73 +35,67 @@ def train(
     from sphereorient.methods.settings import load_proposer_settings, proposer_settings_yaml
 
     settings = load_proposer_settings(config, set_ or [])
-    from sphereorient.learn.train import CHECKPOINT, prepare, train
+    from sphereorient.learn.benchmark import make_examples
+    from sphereorient.learn.train import CHECKPOINT, prepare, train_proposer
+    from sphereorient.report.learning import examples_figure, learning_curve_figure, write_png
 
     prepare(settings, out, resume)
     with put_aside(out / "settings.yaml") as aside:
         aside.write_text(proposer_settings_yaml(settings), encoding="utf-8")
     with progress_bar(quiet, unit="steps") as advance:
-        trained = train(settings, out, resume=resume, advance=advance)
-    _draw(trained, out)
-    if not quiet:
-        judged = trained.judged
-        typer.echo(
-            f"Wrote {out / CHECKPOINT}; {judged.pictures} validation pictures: right first "
-            f"{100 * judged.recall_1:.1f} %, among five {100 * judged.recall_5:.1f} %, "
-            f"calibration error {judged.ece:.3f}"
-        )
-
-
-def _draw(trained: Trained, out: Path) -> None:
-    """Write the learning curve and the sheet of examples."""
-    from sphereorient.learn.examples import make_examples
-    from sphereorient.report.learning import examples_figure, learning_curve_figure, write_png
-
-    best_step = int(trained.checkpoint.about["best_step"])
-    write_png(learning_curve_figure(trained.rows, best_step), out / "learning_curve.png")
+        trained = train_proposer(settings, out, resume=resume, progress=advance)
+    curve = learning_curve_figure(trained.rows, int(trained.checkpoint.about["best_step"]))
+    write_png(curve, out / "learning_curve.png")
     write_png(examples_figure(make_examples(trained.checkpoint, EXAMPLES)), out / "examples.png")
+    if not quiet:
+        metrics = trained.metrics
+        typer.echo(
+            f"Wrote {out / CHECKPOINT}; {metrics.pictures} validation pictures: right first "
+            f"{100 * metrics.recall_1:.1f} %, among five {100 * metrics.recall_5:.1f} %, "
+            f"calibration error {metrics.ece:.3f}"
+        )
 
 
 @app.command()
 def evaluate(
     checkpoint: Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="proposer.ckpt of `sphereorient train`.")],
     config: Annotated[
-        Path | None, typer.Option(help="YAML whose `pictures` to try it on; without: those of its training.")
+        Path | None, typer.Option(help="YAML with the `pictures` to use; without: those of its training.")
     ] = None,
     pictures: Annotated[int, typer.Option(min=1, help="Pictures of each degradation and level.")] = 240,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
-    """Try a proposer's checkpoint on balls that no training sees, one degradation after the other."""
+    """Measure the recall of a proposer's checkpoint on balls that no training sees, one degradation at a time."""
+    from sphereorient.learn.benchmark import benchmark_checkpoint
     from sphereorient.learn.checkpoint import load_checkpoint
-    from sphereorient.learn.trial import try_checkpoint
     from sphereorient.methods.settings import load_proposer_settings
 
     loaded = load_checkpoint(checkpoint)
     chosen = loaded.settings if config is None else load_proposer_settings(config)
     with progress_bar(quiet, unit="maps") as advance:
-        trial = try_checkpoint(loaded, chosen.pictures, pictures, advance)
+        found = benchmark_checkpoint(loaded, chosen.pictures, pictures, advance)
     if as_json:
-        typer.echo(json.dumps({"checkpoint": str(checkpoint), "temperature": loaded.temperature, **asdict(trial)}))
+        typer.echo(json.dumps({"checkpoint": str(checkpoint), "temperature": loaded.temperature, **asdict(found)}))
     else:
-        _print(trial)
+        _print(found)
 
 
-def _print(trial: Trial) -> None:
-    """Print a line a degradation, then the figures of the mixed pictures."""
+def _print(found: ProposerBenchmark) -> None:
+    """Print a line for each degradation, then the metrics of the mixed pictures."""
     from rich.console import Console
     from rich.table import Table
 
-    levels = sorted({one.level for one in trial.families})
+    levels = sorted({one.level for one in found.families})
     table = Table("degradation", *(f"level {level}\nfirst / five" for level in levels))
-    for family in dict.fromkeys(one.family for one in trial.families):
-        found = {one.level: one for one in trial.families if one.family == family}
-        cells = [f"{100 * found[level].recall_1:.1f} / {100 * found[level].recall_5:.1f} %" for level in levels]
+    for family in dict.fromkeys(one.family for one in found.families):
+        row = {one.level: one for one in found.families if one.family == family}
+        cells = [f"{100 * row[level].recall_1:.1f} / {100 * row[level].recall_5:.1f} %" for level in levels]
         table.add_row(family, *cells)
     Console().print(table)
-    mixed = trial.mixed
+    mixed = found.mixed
     typer.echo(
         f"{mixed.pictures} mixed pictures: right first {100 * mixed.recall_1:.1f} %, among five "
         f"{100 * mixed.recall_5:.1f} %, calibration error {mixed.ece:.3f}"
     )
-    typer.echo(f"{trial.pictures_per_s:.0f} pictures/s with {trial.threads} threads")
+    typer.echo(f"{found.pictures_per_s:.0f} pictures/s with {found.threads} threads")

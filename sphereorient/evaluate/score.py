@@ -1,7 +1,8 @@
-"""How far a track is from the truth of a synthetic experiment."""
+"""Errors of a track, or of another program's orientations, against the exact truth of a synthetic experiment."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,16 +12,22 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient import so3
-from sphereorient.errors import TrackError, refusal
+from sphereorient.errors import BenchError, TrackError, refusal
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+Frames = NDArray[np.int64]
 RATES = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
+ALIGNMENTS = ("none", "body", "both")
+ITERATIONS, CONVERGED = 200, 1e-12  # of the alignment
+FICTRAC_FRAME, FICTRAC_ROTATION = 0, slice(8, 11)  # columns: frame counter, absolute rotation vector (camera axes)
+FICTRAC_COLUMNS = 23  # at least; newer versions have more
+DO = "pass the truth.h5 of this synthetic experiment"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Score:
-    """Errors of N frames of a track; made by `score_track`, read by demo, report and benchmarks. NaN: not measured."""
+    """Errors of N frames of a track; made by `score_track`, read by report and benchmarks. NaN: not measured."""
 
     frames: int
     valid: NDArray[np.bool_]  # (N,)
@@ -28,7 +35,7 @@ class Score:
     camera_orientation_deg: dict[str, Floats]  # (N,) each, of each camera alone
     position_mm: Floats  # (N,), distance
     relative_rms: dict[str, float]  # of velocity, acceleration, omega, alpha: rms error over the truth's rms
-    coverage: dict[str, float]  # of the same: share of the frames that have one
+    coverage: dict[str, float]  # of the same: share of the frames with a value
 
     def percentiles_deg(self) -> Floats:
         """Median, 95th, 99th percentile and maximum of the valid frames' orientation error."""
@@ -44,45 +51,14 @@ def _percentiles(values: Floats) -> Floats:
     return np.percentile(values, [50, 95, 99, 100]) if len(values) else np.full(4, np.nan)
 
 
-def _angle_deg(A: Floats, B: Floats) -> Floats:
-    distance = so3.geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy()
-    return np.asarray(np.rad2deg(distance), np.float64)
-
-
-def _read_truth(path: str | Path) -> dict[str, Floats]:
-    """Read the datasets of truth.h5 that a track is compared with."""
-    name, do = f"truth {path}", "pass the truth.h5 of a synthetic experiment"
-    try:
-        with h5py.File(path) as file:
-            return {key: np.asarray(file[key][()]) for key in ("time", "position", "orientation", *RATES)}
-    except OSError as error:
-        raise TrackError(refusal(name, expected="an HDF5 file", got=" ".join(str(error).split()), do=do)) from None
-    except KeyError as error:
-        got = " ".join(str(error.args[0]).split())
-        raise TrackError(refusal(name, expected="time, position, orientation and rates", got=got, do=do)) from None
-
-
 def score_track(track: Trajectory, truth_path: str | Path) -> Score:
-    """Compare a track with the exact truth.
-
-    Args:
-        track: the track; its times pick the frames of the truth, to half a frame.
-        truth_path: truth.h5 of a synthetic experiment (docs/data-format.md).
-
-    Returns:
-        The errors, frame by frame.
+    """Compare a track with the exact truth (docs/data-format.md), matched by time to half a frame.
 
     Raises:
-        TrackError: no truth file, or times that do not fit.
+        TrackError: no truth file, or times that do not match.
     """
-    truth = _read_truth(truth_path)
-    step = float(np.median(np.diff(truth["time"])))
-    row = np.rint((track.time - truth["time"][0]) / step).astype(int)
-    known = (row >= 0) & (row < len(truth["time"]))
-    if not known.all() or np.abs(track.time - truth["time"][row]).max() > step / 2:
-        got = f"{track.time[0]:.6g} .. {track.time[-1]:.6g} s"
-        name = f"truth {truth_path}"
-        raise TrackError(refusal(name, expected="times of the track", got=got, do="pass the truth of this experiment"))
+    truth = _read_truth(truth_path, "position", *RATES)
+    row = _rows(truth["time"], track.time, truth_path)
     relative, coverage = {}, {}
     for key in RATES:
         measured, true = getattr(track, key), truth[key][row]
@@ -100,3 +76,124 @@ def score_track(track: Trajectory, truth_path: str | Path) -> Score:
         relative_rms=relative,
         coverage=coverage,
     )
+
+
+def true_orientations(path: Path, time_s: Floats) -> Floats:
+    """Return R_lab_body (N, 3, 3) of truth.h5 at times (N,), matched to half a frame.
+
+    Raises:
+        TrackError: no truth file, or times that do not match.
+    """
+    truth = _read_truth(path)
+    return truth["orientation"][_rows(truth["time"], time_s, path)]
+
+
+def orientations_at(path: Path, frame: Frames) -> Floats:
+    """Return R_lab_body (N, 3, 3) of truth.h5 in frames (N,), counted from its first.
+
+    Raises:
+        TrackError: no truth file, or too few frames.
+    """
+    R = _read_truth(path)["orientation"]
+    if len(frame) and (frame.min() < 0 or frame.max() >= len(R)):
+        expected, got = f"frames 0 .. {len(R) - 1}", f"{frame.min()} .. {frame.max()}"
+        raise TrackError(refusal(f"truth {path}", expected=expected, got=got, do=DO))
+    return R[frame]
+
+
+def _read_truth(path: str | Path, *names: str) -> dict[str, Floats]:
+    """Read time, orientation and other datasets of truth.h5."""
+    try:
+        with h5py.File(path) as file:
+            truth = {key: np.asarray(file[key][()], np.float64) for key in ("time", "orientation", *names)}
+    except (OSError, KeyError) as error:
+        got, expected = " ".join(str(error).split()), "time, position, orientation and rates"
+        raise TrackError(refusal(f"truth {path}", expected=expected, got=got, do=DO)) from None
+    if not len(truth["time"]) or truth["orientation"].shape != (len(truth["time"]), 3, 3):
+        got = str(truth["orientation"].shape)
+        raise TrackError(refusal(f"truth {path}", expected="one orientation a frame", got=got, do=DO))
+    return truth
+
+
+def _rows(known_s: Floats, time_s: Floats, path: str | Path) -> Frames:
+    """Return the rows of the truth at the nearest times; refuse times further than half a frame."""
+    after = np.clip(np.searchsorted(known_s, time_s), 0, len(known_s) - 1)
+    before = np.maximum(after - 1, 0)
+    row = np.where(np.abs(known_s[before] - time_s) < np.abs(known_s[after] - time_s), before, after)
+    step = float(np.median(np.diff(known_s))) if len(known_s) > 1 else np.inf
+    if len(time_s) and not np.abs(known_s[row] - time_s).max() <= step / 2:
+        got = f"{time_s[0]:.6g} .. {time_s[-1]:.6g} s"
+        raise TrackError(refusal(f"truth {path}", expected="times of the track", got=got, do=DO))
+    return row
+
+
+def _angle_deg(A: Floats, B: Floats) -> Floats:
+    distance = so3.geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy()
+    return np.asarray(np.rad2deg(distance), np.float64)
+
+
+def read_fictrac(path: Path) -> tuple[Frames, Floats]:
+    """Read frames (N,), from 0, and orientations (N, 3, 3), body to camera axes, of a .dat file of FicTrac 2.
+
+    The frame of reference is that of FicTrac's first frame, and the sphere's axes are its own: align with "both".
+
+    Raises:
+        BenchError: the file is missing or not of this form.
+
+    Source: FicTrac's doc/data_header.txt, columns 1 and 9 to 11; exp(vector) is the rotation since its first frame.
+    """
+    do = "pass FicTrac's .dat file"
+    try:
+        rows = np.loadtxt(path, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        got = "no file" if isinstance(error, FileNotFoundError) else "something else"
+        raise BenchError(refusal(str(path), expected="lines of numbers between commas", got=got, do=do)) from None
+    if rows.shape[0] == 0 or rows.shape[1] < FICTRAC_COLUMNS:
+        got = f"{rows.shape[0]} lines of {rows.shape[1]}"
+        raise BenchError(refusal(str(path), expected=f"at least {FICTRAC_COLUMNS} columns", got=got, do=do))
+    R = so3.exp(torch.from_numpy(np.ascontiguousarray(rows[:, FICTRAC_ROTATION]))).numpy()
+    return rows[:, FICTRAC_FRAME].astype(np.int64), R
+
+
+READERS: dict[str, Callable[[Path], tuple[Frames, Floats]]] = {"fictrac": read_fictrac}
+
+
+def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats:
+    """Return the geodesic distances of orientations, (N,) degrees, after the best constant rotations.
+
+    Args:
+        R: (N, 3, 3), measured; NaN: not measured, as in the result.
+        R_true: (N, 3, 3).
+        align: "none"; "body" fits B in R B, for arbitrary body axes; "both" fits A and B in A R B, for an arbitrary
+            frame of reference too.
+
+    Raises:
+        BenchError: another word for align.
+    """
+    if align not in ALIGNMENTS:
+        raise BenchError(refusal("--align", expected="none, body or both", got=repr(align)[:40], do="choose one"))
+    known = np.isfinite(R).all((1, 2))
+    out = np.full(len(R), np.nan)
+    if known.any():
+        measured, true = torch.from_numpy(R[known]), torch.from_numpy(R_true[known])
+        left, right = _alignment(measured, true, align)
+        out[known] = np.rad2deg(so3.geodesic_distance(left @ measured @ right, true).numpy())
+    return out
+
+
+def _alignment(measured: torch.Tensor, true: torch.Tensor, align: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return A and B with the least sum of squared chords, fitted in turn.
+
+    B starts from the first frame: from elsewhere the iteration can converge far from the optimum.
+    """
+    left = right = torch.eye(3, dtype=measured.dtype)
+    if align == "none":
+        return left, right
+    right = measured[0].mT @ true[0]
+    for _ in range(ITERATIONS if align == "both" else 1):
+        if align == "both":
+            left = so3.nearest_rotation((true @ (measured @ right).mT).sum(0))
+        before, right = right, so3.nearest_rotation(((left @ measured).mT @ true).sum(0))
+        if (right - before).abs().max() < CONVERGED:
+            break
+    return left, right

@@ -1,4 +1,4 @@
-"""The optional proposer: a network that says where a ball could point, and how it is trained.
+"""The optional learned proposer: a network, its training data and its training.
 
-`train`, `module` and `data` import pytorch_lightning, which takes seconds: only the command that trains imports them.
+`train` and `module` import pytorch_lightning, which takes seconds: only `sphereorient train` imports them.
 """

@@ -1,4 +1,4 @@
-"""A network that gives a density over SO(3): features of the picture against features of the map, turned with it."""
+"""A network that predicts a density over SO(3): it correlates features of the picture with those of the rotated map."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from sphereorient.sphere import orthographic_view, reduced_texture, sample_textu
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 from sphereorient.sphere.view import disk_offsets
 
-SCALES = (0.06, 0.1, 0.16, 0.25, 0.4, 0.7)  # standard deviations, rad, of the blurs that the map's network sees
-WINDOW = 0.3  # of the neighbourhood that is taken off the picture, radii
+SCALES = (0.06, 0.1, 0.16, 0.25, 0.4, 0.7)  # standard deviations of the map's blurs, rad
+WINDOW = 0.3  # of the neighbourhood mean that is subtracted, radii
 
 
 class PictureNetwork(nn.Module):
-    """Features of a disk, freed of light and dirt as far as can be, at half size."""
+    """Features of a disk at half size, as independent of light and dirt as possible."""
 
     share: Tensor
     along: Tensor
@@ -56,7 +56,7 @@ class PictureNetwork(nn.Module):
         return found
 
     def _seen(self, disks: Tensor) -> Tensor:
-        """Grey levels without scale, without their neighbourhood, and where the rim is, (F, 4, S, S)."""
+        """Return normalised grey levels, those without the neighbourhood mean, radius and disk, (F, 4, S, S)."""
         share = self.share / self.share.sum()
         mean = (disks * share).sum((1, 2), keepdim=True)
         deviation = ((disks - mean).square() * share).sum((1, 2), keepdim=True).sqrt().clamp_min(1e-6)
@@ -69,9 +69,9 @@ class PictureNetwork(nn.Module):
 
 
 class MapNetwork(nn.Module):
-    """Features of every place of a map: a function of how grey it is about there, the same in all directions.
+    """Features of every point of a map: a function of the isotropic blurs there.
 
-    So the features of a turned ball are the turned features, and one look at the map serves all orientations.
+    The features of a rotated ball are the rotated features, so one evaluation serves all orientations.
     """
 
     def __init__(self, settings: NetworkSettings) -> None:
@@ -120,12 +120,12 @@ class Correlator(nn.Module):
         return views
 
     def seen(self, disks: Tensor) -> Tensor:
-        """Return the features of disks (F, S, S) where they are compared, (F, P C)."""
+        """Return the features of disks (F, S, S) at the P compared points, (F, P C)."""
         found: Tensor = self.picture(disks).flatten(2)[..., self.place]  # (F, C, P)
         return found.mT.flatten(1)
 
     def logits(self, seen: Tensor, bank: Tensor) -> Tensor:
-        """Return logarithms of the density on the grid, (F, K), but for a constant of each disk."""
+        """Return the log density on the grid, (F, K), up to a constant of each disk."""
         return seen @ bank.T * (self.gain.exp() / math.sqrt(bank.shape[1]))
 
     def forward(self, disks: Tensor, blurs: Tensor) -> Tensor:
@@ -134,7 +134,7 @@ class Correlator(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two convolutions whose result is added to what came in."""
+    """Two convolutions, added to their input."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -150,17 +150,17 @@ def _convolution(into: int, out: int, stride: int = 1) -> nn.Sequential:
 
 
 def map_blurs(textures: Tensor, side: int) -> Tensor:
-    """Return how grey maps are about each cell of an octahedral map, seen with wider and wider blurs.
+    """Blur maps with wider and wider kernels, sampled in the cells of an octahedral map.
 
     Args:
         textures: (T, H, 2 H), 0 black .. 1 white.
         side: cells along each axis, N = side^2.
 
     Returns:
-        (T, N, B) float32, each map's mean taken off and in units of its deviation.
+        (T, N, B) float32, in standard deviations of each map from its mean.
     """
     direction = octahedral_directions(side).float()
-    # A cell's solid angle: that of its part of the octahedron's face, seen from the middle.
+    # Solid angle of a cell, which is flat on the octahedron's face.
     area = direction.abs().sum(-1).pow(3)
     paint = torch.stack([sample_texture(reduced_texture(each.float(), 0.8 * side), direction) for each in textures], -1)
     share = (area / area.sum())[:, None]
@@ -168,7 +168,7 @@ def map_blurs(textures: Tensor, side: int) -> Tensor:
     paint = paint / (share * paint.square()).sum(0).sqrt().clamp_min(1e-6)
     blurs = [paint]
     for scale in SCALES:
-        # One kernel at a time: all of them would take half a gigabyte.
+        # One kernel at a time: all of them take half a gigabyte.
         kernel = torch.exp((direction @ direction.T - 1) / scale**2) * area
         blurs.append((kernel @ paint) / kernel.sum(1, keepdim=True))
     return torch.stack(blurs, -1).transpose(0, 1).contiguous()

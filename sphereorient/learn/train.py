@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,80 +18,114 @@ from typing import Any
 import torch
 from pytorch_lightning import Trainer
 from pytorch_lightning.callbacks import EarlyStopping
-from pytorch_lightning.loggers import CSVLogger
 
 from sphereorient import __version__
 from sphereorient.errors import CheckpointError, OutputError, SettingsError, refusal
-from sphereorient.learn.callbacks import LAST, Advance, Clock, Keeper, Row
-from sphereorient.learn.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, texture_sha256
-from sphereorient.learn.data import LessonData
-from sphereorient.learn.judge import Judged, answers_of, fitted_temperature, judge
-from sphereorient.learn.module import ProposerModule
+from sphereorient.experiment.recording import Progress, silent
+from sphereorient.learn.checkpoint import Checkpoint, correlator_of, load_checkpoint, save_checkpoint, texture_sha256
+from sphereorient.learn.metrics import Metrics, fitted_temperature, metrics_of, predict_all
+from sphereorient.learn.module import LAST, CheckpointCallback, ProposerModule, Row, TrainingData, TrainingTimer
 from sphereorient.learn.network import Correlator
 from sphereorient.learn.settings import ProposerSettings
 from sphereorient.sphere import load_texture
 
 CHECKPOINT = "proposer.ckpt"
-LENGTH = ("epochs", "minutes", "patience")  # may be others when training goes on
+LENGTH = ("epochs", "minutes", "patience")  # may change when training is resumed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trained:
-    """What a training gave; made by `train`."""
+    """The result of a training; made by `train_proposer`."""
 
     checkpoint: Checkpoint
-    judged: Judged  # on the validation pictures, with the temperature
-    rows: tuple[Row, ...]  # a row of figures an epoch, as metrics.csv has them; the first before any step
+    metrics: Metrics  # on the validation pictures, with the temperature
+    rows: tuple[Row, ...]  # metrics of each epoch, as in metrics.csv; the first is the untrained network
 
 
-def _silent(stage: str, done: int, total: int) -> None:
-    """Show no progress."""
-
-
-def train(settings: ProposerSettings, out: Path, *, resume: bool = False, advance: Advance = _silent) -> Trained:
+def train_proposer(
+    settings: ProposerSettings, out: Path, *, resume: bool = False, progress: Progress = silent
+) -> Trained:
     """Train a proposer and write proposer.ckpt, last.ckpt and metrics.csv into a folder.
 
     Args:
         settings: of network, pictures and training.
-        out: folder; made where there is none.
-        resume: go on from last.ckpt in the folder, to the same weights that an uninterrupted training gives; where
-            `minutes` is set these depend on the clock.
-        advance: told stage, steps done and steps at most.
+        out: folder; created if missing.
+        resume: continue from last.ckpt in the folder, to the same weights as without the interruption, unless
+            `minutes` is set.
+        progress: called with stage, finished steps, steps at most.
 
     Raises:
-        CheckpointError: training.start, or last.ckpt to go on from, is none that fits.
+        CheckpointError: training.start or last.ckpt cannot be used.
         TextureError: pictures.texture cannot be read.
         OutputError: the folder cannot be written.
         SettingsError: the training does not converge to finite numbers.
     """
-    network = prepare(settings, out, resume)
-    clock, keeper = Clock(settings.training.minutes), Keeper(out, advance)
-    advance("draw maps", 0, 1)
-    data = LessonData(settings)
-    advance("draw maps", 1, 1)
-    module = ProposerModule(settings, network)
+    network, minutes = prepare(settings, out, resume), settings.training.minutes
+    timer = TrainingTimer(None if minutes is None else timedelta(minutes=minutes), verbose=False)
+    kept = CheckpointCallback(out, progress)
+    progress("draw maps", 0, 1)
+    data = TrainingData(settings)
+    progress("draw maps", 1, 1)
     with _quiet_lightning():
-        trainer = _trainer(settings, out, keeper, clock, fresh=not resume)
-        _fit(trainer, module, data, out / LAST if resume else None)
-    if not keeper.best:
+        stop = EarlyStopping("validation_nll", patience=settings.training.patience, mode="min")
+        trainer = Trainer(
+            accelerator="gpu" if torch.cuda.is_available() else "cpu",
+            devices=1,
+            max_epochs=settings.training.epochs,
+            callbacks=[stop, kept, timer],
+            logger=False,
+            default_root_dir=str(out),
+            gradient_clip_val=1.0,
+            reload_dataloaders_every_n_epochs=1,
+            num_sanity_val_steps=0 if resume else -1,  # the untrained network is the first row of the history
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        _fit(trainer, ProposerModule(settings, network), data, str(out / LAST) if resume else None)
+    if not kept.best:
         do = "lower training.learning_rate"
         raise SettingsError(refusal("training", expected="finite losses", got="others in the first epoch", do=do))
-    network.load_state_dict(keeper.best)
-    trained = _finished(settings, network.cpu().eval(), data, keeper, clock)
-    save_checkpoint(out / CHECKPOINT, trained.checkpoint)
-    return trained
+    network.load_state_dict(kept.best)
+    network.cpu().eval()
+    predictions = predict_all(network, data.validation)
+    temperature = fitted_temperature(predictions, network.grid)
+    metrics = metrics_of(predictions, network.grid, math.radians(settings.training.spread_deg), temperature)
+    own = settings.pictures.texture
+    checkpoint = Checkpoint(
+        settings=settings,
+        state={name: tensor.detach().clone() for name, tensor in network.state_dict().items()},
+        temperature=temperature,
+        texture_sha256=None if own is None else texture_sha256(load_texture(Path(own))),
+        about={
+            "sphereorient": __version__,
+            "torch": str(torch.__version__),
+            "pytorch_lightning": version("pytorch-lightning"),
+            "best_step": kept.best_step,
+            "steps": int(kept.rows[-1]["step"]),
+            "minutes": round(timer.time_elapsed() / 60, 2),
+            "device": "gpu" if torch.cuda.is_available() else "cpu",
+            "validation_pictures": metrics.pictures,
+            "validation_nll": metrics.nll,
+            "validation_recall_1": metrics.recall_1,
+            "validation_recall_5": metrics.recall_5,
+            "validation_ece": metrics.ece,
+        },
+    )
+    save_checkpoint(out / CHECKPOINT, checkpoint)
+    return Trained(checkpoint=checkpoint, metrics=metrics, rows=tuple(kept.rows))
 
 
 def prepare(settings: ProposerSettings, out: Path, resume: bool = False) -> Correlator:
-    """Refuse at once what would be refused later, make the folder, and return the network to begin with.
+    """Check the inputs, create the folder, and return the initial network.
 
     Raises:
-        CheckpointError: training.start, or last.ckpt to go on from, is none that fits.
-        OutputError: the folder cannot be made.
+        CheckpointError: training.start or last.ckpt cannot be used.
+        OutputError: the folder cannot be created.
     """
     if resume:
         _check_last(out / LAST, settings)
-    network = _network(settings)
+    network = _initial_network(settings)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -99,8 +134,8 @@ def prepare(settings: ProposerSettings, out: Path, resume: bool = False) -> Corr
     return network
 
 
-def _network(settings: ProposerSettings) -> Correlator:
-    """Return a network with random weights, or with those to begin with."""
+def _initial_network(settings: ProposerSettings) -> Correlator:
+    """Return a network with random weights, or with those of training.start."""
     start = settings.training.start
     if start is None:
         with torch.random.fork_rng(devices=[]):
@@ -108,65 +143,38 @@ def _network(settings: ProposerSettings) -> Correlator:
             return Correlator(settings.network)
     checkpoint = load_checkpoint(Path(start))
     if checkpoint.settings.network != settings.network:
-        expected, got = "the network of training.start", "other network settings"
-        raise CheckpointError(
-            refusal(f"checkpoint {start}", expected=expected, got=got, do="copy its settings' branch network")
-        )
-    network = Correlator(settings.network)
-    network.load_state_dict(dict(checkpoint.state))
-    return network
+        expected, do = "the network of training.start", "copy the branch network of its settings"
+        raise CheckpointError(refusal(f"checkpoint {start}", expected=expected, got="other network settings", do=do))
+    return correlator_of(checkpoint).train().requires_grad_(True)
 
 
 def _check_last(last: Path, settings: ProposerSettings) -> None:
-    """Refuse to go on from a file of another training, before Lightning reads it."""
+    """Refuse to resume another training, before Lightning reads the file."""
     name, do = f"--resume {last}", "train anew without --resume"
     if not last.is_file():
-        raise CheckpointError(refusal(name, expected="the file of a training that was cut off", got="none", do=do))
+        raise CheckpointError(refusal(name, expected="the last.ckpt of an interrupted training", got="none", do=do))
     try:
-        # Lightning would execute code that such a file carries; this does not.
-        kept = torch.load(last, map_location="cpu", weights_only=True)
-        before = ProposerSettings.model_validate(kept["sphereorient_settings"])
+        # Lightning would execute code in the file; weights_only does not.
+        saved = torch.load(last, map_location="cpu", weights_only=True)
+        before = ProposerSettings.model_validate(saved["sphereorient_settings"])
     except Exception as error:  # damaged pickles raise nearly anything
-        got = "a damaged one, or one of another version"
+        got = "a damaged file, or one of another version"
         raise CheckpointError(refusal(name, expected="a whole last.ckpt", got=got, do=do)) from error
     if _without_length(before) != _without_length(settings):
-        got = "other settings than those it began with"
-        raise CheckpointError(refusal(name, expected="the same settings", got=got, do="pass settings.yaml beside it"))
+        do = "pass settings.yaml beside it"
+        raise CheckpointError(refusal(name, expected="the same settings", got="other settings", do=do))
 
 
 def _without_length(settings: ProposerSettings) -> dict[str, Any]:
-    tree = settings.model_dump()
-    for key in LENGTH:
-        tree["training"].pop(key)
-    return tree
+    return settings.model_dump(exclude={"training": set(LENGTH)})
 
 
-def _trainer(settings: ProposerSettings, out: Path, keeper: Keeper, clock: Clock, fresh: bool) -> Trainer:
-    training = settings.training
-    stop = EarlyStopping("validation_nll", patience=training.patience, mode="min")
-    return Trainer(
-        accelerator="gpu" if torch.cuda.is_available() else "cpu",
-        devices=1,
-        max_epochs=training.epochs,
-        callbacks=[stop, keeper, clock],
-        logger=CSVLogger(str(out), name="", version=""),
-        default_root_dir=str(out),
-        gradient_clip_val=1.0,
-        reload_dataloaders_every_n_epochs=1,
-        num_sanity_val_steps=-1 if fresh else 0,  # the untrained network is the history's first row
-        log_every_n_steps=max(training.steps, 1),
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
-
-
-def _fit(trainer: Trainer, module: ProposerModule, data: LessonData, last: Path | None) -> None:
-    """Train; Ctrl-C leaves as such, which Lightning would turn into an exit."""
+def _fit(trainer: Trainer, module: ProposerModule, data: TrainingData, last: str | None) -> None:
+    """Train; raise KeyboardInterrupt on Ctrl-C, which Lightning would turn into an exit."""
     main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGINT) if main else None
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=None if last is None else str(last))
+        trainer.fit(module, datamodule=data, ckpt_path=last)
     except SystemExit:
         if trainer.interrupted:
             raise KeyboardInterrupt from None
@@ -176,49 +184,9 @@ def _fit(trainer: Trainer, module: ProposerModule, data: LessonData, last: Path 
             signal.signal(signal.SIGINT, before)
 
 
-def _finished(
-    settings: ProposerSettings, network: Correlator, data: LessonData, keeper: Keeper, clock: Clock
-) -> Trained:
-    """Fit the temperature and gather what the checkpoint says of itself."""
-    answers = answers_of(network, data.validation)
-    temperature = fitted_temperature(answers, network.grid)
-    judged = judge(answers, network.grid, math.radians(settings.training.spread_deg), temperature)
-    own = settings.pictures.texture
-    return Trained(
-        checkpoint=Checkpoint(
-            settings=settings,
-            state={name: tensor.detach().clone() for name, tensor in network.state_dict().items()},
-            temperature=temperature,
-            texture_sha256=None if own is None else texture_sha256(load_texture(Path(own))),
-            about={
-                **_versions(),
-                "best_step": keeper.best_step,
-                "steps": int(keeper.rows[-1]["step"]),
-                "minutes": round(clock.elapsed_s / 60, 2),
-                "device": "gpu" if torch.cuda.is_available() else "cpu",
-                "validation_pictures": judged.pictures,
-                "validation_nll": judged.nll,
-                "validation_recall_1": judged.recall_1,
-                "validation_recall_5": judged.recall_5,
-                "validation_ece": judged.ece,
-            },
-        ),
-        judged=judged,
-        rows=tuple(keeper.rows),
-    )
-
-
-def _versions() -> dict[str, str]:
-    return {
-        "sphereorient": __version__,
-        "torch": str(torch.__version__),
-        "pytorch_lightning": version("pytorch-lightning"),
-    }
-
-
 @contextmanager
 def _quiet_lightning() -> Iterator[None]:
-    """Silence advice about hardware and data loaders, which the user did not choose."""
+    """Silence Lightning's advice on hardware and data loaders."""
     loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:

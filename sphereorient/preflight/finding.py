@@ -1,7 +1,8 @@
-"""What a check has to say: one finding, in words."""
+"""One finding of the check, in words."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -10,21 +11,35 @@ class Severity(StrEnum):
     """How bad a finding is."""
 
     OK = "ok"
-    WARNING = "warning"  # the run will do, but less well than it could
-    FAULT = "fault"  # the run will fail, or its numbers will be wrong
+    WARNING = "warning"  # the run works, but less well than it could
+    FAULT = "fault"  # the run fails, or its numbers are wrong
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One thing looked at; made by the files of this room, read by the command line and the figure."""
+    """The result of one check; made by this room, read by the command line and the figure."""
 
     title: str
     severity: Severity
-    measured: str  # what was found, with numbers and units
-    advice: str = ""  # what to do, as an imperative; empty where nothing is to be done
+    measured: str  # numbers with units
+    advice: str = ""  # what to do, as an imperative; empty if nothing
 
 
-def worst(findings: list[Finding]) -> Severity:
-    """Return the worst severity of some findings; OK of none."""
-    order = list(Severity)
-    return max((finding.severity for finding in findings), key=order.index, default=Severity.OK)
+def ok(title: str, measured: str) -> Finding:
+    """Return a finding without a complaint."""
+    return Finding(title=title, severity=Severity.OK, measured=measured)
+
+
+def warning(title: str, measured: str, advice: str) -> Finding:
+    """Return a warning."""
+    return Finding(title=title, severity=Severity.WARNING, measured=measured, advice=advice)
+
+
+def fault(title: str, measured: str, advice: str) -> Finding:
+    """Return a fault."""
+    return Finding(title=title, severity=Severity.FAULT, measured=measured, advice=advice)
+
+
+def worst(findings: Sequence[Finding]) -> Severity:
+    """Return the worst severity; OK if there are no findings."""
+    return max((finding.severity for finding in findings), key=list(Severity).index, default=Severity.OK)

@@ -1,4 +1,4 @@
-"""Figures of a proposer's training: the learning curve, and a sheet of examples."""
+"""Figures of a proposer's training: learning curve and examples."""
 
 from __future__ import annotations
 
@@ -13,24 +13,19 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from sphereorient.files.outputs import put_aside
-from sphereorient.learn.examples import Example
-from sphereorient.learn.judge import WITHIN_DEG
+from sphereorient.learn.benchmark import Example
+from sphereorient.learn.metrics import WITHIN_DEG
 from sphereorient.report.plots.marks import note
 from sphereorient.report.plots.style import ALL, DPI, GREY, SECOND, SHADE, WIDTH_IN, X, in_style, new_figure
 
-RIGHT, WRONG = "#1A7F37", "#B42318"  # of frames about proposals; titles say it too
+RIGHT, WRONG = "#1A7F37", "#B42318"  # frames of proposals, beside the tick
 SIDE_IN = 1.12  # of a picture of the sheet
-UNLIKELY = 0.005  # proposals of less are not shown
+UNLIKELY = 0.005  # least probability that is shown
 
 
 @in_style
 def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -> Figure:
-    """Draw loss and recall against the steps.
-
-    Args:
-        rows: of metrics.csv, the first before any step.
-        best_step: whose weights were kept.
-    """
+    """Draw loss and recall against the steps; `rows` are those of metrics.csv, `best_step` that of the kept weights."""
     figure = new_figure(WIDTH_IN, 2.7)
     left, right = figure.subplots(1, 2)
     _curve(left, rows, "train_nll", "training", {**SECOND.drawn, "marker": "x"})
@@ -46,8 +41,8 @@ def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -
         axes.legend(loc=corner, frameon=True, framealpha=0.9, edgecolor="none")
     note(
         figure,
-        "Validation: pictures of balls that training never sees. The loss cannot come to 0: right answers are spread "
-        "over the grid. That of the training is the mean of an epoch, while the weights change.",
+        "Validation: pictures of balls that training never sees. The loss cannot reach 0: the target is spread over "
+        "the grid. The training loss is the mean of an epoch, while the weights change.",
     )
     return figure
 
@@ -55,7 +50,7 @@ def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -
 def _curve(axes: Axes, rows: Sequence[Mapping[str, float]], key: str, label: str, look: dict[str, Any]) -> None:
     there = [(row["step"], row[key]) for row in rows if key in row]
     steps, values = np.array(there, np.float64).reshape(-1, 2).T
-    # A marker a row, but no chain of them where there are many.
+    # Not more than a dozen markers.
     axes.plot(steps, values, label=label, markevery=max(len(steps) // 12, 1), **look)
 
 
@@ -70,8 +65,9 @@ def examples_figure(examples: Sequence[Example]) -> Figure:
             axes.set(xticks=[], yticks=[])
             axes.grid(visible=False)
             axes.set_frame_on(False)
+        names = "\n".join(name.replace("_", " ") for name in example.degradations)
         row[0].imshow(example.disk.numpy(), cmap="gray", vmin=0, vmax=255)
-        row[0].set_xlabel(_wrapped(example.degradations), fontsize=5.5, labelpad=2)
+        row[0].set_xlabel(names or "nothing", fontsize=5.5, labelpad=2)
         _paint(row[1], example.true_view)
         for k, axes in enumerate(row[2:]):
             _proposal(axes, example, k)
@@ -79,9 +75,8 @@ def examples_figure(examples: Sequence[Example]) -> Figure:
     panels[0, 1].set_title("true view", fontsize=7)
     note(
         figure,
-        f"Above proposals: their probability, and the angle to the truth; framed green with a tick where it is below "
-        f"{WITHIN_DEG:g}°, red where it is not. Below pictures: what spoils them. Proposals of less than "
-        f"{100 * UNLIKELY:g} % are left out.",
+        f"Above proposals: probability and angle to the truth; green frame and tick: below {WITHIN_DEG:g}°, red frame: "
+        f"above. Below pictures: degradations. Proposals of less than {100 * UNLIKELY:g} % are left out.",
     )
     return figure
 
@@ -101,17 +96,13 @@ def _proposal(axes: Axes, example: Example, k: int) -> None:
 
 
 def _paint(axes: Axes, view: Tensor) -> None:
-    """Show paint as it is; grey beside the ball, or white paint would run into the page."""
+    """Draw a clean view on grey, or white paint would merge with the page."""
     axes.set_facecolor(SHADE)
     axes.patch.set_visible(True)
     axes.set_frame_on(True)
     for side in axes.spines.values():
         side.set_visible(False)
     axes.imshow(np.ma.masked_invalid(view.numpy()), cmap="gray", vmin=0, vmax=1)
-
-
-def _wrapped(names: Sequence[str]) -> str:
-    return "\n".join(name.replace("_", " ") for name in names) if names else "nothing"
 
 
 def write_png(figure: Figure, path: Path) -> None:

@@ -15,7 +15,7 @@ from sphereorient.cameras import Camera
 from sphereorient.errors import TextureError, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.movies import Grey
-from sphereorient.preflight.diameter import expected_outline_px
+from sphereorient.preflight.cameras import expected_outline_px
 from sphereorient.sphere import sample_texture, sphere_normals
 from sphereorient.trajectory import Trajectory
 

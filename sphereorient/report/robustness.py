@@ -1,4 +1,4 @@
-"""The picture and the table of the robustness benchmark."""
+"""Figure and table of the robustness benchmark."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from sphereorient.evaluate.robustness.results import Line, Results, lines_of
+from sphereorient.evaluate.robustness.results import Results, ResultSummary, summaries
 from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
 from sphereorient.files.outputs import put_aside
 from sphereorient.report.plots.style import new_figure
@@ -27,14 +27,10 @@ LEAST_DEG, MOST_DEG = 3e-3, 180.0
 def robustness_figure(results: Results) -> Figure:
     """Draw error and lost frames of each method against severity, a panel for each degradation, worst first.
 
-    Above: median (thick) and 95th percentile (thin) of the orientation's error. Below: share of the frames that are
-    wrong by more than 10 degrees or without an orientation, after assembly. Worst is where the first method has most
-    such frames, and then the largest error.
-
-    Args:
-        results: of `run_benchmark`.
+    Above: median (with markers) and 95th percentile of the orientation's error. Below: share of the frames with an
+    error of more than 10 degrees or without an orientation, after assembly.
     """
-    lines = list(lines_of(results))
+    lines = summaries(results)
     kinds = worst_first(lines, results.methods)
     rows = math.ceil(len(kinds) / COLUMNS)
     figure = new_figure(COLUMNS * PANEL[0], rows * PANEL[1] + 0.6)
@@ -46,8 +42,8 @@ def robustness_figure(results: Results) -> Figure:
     return figure
 
 
-def worst_first(lines: Sequence[Line], methods: Sequence[str]) -> list[str]:
-    """Return the kinds of scenes, without the clean ones, those first that are hardest for the first method."""
+def worst_first(lines: Sequence[ResultSummary], methods: Sequence[str]) -> list[str]:
+    """Return the kinds of scenes except clean ones, sorted by bad frames, then by error, of the first method."""
 
     def hardness(kind: str) -> tuple[float, float]:
         own = [line for line in lines if line.kind == kind and line.method == methods[0]]
@@ -58,17 +54,15 @@ def worst_first(lines: Sequence[Line], methods: Sequence[str]) -> list[str]:
     return sorted(dict.fromkeys(line.kind for line in lines if line.kind != CLEAN), key=hardness)
 
 
-def _panel(part: Any, kind: str, lines: Sequence[Line], methods: Sequence[str], first: bool) -> None:
+def _panel(part: Any, kind: str, lines: Sequence[ResultSummary], methods: Sequence[str], first: bool) -> None:
     above, below = part.subplots(2, 1, sharex=True, height_ratios=(2.2, 1), gridspec_kw={"hspace": 0.08})
     levels = sorted({line.level for line in lines})
     for k, method in enumerate(methods):
         colour, style, marker = LOOKS[k % len(LOOKS)]
         own = sorted((line for line in lines if line.method == method), key=lambda line: line.level)
-        x = [line.level for line in own]
-        above.plot(
-            x, [line.p50_deg for line in own], style, color=colour, marker=marker, ms=4, label=f"{method}, median"
-        )
-        above.plot(x, [line.p95_deg for line in own], style, color=colour, lw=0.8, alpha=0.8, label=f"{method}, 95 %")
+        x, p50, p95 = ([getattr(line, key) for line in own] for key in ("level", "p50_deg", "p95_deg"))
+        above.plot(x, p50, style, color=colour, marker=marker, ms=4, label=f"{method}, median")
+        above.plot(x, p95, style, color=colour, lw=0.8, alpha=0.8, label=f"{method}, 95 %")
         share = [100 * (line.wrong_after + line.lost) for line in own]
         below.plot(x, share, style, color=colour, marker=marker, ms=4, clip_on=False)
     above.set(yscale="log", ylim=(LEAST_DEG, MOST_DEG), yticks=[0.01, 0.1, 1, 10, 100])
@@ -96,12 +90,10 @@ def _unit(kind: str) -> str:
 
 
 def write_table(results: Results, path: Path) -> None:
-    """Write the rows of the table as CSV, aside first."""
-    rows = []
-    for line in lines_of(results):
-        row = asdict(line)
-        recall = row.pop("recall")
-        rows.append(row | {f"recall_{first}": share for first, share in recall.items()})
+    """Write the summaries as CSV, whole or not at all."""
+    rows = [asdict(line) for line in summaries(results)]
+    for row in rows:
+        row |= {f"recall_{first}": share for first, share in row.pop("recall").items()}
     with put_aside(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -109,9 +101,9 @@ def write_table(results: Results, path: Path) -> None:
 
 
 def markdown(results: Results) -> str:
-    """Return the table as a page of the docs has it: by degradation and level, each method's error and bad frames."""
+    """Return the table of docs/robustness.md: error and bad frames of each method by degradation and level."""
     methods = results.methods
-    lines = {(line.kind, line.level, line.method): line for line in lines_of(results)}
+    lines = {(line.kind, line.level, line.method): line for line in summaries(results)}
     head = ["", "value", *(f"{m}: median, 95 % (degrees); wrong, lost (%)" for m in methods)]
     text = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for kind, level in dict.fromkeys((line.kind, line.level) for line in lines.values()):
@@ -121,7 +113,7 @@ def markdown(results: Results) -> str:
     return "\n".join(text) + "\n"
 
 
-def _cell(line: Line) -> str:
+def _cell(line: ResultSummary) -> str:
     if not math.isfinite(line.p50_deg):
         return "refused" if line.refused else "nothing"
     return f"{line.p50_deg:.3g}, {line.p95_deg:.3g}; {100 * line.wrong_after:.0f}, {100 * line.lost:.0f}"

@@ -11,21 +11,24 @@ from scipy.spatial.transform import Rotation
 
 from sphereorient.cli import main
 from sphereorient.errors import BenchError, OutputError, SettingsError, TrackError
-from sphereorient.evaluate.external import aligned_errors_deg, read_fictrac
 from sphereorient.evaluate.robustness import (
     BenchSettings,
-    Outcome,
     Results,
-    compare,
+    SceneResult,
+    compare_runs,
     load_results,
-    measure,
-    save_results,
     scenes_of,
 )
-from sphereorient.evaluate.robustness.measure import no_track
-from sphereorient.evaluate.robustness.results import line_of, lines_of
-from sphereorient.evaluate.robustness.run import run_benchmark, run_scene, track_scene, trackers_of
-from sphereorient.evaluate.truth import orientations_at, true_orientations
+from sphereorient.evaluate.robustness.results import save_results, summaries, summarised
+from sphereorient.evaluate.robustness.run import (
+    measure,
+    no_track,
+    run_benchmark,
+    run_scene,
+    track_scene,
+    trackers_of,
+)
+from sphereorient.evaluate.score import aligned_errors_deg, orientations_at, read_fictrac, true_orientations
 from sphereorient.report.robustness import markdown, robustness_figure, worst_first, write_table
 from sphereorient.trajectory import CameraTrack, Trajectory
 
@@ -81,20 +84,22 @@ def planted(R: np.ndarray) -> Trajectory:
     )
 
 
-def outcome(**changes: object) -> Outcome:
-    numbers = no_track(FRAMES, "", 1.0) | {"orientation_deg": (0.02,) * FRAMES, "stated": FRAMES, "inside": 23}
+def outcome(**changes: object) -> SceneResult:
+    numbers = (
+        no_track(FRAMES, "") | {"seconds": 1.0} | {"orientation_deg": (0.02,) * FRAMES, "stated": FRAMES, "inside": 23}
+    )
     about = {"scene": "defocus-1-0-0", "kind": "defocus", "level": 1, "seed": 0, "degradations": {"defocus": 1}}
-    return Outcome(**(about | {"method": "precise"} | numbers | changes))
+    return SceneResult(**(about | {"method": "precise"} | numbers | changes))
 
 
-def results(*outcomes: Outcome) -> Results:
+def results(*outcomes: SceneResult) -> Results:
     return Results(settings=BenchSettings(), versions={}, outcomes=outcomes)
 
 
 def test_what_was_planted_is_measured(truth):
     path, R = truth
-    found = Outcome(scene="s", kind="k", level=1, seed=0, degradations={}, method="m",
-                    **measure(planted(R), path, 2.0))  # fmt: skip
+    found = SceneResult(scene="s", kind="k", level=1, seed=0, degradations={}, method="m",
+                    seconds=2.0, **measure(planted(R), path))  # fmt: skip
     assert found.wrong == 2
     assert found.lost == 1
     assert np.nanmedian(found.errors_deg) == pytest.approx(1.0, abs=1e-4)
@@ -109,8 +114,8 @@ def test_what_was_planted_is_measured(truth):
 
 def test_the_row_of_a_table_is_that_of_its_frames(truth):
     path, R = truth
-    one = outcome(**measure(planted(R), path, 2.0))
-    line = line_of("defocus", 1, "precise", [one, outcome(seed=1)])
+    one = outcome(seconds=2.0, **measure(planted(R), path))
+    line = summarised([one, outcome(seed=1)])
     assert line.frames == 48
     assert line.wrong_after == pytest.approx(2 / 48)
     assert line.lost == pytest.approx(1 / 48)
@@ -120,7 +125,7 @@ def test_the_row_of_a_table_is_that_of_its_frames(truth):
 
 
 def test_a_refusal_is_a_scene_without_orientations():
-    line = line_of("defocus", 5, "precise", [outcome(**no_track(FRAMES, "movies: expected a ball", 3.0))])
+    line = summarised([outcome(level=5, **no_track(FRAMES, "movies: expected a ball"))])
     assert line.lost == 1.0
     assert np.isnan(line.p50_deg)
     assert line.refused == "movies: expected a ball"
@@ -179,26 +184,26 @@ def noisy(size: float, seed: int) -> tuple[float, ...]:
 def test_what_got_worse_is_named_and_scatter_is_not():
     before = results(outcome(orientation_deg=noisy(0.02, 1)), outcome(scene="spin-1-0-0", kind="spin"))
     same = results(outcome(orientation_deg=noisy(0.02, 2)), outcome(scene="spin-1-0-0", kind="spin"))
-    assert not [change for change in compare(same, before) if change.worse or change.better]
+    assert not [change for change in compare_runs(same, before) if change.worse or change.better]
     now = results(outcome(orientation_deg=noisy(0.06, 2)), outcome(scene="spin-1-0-0", kind="spin"))
-    (worse,) = [change for change in compare(now, before) if change.worse]
+    (worse,) = [change for change in compare_runs(now, before) if change.worse]
     assert (worse.kind, worse.what) == ("defocus", "median error, degrees")
-    (better,) = [change for change in compare(before, now) if change.better]
+    (better,) = [change for change in compare_runs(before, now) if change.better]
     assert better.before > better.now
 
 
 def test_lost_and_wrong_frames_count_as_worse():
     before = results(outcome())
     lost = results(outcome(orientation_deg=(0.02,) * 8 + (None,) * 16))
-    assert [change.what for change in compare(lost, before) if change.worse] == ["lost frames"]
+    assert [change.what for change in compare_runs(lost, before) if change.worse] == ["lost frames"]
     wrong = results(outcome(orientation_deg=(0.02,) * 6 + (50.0,) * 18))
-    assert "wrong frames" in [change.what for change in compare(wrong, before) if change.worse]
+    assert "wrong frames" in [change.what for change in compare_runs(wrong, before) if change.worse]
 
 
-def test_runs_of_other_plans_have_nothing_to_compare():
+def test_runs_of_other_plans_have_nothing_to_compare_runs():
     other = Results(settings=BenchSettings(frames=30), versions={}, outcomes=[outcome()])
     with pytest.raises(BenchError, match="none in common"):
-        compare(results(outcome()), other)
+        compare_runs(results(outcome()), other)
 
 
 def never(experiment: Path) -> Trajectory:
@@ -233,7 +238,7 @@ def test_the_papers_method_on_a_small_run(tmp_path):
     found = run_benchmark(tmp_path, settings, trackers_of(["paper"]), jobs=2, progress=lambda *at: seen.append(at))
     assert seen[0] == (0, 2)
     assert seen[-1] == (2, 2)
-    for line in lines_of(found):
+    for line in summaries(found):
         assert line.lost == 0
         assert 0.1 < line.p50_deg < 3
 
@@ -279,11 +284,11 @@ def test_fictracs_file_is_read_and_scored(truth, tmp_path, monkeypatch, capsys):
     rows[:, 0] = np.arange(FRAMES)
     rows[:, 8:11] = (Rotation.from_rotvec([0.0, 0.02, 0.0]) * Rotation.from_matrix(R) * own).as_rotvec()
     np.savetxt(tmp_path / "out.dat", rows, delimiter=", ")
-    seen = read_fictrac(tmp_path / "out.dat")
-    true = orientations_at(path, seen.frame)
-    assert np.median(aligned_errors_deg(seen.R, true)) > 10
-    np.testing.assert_allclose(aligned_errors_deg(seen.R, true, "both"), 0, atol=1e-5)
-    assert aligned_errors_deg(seen.R, true, "body").max() > 0.3
+    frame, measured = read_fictrac(tmp_path / "out.dat")
+    true = orientations_at(path, frame)
+    assert np.median(aligned_errors_deg(measured, true)) > 10
+    np.testing.assert_allclose(aligned_errors_deg(measured, true, "both"), 0, atol=1e-5)
+    assert aligned_errors_deg(measured, true, "body").max() > 0.3
     code, told, _ = run_command(monkeypatch, capsys, "score", tmp_path / "out.dat", path, "--format", "fictrac",
                                 "--align", "both")  # fmt: skip
     assert code == 0
@@ -320,7 +325,7 @@ def test_the_figure_shows_the_hardest_first_and_all_methods(tmp_path):
         outcome(), outcome(method="paper", orientation_deg=(1.5,) * FRAMES),
         outcome(**hard, orientation_deg=(0.02,) * 12 + (40.0,) * 12), outcome(**hard, method="paper"),
     )  # fmt: skip
-    assert worst_first(list(lines_of(whole)), ["precise"]) == ["spin", "defocus"]
+    assert worst_first(summaries(whole), ["precise"]) == ["spin", "defocus"]
     figure = robustness_figure(whole)
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert titles == ["spin", "defocus"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,7 @@ ABOUT = {"torch": "2.6", "steps": 100, "validation_ece": 0.02}
 
 def example(**changes: Any) -> Checkpoint:
     whole = Checkpoint(settings=tiny(), state=state_of(untrained()), temperature=0.4, about=ABOUT)
-    return replace(whole, **changes)
+    return whole.model_copy(update=changes)
 
 
 def refused(path: Path) -> str:
@@ -202,7 +201,7 @@ FILES: list[tuple[Callable[[Path], None], str]] = [
     (half, "the beginning of one"),
     (flipped, "expected a file of weights"),
     (without_weights, "expected a file of weights"),
-    (packed, "packed"),
+    (packed, "compressed"),
     (claims_much, "claims more"),
     (other_archive, "expected a file of weights"),
     (large, "at most 64 MB"),
@@ -240,13 +239,13 @@ CHANGES: dict[str, tuple[dict[str, Any], str]] = {
     "shape": (other_weight(torch.zeros(2)), "expected shape (), got (2,)"),
     "dtype": (other_weight(torch.tensor(0.0, dtype=torch.float64)), "torch.float64"),
     "whole numbers": (other_weight(torch.tensor(0)), "torch.int64"),
-    "a number": (other_weight(0.0), "a tensor of 32 bit floats"),
+    "a number": (other_weight(0.0), "state.gain: expected an instance of Tensor"),
     "nan": (other_weight(torch.tensor(float("nan"))), "gain: expected finite"),
     "infinite": (other_weight(torch.tensor(float("inf"))), "gain: expected finite"),
     "sparse": (other_weight(torch.zeros(()).to_sparse()), "gain"),
     "another width": (changed_network(width=12), "expected shape"),
-    "impossible width": (changed_network(width=10_000), "settings network.width"),
-    "unknown setting": (changed_network(depth=3), "settings network.depth"),
+    "impossible width": (changed_network(width=10_000), "settings.network.width"),
+    "unknown setting": (changed_network(depth=3), "settings, network: expected one of"),
     "settings that contradict each other": (changed_network(size_px=32), "size_px"),
     "settings of another type": ({"settings": [1, 2]}, "settings"),
     "temperature of 0": ({"temperature": 0.0}, "temperature"),
@@ -269,7 +268,7 @@ def test_a_changed_checkpoint_is_refused_in_one_line(tmp_path, case):
     assert words in refused(path)
 
 
-@pytest.mark.parametrize("key", sorted(module.KEYS))
+@pytest.mark.parametrize("key", sorted({"schema", *Checkpoint.model_fields}))
 def test_a_checkpoint_without_one_of_its_keys_is_refused(tmp_path, key):
     path = tmp_path / "less.ckpt"
     tree = tree_of(path)

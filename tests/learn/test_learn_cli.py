@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 
 from sphereorient.cli import app
 from sphereorient.errors import SphereOrientError
+from sphereorient.learn.benchmark import LEVELS
 from sphereorient.learn.checkpoint import Checkpoint, save_checkpoint
 from sphereorient.learn.settings import ProposerSettings
-from sphereorient.learn.trial import LEVELS
 from sphereorient.methods.settings import load_proposer_settings, proposer_settings_yaml
 
 LENGTH = ["--set", "training.epochs=2", "--set", "training.steps=3", "--set", "pictures.validation=32"]

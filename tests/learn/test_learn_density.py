@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.learn.density import first_right, spread_answer, tops_of
+from sphereorient.learn.density import find_modes, first_right, smoothed_target
 
 GRID = so3.lattman_grid(math.radians(15.0)).float()
 SPREAD = math.radians(8.0)
@@ -28,7 +28,7 @@ def off_deg(a: Tensor, b: Tensor) -> float:
 
 def planted(*tops: tuple[Tensor, float]) -> Tensor:
     """Logits of a mixture of tops (R, weight), with a constant that must not matter."""
-    density = sum(weight * spread_answer(R.float()[None], GRID, SPREAD) for R, weight in tops)
+    density = sum(weight * smoothed_target(R.float()[None], GRID, SPREAD) for R, weight in tops)
     assert isinstance(density, Tensor)
     return density.clamp_min(1e-30).log() + 5.0
 
@@ -36,7 +36,7 @@ def planted(*tops: tuple[Tensor, float]) -> Tensor:
 def test_two_planted_tops_come_in_the_order_of_their_weights(rng):
     for R in so3.random_rotations(10, generator=rng):
         small, large = R, turned((0.6, 0.0, 0.8), 130.0) @ R
-        tops = tops_of(planted((small, 0.3), (large, 0.7)), GRID, 8)
+        tops = find_modes(planted((small, 0.3), (large, 0.7)), GRID, 8)
         assert off_deg(tops.R_view_body[0, 0], large) < 3
         assert off_deg(tops.R_view_body[0, 1], small) < 3
         # A Gaussian of 8 degrees has 0.8 .. 0.95 of itself within 22 degrees of a place at most 10 degrees beside it.
@@ -49,7 +49,7 @@ def test_a_top_between_places_of_the_grid_is_found_between_them(rng):
     """The nearest place is up to 10 degrees away, half of them more than 5."""
     R = so3.random_rotations(200, generator=rng)
     logits = torch.cat([planted((one, 1.0)) for one in R])
-    found = tops_of(logits, GRID, 1).R_view_body[:, 0]
+    found = find_modes(logits, GRID, 1).R_view_body[:, 0]
     off = torch.rad2deg(so3.geodesic_distance(found.double(), R))
     nearest = torch.rad2deg(so3.geodesic_distance(GRID[logits.argmax(1)].double(), R))
     assert off.median() < 0.4 * nearest.median()
@@ -60,7 +60,7 @@ def test_a_top_between_places_of_the_grid_is_found_between_them(rng):
 def test_a_temperature_sharpens_probabilities_and_leaves_places_alone(rng):
     R = so3.random_rotations(20, generator=rng)
     logits = torch.cat([planted((one, 0.6), (turned((0, 0, 1), 100.0) @ one, 0.4)) for one in R])
-    plain, sharp = tops_of(logits, GRID, 2), tops_of(logits, GRID, 2, temperature=0.4)
+    plain, sharp = find_modes(logits, GRID, 2), find_modes(logits, GRID, 2, temperature=0.4)
     assert (sharp.probability[:, 0] > plain.probability[:, 0]).all()
     assert sharp.probability[:, 0].mean() > plain.probability[:, 0].mean() + 0.1
     either = [torch.rad2deg(so3.geodesic_distance(plain.R_view_body, sharp.R_view_body[:, [k]])) for k in range(2)]
@@ -69,11 +69,13 @@ def test_a_temperature_sharpens_probabilities_and_leaves_places_alone(rng):
 
 def test_an_even_temperature_of_one_is_none(rng):
     logits = torch.randn(3, len(GRID), generator=rng)
-    assert torch.equal(tops_of(logits, GRID, 5).probability, tops_of(logits, GRID, 5, temperature=1.0).probability)
+    assert torch.equal(
+        find_modes(logits, GRID, 5).probability, find_modes(logits, GRID, 5, temperature=1.0).probability
+    )
 
 
 def test_tops_are_apart_and_probabilities_fall_and_are_no_more_than_all(rng):
-    tops = tops_of(3 * torch.randn(16, len(GRID), generator=rng), GRID, 6)
+    tops = find_modes(3 * torch.randn(16, len(GRID), generator=rng), GRID, 6)
     assert (tops.probability.diff(dim=1) <= 0).all()
     assert (tops.probability.sum(1) <= 1 + 1e-5).all()
     assert (tops.probability >= 0).all()
@@ -82,7 +84,7 @@ def test_tops_are_apart_and_probabilities_fall_and_are_no_more_than_all(rng):
 def test_where_there_is_one_top_alone_the_others_have_no_probability():
     logits = torch.full((1, len(GRID)), -60.0)
     logits[0, 1234] = 0.0
-    tops = tops_of(logits, GRID, 4)
+    tops = find_modes(logits, GRID, 4)
     assert_close(tops.probability[0, 0], torch.tensor(1.0), atol=1e-5)
     assert off_deg(tops.R_view_body[0, 0], GRID[1234]) < 0.1
     assert tops.probability[0, 1:].max() < 1e-10
@@ -90,22 +92,22 @@ def test_where_there_is_one_top_alone_the_others_have_no_probability():
 
 def test_a_batch_is_the_stack_of_its_singles(rng):
     logits = torch.randn(5, len(GRID), generator=rng) * 2
-    together = tops_of(logits, GRID, 4)
+    together = find_modes(logits, GRID, 4)
     for k in range(5):
-        alone = tops_of(logits[k : k + 1], GRID, 4)
+        alone = find_modes(logits[k : k + 1], GRID, 4)
         assert_close(alone.R_view_body[0], together.R_view_body[k], atol=1e-5)
         assert_close(alone.probability[0], together.probability[k], atol=1e-6)
 
 
 def test_a_constant_of_a_disk_changes_nothing(rng):
     logits = torch.randn(2, len(GRID), generator=rng) * 2
-    moved = tops_of(logits + torch.tensor([[7.0], [-3.0]]), GRID, 3)
-    assert_close(moved.probability, tops_of(logits, GRID, 3).probability, atol=1e-6)
+    moved = find_modes(logits + torch.tensor([[7.0], [-3.0]]), GRID, 3)
+    assert_close(moved.probability, find_modes(logits, GRID, 3).probability, atol=1e-6)
 
 
 def test_a_spread_answer_is_a_gaussian_of_the_angle(rng):
     R = so3.random_rotations(4, generator=rng)
-    answer = spread_answer(R, GRID.double(), SPREAD)
+    answer = smoothed_target(R, GRID.double(), SPREAD)
     assert_close(answer.sum(1), torch.ones(4, dtype=torch.float64), atol=1e-9)
     angle = torch.from_numpy(
         (Rotation.from_matrix(R[2].numpy()).inv() * Rotation.from_matrix(GRID.double().numpy())).magnitude()
@@ -122,7 +124,7 @@ def test_a_spread_answer_is_a_gaussian_of_the_angle(rng):
 def test_the_first_right_one_is_within_the_angle(degrees, place, rng):
     R = so3.random_rotations(1, generator=rng)
     logits = planted((R[0], 0.3), (turned((1, 0, 0), 120.0) @ R[0], 0.7))
-    tops = tops_of(logits, GRID, 5)
+    tops = find_modes(logits, GRID, 5)
     truth = turned((0, 1, 0), degrees) @ tops.R_view_body[:, 1].double()
     assert int(first_right(tops, truth.float(), 10.0)) == place
 
@@ -130,7 +132,7 @@ def test_the_first_right_one_is_within_the_angle(degrees, place, rng):
 def test_a_place_without_probability_is_never_right():
     logits = torch.full((1, len(GRID)), -200.0)
     logits[0, 7] = 0.0
-    tops = tops_of(logits, GRID, 3)
+    tops = find_modes(logits, GRID, 3)
     assert tops.probability[0, 2] == 0
     assert int(first_right(tops, tops.R_view_body[:, 2], 10.0)) == 3
 
@@ -139,9 +141,9 @@ def test_a_place_between_two_tops_counts_for_the_nearer_one_alone():
     """The oracle: a loop over the grid, for two bumps 25 .. 35 degrees apart on a broad hill."""
     apart = torch.rad2deg(so3.geodesic_distance(GRID[2000].double(), GRID.double()))
     near = int(torch.nonzero((apart > 26) & (apart < 34))[0])
-    hill = spread_answer(GRID[[2000]], GRID, math.radians(18)).log()
+    hill = smoothed_target(GRID[[2000]], GRID, math.radians(18)).log()
     hill[0, [2000, near]] = hill.max() + torch.tensor([0.3, 0.2])
-    tops = tops_of(hill, GRID, 2)
+    tops = find_modes(hill, GRID, 2)
     expected = [0.0, 0.0]
     for place, probability in zip(GRID, hill.softmax(1)[0].tolist(), strict=True):
         degrees = [off_deg(place, GRID[2000]), off_deg(place, GRID[near])]

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.learn.density import first_right, tops_of
-from sphereorient.learn.judge import cross_entropy, logits_of
+from sphereorient.learn.density import find_modes, first_right
+from sphereorient.learn.metrics import cross_entropy, predict
 from sphereorient.learn.network import SCALES, Correlator, map_blurs
-from sphereorient.learn.pictures import Lesson
+from sphereorient.learn.pictures import TrainingBatch
 from sphereorient.sphere.texture_table import octahedral_directions
 from sphereorient.synth.textures import map_directions, random_texture
 
@@ -130,7 +130,7 @@ def test_a_planted_answer_is_found_at_its_rotation(rng):
         bank = network.bank(blurs)
         bank = bank - bank.mean(0)
         for k in (0, 77, 1500):
-            tops = tops_of(20 * network.logits(bank[[k]], bank), network.grid, 1)
+            tops = find_modes(20 * network.logits(bank[[k]], bank), network.grid, 1)
             assert so3.geodesic_distance(tops.R_view_body[0, 0], network.grid[k]) < math.radians(9)
 
 
@@ -175,13 +175,14 @@ def test_nothing_stays_on_the_cpu_when_the_network_goes_elsewhere():
 
 def test_training_and_tops_are_on_the_device_of_the_network():
     network = Correlator(tiny().network).to("meta")
-    lesson = Lesson(
+    lesson = TrainingBatch(
         textures=torch.zeros(2, 48, 96, device="meta"),
         blurs=torch.zeros(2, 32 * 32, 1 + len(SCALES), device="meta"),
         disks=torch.zeros(2, 3, 24, 24, device="meta"),
         R_view_body=torch.zeros(2, 3, 3, 3, device="meta"),
     )
-    logits, truth = logits_of(network, lesson), lesson.R_view_body.flatten(0, 1)
-    cross_entropy(logits, truth, network.grid, 0.1).mean().backward()
+    predictions = predict(network, lesson)
+    logits, truth = predictions.logits, predictions.R_view_body
+    cross_entropy(predictions, network.grid, 0.1).mean().backward()
     assert network.gain.grad.device.type == "meta"
-    assert first_right(tops_of(logits, network.grid, 3, 0.4), truth, 10.0).device.type == "meta"
+    assert first_right(find_modes(logits, network.grid, 3, 0.4), truth, 10.0).device.type == "meta"

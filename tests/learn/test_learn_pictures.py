@@ -13,56 +13,54 @@ from learn_examples import tiny
 
 from sphereorient.errors import SettingsError
 from sphereorient.learn import pictures as module
-from sphereorient.learn.data import LessonData, validation_lessons
-from sphereorient.learn.draws import generator_of
-from sphereorient.learn.examples import clean_views
-from sphereorient.learn.pictures import VALIDATION_SEED, draw_lesson, draw_values, make_balls, value_at
+from sphereorient.learn.benchmark import BENCHMARK_SEED, MAPS, clean_views
+from sphereorient.learn.module import TrainingData
+from sphereorient.learn.pictures import VALIDATION_SEED, draw_batch, draw_values, generator_of, make_textures, value_at
 from sphereorient.learn.settings import PictureSettings, ProposerSettings
-from sphereorient.learn.trial import MAPS, TRIAL_SEED
 from sphereorient.synth import random_texture
 from sphereorient.synth.disks import DISK_DEGRADATIONS
 from sphereorient.synth.severities import DEGRADATIONS
 
 SETTINGS = tiny().pictures
 NODES = tiny().network.nodes
-SHAPE = {"maps": 2, "groups": 3, "group": 4}
+SHAPE = (2, 3, 4)
 
 
 @pytest.fixture(scope="module")
 def balls():
-    return make_balls(SETTINGS, NODES, count=6, first_seed=0)
+    return make_textures(SETTINGS, NODES, count=6, first_seed=0)
 
 
 @pytest.fixture(scope="module")
 def data():
-    return LessonData(tiny())
+    return TrainingData(tiny())
 
 
 def test_the_same_numbers_give_the_same_lesson_and_others_another(data):
-    first, again = data.lesson(3, 5), data.lesson(3, 5)
+    first, again = data.training_batch(3, 5), data.training_batch(3, 5)
     assert torch.equal(first.disks, again.disks)
     assert torch.equal(first.R_view_body, again.R_view_body)
     assert torch.equal(first.blurs, again.blurs)
     # epoch 3, step 5 is neither epoch 5, step 3 nor a neighbour of the same sum
     for epoch, step in ((5, 3), (4, 4), (3, 6), (0, 0)):
-        assert not torch.equal(data.lesson(epoch, step).R_view_body, first.R_view_body)
+        assert not torch.equal(data.training_batch(epoch, step).R_view_body, first.R_view_body)
 
 
 def test_each_epoch_has_pictures_of_its_own():
-    data = LessonData(tiny())
+    data = TrainingData(tiny())
     for epoch in (0, 2):
         data.trainer = SimpleNamespace(current_epoch=epoch)
         lessons = list(data.train_dataloader())
         assert len(lessons) == tiny().training.steps
-        assert torch.equal(lessons[3].disks, data.lesson(epoch, 3).disks)
+        assert torch.equal(lessons[3].disks, data.training_batch(epoch, 3).disks)
 
 
 def test_another_data_module_of_the_same_settings_gives_the_same_pictures(data):
-    other = LessonData(tiny())
-    assert torch.equal(other.lesson(1, 2).disks, data.lesson(1, 2).disks)
+    other = TrainingData(tiny())
+    assert torch.equal(other.training_batch(1, 2).disks, data.training_batch(1, 2).disks)
     assert torch.equal(other.validation[0].disks, data.validation[0].disks)
-    seeded = LessonData(tiny(seed=1))
-    assert not torch.equal(seeded.lesson(1, 2).disks, data.lesson(1, 2).disks)
+    seeded = TrainingData(tiny(seed=1))
+    assert not torch.equal(seeded.training_batch(1, 2).disks, data.training_batch(1, 2).disks)
 
 
 def test_generators_of_different_numbers_are_different():
@@ -87,10 +85,10 @@ def test_no_map_of_the_validation_or_of_the_trial_is_one_of_the_training(monkeyp
             return texture
 
         monkeypatch.setattr(module, "random_texture", noted)
-        make_balls(kinds, NODES, count=count, first_seed=first)
+        make_textures(kinds, NODES, count=count, first_seed=first)
         return asked
 
-    training, validation, trial = seeds_of(0, 4000), seeds_of(VALIDATION_SEED, MAPS), seeds_of(TRIAL_SEED, MAPS)
+    training, validation, trial = seeds_of(0, 4000), seeds_of(VALIDATION_SEED, MAPS), seeds_of(BENCHMARK_SEED, MAPS)
     assert len(training) >= 4000
     assert not training & validation
     assert not training & trial
@@ -102,14 +100,16 @@ def test_there_are_as_many_validation_pictures_as_the_settings_say(data):
 
 
 def test_validation_pictures_are_not_those_of_the_training(data):
-    lessons = validation_lessons(data.balls, tiny())  # even of the same balls
+    lessons = data.validation
     assert not any(
-        torch.equal(one.R_view_body[0, :4], data.lesson(0, k).R_view_body[0, :4]) for k in range(5) for one in lessons
+        torch.equal(one.R_view_body[0, :4], data.training_batch(0, k).R_view_body[0, :4])
+        for k in range(5)
+        for one in lessons
     )
 
 
 def test_a_lesson_has_the_shapes_that_it_says(balls):
-    lesson = draw_lesson(balls, SETTINGS, generator_of(1), **SHAPE)
+    lesson = draw_batch(balls, SETTINGS, generator_of(1), SHAPE)
     assert lesson.blurs.shape[:2] == (2, NODES * NODES)
     assert lesson.disks.shape == (2, 12, 24, 24)
     assert lesson.R_view_body.shape == (2, 12, 3, 3)
@@ -121,7 +121,7 @@ def test_pictures_show_the_map_of_the_blurs_as_the_answer_says(balls):
     plain = SETTINGS.model_copy(update={"at_once": 0})
     negatives = 0
     for seed in range(8):
-        lesson = draw_lesson(balls, plain, generator_of(seed), maps=1, groups=1, group=4)
+        lesson = draw_batch(balls, plain, generator_of(seed), (1, 1, 4))
         near = (balls.blurs - lesson.blurs[0]).abs().amax((1, 2)).min()
         negatives += bool(near > 0.1)
         whole = torch.cat([balls.blurs, -balls.blurs])
@@ -165,11 +165,11 @@ def test_one_map_alone_is_learnt_as_it_is_in_the_file(tmp_path):
     grey = (255 * random_texture("dots", 4, 128)).round().to(torch.uint8)
     cv2.imwrite(str(path), grey.numpy())
     own = SETTINGS.model_copy(update={"texture": str(path), "at_once": 0})
-    balls = make_balls(own, NODES, count=5, first_seed=0)
+    balls = make_textures(own, NODES, count=5, first_seed=0)
     assert balls.textures.shape == (1, 48, 96)
     assert_close(balls.textures.mean(), grey.float().mean() / 255, atol=1e-3)
     for seed in range(6):  # never in negative: that would be another ball
-        assert torch.equal(draw_lesson(balls, own, generator_of(seed), **SHAPE).blurs[0], balls.blurs[0])
+        assert torch.equal(draw_batch(balls, own, generator_of(seed), SHAPE).blurs[0], balls.blurs[0])
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,10 @@ from learn_examples import TINY, state_of, tiny, untrained
 
 from sphereorient.errors import CheckpointError, SettingsError
 from sphereorient.learn.checkpoint import Checkpoint, correlator_of, load_checkpoint, save_checkpoint, texture_sha256
-from sphereorient.learn.judge import Answers, fitted_temperature, judge
+from sphereorient.learn.metrics import Predictions, fitted_temperature, metrics_of
 from sphereorient.learn.module import ProposerModule
 from sphereorient.learn.settings import ProposerSettings
-from sphereorient.learn.train import Trained, train
+from sphereorient.learn.train import Trained, train_proposer
 from sphereorient.sphere import load_texture
 from sphereorient.synth import random_texture
 
@@ -37,13 +37,13 @@ def rows_of(folder: Path) -> list[dict[str, float]]:
 def trained(tmp_path_factory) -> tuple[Trained, Path]:
     """A hundred steps: eight seconds on one slow core. It gets better all the time, so the patience is not tried."""
     folder = tmp_path_factory.mktemp("trained") / "proposer"
-    return train(tiny(patience=1), folder), folder
+    return train_proposer(tiny(patience=1), folder), folder
 
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory) -> tuple[Trained, Path]:
     folder = tmp_path_factory.mktemp("short")
-    return train(tiny(**SHORT), folder), folder
+    return train_proposer(tiny(**SHORT), folder), folder
 
 
 def test_training_finds_what_the_untrained_network_does_not(trained):
@@ -54,7 +54,7 @@ def test_training_finds_what_the_untrained_network_does_not(trained):
     assert rows[-1]["validation_recall_5"] > 0.7
     assert rows[-1]["validation_nll"] < rows[0]["validation_nll"] - 3
     assert rows[-1]["train_nll"] < rows[1]["train_nll"] - 2
-    assert trained[0].judged.recall_1 > 0.6
+    assert trained[0].metrics.recall_1 > 0.6
 
 
 def test_the_checkpoint_is_the_best_of_the_validations_and_says_what_it_is(trained):
@@ -80,11 +80,11 @@ def test_the_log_has_a_row_an_epoch(trained):
 
 def test_the_same_seed_gives_the_same_weights_and_another_does_not(short, tmp_path):
     torch.manual_seed(99)  # what was drawn before does not matter
-    again = train(tiny(**SHORT), tmp_path / "again")
+    again = train_proposer(tiny(**SHORT), tmp_path / "again")
     assert same(again.checkpoint, short[0].checkpoint)
     assert again.rows == short[0].rows
     assert (tmp_path / "again" / "proposer.ckpt").stat().st_size == (short[1] / "proposer.ckpt").stat().st_size
-    other = train(tiny(**SHORT, seed=1), tmp_path / "other")
+    other = train_proposer(tiny(**SHORT, seed=1), tmp_path / "other")
     assert not same(other.checkpoint, short[0].checkpoint)
 
 
@@ -100,14 +100,14 @@ def test_what_was_cut_off_goes_on_to_the_same_weights(short, tmp_path, cut):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(tiny(**SHORT), tmp_path, advance=interrupt)
+        train_proposer(tiny(**SHORT), tmp_path, progress=interrupt)
     assert not (tmp_path / "proposer.ckpt").exists()
     steps: list[int] = []
-    resumed = train(
+    resumed = train_proposer(
         tiny(**SHORT),
         tmp_path,
         resume=True,
-        advance=lambda stage, done, total: steps.append(done) if stage == "train" else None,
+        progress=lambda stage, done, total: steps.append(done) if stage == "train" else None,
     )
     assert steps[0] == cut - (cut - 1) % 4  # the epoch that was cut off begins again
     assert same(resumed.checkpoint, short[0].checkpoint)
@@ -119,15 +119,15 @@ def test_what_was_cut_off_goes_on_to_the_same_weights(short, tmp_path, cut):
 @pytest.mark.slow
 def test_a_training_that_is_finished_can_be_resumed_and_stays(tmp_path):
     settings = tiny(**{**SHORT, "epochs": 2})
-    first = train(settings, tmp_path)
-    assert same(train(settings, tmp_path, resume=True).checkpoint, first.checkpoint)
+    first = train_proposer(settings, tmp_path)
+    assert same(train_proposer(settings, tmp_path, resume=True).checkpoint, first.checkpoint)
 
 
 def test_it_goes_on_with_the_same_settings_only_but_may_be_longer(short, tmp_path):
     (tmp_path / "last.ckpt").write_bytes((short[1] / "last.ckpt").read_bytes())
     with pytest.raises(CheckpointError, match="same settings"):
-        train(tiny(**SHORT, learning_rate=1e-3), tmp_path, resume=True)
-    assert train(tiny(**{**SHORT, "epochs": 4}), tmp_path, resume=True).rows[-1]["step"] == 16
+        train_proposer(tiny(**SHORT, learning_rate=1e-3), tmp_path, resume=True)
+    assert train_proposer(tiny(**{**SHORT, "epochs": 4}), tmp_path, resume=True).rows[-1]["step"] == 16
 
 
 class Writer:
@@ -152,7 +152,7 @@ def test_what_is_no_file_to_go_on_from_is_refused_and_nothing_executed(short, tm
     elif kind == "of ours":
         last.write_bytes((short[1] / "proposer.ckpt").read_bytes())
     with pytest.raises(CheckpointError) as caught:
-        train(tiny(**SHORT), tmp_path, resume=True)
+        train_proposer(tiny(**SHORT), tmp_path, resume=True)
     assert "\n" not in str(caught.value)
     assert not mark.exists()
 
@@ -160,7 +160,9 @@ def test_what_is_no_file_to_go_on_from_is_refused_and_nothing_executed(short, tm
 def test_a_checkpoint_to_begin_with_gives_its_weights(short, tmp_path):
     """A learning rate of nearly nothing: the weights stay, whatever the seed."""
     start = str(short[1] / "proposer.ckpt")
-    tuned = train(tiny(epochs=1, steps=1, learning_rate=1e-12, weight_decay=0.0, seed=5, start=start), tmp_path)
+    tuned = train_proposer(
+        tiny(epochs=1, steps=1, learning_rate=1e-12, weight_decay=0.0, seed=5, start=start), tmp_path
+    )
     for name, tensor in short[0].checkpoint.state.items():
         assert (tuned.checkpoint.state[name] - tensor).abs().max() < 1e-6
 
@@ -168,7 +170,7 @@ def test_a_checkpoint_to_begin_with_gives_its_weights(short, tmp_path):
 def test_a_checkpoint_of_another_network_cannot_be_begun_with(short, tmp_path):
     tree = {**TINY, "network": {**TINY["network"], "width": 12}, "training": {"start": str(short[1] / "proposer.ckpt")}}
     with pytest.raises(CheckpointError, match="other network settings"):
-        train(ProposerSettings.model_validate(tree), tmp_path / "out")
+        train_proposer(ProposerSettings.model_validate(tree), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -177,13 +179,13 @@ def test_fine_tuning_on_one_map_binds_the_checkpoint_to_it(short, tmp_path):
     cv2.imwrite(str(path), (255 * random_texture("dots", 4, 128)).round().numpy().astype(np.uint8))
     tree = tiny(epochs=1, steps=2, start=str(short[1] / "proposer.ckpt")).model_dump()
     tree["pictures"]["texture"] = str(path)
-    tuned = train(ProposerSettings.model_validate(tree), tmp_path / "tuned").checkpoint
+    tuned = train_proposer(ProposerSettings.model_validate(tree), tmp_path / "tuned").checkpoint
     assert tuned.texture_sha256 == texture_sha256(load_texture(path))
 
 
 def test_training_ends_when_its_time_is_over(tmp_path):
     """Even before an epoch is done, with a checkpoint."""
-    result = train(tiny(epochs=100, steps=1000, minutes=0.02), tmp_path)
+    result = train_proposer(tiny(epochs=100, steps=1000, minutes=0.02), tmp_path)
     assert 0 < result.rows[-1]["step"] < 500
     assert result.rows[-1]["learning_rate"] < 1e-4  # fallen with the time, not with the steps
     assert (tmp_path / "proposer.ckpt").exists()
@@ -191,14 +193,14 @@ def test_training_ends_when_its_time_is_over(tmp_path):
 
 def test_training_ends_when_validations_get_no_better(tmp_path):
     """Weights that hardly move: the second validation is not better by more than nothing, nor the third."""
-    result = train(tiny(epochs=30, steps=1, learning_rate=1e-15, patience=2), tmp_path)
+    result = train_proposer(tiny(epochs=30, steps=1, learning_rate=1e-15, patience=2), tmp_path)
     assert result.rows[-1]["epoch"] <= 6
 
 
 def test_weights_that_got_worse_are_not_kept(trained, tmp_path):
     """A learning rate that throws away what was learnt: the best are those of the beginning."""
     start = trained[1] / "proposer.ckpt"
-    result = train(tiny(epochs=1, steps=3, learning_rate=0.5, start=str(start)), tmp_path)
+    result = train_proposer(tiny(epochs=1, steps=3, learning_rate=0.5, start=str(start)), tmp_path)
     assert result.rows[-1]["validation_nll"] > result.rows[0]["validation_nll"] + 0.1
     assert result.checkpoint.about["best_step"] == 0
     assert same(result.checkpoint, load_checkpoint(start))
@@ -208,7 +210,7 @@ def test_a_training_that_explodes_is_refused_in_one_line(tmp_path):
     start = {**state_of(untrained()), "gain": torch.tensor(300.0)}  # exp of it is infinite
     save_checkpoint(tmp_path / "start.ckpt", Checkpoint(settings=tiny(), state=start))
     with pytest.raises(SettingsError, match="learning_rate") as caught:
-        train(tiny(**SHORT, start=str(tmp_path / "start.ckpt")), tmp_path / "out")
+        train_proposer(tiny(**SHORT, start=str(tmp_path / "start.ckpt")), tmp_path / "out")
     assert "\n" not in str(caught.value)
 
 
@@ -230,10 +232,10 @@ def test_a_temperature_that_was_planted_is_found(rng):
     grid = untrained().grid
     logits = 14.0 * torch.nn.functional.normalize(torch.randn(200, 9, generator=rng), dim=1) @ grid.flatten(1).T
     truth = grid[torch.multinomial(logits.softmax(1), 1, generator=rng)[:, 0]]
-    full, half = (Answers(logits=factor * logits, R_view_body=truth) for factor in (1.0, 0.5))
+    full, half = (Predictions(logits=factor * logits, R_view_body=truth) for factor in (1.0, 0.5))
     temperatures = [fitted_temperature(answers, grid) for answers in (full, half)]
     assert 1.6 < temperatures[0] / temperatures[1] < 2.5
-    plain, fitted = (judge(half, grid, math.radians(8), temperature) for temperature in (0.25, temperatures[1]))
+    plain, fitted = (metrics_of(half, grid, math.radians(8), temperature) for temperature in (0.25, temperatures[1]))
     assert fitted.ece < 0.08
     assert fitted.ece < 0.5 * plain.ece
 
@@ -245,7 +247,7 @@ def test_judging_counts_right_and_wrong(rng):
     logits[torch.arange(40), k] = 0.0
     R = grid[k].clone()
     R[:10] = R[:10] @ torch.diag(torch.tensor([1.0, -1.0, -1.0]))  # ten are half a turn away
-    found = judge(Answers(logits=logits, R_view_body=R), grid, math.radians(8))
+    found = metrics_of(Predictions(logits=logits, R_view_body=R), grid, math.radians(8))
     assert (found.pictures, found.recall_1, found.recall_5) == (40, 0.75, 0.75)
     assert found.probability == pytest.approx(1.0, abs=1e-6)
     assert found.ece == pytest.approx(0.25, abs=1e-6)
@@ -253,11 +255,13 @@ def test_judging_counts_right_and_wrong(rng):
 
 def test_the_network_of_the_checkpoint_is_as_good_as_the_log_says(trained):
     """Loaded anew, on the same validation pictures."""
-    from sphereorient.learn.data import LessonData
-    from sphereorient.learn.judge import answers_of
+    from sphereorient.learn.metrics import predict_all
+    from sphereorient.learn.module import TrainingData
 
     loaded = load_checkpoint(trained[1] / "proposer.ckpt")
     network = correlator_of(loaded)
-    found = judge(answers_of(network, LessonData(tiny()).validation), network.grid, math.radians(8), loaded.temperature)
+    found = metrics_of(
+        predict_all(network, TrainingData(tiny()).validation), network.grid, math.radians(8), loaded.temperature
+    )
     assert found.recall_1 == pytest.approx(loaded.about["validation_recall_1"])
     assert found.ece == pytest.approx(loaded.about["validation_ece"], abs=1e-6)

@@ -17,16 +17,14 @@ from hypothesis import strategies as st
 from sphereorient.cameras import PinholeCamera, Port, PortCamera, triangulate
 from sphereorient.cameras.telecentric import TelecentricCamera
 from sphereorient.experiment.stream import pictures_of
-from sphereorient.follow.follower import sample_frames
 from sphereorient.locate import Background
 from sphereorient.locate.outline import Outline
 from sphereorient.preflight import Finding, Severity
-from sphereorient.preflight.diameter import expected_outline_px
-from sphereorient.preflight.exposure import limb_blur_px
+from sphereorient.preflight.cameras import expected_outline_px, gaps_between
 from sphereorient.preflight.finding import worst
-from sphereorient.preflight.gap import gaps_between
-from sphereorient.preflight.look import pair_starts
-from sphereorient.preflight.offset import REACH, Steps, gap_by_offset, started
+from sphereorient.preflight.movies import limb_blur_px
+from sphereorient.preflight.offset import REACH, OffsetScan, scan_offsets, starts_in_step
+from sphereorient.preflight.sample import frames_to_sample, pair_starts
 
 
 def f64(value: object) -> torch.Tensor:
@@ -89,14 +87,14 @@ def places(count: int, moving: float = 0.8) -> torch.Tensor:
     return torch.stack([8 * torch.sin(moving * t / 8), 5 * torch.cos(t / 11), 4 * torch.sin(t / 9)], dim=-1)
 
 
-def steps_of(late: int, knock_px: float = 0.0, moving: float = 0.8) -> Steps:
-    """Steps of two stretches, the second movie `late` frames behind and the first camera knocked."""
+def steps_of(late: int, knock_px: float = 0.0, moving: float = 0.8) -> OffsetScan:
+    """OffsetScan of two stretches, the second movie `late` frames behind and the first camera knocked."""
     path = places(80, moving)
     stretches = []
     for begin in (10, 40):
         here = ALONG_Y.project(path[begin : begin + 20]) + f64([knock_px, 0.0])
         stretches.append((here, DOWN_Z.project(path[begin - late : begin - late + 20])))
-    return gap_by_offset(("one", "two"), (ALONG_Y, DOWN_Z), stretches)
+    return scan_offsets(("one", "two"), (ALONG_Y, DOWN_Z), stretches)
 
 
 @pytest.mark.parametrize("late", range(-7, 8))
@@ -121,8 +119,8 @@ def test_a_ball_that_hardly_moves_tells_nothing():
 @given(st.integers(0, 30), st.integers(0, 30), st.integers(-REACH, REACH))
 def test_the_start_advised_shifts_by_the_offset_and_is_never_negative(first, second, shift):
     zero = torch.zeros(2 * REACH + 1)
-    steps = Steps(offset=zero, gap_px=zero, varying_px=zero, moved_px=1.0, best=float(shift), names=("a", "b"))
-    new_first, new_second = started({"a": first, "b": second}, steps)
+    steps = OffsetScan(offset=zero, gap_px=zero, varying_px=zero, moved_px=1.0, best=float(shift), names=("a", "b"))
+    new_first, new_second = starts_in_step({"a": first, "b": second}, steps)
     assert new_second - new_first == second - first + shift
     assert min(new_first, new_second) >= 0
     assert new_first == first or new_second == 0  # no frame more is lost than must be
@@ -146,7 +144,7 @@ def test_the_blur_of_the_limb_is_that_of_the_lens(blur_px):
 
 @given(st.integers(0, 5000))
 def test_the_frames_looked_at_are_few_in_order_and_have_their_neighbours(count):
-    frames = sample_frames(count)
+    frames = frames_to_sample(count)
     assert frames == sorted(set(frames))
     assert len(frames) <= 40
     assert all(0 <= k < count for k in frames)

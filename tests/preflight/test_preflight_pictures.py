@@ -72,7 +72,7 @@ def test_one_camera_is_checked_alone(clean, tmp_path):
     one = replace(clean, pictures={"cam1": clean.pictures["cam1"]})
     result = checked(one, tmp_path, backgrounds={"cam1": "empty_cam1.png"})
     assert {one.title for one in result.findings if one.severity is not OK} == {"paint"}  # no map
-    assert result.steps is None
+    assert result.scan is None
 
 
 def test_a_ball_of_unknown_size_is_measured_and_the_setting_named(clean, tmp_path):

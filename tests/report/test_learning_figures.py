@@ -6,7 +6,7 @@ import pytest
 import torch
 from matplotlib.colors import to_hex
 
-from sphereorient.learn.examples import Example
+from sphereorient.learn.benchmark import Example
 from sphereorient.report.learning import RIGHT, WRONG, examples_figure, learning_curve_figure, write_png
 
 ROWS = [

@@ -1,9 +1,9 @@
-"""All outcomes of a run in one JSON, and by degradation and level."""
+"""Results of the benchmark: of a scene, summed up by degradation and level, and compared between two runs."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -12,100 +12,150 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import BenchError, refusal
-from sphereorient.evaluate.robustness.measure import FIRST, Outcome
-from sphereorient.evaluate.robustness.settings import BenchSettings
+from sphereorient.evaluate.robustness.scenes import BenchSettings
 from sphereorient.files.outputs import put_aside
 
 SCHEMA = "sphereorient-robustness/1"
+WRONG_DEG = 10.0
+FIRST = (1, 3, 10)  # numbers of candidates for the recall
+SIGMAS = 3.0  # a smaller difference, in its own standard deviations, is no change
+LEAST_RATIO = 1.1  # of the median errors; less is no change
+LEAST_FRAMES = 0.02  # of wrong or lost frames; less is no change
+BLOCK = 4  # frames: errors of neighbours are correlated
+DRAWS, SEED = 400, 2011
+SAME_PLAN = ("frames", "at_once", "degradations")  # settings that make scenes of one name equal
 Floats = NDArray[np.float64]
+Key = tuple[str, int, str]  # kind, level, method
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneResult:
+    """One method on one scene; made by `track_scene`, kept as JSON. None: not measured."""
+
+    scene: str
+    kind: str
+    level: int
+    seed: int
+    degradations: Mapping[str, int]
+    method: str
+    refused: str  # the message, if the method gave no track
+    frames: int
+    orientation_deg: tuple[float | None, ...]  # error after assembly, frame by frame
+    position_mm: tuple[float | None, ...]
+    confidence: tuple[float | None, ...]  # of the chosen orientation
+    looks: int  # cameras times frames
+    looks_wrong: int  # of these, without a best candidate within 10 degrees of the truth
+    recall: Mapping[str, float]  # share of the looks with the right orientation among the first K candidates, by K
+    stated: int  # frames with a covariance of the orientation
+    inside: int  # of these, with the truth inside the 95 % region
+    seconds: float
+
+    @property
+    def key(self) -> Key:
+        """Kind, level and method."""
+        return self.kind, self.level, self.method
+
+    @property
+    def errors_deg(self) -> Floats:
+        """(frames,), NaN: no orientation."""
+        return np.array([np.nan if x is None else x for x in self.orientation_deg], np.float64)
+
+    @property
+    def wrong(self) -> int:
+        """Frames with an error of more than 10 degrees after assembly."""
+        return int((np.nan_to_num(self.errors_deg) > WRONG_DEG).sum())
+
+    @property
+    def lost(self) -> int:
+        """Frames without an orientation."""
+        return int(np.isnan(self.errors_deg).sum())
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> SceneResult:
+        """Return the result of which a JSON file holds `asdict`."""
+        values: dict[str, Any] = {entry.name: tree[entry.name] for entry in fields(cls)}
+        return cls(**values | {name: tuple(value) for name, value in values.items() if isinstance(value, list)})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Results:
-    """Outcomes of all scenes and methods; made by `run_benchmark`, read by table, figure and `compare`."""
+    """All scenes and methods of a run; made by `run_benchmark`, read by table, figure and `compare_runs`."""
 
     settings: BenchSettings
     versions: Mapping[str, str]
-    outcomes: Sequence[Outcome]
-
-    def groups(self) -> dict[tuple[str, int, str], list[Outcome]]:
-        """Return the outcomes by kind, level and method, in the order of the scenes."""
-        found: dict[tuple[str, int, str], list[Outcome]] = {}
-        for one in self.outcomes:
-            found.setdefault((one.kind, one.level, one.method), []).append(one)
-        return found
+    outcomes: Sequence[SceneResult]
 
     @property
     def methods(self) -> list[str]:
-        """Names, in the order in which they came."""
+        """Names, in the order of the run."""
         return list(dict.fromkeys(one.method for one in self.outcomes))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Line:
-    """All scenes of one kind and level, one method; made by `lines_of`, a row of the table."""
+class ResultSummary:
+    """All scenes of one kind and level, one method; made by `summarised`, a row of the table."""
 
     kind: str
     level: int
     method: str
     scenes: int
     frames: int
-    p50_deg: float  # of the frames with an orientation; NaN where there is none
+    p50_deg: float  # of the frames with an orientation; NaN: none
     p95_deg: float
     largest_deg: float
     p50_mm: float
-    wrong_before: float  # share of the looks whose best candidate is off by more than 10 degrees
+    wrong_before: float  # share of the looks without a best candidate within 10 degrees of the truth
     wrong_after: float  # share of the frames
     lost: float  # share of the frames without an orientation
     recall: Mapping[str, float]
-    inside: float  # share of the truths within the stated 95 % region; NaN where nothing is stated
+    inside: float  # share of the truths within the stated 95 % region; NaN: no region stated
     frames_per_s: float
-    refused: str  # what the method said of a scene that it refused
+    refused: str  # message of the first scene that the method refused
 
 
-def lines_of(results: Results) -> Iterator[Line]:
-    """Yield the rows of the table."""
-    for (kind, level, method), outcomes in results.groups().items():
-        yield line_of(kind, level, method, outcomes)
+def summaries(results: Results) -> list[ResultSummary]:
+    """Return the rows of the table, in the order of the scenes."""
+    groups: dict[Key, list[SceneResult]] = {}
+    for one in results.outcomes:
+        groups.setdefault(one.key, []).append(one)
+    return [summarised(group) for group in groups.values()]
 
 
-def line_of(kind: str, level: int, method: str, outcomes: Sequence[Outcome]) -> Line:
-    """Put the scenes of one kind and level together."""
-    errors = np.concatenate([one.errors_deg for one in outcomes])
-    metres = np.array([x for one in outcomes for x in one.position_mm if x is not None])
-    frames = sum(one.frames for one in outcomes)
-    looks, stated = sum(one.looks for one in outcomes), sum(one.stated for one in outcomes)
+def summarised(group: Sequence[SceneResult]) -> ResultSummary:
+    """Sum up the scenes of one kind, level and method."""
+    errors = np.concatenate([one.errors_deg for one in group])
+    distances_mm = np.array([x for one in group for x in one.position_mm if x is not None])
+    frames, looks, stated = (sum(getattr(one, key) for one in group) for key in ("frames", "looks", "stated"))
     seen = errors[np.isfinite(errors)]
     p50, p95, largest = np.percentile(seen, (50, 95, 100)) if len(seen) else (np.nan,) * 3
-    return Line(
+    kind, level, method = group[0].key
+    return ResultSummary(
         kind=kind,
         level=level,
         method=method,
-        scenes=len(outcomes),
+        scenes=len(group),
         frames=frames,
         p50_deg=float(p50),
         p95_deg=float(p95),
         largest_deg=float(largest),
-        p50_mm=float(np.median(metres)) if len(metres) else float("nan"),
-        wrong_before=sum(one.looks_wrong for one in outcomes) / max(looks, 1),
-        wrong_after=sum(one.wrong for one in outcomes) / max(frames, 1),
-        lost=sum(one.lost for one in outcomes) / max(frames, 1),
-        recall={
-            str(first): sum(one.recall[str(first)] * one.looks for one in outcomes) / max(looks, 1) for first in FIRST
-        },
-        inside=sum(one.inside for one in outcomes) / stated if stated else float("nan"),
-        frames_per_s=frames / max(sum(one.seconds for one in outcomes), 1e-9),
-        refused=next((one.refused for one in outcomes if one.refused), ""),
+        p50_mm=float(np.median(distances_mm)) if len(distances_mm) else float("nan"),
+        wrong_before=sum(one.looks_wrong for one in group) / max(looks, 1),
+        wrong_after=sum(one.wrong for one in group) / max(frames, 1),
+        lost=sum(one.lost for one in group) / max(frames, 1),
+        recall={str(k): sum(one.recall[str(k)] * one.looks for one in group) / max(looks, 1) for k in FIRST},
+        inside=sum(one.inside for one in group) / stated if stated else float("nan"),
+        frames_per_s=frames / max(sum(one.seconds for one in group), 1e-9),
+        refused=next((one.refused for one in group if one.refused), ""),
     )
 
 
 def save_results(results: Results, path: Path) -> None:
-    """Write results as JSON, aside first."""
+    """Write results as JSON, whole or not at all."""
     tree = {
         "schema": SCHEMA,
         "settings": results.settings.model_dump(),
         "versions": dict(results.versions),
-        "outcomes": [as_tree(one) for one in results.outcomes],
+        "outcomes": [asdict(one) for one in results.outcomes],
     }
     with put_aside(path) as aside:
         aside.write_text(json.dumps(tree, separators=(",", ":")) + "\n", "utf-8")
@@ -115,7 +165,7 @@ def load_results(path: Path) -> Results:
     """Read results of `save_results`.
 
     Raises:
-        BenchError: no such file, not JSON, or of another version.
+        BenchError: the file is missing, not JSON, or of another version.
     """
     do = "pass a results.json of `sphereorient bench robustness`"
     try:
@@ -128,20 +178,87 @@ def load_results(path: Path) -> Results:
         do = "run the benchmark again with this version"
         raise BenchError(refusal(f"{path}: schema", expected=SCHEMA, got=str(schema)[:60], do=do))
     try:
-        outcomes = [from_tree(one) for one in tree["outcomes"]]
+        outcomes = [SceneResult.from_tree(one) for one in tree["outcomes"]]
         return Results(settings=BenchSettings(**tree["settings"]), versions=tree["versions"], outcomes=outcomes)
     except (KeyError, TypeError, ValueError) as error:
         got = " ".join(str(error).split())[:120]
         raise BenchError(refusal(str(path), expected="whole results", got=f"'{got}'", do=do)) from None
 
 
-def as_tree(outcome: Outcome) -> dict[str, Any]:
-    """Return an outcome as JSON takes it."""
-    return asdict(outcome)
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """One number of one kind, level and method in two runs; made by `compare_runs`."""
+
+    kind: str
+    level: int
+    method: str
+    what: str  # "median error, degrees", "wrong frames", "lost frames"
+    before: float
+    now: float
+    scatter: float  # standard deviation of the difference; of medians: of the logarithm of their ratio
+
+    @property
+    def worse(self) -> bool:
+        """Whether the number grew significantly."""
+        return self._significant() > 0
+
+    @property
+    def better(self) -> bool:
+        """Whether the number fell significantly."""
+        return self._significant() < 0
+
+    def _significant(self) -> float:
+        """Return the difference, 0 if it is not significant."""
+        relative = self.what.startswith("median")
+        size = float(np.log(self.now / self.before)) if relative else self.now - self.before
+        least = np.log(LEAST_RATIO) if relative else LEAST_FRAMES
+        return size if abs(size) > max(least, SIGMAS * self.scatter) else 0.0
 
 
-def from_tree(tree: Mapping[str, Any]) -> Outcome:
-    """Return an outcome of `as_tree`."""
-    lists = ("orientation_deg", "position_mm", "confidence")
-    known = {entry.name: tree[entry.name] for entry in fields(Outcome)}
-    return Outcome(**(known | {name: tuple(known[name]) for name in lists}))
+def compare_runs(now: Results, baseline: Results) -> list[Change]:
+    """Compare the scenes and methods that two runs have in common.
+
+    Raises:
+        BenchError: the runs have no scene in common.
+    """
+    same = all(getattr(now.settings, key) == getattr(baseline.settings, key) for key in SAME_PLAN)
+    known = {(one.scene, one.method): one for one in baseline.outcomes if same}
+    groups: dict[Key, list[tuple[SceneResult, SceneResult]]] = {}
+    for one in now.outcomes:
+        if (before := known.get((one.scene, one.method))) is not None and before.frames == one.frames:
+            groups.setdefault(one.key, []).append((before, one))
+    if not groups:
+        do = "run the benchmark with the baseline's settings"
+        raise BenchError(refusal("baseline", expected="scenes of the same plan", got="none in common", do=do))
+    return [change for key, pairs in groups.items() for change in _changes(key, pairs)]
+
+
+def _changes(key: Key, pairs: Sequence[tuple[SceneResult, SceneResult]]) -> list[Change]:
+    errors = [np.concatenate([pair[k].errors_deg for pair in pairs]) for k in (0, 1)]
+    numbers = []
+    p50 = [float(np.nanmedian(x)) if np.isfinite(x).any() else np.nan for x in errors]
+    if np.isfinite(p50).all() and min(p50) > 0:
+        numbers.append(("median error, degrees", p50, _log_scatter(*errors)))
+    frames = len(errors[1])
+    for what, count in (("wrong frames", "wrong"), ("lost frames", "lost")):
+        shares = [sum(getattr(pair[k], count) for pair in pairs) / frames for k in (0, 1)]
+        numbers.append((what, shares, float(np.sqrt(sum(p * (1 - p) for p in shares) * BLOCK / frames))))
+    kind, level, method = key
+    return [
+        Change(kind=kind, level=level, method=method, what=what, before=before, now=now, scatter=scatter)
+        for what, (before, now), scatter in numbers
+    ]
+
+
+def _log_scatter(before: Floats, now: Floats) -> float:
+    """Return the standard deviation of ln(median now / median before), from resampled blocks of frames."""
+    rng = np.random.default_rng(SEED)
+    count = (len(now) - 1) // BLOCK + 1
+    ratios = []
+    for _ in range(DRAWS):
+        drawn = rng.integers(0, count, count)
+        rows = (drawn[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+        a, b = (x[rows[rows < len(now)]] for x in (before, now))
+        if np.isfinite(a).any() and np.isfinite(b).any():
+            ratios.append(np.log(np.nanmedian(b) / np.nanmedian(a)))
+    return float(np.std(ratios)) if len(ratios) > 1 else np.inf

@@ -1,173 +1,48 @@
-"""Runs the benchmark: scene by scene, each kept, so that a run that was cut off goes on."""
+"""The run of the benchmark: each scene is rendered, tracked by all methods and measured; finished scenes are kept."""
 
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from sphereorient import so3
 from sphereorient.errors import BenchError, OutputError, SphereOrientError, refusal
-from sphereorient.evaluate.robustness.measure import Outcome, measure, no_track
-from sphereorient.evaluate.robustness.results import SCHEMA, Results, as_tree, from_tree, save_results
-from sphereorient.evaluate.robustness.scenes import Scene, scenes_of, write_scene
-from sphereorient.evaluate.robustness.settings import BenchSettings
+from sphereorient.evaluate.robustness.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
+from sphereorient.evaluate.robustness.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
+from sphereorient.evaluate.score import score_track, true_orientations
 from sphereorient.files.outputs import put_aside
 from sphereorient.files.provenance import versions
 from sphereorient.methods.settings import Settings
-from sphereorient.trajectory import Trajectory
+from sphereorient.run.stages import track_movies
+from sphereorient.trajectory import CameraTrack, Trajectory
 
-Tracker = Callable[[Path], Trajectory]  # experiment.yaml to a track; must go through pickle
+Tracker = Callable[[Path], Trajectory]  # experiment.yaml to a track; can be pickled
 Progress = Callable[[int, int], None]
 PLAN, RESULTS, KEPT = "plan.json", "results.json", "scenes"
-
-
-def precise(experiment: Path) -> Trajectory:
-    """Track with `--method precise`."""
-    from sphereorient.run.stages import track_movies
-
-    return track_movies(experiment, method="precise", settings=Settings())
-
-
-def paper(experiment: Path) -> Trajectory:
-    """Track with `--method paper`."""
-    from sphereorient.run.stages import track_movies
-
-    return track_movies(experiment, method="paper", settings=Settings())
-
-
-def precise_network(experiment: Path) -> Trajectory:
-    """Track with `--method precise --proposer default`."""
-    from sphereorient.run.stages import track_movies
-
-    return track_movies(experiment, method="precise", settings=Settings(), proposer="default")
-
-
-TRACKERS: dict[str, Tracker] = {"precise": precise, "paper": paper, "precise_network": precise_network}
-USUAL = ("precise", "paper")  # those of a run that does not name them
-
-
-def run_benchmark(
-    folder: Path,
-    settings: BenchSettings,
-    trackers: dict[str, Tracker] | None = None,
-    *,
-    jobs: int = 1,
-    progress: Progress = lambda done, total: None,
-) -> Results:
-    """Render all scenes, track each with all methods, measure; what an earlier run of the same plan did is kept.
-
-    Args:
-        folder: of the run; made where it is missing. Its results.json holds everything at the end.
-        settings: which scenes.
-        trackers: by the method's name, see `TRACKERS`; None: paper and precise. Another proposer comes in here.
-        jobs: processes, one scene each.
-        progress: called with scenes done and all scenes.
-
-    Returns:
-        The results.
-
-    Raises:
-        OutputError: the folder holds another run, or cannot be written.
-    """
-    chosen = trackers_of(USUAL) if trackers is None else trackers
-    _prepare(folder, settings)
-    scenes = scenes_of(settings)
-    missing = [scene for scene in scenes if _missing(folder, scene, chosen)]
-    progress(len(scenes) - len(missing), len(scenes))
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, _one_thread) as pool:
-        tasks = [pool.submit(run_scene, folder, scene, _missing(folder, scene, chosen)) for scene in missing]
-        try:
-            for done, task in enumerate(as_completed(tasks), start=len(scenes) - len(missing) + 1):
-                task.result()
-                progress(done, len(scenes))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    outcomes = [_kept(_place(folder, scene, name)) for scene in scenes for name in chosen]
-    results = Results(settings=settings, versions=versions(), outcomes=outcomes)
-    save_results(results, folder / RESULTS)
-    return results
-
-
-def _one_thread() -> None:
-    """Keep a worker to one core: as many workers as cores are running."""
-    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-    import torch
-
-    torch.set_num_threads(1)
-
-
-def _prepare(folder: Path, settings: BenchSettings) -> None:
-    """Make the folder, or refuse one that holds something else."""
-    plan: dict[str, Any] = {"schema": SCHEMA, "settings": settings.model_dump(mode="json")}
-    path = folder / PLAN
-    do = "choose a new --out, or the same settings to go on"
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(refusal(f"--out {folder}", expected="a folder", got="a file", do=do))
-    try:
-        (folder / KEPT).mkdir(parents=True, exist_ok=True)
-        known = json.loads(path.read_text("utf-8")) if path.exists() else None
-    except (OSError, ValueError) as error:
-        got = f"'{' '.join(str(error).split())[:120]}'"
-        raise OutputError(refusal(f"--out {folder}", expected="a folder to write to", got=got, do=do)) from None
-    if known is not None and known != plan:
-        raise OutputError(refusal(f"--out {folder}", expected="a run of this plan", got="another run's", do=do))
-    if known is None:
-        with put_aside(path) as aside:
-            aside.write_text(json.dumps(plan, indent=1) + "\n", "utf-8")
-
-
-def _place(folder: Path, scene: Scene, method: str) -> Path:
-    return folder / KEPT / f"{scene.name}.{method}.json"
-
-
-def _missing(folder: Path, scene: Scene, trackers: dict[str, Tracker]) -> dict[str, Tracker]:
-    return {name: tracker for name, tracker in trackers.items() if not _place(folder, scene, name).exists()}
-
-
-def _kept(path: Path) -> Outcome:
-    try:
-        return from_tree(json.loads(path.read_text("utf-8")))
-    except (OSError, ValueError, KeyError, TypeError):
-        do = "delete the file and run again"
-        raise BenchError(refusal(str(path), expected="a kept outcome", got="something else", do=do)) from None
-
-
-def run_scene(folder: Path, scene: Scene, trackers: dict[str, Tracker]) -> None:
-    """Render a scene, track it, keep the outcomes; the movies are not kept."""
-    with tempfile.TemporaryDirectory(prefix="scene") as place:
-        experiment = write_scene(Path(place), scene)
-        for name, tracker in trackers.items():
-            outcome = track_scene(experiment, scene, name, tracker)
-            with put_aside(_place(folder, scene, name)) as aside:
-                aside.write_text(json.dumps(as_tree(outcome), separators=(",", ":")), "utf-8")
-
-
-def track_scene(experiment: Path, scene: Scene, method: str, tracker: Tracker) -> Outcome:
-    """Track a scene and measure; what the method refuses is an outcome, too."""
-    begin = time.perf_counter()
-    try:
-        track = tracker(experiment)
-    except SphereOrientError as error:
-        numbers = no_track(scene.frames, " ".join(str(error).split()), time.perf_counter() - begin)
-    else:
-        numbers = measure(track, experiment.parent / "truth.h5", time.perf_counter() - begin)
-    about: dict[str, Any] = {
-        "scene": scene.name,
-        "kind": scene.kind,
-        "level": scene.level,
-        "seed": scene.seed,
-        "degradations": dict(scene.degradations),
-        "method": method,
-    }
-    return Outcome(**about, **numbers)
+INSIDE = 0.95  # probability of the stated region
+DIGITS = 5
+Floats = NDArray[np.float64]
+TRACKERS: dict[str, Tracker] = {
+    "precise": partial(track_movies, method="precise", settings=Settings()),
+    "paper": partial(track_movies, method="paper", settings=Settings()),
+    "precise_network": partial(track_movies, method="precise", settings=Settings(), proposer="default"),
+}
+DEFAULT = ("precise", "paper")
 
 
 def trackers_of(names: Sequence[str]) -> dict[str, Tracker]:
@@ -181,3 +56,177 @@ def trackers_of(names: Sequence[str]) -> dict[str, Tracker]:
             do = "choose among these"
             raise BenchError(refusal("--methods", expected=", ".join(TRACKERS), got=repr(name)[:60], do=do))
     return {name: TRACKERS[name] for name in names}
+
+
+def run_benchmark(
+    folder: Path,
+    settings: BenchSettings,
+    trackers: Mapping[str, Tracker] | None = None,
+    *,
+    jobs: int = 1,
+    progress: Progress = lambda done, total: None,
+) -> Results:
+    """Render all scenes, track each with all methods, measure; an interrupted run of the same plan is continued.
+
+    Args:
+        folder: of the run; created if missing. results.json holds everything at the end.
+        settings: the scenes.
+        trackers: by the method's name; None: precise and paper.
+        jobs: processes, one scene each.
+        progress: called with finished scenes and all scenes.
+
+    Raises:
+        OutputError: the folder holds another run, or cannot be written.
+    """
+    chosen = trackers_of(DEFAULT) if trackers is None else trackers
+    _prepare(folder, settings)
+    scenes = scenes_of(settings)
+    missing = [scene for scene in scenes if _missing(folder, scene, chosen)]
+    progress(len(scenes) - len(missing), len(scenes))
+    context = multiprocessing.get_context("spawn")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # workers inherit it, and read it when they import torch
+    with ProcessPoolExecutor(jobs, context, limit_threads) as pool:
+        tasks = [pool.submit(run_scene, folder, scene, _missing(folder, scene, chosen)) for scene in missing]
+        try:
+            for done, task in enumerate(as_completed(tasks), start=len(scenes) - len(missing) + 1):
+                task.result()
+                progress(done, len(scenes))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    outcomes = [kept_result(_path(folder, scene, name)) for scene in scenes for name in chosen]
+    results = Results(settings=settings, versions=versions(), outcomes=outcomes)
+    save_results(results, folder / RESULTS)
+    return results
+
+
+def limit_threads() -> None:
+    """Limit a worker to one thread."""
+    torch.set_num_threads(1)
+
+
+def _prepare(folder: Path, settings: BenchSettings) -> None:
+    """Create the folder; refuse one with another run."""
+    plan: dict[str, Any] = {"schema": SCHEMA, "settings": settings.model_dump(mode="json")}
+    path, name, do = folder / PLAN, f"--out {folder}", "choose a new --out, or the same settings to go on"
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(refusal(name, expected="a folder", got="a file", do=do))
+    try:
+        (folder / KEPT).mkdir(parents=True, exist_ok=True)
+        known = json.loads(path.read_text("utf-8")) if path.exists() else None
+    except (OSError, ValueError) as error:
+        got = f"'{' '.join(str(error).split())[:120]}'"
+        raise OutputError(refusal(name, expected="a folder to write to", got=got, do=do)) from None
+    if known is None:
+        with put_aside(path) as aside:
+            aside.write_text(json.dumps(plan, indent=1) + "\n", "utf-8")
+    elif known != plan:
+        raise OutputError(refusal(name, expected="a run of this plan", got="another run's", do=do))
+
+
+def _path(folder: Path, scene: BenchmarkScene, method: str) -> Path:
+    return folder / KEPT / f"{scene.name}.{method}.json"
+
+
+def _missing(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracker]) -> dict[str, Tracker]:
+    return {name: tracker for name, tracker in trackers.items() if not _path(folder, scene, name).exists()}
+
+
+def kept_result(path: Path) -> SceneResult:
+    """Read the result of a scene.
+
+    Raises:
+        BenchError: the file is damaged.
+    """
+    try:
+        return SceneResult.from_tree(json.loads(path.read_text("utf-8")))
+    except (OSError, ValueError, KeyError, TypeError):
+        do = "delete the file and run again"
+        raise BenchError(refusal(str(path), expected="the result of a scene", got="something else", do=do)) from None
+
+
+def run_scene(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracker]) -> None:
+    """Render a scene, track it, keep the results; the movies are not kept."""
+    with tempfile.TemporaryDirectory(prefix="scene") as rendered:
+        experiment = write_scene(Path(rendered), scene)
+        for name, tracker in trackers.items():
+            result = track_scene(experiment, scene, name, tracker)
+            with put_aside(_path(folder, scene, name)) as aside:
+                aside.write_text(json.dumps(asdict(result), separators=(",", ":")), "utf-8")
+
+
+def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: Tracker) -> SceneResult:
+    """Track a scene and measure the track; a refusal of the method is a result too."""
+    begin = time.perf_counter()
+    try:
+        track = tracker(experiment)
+    except SphereOrientError as error:
+        measured = no_track(scene.frames, " ".join(str(error).split()))
+        seconds = time.perf_counter() - begin
+    else:
+        seconds = time.perf_counter() - begin
+        measured = measure(track, experiment.parent / "truth.h5")
+    return SceneResult(
+        scene=scene.name,
+        kind=scene.kind,
+        level=scene.level,
+        seed=scene.seed,
+        degradations=dict(scene.degradations),
+        method=method,
+        seconds=round(seconds, 2),
+        **measured,
+    )
+
+
+def measure(track: Trajectory, truth_path: Path) -> dict[str, Any]:
+    """Return the measured fields of `SceneResult`."""
+    score = score_track(track, truth_path)
+    R_true = true_orientations(truth_path, track.time)
+    ranks = np.concatenate([_ranks(seen, R_true) for seen in track.cameras.values()] or [np.zeros(0)])
+    stated, inside = _inside(track, R_true)
+    orientation, position, confidence = (
+        tuple(round(x, DIGITS) if math.isfinite(x) else None for x in np.where(score.valid, values, np.nan).tolist())
+        for values in (score.orientation_deg, score.position_mm, track.confidence)
+    )
+    return {
+        "refused": "",
+        "frames": len(track),
+        "orientation_deg": orientation,
+        "position_mm": position,
+        "confidence": confidence,
+        "looks": len(ranks),
+        "looks_wrong": int((ranks >= 1).sum()),
+        "recall": {str(first): float((ranks < first).mean()) if len(ranks) else 0.0 for first in FIRST},
+        "stated": stated,
+        "inside": inside,
+    }
+
+
+def no_track(frames: int, message: str) -> dict[str, Any]:
+    """Return the measured fields of `SceneResult` for a scene that the method refused."""
+    unknown = dict.fromkeys(("orientation_deg", "position_mm", "confidence"), (None,) * frames)
+    counts = {"frames": frames, "looks": 2 * frames, "looks_wrong": 2 * frames, "stated": 0, "inside": 0}
+    return {"refused": message, "recall": {str(first): 0.0 for first in FIRST}, **unknown, **counts}
+
+
+def _ranks(seen: CameraTrack, R_true: Floats) -> Floats:
+    """Return the rank, 0 the best, of the right orientation among a camera's candidates, (N,); inf: not among them."""
+    counts = np.diff(seen.candidate_offset)
+    frame = np.repeat(np.arange(len(counts)), counts)
+    pair = (torch.from_numpy(seen.candidate_orientation), torch.from_numpy(R_true[frame]))
+    right = np.rad2deg(so3.geodesic_distance(*pair).numpy()) <= WRONG_DEG
+    order = np.lexsort((-np.nan_to_num(seen.candidate_score, nan=-np.inf), frame))
+    rank = np.empty(len(frame))
+    rank[order] = np.arange(len(frame)) - seen.candidate_offset[:-1][frame[order]]
+    ranks = np.full(len(counts), np.inf)
+    np.minimum.at(ranks, frame[right], rank[right])
+    return ranks
+
+
+def _inside(track: Trajectory, R_true: Floats) -> tuple[int, int]:
+    """Return the number of frames with a covariance, and of those with the truth within its 95 % region."""
+    known = track.valid & np.isfinite(track.orientation_cov).all((1, 2)) & np.isfinite(track.orientation).all((1, 2))
+    R, cov = torch.from_numpy(track.orientation[known]), track.orientation_cov[known]
+    delta = so3.log(torch.from_numpy(R_true[known]) @ R.mT).numpy()
+    square = np.einsum("ni,ni->n", delta, np.linalg.solve(cov, delta[..., None])[..., 0]) if len(delta) else np.zeros(0)
+    return int(known.sum()), int((square <= chi2.ppf(INSIDE, 3)).sum())

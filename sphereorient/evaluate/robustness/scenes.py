@@ -1,24 +1,57 @@
-"""The scenes of the benchmark: which there are, and how they are rendered."""
+"""The scenes of the benchmark: their settings, list and rendering."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from sphereorient.evaluate.robustness.settings import BenchSettings
+from sphereorient.errors import SettingsError, refusal
 from sphereorient.synth.degrade_scene import write_degraded
 from sphereorient.synth.settings import SynthSettings
+from sphereorient.synth.severities import DEGRADATIONS, LEVELS, degradation
 
 CLEAN, TOGETHER = "clean", "together"
-SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of where the ball is: small, for speed
-MIXED_SEED = 20110  # of the draws of what is together
+SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of the ball's volume: small, for speed
+MIXED_SEED = 20110  # of the random combinations
+
+
+class BenchSettings(BaseModel):
+    """The list of scenes; results are compared scene by scene, so these settings are part of the results."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    degradations: tuple[str, ...] = Field(
+        tuple(DEGRADATIONS), description="one at a time; names of docs/degradations.md"
+    )
+    levels: tuple[int, ...] = Field((1, 3, 5), description="severities, of 1 .. 5")
+    seeds: tuple[int, ...] = Field((0,), description="each gives another ball, motion and noise")
+    together: int = Field(1, ge=0, description="scenes by level and seed with several degradations at once")
+    at_once: int = Field(3, ge=2, description="number of these degradations, drawn by the seed")
+    frames: int = Field(24, ge=12, description="of each movie")
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        for name in self.degradations:
+            degradation(name)
+        for level in self.levels:
+            if level not in LEVELS:
+                expected, do = f"levels {LEVELS[0]} .. {LEVELS[-1]}", "choose among these"
+                raise SettingsError(refusal("levels", expected=expected, got=str(level), do=do))
+        if not self.levels or not self.seeds:
+            raise SettingsError(refusal("levels and seeds", expected="one at least", got="none", do="name some"))
+        return self
+
+
+FULL = BenchSettings(levels=LEVELS, seeds=(0, 1, 2), together=2, frames=60)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class BenchmarkScene:
     """A movie of two cameras with truth; made by `scenes_of`, rendered by `write_scene`."""
 
     kind: str  # a degradation's name, "clean", or "together"
@@ -34,36 +67,31 @@ class Scene:
         return f"{self.kind}-{self.level}-{self.seed}-{self.number}"
 
 
-def scenes_of(settings: BenchSettings) -> list[Scene]:
+def scenes_of(settings: BenchSettings) -> list[BenchmarkScene]:
     """Return all scenes, clean ones first; the same settings give the same scenes."""
-    return [scene for seed in settings.seeds for scene in _of_seed(settings, seed)]
+    return [
+        BenchmarkScene(kind=kind, level=level, seed=seed, number=number, degradations=mixed, frames=settings.frames)
+        for seed in settings.seeds
+        for kind, level, number, mixed in _of_seed(settings, seed)
+    ]
 
 
-def _of_seed(settings: BenchSettings, seed: int) -> Iterator[Scene]:
-    frames = settings.frames
-    yield Scene(kind=CLEAN, level=0, seed=seed, number=0, degradations={}, frames=frames)
+def _of_seed(settings: BenchSettings, seed: int) -> Iterator[tuple[str, int, int, dict[str, int]]]:
+    """Yield kind, level, number and degradations of the scenes of one seed."""
+    yield CLEAN, 0, 0, {}
     for name in settings.degradations:
         for level in settings.levels:
-            yield Scene(kind=name, level=level, seed=seed, number=0, degradations={name: level}, frames=frames)
+            yield name, level, 0, {name: level}
     count = min(settings.at_once, len(settings.degradations))
     for level in settings.levels:
         for number in range(settings.together if count > 1 else 0):
             rng = np.random.default_rng([MIXED_SEED, seed, level, number])
             drawn = sorted(rng.choice(len(settings.degradations), count, replace=False).tolist())
-            mixed = {settings.degradations[k]: level for k in drawn}
-            yield Scene(kind=TOGETHER, level=level, seed=seed, number=number, degradations=mixed, frames=frames)
+            yield TOGETHER, level, number, {settings.degradations[k]: level for k in drawn}
 
 
-def write_scene(folder: Path, scene: Scene) -> Path:
-    """Render a scene with its truth.
-
-    Args:
-        folder: made where it is missing.
-        scene: of `scenes_of`.
-
-    Returns:
-        Path of experiment.yaml; truth.h5 lies beside it (docs/data-format.md).
-    """
+def write_scene(folder: Path, scene: BenchmarkScene) -> Path:
+    """Render a scene into a folder, with truth.h5 (docs/data-format.md); return the path of experiment.yaml."""
     base = SynthSettings(
         name=scene.name, frames=scene.frames, image_size=(SIDE_PX, SIDE_PX), volume_mm=VOLUME_MM, seed=scene.seed
     )

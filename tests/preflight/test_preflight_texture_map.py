@@ -13,9 +13,16 @@ from preflight_examples import PAINTED, Example, checked, clean_example, of
 
 from sphereorient import so3
 from sphereorient.errors import TextureError
+from sphereorient.mapping.compare import fibonacci
 from sphereorient.preflight import Severity
-from sphereorient.preflight.alike import Alike, look_alikes, most_alike, spread_directions, towards
-from sphereorient.preflight.paint import measure_paint, paint
+from sphereorient.preflight.texture_map import (
+    ViewPair,
+    contrast,
+    look_alikes,
+    measure_texture,
+    most_similar_views,
+    views_towards,
+)
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.synth.textures import map_directions, random_texture
 
@@ -34,14 +41,14 @@ def good() -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def pair(good: torch.Tensor) -> Alike:
-    return most_alike(good, GreySearchSettings())
+def pair(good: torch.Tensor) -> ViewPair:
+    return most_similar_views(good, GreySearchSettings())
 
 
 def test_a_ball_white_in_the_north_is_bright_from_there_by_the_share_that_is_seen():
     """From latitude b the cosine-weighted share of the northern hemisphere in view is (1 + sin b) / 2."""
     north = (map_directions(128)[..., 2] > 0).float()
-    seen = measure_paint(north).view_brightness
+    seen = measure_texture(north).view_brightness
     latitude = math.pi / 2 - math.pi * (torch.arange(len(seen)) + 0.5) / len(seen)
     expected = (1 + latitude.sin().double()) / 2
     assert_close(seen, expected[:, None].expand_as(seen), atol=0.01)
@@ -53,12 +60,12 @@ def test_patches_are_as_wide_as_the_stripes_painted(count):
     directions = map_directions(256)
     longitude = torch.atan2(directions[..., 1], directions[..., 0])
     stripes = (torch.sin(count * longitude) > 0).float()
-    assert math.degrees(measure_paint(stripes).patch_rad) == pytest.approx(180 / count, rel=0.35)
+    assert math.degrees(measure_texture(stripes).patch_rad) == pytest.approx(180 / count, rel=0.35)
 
 
 @pytest.mark.parametrize("kind", ["blobs", "patches", "dots"])
 def test_the_random_paints_are_good(kind):
-    assert paint(measure_paint(random_texture(kind, 1, 256)), RADIUS_PX).severity is OK
+    assert contrast(measure_texture(random_texture(kind, 1, 256)), RADIUS_PX).severity is OK
 
 
 @pytest.mark.parametrize(
@@ -72,7 +79,7 @@ def test_the_random_paints_are_good(kind):
     ],
 )
 def test_what_is_wrong_with_a_paint_is_named(good, spoil, radius_px, words):
-    found = paint(measure_paint(spoil(good)), radius_px)
+    found = contrast(measure_texture(spoil(good)), radius_px)
     assert found.severity is (FAULT if words == "one colour" else WARNING)
     assert words in found.advice
 
@@ -91,7 +98,7 @@ def test_the_angle_is_that_between_the_two_views(pair):
 @pytest.mark.parametrize("times", [2, 3, 5])
 def test_a_paint_that_repeats_itself_around_its_axis_is_a_fault(good, times):
     """Twice around is alike after half a turn, three times after a third; and so on."""
-    found = most_alike(_repeated(good, times), GreySearchSettings())
+    found = most_similar_views(_repeated(good, times), GreySearchSettings())
     assert look_alikes(found).severity is FAULT
     turns = [360 * k / times for k in range(1, times)]
     assert min(abs(math.degrees(found.angle_rad) - min(turn, 360 - turn)) for turn in turns) < 3
@@ -106,12 +113,12 @@ def _repeated(map_: torch.Tensor, times: int) -> torch.Tensor:
 
 def test_a_paint_in_bands_looks_alike_however_it_spins():
     bands = (torch.sin(5 * map_directions(256)[..., 2]) > 0).float()
-    assert look_alikes(most_alike(bands, GreySearchSettings())).severity is FAULT
+    assert look_alikes(most_similar_views(bands, GreySearchSettings())).severity is FAULT
 
 
 def test_a_view_towards_a_direction_has_it_in_the_middle_facing_the_viewer():
-    directions = spread_directions(50)
-    R_view_body = towards(directions)
+    directions = fibonacci(50)
+    R_view_body = views_towards(directions)
     assert_close((R_view_body @ directions[..., None])[..., 0], torch.tensor([0.0, 0, -1]).double().expand(50, 3))
     assert_close(torch.linalg.det(R_view_body), torch.ones(50).double())
     assert_close(R_view_body @ R_view_body.mT, torch.eye(3).double().expand(50, 3, 3))
@@ -119,7 +126,7 @@ def test_a_view_towards_a_direction_has_it_in_the_middle_facing_the_viewer():
 
 def test_spread_directions_leave_no_gap():
     """300 even ones are about 12 degrees apart, so that none of the sphere is further than that from one."""
-    directions = spread_directions(300)
+    directions = fibonacci(300)
     anywhere = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     nearest = (anywhere.double() @ directions.T).amax(1)
     assert float(torch.rad2deg(nearest.clamp(-1, 1).acos()).max()) < 12

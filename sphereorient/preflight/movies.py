@@ -1,0 +1,230 @@
+"""Checks of each movie: files, pictures, background, ball, exposure, sharpness, motion blur."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.experiment import Experiment, outside_paths
+from sphereorient.experiment.timeline import NONE, Timeline
+from sphereorient.locate.outline import Outline
+from sphereorient.preflight.finding import Finding, fault, ok, warning
+from sphereorient.preflight.sample import MovieSample
+from sphereorient.trajectory import Reason
+
+MANY = 0.5  # share of bad frames above which a movie is a fault
+BALL_SEEN = 0.8  # share of the frames in which the ball should be found
+STAYS = 0.5  # share of the frames in which the ball may cover one pixel
+INSIDE = 0.9  # of the radius: the disk whose grey levels count
+SATURATED, MUCH_SATURATED = 0.03, 0.2  # share of the ball's pixels; reflections are 1 % in a good movie
+BLACK = 0.2  # share of the ball's pixels at level 0
+RANGE = 0.12  # of full scale: the least distance of black and white paint
+SIGNAL = 10.0  # white less black paint, in standard deviations of the noise
+SOFT_PX, SOFT_SHARE = 1.3, 0.035  # standard deviation of the limb's blur: px, and as share of the radius
+SMEAR_PX = 2.0  # motion of the ball during an exposure
+INTERPOLATION_PX2 = 1 / 6  # variance that linear interpolation adds: that of a triangle two pixels wide
+AROUND, REACH, FINE = 90, 7.0, 0.25  # directions, px to both sides, px between samples of the limb's profile
+REMEDY = {
+    Reason.UNDECODABLE: "export the movie again; the frames that cannot be decoded are left out of the track",
+    Reason.DARK: "light the ball more, open the lens, or expose longer",
+    Reason.SATURATED: "close the lens or expose shorter: white paint must stay below the brightest level",
+    Reason.REPEATED: "export the movie without a change of frame rate; the repeated frames are left out of the track",
+    Reason.NOT_FOUND: "check sphere.diameter, or set locate.diameter_px; give backgrounds: if the ball hardly moves",
+    Reason.OUTLINE: "give backgrounds: pictures of the scene without the ball; check sphere.diameter and the light",
+}
+
+
+def frames(experiment: Experiment, timeline: Timeline) -> Finding:
+    """Report number, duration and rate of the frames, and the remarks of the timeline."""
+    count = len(timeline)
+    measured = f"{count} of {', '.join(experiment.movie_paths)}"
+    if count > 1:
+        pace = f"{1 / timeline.frame_s:.6g} Hz" if timeline.even else f"uneven, usually {1 / timeline.frame_s:.6g} Hz"
+        measured += f"; {timeline.time_s[-1] - timeline.time_s[0] + timeline.frame_s:.4g} s, {pace}"
+    if not timeline.remarks:
+        return ok("frames", measured)
+    advice = "check start: and frames: if the cameras began and ended together"
+    return warning("frames", "; ".join([measured, *timeline.remarks]), advice)
+
+
+def outside(experiment: Experiment) -> list[Finding]:
+    """Report files outside the folder of the experiment."""
+    paths = [os.path.relpath(path, experiment.folder) for path in outside_paths(experiment)]
+    if not paths:
+        return []
+    measured = f"not in the folder of {experiment.path.name}: {', '.join(paths)}"
+    return [warning("files elsewhere", measured, "check these paths if somebody else made the experiment")]
+
+
+def movie_file(sample: MovieSample) -> Finding:
+    """Report the contents of a movie file, and the remarks of its reader."""
+    movie = sample.stream.movie
+    title, remarks, (height, width) = f"movie {sample.name}", movie.remarks, movie.frame_shape
+    brightest = f"brightest level {sample.background.full_scale:.0f}"
+    measured = f"{movie.path.name}: {len(movie)} pictures of {width} x {height} px, {brightest}"
+    if not remarks:
+        return ok(title, measured)
+    return warning(title, "; ".join([measured, *remarks]), "record or export the movie again if this is not meant")
+
+
+def pictures(samples: Sequence[MovieSample]) -> Finding:
+    """Count the sampled frames that cannot show a ball.
+
+    Args:
+        samples: of one camera, consecutive frames in each.
+    """
+    seen: dict[int, Reason] = {}
+    for sample in samples:
+        # A frame in two samples is repeated if either sample has its neighbour.
+        seen |= {
+            int(row): reason
+            for row, reason in zip(sample.row, sample.screen, strict=True)
+            if row != NONE and seen.get(int(row), Reason.OK) is Reason.OK
+        }
+    title = f"pictures {samples[0].name}"
+    bad = {row: reason for row, reason in sorted(seen.items()) if reason is not Reason.OK}
+    if not bad:
+        return ok(title, f"{len(seen)} frames sampled: all readable, none black, white or repeated")
+    counts = Counter(bad.values()).most_common()
+    words = ", ".join(f"{count} {reason}" for reason, count in counts)
+    measured = f"of {len(seen)} frames sampled: {words} (the first: picture {next(iter(bad))} of the movie)"
+    return (fault if len(bad) > MANY * len(seen) else warning)(title, measured, REMEDY[counts[0][0]])
+
+
+def ball(sample: MovieSample) -> Finding:
+    """Count the frames with a ball, and the reasons why others have none."""
+    usable = [k for k, reason in enumerate(sample.screen) if reason in (Reason.OK, Reason.REPEATED)]
+    reasons = Counter(sample.found[k][1] for k in usable)
+    title, seen = f"ball {sample.name}", reasons.pop(Reason.OK, 0)
+    measured = f"found in {seen} of {len(usable)} frames"
+    if reasons:
+        measured += " (" + ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) + ")"
+    if seen >= BALL_SEEN * len(usable) and seen:
+        return ok(title, measured)
+    likely = reasons.most_common(1)[0][0] if reasons else Reason.NOT_FOUND
+    return (warning if seen else fault)(title, measured, REMEDY[likely])
+
+
+def background(sample: MovieSample, experiment: Experiment) -> Finding:
+    """Report whether the movie itself shows the background of the ball."""
+    title = f"background {sample.name}"
+    if sample.name in experiment.background_paths:
+        return ok(title, f"given: {experiment.background_paths[sample.name].name}")
+    advice = f"write backgrounds: {{{sample.name}: FILE}}, a picture of the scene without the ball"
+    if experiment.fixed:
+        return warning(title, "none given: the background of a fixed ball is guessed from its surroundings", advice)
+    centres = [(outline.u_px, outline.v_px, outline.radius_px) for _, outline in sample.balls]
+    shares = [sum((u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in centres) / len(centres) for u, v, _ in centres]
+    share = max(shares, default=0.0)
+    measured = f"learnt from the movie: the ball covers no pixel in more than {100 * share:.0f} % of the frames"
+    return ok(title, measured) if share <= STAYS else warning(title, measured, advice)
+
+
+def exposure(sample: MovieSample) -> Finding:
+    """Judge the grey levels of the ball."""
+    title, values = f"exposure {sample.name}", []
+    for picture, outline in sample.balls:
+        row, column = np.ogrid[: picture.shape[0], : picture.shape[1]]
+        square = (row - outline.v_px) ** 2 + (column - outline.u_px) ** 2
+        values.append(picture[square < (INSIDE * outline.radius_px) ** 2])
+    if not values:
+        return warning(title, "unknown: no ball was found", "see the finding on the ball")
+    grey, full_scale, noise = np.concatenate(values), sample.background.full_scale, sample.background.typical_noise
+    black, white = np.percentile(grey, [5, 95])
+    signal = (white - black) / max(noise, 1e-9)
+    saturated, dark = float(np.mean(grey >= full_scale)), float(np.mean(grey == 0))
+    measured = (
+        f"paint from {black:.0f} to {white:.0f} of {full_scale:.0f}; {100 * saturated:.1f} % of the ball saturated, "
+        f"{100 * dark:.1f} % at 0; noise {noise:.1f}, signal {signal:.0f} times that"
+    )
+    if saturated > SATURATED:
+        return (fault if saturated > MUCH_SATURATED else warning)(title, measured, REMEDY[Reason.SATURATED])
+    if white - black < RANGE * full_scale or signal < SIGNAL:
+        advice = "light the ball more, or paint it with more contrast: black and white are hardly apart"
+        return warning(title, measured, advice)
+    if dark > BLACK:
+        return warning(title, measured, "raise the camera's black level: dark paint is cut off at 0")
+    return ok(title, measured)
+
+
+def sharpness(sample: MovieSample) -> Finding:
+    """Judge the blur of the ball's limb."""
+    title, blur_px = f"sharpness {sample.name}", limb_blur_px(sample)
+    if math.isnan(blur_px):
+        return ok(title, "unknown: too little of the limb stands out")
+    radius_px = float(np.median([outline.radius_px for _, outline in sample.balls]))
+    measured = f"the limb is blurred by {blur_px:.2f} px (standard deviation), on a ball of {2 * radius_px:.0f} px"
+    if blur_px <= max(SOFT_PX, SOFT_SHARE * radius_px):
+        return ok(title, measured)
+    return warning(title, measured, "focus on the ball, close the lens for more depth, or expose shorter")
+
+
+def limb_blur_px(sample: MovieSample) -> float:
+    """Return the blur of the ball's limb, a Gaussian's standard deviation, px; NaN if it cannot be measured.
+
+    The limb's profiles are shifted to their half height and averaged; the blur is half the distance between 84 and
+    16 %. It includes optics, pixel and motion, without the variance of the interpolation.
+    """
+    offset = np.arange(-REACH, REACH + FINE / 2, FINE)
+    profiles = [_profiles(sample, picture, outline, offset) for picture, outline in sample.balls]
+    shifted = np.concatenate([np.zeros((0, len(offset))), *profiles])
+    if len(shifted) < AROUND // 4:
+        return math.nan
+    mean = np.minimum.accumulate(np.median(shifted, axis=0))
+    x84, x16 = (float(np.interp(-level, -mean, offset)) for level in (0.8413, 0.1587))
+    return math.sqrt(max(0.0, ((x16 - x84) / 2) ** 2 - INTERPOLATION_PX2))
+
+
+def _profiles(
+    sample: MovieSample, picture: NDArray[np.generic], outline: Outline, offset: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return profiles across the limb, 1 inside and 0 outside, in directions with even paint at the limb."""
+    angle = np.arange(AROUND) * (2 * np.pi / AROUND)
+    reach = outline.radius_px + offset
+    u = (outline.u_px + np.cos(angle)[:, None] * reach).astype(np.float32)
+    v = (outline.v_px + np.sin(angle)[:, None] * reach).astype(np.float32)
+    difference = sample.background.difference(picture)
+    profile = cv2.remap(difference, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+    within, beyond = profile[:, offset < -3.0], profile[:, offset > 3.0]
+    inside, outside = within.mean(1), beyond.mean(1)
+    step = inside - outside
+    height, width = picture.shape
+    whole = (u[:, -1] >= 0) & (u[:, -1] <= width - 1) & (v[:, -1] >= 0) & (v[:, -1] <= height - 1)
+    clear = whole & (step > 12 * sample.background.typical_noise)
+    even = (within.std(1) < 0.12 * step) & (beyond.std(1) < 0.12 * step) & clear
+    share = (profile[even] - outside[even, None]) / step[even, None]
+    # Each fit: where the profile last stands above a half.
+    last = share.shape[1] - 1 - (share[:, ::-1] > 0.5).argmax(1)
+    shifted = []
+    for one, k in zip(share, last, strict=True):
+        if not 0 < k < len(offset) - 1:
+            continue
+        crossing = offset[k] + FINE * (one[k] - 0.5) / max(one[k] - one[k + 1], 1e-9)
+        if abs(crossing) < 2.5:
+            shifted.append(np.interp(offset + crossing, offset, one))
+    return np.asarray(shifted).reshape(-1, len(offset))
+
+
+def motion_blur(sample: MovieSample, exposure_s: float | None, frame_s: float) -> Finding:
+    """Judge the motion of the ball during an exposure, measured between consecutive frames."""
+    title, centre = f"motion blur {sample.name}", sample.sightings.centre_px
+    neighbours = np.flatnonzero(np.diff(sample.frame) == 1)
+    moved = (centre[neighbours + 1] - centre[neighbours]).norm(dim=-1).numpy()
+    moved = moved[np.isfinite(moved)]
+    if not len(moved):
+        return ok(title, "unknown: no two consecutive frames show the ball")
+    usual, fast = np.percentile(moved, [50, 95])
+    measured = f"the ball moves {usual:.2f} px a frame, {fast:.2f} at its fastest"
+    if exposure_s is None:
+        return ok(title, measured + "; exposure: is not given")
+    share = exposure_s / frame_s
+    measured += f"; {share * usual:.2f} and {share * fast:.2f} px during an exposure"
+    if share * fast <= SMEAR_PX:
+        return ok(title, measured)
+    return warning(title, measured, "expose shorter, with more light")

@@ -1,0 +1,184 @@
+"""The frames that the check reads: a spread sample, neighbours, two stretches; and the ball in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.cameras import Camera
+from sphereorient.errors import MovieError, refusal
+from sphereorient.experiment import Experiment
+from sphereorient.experiment.given import given_scene
+from sphereorient.experiment.stream import CameraStream, pictures_of, spread_frames, uniform
+from sphereorient.experiment.timeline import NONE
+from sphereorient.locate import (
+    Background,
+    LocateSettings,
+    Sightings,
+    find_ball,
+    learn_background,
+    screened,
+    sightings_of,
+)
+from sphereorient.locate.background import measure_background
+from sphereorient.locate.find import Found
+from sphereorient.locate.outline import Outline
+from sphereorient.trajectory import Reason
+
+SPREAD = 25  # frames all over the movie: enough for a background
+EVERY = 3  # of these, each third one is read with the next frame, for motion and repeated frames
+FEW = 0.2  # share of the frames; if the ball is found in fewer, other sizes are tried
+BALLS = 12  # frames in which a ball of unknown size is searched
+SIZES = 1.4  # ratio of the diameters tried; the outline's tolerance covers it
+SMALLEST_PX = 30.0  # of these diameters: paint on a smaller ball is not read
+
+Grey = NDArray[Any]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MovieSample:
+    """n frames of one camera and the ball in them; made by `sample_movie`, read by the checks."""
+
+    stream: CameraStream
+    frame: NDArray[np.int64]  # (n,), index in the timeline, increasing
+    picture: tuple[Grey | None, ...]  # n; None where missing or undecodable
+    background: Background
+    diameter_px: float  # searched
+    expected_px: float | None  # by cameras and diameter; None: unknown
+    screen: tuple[Reason, ...] = ()  # n, whether the picture as a whole can show a ball
+    found: tuple[Found, ...] = ()  # n
+
+    @property
+    def name(self) -> str:
+        """Name of the camera."""
+        return self.stream.name
+
+    @property
+    def camera(self) -> Camera:
+        """The camera."""
+        return self.stream.camera
+
+    @property
+    def row(self) -> NDArray[np.int64]:
+        """(n,), index in the movie; NONE where there is no picture."""
+        return self.stream.rows[self.frame]
+
+    @cached_property
+    def sightings(self) -> Sightings:
+        """The outlines as arrays."""
+        return sightings_of(self.found)
+
+    @property
+    def balls(self) -> list[tuple[Grey, Outline]]:
+        """Picture and outline of the frames with a ball."""
+        pairs = zip(self.picture, self.found, strict=True)
+        return [(picture, outline) for picture, (outline, _) in pairs if picture is not None and outline is not None]
+
+
+def pair_starts(count: int) -> list[int]:
+    """Return the frames of `frames_to_sample` that are read with the next frame."""
+    return [k for k in spread_frames(range(count), SPREAD)[::EVERY] if k + 1 < count]
+
+
+def frames_to_sample(count: int) -> list[int]:
+    """Return the frames of a timeline to read first: evenly spread ones, some with their next frame."""
+    return sorted({*spread_frames(range(count), SPREAD), *(k + 1 for k in pair_starts(count))})
+
+
+def sample_movie(
+    stream: CameraStream, experiment: Experiment, diameter_px: float | None, settings: LocateSettings
+) -> MovieSample:
+    """Read a spread sample of one camera's frames, learn the background, and find the ball.
+
+    Without an expected diameter, the diameter is measured in the pictures.
+
+    Raises:
+        MovieError: no sampled frame can be decoded.
+        ExperimentError: a background picture cannot be used.
+    """
+    frame = np.asarray(frames_to_sample(len(stream)), np.int64)
+    picture = tuple(pictures_of(stream.movie, stream.rows[frame]))
+    shown = [one for one in picture if one is not None and not uniform(one)]
+    shown = shown or [one for one in picture if one is not None]
+    if not shown:
+        do = "check that it plays; export it again if not"
+        raise MovieError(refusal(str(stream.movie.path), expected="pictures", got="none that can be decoded", do=do))
+    some = np.stack([shown[k] for k in spread_frames(range(len(shown)), SPREAD)])
+    empty = given_scene(experiment, stream.name, stream.movie.frame_shape)
+
+    def at_size(size_px: float) -> MovieSample:
+        if empty is None and experiment.fixed:
+            background = replace(_surroundings(some), shown=stream.shown)
+        else:
+            background = learn_background(some, size_px, settings, empty, stream.shown)
+        sample = MovieSample(
+            stream=stream,
+            frame=frame,
+            picture=picture,
+            background=background,
+            diameter_px=size_px,
+            expected_px=diameter_px,
+        )
+        return _searched(sample, settings)
+
+    largest_px = 0.9 * min(stream.movie.frame_shape)
+    first = at_size(diameter_px if diameter_px is not None and diameter_px >= SMALLEST_PX else largest_px / 4)
+    if diameter_px is not None and len(first.balls) > FEW * len(shown):
+        return first
+    # The size is unknown or wrong: take whatever is as round as a ball.
+    size_px = _measured_size_px(shown, first.background, settings)
+    return first if size_px is None else at_size(size_px)
+
+
+def sample_more(sample: MovieSample, frames: Sequence[int], settings: LocateSettings) -> MovieSample:
+    """Read other frames of the same camera, with the same background and size of the ball."""
+    frame = np.asarray(frames, np.int64)
+    picture = tuple(pictures_of(sample.stream.movie, sample.stream.rows[frame]))
+    return _searched(replace(sample, frame=frame, picture=picture), settings)
+
+
+def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:
+    """Screen the pictures as the tracker does, and find the ball in the usable ones."""
+    screen: list[Reason] = []
+    found: list[Found] = []
+    rows = sample.row
+    for k, (row, picture) in enumerate(zip(rows, sample.picture, strict=True)):
+        if picture is None:
+            reason = Reason.MISSING if row == NONE else Reason.UNDECODABLE
+        else:  # a repeated picture is known only if its neighbour was read
+            neighbour = sample.picture[k - 1] if k > 0 and row == rows[k - 1] + 1 else None
+            reason = screened(picture, neighbour, sample.background).reason
+        screen.append(reason)
+        if picture is None or reason not in (Reason.OK, Reason.REPEATED):
+            found.append((None, reason))
+        else:
+            found.append(find_ball(picture, sample.background, sample.diameter_px, settings))
+    return replace(sample, screen=tuple(screen), found=tuple(found))
+
+
+def _surroundings(pictures: Grey) -> Background:
+    """Guess the background of a ball that never moves: the median grey level of the pictures."""
+    measured = measure_background(pictures)
+    middle = np.full(measured.mean.shape, np.median(measured.mean), np.float32)
+    noise = np.full(middle.shape, measured.typical_noise, np.float32)
+    return Background(mean=middle, noise=noise, full_scale=measured.full_scale)
+
+
+def _measured_size_px(pictures: Sequence[Grey], background: Background, settings: LocateSettings) -> float | None:
+    """Return the diameter at which outlines have the best coverage; None if there are no outlines."""
+    largest = 0.9 * min(background.mean.shape)
+    chosen = [pictures[k] for k in spread_frames(range(len(pictures)), BALLS)]
+    best, size = 0.0, None
+    while largest > SMALLEST_PX:
+        outlines = [find_ball(picture, background, largest, settings)[0] for picture in chosen]
+        seen = [outline for outline in outlines if outline is not None]
+        merit = sum(outline.coverage for outline in seen)
+        if merit > 1.05 * best:  # circles through paint are smaller than the outline: of equals, take the larger
+            best, size = merit, 2 * float(np.median([outline.radius_px for outline in seen]))
+        largest /= SIZES
+    return size

@@ -1,0 +1,282 @@
+"""Checks of the texture map: contrast and patches, views that look alike, and its match with the pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.experiment.stream import spread_frames
+from sphereorient.mapping.compare import fibonacci
+from sphereorient.preflight.finding import Finding, fault, ok, warning
+from sphereorient.preflight.sample import MovieSample
+from sphereorient.search import GreySearch, crop_disk
+from sphereorient.search.normalisation import LocalNormalisation
+from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
+from sphereorient.search.settings import GreySearchSettings
+from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
+from sphereorient.sphere.texture_table import texture_table
+from sphereorient.synth.textures import map_directions
+
+ROWS = 32  # of the reduced map on which views are averaged: 5.6 degrees
+ONE_COLOUR, FAINT = 0.02, 0.12  # standard deviation of the map, 0 black .. 1 white
+LOPSIDED = (0.1, 0.9)  # limits of a view's brightness
+FINE_PX, COARSE_DEG = 5.0, 70.0  # smaller patches are not resolved; with larger ones, many views have hardly a border
+DRAWS = 4000  # random points that are compared with their neighbourhood
+STEP_DEG = 15.0  # of the grid of rotations with which views are compared
+VIEWS = 300  # directions of view, 8 degrees apart; a rotation of the picture makes no other view
+APART_DEG = 20.0  # nearer rotations show the same view
+REFINED = 40  # pairs whose rotation is refined
+BATCH = 64  # views that are normalised at once
+ALIKE, SAME = 0.85, 0.97  # share of one view explained by another: single frames are doubtful, useless
+FRAMES = 8  # of each camera, compared with the map
+FITS, POOR = 0.7, 0.55  # share of the picture that the best view of the map explains
+CLEARLY = 0.08  # difference of this share between the picture and its mirror image
+ONE_DEG = 5.0  # largest difference of the orientations from two cameras
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TextureMeasures:
+    """Measures of a texture map; made by `measure_texture`, read by the check and the figure."""
+
+    contrast: float  # standard deviation over the sphere, 0 black .. 1 white
+    view_brightness: Tensor  # (ROWS, 2 ROWS), mean brightness of the hemisphere seen from each direction, as a map
+    patch_rad: float  # typical width of a patch
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewPair:
+    """Two similar views; made by `most_similar_views`, read by the check and the figure."""
+
+    score: float  # share of one view that the other explains under any smooth light, as the search scores
+    angle_rad: float  # between the two orientations
+    pictures: Tensor  # (2, S, S), 0 black .. 1 white, NaN beyond the disk
+    R_view_body: Tensor  # (2, 3, 3)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TextureMatch:
+    """The match of the map with n pictures of one camera; made by `match_texture`."""
+
+    name: str
+    camera: Camera
+    centre_px: Tensor  # (n, 2)
+    R_view_body: Tensor  # (n, 3, 3), the best; NaN: none found
+    score: Tensor  # (n,), 0: none found
+    mirrored: Tensor  # (n,), score of the mirrored pictures
+
+
+def measure_texture(texture: Tensor) -> TextureMeasures:
+    """Measure a map, (H, 2 H), 0 black .. 1 white."""
+    height = texture.shape[0]
+    factor = max(1, height // ROWS)
+    while height % factor:
+        factor -= 1
+    small = torch.nn.functional.avg_pool2d(texture[None, None].double(), factor)[0, 0]
+    direction, area = map_directions(len(small)).reshape(-1, 3), _cos_latitude(len(small))
+    mean = (small * area).sum() / area.sum()
+    fine = reduced_texture(texture, 200.0).double()
+    share = _cos_latitude(len(fine)) / _cos_latitude(len(fine)).sum()
+    deviation = ((fine - (fine * share).sum()).square() * share).sum()
+    weight = (map_directions(ROWS).reshape(-1, 3) @ direction.T).clamp_min(0) * area.reshape(-1)
+    brightness = (weight @ small.reshape(-1)) / weight.sum(1)
+    return TextureMeasures(
+        contrast=float(deviation.sqrt()),
+        view_brightness=brightness.reshape(ROWS, 2 * ROWS),
+        patch_rad=_patch_rad(fine.float(), float(mean)),
+    )
+
+
+def _cos_latitude(height: int) -> Tensor:
+    """Return the area of each texel, (H, 2 H), any unit."""
+    cosine: Tensor = map_directions(height)[..., :2].norm(dim=-1)
+    return cosine
+
+
+def _patch_rad(texture: Tensor, mean: float) -> float:
+    """Return the typical width of a patch, from the autocorrelation of the map."""
+    rng = torch.Generator().manual_seed(0)
+    at, side = torch.nn.functional.normalize(torch.randn(2, DRAWS, 3, generator=rng), dim=-1)
+    side = torch.nn.functional.normalize(side - (side * at).sum(-1, keepdim=True) * at, dim=-1)
+    angle = torch.deg2rad(torch.cat([torch.arange(0, 10, 0.5), torch.arange(10, 91, 2.0)]))
+    here = sample_texture(texture, at) - mean
+    there = sample_texture(texture, at * angle.cos()[:, None, None] + side * angle.sin()[:, None, None]) - mean
+    correlation = (here * there).mean(1) / here.square().mean().clamp_min(1e-12)
+    below = torch.nonzero(correlation < 0.5)
+    if not len(below):
+        return math.pi
+    k = int(below[0, 0])
+    if k == 0:
+        return 0.0
+    share = float((correlation[k - 1] - 0.5) / (correlation[k - 1] - correlation[k]).clamp_min(1e-9))
+    # The correlation of stripes falls to a half at a quarter of their width.
+    return 4 * float(angle[k - 1] + share * (angle[k] - angle[k - 1]))
+
+
+def contrast(measures: TextureMeasures, radius_px: float) -> Finding:
+    """Judge contrast, balance and patches of a map, for a ball of this radius in the pictures."""
+    title, patch_deg = "paint", math.degrees(measures.patch_rad)
+    low, high = float(measures.view_brightness.min()), float(measures.view_brightness.max())
+    patch_px = measures.patch_rad * radius_px
+    measured = (
+        f"views are {100 * low:.0f} to {100 * high:.0f} % bright; patches of about "
+        f"{patch_deg:.0f} degrees, {patch_px:.0f} px; contrast {measures.contrast:.2f}"
+    )
+    if measures.contrast < ONE_COLOUR:
+        return fault(title, measured, "check the map: it has one colour, which shows no orientation")
+    if measures.contrast < FAINT:
+        advice = "paint with more contrast, or check that the map was exported from black to white"
+        return warning(title, measured, advice)
+    if patch_px < FINE_PX:
+        advice = "paint larger patches, or bring the ball larger into the picture: such detail is blurred away"
+        return warning(title, measured, advice)
+    if patch_deg > COARSE_DEG:
+        return warning(title, measured, "paint smaller patches: many views show hardly a border")
+    if low < LOPSIDED[0] or high > LOPSIDED[1]:
+        return warning(title, measured, "balance black and white: some views show hardly more than one of them")
+    return ok(title, measured)
+
+
+def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPair:
+    """Find two views, far apart, of which one explains most of the other.
+
+    Args:
+        texture: (H, 2 H), 0 black .. 1 white.
+        settings: of the search for orientations.
+    """
+    size = settings.size_px
+    view = orthographic_view(size)
+    normal = view.normal_view.T.contiguous()
+    table = texture_table(texture, min(2.0 / size, settings.detail), 192)
+
+    def pictures(R: Tensor) -> Tensor:
+        return view.picture(table.sample(R.mT @ normal)[0])
+
+    normalisation = LocalNormalisation(size, detail=settings.detail, window=settings.window, clip=settings.clip)
+
+    def normalised(R: Tensor) -> Tensor:
+        return torch.cat([normalisation(pictures(some)) for some in torch.split(R, BATCH)])
+
+    seen = views_towards(fibonacci(VIEWS)).float()
+    grid = so3.lattman_grid(math.radians(STEP_DEG)).float()
+    cosine = (seen.reshape(-1, 9) @ grid.reshape(-1, 9).T - 1) / 2
+    likeness = normalised(seen) @ normalised(grid).T
+    best = likeness.masked_fill(cosine > math.cos(math.radians(APART_DEG)), -1.0).max(1)
+    rough, fine = detail_level(view, table, settings.detail, 2), detail_level(view, table, 2.0 / size, 1)
+    found = ViewPair(score=0.0, angle_rad=math.pi, pictures=pictures(seen[:1]).expand(2, -1, -1), R_view_body=seen[:2])
+    for k in best.values.argsort(descending=True)[:REFINED].tolist():
+        disk = pictures(seen[k : k + 1])[0]
+        R, _ = refine_rotation(rough, level_reference(rough, disk), grid[best.indices[k]][None], settings.rough_steps)
+        R, score = refine_rotation(fine, level_reference(fine, disk), R, settings.fine_steps)
+        angle = float(so3.geodesic_distance(seen[k].double(), R[0].double()))
+        if float(score) > found.score and angle > math.radians(APART_DEG):
+            pair = torch.stack([seen[k], R[0]])
+            shown = view.picture(table.sample(pair.mT @ normal)[0], math.nan)
+            found = ViewPair(score=float(score), angle_rad=angle, pictures=shown, R_view_body=pair)
+    return found
+
+
+def views_towards(direction_body: Tensor) -> Tensor:
+    """Return orientations R_view_body, (n, 3, 3), with body directions (n, 3) towards the viewer, against z of V."""
+    back = -direction_body
+    helper = torch.eye(3, dtype=back.dtype)[back.abs().argmin(-1)]
+    right = torch.nn.functional.normalize(torch.linalg.cross(helper, back), dim=-1)
+    return torch.stack([right, torch.linalg.cross(back, right), back], dim=-2)
+
+
+def look_alikes(pair: ViewPair) -> Finding:
+    """Judge the two most similar views."""
+    title = "views that look alike"
+    measured = (
+        f"the worst pair, {math.degrees(pair.angle_rad):.0f} degrees apart: "
+        f"one explains {100 * pair.score:.0f} % of the other"
+    )
+    if pair.score >= SAME:
+        advice = "break the paint's symmetry: add a patch that exists only once; these two views cannot be told apart"
+        return fault(title, measured, advice)
+    if pair.score >= ALIKE:
+        advice = "add a patch where the two views are alike: there a single frame is ambiguous without its history"
+        return warning(title, measured, advice)
+    return ok(title, measured + ": single frames are unambiguous")
+
+
+def match_texture(search: GreySearch, samples: Sequence[MovieSample]) -> list[TextureMatch]:
+    """Search the map in some frames in which every camera shows the ball."""
+    seen = torch.stack([sample.sightings.placed for sample in samples]).all(0).nonzero()[:, 0].tolist()
+    chosen = [seen[k] for k in spread_frames(range(len(seen)), FRAMES)]
+    return [_matched(search, sample, chosen) for sample in samples] if chosen else []
+
+
+def _matched(search: GreySearch, sample: MovieSample, chosen: list[int]) -> TextureMatch:
+    centre, radius = sample.sightings.centre_px[chosen], sample.sightings.radius_px[chosen]
+    crops = []
+    for k, (u, v), r in zip(chosen, centre.tolist(), radius.tolist(), strict=True):
+        picture = sample.picture[k]
+        assert picture is not None  # there is an outline
+        crops.append(torch.from_numpy(crop_disk(picture, u, v, r, search.size_px)))
+    disks = torch.stack(crops)
+    R, score = _best(search, disks)
+    _, mirrored = _best(search, disks.flip(-1))
+    return TextureMatch(
+        name=sample.name, camera=sample.camera, centre_px=centre, R_view_body=R, score=score, mirrored=mirrored
+    )
+
+
+def _best(search: GreySearch, disks: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the best proposal for each disk (n, S, S): R_view_body (n, 3, 3) and score (n,)."""
+    found = search.propose(disks)
+    R, score = torch.full((len(disks), 3, 3), math.nan, dtype=torch.float64), torch.zeros(len(disks)).double()
+    for k, first in enumerate(found.offset[:-1].tolist()):
+        if found.offset[k + 1] > first:
+            R[k], score[k] = found.R_view_body[first], found.score[first]
+    return R, score
+
+
+def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
+    """Judge the match of the map with one camera's pictures."""
+    title = f"map in {match.name}"
+    score, mirrored = float(match.score.median()), float(match.mirrored.median())
+    measured = f"the best view explains {100 * score:.0f} % of the picture, its mirror image {100 * mirrored:.0f} %"
+    if mirrored > score + CLEARLY and mirrored > POOR:
+        if len(matches) > 1 and all(float((one.mirrored - one.score).median()) > CLEARLY for one in matches):
+            advice = "mirror the map left to right, or write flip: for both movies: all pictures are mirrored"
+        else:
+            advice = f"write flip: {{{match.name}: vertical}}, or horizontal: this movie is mirrored"
+        return fault(title, measured, advice)
+    if score < POOR:
+        return fault(title, measured, "check sphere.texture: the movie does not show this map")
+    if score < FITS or score < mirrored + CLEARLY:
+        advice = "check light and map: reflections, worn paint and errors of the map reduce the certainty"
+        return warning(title, measured, advice)
+    return ok(title, measured)
+
+
+def one_orientation(matches: Sequence[TextureMatch]) -> Finding:
+    """Judge whether two cameras show the same orientation."""
+    title, (first, second) = "one orientation", matches
+    angle = _median_angle_deg(matches, (first.camera, second.camera))
+    measured = f"the orientations from {first.name} and {second.name} differ by {angle:.1f} degrees (median)"
+    if angle <= ONE_DEG:
+        return ok(title, measured)
+    if math.isnan(angle):
+        return warning(title, "unknown: the map is not found in the pictures", "see the findings on the map")
+    swapped = _median_angle_deg(matches, (second.camera, first.camera))
+    if swapped <= ONE_DEG:
+        advice = f"swap {first.name} and {second.name} in movies: (then they differ by {swapped:.1f} degrees)"
+    else:
+        advice = "check R of both cameras in cameras.yaml, flip:, and whether the movies are of one experiment"
+    return fault(title, measured, advice)
+
+
+def _median_angle_deg(matches: Sequence[TextureMatch], cameras: tuple[Camera, Camera]) -> float:
+    """Return the median angle between the orientations in the lab, degrees; NaN: no frame in common."""
+    lab = []
+    for match, camera in zip(matches, cameras, strict=True):
+        direction_cam = camera.rays(match.centre_px).direction_lab @ camera.R_cam_lab.mT
+        lab.append(camera.R_cam_lab.mT @ R_cam_view(direction_cam) @ match.R_view_body)
+    return float(torch.rad2deg(so3.geodesic_distance(lab[0], lab[1])).nanmedian())

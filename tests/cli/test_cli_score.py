@@ -1,0 +1,56 @@
+"""`sphereorient score`: the errors of a track, and refusals in one line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import REPO
+from typer.testing import CliRunner
+
+from sphereorient.cli import app
+from sphereorient.errors import TrackError
+from sphereorient.trajectory import Trajectory
+
+TRUTH = REPO / "synthetic_data" / "excerpt" / "truth.h5"
+
+
+@pytest.fixture
+def track(tmp_path: Path) -> Path:
+    """A track with a position error of 0.3 mm and a velocity that is 10 % too large."""
+    with h5py.File(TRUTH) as file:
+        truth = {key: file[key][()] for key in ("time", "position", "orientation", "velocity")}
+    track = Trajectory.empty(truth["time"], cameras=("cam1", "cam2"), frame_rate=600.0, method="paper")
+    shifted = truth["position"] + np.array([0.3, 0.0, 0.0])
+    track = replace(track, orientation=truth["orientation"], position=shifted, velocity=1.1 * truth["velocity"])
+    replace(track, valid=np.ones(len(track), bool)).save(tmp_path / "track.h5")
+    return tmp_path / "track.h5"
+
+
+def test_the_errors_of_a_track_are_printed(track):
+    run = CliRunner().invoke(app, ["score", str(track), str(TRUTH)])
+    assert run.exit_code == 0, run.exception
+    words = run.output.split()
+    assert "40 of 40" in run.output
+    assert "0.3000" in words
+    assert "10.00" in words
+
+
+def refused(*arguments: object) -> str:
+    run = CliRunner().invoke(app, ["score", *map(str, arguments)])
+    assert isinstance(run.exception, TrackError), (run.exception, run.output)
+    assert "\n" not in str(run.exception)
+    return str(run.exception)
+
+
+def test_files_of_another_kind_are_refused_in_one_line(track, tmp_path):
+    (tmp_path / "text.h5").write_text("no track")
+    assert "text.h5" in refused(tmp_path / "text.h5", TRUTH)
+    assert "text.h5" in refused(track, tmp_path / "text.h5")
+    assert "none.h5" in refused(tmp_path / "none.h5", TRUTH)
+    assert "none.h5" in refused(track, tmp_path / "none.h5")
+    assert "truth.h5" in refused(TRUTH, track)  # swapped
+    assert "track.h5" in refused(track, track)
