@@ -168,9 +168,7 @@ def _range(text: str, opened: Movie) -> tuple[int, int]:
 
 def _pictures(opened: Movie, first: int, last: int, dead: list[int], advance: Advance) -> Iterator[Grey | None]:
     """Yield the frames to write, noting those that cannot be decoded in `dead`."""
-    from sphereorient.movies import readable
-
-    for number, picture in enumerate(readable(opened, first, last), start=first):
+    for number, picture in enumerate(opened.readable(first, last), start=first):
         if picture is None:
             dead.append(number)
         yield picture

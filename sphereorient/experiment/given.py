@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment.experiment import Experiment
-from sphereorient.files.picture_claim import claimed_pixels, decoded_grey
+from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 from sphereorient.movies import flipped_picture
 

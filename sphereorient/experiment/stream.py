@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sphereorient.cameras import Camera
 from sphereorient.errors import MovieError, refusal
 from sphereorient.experiment.timeline import NONE
-from sphereorient.movies import Grey, Movie, readable
+from sphereorient.movies import Grey, Movie
 from sphereorient.trajectory.trajectory import Reason
 
 EVERY = 4  # pixels: a fault of a whole picture shows in every fourth row and column
@@ -88,7 +88,7 @@ def _read(movie: Movie, numbers: Sequence[int]) -> Iterator[Grey | None]:
     begin = 0
     for end in range(1, len(numbers) + 1):
         if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:
-            yield from readable(movie, numbers[begin], numbers[end - 1] + 1)
+            yield from movie.readable(numbers[begin], numbers[end - 1] + 1)
             begin = end
 
 

@@ -26,7 +26,7 @@ from movie_examples import encode
 
 from sphereorient.experiment.given import load_background
 from sphereorient.experiment.timeline import load_times
-from sphereorient.movies import open_movie, readable
+from sphereorient.movies import open_movie
 from sphereorient.sphere import load_texture
 from sphereorient.trajectory import CameraTrack, Trajectory
 
@@ -358,9 +358,9 @@ def watch(path: Path) -> None:
         assert count > 0
         assert movie.times_s is None or movie.times_s.shape == (count,)
         assert all(remark.isprintable() for remark in movie.remarks)
-        for picture in readable(movie, 0, min(count, 4)):
+        for picture in movie.readable(0, min(count, 4)):
             assert picture is None or (picture.shape == movie.frame_shape and picture.dtype == movie.dtype)
-        for _ in readable(movie, count - 1, count):
+        for _ in movie.readable(count - 1, count):
             pass
         movie.sample([0, count - 1])
 
