@@ -64,11 +64,7 @@ def preflight(
         experiment = load_experiment(Path(experiment))
     settings = settings or Settings()
     movies = open_movies(experiment)
-    try:
-        return _checked(experiment, movies, timeline(experiment, movies), settings, progress)
-    finally:
-        for movie in movies.values():
-            movie.close()
+    return _checked(experiment, movies, timeline(experiment, movies), settings, progress)
 
 
 def _checked(
