@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -17,7 +16,7 @@ Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
 FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns
 
 
-class Movie(ABC):
+class Movie:
     """A sequence of grey pictures; a format implements `_read`. No file stays open between calls."""
 
     path: Path
@@ -31,9 +30,9 @@ class Movie(ABC):
         self.path, self.format, self._count = path, form, count
         self.frame_shape, self.dtype = frame_shape, dtype
 
-    @abstractmethod
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
         """Yield the frames of these increasing numbers; raise MovieError at a damaged one."""
+        raise NotImplementedError
 
     def _read_on(self, numbers: Sequence[int]) -> Iterator[Grey | None]:
         """Yield the frames of these numbers, None for damaged ones: restart after each, as frames are independent."""

@@ -57,8 +57,10 @@ def tiff(width: int, height: int, big: bool = False, entries: int = 0) -> bytes:
     order = ">" if big else "<"
     tags = [(256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, 200)]
     tags += [(277, 3, 1, 1), (278, 4, 1, height), (279, 4, 1, 2**32 - 1)]
+    short = 16 if big else 0  # a number of 16 bits stands in the first half of its field
     body = b"".join(
-        struct.pack(f"{order}HHII", *(n % 2 ** (16 if k < 2 else 32) for k, n in enumerate(t))) for t in tags
+        struct.pack(f"{order}HHII", tag, kind, count, (value << short if kind == 3 else value) % 2**32)
+        for tag, kind, count, value in tags
     )
     head = (b"MM\0*" if big else b"II*\0") + struct.pack(f"{order}I", 8)
     return head + struct.pack(f"{order}H", entries or len(tags)) + body + bytes(500)
