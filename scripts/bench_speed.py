@@ -28,7 +28,7 @@ from sphereorient.experiment import Experiment, load_experiment, open_movies
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow import Appearance, BlockTracker, initialise
 from sphereorient.follow.appearance import estimate_appearance
-from sphereorient.locate import Shot, screened_frames
+from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods.precise import open_view, sample_frames
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
@@ -53,7 +53,7 @@ class Bench:
 
     experiment: Experiment
     eyes: list[CameraView]
-    shots: list[list[Shot]]  # per eye
+    shots: list[list[Frame]]  # per eye
     times: list[float]  # of the same frames, s
     search: GreySearch
     learnt: Appearance

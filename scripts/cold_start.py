@@ -23,7 +23,7 @@ from sphereorient.cameras import Camera
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow import initialise
 from sphereorient.follow.appearance import estimate_appearance
-from sphereorient.locate import Background, Shot
+from sphereorient.locate import Background, Frame
 from sphereorient.methods.precise import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, LinesOfSight, base_table
@@ -64,14 +64,14 @@ def errors_deg(
     search = {view.name: GreySearch(texture, settings.search)}
     spread = locate.spread_frames(range(len(frames)), settings.refine.study_frames)
     base = base_table(texture, view.diameter_px)
-    shots = [[Shot(picture=frames[k])] for k in spread]
+    shots = [[Frame(picture=frames[k])] for k in spread]
     learnt = estimate_appearance([view], shots, base, search, radius_mm, settings.locate, settings.refine)
     errors = []
     for frame, R in zip(frames, R_lab_body, strict=True):
         poses = initialise(
             learnt.fitter,
             search,
-            [Shot(picture=frame)],
+            [Frame(picture=frame)],
             settings.locate,
             candidates=settings.refine.candidates,
             score_min=learnt.clear_score,

@@ -16,7 +16,7 @@ from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.initialise import Poses, initialise
 from sphereorient.follow.light_and_blur import LEAST_LEFT, learn_light_and_blur
-from sphereorient.locate import LocateSettings, Shot
+from sphereorient.locate import Frame, LocateSettings
 from sphereorient.pose.defocus import FIRST_BLUR_PX, defocus_radii
 from sphereorient.pose.fit import Fit
 from sphereorient.pose.fitter import CameraView, Fitter, Optics, Picture, unknown_light, widest_px
@@ -66,7 +66,7 @@ class Appearance:
 
 def estimate_appearance(
     views: Sequence[CameraView],
-    shots: Sequence[Sequence[Shot]],
+    shots: Sequence[Sequence[Frame]],
     base: TextureTable,
     proposers: Mapping[str, Proposer],
     radius_mm: float,
@@ -99,7 +99,7 @@ def estimate_appearance(
         light=unknown_light(views),
     )
 
-    def search(seeing: Fitter, frames: Sequence[Sequence[Shot]]) -> list[Poses]:
+    def search(seeing: Fitter, frames: Sequence[Sequence[Frame]]) -> list[Poses]:
         ask = partial(
             initialise, seeing, proposers, locating=locating, candidates=settings.candidates, score_min=score_min
         )

@@ -13,7 +13,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.initialise import initialise
-from sphereorient.locate import LocateSettings, Shot
+from sphereorient.locate import Frame, LocateSettings
 from sphereorient.pose.fit import EDGE_PX
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
@@ -56,7 +56,7 @@ class FixedCentre:
 def find_fixed_centre(
     learnt: Appearance,
     proposers: Mapping[str, Proposer],
-    shots: Sequence[Sequence[Shot]],
+    shots: Sequence[Sequence[Frame]],
     locating: LocateSettings,
     settings: RefineSettings,
 ) -> FixedCentre | None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import R_cam_view
 from sphereorient.follow.scan import relocalise
-from sphereorient.locate import LocateSettings, Shot, find_ball, find_positions, sightings_of
+from sphereorient.locate import Frame, LocateSettings, find_ball, find_positions, sightings_of
 from sphereorient.locate.find import Found
 from sphereorient.pose.fit import Fit
 from sphereorient.pose.fitter import Fitter, Picture
@@ -75,7 +75,7 @@ def no_pose(cameras: int, reason: Sequence[Reason]) -> Poses:
 def initialise(
     fitter: Fitter,
     proposers: Mapping[str, Proposer],
-    shots: Sequence[Shot],
+    shots: Sequence[Frame],
     locating: LocateSettings,
     *,
     candidates: int,
@@ -123,7 +123,7 @@ def _best_score(poses: Poses) -> float:
 def _with_outlines(
     fitter: Fitter,
     proposers: Mapping[str, Proposer],
-    shots: Sequence[Shot],
+    shots: Sequence[Frame],
     locating: LocateSettings,
     candidates: int,
     finalists: int,

@@ -11,7 +11,7 @@ from sphereorient import so3
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.initialise import Poses, no_pose
 from sphereorient.follow.tracker import BlockTracker
-from sphereorient.locate import LocateSettings, Shot
+from sphereorient.locate import Frame, LocateSettings
 from sphereorient.search.proposer import Proposer
 from sphereorient.search.settings import RefineSettings
 from sphereorient.trajectory import Reason
@@ -37,7 +37,9 @@ class PerCameraTracker:
         """Return the lengths of the blocks that are followed side by side; see `BlockTracker`."""
         return self.trackers[0].windows(frames)
 
-    def track(self, shots: Sequence[Sequence[Shot]], window: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
+    def track(
+        self, shots: Sequence[Sequence[Frame]], window: Sequence[int], time_s: Sequence[float]
+    ) -> Iterator[Poses]:
         """Follow the blocks of one window; see `BlockTracker`."""
         each = [tracker.track([movie], window, time_s) for tracker, movie in zip(self.trackers, shots, strict=True)]
         yield from (cameras_disagree(poses) for poses in zip(*each, strict=True))

@@ -14,7 +14,7 @@ from sphereorient import so3
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.fixed_centre import FixedCentre
 from sphereorient.follow.initialise import Poses, explaining_first, initialise, poses_of
-from sphereorient.locate import LocateSettings, Shot
+from sphereorient.locate import Frame, LocateSettings
 from sphereorient.pose.fit import Fit
 from sphereorient.pose.fitter import Fitter, Picture, PyramidLevel
 from sphereorient.search.proposer import Proposer
@@ -149,7 +149,9 @@ class BlockTracker:
         lengths = [last - first for first, last in pairwise([*firsts, frames.stop])]
         return [lengths[k : k + self.settings.lanes] for k in range(0, len(lengths), self.settings.lanes)]
 
-    def track(self, shots: Sequence[Sequence[Shot]], window: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
+    def track(
+        self, shots: Sequence[Sequence[Frame]], window: Sequence[int], time_s: Sequence[float]
+    ) -> Iterator[Poses]:
         """Follow the blocks of one window.
 
         Args:
@@ -171,7 +173,7 @@ class BlockTracker:
                 found[lane.first + k] = poses
         yield from (found[k] for k in range(sum(window)))
 
-    def _step(self, lanes: Sequence[_Lane], k: int, frames: Mapping[int, Sequence[Shot]]) -> Iterator[Poses]:
+    def _step(self, lanes: Sequence[_Lane], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
         """Measure one frame of each lane: predicted where that holds, searched for where not."""
         expected = {lane.first: self._in_place(lane.expected(lane.first + k, self.fitter.radius_mm)) for lane in lanes}
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
@@ -187,7 +189,7 @@ class BlockTracker:
             return expected
         return replace(expected, position_lab_mm=self.place.position_lab_mm, place_precision=self.place.precision)
 
-    def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Shot]]) -> list[Poses | None]:
+    def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
         """Fit expected poses, all in one batch of fixed size; None where the pictures do not bear one out."""
         if not expected:
             return []
@@ -315,7 +317,7 @@ class BlockTracker:
             wrong = wrong | (use[:, k] & use[:, m] & far & (away > limit * CONTRADICTS_SIGMAS))
         return wrong
 
-    def _search(self, shots: Sequence[Shot]) -> Poses:
+    def _search(self, shots: Sequence[Frame]) -> Poses:
         """Find the poses of a frame of which nothing is known, by those cameras whose pictures bear them out."""
         count = self.settings.candidates
         poses = initialise(
@@ -415,7 +417,7 @@ def _beside(fit: Fit, other: Fit, rows: Tensor, camera: int) -> Fit:
     return replace(fit, **told)
 
 
-def _reason(used: bool, contradicts: bool, shot: Shot, before: Reason) -> Reason:
+def _reason(used: bool, contradicts: bool, shot: Frame, before: Reason) -> Reason:
     """Say why a camera does not count: its picture is none, it says something else, or it was blind before."""
     if used:
         return Reason.OK

@@ -27,7 +27,7 @@ from sphereorient.locate import (
     screened_frames,
     sightings_of,
 )
-from sphereorient.locate.fixed import fixed_ball
+from sphereorient.locate.scene import fixed_ball
 from sphereorient.mapping.settings import PaintSettings
 from sphereorient.pose.fitter import CameraView
 

@@ -16,7 +16,7 @@ from sphereorient.experiment.stream import CameraStream, spread_frames
 from sphereorient.follow import Appearance, BlockTracker, PerCameraTracker, Poses, PoseTable, joined_tables, pose_table
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre
-from sphereorient.locate import Shot, find_scene, known_diameter_px, screened_frames
+from sphereorient.locate import Frame, find_scene, known_diameter_px, screened_frames
 from sphereorient.methods import results
 from sphereorient.methods.learnt import Learnt, with_motion
 from sphereorient.methods.proposers import BlurMatchedSearch
@@ -98,7 +98,7 @@ def open_view(recording: Recording, stream: CameraStream, settings: Settings, pr
     return CameraView.of(stream.name, stream.camera, scene)
 
 
-def sample_frames(recording: Recording, views: Sequence[CameraView], count: int) -> list[tuple[Shot, ...]]:
+def sample_frames(recording: Recording, views: Sequence[CameraView], count: int) -> list[tuple[Frame, ...]]:
     """Return frames spread over the movies; where a picture is none, the next frame of which all are."""
     total = len(recording.timeline)
     spread = spread_frames(range(total), count)
@@ -165,7 +165,7 @@ def follow(follower: Follower, windows: Sequence[Window]) -> Iterator[tuple[Wind
             for stream, view in zip(streams, follower.study.fitter.views, strict=True)
         ]
 
-        def ahead(window: Window) -> list[Future[list[Shot]]]:
+        def ahead(window: Window) -> list[Future[list[Frame]]]:
             return [pool.submit(_taken, movie, window.last - window.first) for movie in movies]
 
         coming = ahead(windows[0])
@@ -176,7 +176,7 @@ def follow(follower: Follower, windows: Sequence[Window]) -> Iterator[tuple[Wind
             yield window, list(follower.tracker.track(read, window.lengths, times))
 
 
-def _taken(shots: Iterator[Shot], count: int) -> list[Shot]:
+def _taken(shots: Iterator[Frame], count: int) -> list[Frame]:
     """Take the next pictures of a movie."""
     return list(islice(shots, count))
 

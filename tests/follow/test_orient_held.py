@@ -18,7 +18,7 @@ from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow import BlockTracker, Poses
 from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre, mean_place
-from sphereorient.locate import Shot, screened_frames
+from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods.precise import learn, sample_frames
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import Fitter
@@ -84,7 +84,7 @@ def truth(path: Path) -> tuple[Tensor, Tensor]:
         return torch.from_numpy(file["position"][()]), torch.from_numpy(file["orientation"][()])
 
 
-def beside(fitter: Fitter, shots: Sequence[Shot], pose: Poses, place: FixedCentre, error_mm: Tensor) -> Tensor:
+def beside(fitter: Fitter, shots: Sequence[Frame], pose: Poses, place: FixedCentre, error_mm: Tensor) -> Tensor:
     """Delta by which a frame's attitude is found to differ where the ball is held beside its place; brute force."""
     fine, use = fitter.optics.fine, pose.use[None]
     pixels = fitter.pixels([[shot.picture for shot in shots]], place.position_lab_mm[None], fine)
