@@ -21,7 +21,7 @@ class Blob:
 
 
 def _reduce(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Average by an integer factor; the rest at the right and lower border is cut (other ratios are 40 times slower)."""
+    """Average by an integer factor, cropping right and lower borders (other ratios are 40 times slower)."""
     height, width = (side // factor * factor for side in picture.shape)
     if factor == 1:
         return picture

@@ -21,7 +21,7 @@ PAINTED = 0.15  # least variance of the ball, as a share of the largest variance
 BESIDE, NEAR_RIM = (
     0.1,
     1.1,
-)  # share of the disk: more foreground beside it is another object; radii: nearer foreground is halo
+)  # share of the disk: more foreground beside it is another object; radii: halo
 SET_ASIDE = 2  # other round objects whose rims are removed
 PROFILES = 180  # radial profiles of the sub-pixel fit; more sample the same pixels again
 
@@ -183,7 +183,7 @@ def _radial_edges(
     The outermost, not the steepest: texture edges inside are often steeper than the rim.
 
     Returns:
-        Of each profile with such a fall: unit direction (n, 2), signed distance from the circle (n,), px, steepness (n,).
+        Of profiles with such a fall: unit direction (n, 2), signed distance from the circle (n,), px, steepness (n,).
     """
     step = 0.5
     # Two samples to each side of a fall are needed, however small the circle.
