@@ -70,7 +70,7 @@ def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None
 
 
 def _full_scale(pictures: NDArray[Any]) -> float:
-    """Return the grey level of a saturated pixel: 10 to 14 bit cameras use the lower bits of 16, and files do not say so."""
+    """Return the grey level of a saturated pixel: 10 to 14 bit cameras use the lower bits of 16."""
     if pictures.dtype.itemsize == 1:
         return 255.0
     brightest = int(pictures.max(initial=0))
