@@ -12,6 +12,8 @@ import h5py
 
 from sphereorient.files.outputs import put_aside
 
+# What h5py raises on damaged files, depending on the place where HDF5 notices.
+DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)
 ROOM = "check the space left and the permissions of the folder"
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.movies.grey import COLOUR_REMARK, luma
-from sphereorient.movies.movie import Grey, Movie, refused, truncated_remark
+from sphereorient.movies.movie import Grey, Movie, mapped, refused, truncated_remark
 
 FILE_HEADER = struct.Struct("<2s3HiIiI3IQ")
 BITMAP_HEADER = struct.Struct("<IiiHHIIiiII")
@@ -23,7 +23,7 @@ TIME_BLOCK = 1002  # a TIME64 for each image
 MAX_BLOCKS = 10_000  # tagged blocks; recorders write a handful
 FLAG_BITS = np.uint64(3)  # the two lowest bits of a TIME64 are flags
 MAX_SIDE = 1 << 16  # px; larger than any sensor
-FRAMES_A_MAP = 64  # see NpyMovie: keeps memory flat
+FIRST = 64  # images that determine the usual size
 JPEG, FILTER_ARRAY = 1, 2  # values of `compression`
 PREFIX = 8  # bytes before the pixels at least: size of the annotation, size of the image
 COPY_AGAIN = "copy it from the camera again"
@@ -74,7 +74,7 @@ class CineMovie(Movie):
         layout = self._layout = _layout(path, header)
         self._top_down = header.flip_vertical != layout.packed
         content = np.memmap(path, np.uint8, "r")
-        found = Counter(_prefix_and_size(content, int(offset)) for offset in header.offsets[:FRAMES_A_MAP])
+        found = Counter(_prefix_and_size(content, int(offset)) for offset in header.offsets[:FIRST])
         found.pop((0, 0), None)
         if not found:
             raise refused(path, "at least one whole image", "none", COPY_AGAIN)
@@ -108,10 +108,9 @@ class CineMovie(Movie):
             yield f"its header asks for a turn by {self._header.rotate_deg} degrees, which is not applied"
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
-        for start in range(0, len(numbers), FRAMES_A_MAP):
-            content = np.memmap(self.path, np.uint8, "r")
-            for number in numbers[start : start + FRAMES_A_MAP]:
-                yield self._picture(content, number)
+        whole = (self.path.stat().st_size,)
+        for number, content in mapped(self.path, numbers, np.dtype(np.uint8), 0, whole):
+            yield self._picture(content, number)
 
     def _picture(self, content: NDArray[np.uint8], number: int) -> Grey:
         offset = int(self._header.offsets[number])

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.files.hdf5 import DAMAGE
 from sphereorient.movies.movie import Grey, Movie, error_words, refused, truncated_remark
 
 SEPARATOR = "::"  # between the file and the data set in it
@@ -20,8 +21,6 @@ TIMES = ("time", "times", "timestamps")
 MAX_OBJECTS = 10_000  # searched for the one data set
 BLOCK_BYTES = 64 << 20  # held at once, of a data set whose chunks hold many frames
 LARGEST_RATIO = 1200  # largest compression ratio of a picture of one grey value
-# What h5py raises on damaged files, depending on the place where HDF5 notices.
-DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)
 
 
 class Hdf5Movie(Movie):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sphereorient.errors import MovieError, refusal
 
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
+FRAMES_A_MAP = 64
 FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns
 
 
@@ -141,6 +142,19 @@ def flipped_picture(picture: NDArray[Any], how: str) -> NDArray[Any]:
     """Mirror a picture (..., H, W) as `flipped` mirrors a movie."""
     rows, columns = FLIPS[how]
     return np.ascontiguousarray(picture[..., ::rows, ::columns])
+
+
+def mapped(
+    path: Path, numbers: Sequence[int], dtype: np.dtype[Any], offset: int, shape: tuple[int, ...]
+) -> Iterator[tuple[int, NDArray[Any]]]:
+    """Yield each frame number with the array of a file mapped into memory, from a new map for every 64 frames.
+
+    Pages once read stay in memory while the process holds the map: new maps keep memory flat.
+    """
+    for place, number in enumerate(numbers):
+        if place % FRAMES_A_MAP == 0:
+            values = np.memmap(path, dtype, "r", offset, shape)
+        yield number, values
 
 
 def refused(path: Path, expected: str, got: str, do: str) -> MovieError:

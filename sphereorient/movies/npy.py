@@ -10,11 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from sphereorient.movies.movie import Grey, Movie, error_words, refused, truncated_remark
+from sphereorient.movies.movie import Grey, Movie, error_words, mapped, refused, truncated_remark
 
-# Frames read through one map of the file. Pages once read stay in memory while the process holds the map: a new map
-# for every few frames keeps memory flat.
-FRAMES_A_MAP = 64
 # numpy parses a header as a Python literal, and old ones as its tokens.
 DAMAGE = (OSError, ValueError, EOFError, TypeError, LookupError, SyntaxError, TokenError, RecursionError, MemoryError)
 ZIP = b"PK"  # numpy's archives of several arrays, whatever their suffix
@@ -37,10 +34,9 @@ class NpyMovie(Movie):
         self.remarks = truncated_remark(shape[0], count)
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
-        for start in range(0, len(numbers), FRAMES_A_MAP):
-            frames: Grey = np.memmap(self.path, self._stored, "r", self._offset, (self._count, *self.frame_shape))
-            for number in numbers[start : start + FRAMES_A_MAP]:
-                yield np.array(frames[number], self.dtype)
+        shape = (len(self), *self.frame_shape)
+        for number, frames in mapped(self.path, numbers, self._stored, self._offset, shape):
+            yield np.array(frames[number], self.dtype)
 
 
 def _header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:

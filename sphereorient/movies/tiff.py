@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.movies.grey import COLOUR_REMARK, luma
-from sphereorient.movies.movie import Grey, Movie, error_words, refused, truncated_remark
+from sphereorient.movies.movie import Grey, Movie, error_words, mapped, refused, truncated_remark
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
@@ -29,7 +29,6 @@ WHITE_IS_ZERO, BLACK_IS_ZERO, RGB = 0, 1, 2  # PhotometricInterpretation
 UNCOMPRESSED = 1
 ORIENTATION = 274  # tag: where row 0 and column 0 are
 STEPS = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1)}  # of rows and columns, by orientation
-FRAMES_A_MAP = 64  # see NpyMovie: keeps memory flat
 LARGEST_RATIO = 1200  # largest compression ratio of a picture of one grey value
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damage is reported by our own refusals
@@ -63,14 +62,11 @@ class TiffMovie(Movie):
         self.remarks = remarks + (("stored with white as 0: inverted",) if self._white_is_zero else ())
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
-        return self._read_pages(numbers) if self._offset is None else self._read_values(self._offset, numbers)
-
-    def _read_values(self, offset: int, numbers: Sequence[int]) -> Iterator[Grey]:
-        for start in range(0, len(numbers), FRAMES_A_MAP):
-            shape = (self._count, *self._kind[0])
-            values: Grey = np.memmap(self.path, self._stored, "r", offset, shape)
-            for number in numbers[start : start + FRAMES_A_MAP]:
-                yield self._grey(values[number])
+        if self._offset is None:
+            return self._read_pages(numbers)
+        shape = (len(self), *self._kind[0])
+        pages = mapped(self.path, numbers, self._stored, self._offset, shape)
+        return (self._grey(values[number]) for number, values in pages)
 
     def _read_pages(self, numbers: Sequence[int]) -> Iterator[Grey]:
         with _opened(self.path) as file:

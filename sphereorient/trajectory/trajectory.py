@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, ShapeError, TrackError, refusal
-from sphereorient.files.hdf5 import whole_hdf5
+from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
 from sphereorient.trajectory.camera import AGAIN, CameraTrack, read_camera, write_camera
 from sphereorient.trajectory.columns import blank, check_shapes, column, columns, inside, read_columns, write_columns
 from sphereorient.trajectory.reasons import Flag, Reason
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = "sphereorient-track/1"
-# What h5py raises on damaged files, depending on the place where HDF5 notices; ShapeError and broken JSON among them.
-DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)
 TEXTS = ("method", "settings", "experiment")  # root attributes
 # Rows of `plot`: the label, the measured field, the smoothed one.
 PLOTTED = (
@@ -186,7 +184,7 @@ class Trajectory:
         try:
             with file:
                 return cls(**_read(file))
-        except DAMAGE as error:
+        except DAMAGE as error:  # ShapeError and broken JSON among them
             got = f"'{' '.join(str(error).split())[:200]}'"
             raise TrackError(refusal(str(path), expected="a whole track", got=got, do=AGAIN)) from error
 
