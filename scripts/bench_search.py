@@ -37,7 +37,7 @@ NOISE = 0.05
 RIGHT_DEG = 3.0
 CENTRE_PX, RADIUS_SHARE = 0.5, 0.01  # errors planted
 
-Frame = tuple[np.ndarray, float, float, float, Tensor]  # picture, outline's u, v and radius (px), R_view_body
+Sample = tuple[np.ndarray, float, float, float, Tensor]  # picture, outline's u, v and radius (px), R_view_body
 
 
 def main() -> None:
@@ -60,7 +60,7 @@ def speed() -> None:
         speed_at(size_px, rendered)
 
 
-def speed_at(size_px: int, rendered: list[Frame]) -> None:
+def speed_at(size_px: int, rendered: list[Sample]) -> None:
     texture = random_texture("blobs", PAINTS["blobs"])
     start = time.process_time()
     search = GreySearch(texture, GreySearchSettings(size_px=size_px))
@@ -71,7 +71,7 @@ def speed_at(size_px: int, rendered: list[Frame]) -> None:
     def rate(count: int) -> str:
         return f"{count * templates / cpu_s(lambda: search.search(disks[:count])) / 1e6:.0f} M ({count} disks)"
 
-    def first_s(one: Frame) -> float:
+    def first_s(one: Sample) -> float:
         return cpu_s(lambda: search.propose(cropped(size_px, *one)), 8)
 
     pixels = int(orthographic_view(size_px).inside.sum())
@@ -127,7 +127,7 @@ def report(name: str, search: GreySearch, disks: Tensor, R_view_body: Tensor) ->
     )
 
 
-def frames(paint: str, ambient: float, count: int) -> list[Frame]:
+def frames(paint: str, ambient: float, count: int) -> list[Sample]:
     """Picture, outline (u, v, radius; errors planted) and R_view_body of random attitudes."""
     settings = SynthSettings(
         diameter_px=80, image_size=(128, 128), ambient=ambient, shot_noise=0.0, read_noise=NOISE * (170 - 20)
@@ -135,7 +135,7 @@ def frames(paint: str, ambient: float, count: int) -> list[Frame]:
     return list(_frames(paint, settings, count))
 
 
-def _frames(paint: str, settings: SynthSettings, count: int) -> Iterator[Frame]:
+def _frames(paint: str, settings: SynthSettings, count: int) -> Iterator[Sample]:
     scene = make_scene(random_texture(paint, PAINTS[paint]), settings)
     camera = default_cameras(settings)["cam1"]
     rng, generator = np.random.default_rng(7), torch.Generator().manual_seed(7)

@@ -30,7 +30,7 @@ from sphereorient.follow import Appearance, ChunkTracker
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.locate import Shot, screened_frames
+from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
@@ -56,7 +56,7 @@ class Bench:
 
     experiment: Experiment
     eyes: list[CameraView]
-    shots: list[list[Shot]]  # per eye
+    shots: list[list[Frame]]  # per eye
     times: list[float]  # of the same frames, s
     search: GreySearch
     learnt: Appearance

@@ -23,7 +23,7 @@ from sphereorient.cameras import Camera
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.locate import Background, Shot
+from sphereorient.locate import Background, Frame
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, LinesOfSight, base_table
@@ -66,7 +66,7 @@ def errors_deg(
     search = {view.name: GreySearch(texture, settings.search)}
     spread = locate.spread_frames(range(len(frames)), settings.refine.appearance_frames)
     base = base_table(texture, view.diameter_px)
-    shots = [[Shot(picture=frames[k])] for k in spread]
+    shots = [[Frame(picture=frames[k])] for k in spread]
     first = Initialiser(
         fitter=first_fitter([view], radius_mm, base, FIRST_BLUR_PX),
         proposers=search,
@@ -76,7 +76,7 @@ def errors_deg(
     learnt = estimate_appearance(first, shots, base, settings.refine)
     errors = []
     for frame, R in zip(frames, R_lab_body, strict=True):
-        poses = learnt.search(search, settings.locate, settings.refine.candidates).poses([Shot(picture=frame)])
+        poses = learnt.search(search, settings.locate, settings.refine.candidates).poses([Frame(picture=frame)])
         error = float(so3.geodesic_distance(poses.R_lab_body[0], R)) if len(poses) else math.inf
         errors.append(math.degrees(error))
     return errors

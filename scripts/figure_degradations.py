@@ -133,8 +133,6 @@ def crop(path: Path, name: str, number: int, half: float) -> NDArray[np.uint8]:
         u, v = np.rint(file[f"{name}/centre_px"][number]).astype(int)
     movies = open_movies(load_experiment(path))
     frame = list(movies[name].frames())[number]
-    for movie in movies.values():
-        movie.close()
     r = round(half)
     return np.asarray(np.pad(frame, r)[v : v + 2 * r + 1, u : u + 2 * r + 1])
 

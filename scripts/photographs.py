@@ -31,7 +31,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import save_cameras
 from sphereorient.errors import PaintError
-from sphereorient.experiment.recording import open_unpainted, silent
+from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.mapping import take_footage
 from sphereorient.mapping.compare import compare_maps
 from sphereorient.mapping.cut import disks_of
@@ -168,7 +168,7 @@ def paired(experiment: Path) -> Solved:
     with h5py.File(experiment.parent / "truth.h5") as file:
         R = torch.full(file["orientation"].shape, torch.nan, dtype=torch.float64)
     try:
-        with open_unpainted(experiment) as recording:
+        with open_recording(experiment, textured=False) as recording:
             footage = take_footage(recording, paint, settings.locate, silent)
         frames = torch.nonzero(footage.seen.any(1))[:, 0]
         finer = finer_settings(paint, widest_px(footage.views))

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.recording import open_unpainted, silent
+from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.mapping import LearntMap, learn_from, take_footage
 from sphereorient.mapping.chain import find_chain
 from sphereorient.mapping.cut import disks_of
@@ -175,7 +175,7 @@ def learnt_from(path: Path, settings: Settings) -> tuple[LearntMap, torch.Tensor
     """Learn the map; return it, the attitudes of the chain without any loop, and the open experiment's frames."""
     begun = time.perf_counter()
     cpu = time.process_time()
-    with open_unpainted(path) as recording:
+    with open_recording(path, textured=False) as recording:
         footage = take_footage(recording, settings.paint, settings.locate, silent)
         learnt = learn_from(footage, settings.paint, silent)
         seconds, busy = time.perf_counter() - begun, time.process_time() - cpu

@@ -20,7 +20,7 @@ from sphereorient.calibration.guess import guess_from_points, guess_rig
 from sphereorient.calibration.plate_view import PlateView, placed
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.errors import CameraError, refusal
-from sphereorient.files.picture_claim import claimed_pixels, decoded_grey
+from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 
 LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a plate

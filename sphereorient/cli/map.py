@@ -116,7 +116,7 @@ class Made:
 def _learn(path: Path, names: list[str] | None, settings: Settings, old: Tensor | None, advance: Advance) -> Made:
     """Learn a map, and bring it into an old one's frame where there is one."""
     from sphereorient.experiment import input_files
-    from sphereorient.experiment.recording import open_unpainted
+    from sphereorient.experiment.recording import open_recording
     from sphereorient.files.provenance import provenance
     from sphereorient.mapping import learn_map
     from sphereorient.mapping.correct import corrected
@@ -124,7 +124,7 @@ def _learn(path: Path, names: list[str] | None, settings: Settings, old: Tensor 
     from sphereorient.methods.settings import settings_yaml
     from sphereorient.run.stages import one_thread
 
-    with open_unpainted(path, names) as recording, one_thread():
+    with open_recording(path, names, textured=False) as recording, one_thread():
         learnt = learn_map(recording, settings.paint, settings.locate, advance)
         correction = None if old is None else corrected(learnt, old)
         learnt = learnt if correction is None else correction.learnt

@@ -24,25 +24,25 @@ if TYPE_CHECKING:
 Source = Annotated[
     str, typer.Argument(metavar="FILE", help="A movie, a folder of pictures, a pattern, or file.h5::dataset.")
 ]
-Flip = Annotated[str, typer.Option(help="Turn round: none, vertical (rows), horizontal (columns), both.")]
+Flip = Annotated[str, typer.Option(help="Mirror: none, vertical (rows), horizontal (columns), both.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
 SHOWN = 12  # numbers of frames named in a line
 LINE = 100  # characters
 UNEVEN = 1e-3  # of the usual time between frames
 
 
-@app.command()
-def movie(
+@app.command("movie")
+def show_movie(
     source: Source,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Contact sheet (.png, .pdf); FILE.contact.png here without it.")
     ] = None,
     count: Annotated[int, typer.Option(min=1, max=240, help="Frames on the sheet.")] = 24,
-    every: Annotated[bool, typer.Option("--all", help="Look at every frame, not only at those of the sheet.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="Examine every frame, not only those of the sheet.")] = False,
     flip: Flip = "none",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
-    """Tell what is in a movie, and draw a contact sheet of it."""
+    """Print what is in a movie, and draw a contact sheet of it."""
     sheet = Path(f"{_stem(source)}.contact.png") if out is None else out
     check_writable(sheet)
     from sphereorient.movies import flipped, open_movie
@@ -56,7 +56,7 @@ def movie(
             with put_aside(sheet) as partial:
                 contact_sheet(opened, seen, partial)
             advance("sheet", 1, 1)
-        for title, text in [*facts(opened), *findings(opened, seen), ("sheet", str(sheet))]:
+        for title, text in [*_facts(opened), *_findings(opened, seen), ("sheet", str(sheet))]:
             typer.echo(textwrap.fill(text, LINE, initial_indent=f"{title:14}", subsequent_indent=" " * 14))
 
 
@@ -95,10 +95,12 @@ def convert(
             typer.echo(f"Wrote {times_path(target)}: their times (experiment.yaml, times:)")
 
 
-def facts(opened: Movie) -> list[tuple[str, str]]:
-    """Return what the file says of itself, as title and text."""
+def _facts(opened: Movie) -> list[tuple[str, str]]:
+    """Return the properties of the file, as title and text."""
+    from sphereorient.movies import movie_files
+
     height, width = opened.frame_shape
-    size = _size(opened.path)
+    size = sum(file.stat().st_size for file in movie_files(opened.path))
     return [
         ("file", f"{opened.path}" + (f", {size / 1e6:.1f} MB" if size else "")),
         ("format", opened.format),
@@ -109,8 +111,8 @@ def facts(opened: Movie) -> list[tuple[str, str]]:
     ]
 
 
-def findings(opened: Movie, seen: Survey) -> list[tuple[str, str]]:
-    """Return what was seen in the frames, as title and text."""
+def _findings(opened: Movie, seen: Survey) -> list[tuple[str, str]]:
+    """Return the result of the survey, as title and text."""
     whole = "all frames" if seen.looked == len(opened) else f"{seen.looked} of {len(opened)} frames"
     lines = [("looked at", f"{whole}: grey levels {seen.lowest} .. {seen.highest}")]
     for fault, numbers in seen.faults.items():
@@ -136,13 +138,6 @@ def _times(times_s: NDArray[np.float64] | None) -> str:
     return f"{span}, not even: usually {1 / usual:.6g} Hz, {len(off)} of {len(steps)} steps differ, {gap}"
 
 
-def _size(path: Path) -> int:
-    """Return the bytes of the files that a movie is made of."""
-    from sphereorient.movies import movie_files
-
-    return sum(file.stat().st_size for file in movie_files(path))
-
-
 def _frames(count: int) -> str:
     return "1 frame" if count == 1 else f"{count} frames"
 
@@ -153,7 +148,7 @@ def _numbers(numbers: Sequence[int]) -> str:
 
 
 def _stem(source: str) -> str:
-    """Return the movie's name without what a file's name cannot hold."""
+    """Return the name of the movie without characters that file names cannot have."""
     return re.sub(r"[^\w.+-]+", "_", Path(source.replace("::", "_").rstrip("/")).name) or "movie"
 
 
@@ -167,10 +162,8 @@ def _range(text: str, opened: Movie) -> tuple[int, int]:
 
 
 def _pictures(opened: Movie, first: int, last: int, dead: list[int], advance: Advance) -> Iterator[Grey | None]:
-    """Yield the frames to write, noting those that cannot be decoded in `dead`."""
-    from sphereorient.movies import readable
-
-    for number, picture in enumerate(readable(opened, first, last), start=first):
+    """Yield the frames to write; append the numbers of those that cannot be decoded to `dead`."""
+    for number, picture in enumerate(opened.readable(first, last), start=first):
         if picture is None:
             dead.append(number)
         yield picture

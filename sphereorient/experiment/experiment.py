@@ -1,9 +1,9 @@
-"""The noun that goes in: an experiment, its cameras and its movies; `timeline` tells which frame is when."""
+"""The input of a measurement: an experiment, its cameras and its movies, read from experiment.yaml."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,7 +24,7 @@ FrameNumber = Annotated[int, Field(ge=0)]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Experiment:
-    """What experiment.yaml says; made by `load_experiment` or synth, read by everyone who opens movies."""
+    """The content of experiment.yaml; made by `load_experiment` or synth, read by everyone who opens movies."""
 
     name: str
     path: Path  # of experiment.yaml
@@ -72,7 +72,7 @@ class FlowKeys(BaseModel):
 
 
 class ExperimentKeys(BaseModel):
-    """The keys of experiment.yaml (DESIGN section 2)."""
+    """The keys of experiment.yaml (docs/data-format.md)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     name: str | None = None
@@ -91,16 +91,11 @@ class ExperimentKeys(BaseModel):
 
 
 def load_experiment(path: Path | str) -> Experiment:
-    """Read experiment.yaml and the cameras that it names; movies, masks and texture are opened by who needs them.
-
-    Args:
-        path: the YAML file; paths in it are relative to its folder.
+    """Read experiment.yaml, with paths relative to its folder, and its cameras; movies and pictures are not opened.
 
     Raises:
         ExperimentError: missing, malformed or inconsistent.
         CameraError: the cameras' file is missing or malformed.
-
-    Source: DESIGN section 2.
     """
     path = Path(path)
     document = read_document(path, SCHEMA, ExperimentError)
@@ -108,7 +103,11 @@ def load_experiment(path: Path | str) -> Experiment:
     _check_names(path, keys)
     _check_numbers(path, keys)
     cameras_path = path.parent / keys.cameras
-    cameras = _cameras_of(cameras_path, keys.movies)
+    known = load_cameras(cameras_path)
+    for name in keys.movies:
+        if name not in known:
+            raise ExperimentError(refuse_unknown(name, known, f"{cameras_path}, camera of movie {name}"))
+    cameras = {name: known[name] for name in keys.movies}
     return Experiment(
         name=path.stem if keys.name is None else keys.name,
         path=path,
@@ -133,13 +132,9 @@ def load_experiment(path: Path | str) -> Experiment:
 
 
 def write_experiment(experiment: Experiment, comment: str = "") -> Path:
-    """Write an experiment to its `path`, with paths relative to it, and return the path.
+    """Write an experiment to its `path`, with `comment` at the top, and return the path.
 
-    The cameras' file is not written: `save_cameras(experiment.cameras_path, experiment.cameras)` does that.
-
-    Args:
-        experiment: what to write.
-        comment: lines for the top of the file.
+    The cameras' file is not written: see `save_cameras`.
 
     Raises:
         OutputError: the file cannot be written.
@@ -179,41 +174,29 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
 
 
 def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> dict[str, Movie]:
-    """Open the movies of an experiment and check that they fit the cameras.
-
-    Args:
-        experiment: which movies.
-        names: of the cameras wanted; all if None.
-
-    Returns:
-        Name -> movie; close them when done.
+    """Open the movies of an experiment, all or those of the named cameras, and check that they fit the cameras.
 
     Raises:
         ExperimentError: a name that the experiment does not have.
         MovieError: a movie is missing or unreadable, or of another size than its camera's picture.
     """
     movies: dict[str, Movie] = {}
-    try:
-        for name in experiment.movie_paths if names is None else names:
-            if name not in experiment.movie_paths:
-                raise ExperimentError(refuse_unknown(name, experiment.movie_paths, f"{experiment.path}, movies"))
-            movies[name] = open_movie(experiment.movie_paths[name])
-            movies[name] = flipped(movies[name], experiment.flip.get(name, "none"))
-            _check_size(experiment, name, movies[name])
-    except BaseException:
-        for movie in movies.values():
-            movie.close()
-        raise
+    for name in experiment.movie_paths if names is None else names:
+        if name not in experiment.movie_paths:
+            raise ExperimentError(refuse_unknown(name, experiment.movie_paths, f"{experiment.path}, movies"))
+        movie = flipped(open_movie(experiment.movie_paths[name]), experiment.flip.get(name, "none"))
+        width, height = experiment.cameras[name].image_size
+        if movie.frame_shape != (height, width):
+            expected = f"{width} x {height} px as camera {name} in {experiment.cameras_path}"
+            got = f"{movie.frame_shape[1]} x {movie.frame_shape[0]}"
+            do = "calibrate the camera with this movie's picture size"
+            raise MovieError(refusal(str(movie.path), expected=expected, got=got, do=do))
+        movies[name] = movie
     return movies
 
 
 def input_files(experiment: Experiment, names: Sequence[str] | None = None) -> dict[Path, list[Path]]:
-    """Return the inputs of an experiment, each with the files it consists of: itself, or a sequence's pictures.
-
-    Args:
-        experiment: what it names, experiment.yaml included.
-        names: of the cameras in use; None: all.
-    """
+    """Return the inputs of an experiment for the named cameras or all, each with its files: itself, or its pictures."""
     used = list(experiment.movie_paths) if names is None else list(names)
     single = [experiment.path, experiment.cameras_path]
     for paths in (experiment.background_paths, experiment.mask_paths):
@@ -227,20 +210,14 @@ def input_files(experiment: Experiment, names: Sequence[str] | None = None) -> d
 
 
 def outside_paths(experiment: Experiment) -> list[Path]:
-    """Return the inputs that an experiment names outside of its own folder, to tell whoever got it from others."""
+    """Return the inputs of an experiment that lie outside of its own folder."""
     folder = Path(os.path.realpath(experiment.folder))
     return [path for path in input_files(experiment) if not Path(os.path.realpath(path)).is_relative_to(folder)]
 
 
 def _check_names(path: Path, keys: ExperimentKeys) -> None:
-    by_name: dict[str, Mapping[str, object]] = {
-        "masks": keys.masks,
-        "backgrounds": keys.backgrounds,
-        "start": keys.start,
-        "flip": keys.flip,
-    }
-    for key, named in by_name.items():
-        for name in named:
+    for key in ("masks", "backgrounds", "start", "flip"):
+        for name in getattr(keys, key):
             if name not in keys.movies:
                 raise ExperimentError(refuse_unknown(name, keys.movies, f"{path}, {key}"))
 
@@ -255,20 +232,3 @@ def _check_numbers(path: Path, keys: ExperimentKeys) -> None:
     if keys.exposure is not None and keys.frame_rate is not None and keys.exposure > 1 / keys.frame_rate:
         expected, do = f"at most the time between frames, {1 / keys.frame_rate:.4g} s", "write it in seconds"
         raise ExperimentError(refusal(f"{path}, exposure", expected=expected, got=f"{keys.exposure:g}", do=do))
-
-
-def _cameras_of(cameras_path: Path, movies: Mapping[str, str]) -> dict[str, Camera]:
-    known = load_cameras(cameras_path)
-    for name in movies:
-        if name not in known:
-            raise ExperimentError(refuse_unknown(name, known, f"{cameras_path}, camera of movie {name}"))
-    return {name: known[name] for name in movies}
-
-
-def _check_size(experiment: Experiment, name: str, movie: Movie) -> None:
-    width, height = experiment.cameras[name].image_size
-    if movie.frame_shape != (height, width):
-        expected = f"{width} x {height} px as camera {name} in {experiment.cameras_path}"
-        got = f"{movie.frame_shape[1]} x {movie.frame_shape[0]}"
-        do = "calibrate the camera with this movie's picture size"
-        raise MovieError(refusal(str(movie.path), expected=expected, got=got, do=do))

@@ -1,4 +1,4 @@
-"""What an experiment itself gives of a camera's scene: its picture without the ball, and what hides the ball."""
+"""Pictures that an experiment gives of a camera's scene: without the ball, and what hides the ball."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment.experiment import Experiment
-from sphereorient.files.picture_claim import claimed_pixels, decoded_grey
+from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 from sphereorient.movies import flipped_picture
 
@@ -18,20 +18,18 @@ BYTES_A_PIXEL, HEADER_BYTES = 8, 1_000_000  # of a picture without any compressi
 
 
 def given_scene(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.float32] | None:
-    """Return the experiment's own picture of a camera's scene without the ball, None where it gives none."""
+    """Return the given picture of a camera's scene without the ball, flipped as its movie is; None without one."""
     path = experiment.background_paths.get(name)
     if path is None:
         return None
-    # It is a frame of the movie as its file holds it.
     return flipped_picture(load_background(path, frame_shape), experiment.flip.get(name, "none"))
 
 
 def given_mask(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """Return where a camera sees the ball, (H, W), None where nothing hides it."""
+    """Return where a camera sees the ball, (H, W), flipped as its movie is; None where nothing hides it."""
     path = experiment.mask_paths.get(name)
     if path is None:
         return None
-    # It is painted on a frame of the movie as its file holds it.
     return flipped_picture(load_mask(path, frame_shape), experiment.flip.get(name, "none"))
 
 
@@ -39,17 +37,17 @@ def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.floa
     """Read a picture of the scene without the ball, (H, W), grey levels.
 
     Raises:
-        ExperimentError: the file is missing, no picture, or of another size than the movie's frames.
+        ExperimentError: missing, not a picture, or not of the size of the movie's frames.
     """
     do = "save a frame without the ball as PNG, in the movie's own grey levels"
     return np.asarray(_picture(path, f"background {path}", frame_shape, do), np.float32)
 
 
 def load_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Read where the ball can be seen, (H, W): black in the picture is what hides it, white all else.
+    """Read a mask, (H, W), True (white) where the ball can be seen, False (black) where something hides it.
 
     Raises:
-        ExperimentError: the file is missing, no picture, of another size than the movie's frames, or all black.
+        ExperimentError: missing, not a picture, not of the size of the movie's frames, or all black.
     """
     name, do = f"mask {path}", "paint what hides the ball black, all else white, on a frame of the movie"
     picture = _picture(path, name, frame_shape, do)
@@ -63,14 +61,13 @@ def _picture(path: Path, name: str, frame_shape: tuple[int, int], do: str) -> ND
     """Read a grey picture of the size of a movie's frames, (H, W), in its own depth."""
     height, width = frame_shape
     content = read_whole(path, BYTES_A_PIXEL * height * width + HEADER_BYTES, "a picture", ExperimentError, do)
-    claimed = claimed_pixels(content)
-    if claimed is not None and claimed > height * width:  # told before room is made for it
-        expected, got = f"{width} x {height} px as the movie", f"{claimed} px"
-        raise ExperimentError(refusal(name, expected=expected, got=got, do=do))
+    claimed, expected = claimed_pixels(content), f"{width} x {height} px as the movie"
+    if claimed is not None and claimed > height * width:  # before memory is allocated for it
+        raise ExperimentError(refusal(name, expected=expected, got=f"{claimed} px", do=do))
     picture = None if claimed is None else decoded_grey(content)
     if picture is None:
-        raise ExperimentError(refusal(name, expected="a picture", got="a file that is none", do=do))
+        raise ExperimentError(refusal(name, expected="a picture", got="a file that cannot be decoded", do=do))
     if picture.shape != frame_shape:
-        expected, got = (f"{shape[1]} x {shape[0]} px as the movie" for shape in (frame_shape, picture.shape))
-        raise ExperimentError(refusal(name, expected=expected, got=got.removesuffix(" as the movie"), do=do))
+        got = f"{picture.shape[1]} x {picture.shape[0]} px"
+        raise ExperimentError(refusal(name, expected=expected, got=got, do=do))
     return picture

@@ -1,4 +1,4 @@
-"""An experiment opened: its frames, its cameras' pictures, the paint. What the stages of a method work on."""
+"""An experiment opened: its frames, its camera streams, its texture map. What the stages of a method work on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Progress = Callable[[str, int, int], None]  # (stage, frames done, frames in all
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Tell nobody."""
+    """Report no progress."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +33,7 @@ class Recording:
     streams: Sequence[CameraStream]
     timeline: Timeline
     texture: Tensor  # (H, 2 H); (0, 0) where it is to be learnt
-    remarks: tuple[str, ...]  # what a user should know of the inputs
+    remarks: tuple[str, ...]  # warnings about the inputs, for the user
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -63,91 +63,61 @@ class Recording:
         return None if whole is None else whole.of(list(self.cameras))
 
     def gridded(self) -> tuple[Recording, Rows]:
-        """Return the recording on an even grid of times, and the places of its frames in it; see `Timeline`."""
+        """Return the recording on a regular time grid, and the indices of its frames in it; see `Timeline`."""
         grid, place = self.timeline.gridded()
         streams = [replace(stream, rows=grid.rows[stream.name]) for stream in self.streams]
         return replace(self, timeline=grid, streams=streams), place
 
 
 @contextmanager
-def open_recording(source: Experiment | str | Path, cameras: Sequence[str] | None = None) -> Iterator[Recording]:
-    """Open an experiment for tracking, and close its movies at the end.
+def open_recording(
+    source: Experiment | str | Path, cameras: Sequence[str] | None = None, *, textured: bool = True
+) -> Iterator[Recording]:
+    """Open an experiment for tracking or for learning its texture map.
 
     Args:
         source: the experiment as loaded, or the path of its experiment.yaml.
         cameras: names of those to use; None: all.
+        textured: read its texture map, which must be given; False: the map is to be learnt.
 
     Raises:
         SphereOrientError: inputs that are missing, unreadable or do not fit together.
     """
     experiment = source if isinstance(source, Experiment) else load_experiment(Path(source))
-    texture = load_texture(_texture_path(experiment))
-    with _opened(experiment, cameras, texture) as recording:
-        yield recording
-
-
-@contextmanager
-def open_unpainted(source: Experiment | str | Path, cameras: Sequence[str] | None = None) -> Iterator[Recording]:
-    """Open an experiment whose map is to be learnt; its `texture`, if any, is not looked at.
-
-    Args:
-        source: the experiment as loaded, or the path of its experiment.yaml.
-        cameras: names of those to use; None: all.
-
-    Raises:
-        SphereOrientError: inputs that are missing, unreadable or do not fit together.
-    """
-    experiment = source if isinstance(source, Experiment) else load_experiment(Path(source))
-    with _opened(experiment, cameras, torch.empty(0, 0)) as recording:
-        yield recording
-
-
-@contextmanager
-def _opened(experiment: Experiment, cameras: Sequence[str] | None, texture: Tensor) -> Iterator[Recording]:
+    if textured and experiment.texture_path is None:
+        do = "learn it with `sphereorient map`, then write sphere.texture: the file that this gives"
+        raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
+    texture = load_texture(experiment.texture_path) if textured and experiment.texture_path else torch.empty(0, 0)
     names = _chosen(experiment, cameras)
     movies = open_movies(experiment, names)
-    try:
-        frames = timeline(experiment, movies)
-        streams = [
-            CameraStream(
-                name=name,
-                camera=experiment.cameras[name],
-                movie=movies[name],
-                rows=frames.rows[name],
-                shown=given_mask(experiment, name, movies[name].frame_shape),
-            )
-            for name in names
-        ]
-        outside = outside_paths(experiment)
-        remarks = [f"{experiment.path}: reads outside of its folder: {path}" for path in outside]
-        remarks += [f"{movie.path}: {remark}" for movie in movies.values() for remark in movie.remarks]
-        yield Recording(
-            experiment=experiment,
-            streams=streams,
-            timeline=frames,
-            texture=texture,
-            remarks=(*remarks, *frames.remarks),
+    frames = timeline(experiment, movies)
+    streams = [
+        CameraStream(
+            name=name,
+            camera=experiment.cameras[name],
+            movie=movie,
+            rows=frames.rows[name],
+            shown=given_mask(experiment, name, movie.frame_shape),
         )
-    finally:
-        for movie in movies.values():
-            movie.close()
+        for name, movie in movies.items()
+    ]
+    remarks = [f"{experiment.path}: reads outside of its folder: {path}" for path in outside_paths(experiment)]
+    remarks += [f"{movie.path}: {remark}" for movie in movies.values() for remark in movie.remarks]
+    yield Recording(
+        experiment=experiment,
+        streams=streams,
+        timeline=frames,
+        texture=texture,
+        remarks=(*remarks, *frames.remarks),
+    )
 
 
 def _chosen(experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:
-    """Names of the cameras to use, in the experiment's order."""
+    """Return the names of the cameras to use, in the experiment's order."""
     known = list(experiment.movie_paths)
     wanted = known if cameras is None else list(cameras)
     unknown = [name for name in wanted if name not in known]
     if unknown or not wanted:
-        got = ", ".join(unknown) or "none"
-        raise ExperimentError(
-            refusal("cameras", expected=" or ".join(known), got=got, do="name cameras of the experiment")
-        )
+        got, do = ", ".join(unknown) or "none", "name cameras of the experiment"
+        raise ExperimentError(refusal("cameras", expected=" or ".join(known), got=got, do=do))
     return [name for name in known if name in wanted]
-
-
-def _texture_path(experiment: Experiment) -> Path:
-    if experiment.texture_path is None:
-        do = "learn it with `sphereorient map`, then write sphere.texture: the file that this gives"
-        raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
-    return experiment.texture_path

@@ -1,4 +1,4 @@
-"""One camera's share of an experiment: the pictures of its frames, faults included."""
+"""One camera's part of an experiment: the pictures of its frames."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from sphereorient.cameras import Camera
 from sphereorient.errors import MovieError, refusal
 from sphereorient.experiment.timeline import NONE
-from sphereorient.movies import Grey, Movie, readable
-from sphereorient.trajectory.trajectory import Reason
+from sphereorient.movies import Grey, Movie
+from sphereorient.trajectory import Reason
 
 EVERY = 4  # pixels: a fault of a whole picture shows in every fourth row and column
-GLARE_SHARE = 0.5  # of the pixels at full scale: such a picture teaches nothing of the scene
+GLARE_SHARE = 0.5  # of the pixels at full scale: such a picture is useless for the background
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraStream:
-    """A camera, its movie, and which of its pictures show the frames; made by the pipeline, read by the stages."""
+    """A camera, its movie, and which of its pictures show the frames; made by `open_recording`, read by the stages."""
 
     name: str
     camera: Camera
@@ -33,12 +33,7 @@ class CameraStream:
         return len(self.rows)
 
     def pictures(self, first: int = 0, last: int | None = None) -> Iterator[tuple[Grey | None, Reason]]:
-        """Yield the pictures of frames first .. last - 1 of the experiment, and None with the reason where one is none.
-
-        Args:
-            first: counted from the first frame that is used.
-            last: + 1; None: to the end.
-        """
+        """Yield the pictures of frames first .. last - 1, counted from the first frame in use; None with the reason."""
         rows = self.rows[first:last]
         for row, picture in zip(rows.tolist(), pictures_of(self.movie, rows), strict=True):
             why = Reason.MISSING if row == NONE else Reason.UNDECODABLE
@@ -71,7 +66,7 @@ def spread_frames(frames: range, count: int) -> list[int]:
 
 
 def uniform(picture: Grey) -> bool:
-    """Whether a picture is of one grey: no scene is, with a camera's noise on it."""
+    """Return whether a picture has only one grey value: camera noise rules this out for any scene."""
     some = picture[::EVERY, ::EVERY]
     return bool(some.min() == some.max())
 
@@ -84,11 +79,11 @@ def pictures_of(movie: Movie, rows: NDArray[np.int64]) -> Iterator[Grey | None]:
 
 
 def _read(movie: Movie, numbers: Sequence[int]) -> Iterator[Grey | None]:
-    """Yield pictures by their own numbers, those that follow each other in one go."""
+    """Yield pictures by their numbers, consecutive ones in one pass."""
     begin = 0
     for end in range(1, len(numbers) + 1):
         if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:
-            yield from readable(movie, numbers[begin], numbers[end - 1] + 1)
+            yield from movie.readable(numbers[begin], numbers[end - 1] + 1)
             begin = end
 
 

@@ -1,8 +1,8 @@
-"""When each frame of an experiment was taken, and which picture of each movie shows it."""
+"""The time of each frame of an experiment, and which picture of each movie shows it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,23 +17,23 @@ from sphereorient.movies import Movie
 Rows = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
-NONE = -1  # in `Timeline.rows`: this camera has no picture of the frame
-PAIR_STEPS = 0.5  # of the usual time between frames: stamps of two cameras nearer than this are one instant
-LATE_STEPS = 0.05  # stamps that differ by more, usually, are worth a remark
-EVEN_STEPS = 1e-3  # times that keep to a grid this well are evenly spaced
-ON_GRID = 0.02  # of a step: frames this near to a grid are on it
-LONGEST_PAUSE = 50  # steps; nothing goes on over longer ones
-TIMES_BYTES = 1 << 24  # larger files are no table of times
+NONE = -1  # in `Timeline.rows`: the camera has no picture of the frame
+PAIR_STEPS = 0.5  # of the frame period: stamps of two cameras nearer than this are one instant
+LATE_STEPS = 0.05  # of the frame period: a larger median difference of the stamps is worth a remark
+EVEN_STEPS = 1e-3  # of the frame period: largest deviation of evenly spaced times
+ON_GRID = 0.02  # of the frame period: largest deviation of frames on a regular grid
+LONGEST_PAUSE = 50  # frame periods; the motion does not continue over longer ones
+TIMES_BYTES = 1 << 24  # largest table of times
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Timeline:
-    """N frames of an experiment; made by `timeline`, read by everyone who opens movies."""
+    """N frames of an experiment; made by `timeline`."""
 
     number: Rows  # (N,), of the frames, increasing; blocks begin at round ones
     time_s: Floats  # (N,), s, increasing: the middle of the exposures
     rows: Mapping[str, Rows]  # (N,) of each camera: the picture in its movie's own counting, NONE where it has none
-    remarks: tuple[str, ...] = ()  # what a user should know of it
+    remarks: tuple[str, ...] = ()  # warnings for the user
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -41,14 +41,14 @@ class Timeline:
 
     @property
     def frame_s(self) -> float:
-        """Usual time between frames, s; NaN for a single one."""
+        """Median time between frames, s; NaN for a single one."""
         return float(np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")
 
     def gridded(self) -> tuple[Timeline, Rows]:
-        """Return the same frames on an even grid of times, those that nobody took put in, and their places in it.
+        """Resample onto a regular time grid, inserting missing frames; return it and the indices of the frames in it.
 
         Raises:
-            ExperimentError: the times keep to no grid.
+            ExperimentError: the times lie on no regular grid.
         """
         steps = np.rint(np.diff(self.time_s) / self.frame_s).clip(1, LONGEST_PAUSE).astype(np.int64)
         place: Rows = np.concatenate([[0], np.cumsum(steps)])
@@ -67,35 +67,23 @@ class Timeline:
 
     @property
     def even(self) -> bool:
-        """Whether all frames are equally far apart in time."""
+        """Whether all frames are evenly spaced."""
         steps = np.diff(self.time_s)
         return bool((np.abs(steps - self.frame_s) <= EVEN_STEPS * self.frame_s).all())
 
 
 def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
-    """Tell when the frames were taken, and pair the pictures of the cameras.
+    """Return the times of the frames of `frames:` or of all, and pair the pictures of the cameras.
 
-    Evenly spaced frames have the time number / frame rate; with `times: FILE` it is that file's value; with
-    `times: movies` the files' own stamps tell, and pictures of two cameras taken at one instant are one frame, however
-    many pictures either camera lost before.
-
-    Args:
-        experiment: the experiment.
-        movies: of the cameras that count, as `open_movies` returns them.
-
-    Returns:
-        The frames of `frames:`, or all. A movie that ends early has no pictures of the last ones, and a remark says so.
+    The time of a frame is its number / frame rate; with `times: FILE` the value in the file; with `times: movies` the
+    time stamp in the movie, and pictures of two cameras with the same stamp are one frame. Stamps of MKV are not used:
+    they are rounded to 1 ms. A movie that ends early has no pictures of the last frames, and a remark says so.
 
     Raises:
-        ExperimentError: a table of times that is none, or of another length.
-        MovieError: no movie has the frames asked for, or stamps are asked for and a movie has none.
-
-    Source: DESIGN section 2 (Time). Stamps of MKV take no part: they are rounded to 1 ms.
+        ExperimentError: an unreadable table of times, or one of another length.
+        MovieError: no movie has the frames asked for, or a movie has no stamps with `times: movies`.
     """
-    if experiment.times == MOVIES_OWN:
-        whole = _stamped(experiment, movies)
-    else:
-        whole = _counted(experiment, movies)
+    whole = _stamped(experiment, movies) if experiment.times == MOVIES_OWN else _counted(experiment, movies)
     if experiment.frames is None:
         return whole
     first, last = experiment.frames
@@ -107,7 +95,7 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
 
 def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
-    """Pictures of one number are one frame."""
+    """Pair pictures by their number."""
     there = {name: len(movie) - experiment.start.get(name, 0) for name, movie in movies.items()}
     subject = f"{experiment.path}, movies"
     if min(there.values()) <= 0:
@@ -128,22 +116,19 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     if experiment.times is None:
         time_s = number / experiment.frame_rate_hz
     else:
-        time_s = _of_length(Path(experiment.times), load_times(Path(experiment.times)), count)
+        time_s = load_times(Path(experiment.times))
+        if len(time_s) != count:
+            do = "give one time for each frame of the experiment, counted after start:"
+            got = f"{len(time_s)}"
+            raise ExperimentError(refusal(experiment.times, expected=f"{count} times", got=got, do=do))
     return Timeline(number=number, time_s=np.asarray(time_s, np.float64), rows=rows, remarks=remarks)
 
 
-def _of_length(path: Path, time_s: Floats, count: int) -> Floats:
-    if len(time_s) != count:
-        do = "give one time for each frame of the experiment, counted after start:"
-        raise ExperimentError(refusal(str(path), expected=f"{count} times", got=f"{len(time_s)}", do=do))
-    return time_s
-
-
 def load_times(path: Path) -> Floats:
-    """Read a table of times, (N,), s: one a line; a first line of words and lines after # do not count.
+    """Read a table of times, (N,), s: one a line; a heading and comments after # are skipped.
 
     Raises:
-        ExperimentError: missing, too large, not a number in a line, or times that do not increase.
+        ExperimentError: missing, too large, a line without a number, or times that do not increase.
     """
     do = "write one time a line, in seconds, increasing"
     content = read_whole(path, TIMES_BYTES, "a table of times", ExperimentError, "correct times:")
@@ -164,8 +149,7 @@ def load_times(path: Path) -> Floats:
                 continue
             name = f"{path}, line {number}"
             raise ExperimentError(refusal(name, expected="a number", got=repr(text[:40]), do=do)) from None
-    time_s = np.asarray(values, np.float64)
-    return _increasing(str(path), time_s, do)
+    return _increasing(str(path), np.asarray(values, np.float64), do)
 
 
 def _increasing(name: str, time_s: Floats, do: str) -> Floats:
@@ -181,7 +165,7 @@ def _increasing(name: str, time_s: Floats, do: str) -> Floats:
 
 
 def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
-    """Pictures of one instant are one frame."""
+    """Pair pictures by their time stamps."""
     clocks: dict[str, Floats] = {}
     for name, movie in movies.items():
         start = experiment.start.get(name, 0)
@@ -192,7 +176,7 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
             got, do = f"{len(movie)}", "correct start:"
             raise MovieError(refusal(str(movie.path), expected=f"more than {start} frames", got=got, do=do))
         stamps = _increasing(f"{movie.path}, time stamps", movie.times_s, "write frame_rate:, or times: with a file")
-        # With start: each clock begins at that picture; without, the stamps are of one clock, the trigger's.
+        # With start: each clock begins at that picture; without, all stamps count from the trigger.
         clocks[name] = stamps[start:] - stamps[start] if experiment.start_given else stamps[start:]
     usual_s = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]) if clocks else [np.nan]))
     names = list(clocks)
@@ -205,18 +189,6 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         name: np.where(row >= 0, row + experiment.start.get(name, 0), NONE)
         for name, row in zip(names, pairs.T, strict=True)
     }
-    return Timeline(
-        number=np.arange(len(pairs)),
-        time_s=np.nanmean(taken, axis=0),
-        rows=rows,
-        remarks=_stamp_remarks(experiment, movies, names, taken, usual_s),
-    )
-
-
-def _stamp_remarks(
-    experiment: Experiment, movies: Mapping[str, Movie], names: Sequence[str], taken: Floats, usual_s: float
-) -> tuple[str, ...]:
-    """Say how many pictures each camera lacks, and whether the cameras are late on each other."""
     remarks = [
         f"{movies[name].path}: {lacking} of {taken.shape[1]} instants have no picture"
         for name, lacking in zip(names, np.isnan(taken).sum(1).tolist(), strict=True)
@@ -229,17 +201,18 @@ def _stamp_remarks(
             remarks.append(f"{experiment.path}: no picture of {names[0]} is of one instant with one of {names[1]}")
         elif late > LATE_STEPS * usual_s:
             remarks.append(f"{experiment.path}: the cameras' stamps differ by {late:.3g} s, usually")
-    return tuple(remarks)
+    number = np.arange(len(pairs))
+    return Timeline(number=number, time_s=np.nanmean(taken, axis=0), rows=rows, remarks=tuple(remarks))
 
 
 def _paired(one: Floats, other: Floats, within_s: float) -> Rows:
-    """Pair increasing times nearer than `within_s`; (N, 2) indices in the order of time, NONE where there is none."""
+    """Pair increasing times nearer than `within_s`; (N, 2) indices in order of time, NONE without a partner."""
     after = np.searchsorted(other, one).clip(1, max(len(other) - 1, 1))
     low = np.clip(after - 1, 0, len(other) - 1)
     high = np.clip(after, 0, len(other) - 1)
     nearest = np.where(np.abs(other[high] - one) < np.abs(other[low] - one), high, low)
     near = np.abs(other[nearest] - one) <= within_s
-    # Two of `one` may have the same neighbour in `other`: the nearer one has it.
+    # Two of `one` may have the same nearest neighbour in `other`: it is paired with the nearer one.
     best = np.full(len(other), NONE)
     for k in np.flatnonzero(near):
         j = nearest[k]

@@ -1,4 +1,4 @@
-"""HDF5 files that appear whole or not at all, also when the disk is full or the power fails."""
+"""HDF5 files that appear whole or not at all, even if the disk is full or the power fails."""
 
 from __future__ import annotations
 
@@ -12,37 +12,34 @@ import h5py
 
 from sphereorient.files.outputs import put_aside
 
+# What h5py raises on damaged files, depending on the place where HDF5 notices.
+DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)
 ROOM = "check the space left and the permissions of the folder"
 
 
 @contextmanager
 def whole_hdf5(path: Path, do: str = ROOM) -> Iterator[h5py.File]:
-    """Give an HDF5 file to fill, which takes its place under its name, on the disk, when all is written.
-
-    Args:
-        path: the file; an old one is replaced at the end.
-        do: the remedy, for the message.
+    """Open an HDF5 file for writing that replaces `path` once it is complete and on the disk.
 
     Raises:
-        OutputError: it cannot be written; what was there before is still there.
+        OutputError: it cannot be written, with the remedy `do`; the old file is kept.
     """
-    # A full disk comes out of HDF5 as either error.
+    # HDF5 reports a full disk as either error.
     with put_aside(path, do, also=(RuntimeError,)) as aside, GuardedFile(aside) as guarded:
         with h5py.File(guarded, "w", track_order=False) as file:
             yield file
         guarded.check()
-        guarded.to_disk()
+        os.fsync(guarded.fileno())
 
 
-class GuardedFile(io.RawIOBase):
-    """A file that takes no more bytes after the first error, and keeps the error for `check`.
+class GuardedFile(io.FileIO):
+    """A file that ignores writes after the first error, and keeps the error for `check`.
 
-    HDF5 cannot close a file that it cannot write: it complains again at every object, and may take the program down
-    with it. Here it closes in peace, and the error is raised afterwards.
+    HDF5 cannot close a file that it cannot write: it fails again at every object and may crash the process.
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("w+b", buffering=0)
+        super().__init__(path, "w+")
         self._error: OSError | None = None
 
     def check(self) -> None:
@@ -50,56 +47,23 @@ class GuardedFile(io.RawIOBase):
         if self._error is not None:
             raise self._error
 
-    def to_disk(self) -> None:
-        """Make sure that the bytes outlive a power cut before anything points at them."""
-        os.fsync(self._file.fileno())
-
     def write(self, content: bytes) -> int:  # type: ignore[override]
-        """Write all bytes, or none from the first error on."""
+        """Write all bytes."""
         view = memoryview(content).cast("B")
         if self._error is None:
             try:
                 done = 0
-                while done < len(view):  # a disk that is nearly full takes a part
-                    done += self._file.write(view[done:])
+                while done < len(view):  # a disk that is nearly full accepts a part
+                    done += super().write(view[done:])
             except OSError as error:
                 self._error = error
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the length, unless there was an error."""
+        """Set the length."""
         if self._error is None:
             try:
-                return self._file.truncate(size)
+                return super().truncate(size)
             except OSError as error:
                 self._error = error
         return size or 0
-
-    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        """Read bytes."""
-        return self._file.readinto(buffer)
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a place."""
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        """Return the place."""
-        return self._file.tell()
-
-    def readable(self) -> bool:
-        """Return that it can be read."""
-        return True
-
-    def writable(self) -> bool:
-        """Return that it can be written."""
-        return True
-
-    def seekable(self) -> bool:
-        """Return that it has places."""
-        return True
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-        super().close()

@@ -13,15 +13,15 @@ ROOM = "choose a folder that exists, may be written and has room"
 
 @contextmanager
 def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()) -> Iterator[Path]:
-    """Give a name to write under; what was written takes its place at the end, or vanishes where something failed.
+    """Give a temporary name with the same suffix; the file replaces `path` at the end, or is deleted after an error.
 
     Args:
-        path: the file; an old one is replaced at the end. The other name has its suffix, which libraries go by.
+        path: the file.
         do: the remedy, for the message.
-        also: what a library raises, beside OSError, where it cannot write.
+        also: errors of a library, beside OSError, that mean a failed write.
 
     Raises:
-        OutputError: it cannot be written; what was there before is still there.
+        OutputError: it cannot be written; the old file is kept.
     """
     aside = path.with_name(f".{path.stem}.partial{path.suffix}")
     failures: tuple[type[Exception], ...] = (OSError, *also)

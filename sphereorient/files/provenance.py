@@ -1,4 +1,4 @@
-"""Where a result comes from: versions, command, fingerprints of the inputs."""
+"""Where a result comes from: versions, command, hashes of the inputs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PACKAGES = ("sphereorient", "torch", "kornia", "numpy", "scipy", "opencv-python-
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages whose numbers enter a result."""
+    """Return the versions of Python and of the packages that results depend on."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -27,31 +27,30 @@ def versions() -> dict[str, str]:
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file in hexadecimal digits, read in pieces."""
+    """Return the SHA-256 of a file in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def _digest(files: Sequence[Path]) -> str:
+    """Return the hash of one file, or of the hashes of several in order."""
+    hashes = [sha256(file) for file in files]
+    return hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
+
+
 def provenance(inputs: Mapping[Path, Sequence[Path]], folder: Path, command: str) -> dict[str, Any]:
-    """Return what the track's attribute `provenance` holds, all of it fit for JSON.
+    """Return the track's attribute `provenance`, ready for JSON.
 
     Args:
-        inputs: each input with the files it consists of: itself, or the pictures of a sequence in their order.
+        inputs: each input with its files: itself, or the pictures of a sequence in order.
         folder: inputs are named relative to it.
-        command: what made the result.
+        command: the command that made the result.
     """
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
         "platform": f"{platform.system()} {platform.machine()}, {sys.implementation.name}",
         "versions": versions(),
-        # By their place beside experiment.yaml: two cameras' movies in two folders often share a name.
+        # By their path relative to experiment.yaml: two cameras' movies in two folders often share a name.
         "sha256": {Path(os.path.relpath(path, folder)).as_posix(): _digest(files) for path, files in inputs.items()},
     }
-
-
-def _digest(files: Sequence[Path]) -> str:
-    """Return the hash of one file, or of the hashes of several in their order."""
-    if len(files) == 1:
-        return sha256(files[0])
-    return hashlib.sha256("".join(sha256(file) for file in files).encode()).hexdigest()

@@ -1,35 +1,36 @@
-"""Reading and writing the project's YAML files; every fault becomes one line that names the file and the key."""
+"""Reading and writing YAML files: plain values only, bounded in size; every fault is one line with file and key."""
 
 from __future__ import annotations
 
 import difflib
-import os
-import tempfile
+import unicodedata
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from yaml.composer import ComposerError
 
-from sphereorient.errors import OutputError, SphereOrientError, refusal
-from sphereorient.files.bounded_yaml import FAULTS, parse_yaml
+from sphereorient.errors import SphereOrientError, refusal
+from sphereorient.files.outputs import put_aside
 from sphereorient.files.whole_file import TEXT_BYTES, read_whole
 
 Model = TypeVar("Model", bound=BaseModel)
 SHOWN = 20  # known names in a message
+MAX_DEPTH = 30  # our files have five levels
+MAX_NODES = 20_000  # an alias counts as often as it is used; a covariance of 100 parameters has 10,000
+MAX_TEXT = 4096  # characters of one value, such as a path
+MAX_NUMBER = 64  # characters of a number: longer ones take long to convert, and fill messages
+MAX_KEY = 100  # characters of a key: it appears in messages
+NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+# Control characters, lone surrogates and line separators would break messages of one line.
+UNSEEN = frozenset({"Cc", "Cs", "Zl", "Zp"})
+FAULTS = (yaml.YAMLError, ValueError, OverflowError)  # a date that does not exist is a ValueError, 1:1:...:1.5 the last
 
 
 def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> dict[str, Any]:
-    """Read a YAML file that declares a schema.
-
-    Args:
-        path: the file.
-        schema: what its key `schema` must say, such as sphereorient-cameras/1.
-        error: the error to raise.
-
-    Returns:
-        The mapping without the key `schema`.
+    """Read a YAML file whose key `schema` must be `schema`; return the mapping without this key.
 
     Raises:
         error: missing, unreadable, not YAML, not a mapping, or of another schema.
@@ -46,21 +47,14 @@ def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> di
 
 
 def read_yaml(path: Path, error: type[SphereOrientError]) -> Any:
-    """Read a YAML file of plain values, whoever wrote it.
-
-    Args:
-        path: the file, UTF-8, at most TEXT_BYTES.
-        error: the error to raise.
-
-    Returns:
-        What it says; None where it is empty.
+    """Read a YAML file of plain values, UTF-8, at most TEXT_BYTES; None for an empty one.
 
     Raises:
-        error: missing, unreadable, no text, or no YAML that `parse_yaml` takes.
+        error: missing, unreadable, not text, or not YAML as `parse_yaml` accepts it.
     """
     content = read_whole(path, TEXT_BYTES, "a YAML file", error, "correct the path")
     try:
-        return parse_yaml(content.decode("utf-8-sig"))  # editors of some systems put a mark in front
+        return parse_yaml(content.decode("utf-8-sig"))  # some editors put a byte order mark in front
     except UnicodeDecodeError:
         got, do = "bytes that are no text", "save it as UTF-8"
         raise error(refusal(str(path), expected="a YAML file", got=got, do=do)) from None
@@ -69,12 +63,12 @@ def read_yaml(path: Path, error: type[SphereOrientError]) -> Any:
 
 
 def validated(model: type[Model], data: Any, where: str, error: type[SphereOrientError]) -> Model:
-    """Check data from a YAML file against a model, and word its first fault in one line.
+    """Validate data from a YAML file against a model, and word its first fault in one line.
 
     Args:
-        model: which keys there are and what they hold; it must forbid extra keys.
-        data: what the file says.
-        where: file, and place in it, for the message.
+        model: its keys and their types; it must forbid extra keys.
+        data: content of the file.
+        where: file and place in it, for the message.
         error: the error to raise.
 
     Raises:
@@ -87,7 +81,7 @@ def validated(model: type[Model], data: Any, where: str, error: type[SphereOrien
 
 
 def refuse_unknown(key: object, known: Iterable[str], where: str) -> str:
-    """Word the refusal of a key or name that is not known, with the nearest one that is."""
+    """Word the refusal of an unknown key or name, with the nearest known one."""
     names = [str(name) for name in known]
     shown = names if len(names) <= SHOWN else [*names[:SHOWN], "..."]
     near = difflib.get_close_matches(str(key), names, n=1, cutoff=0.5)
@@ -96,14 +90,9 @@ def refuse_unknown(key: object, known: Iterable[str], where: str) -> str:
 
 
 def write_document(path: Path, schema: str, document: Mapping[str, Any], comment: str = "") -> None:
-    """Write a YAML file aside and put it in place at once, so that no half file is ever seen.
+    """Write a YAML file with its schema as first key and `comment` above; it replaces an old file at once.
 
-    Args:
-        path: the file; an old one is replaced.
-        schema: value of its first key.
-        document: plain mappings, lists, texts and numbers. Small numbers come out as 1.0e-05, which YAML 1.1 reads
-            as numbers (1e-05 it takes for text).
-        comment: lines for the top of the file.
+    Small numbers are written as 1.0e-05: YAML 1.1 reads 1e-05 as text.
 
     Raises:
         OutputError: the file cannot be written.
@@ -111,26 +100,95 @@ def write_document(path: Path, schema: str, document: Mapping[str, Any], comment
     lines = "".join(f"# {line}\n" for line in comment.splitlines())
     content = {"schema": schema, **document}
     text = lines + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
-    aside = None
-    try:
-        with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=path.parent, delete=False) as file:
-            aside = Path(file.name)
-            file.write(text)
-        aside.chmod(0o666 & ~_umask())  # temporary files are private; a result is not
-        aside.replace(path)
-    except OSError as fault:
-        if aside is not None:
-            aside.unlink(missing_ok=True)
-        do = "choose a folder that exists and may be written"
-        raise OutputError(
-            refusal(str(path), expected="a file that can be written", got=f"'{fault.strerror}'", do=do)
-        ) from fault
+    with put_aside(path) as aside:
+        aside.write_text(text, encoding="utf-8")
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def short(value: object) -> str:
+    """Return a value as one line of at most 60 characters, for a message."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def yaml_words(fault: Exception) -> str:
+    """Word what is wrong with a YAML text in one short line."""
+    mark = getattr(fault, "problem_mark", None)
+    problem = " ".join((getattr(fault, "problem", None) or str(fault).partition("\n")[0]).split())
+    problem = problem if len(problem) <= 120 else problem[:117] + "..."
+    return f"'{problem}'" + (f" in line {mark.line + 1}" if mark else "")
+
+
+def parse_yaml(text: str) -> Any:
+    """Parse one YAML document of mappings, lists, texts, numbers and dates; aliases are allowed, tags are not.
+
+    Raises:
+        yaml.YAMLError: not YAML, or with tags, repeated keys, keys that are not names, or beyond a bound above.
+        ValueError: an impossible value, such as a date that does not exist.
+        OverflowError: a number to the base 60 that is too large.
+    """
+    return _BoundedLoader(text).get_single_data()
+
+
+def is_one_line(text: str) -> bool:
+    """Return whether a text can stand in a message of one line."""
+    return text.isprintable() or not any(unicodedata.category(letter) in UNSEEN for letter in text)
+
+
+class _BoundedLoader(yaml.SafeLoader):
+    """PyYAML's safe loader, with bounds that are checked while nodes are composed, before any value is built.
+
+    An alias counts with its size: what walks through the values later meets it as often as it is used.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._depth = 0
+        self._nodes = 0
+        self._size: dict[yaml.Node, int] = {}  # nodes of each finished node, itself included
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose a node and count it."""
+        event, before = self._next(), self._nodes
+        self._depth, self._nodes = self._depth + 1, self._nodes + 1
+        self._check(self._depth <= MAX_DEPTH, f"more than {MAX_DEPTH} levels", event)
+        self._check(getattr(event, "tag", None) in (None, "!"), "a tag, which is not used here", event)
+        node = super().compose_node(parent, index)
+        if isinstance(event, yaml.AliasEvent):
+            self._check(node in self._size, "a value that contains itself", event)
+            self._nodes += self._size.get(node, 0) if node is not None else 0
+        elif node is not None:
+            self._size[node] = self._nodes - before
+        self._check(self._nodes <= MAX_NODES, f"more than {MAX_NODES} values", event)
+        self._depth -= 1
+        return node
+
+    def compose_scalar_node(self, anchor: Any) -> yaml.ScalarNode:
+        """Compose a text or a number of bounded length."""
+        event = self._next()
+        node = super().compose_scalar_node(anchor)
+        longest = MAX_NUMBER if node.tag in NUMBERS else MAX_TEXT
+        self._check(len(node.value) <= longest, f"a value of more than {longest} characters", event)
+        self._check(is_one_line(node.value), "a text of several lines, or with control characters", event)
+        return node
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        """Compose a mapping whose keys are different names."""
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:
+            plain = isinstance(key, yaml.ScalarNode) and len(key.value) <= MAX_KEY
+            self._check(plain, f"a key that is no name of at most {MAX_KEY} characters", key)
+            self._check(key.value not in seen, f"the key '{key.value}' twice", key)
+            seen.add(key.value)
+        return node
+
+    def _next(self) -> yaml.Event:
+        event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
+        return event
+
+    def _check(self, holds: bool, problem: str, at: Any) -> None:
+        if not holds:
+            raise ComposerError(None, None, problem, at.start_mark)
 
 
 def _worded(fault: ValidationError, model: type[BaseModel], where: str) -> str:
@@ -148,29 +206,10 @@ def _worded(fault: ValidationError, model: type[BaseModel], where: str) -> str:
 
 
 def _keys(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the model that stands at a place inside another."""
+    """Return the keys of the model at a place inside another."""
     for step in place:
-        if str(step) not in model.model_fields:  # a name or a number that the file gives, such as a camera's
-            continue
-        annotation = model.model_fields[str(step)].annotation
-        inner = [kind for kind in (annotation, *get_args(annotation)) if _is_model(kind)]
-        model = inner[0]
+        if str(step) in model.model_fields:  # others are names or numbers from the file, such as a camera's
+            annotation = model.model_fields[str(step)].annotation
+            kinds = (annotation, *get_args(annotation))
+            model = next(kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel))
     return list(model.model_fields)
-
-
-def _is_model(kind: object) -> bool:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
-
-
-def short(value: object) -> str:
-    """Return a value as one line of at most 60 characters, for a message."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def yaml_words(fault: Exception) -> str:
-    """Word what is wrong with a YAML text in one short line."""
-    mark = getattr(fault, "problem_mark", None)
-    problem = " ".join((getattr(fault, "problem", None) or str(fault).partition("\n")[0]).split())
-    problem = problem if len(problem) <= 120 else problem[:117] + "..."
-    return f"'{problem}'" + (f" in line {mark.line + 1}" if mark else "")

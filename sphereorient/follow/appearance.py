@@ -16,7 +16,7 @@ from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.settings import RefineSettings
-from sphereorient.locate import LocateSettings, Shot
+from sphereorient.locate import Frame, LocateSettings
 from sphereorient.pose.defocus import defocus_radii
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import FINEST_PX, Fitter, Optics, Picture, level_of, widest_px
@@ -80,7 +80,7 @@ class Appearance:
 
 
 def estimate_appearance(
-    first: Initialiser, frames: Sequence[Sequence[Shot]], base: TextureTable, settings: RefineSettings
+    first: Initialiser, frames: Sequence[Sequence[Frame]], base: TextureTable, settings: RefineSettings
 ) -> Appearance:
     """Estimate light, blur and noise of movies.
 
@@ -98,7 +98,7 @@ def estimate_appearance(
     if defocus_radii(fitter.optics.blur_px, diameter_px):
         first = replace(first, score_min=ALWAYS)
 
-    def search(fitter: Fitter, frames: Sequence[Sequence[Shot]]) -> list[Poses]:
+    def search(fitter: Fitter, frames: Sequence[Sequence[Frame]]) -> list[Poses]:
         with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
             return list(pool.map(replace(first, fitter=fitter).poses, frames))
 

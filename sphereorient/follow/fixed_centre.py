@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.locate import Shot
+from sphereorient.locate import Frame
 from sphereorient.pose.fit import EDGE_PX
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
@@ -46,7 +46,7 @@ class FixedCentre:
         return whole
 
 
-def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Shot]], score_min: float) -> FixedCentre | None:
+def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Frame]], score_min: float) -> FixedCentre | None:
     """Find the centre of a ball that turns in one place.
 
     Args:

@@ -13,7 +13,7 @@ from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.per_camera import PerCameraTracker
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.tracker import ChunkTracker
-from sphereorient.locate import Shot, screened_frames
+from sphereorient.locate import Frame, screened_frames
 from sphereorient.pose import CameraView
 
 
@@ -62,7 +62,7 @@ class Follower:
                 for stream, view in zip(streams, self.appearance.fitter.views, strict=True)
             ]
 
-            def ahead(batch: Batch) -> list[Future[list[Shot]]]:
+            def ahead(batch: Batch) -> list[Future[list[Frame]]]:
                 return [pool.submit(_taken, movie, len(batch)) for movie in movies]
 
             coming = ahead(batches[0])
@@ -73,7 +73,7 @@ class Follower:
                 yield batch, list(self.tracker.track(read, batch.lengths, times))
 
 
-def _taken(frames: Iterator[Shot], count: int) -> list[Shot]:
+def _taken(frames: Iterator[Frame], count: int) -> list[Frame]:
     return list(islice(frames, count))
 
 
@@ -89,7 +89,7 @@ def _consecutive(batches: Sequence[Batch]) -> Iterator[list[Batch]]:
         yield stretch
 
 
-def sample_frames(recording: Recording, views: Sequence[CameraView], count: int) -> list[tuple[Shot, ...]]:
+def sample_frames(recording: Recording, views: Sequence[CameraView], count: int) -> list[tuple[Frame, ...]]:
     """Return `count` frames of all cameras, spread over the movies; each the first of its stretch that is readable."""
     total = len(recording.timeline)
     spread = spread_frames(range(total), count)

@@ -11,7 +11,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import R_cam_view
 from sphereorient.follow.poses import Poses, no_pose, poses_of
-from sphereorient.locate import LocateSettings, Shot, find_ball, find_positions, sightings_of
+from sphereorient.locate import Frame, LocateSettings, find_ball, find_positions, sightings_of
 from sphereorient.locate.blob import find_blobs
 from sphereorient.locate.find import Found
 from sphereorient.locate.outline import Outline
@@ -42,7 +42,7 @@ class Initialiser:
     score_min: float = 0.0  # where no picture is explained this well, other outlines are tried
     finalists: int = 2  # poses that are fitted to all detail
 
-    def poses(self, shots: Sequence[Shot]) -> Poses:
+    def poses(self, shots: Sequence[Frame]) -> Poses:
         """Find all poses that the C pictures of one instant allow; pictures that cannot be used take no part.
 
         Black paint that hides half of a rim leaves arcs that a smaller circle fits as well: where no picture is
@@ -67,7 +67,7 @@ class Initialiser:
             poses = max(poses, self._search(shots, found), key=_best_score)
         return poses
 
-    def _with_outlines(self, shots: Sequence[Shot], locating: LocateSettings) -> Poses:
+    def _with_outlines(self, shots: Sequence[Frame], locating: LocateSettings) -> Poses:
         views = self.fitter.views
         found = [
             find_ball(shot.picture, view.background, view.diameter_px, locating) if shot.usable else (None, shot.reason)
@@ -86,7 +86,7 @@ class Initialiser:
                 return max((self._search(shots, each) for each in alone), key=_best_score)
         return self._search(shots, found)
 
-    def _search(self, shots: Sequence[Shot], found: Sequence[Found]) -> Poses:
+    def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
         """Propose orientations inside given outlines, and fit them."""
         fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])

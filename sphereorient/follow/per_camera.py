@@ -13,7 +13,7 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, no_pose
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.follow.tracker import ChunkTracker
-from sphereorient.locate import Shot
+from sphereorient.locate import Frame
 from sphereorient.trajectory import Reason
 
 
@@ -35,7 +35,7 @@ class PerCameraTracker:
         """Return the lengths of the chunks of each batch; see `ChunkTracker`."""
         return self.trackers[0].batches(frames)
 
-    def track(self, shots: Sequence[Sequence[Shot]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
+    def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
         """Follow the chunks of one batch; see `ChunkTracker`."""
         each = [tracker.track([movie], batch, time_s) for tracker, movie in zip(self.trackers, shots, strict=True)]
         yield from (cameras_disagree(poses) for poses in zip(*each, strict=True))

@@ -16,7 +16,7 @@ from sphereorient.follow.fixed_centre import FixedCentre
 from sphereorient.follow.initialise import Initialiser, explaining_first
 from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.follow.settings import RefineSettings
-from sphereorient.locate import Shot
+from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Fitter, Picture, PyramidLevel
 from sphereorient.trajectory import Reason
@@ -141,7 +141,7 @@ class ChunkTracker:
         lengths = [last - first for first, last in pairwise([*firsts, frames.stop])]
         return [lengths[k : k + self.settings.chunks] for k in range(0, len(lengths), self.settings.chunks)]
 
-    def track(self, shots: Sequence[Sequence[Shot]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
+    def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
         """Follow the chunks of one batch.
 
         Args:
@@ -163,7 +163,7 @@ class ChunkTracker:
                 found[chunk.first + k] = poses
         yield from (found[k] for k in range(sum(batch)))
 
-    def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Shot]]) -> Iterator[Poses]:
+    def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
         """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
         expected = {
             chunk.first: self._in_place(chunk.expected(chunk.first + k, self.fitter.radius_mm)) for chunk in chunks
@@ -181,7 +181,7 @@ class ChunkTracker:
             return expected
         return replace(expected, position_lab_mm=self.centre.position_lab_mm, place_precision=self.centre.precision)
 
-    def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Shot]]) -> list[Poses | None]:
+    def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
         """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
         if not expected:
             return []
@@ -308,7 +308,7 @@ class ChunkTracker:
             wrong = wrong | (use[:, k] & use[:, m] & far & (away > limit * CONTRADICTS_SIGMAS))
         return wrong
 
-    def _search(self, shots: Sequence[Shot]) -> Poses:
+    def _search(self, shots: Sequence[Frame]) -> Poses:
         """Find the poses of a frame without history, with those cameras whose pictures support them."""
         poses = self.search.poses(shots)
         if not len(poses):
@@ -405,7 +405,7 @@ def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> 
     return replace(fit, **told)
 
 
-def _reason(used: bool, contradicts: bool, shot: Shot, before: Reason) -> Reason:
+def _reason(used: bool, contradicts: bool, shot: Frame, before: Reason) -> Reason:
     """Return why a camera does not count: no picture, it contradicts, or it was blind before."""
     if used:
         return Reason.OK

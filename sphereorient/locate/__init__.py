@@ -1,32 +1,30 @@
-"""Where is it: background, blob, outline, gaps."""
+"""Where the ball is in a picture: background, blob, outline, gaps, and its position in the lab."""
 
 from sphereorient.locate.background import Background
-from sphereorient.locate.expected import check_seen, expected_diameter_px, size_of
 from sphereorient.locate.find import Found, find_ball, sightings_of
-from sphereorient.locate.gaps import repair
-from sphereorient.locate.learn import learn_background
+from sphereorient.locate.gaps import fill_gaps
 from sphereorient.locate.position import Positions, find_positions
-from sphereorient.locate.scene import Scene, find_scene, known_diameter_px
-from sphereorient.locate.screen import Shot, screened, screened_frames
+from sphereorient.locate.scene import Scene, expected_diameter_px, find_scene, known_diameter_px, learn_background
+from sphereorient.locate.screen import Frame, screened, screened_frames
 from sphereorient.locate.settings import LocateSettings
-from sphereorient.locate.sightings import Sightings
+from sphereorient.locate.sightings import Sightings, check_seen, size_of
 
 __all__ = [
     "Background",
     "Found",
+    "Frame",
     "LocateSettings",
     "Positions",
     "Scene",
-    "Shot",
     "Sightings",
     "check_seen",
     "expected_diameter_px",
+    "fill_gaps",
     "find_ball",
     "find_positions",
     "find_scene",
     "known_diameter_px",
     "learn_background",
-    "repair",
     "screened",
     "screened_frames",
     "sightings_of",

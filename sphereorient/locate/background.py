@@ -1,4 +1,4 @@
-"""What the movie shows without the sphere: the mean of evenly spread frames, and its noise."""
+"""The background of a movie: the mean of evenly spread frames without the ball, and its noise."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# A pixel's scatter is read off at this share of its frames, and divided by what that is for Gaussian noise in standard
-# deviations. About a background taken from the movie: things that turn and glitter move a pixel in more frames than
-# that, the passing ball in fewer. About a picture of the scene without the ball: also where the ball stays for most
-# of the movie, a tenth of the frames shows the scene.
+# The noise of a pixel is this quantile of its deviations, divided by the quantile of Gaussian noise in standard
+# deviations. About the mean of the movie: glittering things move a pixel in more frames than that, the passing ball in
+# fewer. About a given picture of the scene: a tenth of the frames shows the scene even where the ball stays long.
 MEASURED_SHARE, MEASURED_SIGMAS = 0.8, 1.2816
 GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
-FEW = 10  # frames; the share above means nothing in fewer, and all pixels are taken to be alike
+FEW = 10  # frames; with fewer, the quantile is meaningless and all pixels get the same noise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,10 +32,9 @@ class Background:
         return float(np.median(self.noise))
 
     def difference(self, frame: NDArray[np.generic]) -> NDArray[np.float32]:
-        """Return |frame - background|, (H, W) float32, grey levels.
+        """Return |frame - background|, (H, W) float32, grey levels; 0 where the ball is hidden.
 
-        White paint is brighter and black paint often darker than what lies behind: both count as ball. Where the ball
-        is hidden nothing differs.
+        White paint is brighter and black paint often darker than the background: both belong to the ball.
         """
         out: NDArray[np.float32] = np.abs(frame.astype(np.float32) - self.mean)
         if self.shown is not None:
@@ -45,19 +43,14 @@ class Background:
 
 
 def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None = None) -> Background:
-    """Average frames of a movie and measure how much each pixel scatters without the ball.
+    """Return the clipped mean and the noise of each pixel over the frames of a movie.
 
-    Turning, glittering things scatter in every frame and the passing ball only in some: a quantile tells them apart.
+    The paper's plain mean (section III A) keeps 1/n of the ball's brightness wherever it passed, as much as black paint
+    differs from a dark wall; here, values more than four robust sigmas from the median are left out.
 
     Args:
         pictures: (n, H, W), evenly spread frames, uint8 or uint16.
-        empty: (H, W), the scene without the ball, where there is such a picture: for short movies, or a ball that
-            hardly moves; only the noise is then measured.
-
-    Returns:
-        The background. The paper's plain mean keeps 1/n of the ball's brightness wherever it passed, as much as black
-        paint differs from a dark wall; the mean here leaves out the frames in which a pixel was covered (more than
-        four robust sigmas from its median), and so sees the rim where the plain mean is blind (paper section III A).
+        empty: (H, W), a picture of the scene without the ball, if there is one; then only the noise is measured.
     """
     full_scale = _full_scale(pictures)
     shape = pictures.shape[1:]
@@ -67,17 +60,17 @@ def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None
         given = None if empty is None else empty[these]
         mean[these], noise[these] = _statistics(pictures[:, these].astype(np.float32), given, full_scale)
     if empty is not None:
-        # A low quantile of whole grey levels is often 0: no pixel is quieter than most of them are in most frames.
+        # A low quantile of integer grey levels is often 0: the noise is at least the typical one.
         quiet = np.abs(pictures[:, ::8, ::8].astype(np.float32) - empty[::8, ::8])
         if len(pictures) >= FEW:
             noise = np.maximum(noise, np.median(_nan_quantile(quiet, MEASURED_SHARE)) / MEASURED_SIGMAS)
-        else:  # the ball itself would pass for a glittering thing wherever it is
+        else:  # the ball itself would count as noise
             noise = np.full(shape, max(1.4826 * np.median(quiet), _rounding(full_scale)), np.float32)
     return Background(mean=mean, noise=noise, full_scale=full_scale)
 
 
 def _full_scale(pictures: NDArray[Any]) -> float:
-    """Grey level of a saturated pixel. Cameras of 10 to 14 bits fill 16-bit numbers from below, and no file says so."""
+    """Return the grey level of a saturated pixel: 10 to 14 bit cameras use the lower bits of 16."""
     if pictures.dtype.itemsize == 1:
         return 255.0
     brightest = int(pictures.max(initial=0))
@@ -85,15 +78,9 @@ def _full_scale(pictures: NDArray[Any]) -> float:
 
 
 def without_ball(background: Background, pictures: NDArray[Any], covered: NDArray[np.bool_]) -> Background:
-    """Measure a background again where the ball was found, from the frames in which it was elsewhere.
+    """Measure a background again without the pixels of the ball, `covered` (n, H, W), in the same `pictures`.
 
-    Args:
-        background: as measured from all frames.
-        pictures: (n, H, W), the same frames.
-        covered: (n, H, W) bool, the pixels of the ball and its rim in each frame.
-
-    Returns:
-        The background; a pixel that is free in fewer than four frames keeps its values.
+    A pixel that is free in fewer than four frames keeps its values.
     """
     free = len(pictures) - covered.sum(axis=0)
     again = (free < len(pictures)) & (free >= 4)
@@ -105,14 +92,14 @@ def without_ball(background: Background, pictures: NDArray[Any], covered: NDArra
 
 
 def _rounding(full_scale: float) -> float:
-    """Scatter of a pixel, grey levels, where all frames are equal."""
+    """Return the rounding noise of a pixel, grey levels."""
     return float(full_scale / 255 / 12**0.5)
 
 
 def _statistics(
     values: NDArray[np.float32], given: NDArray[np.float32] | None, full_scale: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Clipped mean, or the given one, and robust sigma over the first axis; NaN does not count."""
+    """Return the clipped mean, or the given one, and the robust sigma over the first axis, ignoring NaN."""
     rounding = _rounding(full_scale)
     share, sigmas = (MEASURED_SHARE, MEASURED_SIGMAS) if given is None else (GIVEN_SHARE, GIVEN_SIGMAS)
     middle = _nan_quantile(values, 0.5) if given is None else given
@@ -125,7 +112,7 @@ def _statistics(
 
 
 def _nan_quantile(values: NDArray[np.float32], share: float) -> NDArray[np.float32]:
-    """Quantile over the first axis without NaN, nearest rank; numpy's own is a Python loop over the pixels."""
+    """Return the quantile over the first axis without NaN, nearest rank; np.nanquantile loops over the pixels."""
     ordered = np.sort(values, axis=0)  # NaN last
     count = np.isfinite(values).sum(axis=0)
     rank = np.clip(np.rint(share * (count - 1)), 0, None).astype(np.int64)

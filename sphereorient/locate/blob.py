@@ -1,4 +1,4 @@
-"""Where a ball may be: round blobs of about the expected size, ranked by variance and roundness."""
+"""Candidates for the ball: round blobs of about the expected size, ranked by variance and roundness."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from sphereorient.locate.settings import LocateSettings
 
 @dataclass(frozen=True, kw_only=True)
 class Blob:
-    """A rough place of the ball; made by `find_blobs`, read by outline."""
+    """Approximate position of the ball; made by `find_blobs`, read by outline."""
 
     u_px: float
     v_px: float
-    merit: float  # variance inside times resemblance to a disk; the best of a frame is first
+    merit: float  # variance inside times similarity to a disk
 
 
 def _reduce(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Average by a whole factor; the rest at the right and lower border is cut (other ratios are 40 times slower)."""
+    """Average by an integer factor, cropping right and lower borders (other ratios are 40 times slower)."""
     height, width = (side // factor * factor for side in picture.shape)
     if factor == 1:
         return picture
@@ -35,16 +35,15 @@ def find_blobs(
 ) -> list[Blob]:
     """Find round blobs of about the expected diameter.
 
-    A difference of two box filters (a fast stand-in for Gaussians) on the reduced, clipped difference answers to
-    blobs of the ball's size; each maximum is judged by the variance inside the disk and by how much of the
-    foreground in its neighbourhood lies inside the disk.
+    A difference of two box filters (fast approximations of Gaussians) on the reduced, clipped difference responds to
+    blobs of the ball's size; the merit of a maximum is the variance inside the disk times the share of the foreground
+    around it that lies inside.
 
     Args:
         difference: (H, W), |frame - background|, grey levels.
-        noise: (H, W), standard deviation of each pixel of the background, grey levels; where things turn and glitter
-            it is large and hides them.
-        diameter_px: expected diameter, px.
-        settings: of the room.
+        noise: (H, W), standard deviation of each background pixel, grey levels; large values hide glittering things.
+        diameter_px: expected diameter.
+        settings: of this room.
 
     Returns:
         At most `settings.blob_candidates` blobs, best first; none in a picture without foreground.
@@ -53,7 +52,7 @@ def find_blobs(
     """
     factor = settings.reduction
     small = np.maximum(_reduce(difference - settings.noise_factor * noise, factor), 0)
-    # A cap near the ball's own brightness keeps a glaring reflection from drowning it.
+    # Clip near the ball's own brightness, so that a bright reflection does not dominate.
     lit = small[small > 0]
     if lit.size == 0:
         return []
@@ -78,7 +77,7 @@ def find_blobs(
 
 
 def _judge(small: NDArray[np.float32], u: float, v: float, radius: float) -> tuple[float, float, float]:
-    """Centre a blob on its foreground's mean and return (u, v, variance times share inside the disk)."""
+    """Centre a blob on the mean of its foreground and return (u, v, merit)."""
     merit = 0.0
     for _ in range(2):
         reach = int(np.ceil(1.5 * radius))

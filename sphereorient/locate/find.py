@@ -1,4 +1,4 @@
-"""Find the ball in single frames: background, blobs, outline, in this order."""
+"""Finding the ball in single frames: background, blobs, outline, in this order."""
 
 from __future__ import annotations
 
@@ -21,13 +21,7 @@ Found = tuple[Outline | None, Reason]
 def find_ball(
     frame: NDArray[np.generic], background: Background, diameter_px: float, settings: LocateSettings
 ) -> Found:
-    """Find the outline of the ball in one frame, or the reason why there is none.
-
-    Args:
-        frame: (H, W), grey levels.
-        background: of the same movie.
-        diameter_px: expected diameter, px.
-        settings: of the room.
+    """Find the outline of the ball in one frame (H, W), or the reason why it has none.
 
     Returns:
         The outline and `Reason.OK`, or None and `NOT_FOUND` (no blob of that size), `OUTLINE` (no circle that enough
@@ -42,7 +36,7 @@ def find_ball(
         outline = fit_outline(difference, background.typical_noise, blob, diameter_px, settings, background.shown)
         if outline is not None and (best is None or _likelier(outline, best, settings)):
             best = outline
-        # The likeliest blob usually is the ball; the others are looked at only where its rim is not convincing.
+        # The best blob usually is the ball; the others are tried only if its rim is incomplete.
         if best is not None and best.painted and best.coverage >= max(settings.coverage_min, 0.5):
             break
     if best is None or best.coverage < settings.coverage_min:
@@ -52,7 +46,7 @@ def find_ball(
 
 
 def _likelier(one: Outline, other: Outline, settings: LocateSettings) -> bool:
-    """Tell whether an outline is likelier the ball's than another: painted if supported at all, then by its support."""
+    """Compare two outlines: a painted and supported one is likelier the ball, then the better supported one."""
     rank = [(each.painted and each.coverage >= settings.coverage_min, each.coverage) for each in (one, other)]
     return rank[0] > rank[1]
 
@@ -78,7 +72,7 @@ def _why_unreadable(
     outline: Outline,
     settings: LocateSettings,
 ) -> Reason:
-    """Tell a ball that is too dark or too bright to read; OK otherwise."""
+    """Return DARK or SATURATED for a ball that cannot be read, OK otherwise."""
     half = int(0.7 * outline.radius_px)  # the square inside the disk
     height, width = frame.shape
     u, v = min(max(round(outline.u_px), 0), width - 1), min(max(round(outline.v_px), 0), height - 1)

@@ -1,4 +1,4 @@
-"""Repair of the rough track in the picture: outliers of a spline replaced, short gaps interpolated, both flagged."""
+"""Outliers of the track in the picture replaced by a spline, and short gaps interpolated; both are flagged."""
 
 from __future__ import annotations
 
@@ -16,23 +16,18 @@ from sphereorient.trajectory import Flag, Reason
 DEGREE = 3
 
 
-def repair(sightings: Sightings, settings: LocateSettings) -> Sightings:
-    """Replace outliers by a least-squares spline and fill short gaps, with a flag on each such frame.
+def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
+    """Replace outliers of one camera by a least-squares spline and fill short gaps.
 
-    Args:
-        sightings: of one camera, as measured.
-        settings: of the room.
-
-    Returns:
-        The same frames; replaced and interpolated ones carry their flag and no `outline_rms_px`. Longer gaps stay
-        NaN: a sphere that left the view is not an error.
+    Replaced and interpolated frames have a flag and no `outline_rms_px`. Longer gaps stay NaN: a sphere that left the
+    view is not an error.
 
     Source: paper section III A.
     """
     track = np.column_stack([sightings.centre_px.numpy(), sightings.radius_px.numpy()])
     flags = sightings.flags.clone()
     rms = sightings.outline_rms_px.clone()
-    for stretch in stretches(np.isfinite(track[:, 2]), settings.gap_frames_max):
+    for stretch in known_stretches(np.isfinite(track[:, 2]), settings.gap_frames_max):
         known = stretch[np.isfinite(track[stretch, 2])]
         spline, outlier = robust_spline(known, track[known], settings)
         track[known[outlier]] = spline[outlier]
@@ -56,8 +51,8 @@ def repair(sightings: Sightings, settings: LocateSettings) -> Sightings:
     )
 
 
-def stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArray[np.int64]]:
-    """Return runs of frame numbers whose holes are no longer than `gap_frames_max`, each from known to known."""
+def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArray[np.int64]]:
+    """Return runs of frame numbers with gaps of at most `gap_frames_max`, each from a known to a known frame."""
     at = np.flatnonzero(known)
     if not len(at):
         return []
@@ -68,21 +63,16 @@ def stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArray[np.
 def robust_spline(
     frame: NDArray[np.int64], value: NDArray[np.float64], settings: LocateSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Fit a least-squares cubic spline to (n, D) values, leaving outliers out.
-
-    Args:
-        frame: (n,) increasing frame numbers.
-        value: (n, D), px; an outlier in one component is an outlier.
-        settings: knots and limits.
+    """Fit a least-squares cubic spline to values (n, D), px, at increasing frame numbers (n,), without outliers.
 
     Returns:
-        The spline at the frames (n, D), and which are outliers (n,) bool.
+        The spline at the frames (n, D), and the outliers (n,) bool: values with an outlier in any component.
     """
     outlier = np.zeros(len(frame), bool)
     fitted = value.copy()
     for _ in range(5):
         good = ~outlier
-        if good.sum() < 4 * (DEGREE + 1):  # too short to tell an outlier from motion
+        if good.sum() < 4 * (DEGREE + 1):  # too few to distinguish an outlier from motion
             return value.copy(), np.zeros(len(frame), bool)
         fitted = _spline(frame[good], value[good], settings.spline_knot_frames)(frame)
         deviation = np.abs(fitted - value)
@@ -95,7 +85,7 @@ def robust_spline(
 
 
 def _spline(x: NDArray[np.int64], y: NDArray[np.float64], spacing: int):  # type: ignore[no-untyped-def]
-    """Cubic least-squares spline with inner knots `spacing` frames apart, each with data about it."""
+    """Return a cubic least-squares spline with inner knots `spacing` frames apart."""
     inner = np.arange(x[0] + spacing, x[-1] - spacing / 2, spacing, dtype=float)
     counts = np.histogram(x, np.concatenate([[x[0]], inner, [x[-1] + 1]]))[0]
     # Schoenberg and Whitney: a knot needs data between its neighbours.

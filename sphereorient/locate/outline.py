@@ -1,4 +1,4 @@
-"""The ball's outline to a fraction of a pixel: edges, the circle that most directions support, a robust fit."""
+"""The ball's outline with sub-pixel accuracy: edges, the circle with the most support, a robust fit."""
 
 from __future__ import annotations
 
@@ -12,27 +12,30 @@ from sphereorient.locate.blob import Blob
 from sphereorient.locate.settings import LocateSettings
 
 DIRECTIONS = 72  # bins of 5 degrees in which the support of a circle is counted
-BEYOND = 1.0  # weight of a rim place beyond a circle against one on it
-NOISE_FLOOR = 2.0  # below so many sigmas the root is linear: noise is not magnified
-NOISE_STEEPNESS = 0.28  # times the root of the noise: stabilised noise falls as steeply in one place of ten thousand
-LEAST_RIM = 0.25  # of all directions that coverage is a share of at least, however much of the rim is hidden
-NEAR_HIDDEN_PX = 3  # from what hides the ball: edges there are not the rim's
-PAINTED = 0.15  # of the variance at the most varied place that the ball's own has at least
-BESIDE, NEAR_RIM = 0.1, 1.1  # of the disk: so much beside it is something else; radii: its halo is nearer
-SET_ASIDE = 2  # things as round as the ball whose rims are set aside
-PROFILES = 180  # radial profiles of the sub-pixel fit; more only repeat the same pixels
+BEYOND = 1.0  # weight of a rim point beyond a circle against one on it
+NOISE_FLOOR = 2.0  # below so many sigmas the root is linear, so that noise is not amplified
+NOISE_STEEPNESS = 0.28  # times the root of the noise: steepness of stabilised noise at one pixel of ten thousand
+LEAST_RIM = 0.25  # of all directions: least denominator of the coverage, however much of the rim is hidden
+NEAR_HIDDEN_PX = 3  # from the border of the mask: edges there do not belong to the rim
+PAINTED = 0.15  # least variance of the ball, as a share of the largest variance in the window
+BESIDE, NEAR_RIM = (
+    0.1,
+    1.1,
+)  # share of the disk: more foreground beside it is another object; radii: halo
+SET_ASIDE = 2  # other round objects whose rims are removed
+PROFILES = 180  # radial profiles of the sub-pixel fit; more sample the same pixels again
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outline:
-    """The circle fitted to a ball's rim; made by `fit_outline`, read by locate."""
+    """The circle fitted to the rim of a ball; made by `fit_outline`."""
 
     u_px: float
     v_px: float
     radius_px: float
-    rms_px: float  # of the edges that support the circle about it
-    coverage: float  # share of directions with a supporting edge, of those that nothing hides
-    painted: bool = True  # whether more than one grey is seen in it
+    rms_px: float  # distance of the supporting edges from the circle
+    coverage: float  # share of the visible directions that have a supporting edge
+    painted: bool = True  # whether it holds more than one grey
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +47,7 @@ class _Edges:
 
 
 def _edge_points(window: NDArray[np.float32], steepness: float) -> _Edges:
-    """Canny edges of a blurred window, in window pixels, moved to the gradient's maximum between pixels."""
+    """Return the Canny edges of a blurred window, in window pixels."""
     du = cv2.Scharr(window, cv2.CV_32F, 1, 0) / 32
     dv = cv2.Scharr(window, cv2.CV_32F, 0, 1) / 32
     scale = 8192 / max(float(np.abs(du).max()), float(np.abs(dv).max()), 1e-6)
@@ -59,7 +62,7 @@ def _edge_points(window: NDArray[np.float32], steepness: float) -> _Edges:
 
 
 def _in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """Return which places (n, 2), window px, lie away from what hides the ball, (n,)."""
+    """Return which points (n, 2), window px, are not near the mask, (n,)."""
     if clear is None:
         return np.ones(len(place), bool)
     limit = np.array(clear.shape[::-1]) - 1
@@ -68,7 +71,7 @@ def _in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_] | None) -
 
 
 def _rim_in_the_clear(circle: NDArray[np.float64], clear: NDArray[np.bool_] | None) -> float:
-    """Return how many of the directions about a circle show its rim away from what hides the ball."""
+    """Return the number of directions in which the rim of a circle is not near the mask."""
     if clear is None:
         return DIRECTIONS
     angle = (np.arange(DIRECTIONS) + 0.5) * (2 * np.pi / DIRECTIONS)
@@ -77,7 +80,7 @@ def _rim_in_the_clear(circle: NDArray[np.float64], clear: NDArray[np.bool_] | No
 
 
 def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Circles (n, 3: u, v, r) through triples of points (n, 3, 2); NaN where they lie on a line."""
+    """Return circles (n, 3: u, v, r) through triples of points (n, 3, 2); NaN for collinear ones."""
     a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     cross = 2 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -87,10 +90,10 @@ def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _support(circles: NDArray[np.float64], edges: _Edges, tolerance: float) -> NDArray[np.float64]:
-    """How well edges support circles: directions with an edge on the circle, less those with edges just outside.
+    """Return the support of circles: directions with an edge on the circle, less half of those with one just outside.
 
-    An edge supports where it lies on the circle and falls outwards along the radius. The rim's edges are the
-    outermost: a circle through texture edges has more of the ball's edges beyond it.
+    An edge supports a circle if it lies on it and falls outwards along the radius. The edges of the rim are the
+    outermost: a circle through texture edges has more edges of the ball outside.
     """
     away = edges.point[None] - circles[:, None, :2]
     distance = np.linalg.norm(away, axis=2)
@@ -108,10 +111,9 @@ def _support(circles: NDArray[np.float64], edges: _Edges, tolerance: float) -> N
 
 
 def _painted(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
-    """Tell whether a circle holds something painted: not much less varied than what squares of its size hold elsewhere.
+    """Return whether the variance inside a circle is not much less than in squares of its size elsewhere.
 
-    What passes before the ball, or beside it, may be as round and as large, and its rim is whole where the ball's is
-    not; but it is of one colour.
+    An object before or beside the ball may be as round and as large, with a more complete rim; but it has one colour.
     """
     side = max(3, round(2**0.5 * circle[2]) | 1)  # of the square within the circle
     mean, square = (
@@ -124,7 +126,7 @@ def _painted(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
 
 
 def _alone(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
-    """Tell whether a circle holds all that there is: then it may be a ball of one colour."""
+    """Return whether there is no foreground outside a circle: then it may be a ball of one colour."""
     row, column = np.ogrid[: window.shape[0], : window.shape[1]]
     away = np.hypot(row - circle[1], column - circle[0]) / circle[2]
     inside = away < 1
@@ -135,7 +137,7 @@ def _alone(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
 def _best_circle(
     edges: _Edges, radius_range: tuple[float, float], tolerance: float, tries: int = 400
 ) -> NDArray[np.float64] | None:
-    """The circle of an allowed size with the most support, from seeded random triples (RANSAC)."""
+    """Return the circle of an allowed size with the most support, from seeded random triples (RANSAC)."""
     if len(edges.point) < 8:
         return None
     # A fixed seed: the same picture gives the same circle.
@@ -145,7 +147,7 @@ def _best_circle(
     circles = circles[good]
     if not len(circles):
         return None
-    # All three edges must fall outwards: most triples through paint fail here, before anything dear is computed.
+    # All three edges must fall outwards: most triples of texture edges fail this cheap test.
     away = edges.point[choice[good]] - circles[:, None, :2]
     outwards = -(away * edges.inward[choice[good]]).sum(2) / circles[:, 2:3] > 0.8
     circles = circles[outwards.all(1)][:tries]
@@ -158,7 +160,7 @@ def _best_circle(
 def _ball_circle(
     edges: _Edges, window: NDArray[np.float32], radius_range: tuple[float, float], tolerance: float
 ) -> tuple[NDArray[np.float64] | None, bool]:
-    """The best circle that may be the ball, and whether it is painted: rims of what cannot be it are set aside."""
+    """Return the best circle that may be the ball, and whether it is painted; rims of other objects are removed."""
     for _ in range(SET_ASIDE + 1):
         circle = _best_circle(edges, radius_range, tolerance)
         painted = circle is not None and _painted(window, circle)
@@ -176,12 +178,12 @@ def _radial_edges(
     steepness: float,
     clear: NDArray[np.bool_] | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Sub-pixel places of the outermost steep fall along radial profiles about a circle.
+    """Find the outermost steep fall along radial profiles about a circle, with sub-pixel accuracy.
 
-    The outermost and not the steepest: inside, paint against paint falls as steeply as the rim and often steeper.
+    The outermost, not the steepest: texture edges inside are often steeper than the rim.
 
     Returns:
-        Where there is such a fall: unit directions (n, 2), signed distances from the circle (n,), px, steepness (n,).
+        Of profiles with such a fall: unit direction (n, 2), signed distance from the circle (n,), px, steepness (n,).
     """
     step = 0.5
     # Two samples to each side of a fall are needed, however small the circle.
@@ -197,7 +199,7 @@ def _radial_edges(
         borderMode=cv2.BORDER_REPLICATE,
     )
     fall = np.asarray(cv2.blur(profile[:, :-2] - profile[:, 2:], (3, 1)) / (2 * step), np.float32)
-    # A maximum within 1 px to both sides: the blurred rim's own tail ripples with the interpolation.
+    # A maximum within 1 px to both sides: interpolation makes the tail of the blurred rim ripple.
     peak = (fall >= cv2.dilate(fall, np.ones((1, 5), np.uint8))) & (fall > steepness)
     peak[:, [0, -1]] = False
     last = peak.shape[1] - 1 - peak[:, ::-1].argmax(1)
@@ -215,20 +217,20 @@ def _radial_edges(
 def _consensus(
     outward: NDArray[np.float64], offset: NDArray[np.float64], trust: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.float64]:
-    """The move (du, dv, dr) of a circle on which most rim places agree, from seeded random triples.
+    """Return the shift (du, dv, dr) of a circle on which most rim points agree, from seeded random triples.
 
-    Where black paint hides the rim, the outermost fall lies further inside, on a texture edge: such places are on
-    one side only, so a mean or a median would shrink the circle; the largest agreeing set does not.
+    Where black paint hides the rim, the outermost fall is a texture edge further inside. Such outliers are one-sided: a
+    mean or a median would shrink the circle; the largest consensus set does not.
     """
     design = np.column_stack([outward, np.ones(len(outward))])
     choice = np.random.default_rng(0).integers(0, len(offset), (300, 3))
     triple = design[choice]
-    solvable = np.abs(np.linalg.det(triple)) > 0.2  # triples spread over less than about 60 degrees say little
+    solvable = np.abs(np.linalg.det(triple)) > 0.2  # triples within about 60 degrees are ill-conditioned
     if not solvable.any():
         return np.zeros(3)
     moves = np.linalg.solve(triple[solvable], offset[choice[solvable]][..., None])[..., 0]
     residual = offset - moves @ design.T
-    # Nothing of the ball lies beyond its rim: places beyond count against a circle more than places on it count for it.
+    # Nothing of the ball lies beyond its rim: points beyond a circle weigh more than points on it.
     merit = (np.abs(residual) < tolerance) @ trust - BEYOND * ((residual > 2 * tolerance) @ trust)
     best: NDArray[np.float64] = moves[int(merit.argmax())]
     return best
@@ -241,12 +243,12 @@ def _fit_circle(
     steepness: float,
     clear: NDArray[np.bool_] | None,
 ) -> Outline | None:
-    """Consensus and then a least-squares circle with Tukey weights on the sub-pixel places of the rim."""
+    """Fit a circle to the sub-pixel rim points: consensus, then least squares with Tukey weights."""
     for reach in ((0.35 * circle[2], 0.25 * circle[2]), (0.1 * circle[2], 0.1 * circle[2])):
         outward, offset, fall = _radial_edges(window, circle, reach, steepness, clear)
         if len(offset) < 12:
             return None
-        # Faint falls are the halo of a patch's corner as often as the rim.
+        # Weak falls are often the halo of a texture patch.
         trust = np.minimum(fall / np.percentile(fall, 75), 1.0)
         design = np.column_stack([outward, np.ones(len(outward))])
         move = _consensus(outward, offset, trust, 0.4 * tolerance)
@@ -272,7 +274,7 @@ def _fit_circle(
 
 
 def _stabilised(window: NDArray[np.float32], noise: float, blur_px: float) -> NDArray[np.float32]:
-    """Blur, and take the root, as for shot noise: a dim rim counts beside a bright one, noise equally everywhere."""
+    """Blur and take the root (variance stabilisation for shot noise), so that dim and bright rims count alike."""
     blurred = cv2.GaussianBlur(window, (0, 0), blur_px)
     out: NDArray[np.float32] = np.sqrt(blurred + noise) - np.float32(np.sqrt(noise))
     return out
@@ -286,23 +288,23 @@ def fit_outline(
     settings: LocateSettings,
     shown: NDArray[np.bool_] | None = None,
 ) -> Outline | None:
-    """Fit the circle of a ball near a rough place.
+    """Fit the circle of a ball near a blob.
 
-    Survives the texture's own edges (they do not lie on one circle), bubbles (few directions), and black paint that
-    vanishes into a dark background (those directions are simply missing).
+    Robust against texture edges (not on one circle), bubbles (few directions), and black paint before a dark background
+    (missing directions).
 
     Args:
         difference: (H, W), |frame - background|, grey levels.
-        noise: typical standard deviation of a pixel of the background, grey levels.
-        blob: rough place.
+        noise: typical standard deviation of a background pixel, grey levels.
+        blob: approximate position.
         diameter_px: expected diameter.
-        settings: of the room.
+        settings: of this room.
         shown: (H, W), False where something hides the ball; None: nowhere.
 
     Returns:
-        The outline in the picture's pixels, or None where no circle of an allowed size is supported.
+        The outline in picture pixels, or None if no circle of an allowed size is supported.
 
-    Source: paper section III A (Canny edges and a circle's fit); the robust part is ours.
+    Source: paper section III A (Canny edges and a circle fit); the robust part is ours.
     """
     reach = int(np.ceil(0.5 * diameter_px * (1 + settings.diameter_tolerance) + 8))
     left, top = max(0, int(blob.u_px) - reach), max(0, int(blob.v_px) - reach)
@@ -316,7 +318,7 @@ def fit_outline(
     window = _stabilised(window, NOISE_FLOOR * noise, settings.edge_blur_px)
     contrast = float(np.percentile(window, 90))
     # A step blurred by sigma is contrast / (sigma sqrt(2 pi)) steep.
-    # Where nothing is bright, noise alone would make up a circle.
+    # The floor keeps circles from being fitted to noise alone.
     floor = NOISE_STEEPNESS * noise**0.5
     steepness = max(settings.edge_fraction * contrast / (settings.edge_blur_px * 2.5), floor)
     edges = _edge_points(window, steepness)

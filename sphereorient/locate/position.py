@@ -1,4 +1,4 @@
-"""From outlines to a place in the lab: two rays where two cameras see the sphere, ray and size where one does."""
+"""Position of the sphere in the lab: by two rays if two cameras see it, by ray and size if one does."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NOT_MEASURED = int(Flag.POSITION_INTERPOLATED | Flag.POSITION_OUTLIER_REPLACED)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Positions:
-    """Centre of the sphere in the lab in N frames; made by locate, read by motion and the pipeline."""
+    """Centre of the sphere in the lab in N frames; made by `find_positions`."""
 
     position_lab_mm: Tensor  # (N, 3), NaN where no camera has a centre
     covariance_mm2: Tensor  # (N, 3, 3), NaN where the position is not measured
@@ -26,10 +26,10 @@ class Positions:
     flags: Tensor  # (N,) int64
 
     def for_motion(self) -> Tensor:
-        """Positions fit for derivatives, (N, 3), mm: all, or where some come from two rays, only those.
+        """Return positions for derivatives, (N, 3), mm: those from two rays if there are any, else all.
 
-        A distance from the size is a hundred times less sure than one from two rays: a change between the two would
-        pass for a velocity.
+        A distance from the size is a hundred times less accurate than one from two rays: switching between them would
+        look like a velocity.
         """
         two_rays = torch.isfinite(self.gap_mm)
         return torch.where(two_rays[:, None] | ~two_rays.any(), self.position_lab_mm, torch.nan)
@@ -43,22 +43,16 @@ class Positions:
 def find_positions(
     sightings: Mapping[str, Sightings], cameras: Mapping[str, Camera], diameter_mm: float | None
 ) -> Positions:
-    """Place the sphere in the lab.
+    """Triangulate the sphere from the outlines of one or two cameras in the same N frames.
 
-    Args:
-        sightings: of one or two cameras, the same N frames.
-        cameras: of the same names.
-        diameter_mm: of the sphere; None: lengths are in radii of the sphere (one camera only).
-
-    Returns:
-        Positions. Where one camera alone has the outline, the distance comes from its radius, is far less sure, and
-        the frame carries `ONE_CAMERA`.
+    If only one camera has the outline, the distance comes from its radius, is far less accurate, and the frame is
+    flagged `ONE_CAMERA`. If the diameter is None, lengths are in radii of the sphere. The standard deviation of a
+    centre per axis is the rms of its outline.
 
     Raises:
-        ExperimentError: two cameras, and the diameter is unknown: radii and mm would stand side by side.
+        ExperimentError: two cameras and an unknown diameter: radii and mm would be mixed.
 
-    Source: paper section III A (triangulation). The sigma of one camera's centre, per axis, is the rms of its
-    outline; the rays carry it into space.
+    Source: paper section III A (triangulation).
     """
     if diameter_mm is None and len(sightings) > 1:
         do = "give the diameter, or track with one camera"
@@ -88,10 +82,10 @@ def find_positions(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
-    """What one camera says of the sphere's place."""
+    """Position of the sphere by one camera."""
 
-    rays: Rays  # (N), to the outline's centre
-    from_size_mm: Tensor  # (N, 3), on the ray, at the distance that the radius tells
+    rays: Rays  # (N), to the centre of the outline
+    from_size_mm: Tensor  # (N, 3), on the ray, at the distance by the radius
     across: Tensor  # (N, 3, 3), information (1/mm^2) across the ray
     along: Tensor  # (N, 3, 3), information along the ray, from the size
 
@@ -100,11 +94,11 @@ def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
     rays = camera.rays(seen.centre_px)
     rim = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=seen.centre_px.dtype)
     limb = camera.rays(seen.centre_px[:, None] + rim * seen.radius_px[:, None, None])
-    # sin of the angle between the centre's ray and the limb's: the cross product is exact for small angles.
+    # sin of the angle between the rays of centre and limb: the cross product is exact for small angles.
     away = torch.linalg.cross(rays.direction_lab[:, None].expand_as(limb.direction_lab), limb.direction_lab)
     sine = away.norm(dim=-1).mean(1)
-    distance = radius_mm / sine  # from where the rays would meet
-    # Behind a wall they begin that far from each other already, over the angle: so much of the distance is not theirs.
+    distance = radius_mm / sine  # from the point where the rays would meet
+    # Behind a window the rays begin apart: this part of the distance, over the angle, is subtracted.
     begun = torch.linalg.cross(rays.origin_lab_mm[:, None] - limb.origin_lab_mm, limb.direction_lab)
     before = (begun * away).sum(-1).mean(1) / sine.square()
     per_px = distance * sine / seen.radius_px  # mm in space per px, at the sphere

@@ -1,29 +1,47 @@
-"""One camera's scene: what it shows without the ball, and how large the ball is in it."""
+"""One camera's scene: what it shows without the ball, and the expected size of the ball in it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sphereorient.cameras import Camera, triangulate
+from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.given import given_scene
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream
-from sphereorient.locate.background import Background
-from sphereorient.locate.expected import expected_diameter_px
-from sphereorient.locate.fixed import fixed_ball
-from sphereorient.locate.learn import learn_background
+from sphereorient.locate.background import Background, measure_background, without_ball
+from sphereorient.locate.blob import Blob
+from sphereorient.locate.find import find_ball
+from sphereorient.locate.outline import Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
+
+ROUNDS = 4  # iterations at most; each finds the ball in more frames, most movies need two
+RIM = 1.15  # of the radius: the ball's halo and shadow belong to it
+LOUD, LOUD_SHARE = 5.0, 0.1  # times the typical noise; share of such pixels in the disk that triggers `_quieter`
+CHANGE_SIGMAS = 0.6745 * 2**0.5  # median of the difference of two normal numbers, in their standard deviation
+CHANGES = 2.5  # times the typical scatter of a pixel: texture passes there
+RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
+RING = 1.5  # of the radius: the median grey of the scene in this ring is taken as background behind the ball
+WINDOW = 5  # px of the median filter that removes single pixels
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """What one camera shows without the ball; made by `find_scene`."""
+    """The scene of one camera; made by `find_scene`."""
 
     background: Background
-    diameter_px: float  # expected, of the ball's picture
+    diameter_px: float  # expected, of the ball
 
 
 def known_diameter_px(recording: Recording, name: str, settings: LocateSettings) -> float | None:
-    """Return the expected diameter of the ball's picture in a camera; None where only the movie can show it.
+    """Return the expected diameter of the ball in a camera; None where only the movie can show it.
 
     Raises:
         SettingsError: see `expected_diameter_px`.
@@ -34,7 +52,7 @@ def known_diameter_px(recording: Recording, name: str, settings: LocateSettings)
 
 
 def find_scene(recording: Recording, stream: CameraStream, count: int, settings: LocateSettings) -> Scene:
-    """Estimate what one camera shows without the ball, from `count` frames or from the experiment's own picture.
+    """Estimate the background of one camera, from `count` frames or from the experiment's own picture.
 
     Raises:
         ExperimentError: a ball that is said to be fixed does not turn in one place.
@@ -47,6 +65,179 @@ def find_scene(recording: Recording, stream: CameraStream, count: int, settings:
         diameter_px = diameter_px or 2 * fixed.outline.radius_px
         if empty is None:
             return Scene(background=fixed.scene, diameter_px=diameter_px)
-    assert diameter_px is not None  # a ball that moves has one, or is refused
+    assert diameter_px is not None  # a moving ball has one, or is refused
     background = learn_background(stream.spread(count), diameter_px, settings, empty, stream.shown)
     return Scene(background=background, diameter_px=diameter_px)
+
+
+def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: float | None) -> float:
+    """Return the diameter of the sphere in the picture of camera `name`, if it is in the middle of the volume.
+
+    The middle is where the optical axes of two cameras pass nearest, or the lab origin for one camera.
+
+    Raises:
+        SettingsError: the diameter is unknown, or the single camera is at the lab origin (not calibrated).
+    """
+    camera = cameras[name]
+    do = "set locate.diameter_px to the diameter of the ball in the picture"
+    if diameter_mm is None:
+        raise SettingsError(refusal("sphere.diameter", expected="a number of mm", got="null", do=do))
+    middle = torch.zeros(3, dtype=torch.float64)
+    if len(cameras) == 2:
+        axes = [each.rays((torch.tensor(each.image_size, dtype=torch.float64) - 1) / 2) for each in cameras.values()]
+        middle, _ = triangulate(axes[0], axes[1])
+    # Two points half a diameter to the sides, at right angles to the camera's axis.
+    right_lab = camera.R_cam_lab[0] * diameter_mm / 2
+    rim = camera.project(torch.stack([middle - right_lab, middle + right_lab]))
+    diameter_px = float((rim[1] - rim[0]).norm())
+    if not 4 < diameter_px < max(camera.image_size):
+        got = f"a sphere of {diameter_px:.3g} px in the middle of the volume"
+        raise SettingsError(refusal(f"camera {name}", expected="a sphere that fits the picture", got=got, do=do))
+    return diameter_px
+
+
+def learn_background(
+    pictures: NDArray[Any],
+    diameter_px: float,
+    settings: LocateSettings,
+    empty: NDArray[np.float32] | None = None,
+    shown: NDArray[np.bool_] | None = None,
+) -> Background:
+    """Estimate the background of a movie.
+
+    Average the frames, find the ball in them, and measure the pixels that it covers again from the other frames:
+    otherwise a ball that stays long in one region becomes part of the background there.
+
+    Args:
+        pictures: (n, H, W), evenly spread frames of one movie.
+        diameter_px: expected diameter of the ball.
+        settings: of this room.
+        empty: (H, W), a picture of the scene without the ball, if there is one; then only the noise is measured.
+        shown: (H, W), False where something that does not move hides the ball; None: nowhere.
+    """
+    background = replace(measure_background(pictures, empty), shown=shown)
+    if empty is not None:
+        return _quieter(background, pictures, diameter_px, settings)
+    first, before = background, 0
+    for _ in range(ROUNDS):
+        covered = _covered(pictures, background, diameter_px, settings)
+        background = without_ball(first, pictures, covered)
+        found = int(covered.any(axis=(1, 2)).sum())
+        if found <= before or found == len(pictures):  # nothing new to learn
+            break
+        before = found
+    return background
+
+
+def _quieter(
+    background: Background, pictures: NDArray[Any], diameter_px: float, settings: LocateSettings
+) -> Background:
+    """Limit the noise of a pixel to its change from frame to frame, if the ball is not found otherwise.
+
+    With a given scene, a pixel that the ball never leaves scatters by the contrast of the ball, which hides a blurred
+    ball. Glittering things change from frame to frame and stay hidden.
+    """
+    loud = background.noise > LOUD * background.typical_noise
+    if loud.sum() < LOUD_SHARE * np.pi / 4 * diameter_px**2:
+        return background
+    found = [find_ball(picture, background, diameter_px, settings)[0] is not None for picture in pictures]
+    if 2 * sum(found) >= len(pictures):
+        return background
+    values = pictures[:, loud].astype(np.float32)
+    changed = np.median(np.abs(np.diff(values, axis=0)), axis=0) / CHANGE_SIGMAS
+    noise = background.noise.copy()
+    noise[loud] = np.clip(changed, background.typical_noise, noise[loud])
+    return replace(background, noise=noise)
+
+
+def _covered(
+    pictures: NDArray[Any], background: Background, diameter_px: float, settings: LocateSettings
+) -> NDArray[np.bool_]:
+    """Return the pixels of the ball in each of (n, H, W) frames; all False where it was not found."""
+    covered = np.zeros(pictures.shape, bool)
+    for picture, mask in zip(pictures, covered, strict=True):
+        outline, _ = find_ball(picture, background, diameter_px, settings)
+        if outline is None:
+            continue
+        reach = RIM * outline.radius_px + 1
+        left, top = max(0, int(outline.u_px - reach)), max(0, int(outline.v_px - reach))
+        window = mask[top : int(outline.v_px + reach) + 2, left : int(outline.u_px + reach) + 2]
+        row, column = np.ogrid[: window.shape[0], : window.shape[1]]
+        window[...] = (row + top - outline.v_px) ** 2 + (column + left - outline.u_px) ** 2 <= reach**2
+    return covered
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FixedBall:
+    """Outline of a fixed ball in all frames, and the scene, with a guess behind the ball; made by `fixed_ball`."""
+
+    outline: Outline
+    scene: Background
+
+
+def fixed_ball(
+    pictures: NDArray[Any],
+    locating: LocateSettings,
+    empty: NDArray[np.float32] | None = None,
+    shown: NDArray[np.bool_] | None = None,
+) -> FixedBall:
+    """Find a ball that rotates about a fixed centre: its pixels change from frame to frame, the scene does not.
+
+    Args:
+        pictures: (n, H, W), evenly spread frames of one movie.
+        locating: how outlines are found.
+        empty: (H, W), a picture of the scene without the ball, if there is one.
+        shown: (H, W), False where something hides the ball; None: nowhere.
+
+    Raises:
+        ExperimentError: nothing round changes.
+    """
+    grey = pictures.astype(np.float32)
+    middle = np.median(grey, axis=0)
+    scatter = np.asarray(grey.std(axis=0), np.float32)
+    if shown is not None:
+        scatter = np.where(shown, scatter, np.float32(0))
+    usual = float(np.median(scatter)) + 0.3 * float(np.iinfo(pictures.dtype).max) / 255
+    moved = (cv2.medianBlur(scatter, WINDOW) > CHANGES * usual).astype(np.uint8)
+    count, labels, stats, centres = cv2.connectedComponentsWithStats(moved, connectivity=8)
+    if count < 2:
+        raise _none_fixed("nothing that changes")
+    largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    inside = (labels == largest).astype(np.uint8)
+    guess = locating.diameter_px or _diameter(inside, shown is not None)
+    change = np.minimum(scatter, np.percentile(scatter[inside > 0], 30))  # the rim without the texture
+    blob = Blob(u_px=float(centres[largest][0]), v_px=float(centres[largest][1]), merit=1.0)
+    outline = fit_outline(change, 0.2 * usual, blob, guess, locating, shown)
+    if outline is None or outline.coverage < locating.coverage_min:
+        raise _none_fixed("no circle about what changes")
+    scene = replace(_around(middle, scatter, outline, pictures.dtype, empty), shown=shown)
+    return FixedBall(outline=outline, scene=scene)
+
+
+def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
+    """Return the diameter of a region by its area, or by its enclosing circle if a part may be hidden."""
+    if hidden:
+        return 2 * float(cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1])
+    return 2 * float(np.sqrt(inside.sum() / np.pi))
+
+
+def _around(
+    middle: NDArray[np.float32],
+    scatter: NDArray[np.float32],
+    outline: Outline,
+    dtype: np.dtype[Any],
+    empty: NDArray[np.float32] | None,
+) -> Background:
+    row, column = np.ogrid[: middle.shape[0], : middle.shape[1]]
+    away = np.hypot(row - outline.v_px, column - outline.u_px) / outline.radius_px
+    ball, ring = away < RIM_FIXED, (away >= RIM_FIXED) & (away < RING)
+    around = ring if ring.any() else ~ball
+    mean, noise = middle.astype(np.float32), np.maximum(scatter, 0.3).astype(np.float32)
+    mean[ball], noise[ball] = np.median(middle[around]), np.median(noise[around])
+    full = float(np.iinfo(dtype).max)
+    return Background(mean=mean if empty is None else empty, noise=noise, full_scale=full)
+
+
+def _none_fixed(got: str) -> ExperimentError:
+    do = "check sphere.fixed: is the ball in one place, and does it turn? Or set locate.diameter_px"
+    return ExperimentError(refusal("movies", expected="a ball that turns in its place", got=got, do=do))

@@ -1,22 +1,23 @@
-"""The record between locate and orient: where is the sphere, frame by frame, in one camera."""
+"""The outlines of the sphere in one camera, frame by frame."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from sphereorient.errors import ShapeError, refusal
+from sphereorient.errors import ExperimentError, ShapeError, refusal
 from sphereorient.trajectory import Reason
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sightings:
-    """Outline of the sphere in N frames of one camera; made by locate, read by orient and the pipeline.
+    """Outline of the sphere in N frames of one camera.
 
-    Centre and radius are NaN where the sphere was not found and not interpolated; `outline_rms_px` is NaN wherever
-    they were not measured in the frame itself.
+    Centre and radius are NaN where the sphere was neither found nor interpolated; `outline_rms_px` is NaN where they
+    were not measured in the frame itself.
     """
 
     centre_px: Tensor  # (N, 2) float64, (u, v)
@@ -24,7 +25,7 @@ class Sightings:
     outline_rms_px: Tensor  # (N,) float64, deviation of the edges from the circle
     coverage: Tensor  # (N,) float64, share of the outline's directions with an edge
     flags: Tensor  # (N,) int64, POSITION_INTERPOLATED and POSITION_OUTLIER_REPLACED of trajectory.Flag
-    reason: tuple[Reason, ...]  # N, why the sphere was not measured; Reason.OK where it was
+    reason: tuple[Reason, ...]  # N; Reason.OK where the sphere was measured
 
     def __post_init__(self) -> None:
         """Compare the lengths of the parts."""
@@ -39,5 +40,25 @@ class Sightings:
 
     @property
     def placed(self) -> Tensor:
-        """Frames with a centre, measured, interpolated or replaced; (N,) bool."""
+        """Frames with a centre, measured or not; (N,) bool."""
         return torch.isfinite(self.radius_px)
+
+
+def check_seen(sightings: Mapping[str, Sightings]) -> None:
+    """Refuse an experiment in which no camera found the sphere in any frame.
+
+    Raises:
+        ExperimentError: with the reasons of the frames.
+    """
+    if any(bool(seen.placed.any()) for seen in sightings.values()):
+        return
+    reasons = ", ".join(sorted({str(why) for seen in sightings.values() for why in seen.reason}))
+    do = "check sphere.diameter and the cameras, or set locate.diameter_px"
+    raise ExperimentError(refusal("movies", expected="the sphere in some frame", got=f"none ({reasons})", do=do))
+
+
+def size_of(sightings: Sightings, size_px: int | None) -> int:
+    """Return the side of the normalised disks, px: the setting, or the median diameter in the movie."""
+    if size_px is not None:
+        return size_px
+    return max(16, round(2 * float(sightings.radius_px[sightings.placed].median())))

@@ -20,14 +20,14 @@ from sphereorient.locate import (
     Scene,
     Sightings,
     check_seen,
+    fill_gaps,
     find_ball,
     find_positions,
     find_scene,
-    repair,
     screened_frames,
     sightings_of,
 )
-from sphereorient.locate.fixed import fixed_ball
+from sphereorient.locate.scene import fixed_ball
 from sphereorient.mapping.settings import PaintSettings
 from sphereorient.pose.fitter import CameraView
 
@@ -130,7 +130,7 @@ def _moving(recording: Recording, settings: PaintSettings, locating: LocateSetti
             progress(f"{stream.name}: ball", k + 1, 0)
         views.append(CameraView.of(stream.name, stream.camera, scene))
         windows.append(row)
-        sightings[stream.name] = repair(sightings_of(found), locating)
+        sightings[stream.name] = fill_gaps(sightings_of(found), locating)
     return views, sightings, windows
 
 

@@ -83,7 +83,7 @@ def locate_sphere(recording: Recording, stream: CameraStream, settings: Settings
             found.append((None, shot.reason))
         if done % CHUNK == 0 or done == len(stream):
             progress(stage, done, len(stream))
-    return locate.repair(locate.sightings_of(found), settings.locate)
+    return locate.fill_gaps(locate.sightings_of(found), settings.locate)
 
 
 def propose_orientations(

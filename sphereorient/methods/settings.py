@@ -16,8 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.errors import SettingsError, refusal
-from sphereorient.files.bounded_yaml import FAULTS, parse_yaml
-from sphereorient.files.yaml_file import read_yaml, short
+from sphereorient.files.yaml_file import FAULTS, parse_yaml, read_yaml, short
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.learn.settings import ProposerSettings
 from sphereorient.locate.settings import LocateSettings

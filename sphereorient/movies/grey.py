@@ -1,4 +1,4 @@
-"""Exact grey values of a decoded video frame: those of the file, never converted through a colour range."""
+"""Exact grey values of colour pictures and of decoded video frames, without any colour range conversion."""
 
 from __future__ import annotations
 
@@ -6,15 +6,27 @@ import ctypes
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
-from sphereorient.movies.luma import luma
 from sphereorient.movies.movie import Grey
 
 if TYPE_CHECKING:
     import av
 
-PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # starts of the names of formats whose first plane may be the grey one
+# Thousandths that add up to 1000: R = G = B comes out as it is.
+RED, GREEN, BLUE = 299, 587, 114
+COLOUR_REMARK = "colour, made grey (0.299 R + 0.587 G + 0.114 B)"
+PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # pixel formats that begin so may have a grey first plane
+
+
+def luma(red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any]) -> NDArray[Any]:
+    """Return the grey values of a colour picture (...), uint8 or uint16; exact where R = G = B.
+
+    Source: ITU-R BT.601.
+    """
+    total = RED * red.astype(np.uint32) + GREEN * green.astype(np.uint32) + BLUE * blue.astype(np.uint32)
+    return ((total + 500) // 1000).astype(red.dtype)
 
 
 def grey_dtype(pixel_format: av.VideoFormat) -> np.dtype[Any]:
@@ -23,62 +35,47 @@ def grey_dtype(pixel_format: av.VideoFormat) -> np.dtype[Any]:
 
 
 def check_format(name: str, pixel_format: av.VideoFormat) -> None:
-    """Refuse pixel formats whose grey values cannot be had exactly.
-
-    Args:
-        name: of the movie, for the message.
-        pixel_format: of its frames.
+    """Refuse pixel formats without exact grey values.
 
     Raises:
-        MovieError: neither a format with a grey plane of whole numbers nor a colour format.
+        MovieError: neither a format with an integer grey plane nor a colour format.
     """
-    if not (_has_grey_plane(pixel_format) or _is_colour(pixel_format)):
+    colour = (pixel_format.is_rgb or pixel_format.has_palette) and not pixel_format.is_bit_stream
+    if not (colour or _has_grey_plane(pixel_format)):
         do = "convert it, lossless: ffmpeg -i MOVIE -c:v ffv1 -pix_fmt gray MOVIE.mkv"
         raise MovieError(refusal(name, expected="grey, planar YUV or RGB pixels", got=pixel_format.name, do=do))
 
 
 def grey_values(frame: av.VideoFrame) -> Grey:
-    """Return the grey values of a frame, (H, W) uint8 or uint16, row 0 on top.
-
-    Grey and YUV formats give their first plane as it is, RGB formats their luma, which is exact for R = G = B.
-    """
-    pixel_format = frame.format
-    if _has_grey_plane(pixel_format):
+    """Return the first plane of grey and YUV frames unchanged, the luma of RGB frames; (H, W), row 0 on top."""
+    if _has_grey_plane(frame.format):
         return _plane_0(frame)
-    return _colour(frame, grey_dtype(pixel_format), pixel_format.components[0].bits)
-
-
-def _colour(frame: av.VideoFrame, dtype: np.dtype[Any], bits: int) -> Grey:
-    # FFmpeg only puts the channels side by side here; its own grey would follow another formula than our formats'.
-    interleaved = frame.reformat(format="rgb24" if dtype.itemsize == 1 else "rgb48le")
+    # FFmpeg only interleaves the channels here: its own grey follows another formula than the other formats'.
+    deep = grey_dtype(frame.format).itemsize == 2
+    interleaved = frame.reformat(format="rgb48le" if deep else "rgb24")
     values = _plane_0(interleaved, samples=3).reshape(frame.height, frame.width, 3)
-    if dtype.itemsize == 2:
-        values = values >> (16 - bits)  # 10 and 12 bit come scaled to 16, by their own leading bits
-    red, green, blue = np.moveaxis(values, 2, 0)
-    return luma(red, green, blue)
-
-
-def _is_colour(pixel_format: av.VideoFormat) -> bool:
-    return bool(pixel_format.is_rgb or pixel_format.has_palette) and not pixel_format.is_bit_stream
+    if deep:
+        values = values >> (16 - frame.format.components[0].bits)  # 10 and 12 bit are scaled to 16
+    return luma(*np.moveaxis(values, 2, 0))
 
 
 def _has_grey_plane(pixel_format: av.VideoFormat) -> bool:
-    """Whether plane 0 holds nothing but grey: not so for packed formats (yuyv422, ya8), whose planes are shared."""
+    """Return whether plane 0 holds only grey; packed formats (yuyv422, ya8) share it."""
     grey, *others = pixel_format.components
     alone = all(other.plane != grey.plane for other in others)
     return alone and pixel_format.name.startswith(PLANE_0_IS_GREY) and "f32" not in pixel_format.name
 
 
 def _plane_0(frame: av.VideoFrame, samples: int = 1) -> Grey:
-    """Return the values of the first plane, (H, W), or (H, samples W) where pixels hold several."""
+    """Return the first plane, (H, samples W)."""
     plane, height, width = frame.planes[0], frame.height, frame.width * samples
     dtype = grey_dtype(frame.format)
     stored = dtype.newbyteorder(">" if frame.format.is_big_endian else "<")
-    # Rows are padded to line_size, which is negative where the picture is stored bottom-up; buffer_ptr is then the
-    # top row, the last one in memory. Read by address: releases of PyAV differ in where their buffer begins.
+    # Rows are padded to line_size, which is negative for pictures stored bottom-up; buffer_ptr is then the top row,
+    # the last one in memory. Read by address: PyAV releases differ in where their buffer begins.
     reach = (height - 1) * plane.line_size
     size = abs(reach) + width * dtype.itemsize
     memory = memoryview((ctypes.c_uint8 * size).from_address(plane.buffer_ptr + min(reach, 0))).cast("B")
     strides = (plane.line_size, dtype.itemsize)
     rows: Grey = np.ndarray((height, width), stored, buffer=memory, offset=max(-reach, 0), strides=strides)
-    return rows.astype(dtype, order="C")  # a copy: the memory is the frame's
+    return rows.astype(dtype, order="C")  # a copy: the memory belongs to the frame

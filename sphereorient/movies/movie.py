@@ -1,11 +1,11 @@
-"""The one interface to movies, whatever the format."""
+"""The one interface to movies, and what the readers of all formats share."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,69 +13,91 @@ from numpy.typing import NDArray
 from sphereorient.errors import MovieError, refusal
 
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
+FRAMES_A_MAP = 64
+FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns
 
 
-class Movie(Protocol):
-    """A sequence of grey pictures, with the times of the frames where the file holds exact ones."""
+class Movie:
+    """A sequence of grey pictures; a format implements `_read`. No file stays open between calls."""
 
-    @property
-    def path(self) -> Path:
-        """The file."""
+    path: Path
+    format: str  # kind of file, codec, bits, in words
+    frame_shape: tuple[int, int]  # (H, W)
+    dtype: np.dtype[Any]  # uint8, or uint16 where the file holds more than 8 bits; values are not rescaled
+    times_s: NDArray[np.float64] | None = None  # (N,), s, exact time stamps of the file; None: none, or rounded (MKV)
+    remarks: tuple[str, ...] = ()  # warnings for the user: truncated, colour converted to grey, lossy codec
 
-    @property
-    def frame_shape(self) -> tuple[int, int]:
-        """Rows and columns (H, W) of every frame."""
+    def __init__(self, path: Path, form: str, count: int, frame_shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        self.path, self.format, self._count = path, form, count
+        self.frame_shape, self.dtype = frame_shape, dtype
 
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """uint8, or uint16 where the file holds more than 8 bits; values are those of the file, not rescaled."""
+    def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
+        """Yield the frames of these increasing numbers; raise MovieError at a damaged one."""
+        raise NotImplementedError
 
-    @property
-    def format(self) -> str:
-        """How the file holds the pictures, in words: container or kind of file, codec, bits."""
-
-    @property
-    def times_s(self) -> NDArray[np.float64] | None:
-        """Time of each frame by the file's own stamps, (N,), s; None where it has none or rounds them (MKV, AVI)."""
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """What a user should know: that the file is cut off, that colour was made grey, that its codec loses."""
+    def _read_on(self, numbers: Sequence[int]) -> Iterator[Grey | None]:
+        """Yield the frames of these numbers, None for damaged ones: restart after each, as frames are independent."""
+        while numbers:
+            try:
+                for picture in self._read(numbers):
+                    yield picture
+                    numbers = numbers[1:]
+            except MovieError:
+                yield None
+                numbers = numbers[1:]
 
     def __len__(self) -> int:
         """Return the number of frames."""
+        return self._count
 
     def frames(self, first: int = 0, last: int | None = None) -> Iterator[Grey]:
-        """Yield frames first .. last - 1 in order, (H, W) each, the caller's own.
+        """Yield frames first .. last - 1 in order, (H, W) each, as copies.
 
         Raises:
             MovieError: the range lies outside the movie, or a frame cannot be decoded.
         """
+        return self._read(self._range(first, last))
+
+    def readable(self, first: int = 0, last: int | None = None) -> Iterator[Grey | None]:
+        """Yield frames first .. last - 1 in order, None for those that cannot be decoded.
+
+        Frames that are predicted from a damaged one are None too, up to the next key frame.
+
+        Raises:
+            MovieError: the range lies outside the movie.
+        """
+        return self._read_on(self._range(first, last))
 
     def sample(self, indices: Sequence[int]) -> Grey:
-        """Return any frames in the order asked for, (n, H, W).
+        """Return frames in the given order, (n, H, W).
 
         Raises:
             MovieError: an index lies outside the movie, or a frame cannot be decoded.
         """
+        asked = [int(index) for index in indices]
+        outside = [index for index in asked if not 0 <= index < len(self)]
+        if outside:
+            raise self._outside(f"0 .. {len(self) - 1}", str(outside[0]))
+        order = sorted(set(asked))
+        pictures = np.empty((len(order), *self.frame_shape), self.dtype)
+        for place, picture in enumerate(self._read(order)):
+            pictures[place] = picture
+        return pictures if order == asked else pictures[np.searchsorted(order, asked)]
 
-    def close(self) -> None:
-        """Let go of the file."""
+    def _range(self, first: int, last: int | None) -> range:
+        last = len(self) if last is None else last
+        if not 0 <= first <= last <= len(self):
+            raise self._outside(f"0 .. {len(self)}", f"{first} .. {last}")
+        return range(first, last)
 
-    def __enter__(self) -> Self:
-        """Return the movie."""
+    def _outside(self, within: str, got: str) -> MovieError:
+        do = "ask for frames that the movie has"
+        return MovieError(refusal(str(self.path), expected=f"frames within {within}", got=got, do=do))
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the movie."""
-
-
-class HoldsNothing:
-    """What movies share that hold no file open between reads."""
-
-    def close(self) -> None:
-        """Do nothing: no file is held open."""
+    def _damage(self, number: int, got: str) -> MovieError:
+        """Word the refusal of a frame that cannot be read."""
+        do = "export the movie again, or leave the frame out with frames: in the experiment"
+        return MovieError(refusal(f"{self.path}, frame {number}", expected="a decodable picture", got=got, do=do))
 
     def __enter__(self) -> Self:
         """Return the movie."""
@@ -84,32 +106,68 @@ class HoldsNothing:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the movie."""
-        self.close()
+        """Do nothing: no file is open."""
 
 
-def check_range(path: Path, length: int, first: int, last: int | None) -> int:
-    """Return the end of a range of frames, refusing one that leaves the movie.
+class FlippedMovie(Movie):
+    """Another movie with its rows, its columns or both reversed."""
+
+    def __init__(self, movie: Movie, how: str) -> None:
+        super().__init__(movie.path, movie.format, len(movie), movie.frame_shape, movie.dtype)
+        self.times_s = movie.times_s
+        self.remarks = (*movie.remarks, f"flipped on reading: {how}")
+        self._movie, self._how = movie, how
+
+    def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
+        return (flipped_picture(picture, self._how) for picture in self._movie._read(numbers))
+
+    def _read_on(self, numbers: Sequence[int]) -> Iterator[Grey | None]:
+        pictures = self._movie._read_on(numbers)
+        return (None if picture is None else flipped_picture(picture, self._how) for picture in pictures)
+
+
+def flipped(movie: Movie, how: str) -> Movie:
+    """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both.
 
     Raises:
-        MovieError: not 0 <= first <= last <= length.
+        MovieError: another word.
     """
-    last = length if last is None else last
-    if not 0 <= first <= last <= length:
-        expected, got = f"frames within 0 .. {length}", f"{first} .. {last}"
-        raise MovieError(refusal(str(path), expected=expected, got=got, do="ask for frames that the movie has"))
-    return last
+    if how not in FLIPS:
+        do = "write one of these"
+        raise MovieError(refusal(f"{movie.path}, flip", expected=", ".join(FLIPS), got=f"'{how}'", do=do))
+    return movie if how == "none" else FlippedMovie(movie, how)
 
 
-def check_indices(path: Path, length: int, indices: Sequence[int]) -> list[int]:
-    """Return indices as plain whole numbers, refusing those that the movie does not have.
+def flipped_picture(picture: NDArray[Any], how: str) -> NDArray[Any]:
+    """Mirror a picture (..., H, W) as `flipped` mirrors a movie."""
+    rows, columns = FLIPS[how]
+    return np.ascontiguousarray(picture[..., ::rows, ::columns])
 
-    Raises:
-        MovieError: an index is negative or not below the length.
+
+def mapped(
+    path: Path, numbers: Sequence[int], dtype: np.dtype[Any], offset: int, shape: tuple[int, ...]
+) -> Iterator[tuple[int, NDArray[Any]]]:
+    """Yield each frame number with the array of a file mapped into memory, from a new map for every 64 frames.
+
+    Pages once read stay in memory while the process holds the map: new maps keep memory flat.
     """
-    plain = [int(index) for index in indices]
-    outside = [index for index in plain if not 0 <= index < length]
-    if outside:
-        expected, do = f"frames within 0 .. {length - 1}", "ask for frames that the movie has"
-        raise MovieError(refusal(str(path), expected=expected, got=str(outside[0]), do=do))
-    return plain
+    for place, number in enumerate(numbers):
+        if place % FRAMES_A_MAP == 0:
+            values = np.memmap(path, dtype, "r", offset, shape)
+        yield number, values
+
+
+def refused(path: Path, expected: str, got: str, do: str) -> MovieError:
+    """Word the refusal of a movie file."""
+    return MovieError(refusal(str(path), expected=expected, got=got, do=do))
+
+
+def truncated_remark(told: int, there: int) -> tuple[str, ...]:
+    """Return the remark on a movie whose header states more frames than the file holds."""
+    return (f"truncated: its header tells of {told} frames, {there} are there",) if there < told else ()
+
+
+def error_words(error: Exception) -> str:
+    """Return a library's error in one line of at most 200 characters."""
+    text = str(getattr(error, "strerror", None) or error)
+    return f"'{text.splitlines()[0][:200]}'" if text else type(error).__name__

@@ -1,4 +1,4 @@
-"""The table of a movie's packets: which frame is where, and what hangs on what, found without decoding."""
+"""The packet table of a video: frame numbers and dependencies, found without decoding."""
 
 from __future__ import annotations
 
@@ -11,51 +11,51 @@ from itertools import pairwise
 from math import gcd
 from typing import NamedTuple
 
-MOST_MISSING = 10  # times the packets that are there: beyond, the stamps are not those of an even movie
-OFF_GRID = 0.45  # of the time between frames: stamps further off are not those of an even movie
+MOST_MISSING = 10  # times the packets in the file: with more gaps the time stamps are not evenly spaced
+OFF_GRID = 0.45  # of the frame period: a larger deviation means unevenly spaced frames
 
 
 class Packet(NamedTuple):
-    """What demuxing tells of one packet."""
+    """What the container states of one packet."""
 
     pts: int | None  # presentation stamp
     dts: int | None  # decoding stamp
     key: bool
-    pos: int | None = None  # its place in the file, bytes
+    pos: int | None = None  # byte offset in the file
 
 
 @dataclass(frozen=True)
 class PacketIndex:
-    """What demuxing alone tells: how many frames there are, their numbers, and where decoding may start."""
+    """Number of frames, their packets, and where decoding may start."""
 
-    count: int  # frames, those among them that have no packet
-    by_place: bool  # whether `number_of` takes the packets' places in the file, else their presentation stamps
-    number_of: dict[int, int]  # stamp or place -> frame number; empty where neither tells
-    keys: tuple[tuple[int, int], ...]  # (frame number, stamp to seek to) of the key frames, increasing
-    order: tuple[int, ...] = ()  # frame numbers in the order of decoding
-    groups: tuple[int, ...] = ()  # places in `order` where a key frame begins a group
+    count: int  # frames, those without a packet included
+    by_place: bool = False  # keys of `number_of` are byte offsets, else presentation stamps
+    number_of: dict[int, int] | None = None  # stamp or offset -> frame number; None: frames can only be counted
+    keys: tuple[tuple[int, int], ...] = ((0, 0),)  # (frame number, stamp to seek to) of key frames, increasing
+    order: tuple[int, ...] = ()  # frame numbers in decoding order
+    groups: tuple[int, ...] = ()  # indices into `order` where a key frame begins a group
 
     @property
     def each_alone(self) -> bool:
-        """Whether every frame is a key frame, predicted from no other."""
+        """Whether every frame is a key frame."""
         return len(self.groups) == len(self.order)
 
     @property
     def missing(self) -> list[int]:
-        """Frames that the stamps leave out."""
+        """Frames without a packet, according to the time stamps."""
         return sorted(set(range(self.count)) - set(self.order)) if len(self.order) not in (0, self.count) else []
 
     def number(self, pts: int | None, pos: int | None) -> int | None:
-        """Return the frame number of a packet, None where the table does not tell."""
+        """Return the frame number of a packet, None where it is unknown."""
         mark = pos if self.by_place else pts
-        return None if mark is None else self.number_of.get(mark)
+        return None if mark is None or self.number_of is None else self.number_of.get(mark)
 
     def key_before(self, number: int) -> tuple[int, int]:
         """Return number and stamp of the last key frame at or before frame `number`."""
         return self.keys[max(bisect_right(self.keys, number, key=lambda key: key[0]) - 1, 0)]
 
-    def runs(self, numbers: list[int]) -> list[list[int]]:
-        """Cut increasing frame numbers where a seek saves decoding: where a key frame lies in a gap."""
+    def runs(self, numbers: Sequence[int]) -> list[list[int]]:
+        """Split increasing frame numbers where a key frame lies in a gap, so that a seek saves decoding."""
         runs: list[list[int]] = []
         for number in numbers:
             if runs and self.key_before(number)[0] <= runs[-1][-1] + 1:
@@ -65,10 +65,10 @@ class PacketIndex:
         return runs
 
     def spoilt_by(self, number: int) -> Sequence[int]:
-        """Return the frames that cannot be trusted once frame `number` is damaged, itself among them.
+        """Return the frames that cannot be trusted once frame `number` is damaged, itself included.
 
-        Those are the ones decoded after it up to the next key frame, and those decoded after that key frame but shown
-        before it, which lean on both sides. Where frames have no numbers, all that follow.
+        These are the frames decoded after it up to the next key frame, and frames decoded after that key frame but
+        shown before it. If frames can only be counted: all that follow.
         """
         if not self.order:
             return range(number, self.count)
@@ -81,13 +81,12 @@ class PacketIndex:
 
 
 def index_packets(packets: list[Packet], guessed: bool, step: Fraction | None = None) -> PacketIndex:
-    """Number the packets of a movie by their time stamps, or by their place in the file where stamps do not tell.
+    """Number the packets of a video by their time stamps, or by their byte offsets if stamps are ambiguous.
 
     Args:
         packets: in the order of the file.
-        guessed: whether the presentation stamps are not the file's own.
-        step: time between frames by the header, in units of the stamps; where all stamps keep to it, a gap between
-            them is a frame that was lost, and those after it keep their numbers.
+        guessed: whether the presentation stamps were guessed by the demuxer.
+        step: frame period by the header, in stamp units; a gap between evenly spaced stamps is a lost frame.
     """
     stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
     if not guessed and len(stamps) == len(packets):
@@ -95,14 +94,14 @@ def index_packets(packets: list[Packet], guessed: bool, step: Fraction | None = 
     places = [packet.pos for packet in packets if packet.pos is not None and packet.pos >= 0]
     if all(packet.key for packet in packets) and len(set(places)) == len(packets):
         return _by_places(packets, places)
-    return PacketIndex(count=len(packets), by_place=False, number_of={}, keys=((0, 0),))
+    return PacketIndex(count=len(packets))
 
 
 def _by_stamps(packets: list[Packet], stamps: list[int], step: Fraction | None) -> PacketIndex:
     numbers = (_on_grid(stamps, step) if step and stamps else None) or range(len(stamps))
     number_of = dict(zip(stamps, numbers, strict=True))
     order = tuple(number_of[packet.pts] for packet in packets if packet.pts is not None)
-    # Seeking to the decoding stamp lands on the key frame or before it, whichever of the two a container searches.
+    # Containers search by either stamp: seeking to the decoding stamp lands on the key frame or before it.
     keys = sorted(
         (number, packet.pts if packet.dts is None else packet.dts)
         for number, packet in zip(order, packets, strict=True)
@@ -113,19 +112,19 @@ def _by_stamps(packets: list[Packet], stamps: list[int], step: Fraction | None) 
 
 
 def _on_grid(stamps: list[int], step: Fraction) -> list[int] | None:
-    """Return the frame numbers of increasing stamps in steps of `step`, None where they do not keep to it."""
+    """Return the frame numbers of increasing stamps, None if they are not evenly spaced."""
     numbers = [round((stamp - stamps[0]) / step) for stamp in stamps]
     off = max(abs(stamp - stamps[0] - number * step) for stamp, number in zip(stamps, numbers, strict=True))
     if off > min(1, OFF_GRID * step) or numbers[-1] > MOST_MISSING * len(stamps) or len(set(numbers)) < len(stamps):
         return None
-    every = reduce(gcd, numbers, 0) or 1  # headers that count fields tell of two a frame
+    every = reduce(gcd, numbers, 0) or 1  # headers that count fields state two a frame
     return [number // every for number in numbers]
 
 
 def _by_places(packets: list[Packet], places: list[int]) -> PacketIndex:
-    """Number frames that are all key frames as they come: MKV counts whole ms, so above 1 kHz stamps repeat."""
+    """Number key frames in file order: MKV counts whole ms, so above 1 kHz stamps repeat."""
     every = tuple(range(len(packets)))
-    # Which of the packets of one stamp a seek finds is not told: to be before them, seek to the stamp before.
+    # A seek finds any packet of a repeated stamp: to be before all of them, seek to the stamp before.
     keys = [(0, 0)]
     for number, (before, here) in enumerate(pairwise(packets), start=1):
         if before.pts is not None and here.pts is not None and before.pts < here.pts:

@@ -1,4 +1,4 @@
-"""Movies as one picture file a frame: a folder, or a pattern with * or %05d."""
+"""Movies of one picture file a frame: a folder, or a pattern with * or %05d."""
 
 from __future__ import annotations
 
@@ -10,21 +10,31 @@ from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 
-from sphereorient.errors import MovieError, refusal
-from sphereorient.movies.indexed import IndexedMovie
-from sphereorient.movies.luma import COLOUR_REMARK
-from sphereorient.movies.movie import Grey
-from sphereorient.movies.picture import LOSSY, PICTURES, read_picture
+import cv2
+import numpy as np
 
+from sphereorient.errors import MovieError
+from sphereorient.files.picture import claimed_pixels, decoded
+from sphereorient.movies.grey import COLOUR_REMARK, luma
+from sphereorient.movies.movie import Grey, Movie, refused
+from sphereorient.movies.tiff import TiffMovie
+
+TIFF = (".tif", ".tiff")
+LOSSY = (".jpg", ".jpeg")
+PICTURES = (".png", ".bmp", ".pgm", ".ppm", *LOSSY, *TIFF)
 WILD = re.compile(r"(\*|%0?\d*d)")
 DIGITS = re.compile(r"(\d+)")
-MOST_MISSING = 100  # times the pictures that are there: beyond, the numbers are no frame numbers
+MOST_MISSING = 100  # times the pictures in the folder: with more gaps the numbers are not frame numbers
 SHOWN = 5  # gaps named in a remark
-ENOUGH, TRIED = 5, 64  # pictures that tell the size; those looked at where the first ones are damaged
+ENOUGH, TRIED = 5, 64  # pictures that determine the size, and how many are tried if the first ones are damaged
+# The largest compression ratio of a black picture: a header that claims more has no such picture behind it.
+LARGEST_RATIO = 1200
+MOST_PIXELS = 1 << 26  # more than any movie camera has
+LARGEST_BYTES = 1 << 28  # of a picture file, which is read whole
 
 
-class SequenceMovie(IndexedMovie):
-    """Picture files in the order of the number in their names; a number that is missing is an unreadable frame."""
+class SequenceMovie(Movie):
+    """Picture files ordered by the number in their names; a missing number is an unreadable frame."""
 
     def __init__(self, path: Path) -> None:
         numbered = _numbered(path, sequence_files(path))
@@ -32,17 +42,18 @@ class SequenceMovie(IndexedMovie):
         step = max(1, reduce(math.gcd, (number - numbers[0] for number in numbers), 0))
         count = (numbers[-1] - numbers[0]) // step + 1
         if count > MOST_MISSING * (len(numbers) + 1):
-            got, do = f"{len(numbers)} with numbers from {numbers[0]} to {numbers[-1]}", "number them by frame"
-            raise MovieError(refusal(str(path), expected="pictures numbered by frame", got=got, do=do))
+            got = f"{len(numbers)} with numbers from {numbers[0]} to {numbers[-1]}"
+            raise refused(path, "pictures numbered by frame", got, "number them by frame")
         self._files = {(number - numbers[0]) // step: numbered[number] for number in numbers}
         picture, colour = _usual_picture(path, list(self._files.values()))
-        remarks = list(_number_remarks(numbers, step, count))
-        if colour:
-            remarks.append(COLOUR_REMARK)
-        if self._files[0].suffix.lower() in LOSSY:
-            remarks.append("JPEG loses fine detail of the pictures")
-        form = f"{len(numbers)} pictures, {self._files[0].suffix.lower()[1:]}"
-        super().__init__(path, form, count, (picture.shape[0], picture.shape[1]), picture.dtype, remarks=remarks)
+        suffix = self._files[0].suffix.lower()
+        form = f"{len(numbers)} pictures, {suffix[1:]}"
+        super().__init__(path, form, count, (picture.shape[0], picture.shape[1]), picture.dtype)
+        self.remarks = (
+            *_number_remarks(numbers, step, count),
+            *([COLOUR_REMARK] if colour else []),
+            *(["JPEG loses fine detail of the pictures"] if suffix in LOSSY else []),
+        )
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
         for number in numbers:
@@ -50,7 +61,7 @@ class SequenceMovie(IndexedMovie):
             if file is None:
                 raise self._damage(number, "no file of its number")
             try:
-                picture, _ = read_picture(file)
+                picture, _ = _read_picture(file)
             except MovieError as error:
                 raise self._damage(number, f"{file.name}, which cannot be decoded") from error
             if (picture.shape, picture.dtype) != (self.frame_shape, self.dtype):
@@ -59,7 +70,7 @@ class SequenceMovie(IndexedMovie):
 
 
 def is_pattern(path: Path) -> bool:
-    """Return whether a path names many files: with * or %05d in its last part."""
+    """Return whether the last part of a path has * or %05d."""
     return WILD.search(path.name) is not None
 
 
@@ -71,60 +82,51 @@ def sequence_files(path: Path) -> list[Path]:
     """
     folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)
     if not folder.is_dir():
-        raise MovieError(refusal(str(path), expected="a folder", got="no such folder", do="correct the path"))
-    pieces = [r"\d+" if piece[0] == "%" else ".*" if piece == "*" else re.escape(piece) for piece in _pieces(pattern)]
-    fits = re.compile("".join(pieces))
+        raise refused(path, "a folder", "no such folder", "correct the path")
+    pieces = [piece for piece in WILD.split(pattern) if piece]
+    fits = re.compile("".join(r"\d+" if p[0] == "%" else ".*" if p == "*" else re.escape(p) for p in pieces))
     files = sorted(
         file
         for file in folder.iterdir()
         if file.suffix.lower() in PICTURES and fits.fullmatch(file.name) and not file.name.startswith(".")
     )
     if not files:
-        expected, do = f"pictures ({' '.join(PICTURES)})", "correct the folder or the pattern"
-        raise MovieError(refusal(str(path), expected=expected, got="none", do=do))
+        raise refused(path, f"pictures ({' '.join(PICTURES)})", "none", "correct the folder or the pattern")
     return files
 
 
-def _pieces(pattern: str) -> list[str]:
-    return [piece for piece in WILD.split(pattern) if piece]
-
-
 def _numbered(path: Path, files: list[Path]) -> dict[int, Path]:
-    """Return number -> file: the number is the one part of the names that differs from file to file."""
+    """Return number -> file; the number is the only part of the names that differs between files."""
     names = [DIGITS.split(file.stem) for file in files]
     words = [(*name[0::2], file.suffix) for name, file in zip(names, files, strict=True)]
     do = "choose one movie's pictures by a pattern, such as cam1_*.tif"
     other = next((file for file, word in zip(files, words, strict=True) if word != words[0]), None)
     if other is not None:
-        got = f"{files[0].name} beside {other.name}"
-        raise MovieError(refusal(str(path), expected="names alike but for a number", got=got, do=do))
+        raise refused(path, "names alike but for a number", f"{files[0].name} beside {other.name}", do)
     numbers = [name[1::2] for name in names]
     varying = [place for place, column in enumerate(zip(*numbers, strict=True)) if len(set(map(int, column))) > 1]
     if len(files) > 1 and len(varying) != 1:
-        got = f"{files[0].name} .. {files[-1].name}"
-        raise MovieError(refusal(str(path), expected="names alike but for one number", got=got, do=do))
+        raise refused(path, "names alike but for one number", f"{files[0].name} .. {files[-1].name}", do)
     place = varying[0] if varying else 0
     numbered = {int(number[place]) if number else 0: file for number, file in zip(numbers, files, strict=True)}
     if len(numbered) < len(files):
-        got = f"{len(files) - len(numbered)} numbers twice"
-        raise MovieError(refusal(str(path), expected="one picture of each number", got=got, do=do))
+        raise refused(path, "one picture of each number", f"{len(files) - len(numbered)} numbers twice", do)
     return numbered
 
 
 def _usual_picture(path: Path, files: list[Path]) -> tuple[Grey, bool]:
-    """Return a picture of the size and type that most of the first ones have, and whether it is in colour."""
+    """Return a picture of the most frequent size and type among the first ones, and whether it is in colour."""
     found: list[tuple[Grey, bool]] = []
     last: MovieError | None = None
     for file in files[:TRIED]:
         try:
-            found.append(read_picture(file))
+            found.append(_read_picture(file))
         except MovieError as error:
             last = error
         if len(found) == ENOUGH:
             break
     if not found:
-        got, do = "none that can be decoded", "export them again"
-        raise MovieError(refusal(str(path), expected="pictures", got=got, do=do)) from last
+        raise refused(path, "pictures", "none that can be decoded", "export them again") from last
     (shape, dtype), _ = Counter((picture.shape, picture.dtype) for picture, _ in found).most_common(1)[0]
     return next(one for one in found if (one[0].shape, one[0].dtype) == (shape, dtype))
 
@@ -137,3 +139,39 @@ def _number_remarks(numbers: list[int], step: int, count: int) -> Iterator[str]:
         named = [f"{a}" if a == b else f"{a} .. {b}" for a, b in gaps[:SHOWN]]
         more = [f"{len(gaps) - SHOWN} more gaps"] if len(gaps) > SHOWN else []
         yield f"{count - len(numbers)} pictures are missing: {', '.join(named + more)}"
+
+
+def _read_picture(path: Path) -> tuple[Grey, bool]:
+    """Return a picture (H, W), uint8 or uint16, row 0 on top, and whether it was in colour.
+
+    Raises:
+        MovieError: missing, not a picture, or not of 8 or 16 bit.
+    """
+    if not path.is_file():
+        raise refused(path, "a picture", "no such file", "find it, or record it as missing")
+    if path.suffix.lower() in TIFF:
+        movie = TiffMovie(path)
+        if len(movie) != 1:
+            raise refused(path, "one picture a file", f"{len(movie)} pages", "name the stack itself as the movie")
+        return movie.sample([0])[0], movie.colour
+    if path.stat().st_size > LARGEST_BYTES:
+        raise refused(path, "a picture", "a file as large as a movie", "export it again")
+    content = path.read_bytes()
+    claimed = claimed_pixels(content) or 0
+    if claimed > MOST_PIXELS:
+        expected, do = f"at most {MOST_PIXELS / 1e6:.3g} million pixels", "cut out the part where the ball is"
+        raise refused(path, expected, f"{claimed / 1e6:.3g} million", do)
+    if claimed > LARGEST_RATIO * len(content):
+        raise refused(path, "a picture", "a header that claims more than the file can hold", "export it again")
+    # As stored: neither rotated by the camera's orientation tag nor reduced to 8 bit.
+    picture = decoded(content, cv2.IMREAD_UNCHANGED) if claimed else None
+    if picture is None:
+        raise refused(path, "a picture", "none that can be decoded", "export it again")
+    if picture.dtype not in (np.uint8, np.uint16):
+        raise refused(path, "8 or 16 bit", str(picture.dtype), "export it as 8 or 16 bit grey")
+    if picture.ndim == 2:
+        return picture, False
+    if picture.shape[2] < 3:  # grey with opacity
+        return np.ascontiguousarray(picture[..., 0]), False
+    blue, green, red = np.moveaxis(picture[..., :3], 2, 0)
+    return luma(red, green, blue), True

@@ -1,4 +1,4 @@
-"""A look at some frames of a movie: what is in them, and what is wrong with them."""
+"""What some frames of a movie show, and what is wrong with them."""
 
 from __future__ import annotations
 
@@ -9,97 +9,89 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.movies.movie import Grey, Movie
-from sphereorient.movies.readable import readable
 
 UNDECODABLE, DARK, SATURATED, REPEATED = "undecodable", "black", "saturated", "repeated"
 FAULTS = (UNDECODABLE, DARK, SATURATED, REPEATED)
 DARK_LEVEL = 0.2  # of the brightness that frames of this movie usually reach
 WHITE_SHARE = 0.2  # of the pixels at full scale
-BRIGHT_QUANTILE = 0.999  # of a frame's pixels: what a frame reaches, hot pixels aside
+BRIGHT_QUANTILE = 0.999  # of the pixels of a frame: its brightness without hot pixels
 SCALES = (255, 1023, 4095, 16383, 65535)  # largest values of 8, 10, 12, 14 and 16 bit
 SHOWN_PX = 320  # longest side of the small pictures that are kept
 
 
-@dataclass(frozen=True, eq=False)
-class SeenFrame:
-    """One frame that was looked at."""
+@dataclass(kw_only=True, eq=False)
+class SurveyedFrame:
+    """One frame of a survey."""
 
     number: int
-    small: NDArray[np.float32] | None  # (h, w) grey levels, reduced; None: undecodable
-    fault: str  # one of FAULTS, empty where nothing is wrong
+    small: NDArray[np.float32] | None = None  # (h, w) grey levels, reduced; None: undecodable or not kept
+    fault: str = ""  # one of FAULTS, empty for a good frame
+    lowest: int = 0  # grey levels
+    highest: int = 0
+    bright: float = 0.0
+    white: dict[int, float] | None = None  # share of pixels at each full scale; None: undecodable
+    repeated: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
     """What some frames of a movie show; made by `survey`, read by the contact sheet."""
 
-    frames: tuple[SeenFrame, ...]  # spread over the movie, those that are shown
-    looked: int  # frames that were looked at
+    frames: tuple[SurveyedFrame, ...]  # evenly spread over the movie, to be shown
+    looked: int  # number of frames examined
     lowest: int  # grey levels
     highest: int
-    faults: dict[str, tuple[int, ...]]  # fault -> numbers of the frames that have it
-
-
-@dataclass
-class _Seen:
-    number: int
-    small: NDArray[np.float32] | None
-    lowest: int = 0
-    highest: int = 0
-    bright: float = 0.0
-    white: dict[int, float] | None = None  # share of pixels at each full scale
-    repeated: bool = False
+    faults: dict[str, tuple[int, ...]]  # fault -> frame numbers
 
 
 def survey(
     movie: Movie, count: int = 24, every: bool = False, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Survey:
-    """Look at frames spread over a movie, each with the one before it, or at every frame.
+    """Examine frames spread over a movie, each with the one before it, or every frame.
 
     Args:
         movie: any movie.
-        count: of the frames to look at and to keep.
-        every: look at every frame of the movie; `count` are kept.
-        progress: called with frames done and of all.
+        count: frames to examine and to keep.
+        every: examine all frames; `count` are kept.
+        progress: called with the number of frames done and in all.
     """
     kept = {int(number) for number in np.linspace(0, len(movie) - 1, min(count, len(movie))).round()}
-    pairs = _all_pairs(movie) if every else _spread_pairs(movie, sorted(kept))
-    total = len(movie) if every else len(kept)
-    seen = []
-    for number, before, picture in pairs:
-        seen.append(_look(number, before, picture, number in kept))
-        progress(len(seen), total)
+    seen: list[SurveyedFrame] = []
+    for number, before, picture in _all_pairs(movie) if every else _spread_pairs(movie, sorted(kept)):
+        seen.append(_examine(number, before, picture, number in kept))
+        progress(len(seen), len(movie) if every else len(kept))
     highest = max((one.highest for one in seen), default=0)
-    there = [one for one in seen if one.white is not None]
-    usual = float(np.median([one.bright for one in there])) if there else 0.0
+    decoded = [one for one in seen if one.white is not None]
+    usual = float(np.median([one.bright for one in decoded])) if decoded else 0.0
     scale = next(scale for scale in SCALES if scale >= highest)
-    fault = {one.number: _fault(one, usual, scale) for one in seen}
+    for one in seen:
+        one.fault = _fault(one, usual, scale)
     return Survey(
-        frames=tuple(SeenFrame(one.number, one.small, fault[one.number]) for one in seen if one.number in kept),
+        frames=tuple(one for one in seen if one.number in kept),
         looked=len(seen),
-        lowest=min((one.lowest for one in there), default=0),
+        lowest=min((one.lowest for one in decoded), default=0),
         highest=highest,
-        faults={name: tuple(number for number, this in fault.items() if this == name) for name in FAULTS},
+        faults={name: tuple(one.number for one in seen if one.fault == name) for name in FAULTS},
     )
 
 
 def _spread_pairs(movie: Movie, numbers: list[int]) -> Iterator[tuple[int, Grey | None, Grey | None]]:
     for number in numbers:
-        *before, picture = readable(movie, max(number - 1, 0), number + 1)
+        *before, picture = movie.readable(max(number - 1, 0), number + 1)
         yield number, before[0] if before else None, picture
 
 
 def _all_pairs(movie: Movie) -> Iterator[tuple[int, Grey | None, Grey | None]]:
     before: Grey | None = None
-    for number, picture in enumerate(readable(movie)):
+    for number, picture in enumerate(movie.readable()):
         yield number, before, picture
         before = picture
 
 
-def _look(number: int, before: Grey | None, picture: Grey | None, keep: bool) -> _Seen:
+def _examine(number: int, before: Grey | None, picture: Grey | None, keep: bool) -> SurveyedFrame:
     if picture is None:
-        return _Seen(number, None)
-    return _Seen(
+        return SurveyedFrame(number=number)
+    return SurveyedFrame(
         number=number,
         small=_reduced(picture) if keep else None,
         lowest=int(picture.min()),
@@ -110,7 +102,7 @@ def _look(number: int, before: Grey | None, picture: Grey | None, keep: bool) ->
     )
 
 
-def _fault(one: _Seen, usual: float, scale: int) -> str:
+def _fault(one: SurveyedFrame, usual: float, scale: int) -> str:
     if one.white is None:
         return UNDECODABLE
     if one.white.get(scale, 0.0) > WHITE_SHARE:
@@ -121,7 +113,7 @@ def _fault(one: _Seen, usual: float, scale: int) -> str:
 
 
 def _reduced(picture: Grey) -> NDArray[np.float32]:
-    """Return a picture made smaller by a whole number, each pixel the mean of those that it stands for."""
+    """Return a picture averaged over whole-number blocks to at most SHOWN_PX."""
     times = max(1, -(-max(picture.shape) // SHOWN_PX))
     height, width = picture.shape[0] // times, picture.shape[1] // times
     tiles = picture[: height * times, : width * times].reshape(height, times, width, times)

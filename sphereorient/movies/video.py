@@ -1,228 +1,249 @@
-"""Movies that FFmpeg decodes, frame by frame, with exact seeks."""
+"""Videos that FFmpeg decodes, with exact seeks, and nothing decoded from damaged data."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator, Sequence
-from functools import cached_property
-from itertools import islice
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
-import numpy as np
-from numpy.typing import NDArray
 
 from sphereorient.errors import MovieError, refusal
-from sphereorient.movies.ffv1_sums import sums_are_right
-from sphereorient.movies.grey import check_format, grey_dtype, grey_values
-from sphereorient.movies.movie import Grey, HoldsNothing, check_indices, check_range
+from sphereorient.movies.grey import COLOUR_REMARK, check_format, grey_dtype, grey_values
+from sphereorient.movies.movie import Grey, Movie, error_words, refused, truncated_remark
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
-from sphereorient.movies.stream import frame_step, loss, opened, stream_remarks, words
 
+LOSSLESS = "lossless"
 NOTHING = "none from the decoder"
-PACKETS_TRIED = 8  # of FFV1: one whose check sums are right tells that all should have them
+PACKETS_TRIED = 8  # of FFV1: if the check sums of one are right, all packets have them
+SHOWN = 8  # missing frames named in a remark
+SLACK = 1.5  # frames by which a rounded duration may be too long
+THREADS = 2  # slices of one frame in parallel: 1.8 times faster for FFV1 on 2 cores, and errors keep their frame
+TRAILER = 8  # bytes after each slice of FFV1: 3 its size, 1 a status, 4 the check sum
+# FFV1 computes its CRC from the most significant bit on, zlib from the least: they agree on bit-reversed bytes.
+REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+INVERTED = 0xFFFFFFFF  # zlib inverts check sums before and after
 
 
-class VideoMovie(HoldsNothing):
-    """A movie in a container with one video stream; no file stays open between calls."""
-
-    times_s: NDArray[np.float64] | None = None  # MKV rounds stamps to 1 ms, AVI has none: see Movie
+class VideoMovie(Movie):
+    """A container with one video stream."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        with opened(path) as container:
+        with _opened(path) as container:
             frame = _first_frame(container)
             if frame is None:
-                raise self._refusal("a movie with frames", "no frame", "record or export it again")
+                raise refused(path, "a movie with frames", "no frame", "record or export it again")
             check_format(str(path), frame.format)
-            self._format = frame.format.name
+            self._pixels = frame.format.name
             codec = container.streams.video[0].codec_context
-            self.format = f"{path.suffix[1:].lower()}, codec {codec.name} ({loss(codec)}), pixels {frame.format.name}"
-            self.frame_shape: tuple[int, int] = (frame.height, frame.width)
-            self.dtype: np.dtype[Any] = grey_dtype(frame.format)
+            form = f"{path.suffix[1:].lower()}, codec {codec.name} ({_loss(codec)}), pixels {self._pixels}"
+        self._checked = False  # whether the packets carry check sums that can be verified
+        with _opened(path) as container:
+            self._index, broken = self._read_index(container)
+            count = self._index.count
+            super().__init__(path, form, count, (frame.height, frame.width), grey_dtype(frame.format))
+            damaged = (f"damaged: reading it breaks off after {count} frames, {broken}",) if broken else ()
+            self.remarks = (*damaged, *_remarks(container, self._pixels, self._index))
 
-    def __len__(self) -> int:
-        """Return the number of frames, counted once, as packets without decoding them."""
-        return self._index.count
-
-    @cached_property
-    def remarks(self) -> tuple[str, ...]:
-        """What a user should know: see Movie."""
-        with opened(self.path) as container:
-            return (*self._read_error, *stream_remarks(container, self._format, len(self), self._index.missing))
-
-    def frames(self, first: int = 0, last: int | None = None) -> Iterator[Grey]:
-        """Yield frames first .. last - 1 in order, (H, W) each."""
-        last = check_range(self.path, len(self), first, last)
-        return self._wanted(list(range(first, last)))
-
-    def readable(self, first: int = 0, last: int | None = None) -> Iterator[Grey | None]:
-        """Yield frames first .. last - 1 in order, None for those that cannot be decoded."""
-        last = check_range(self.path, len(self), first, last)
-        for got in self._recovered(list(range(first, last))):
-            yield None if isinstance(got, MovieError) else got
-
-    def sample(self, indices: Sequence[int]) -> Grey:
-        """Return any frames in the order asked for, (n, H, W); only what leads to them is decoded."""
-        asked = check_indices(self.path, len(self), indices)
-        order = sorted(set(asked))
-        pictures = np.empty((len(order), *self.frame_shape), self.dtype)
-        for place, picture in enumerate(self._wanted(order)):
-            pictures[place] = picture
-        return pictures[np.searchsorted(order, asked)] if asked else pictures
-
-    def _refusal(self, expected: str, got: str, do: str, frame: int | None = None) -> MovieError:
-        name = str(self.path) if frame is None else f"{self.path}, frame {frame}"
-        return MovieError(refusal(name, expected=expected, got=got, do=do))
-
-    @cached_property
-    def _packets(self) -> tuple[PacketIndex, str]:
-        """The table of packets, and in words where reading it broke off."""
+    def _read_index(self, container: av.container.InputContainer) -> tuple[PacketIndex, str]:
+        """Return the packet table, and the error that ended it, if any."""
+        stream = container.streams.video[0]
         packets: list[Packet] = []
         broken = ""
-        with opened(self.path) as container:
-            try:
-                for packet in container.demux(container.streams.video[0]):
-                    if packet.size and not packet.is_discard:
-                        packets.append(Packet(packet.pts, packet.dts, packet.is_keyframe, packet.pos))
-            except av.FFmpegError as error:
-                broken = words(error)
-            # AVI stores no presentation stamps: where frames are reordered, FFmpeg's guesses are wrong after a seek.
-            guessed = container.format.name == "avi" and any(packet.pts != packet.dts for packet in packets)
-            step = frame_step(container)
+        try:
+            for number, packet in enumerate(container.demux(stream)):
+                if number < PACKETS_TRIED and stream.codec_context.name == "ffv1":
+                    self._checked |= _check_sums_right(bytes(packet))
+                if packet.size and not packet.is_discard:
+                    packets.append(Packet(packet.pts, packet.dts, packet.is_keyframe, packet.pos))
+        except av.FFmpegError as error:
+            broken = error_words(error)
+        # AVI stores no presentation stamps: where frames are reordered, FFmpeg's guesses are wrong after a seek.
+        guessed = container.format.name == "avi" and any(packet.pts != packet.dts for packet in packets)
+        known = stream.average_rate and stream.time_base
+        step: Fraction | None = 1 / (stream.average_rate * stream.time_base) if known else None
         return index_packets(packets, guessed, step), broken
 
-    @cached_property
-    def _summed(self) -> bool:
-        """Whether the packets carry check sums that can be held against them."""
-        with opened(self.path) as container:
-            if container.streams.video[0].codec_context.name != "ffv1":
-                return False
-            return any(sums_are_right(bytes(packet)) for packet in islice(_demuxed(container), PACKETS_TRIED))
-
-    @property
-    def _index(self) -> PacketIndex:
-        return self._packets[0]
-
-    @property
-    def _read_error(self) -> tuple[str, ...]:
-        count, broken = self._index.count, self._packets[1]
-        return (f"damaged: reading it breaks off after {count} frames, {broken}",) if broken else ()
-
-    def _wanted(self, numbers: list[int]) -> Iterator[Grey]:
-        """Yield the pictures of increasing frame numbers, jumping over what need not be decoded."""
-        for got in self._recovered(numbers):
+    def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
+        for got in self._decode(numbers):
             if isinstance(got, MovieError):
                 raise got
             yield got
 
-    def _recovered(self, numbers: list[int]) -> Iterator[Grey | MovieError]:
-        """Yield a picture or the reason why there is none for each of increasing frame numbers."""
-        with opened(self.path) as container:
-            for run in self._index.runs(numbers):
-                yield from self._run(container, run)
+    def _read_on(self, numbers: Sequence[int]) -> Iterator[Grey | None]:
+        return (None if isinstance(got, MovieError) else got for got in self._decode(numbers))
 
-    def _run(self, container: av.container.InputContainer, numbers: list[int]) -> Iterator[Grey | MovieError]:
-        key = self._seek(container, numbers[0])
-        pictures = self._pictures(container, numbers, key)
-        first = next(pictures)
-        if isinstance(first, MovieError) and key > 0 and not self._index.each_alone:
-            # Frames beside a key frame may lean on frames before it (open groups of pictures): only the way from
-            # the start tells whether the fault is the file's or the seek's.
-            with opened(self.path) as fresh:
-                yield from self._pictures(fresh, numbers, 0)
-            return
-        yield first
-        yield from pictures
+    def _decode(self, numbers: Sequence[int]) -> Iterator[Grey | MovieError]:
+        """Yield the picture or the error of each of increasing frame numbers."""
+        with _opened(self.path) as container:
+            for run in self._index.runs(numbers):
+                key = self._seek(container, run[0])
+                pictures = self._pictures(container, run, key)
+                first = next(pictures)
+                if isinstance(first, MovieError) and key > 0 and not self._index.each_alone:
+                    # In open groups of pictures frames beside a key frame depend on frames before it: only decoding
+                    # from the start shows whether the file or the seek is at fault.
+                    with _opened(self.path) as fresh:
+                        yield from self._pictures(fresh, run, 0)
+                else:
+                    yield first
+                    yield from pictures
 
     def _seek(self, container: av.container.InputContainer, number: int) -> int:
-        """Go to the last key frame at or before frame `number`, and return that key frame's number."""
+        """Go to the last key frame at or before frame `number`, and return its number."""
         key, stamp = self._index.key_before(number)
-        if key > 0:  # a fresh container stands at frame 0 already
+        if key > 0:  # a fresh container is at frame 0 already
             try:
                 container.seek(stamp, stream=container.streams.video[0])
             except av.FFmpegError as error:
-                raise self._damage(words(error), number) from error
+                raise self._damage(number, error_words(error)) from error
         return key
 
     def _pictures(
         self, container: av.container.InputContainer, numbers: list[int], key: int
     ) -> Iterator[Grey | MovieError]:
-        """Yield for each of increasing frame numbers its picture or the reason why there is none.
+        """Yield the picture or the error of each of increasing frame numbers.
 
         Args:
-            container: stands at frame `key`, or before it.
-            numbers: of the frames wanted.
-            key: what is damaged before this frame does not count, since the seek may have cut off what it leans on.
+            container: positioned at frame `key` or before it.
+            numbers: frames wanted.
+            key: damage before this frame is ignored: the seek may have cut off what it depends on.
         """
         waiting = iter(numbers)
         wanted = next(waiting, None)
         spoilt: dict[int, str] = {}
         for number, frame in self._decoded(container):
-            if wanted is None:
-                return
             if isinstance(frame, str):
                 if number >= key:
                     spoilt |= {lost: frame for lost in self._index.spoilt_by(number) if lost not in spoilt}
                 continue
             while wanted is not None and wanted < number:
-                yield self._damage(spoilt.get(wanted, NOTHING), wanted)
+                yield self._damage(wanted, spoilt.get(wanted, NOTHING))
                 wanted = next(waiting, None)
             if wanted == number:
-                yield self._damage(spoilt[number], number) if number in spoilt else self._picture(frame, number)
+                yield self._damage(number, spoilt[number]) if number in spoilt else self._picture(frame, number)
                 wanted = next(waiting, None)
-                if wanted is None:
-                    return
+            if wanted is None:
+                return
         while wanted is not None:
-            yield self._damage(spoilt.get(wanted, NOTHING), wanted)
+            yield self._damage(wanted, spoilt.get(wanted, NOTHING))
             wanted = next(waiting, None)
 
     def _decoded(self, container: av.container.InputContainer) -> Iterator[tuple[int, av.VideoFrame | str]]:
-        """Decode from where the container stands: frames with their numbers, and in words what cannot be decoded."""
-        following = 0  # for movies whose frames can only be counted, from the start
+        """Decode from the container's position on; yield frame numbers with the frame or the error in words."""
+        following = 0  # for videos whose frames can only be counted, from the start
         for packet in _demuxed(container):
             number = self._index.number(packet.pts, packet.pos)
             if number is not None:
-                packet.pts = number  # the decoder hands it on to the frame, whatever the order
-            if packet.size and self._summed and not sums_are_right(bytes(packet)):
+                packet.pts = number  # the decoder passes it on to the frame, in any order
+            if packet.size and self._checked and not _check_sums_right(bytes(packet)):
                 yield (following if number is None else number), "one whose check sum is wrong"
                 continue
             try:
                 frames = packet.decode()
             except av.FFmpegError as error:
-                yield (following if number is None else number), words(error)
+                yield (following if number is None else number), error_words(error)
                 continue
             for frame in frames:
                 number = following if frame.pts is None or not self._index.number_of else frame.pts
                 following = number + 1
                 yield number, ("a damaged one" if frame.is_corrupt else frame)
 
-    def _damage(self, got: str, number: int) -> MovieError:
-        do = "export the movie again, or leave the frame out with frames: in the experiment"
-        return self._refusal("a decodable picture", got, do, number)
-
     def _picture(self, frame: av.VideoFrame, number: int) -> Grey | MovieError:
-        if (frame.height, frame.width) != self.frame_shape or frame.format.name != self._format:
-            expected, got = f"{self.frame_shape} {self._format}", f"{(frame.height, frame.width)} {frame.format.name}"
-            return self._refusal(f"pictures of one kind, {expected}", got, "split the movie where it changes", number)
-        return grey_values(frame)
+        if (frame.height, frame.width) == self.frame_shape and frame.format.name == self._pixels:
+            return grey_values(frame)
+        expected = f"pictures of one kind, {self.frame_shape} {self._pixels}"
+        got, do = f"{(frame.height, frame.width)} {frame.format.name}", "split the movie where it changes"
+        return MovieError(refusal(f"{self.path}, frame {number}", expected=expected, got=got, do=do))
+
+
+def _opened(path: Path) -> av.container.InputContainer:
+    """Open a video so that damage raises an error instead of being concealed."""
+    try:
+        container = av.open(str(path))
+    except (av.FFmpegError, OSError, ValueError) as error:
+        do = "check that it plays; export it again if not"
+        raise refused(path, "a readable movie", error_words(error), do) from error
+    if not container.streams.video:
+        container.close()
+        raise refused(path, "a movie with pictures", "no video stream", "name the movie's own file")
+    context: Any = container.streams.video[0].codec_context  # None for a codec that FFmpeg does not know
+    if context is None:
+        container.close()
+        raise refused(path, "a movie that FFmpeg decodes", "an unknown codec", "export it as FFV1 in .mkv")
+    context.thread_type, context.thread_count = "SLICE", THREADS
+    context.options = {"err_detect": "crccheck+explode"}
+    return container
 
 
 def _demuxed(container: av.container.InputContainer) -> Iterator[Any]:
-    """Yield the packets as far as the file can be read, the empty one that ends decoding last."""
+    """Yield the packets as far as the file can be read, at last the empty one that ends decoding."""
     try:
         yield from container.demux(container.streams.video[0])
     except av.FFmpegError:
-        return  # told in the remarks: the table of packets broke off at the same place
+        return  # reported in the remarks: the packet table ended at the same place
 
 
 def _first_frame(container: av.container.InputContainer) -> av.VideoFrame | None:
-    """Return the first frame that can be decoded, None where there is none."""
+    """Return the first frame that can be decoded: a damaged one at the start does not make the movie unreadable."""
     for packet in _demuxed(container):
         try:
             frames: list[av.VideoFrame] = packet.decode()
         except av.FFmpegError:
-            continue  # a dead frame at the start does not make the movie unreadable
+            continue
         if frames:
             return frames[0]
     return None
+
+
+def _check_sums_right(packet: bytes) -> bool:
+    """Verify the check sums of all slices of an FFV1 packet, which FFmpeg's decoder only logs.
+
+    Source: RFC 9043, sections 4.9 and 4.9.3.
+    """
+    end = len(packet)
+    while end > 0:
+        first = end - TRAILER - int.from_bytes(packet[end - TRAILER : end - TRAILER + 3], "big")
+        if end < TRAILER or first < 0:
+            return False
+        reversed_slice = packet[first:end].translate(REVERSED_BITS)
+        if zlib.crc32(reversed_slice, INVERTED) ^ INVERTED != 0:  # 0 for a slice followed by its own sum
+            return False
+        end = first
+    return bool(packet)
+
+
+def _remarks(container: av.container.InputContainer, pixels: str, index: PacketIndex) -> Iterator[str]:
+    stream = container.streams.video[0]
+    yield from truncated_remark(_stated_frames(container, index.count), index.count)
+    if index.missing:
+        some = ", ".join(map(str, index.missing[:SHOWN])) + (" ..." if len(index.missing) > SHOWN else "")
+        yield f"its time stamps leave out frames, which count as unreadable ({len(index.missing)}): {some}"
+    if _loss(stream.codec_context) != LOSSLESS:
+        yield f"codec {stream.codec_context.name} ({_loss(stream.codec_context)}): fine detail may be lost"
+    if av.VideoFormat(pixels).is_rgb:
+        yield COLOUR_REMARK
+    elif not pixels.startswith("gray"):
+        yield f"stored as colour ({pixels}): its brightness is taken as it is"
+
+
+def _stated_frames(container: av.container.InputContainer, count: int) -> int:
+    """Return how many frames the header states, 0 where it states none or no more than there are."""
+    stream = container.streams.video[0]
+    if stream.frames:
+        return int(stream.frames)
+    # Matroska states no number of frames, but the duration of what was written.
+    matroska = "matroska" in container.format.name and len(container.streams) == 1
+    if not (matroska and container.duration and stream.average_rate):
+        return 0
+    whole = container.duration * stream.average_rate / av.time_base
+    return round(whole) if count < whole - SLACK else 0
+
+
+def _loss(context: av.CodecContext) -> str:
+    """Return in words whether a codec loses grey values."""
+    if not context.codec.lossy:
+        return LOSSLESS
+    return "may be lossy" if context.codec.lossless else "lossy"

@@ -1,12 +1,13 @@
-"""Writing movies without loss, whatever they were read from."""
+"""Writing movies without loss: FFV1 in Matroska, or HDF5."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
+import av
 import h5py
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,14 @@ from numpy.typing import NDArray
 from sphereorient.errors import MovieError, refusal
 from sphereorient.files.hdf5 import GuardedFile
 from sphereorient.files.outputs import put_aside
-from sphereorient.movies.ffv1 import check_alike, check_kind, write_ffv1
-from sphereorient.movies.movie import Grey
+from sphereorient.movies.movie import Grey, refused
 
 PLAYER_RATE_HZ = 25.0
-FRAMES, TIME = "frames", "time"  # names of the data sets
-LEVEL = 1  # of gzip: higher ones cost twice the time for 4 % less
 WRITERS = (".mkv", ".h5", ".hdf5")
+PIXEL_FORMATS = {np.dtype(np.uint8): "gray", np.dtype(np.uint16): "gray16le"}
+# Every frame a key frame, with check sums: any frame can be read alone, and damage stays in its frame.
+FFV1_OPTIONS = {"level": "3", "g": "1", "slicecrc": "1"}
+LEVEL = 1  # of gzip: higher ones cost twice the time for 4 % less
 
 
 def write_movie(
@@ -29,16 +31,16 @@ def write_movie(
     times_s: NDArray[np.float64] | None = None,
     frame_rate_hz: float = PLAYER_RATE_HZ,
 ) -> int:
-    """Write grey frames as FFV1 (.mkv) or HDF5 (.h5, .hdf5), aside and then under their name, and return their number.
+    """Write grey frames as FFV1 (.mkv) or HDF5 (.h5, .hdf5), replacing an old file at the end; return their number.
 
-    A frame that is None keeps its number: in HDF5 nothing is written for it, and reading finds it unreadable as before;
-    in .mkv it is black. HDF5 holds the times beside the frames; .mkv has no place for exact ones, and they go to a
-    table beside it, `MOVIE.times.csv`, which experiment.yaml takes as `times:`.
+    A frame that is None keeps its number: in HDF5 it is not written and reads as unreadable; in .mkv it is black.
+    Times are written beside the frames in HDF5, for .mkv into the table `MOVIE.times.csv`, which experiment.yaml takes
+    as `times:`.
 
     Args:
-        path: the movie; an old one is replaced.
+        path: the movie.
         frames: (H, W) uint8 or uint16 each, all alike; taken one by one.
-        times_s: (N,) s, of the frames, where they are known.
+        times_s: (N,) s, if known.
         frame_rate_hz: of .mkv, for players only.
 
     Raises:
@@ -47,11 +49,11 @@ def write_movie(
     """
     path = Path(path)
     if path.suffix.lower() not in WRITERS:
-        do = "end its name in one of these"
-        raise MovieError(refusal(str(path), expected=" ".join(WRITERS), got=f"'{path.suffix}'", do=do))
+        raise refused(path, " ".join(WRITERS), f"'{path.suffix}'", "end its name in one of these")
     if path.suffix.lower() != ".mkv":
-        return write_hdf5(path, frames, times_s)
-    count = write_ffv1(path, _black_where_none(path, frames), frame_rate_hz)
+        with put_aside(path, also=(RuntimeError,)) as aside:
+            return _write_hdf5(aside, path, frames, times_s)
+    count = write_ffv1(path, frames, frame_rate_hz)
     if times_s is not None:
         text = "".join(f"{time!r}\n" for time in np.asarray(times_s, np.float64).tolist())
         with put_aside(times_path(path)) as aside:
@@ -64,21 +66,43 @@ def times_path(path: Path) -> Path:
     return path.with_suffix(".times.csv")
 
 
-def write_hdf5(path: Path, frames: Iterable[Grey | None], times_s: NDArray[np.float64] | None = None) -> int:
-    """Write frames as the data set `frames` (N, H, W), a chunk each, and times as `time` (N,); see `write_movie`."""
-    with put_aside(path, also=(RuntimeError,)) as aside:
-        return _fill(aside, path, frames, times_s)
+def write_ffv1(path: Path | str, frames: Iterable[Grey | None], frame_rate_hz: float) -> int:
+    """Write grey frames as FFV1 in Matroska; see `write_movie`."""
+    path = Path(path)
+    rate = Fraction(frame_rate_hz).limit_denominator(1_000_000)
+    count, first, checked = _checked(path, frames)
+    black = np.zeros_like(first)
+    with put_aside(path, also=(av.FFmpegError,)) as aside, av.open(str(aside), "w", format="matroska") as container:
+        stream = container.add_stream("ffv1", rate=rate, options=dict(FFV1_OPTIONS))
+        stream.height, stream.width = first.shape
+        stream.pix_fmt = PIXEL_FORMATS[first.dtype]
+        number = -1
+        for number, picture in enumerate(chain([None] * count, checked)):
+            whole = np.ascontiguousarray(black if picture is None else picture)
+            frame = av.VideoFrame.from_ndarray(whole, format=stream.pix_fmt)
+            frame.pts, frame.time_base = number, 1 / rate
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return number + 1
 
 
-def _fill(aside: Path, path: Path, frames: Iterable[Grey | None], times_s: NDArray[np.float64] | None) -> int:
-    dead, first, rest = _first(path, frames)
+def _write_hdf5(aside: Path, path: Path, frames: Iterable[Grey | None], times_s: NDArray[np.float64] | None) -> int:
+    """Write frames as the data set `frames` (N, H, W), a chunk each, and times as `time` (N,)."""
+    count, first, checked = _checked(path, frames)
     with GuardedFile(aside) as guarded:
         with h5py.File(guarded, "w") as file:
-            data = _data_set(file, first)
-            count = dead
-            for picture in chain([first], rest):
+            data = file.create_dataset(
+                "frames",
+                shape=(0, *first.shape),
+                maxshape=(None, *first.shape),
+                dtype=first.dtype,
+                chunks=(1, *first.shape),
+                compression="gzip",
+                compression_opts=LEVEL,
+            )
+            data.attrs["units"], data.attrs["description"] = "grey level", "pictures, row 0 on top"
+            for picture in checked:
                 if picture is not None:
-                    check_alike(path, count, picture, first)
                     if count >= len(data):
                         data.resize(2 * count + 64, axis=0)
                     data[count] = picture
@@ -86,41 +110,36 @@ def _fill(aside: Path, path: Path, frames: Iterable[Grey | None], times_s: NDArr
                 count += 1
             data.resize(count, axis=0)
             if times_s is not None:
-                time = file.create_dataset(TIME, data=np.asarray(times_s, np.float64))
+                time = file.create_dataset("time", data=np.asarray(times_s, np.float64))
                 time.attrs["units"], time.attrs["description"] = "s", "time of each frame"
         guarded.check()
     return count
 
 
-def _data_set(file: Any, picture: Grey) -> Any:
-    data = file.create_dataset(
-        FRAMES,
-        shape=(0, *picture.shape),
-        maxshape=(None, *picture.shape),
-        dtype=picture.dtype,
-        chunks=(1, *picture.shape),
-        compression="gzip",
-        compression_opts=LEVEL,
-    )
-    data.attrs["units"], data.attrs["description"] = "grey level", "pictures, row 0 on top"
-    return data
+def _checked(path: Path, frames: Iterable[Grey | None]) -> tuple[int, Grey, Iterator[Grey | None]]:
+    """Return how many leading frames are None, the first picture, and all frames from it on, checked one by one.
 
-
-def _first(path: Path, frames: Iterable[Grey | None]) -> tuple[int, Grey, Iterable[Grey | None]]:
-    """Return how many frames at the start are None, the first that is not, and those after it."""
+    Raises:
+        MovieError: no picture, or pictures that are not alike (H, W) uint8 or uint16.
+    """
     rest = iter(frames)
     dead = 0
     for picture in rest:
         if picture is not None:
-            check_kind(path, dead, picture)
-            return dead, picture, rest
+            break
         dead += 1
-    got = f"{dead}, none of which is readable" if dead else "none"
-    raise MovieError(refusal(str(path), expected="frames to write", got=got, do="pass at least one"))
+    else:
+        got = f"{dead}, none of which is readable" if dead else "none"
+        raise refused(path, "frames to write", got, "pass at least one")
+    if picture.ndim != 2 or picture.dtype not in PIXEL_FORMATS:
+        expected, got = "frames (H, W) of uint8 or uint16", f"{picture.shape} of {picture.dtype}"
+        raise MovieError(refusal(f"{path}, frame {dead}", expected=expected, got=got, do="convert them"))
+    return dead, picture, _alike(path, dead, picture, chain([picture], rest))
 
 
-def _black_where_none(path: Path, frames: Iterable[Grey | None]) -> Iterable[Grey]:
-    dead, first, rest = _first(path, frames)
-    black = np.zeros_like(first)
-    for picture in chain([black] * dead, [first], rest):
-        yield black if picture is None else picture
+def _alike(path: Path, number: int, first: Grey, frames: Iterable[Grey | None]) -> Iterator[Grey | None]:
+    for at, picture in enumerate(frames, start=number):
+        if picture is not None and (picture.shape != first.shape or picture.dtype != first.dtype):
+            expected, got = f"{first.shape} of {first.dtype}", f"{picture.shape} of {picture.dtype}"
+            raise MovieError(refusal(f"{path}, frame {at}", expected=expected, got=got, do="make them alike"))
+        yield picture

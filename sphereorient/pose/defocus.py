@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.locate import LocateSettings, Shot
+from sphereorient.locate import Frame, LocateSettings
 from sphereorient.locate.blob import find_blobs
 from sphereorient.pose.fitter import CameraView
 
@@ -26,7 +26,7 @@ def defocus_radii(blur_px: float, diameter_px: float) -> float:
     return blur if blur > SOFT and blur_px > SOFT_PX else 0.0
 
 
-def estimate_blur_px(views: Sequence[CameraView], shots: Sequence[Sequence[Shot]], locating: LocateSettings) -> float:
+def estimate_blur_px(views: Sequence[CameraView], shots: Sequence[Sequence[Frame]], locating: LocateSettings) -> float:
     """Return the standard deviation of the blur of the steepest edges about the ball, px; the median of all frames.
 
     Noise makes slopes steeper, and paint without edges less steep: it is a first guess.

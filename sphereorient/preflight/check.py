@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.recording import Progress, open_unpainted, silent
+from sphereorient.experiment.recording import Progress, open_recording, silent
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.settings import Settings
@@ -58,7 +58,7 @@ def preflight(
         SphereOrientError: a file is missing, unreadable, or does not fit the others at all.
     """
     settings = settings or Settings()
-    with open_unpainted(experiment) as recording, ThreadPoolExecutor(3) as pool:
+    with open_recording(experiment, textured=False) as recording, ThreadPoolExecutor(3) as pool:
         # Threads: decoding, outlines and products release the interpreter.
         experiment = recording.experiment
         image = None if experiment.texture_path is None else load_texture(experiment.texture_path)

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sphereorient.movies import Movie
-from sphereorient.movies.survey import SeenFrame, Survey
+from sphereorient.movies.survey import Survey, SurveyedFrame
 
 COLUMNS = 6
 WIDTH, LINE, HEAD = 13.0, 0.27, 0.8  # inches: of the figure, of the line above a frame, of the title
@@ -57,7 +57,7 @@ def _scale(seen: Survey) -> tuple[float, float]:
     return black, max(white, black + 1)
 
 
-def _draw(ax: Any, frame: SeenFrame, movie: Movie, black: float, white: float) -> None:
+def _draw(ax: Any, frame: SurveyedFrame, movie: Movie, black: float, white: float) -> None:
     height, width = movie.frame_shape
     edges = (-0.5, width - 0.5, height - 0.5, -0.5)  # row 0 on top
     picture = np.zeros((1, 1)) if frame.small is None else frame.small

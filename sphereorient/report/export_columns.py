@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, refusal
-from sphereorient.trajectory import CameraTrack, Flag, Trajectory
+from sphereorient.trajectory import CameraTrack, Flag, Trajectory, quaternions_wxyz
 
 REASON = "why this camera has no orientation in the frame; ok where it has one"
 AXES: dict[tuple[int, ...], str] = {(3,): "xyz", (2,): "uv"}  # names of the components, by the shape of a frame's value
@@ -115,17 +115,6 @@ def as_text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def quaternions(R: NDArray[Any]) -> NDArray[np.float64]:
-    """Return (N, 4), w first and w >= 0, of rotations (N, 3, 3); NaN where one is missing."""
-    from scipy.spatial.transform import Rotation
-
-    quat_wxyz = np.full((len(R), 4), np.nan)
-    there = np.isfinite(R).all((1, 2))
-    if there.any():
-        quat_wxyz[there] = Rotation.from_matrix(R[there]).as_quat(canonical=True, scalar_first=True)
-    return quat_wxyz
-
-
 def with_unit(name: str, units: str) -> str:
     """Return a name with its unit at the end, once: alpha_lab_rad_s2, score, centre_px."""
     unit = "" if units == "1" else "_" + units.replace("^", "").replace("/", "_")
@@ -156,7 +145,7 @@ def _split(dataset: Dataset, prefix: str) -> Iterator[Column]:
 
     if dataset.rotation:
         stem = prefix + dataset.name.replace("orientation", "quat", 1)
-        for axis, values in zip("wxyz", quaternions(dataset.values).T, strict=True):
+        for axis, values in zip("wxyz", quaternions_wxyz(dataset.values).T, strict=True):
             yield column(f"{stem}_{axis}", values)
     elif dataset.tail == (3, 3):
         for i, j in PAIRS:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sphereorient.report.export_columns import as_text, frame_wise, metadata, quaternions, safe_names, with_unit
-from sphereorient.trajectory import CameraTrack, Trajectory
+from sphereorient.report.export_columns import as_text, frame_wise, metadata, safe_names, with_unit
+from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 
 
 def write_mat(track: Trajectory, path: Path, progress: Callable[[int, int], None]) -> None:
@@ -37,7 +37,7 @@ def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
     for dataset in frame_wise(record):
         arrays[with_unit(dataset.name, dataset.units)] = dataset.values
         if dataset.rotation:
-            arrays[dataset.name.replace("orientation", "quat_wxyz", 1)] = quaternions(dataset.values)
+            arrays[dataset.name.replace("orientation", "quat_wxyz", 1)] = quaternions_wxyz(dataset.values)
     if isinstance(record, CameraTrack):
         arrays["reason"] = np.array([str(reason) for reason in record.reason], dtype=object)
     return arrays

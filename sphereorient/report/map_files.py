@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sphereorient.errors import OutputError, TextureError, refusal
 from sphereorient.files.outputs import put_aside
-from sphereorient.files.picture_claim import decoded_grey
+from sphereorient.files.picture import decoded_grey
 from sphereorient.mapping import LearntMap
 from sphereorient.trajectory import Trajectory
 

@@ -16,12 +16,11 @@ from sphereorient.cameras import Camera
 from sphereorient.experiment import Experiment, open_movies
 from sphereorient.experiment.stream import CameraStream
 from sphereorient.movies import Grey
-from sphereorient.report.export_columns import quaternions
 from sphereorient.report.overlay import frames_of, pictures_at
 from sphereorient.report.overlay_canvas import AXES, OUTLINE, TRAIL
 from sphereorient.report.overlay_model import Path3D, finite_rows
 from sphereorient.sphere import load_texture, reduced_texture
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Trajectory, quaternions_wxyz
 
 Floats = NDArray[np.float64]
 GRID = 9  # pixels along each side of the picture that a pinhole is fitted to
@@ -108,7 +107,7 @@ def log_sphere(
     recording.log("lab/sphere/axes", arrows, static=True)
     rows = np.flatnonzero(path.whole)
     if len(rows):
-        xyzw = np.roll(quaternions(path.R_lab_body[rows]), -1, axis=1)  # Rerun's order, w last
+        xyzw = np.roll(quaternions_wxyz(path.R_lab_body[rows]), -1, axis=1)  # Rerun's order, w last
         poses = rr.Transform3D.columns(translation=path.position_mm[rows], quaternion=xyzw)
         recording.send_columns("lab/sphere", when(rows), poses)
     strips = [path.position_mm[a:b] for a, b in _stretches(track, path)]

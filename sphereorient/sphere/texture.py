@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient.errors import ShapeError, TextureError, check_tail, refusal
-from sphereorient.files.picture_claim import claimed_pixels, decoded_grey
+from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 
 PICTURE_BYTES = 100_000_000

@@ -1,10 +1,13 @@
-"""The noun that comes out: reasons and flags, HDF5, tables."""
+"""The result of a measurement: the trajectory, its file, reasons and flags."""
 
-from sphereorient.trajectory.trajectory import CameraTrack, Flag, Reason, Trajectory
+from sphereorient.trajectory.camera import CameraTrack
+from sphereorient.trajectory.reasons import Flag, Reason
+from sphereorient.trajectory.trajectory import Trajectory, quaternions_wxyz
 
 __all__ = [
     "CameraTrack",
     "Flag",
     "Reason",
     "Trajectory",
+    "quaternions_wxyz",
 ]

@@ -66,7 +66,7 @@ def test_the_stated_sigma_is_the_scatter_about_the_truth(seed: int) -> None:
     scene = Scene(tilt_deg=30, about_deg=25, spin_deg=10)
     dots = find_dots(scene.picture(noise=10.0, seed=seed))
     _, miss = against_truth(dots, scene)
-    # Shot noise is smaller on the dots than about them, where most pixels are: the sigma is a little too large.
+    # Frame noise is smaller on the dots than about them, where most pixels are: the sigma is a little too large.
     assert 0.65 < rms(miss / dots.sigma_px[:, None]) < 1.2
 
 

@@ -32,9 +32,8 @@ from precise_examples import (
 from sphereorient import so3
 from sphereorient.errors import ExperimentError
 from sphereorient.evaluate import score_track
-from sphereorient.follow import ChunkTracker
-from sphereorient.follow.poses import Poses
-from sphereorient.locate import Shot
+from sphereorient.follow import ChunkTracker, Poses
+from sphereorient.locate import Frame
 from sphereorient.methods import precise
 from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import Flag, Reason, Trajectory
@@ -409,7 +408,7 @@ def test_a_part_of_the_movie_keeps_the_clock(short, tmp_path, frames):
 FINGERPRINT = """
 import hashlib, sys
 import h5py
-from sphereorient.locate import Shot
+from sphereorient.locate import Frame
 from sphereorient import track_movies
 track_movies(sys.argv[1]).save(sys.argv[2])
 digest = hashlib.sha256()
@@ -454,7 +453,7 @@ def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tm
     def poses_of(*blocks: int) -> list[str]:
         """Follow blocks, by number, in one window."""
         rows = np.concatenate([np.arange(16 * block, 16 * block + 16) for block in blocks])
-        shots = [[Shot(picture=picture) for picture in movie[rows]] for movie in pictures]
+        shots = [[Frame(picture=picture) for picture in movie[rows]] for movie in pictures]
         return [_digest(poses) for poses in tracker.track(shots, [16] * len(blocks), (rows / 600.0).tolist())]
 
     each = [poses_of(block) for block in range(3)]

@@ -20,7 +20,7 @@ from sphereorient.follow import ChunkTracker
 from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre, mean_place
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.poses import Poses
-from sphereorient.locate import Shot, screened_frames
+from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods.method import Job
 from sphereorient.methods.precise import learn
 from sphereorient.methods.settings import Settings
@@ -87,7 +87,7 @@ def truth(path: Path) -> tuple[Tensor, Tensor]:
         return torch.from_numpy(file["position"][()]), torch.from_numpy(file["orientation"][()])
 
 
-def beside(fitter: Fitter, shots: Sequence[Shot], pose: Poses, place: FixedCentre, error_mm: Tensor) -> Tensor:
+def beside(fitter: Fitter, shots: Sequence[Frame], pose: Poses, place: FixedCentre, error_mm: Tensor) -> Tensor:
     """Delta by which a frame's attitude is found to differ where the ball is held beside its place; brute force."""
     fine, use = fitter.optics.fine, pose.use[None]
     pixels = fitter.pixels([[shot.picture for shot in shots]], place.position_lab_mm[None], fine)

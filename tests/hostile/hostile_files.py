@@ -26,7 +26,7 @@ from movie_examples import encode
 
 from sphereorient.experiment.given import load_background
 from sphereorient.experiment.timeline import load_times
-from sphereorient.movies import open_movie, readable
+from sphereorient.movies import open_movie
 from sphereorient.sphere import load_texture
 from sphereorient.trajectory import CameraTrack, Trajectory
 
@@ -57,8 +57,10 @@ def tiff(width: int, height: int, big: bool = False, entries: int = 0) -> bytes:
     order = ">" if big else "<"
     tags = [(256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, 200)]
     tags += [(277, 3, 1, 1), (278, 4, 1, height), (279, 4, 1, 2**32 - 1)]
+    short = 16 if big else 0  # a number of 16 bits stands in the first half of its field
     body = b"".join(
-        struct.pack(f"{order}HHII", *(n % 2 ** (16 if k < 2 else 32) for k, n in enumerate(t))) for t in tags
+        struct.pack(f"{order}HHII", tag, kind, count, (value << short if kind == 3 else value) % 2**32)
+        for tag, kind, count, value in tags
     )
     head = (b"MM\0*" if big else b"II*\0") + struct.pack(f"{order}I", 8)
     return head + struct.pack(f"{order}H", entries or len(tags)) + body + bytes(500)
@@ -358,9 +360,9 @@ def watch(path: Path) -> None:
         assert count > 0
         assert movie.times_s is None or movie.times_s.shape == (count,)
         assert all(remark.isprintable() for remark in movie.remarks)
-        for picture in readable(movie, 0, min(count, 4)):
+        for picture in movie.readable(0, min(count, 4)):
             assert picture is None or (picture.shape == movie.frame_shape and picture.dtype == movie.dtype)
-        for _ in readable(movie, count - 1, count):
+        for _ in movie.readable(count - 1, count):
             pass
         movie.sample([0, count - 1])
 

@@ -239,8 +239,8 @@ def write_small(path: Path) -> None:
     [
         (lambda path: None, ["no such file"]),
         (Path.mkdir, ["a folder"]),
-        (write_nothing, ["a file that is none"]),
-        (write_text, ["a file that is none"]),
+        (write_nothing, ["a file that cannot be decoded"]),
+        (write_text, ["a file that cannot be decoded"]),
         (write_small, ["17 x 12 px as the movie", "20 x 10 px"]),
     ],
     ids=["missing", "folder", "empty", "text", "size"],

@@ -13,7 +13,7 @@ from locate_examples import SETTINGS, sightings
 from torch import Tensor
 
 from sphereorient.locate import LocateSettings, repair
-from sphereorient.locate.gaps import stretches
+from sphereorient.locate.gaps import known_stretches
 from sphereorient.trajectory import Flag, Reason
 
 N = 120
@@ -180,8 +180,8 @@ def test_flags_that_were_there_stay():
 
 @given(st.lists(st.booleans(), max_size=40), st.integers(0, 5))
 @settings(max_examples=60, deadline=None)
-def test_stretches_hold_every_known_frame_once_and_no_long_hole(known, gap):
-    parts = stretches(np.array(known, bool), gap)
+def test_known_stretches_hold_every_known_frame_once_and_no_long_hole(known, gap):
+    parts = known_stretches(np.array(known, bool), gap)
     covered = np.concatenate([*parts, np.zeros(0, int)])
     assert set(np.flatnonzero(known)) <= set(covered)
     assert len(set(covered)) == len(covered)

@@ -13,8 +13,7 @@ from locate_examples import BACK, DIAMETER, SETTINGS, SHAPE, blobs, even_backgro
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment.given import load_mask
 from sphereorient.locate import find_ball
-from sphereorient.locate.fixed import fixed_ball
-from sphereorient.locate.learn import learn_background
+from sphereorient.locate.scene import fixed_ball, learn_background
 from sphereorient.pose.pixels import LinesOfSight, cut_pixels, disk_stencil
 
 MIDDLE = (99.37, 84.81)

@@ -16,7 +16,7 @@ from map_examples import QUICK, rewrite, save_map, unpainted, warped
 
 from sphereorient import so3
 from sphereorient.cli import main
-from sphereorient.experiment.recording import open_recording, open_unpainted
+from sphereorient.experiment.recording import open_recording
 from sphereorient.mapping.compare import compare_maps
 from sphereorient.movies import open_movie
 from sphereorient.report.map_files import read_seen, seen_path, shares_seen, write_seen, write_texture
@@ -164,10 +164,10 @@ def test_track_without_a_map_says_how_to_get_one(copy, tmp_path, monkeypatch, ca
 
 
 def test_a_recording_without_map_has_none_and_one_with_a_map_is_not_looked_at(copy):
-    with open_unpainted(copy) as recording:
+    with open_recording(copy, textured=False) as recording:
         assert recording.texture.shape == (0, 0)
     rewrite(copy, texture="missing.png")
-    with open_unpainted(copy) as recording:
+    with open_recording(copy, textured=False) as recording:
         assert len(recording.streams) == 2
     rewrite(copy, texture="texture.png")
     with open_recording(copy) as recording:

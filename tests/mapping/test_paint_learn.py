@@ -42,11 +42,7 @@ def opened(path, cameras=None, frames=None):
         for name in names
     ]
     grey = torch.full((8, 16), 0.5)
-    try:
-        yield Recording(experiment=experiment, streams=streams, timeline=lines, texture=grey, remarks=())
-    finally:
-        for movie in movies.values():
-            movie.close()
+    yield Recording(experiment=experiment, streams=streams, timeline=lines, texture=grey, remarks=())
 
 
 def truth(path):

@@ -22,7 +22,7 @@ from sphereorient import so3
 from sphereorient.cli import main
 from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.recording import open_unpainted, silent
+from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import PaintSettings, learn_map
 from sphereorient.mapping.compare import compare_maps
@@ -173,7 +173,7 @@ def true_attitudes(path):
 @pytest.mark.parametrize("moves", [False, True])
 def test_a_map_is_learnt_from_photographs_at_random_attitudes(tmp_path, moves):
     path = write_stills(tmp_path, Stills(count=14, seed=2, paint="dots", moves=moves, diameter_px=90.0))
-    with open_unpainted(path) as recording:
+    with open_recording(path, textured=False) as recording:
         learnt = learn_map(recording, PaintSettings(unordered=True), LocateSettings(), silent)
     assert learnt.valid.all()
     assert error_deg(learnt.R_lab_body, true_attitudes(path)).median() < 0.2
@@ -186,7 +186,7 @@ def test_a_photograph_of_another_ball_keeps_its_place_and_gets_no_attitude(tmp_p
     path = write_stills(tmp_path, Stills(count=14, seed=2, paint="dots", moves=True, diameter_px=60.0))
     other = write_stills(tmp_path / "other", Stills(count=6, seed=3, paint="blobs", moves=True, diameter_px=60.0))
     shutil.copy(other.parent / "photographs" / "005.png", path.parent / "photographs" / "005.png")
-    with open_unpainted(path) as recording:
+    with open_recording(path, textured=False) as recording:
         learnt = learn_map(recording, PaintSettings(unordered=True), LocateSettings(), silent)
     assert learnt.valid.tolist() == [k != 5 for k in range(14)]
     assert learnt.R_lab_body[5].isnan().all()
@@ -205,7 +205,7 @@ def test_frames_of_the_shared_experiment_shuffled_and_thinned_are_photographs(tm
     experiment = replace(
         load_experiment(source), texture_path=None, movie_paths={"cam1": tmp_path / "stills.npy"}, start={}
     )
-    with open_unpainted(experiment, ["cam1"]) as recording:
+    with open_recording(experiment, ["cam1"], textured=False) as recording:
         learnt = learn_map(recording, PaintSettings(unordered=True), LocateSettings(), silent)
     assert learnt.valid.all()
     error = error_deg(learnt.R_lab_body, true_attitudes(source)[rows])

@@ -16,7 +16,7 @@ from map_examples import SMALL, rewrite, unpainted
 
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.recording import open_unpainted, silent
+from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import PaintSettings, learn_map, take_footage
 from sphereorient.mapping.first import first_stage
@@ -54,7 +54,7 @@ def test_instants_that_do_not_fit_are_found_again_and_the_others_stay(tmp_path):
     path = unpainted(tmp_path / "scene", frames=24)
     R, _ = truth_of(path)
     texture = reduced_texture(load_texture(path.parent / "texture.png"), 64.0)
-    with open_unpainted(path) as recording:
+    with open_recording(path, textured=False) as recording:
         footage = take_footage(recording, QUICK, LocateSettings(), silent)
     stage = first_stage(footage, torch.arange(len(R)), R, texture, QUICK)
     for k in range(2):
@@ -103,7 +103,7 @@ def in_one_place(folder: Path) -> tuple[Path, float]:
 @pytest.mark.slow
 def test_a_half_hidden_ball_of_unknown_size_is_measured_with_its_map(tmp_path):
     path, far = in_one_place(tmp_path / "scene")
-    with open_unpainted(path) as recording:
+    with open_recording(path, textured=False) as recording:
         learnt = learn_map(recording, QUICK, LocateSettings(), silent)
     assert learnt.valid.all()
     place = learnt.position_lab_mm

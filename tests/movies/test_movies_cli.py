@@ -12,7 +12,7 @@ from movie_examples import FRAMES, pictures
 from movie_formats import LOSSLESS
 
 from sphereorient.cli import main
-from sphereorient.movies import open_movie, readable
+from sphereorient.movies import open_movie
 from sphereorient.movies.survey import survey
 
 
@@ -100,7 +100,7 @@ def test_convert_goes_on_after_frames_that_cannot_be_decoded(tmp_path, monkeypat
     assert code == 0
     assert "Not decodable" in out
     assert "1 frame, 3" in out
-    read = list(readable(open_movie(target)))
+    read = list(open_movie(target).readable())
     assert len(read) == FRAMES
     assert all(np.array_equal(read[number], pictures()[number]) for number in range(FRAMES) if number != 3)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from conftest import REPO
 
-from sphereorient.movies.flipped import STEPS
 from sphereorient.movies.hdf5 import TIMES
+from sphereorient.movies.movie import FLIPS
 from sphereorient.movies.open import READERS
-from sphereorient.movies.picture import PICTURES
+from sphereorient.movies.sequence import PICTURES
 from sphereorient.movies.write import WRITERS
 
 TEXT = (REPO / "docs" / "movies.md").read_text()
@@ -21,5 +21,5 @@ def test_every_suffix_flip_and_name_of_times_is_on_the_page():
         assert NAMED.get(suffix, "TIFF") in TEXT, suffix
     for name in TIMES:
         assert f"`{name}`" in TEXT, name
-    for how in STEPS:
+    for how in FLIPS:
         assert how in TEXT, how

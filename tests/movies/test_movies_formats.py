@@ -9,7 +9,7 @@ import tifffile
 from movie_examples import FRAMES, HEIGHT, WIDTH, pictures
 from movie_formats import EIGHT_BIT, LOSSLESS, LOSSY
 
-from sphereorient.movies import flipped, movie_files, open_movie, readable
+from sphereorient.movies import flipped, movie_files, open_movie
 
 EVERY = [(name, write, np.uint8) for name, write in (LOSSLESS | EIGHT_BIT).items()]
 EVERY += [(name, write, np.uint16) for name, write in LOSSLESS.items()]
@@ -32,7 +32,7 @@ def test_the_same_frames_come_back_bit_for_bit_from_every_lossless_format(tmp_pa
             assert np.array_equal(
                 np.array(list(movie.frames(first, last))).reshape(-1, HEIGHT, WIDTH), frames[first:last]
             )
-            again = list(readable(movie, first, last))
+            again = list(movie.readable(first, last))
             assert np.array_equal(np.array(again).reshape(-1, HEIGHT, WIDTH), frames[first:last])
         assert not any("truncated" in remark for remark in movie.remarks)
 
@@ -77,7 +77,7 @@ def test_a_flipped_movie_is_the_movie_in_a_mirror(tmp_path, name, how, turn):
     movie = open_movie(LOSSLESS[name](tmp_path, frames))
     with flipped(movie, how) as mirrored:
         assert np.array_equal(np.stack(list(mirrored.frames(3, 9))), turn(frames)[3:9])
-        assert np.array_equal(np.stack(list(readable(mirrored, 3, 9))), turn(frames)[3:9])
+        assert np.array_equal(np.stack(list(mirrored.readable(3, 9))), turn(frames)[3:9])
         assert np.array_equal(mirrored.sample([5, 1]), turn(frames)[[5, 1]])
         assert (len(mirrored), mirrored.path, mirrored.frame_shape) == (FRAMES, movie.path, movie.frame_shape)
         assert any("flipped" in remark for remark in mirrored.remarks) == (how != "none")

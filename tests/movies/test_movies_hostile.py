@@ -15,7 +15,7 @@ from movie_examples import pictures, smooth
 from movie_formats import LOSSLESS, LOSSY, cine, video
 
 from sphereorient.errors import MovieError
-from sphereorient.movies import open_movie, readable
+from sphereorient.movies import open_movie
 
 SHAPE = (12, 37, 51)
 PREDICTED = {"g": "5", "bf": "2", "qp": "2", "b_strategy": "0"}
@@ -58,7 +58,7 @@ def read(path: Path) -> None:
     with open_movie(path) as movie:
         count = len(movie)
         assert 0 < count <= MOST_FRAMES
-        for frame in islice(readable(movie), 40):
+        for frame in islice(movie.readable(), 40):
             assert frame is None or (frame.shape, frame.dtype) == (movie.frame_shape, movie.dtype)
         assert all(isinstance(remark, str) and "\n" not in remark for remark in movie.remarks)
         assert movie.times_s is None or (len(movie.times_s) == count and np.isfinite(movie.times_s).all())

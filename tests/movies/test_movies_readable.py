@@ -10,7 +10,7 @@ import pytest
 from movie_examples import FRAMES, encode, pictures, smooth
 
 from sphereorient.errors import MovieError
-from sphereorient.movies import open_movie, readable, write_ffv1
+from sphereorient.movies import open_movie, write_ffv1
 from sphereorient.movies.packets import Packet, index_packets
 
 
@@ -45,10 +45,10 @@ def test_a_damaged_frame_of_ffv1_is_the_only_one_lost(tmp_path, frame_rate_hz):
     damage(path, [0, 7, 8, 29])
     movie = open_movie(path)
     assert len(movie) == FRAMES
-    read = list(readable(movie))
+    read = list(movie.readable())
     assert [number for number, frame in enumerate(read) if frame is None] == [0, 7, 8, 29]
     assert all(frame is None or np.array_equal(frame, pictures()[number]) for number, frame in enumerate(read))
-    assert [frame is None for frame in readable(movie, 6, 10)] == [False, True, True, False]
+    assert [frame is None for frame in movie.readable(6, 10)] == [False, True, True, False]
     assert np.array_equal(movie.sample([28, 9, 1]), pictures()[[28, 9, 1]])
     with pytest.raises(MovieError, match=r"movie.mkv, frame 7: expected a decodable picture"):
         list(movie.frames(1))
@@ -64,7 +64,7 @@ def test_a_packet_that_is_gone_leaves_its_number_behind(tmp_path):
     path.write_bytes(content)
     movie = open_movie(path)
     assert len(movie) == FRAMES
-    read = list(readable(movie))
+    read = list(movie.readable())
     lost = [number for number, frame in enumerate(read) if frame is None]
     assert 12 in lost
     assert len(lost) < 10
@@ -94,7 +94,7 @@ def test_frames_that_lean_on_a_damaged_one_are_lost_with_it_and_no_others_change
     blank(path, 18)
     movie = open_movie(path)
     for first in (0, 5, 30):
-        read = list(readable(movie, first))
+        read = list(movie.readable(first))
         assert len(read) == len(clean) - first
         for frame, expected in zip(read, clean[first:], strict=True):
             assert frame is None or np.array_equal(frame, expected)
@@ -139,7 +139,7 @@ def test_what_is_decoded_after_a_damaged_frame_is_spoilt_up_to_the_next_key_fram
 def test_a_range_outside_the_movie_is_refused_at_once(tmp_path):
     np.save(tmp_path / "movie.npy", pictures())
     with pytest.raises(MovieError, match=r"expected frames within 0 .. 30"):
-        readable(open_movie(tmp_path / "movie.npy"), 0, 31)
+        open_movie(tmp_path / "movie.npy").readable(0, 31)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from movie_examples import FRAMES, pictures
 from movie_formats import sequence
 
 from sphereorient.errors import MovieError
-from sphereorient.movies import open_movie, readable
+from sphereorient.movies import open_movie
 
 
 def refused(path: Path, message: str) -> None:
@@ -29,7 +29,7 @@ def test_pictures_are_in_natural_order_and_a_missing_number_is_an_unreadable_fra
         (folder / f"cam1_{number}.png").unlink()
     movie = open_movie(folder)
     assert movie.remarks == ("3 pictures are missing: 9 .. 10, 20",)
-    read = list(readable(movie))
+    read = list(movie.readable())
     assert [number for number, frame in enumerate(read) if frame is None] == [2, 3, 13]
     assert all(frame is None or np.array_equal(frame, pictures()[number]) for number, frame in enumerate(read))
     with pytest.raises(MovieError, match=r"frame 13: .* no file of its number"):
@@ -52,7 +52,7 @@ def test_a_broken_picture_is_one_unreadable_frame(tmp_path):
     whole = (folder / "cam1_11.png").read_bytes()
     (folder / "cam1_11.png").write_bytes(whole[:40])
     movie = open_movie(folder)
-    assert [number for number, frame in enumerate(readable(movie)) if frame is None] == [0, 1, 2, 4]
+    assert [number for number, frame in enumerate(movie.readable()) if frame is None] == [0, 1, 2, 4]
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_a_page_of_another_size_is_one_unreadable_frame(tmp_path):
         for number, frame in enumerate(pictures()[:6]):
             file.write(frame[: 20 if number == 3 else None], metadata=None)
     movie = open_movie(tmp_path / "movie.tif")
-    assert [frame is None for frame in readable(movie)] == [False] * 3 + [True] + [False] * 2
+    assert [frame is None for frame in movie.readable()] == [False] * 3 + [True] + [False] * 2
 
 
 @pytest.mark.parametrize("imagej", [True, False])
@@ -214,6 +214,6 @@ def test_a_claim_of_a_billion_frames_allocates_nothing(tmp_path, chunks):
     else:
         movie = open_movie(path)
         assert "tells of 1000000000 frames, 3 are there" in movie.remarks[0]
-        assert [frame is None for frame in readable(movie)] == [True, True, False]
+        assert [frame is None for frame in movie.readable()] == [True, True, False]
     assert tracemalloc.get_traced_memory()[1] < 2_000_000
     tracemalloc.stop()

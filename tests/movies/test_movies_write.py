@@ -8,7 +8,7 @@ from movie_examples import FRAMES, pictures
 
 from sphereorient.errors import MovieError, OutputError
 from sphereorient.experiment.timeline import load_times
-from sphereorient.movies import open_movie, readable, write_movie
+from sphereorient.movies import open_movie, write_movie
 
 
 @pytest.mark.parametrize("suffix", ["mkv", "h5", "hdf5"])
@@ -27,7 +27,7 @@ def test_frames_that_are_none_keep_their_numbers(tmp_path, suffix):
     path = tmp_path / f"movie.{suffix}"
     given = [None if number in (0, 1, 7) else frame for number, frame in enumerate(pictures())]
     assert write_movie(path, given) == FRAMES
-    for frame, expected in zip(readable(open_movie(path)), given, strict=True):
+    for frame, expected in zip(open_movie(path).readable(), given, strict=True):
         if expected is not None:
             assert np.array_equal(frame, expected)
         else:

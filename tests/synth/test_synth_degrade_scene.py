@@ -46,10 +46,7 @@ SETTINGS = SynthSettings(
 
 def frames_of(path: Path) -> dict[str, np.ndarray]:
     movies = open_movies(load_experiment(path))
-    frames = {name: np.stack(list(movie.frames())).astype(np.float64) for name, movie in movies.items()}
-    for movie in movies.values():
-        movie.close()
-    return frames
+    return {name: np.stack(list(movie.frames())).astype(np.float64) for name, movie in movies.items()}
 
 
 def empty_of(path: Path) -> np.ndarray:

@@ -63,10 +63,7 @@ def truth_of(path: Path) -> dict[str, torch.Tensor]:
 
 def frames_of(path: Path) -> dict[str, np.ndarray]:
     movies = open_movies(load_experiment(path))
-    frames = {name: np.stack(list(movie.frames())) for name, movie in movies.items()}
-    for movie in movies.values():
-        movie.close()
-    return frames
+    return {name: np.stack(list(movie.frames())) for name, movie in movies.items()}
 
 
 def test_it_is_an_experiment_that_loads(written):

@@ -18,7 +18,7 @@ from sphereorient.errors import OutputError, ShapeError, TrackError
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 FRAMES = 7
-# DESIGN.md section 3, written out once more so that the code's own table cannot vouch for itself
+# docs/data-format.md, written out once more so that the code's own table cannot vouch for itself
 DESIGN_SHAPES: dict[str, tuple[int, ...]] = {"time": (), "valid": (), "segment": (), "flags": (), "confidence": ()}
 DESIGN_SHAPES |= dict.fromkeys(("position", "position_smooth"), (3,))
 DESIGN_SHAPES |= dict.fromkeys(("position_cov", "position_smooth_cov", "orientation", "orientation_cov"), (3, 3))
@@ -79,7 +79,7 @@ def datasets(path: Path) -> dict[str, h5py.Dataset]:
     return found
 
 
-# convention: the file is the one of DESIGN.md
+# convention: the file is the one of docs/data-format.md
 
 
 def test_an_empty_trajectory_has_every_dataset_of_the_design_in_its_shape(tmp_path: Path) -> None:
@@ -185,7 +185,7 @@ def test_a_failure_while_writing_leaves_the_old_file_and_no_other(
         assert len(list(tmp_path.iterdir())) == 2
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("sphereorient.trajectory._write_camera", disk_full)
+    monkeypatch.setattr("sphereorient.trajectory.trajectory.write_camera", disk_full)
     with pytest.raises(OutputError, match="No space left"):
         full_trajectory().save(path)
     assert path.read_bytes() == b"the old one"
@@ -287,7 +287,7 @@ def test_the_summary_counts_lost_frames_by_reason() -> None:
     assert json.loads(json.dumps(summary)) == summary
 
 
-def test_the_noun_does_not_bring_torch_along() -> None:
+def test_the_trajectory_does_not_import_torch() -> None:
     look = "import sys, sphereorient.trajectory; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", look], check=False).returncode == 0
 
@@ -305,3 +305,69 @@ def test_a_track_of_before_the_systematic_errors_is_read_without_them(tmp_path: 
         assert np.shape(getattr(old, name)) == (len(track), 3, 3)
         assert np.isnan(getattr(old, name)).all()
     np.testing.assert_array_equal(old.position_cov, track.position_cov)
+
+
+# in a notebook
+
+
+def test_a_slice_is_a_part_with_its_candidates() -> None:
+    track = full_trajectory()
+    part = track[2:7:2]
+    np.testing.assert_array_equal(part.time, track.time[[2, 4, 6]])
+    np.testing.assert_array_equal(part.cameras["cam1"].candidate_offset, [0, 1, 1, 3])
+    np.testing.assert_array_equal(
+        part.cameras["cam1"].candidate_score, track.cameras["cam1"].candidate_score[[2, 3, 4]]
+    )
+    assert part.cameras["cam1"].reason == (Reason.OK, Reason.DARK, Reason.OK)
+    np.testing.assert_array_equal(track[-3:].position, track.position[-3:])
+    assert len(track[10:50]) == 0
+
+
+@pytest.mark.parametrize(
+    ("index", "error", "words"),
+    [
+        (3, TypeError, r"expected a slice of frames, got 3; write track\[10:11\] for one frame"),
+        ("time", TypeError, "got 'time'"),
+        (slice(None, None, -1), ShapeError, "expected a positive step, got -1"),
+    ],
+)
+def test_other_indices_are_refused(index: Any, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        full_trajectory()[index]
+
+
+def test_the_summary_of_a_track_is_a_few_lines() -> None:
+    lines = repr(full_trajectory()).splitlines()
+    assert lines[:2] == ["Trajectory", "  of       mixer-3Hz"]
+    assert lines[2] == f"  frames   7, {int(full_trajectory().valid.sum())} valid"
+    assert lines[3:] == [
+        "  time     0.0666667 .. 0.0766667 s, 600 Hz",
+        "  cameras  cam2 (7 frames lost), cam1 (4 frames lost)",
+        "  method   precise",
+    ]
+    assert "none" in repr(Trajectory.empty(np.zeros(0)))
+
+
+def test_the_summary_in_a_notebook_is_an_escaped_table() -> None:
+    page = replace(full_trajectory(), experiment="<b>& co")._repr_html_()
+    assert "<td>&lt;b&gt;&amp; co</td>" in page
+    assert page.count("<tr>") == 5
+
+
+def test_the_plot_has_a_row_of_axes_for_each_quantity_with_its_unit(tmp_path: Path) -> None:
+    track = full_trajectory()
+    about_z = np.linspace(0, 5, FRAMES)  # rad: the canonical quaternion changes its sign on the way
+    R = np.zeros((FRAMES, 3, 3))
+    R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1] = np.cos(about_z), -np.sin(about_z), np.sin(about_z), np.cos(about_z)
+    R[:, 2, 2] = 1
+    R[3] = np.nan
+    figure = replace(track, orientation=R, orientation_smooth=R).plot()
+    figure.savefig(tmp_path / "track.png")
+    labels = ["position (mm)", "orientation (quaternion, 1)", "velocity (m/s)", "angular velocity, lab (rad/s)"]
+    assert [axes.get_ylabel() for axes in figure.axes] == labels
+    assert figure.axes[-1].get_xlabel() == "time (s)"
+    w = figure.axes[1].lines[-4].get_ydata()
+    np.testing.assert_allclose(np.delete(w, 3), np.delete(np.cos(about_z / 2), 3))
+    assert np.isnan(w[3])
+    np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), track.position[:, 0])
+    assert len(Trajectory.empty(np.zeros(0)).plot().axes) == 4

@@ -1,0 +1,45 @@
+"""Picture files from anybody: the size that the header claims, before anything is decoded, and the grey values."""
+
+from __future__ import annotations
+
+import warnings
+from io import BytesIO
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF")
+GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+BOMBS = (Image.DecompressionBombError, Image.DecompressionBombWarning)  # the warning where warnings are errors
+FAULTS = (OSError, ValueError, ArithmeticError, LookupError, MemoryError, SyntaxError)  # of damaged headers
+BOMB_PIXELS = 1 << 40  # reported for pictures that Pillow refuses by their size
+
+warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # callers compare the size with their own limit
+
+
+def claimed_pixels(content: bytes) -> int | None:
+    """Return how many pixels a PNG, JPEG, BMP, PNM or TIFF file claims to have; None for other files."""
+    try:
+        with Image.open(BytesIO(content), formats=FORMATS) as picture:
+            return picture.width * picture.height
+    except BOMBS:
+        return BOMB_PIXELS
+    except FAULTS:
+        return None
+
+
+def decoded(content: bytes, flags: int) -> NDArray[Any] | None:
+    """Decode a picture file with OpenCV; None where that fails. Check `claimed_pixels` first: memory is allocated."""
+    try:
+        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error:  # an empty file, or a header with impossible numbers
+        return None
+
+
+def decoded_grey(content: bytes) -> NDArray[Any] | None:
+    """Return the grey values of a picture file, (H, W), in its own depth; None where decoding fails."""
+    picture = decoded(content, GREY)
+    return None if picture is None or picture.ndim != 2 else np.asarray(picture)

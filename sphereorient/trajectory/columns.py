@@ -1,0 +1,112 @@
+"""The table of datasets of a track file: each field of a record declares its axes, unit, description and type."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.errors import ShapeError, TrackError, refusal
+
+KEY = "column"
+LARGEST_RATIO = 1200  # largest compression ratio: a dataset that claims more is not in the file
+
+
+@dataclass(frozen=True)
+class Column:
+    """One dataset of the file."""
+
+    units: str
+    description: str
+    tail: tuple[int, ...] = ()  # axes after the first
+    dtype: str = "float64"
+    fill: float = np.nan  # value of what was not measured
+    since: str = ""  # the version that added it: files of older ones are read without it
+    rows: str = "frames"  # or offsets (frames + 1), or candidates
+
+
+def column(units: str, description: str, *tail: int, **more: Any) -> Any:
+    """Declare a field of a record that is a dataset of the file."""
+    return field(metadata={KEY: Column(units, description, tail, **more)})
+
+
+def columns(record: type[Any]) -> Iterator[tuple[str, Column]]:
+    """Yield field name and column of every dataset of a record, in the order of the table."""
+    return ((entry.name, entry.metadata[KEY]) for entry in fields(record) if KEY in entry.metadata)
+
+
+def blank(record: type[Any], frames: int) -> dict[str, NDArray[Any]]:
+    """Return every dataset of a record with nothing measured."""
+    rows = {"frames": frames, "offsets": frames + 1, "candidates": 0}
+    return {name: np.full((rows[c.rows], *c.tail), c.fill, c.dtype) for name, c in columns(record)}
+
+
+def check_shapes(record: object, rows: Mapping[str, int]) -> None:
+    """Refuse a record in which a dataset has another shape than the table says."""
+    for name, c in columns(type(record)):
+        expected, got = (rows[c.rows], *c.tail), np.shape(getattr(record, name))
+        if got != expected:
+            label = f"{type(record).__name__}.{name}"
+            do = "give every dataset one row a frame"
+            raise ShapeError(refusal(label, expected=f"shape {expected}", got=str(got), do=do))
+
+
+def write_columns(record: Any, group: h5py.Group) -> None:
+    """Write all datasets of a record."""
+    for name, c in columns(type(record)):
+        write_column(group, _place(name), np.asarray(getattr(record, name), c.dtype), c)
+
+
+def write_column(group: h5py.Group, place: str, values: NDArray[Any], column: Column) -> None:
+    """Write one dataset with unit and description; without times, so that equal arrays give equal bytes."""
+    dataset = group.create_dataset(place, data=values, track_times=False)
+    dataset.attrs["units"], dataset.attrs["description"] = column.units, column.description
+
+
+def read_columns(group: h5py.Group, record: type[Any]) -> dict[str, NDArray[Any]]:
+    """Return all datasets of a record by field name; those that an older version did not write are blank."""
+    known = {
+        name: read_column(group, _place(name), c.dtype).astype(c.dtype)
+        for name, c in columns(record)
+        if not c.since or _place(name) in group
+    }
+    if len(known) == sum(1 for _ in columns(record)):
+        return known
+    return blank(record, len(next(iter(known.values())))) | known
+
+
+def read_column(group: h5py.Group, place: str, dtype: str) -> NDArray[Any]:
+    """Return the values of a dataset; refuse, before reading, one in other files or of an impossible size."""
+    dataset = inside(group, place)
+    got = ""
+    if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
+        got = "none"
+    elif dataset.external or dataset.is_virtual:
+        got = "one that lies in other files"
+    elif dataset.nbytes > LARGEST_RATIO * Path(group.file.filename).stat().st_size:
+        got = f"one that claims {dataset.nbytes / 1e6:.3g} MB"
+    elif not (dataset.dtype.kind == "S" if dtype == "S" else np.can_cast(dataset.dtype, dtype, "same_kind")):
+        got = f"values of type {dataset.dtype}"[:100]
+    if got:
+        name, do = f"{group.file.filename}: {group.name.rstrip('/')}/{place}", "write the track again"
+        raise TrackError(refusal(name, expected="a dataset", got=got, do=do))
+    return np.asarray(dataset[()])
+
+
+def inside(group: h5py.Group, place: str) -> Any:
+    """Return the object at a place in a group; None if there is none, or a link, which may lead to other files."""
+    here: Any = group
+    for part in place.split("/"):
+        if not isinstance(here, h5py.Group) or not isinstance(here.get(part, getlink=True), h5py.HardLink):
+            return None
+        here = here[part]
+    return here
+
+
+def _place(name: str) -> str:
+    return name.replace("candidate_", "candidates/")

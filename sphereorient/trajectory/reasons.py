@@ -1,0 +1,36 @@
+"""Flags of a frame, and reasons why a camera has no orientation."""
+
+from __future__ import annotations
+
+from enum import IntFlag, StrEnum
+
+
+class Flag(IntFlag):
+    """Bits of the dataset `flags`; several may hold for one frame."""
+
+    POSITION_INTERPOLATED = 1
+    POSITION_OUTLIER_REPLACED = 2
+    ONE_CAMERA = 4
+    REPAIRED_FROM_OTHER_CAMERA = 8
+    AMBIGUOUS = 16
+    DOUBTFUL_FIT = 32
+    RECOVERED = 64
+    SPIKE = 128
+    EXTRAPOLATED = 256
+
+
+class Reason(StrEnum):
+    """Reason why one camera has no orientation in a frame; `OK` if it has one."""
+
+    OK = "ok"
+    NOT_FOUND = "not_found"
+    OUTLINE = "outline"
+    DARK = "dark"
+    SATURATED = "saturated"
+    REPEATED = "repeated"
+    RUNAWAY = "runaway"
+    LOW_SCORE = "low_score"
+    AMBIGUOUS = "ambiguous"
+    CONTRADICTS = "contradicts"  # its line of sight misses the other camera's ball: the cameras disagree
+    UNDECODABLE = "undecodable"
+    MISSING = "missing"  # the camera has no picture of the frame
