@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import Experiment, load_experiment, open_movies
+from sphereorient.experiment.recording import Progress, silent
 from sphereorient.experiment.timeline import Timeline, timeline
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.settings import Settings
@@ -21,12 +22,6 @@ from sphereorient.preflight.finding import Finding, Severity, worst
 from sphereorient.preflight.look import Look, look_at, look_closer
 from sphereorient.search import GreySearch
 from sphereorient.sphere import load_texture
-
-Progress = Callable[[str, int, int], None]  # (stage, done, total)
-
-
-def silent(stage: str, done: int, total: int) -> None:
-    """Tell nobody."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
