@@ -20,10 +20,10 @@ from sphereorient.locate import (
     LocateSettings,
     Sightings,
     check_seen,
+    fill_gaps,
     find_ball,
     find_positions,
     find_scene,
-    repair,
     screened_frames,
     sightings_of,
 )
@@ -130,7 +130,7 @@ def _moving(recording: Recording, settings: PaintSettings, locating: LocateSetti
             progress(f"{stream.name}: ball", k + 1, 0)
         views.append(CameraView.of(stream.name, stream.camera, scene))
         windows.append(row)
-        sightings[stream.name] = repair(sightings_of(found), locating)
+        sightings[stream.name] = fill_gaps(sightings_of(found), locating)
     return views, sightings, windows
 
 
