@@ -33,7 +33,7 @@ WINDOW = 5  # px of the median filter that removes single pixels
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class CameraScene:
     """The scene of one camera; made by `find_scene`."""
 
     background: Background
@@ -51,7 +51,7 @@ def known_diameter_px(recording: Recording, name: str, settings: LocateSettings)
     return settings.diameter_px or expected_diameter_px(name, recording.cameras, recording.experiment.diameter_mm)
 
 
-def find_scene(recording: Recording, stream: CameraStream, count: int, settings: LocateSettings) -> Scene:
+def find_scene(recording: Recording, stream: CameraStream, count: int, settings: LocateSettings) -> CameraScene:
     """Estimate the background of one camera, from `count` frames or from the experiment's own picture.
 
     Raises:
@@ -64,10 +64,10 @@ def find_scene(recording: Recording, stream: CameraStream, count: int, settings:
         fixed = fixed_ball(stream.spread(settings.background_frames), settings, empty, stream.shown)
         diameter_px = diameter_px or 2 * fixed.outline.radius_px
         if empty is None:
-            return Scene(background=fixed.scene, diameter_px=diameter_px)
+            return CameraScene(background=fixed.scene, diameter_px=diameter_px)
     assert diameter_px is not None  # a moving ball has one, or is refused
     background = learn_background(stream.spread(count), diameter_px, settings, empty, stream.shown)
-    return Scene(background=background, diameter_px=diameter_px)
+    return CameraScene(background=background, diameter_px=diameter_px)
 
 
 def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: float | None) -> float:

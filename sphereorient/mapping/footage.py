@@ -15,9 +15,9 @@ from sphereorient.errors import PaintError, refusal
 from sphereorient.experiment.given import given_scene
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.locate import (
+    CameraScene,
     Found,
     LocateSettings,
-    Scene,
     Sightings,
     check_seen,
     fill_gaps,
@@ -150,7 +150,9 @@ def _fixed(recording: Recording, settings: PaintSettings, locating: LocateSettin
             found.append((outline if shot.usable else None, shot.reason))
             progress(f"{stream.name}: ball", k + 1, 0)
         views.append(
-            CameraView.of(stream.name, stream.camera, Scene(background=where.scene, diameter_px=2 * outline.radius_px))
+            CameraView.of(
+                stream.name, stream.camera, CameraScene(background=where.scene, diameter_px=2 * outline.radius_px)
+            )
         )
         windows.append(row)
         sightings[stream.name] = sightings_of(found)

@@ -15,7 +15,7 @@ from sphereorient.errors import TrackError, refusal
 from sphereorient.experiment.recording import Recording
 from sphereorient.files.hdf5 import whole_hdf5
 from sphereorient.follow import Appearance
-from sphereorient.locate import Background, Scene
+from sphereorient.locate import Background, CameraScene
 from sphereorient.motion import Learnt as Motion
 from sphereorient.motion import Prior, ProcessNoise
 from sphereorient.pose import CameraView, Fitter, Light, Optics, base_table
@@ -69,7 +69,7 @@ class Learnt:
                 got = ", ".join(f"{name} {one.mean.shape}" for name, one in self.backgrounds.items())
                 expected = f"what was learnt of {stream.name}, {stream.movie.frame_shape}"
                 raise TrackError(refusal("learnt", expected=expected, got=got, do="pass that of the same cameras"))
-            scene = Scene(background=background, diameter_px=self.diameter_px[stream.name])
+            scene = CameraScene(background=background, diameter_px=self.diameter_px[stream.name])
             views.append(CameraView.of(stream.name, stream.camera, scene))
         order = list(self.backgrounds)
         if [view.name for view in views] != order:

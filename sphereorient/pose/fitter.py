@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera
-from sphereorient.locate import Background, Scene
+from sphereorient.locate import Background, CameraScene
 from sphereorient.pose.fit import FittedPoses, PoseStart, refine
 from sphereorient.pose.learn_light import learn_light
 from sphereorient.pose.light import FIRST, LATER, Light, Shading
@@ -42,7 +42,7 @@ class CameraView:
     sight: LinesOfSight
 
     @classmethod
-    def of(cls, name: str, camera: Camera, scene: Scene) -> CameraView:
+    def of(cls, name: str, camera: Camera, scene: CameraScene) -> CameraView:
         """Return the view of a camera whose scene is known."""
         background, diameter_px = scene.background, scene.diameter_px
         return cls(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))

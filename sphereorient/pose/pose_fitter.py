@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from sphereorient.cameras import Camera
 from sphereorient.errors import ShapeError, check_tail, refusal
-from sphereorient.locate import Background, Scene
+from sphereorient.locate import Background, CameraScene
 from sphereorient.pose.fitter import CameraView, base_table, first_fitter
 
 STEPS = (("coarse", 4), ("middle", 3), ("fine", 4))  # pyramid levels, and iterations at each
@@ -48,7 +48,7 @@ class PoseFitter(nn.Module):
             width, height = camera.image_size
             mean = np.zeros((height, width), np.float32) if background is None else _grey(background[k])
             noise = np.full(mean.shape, NOISE, np.float32)
-            scene = Scene(
+            scene = CameraScene(
                 background=Background(mean=mean, noise=noise, full_scale=float("inf")), diameter_px=diameter_px
             )
             views.append(CameraView.of(f"camera {k + 1}", camera, scene))

@@ -1,6 +1,6 @@
 """The record of one camera in a trajectory, and its group in the file."""
 
-# ruff: noqa: RUF009 -- column returns a dataclass field without a default
+# ruff: noqa: RUF009 -- stored returns a dataclass field without a default
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import ShapeError, TrackError, refusal
-from sphereorient.trajectory.columns import (
-    Column,
-    blank,
+from sphereorient.trajectory.datasets import (
+    DatasetSpec,
+    blank_datasets,
     check_shapes,
-    column,
-    columns,
     inside,
-    read_column,
-    read_columns,
-    write_column,
-    write_columns,
+    read_dataset,
+    read_datasets,
+    stored,
+    stored_fields,
+    write_dataset,
+    write_datasets,
 )
 from sphereorient.trajectory.reasons import Reason
 
 LONGEST_NAME = 100  # characters
 AGAIN = "write the track again"
-REASON = Column("1", "why this camera has no orientation in the frame; ok where it has one")
+REASON = DatasetSpec("1", "why this camera has no orientation in the frame; ok where it has one")
 Floats = NDArray[np.float64]
 
 
@@ -36,19 +36,19 @@ Floats = NDArray[np.float64]
 class CameraTrack:
     """Results of one camera, N frames; the candidates of frame k are the rows offset[k] .. offset[k + 1]."""
 
-    centre_px: Floats = column("px", "projection of the sphere's centre, (u, v)", 2)
-    radius_px: Floats = column("px", "radius of the outline")
-    outline_rms_px: Floats = column("px", "rms distance of the edge points from the fitted outline")
-    orientation: Floats = column("1", "R_lab_body of this camera's own best candidate", 3, 3)
-    orientation_cov: Floats = column("rad^2", "covariance of delta, R_true = exp([delta]x) R, lab components", 3, 3)
-    score: Floats = column("1", "agreement of the picture with the map at this orientation, 0 to 1")
-    xi: Floats = column("rad", "the paper's measure of this camera's noise; its moving variance weighs the cameras")
+    centre_px: Floats = stored("px", "projection of the sphere's centre, (u, v)", 2)
+    radius_px: Floats = stored("px", "radius of the outline")
+    outline_rms_px: Floats = stored("px", "rms distance of the edge points from the fitted outline")
+    orientation: Floats = stored("1", "R_lab_body of this camera's own best candidate", 3, 3)
+    orientation_cov: Floats = stored("rad^2", "covariance of delta, R_true = exp([delta]x) R, lab components", 3, 3)
+    score: Floats = stored("1", "agreement of the picture with the map at this orientation, 0 to 1")
+    xi: Floats = stored("rad", "the paper's measure of this camera's noise; its moving variance weighs the cameras")
     reason: tuple[str, ...]  # N values of Reason; a newer file may name reasons that Reason does not know yet
-    candidate_offset: NDArray[np.int64] = column(
+    candidate_offset: NDArray[np.int64] = stored(
         "1", "candidates of frame k are the rows offset[k] .. offset[k + 1]", dtype="int64", fill=0, rows="offsets"
     )
-    candidate_orientation: Floats = column("1", "R_lab_body of every candidate", 3, 3, rows="candidates")
-    candidate_score: Floats = column("1", "score of every candidate", rows="candidates")
+    candidate_orientation: Floats = stored("1", "R_lab_body of every candidate", 3, 3, rows="candidates")
+    candidate_score: Floats = stored("1", "score of every candidate", rows="candidates")
 
     def __post_init__(self) -> None:
         """Compare the lengths of the parts."""
@@ -65,7 +65,7 @@ class CameraTrack:
         counts = np.diff(self.candidate_offset)
         kept = np.isin(np.repeat(np.arange(len(counts)), counts), rows)
         parts = {}
-        for name, c in columns(type(self)):
+        for name, c in stored_fields(type(self)):
             parts[name] = getattr(self, name)[kept if c.rows == "candidates" else rows]
         parts["candidate_offset"] = np.concatenate([[0], np.cumsum(counts[rows])])
         return replace(self, **parts, reason=tuple(self.reason[k] for k in rows.tolist()))
@@ -73,15 +73,15 @@ class CameraTrack:
     @classmethod
     def empty(cls, frames: int) -> Self:
         """Return the record of a camera that found nothing in `frames` frames."""
-        return cls(reason=(Reason.NOT_FOUND,) * frames, **blank(cls, frames))
+        return cls(reason=(Reason.NOT_FOUND,) * frames, **blank_datasets(cls, frames))
 
 
 def write_camera(camera: CameraTrack, group: h5py.Group) -> None:
     """Write the datasets of one camera."""
-    write_columns(camera, group)
+    write_datasets(camera, group)
     # of fixed length: HDF5 stores strings of varying length apart from their dataset
     width = max([16, *map(len, camera.reason)])
-    write_column(group, "reason", np.array([str(r) for r in camera.reason], f"S{width}"), REASON)
+    write_dataset(group, "reason", np.array([str(r) for r in camera.reason], f"S{width}"), REASON)
 
 
 def read_camera(cameras: h5py.Group, name: str) -> CameraTrack:
@@ -91,5 +91,5 @@ def read_camera(cameras: h5py.Group, name: str) -> CameraTrack:
         label = f"{cameras.file.filename}: cameras"
         raise TrackError(refusal(label, expected="groups with names", got=repr(name)[:60], do=AGAIN))
     known = {str(reason): reason for reason in Reason}
-    texts = [text.decode() for text in read_column(group, "reason", "S").tolist()]
-    return CameraTrack(reason=tuple(known.get(text, text) for text in texts), **read_columns(group, CameraTrack))
+    texts = [text.decode() for text in read_dataset(group, "reason", "S").tolist()]
+    return CameraTrack(reason=tuple(known.get(text, text) for text in texts), **read_datasets(group, CameraTrack))

@@ -1,6 +1,6 @@
 """The result of a measurement: position, orientation and motion of one sphere, and what each camera saw."""
 
-# ruff: noqa: RUF009 -- column returns a dataclass field without a default
+# ruff: noqa: RUF009 -- stored returns a dataclass field without a default
 
 from __future__ import annotations
 
@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 from sphereorient.errors import OutputError, ShapeError, TrackError, refusal
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
 from sphereorient.trajectory.camera import AGAIN, CameraTrack, read_camera, write_camera
-from sphereorient.trajectory.columns import blank, check_shapes, column, columns, inside, read_columns, write_columns
+from sphereorient.trajectory.datasets import (
+    blank_datasets,
+    check_shapes,
+    inside,
+    read_datasets,
+    stored,
+    stored_fields,
+    write_datasets,
+)
 from sphereorient.trajectory.reasons import Flag, Reason
 
 if TYPE_CHECKING:
@@ -47,45 +55,45 @@ class Trajectory:
     Make one with `Trajectory.empty` and `dataclasses.replace`; `track[10:50]` is a part of it.
     """
 
-    time: Floats = column("s", "frame number of the experiment / frame rate; middle of the exposure")
-    valid: NDArray[np.bool_] = column("1", "orientation and position measured in this frame", dtype="bool", fill=0)
-    position: Floats = column("mm", "centre of the sphere, lab", 3)
-    position_cov: Floats = column("mm^2", "covariance of position", 3, 3)
-    orientation: Floats = column("1", "R_lab_body: columns are the body axes in the lab", 3, 3)
-    orientation_cov: Floats = column("rad^2", "covariance of delta, R_true = exp([delta]x) R, lab components", 3, 3)
-    position_systematic_cov: Floats = column(
+    time: Floats = stored("s", "frame number of the experiment / frame rate; middle of the exposure")
+    valid: NDArray[np.bool_] = stored("1", "orientation and position measured in this frame", dtype="bool", fill=0)
+    position: Floats = stored("mm", "centre of the sphere, lab", 3)
+    position_cov: Floats = stored("mm^2", "covariance of position", 3, 3)
+    orientation: Floats = stored("1", "R_lab_body: columns are the body axes in the lab", 3, 3)
+    orientation_cov: Floats = stored("rad^2", "covariance of delta, R_true = exp([delta]x) R, lab components", 3, 3)
+    position_systematic_cov: Floats = stored(
         "mm^2",
         "covariance of the error of position that the calibration leaves, shared by all frames",
         3,
         3,
         since="0.2",
     )
-    orientation_systematic_cov: Floats = column(
+    orientation_systematic_cov: Floats = stored(
         "rad^2", "covariance of delta that the calibration leaves, shared by all frames", 3, 3, since="0.2"
     )
-    position_smooth: Floats = column("mm", "the smoother's position, lab", 3)
-    position_smooth_cov: Floats = column("mm^2", "covariance of position_smooth", 3, 3)
-    orientation_smooth: Floats = column("1", "the smoother's R_lab_body", 3, 3)
-    orientation_smooth_cov: Floats = column("rad^2", "covariance of orientation_smooth, as orientation_cov", 3, 3)
-    velocity: Floats = column("m/s", "velocity of the centre, lab", 3)
-    velocity_sigma: Floats = column("m/s", "standard deviation of velocity", 3)
-    acceleration: Floats = column("m/s^2", "acceleration of the centre, lab", 3)
-    acceleration_sigma: Floats = column("m/s^2", "standard deviation of acceleration", 3)
-    omega_lab: Floats = column("rad/s", "angular velocity, dR/dt R^T = [omega_lab]x, lab components", 3)
-    omega_lab_sigma: Floats = column("rad/s", "standard deviation of omega_lab", 3)
-    omega_body: Floats = column("rad/s", "angular velocity, body components: R^T omega_lab", 3)
-    omega_body_sigma: Floats = column("rad/s", "standard deviation of omega_body", 3)
-    alpha_lab: Floats = column("rad/s^2", "angular acceleration, lab components: derivative of omega_lab", 3)
-    alpha_lab_sigma: Floats = column("rad/s^2", "standard deviation of alpha_lab", 3)
-    alpha_body: Floats = column("rad/s^2", "angular acceleration, body components: R^T alpha_lab", 3)
-    alpha_body_sigma: Floats = column("rad/s^2", "standard deviation of alpha_body", 3)
-    segment: NDArray[np.int64] = column("1", "number of the segment, -1 outside any", dtype="int64", fill=-1)
-    flags: NDArray[np.uint32] = column("1", "bit mask, named in the attribute bits", dtype="uint32", fill=0)
-    confidence: Floats = column("1", "probability of the chosen orientation among the candidates")
-    margin: Floats = column(
+    position_smooth: Floats = stored("mm", "the smoother's position, lab", 3)
+    position_smooth_cov: Floats = stored("mm^2", "covariance of position_smooth", 3, 3)
+    orientation_smooth: Floats = stored("1", "the smoother's R_lab_body", 3, 3)
+    orientation_smooth_cov: Floats = stored("rad^2", "covariance of orientation_smooth, as orientation_cov", 3, 3)
+    velocity: Floats = stored("m/s", "velocity of the centre, lab", 3)
+    velocity_sigma: Floats = stored("m/s", "standard deviation of velocity", 3)
+    acceleration: Floats = stored("m/s^2", "acceleration of the centre, lab", 3)
+    acceleration_sigma: Floats = stored("m/s^2", "standard deviation of acceleration", 3)
+    omega_lab: Floats = stored("rad/s", "angular velocity, dR/dt R^T = [omega_lab]x, lab components", 3)
+    omega_lab_sigma: Floats = stored("rad/s", "standard deviation of omega_lab", 3)
+    omega_body: Floats = stored("rad/s", "angular velocity, body components: R^T omega_lab", 3)
+    omega_body_sigma: Floats = stored("rad/s", "standard deviation of omega_body", 3)
+    alpha_lab: Floats = stored("rad/s^2", "angular acceleration, lab components: derivative of omega_lab", 3)
+    alpha_lab_sigma: Floats = stored("rad/s^2", "standard deviation of alpha_lab", 3)
+    alpha_body: Floats = stored("rad/s^2", "angular acceleration, body components: R^T alpha_lab", 3)
+    alpha_body_sigma: Floats = stored("rad/s^2", "standard deviation of alpha_body", 3)
+    segment: NDArray[np.int64] = stored("1", "number of the segment, -1 outside any", dtype="int64", fill=-1)
+    flags: NDArray[np.uint32] = stored("1", "bit mask, named in the attribute bits", dtype="uint32", fill=0)
+    confidence: Floats = stored("1", "probability of the chosen orientation among the candidates")
+    margin: Floats = stored(
         "1", "negative log-likelihood of the next distinct orientation less that of the chosen one", since="0.2"
     )
-    margin_angle: Floats = column("rad", "angle between these two; NaN where no other one was looked for", since="0.2")
+    margin_angle: Floats = stored("rad", "angle between these two; NaN where no other one was looked for", since="0.2")
     cameras: Mapping[str, CameraTrack]
     frame_rate: float  # Hz
     method: str  # paper, precise
@@ -138,7 +146,7 @@ class Trajectory:
             fields: frame_rate (Hz; NaN for uneven times), method, settings (YAML), experiment, provenance (for JSON).
         """
         known = {"frame_rate": np.nan, "method": "", "settings": "", "experiment": "", "provenance": {}} | fields
-        datasets = blank(cls, len(time)) | {"time": np.asarray(time, "float64")}
+        datasets = blank_datasets(cls, len(time)) | {"time": np.asarray(time, "float64")}
         return cls(cameras={name: CameraTrack.empty(len(time)) for name in cameras}, **datasets, **known)
 
     def save(self, path: str | Path) -> None:
@@ -158,7 +166,7 @@ class Trajectory:
             file.attrs["provenance"] = json.dumps(self.provenance, sort_keys=True)
             for name in (*TEXTS, "frame_rate"):
                 file.attrs[name] = getattr(self, name)
-            write_columns(self, file)
+            write_datasets(self, file)
             file["flags"].attrs["bits"] = json.dumps({flag.name: flag.value for flag in Flag})
             cameras = file.create_group("cameras")
             for name in sorted(self.cameras):
@@ -205,7 +213,7 @@ class Trajectory:
 
     def at(self, rows: NDArray[np.int64]) -> Self:
         """Return the frames of increasing `rows`."""
-        parts = {name: getattr(self, name)[rows] for name, _ in columns(type(self))}
+        parts = {name: getattr(self, name)[rows] for name, _ in stored_fields(type(self))}
         return replace(self, **parts, cameras={name: camera.at(rows) for name, camera in self.cameras.items()})
 
     def to_pandas(self) -> pd.DataFrame:
@@ -225,7 +233,7 @@ class Trajectory:
             raise OutputError(refusal("to_pandas", expected="the package pandas", got="none", do=do)) from error
         table: dict[str, NDArray[Any]] = {"time_s": self.time}
         table |= {name: getattr(self, name) for name in ("valid", "segment", "flags", "confidence")}
-        for name, c in columns(Trajectory):
+        for name, c in stored_fields(Trajectory):
             if c.tail == (3,):
                 unit = c.units.replace("^", "").replace("/", "_")
                 table |= {f"{name}_{axis}_{unit}": getattr(self, name)[:, i] for i, axis in enumerate("xyz")}
@@ -298,7 +306,7 @@ def _read(file: h5py.File) -> dict[str, Any]:
             label = f"{file.filename}: attribute {name}"
             raise TrackError(refusal(label, expected="a value", got="none", do=AGAIN))
     cameras = inside(file, "cameras")
-    return read_columns(file, Trajectory) | {
+    return read_datasets(file, Trajectory) | {
         "cameras": {name: read_camera(cameras, name) for name in cameras or ()},
         "frame_rate": float(file.attrs["frame_rate"]),
         "provenance": json.loads(file.attrs["provenance"]),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from locate_examples import SETTINGS, sightings
 from torch import Tensor
 
-from sphereorient.locate import LocateSettings, repair
+from sphereorient.locate import LocateSettings, fill_gaps
 from sphereorient.locate.gaps import known_stretches
 from sphereorient.trajectory import Flag, Reason
 
@@ -43,7 +43,7 @@ def with_outliers(centre_px: Tensor, *wrong: int, by: tuple[float, float] = (7.0
 @pytest.mark.parametrize("by", [(7.0, -4.0), (0.0, 5.0), (-60.0, 0.0)])
 def test_outliers_are_replaced_and_flagged(by):
     wrong = [20, 55, 56, 90]
-    fixed = repair(sightings(with_outliers(path(), *wrong, by=by)), SETTINGS)
+    fixed = fill_gaps(sightings(with_outliers(path(), *wrong, by=by)), SETTINGS)
     assert torch.nonzero(fixed.flags)[:, 0].tolist() == wrong
     assert (fixed.flags[wrong] == REPLACED).all()
     assert ((fixed.centre_px - path(noise_px=0.0)).norm(dim=1)[wrong] < 0.6).all()
@@ -54,7 +54,7 @@ def test_outliers_are_replaced_and_flagged(by):
 def test_an_outlier_of_the_radius_is_one():
     radius = torch.full((N,), 39.0, dtype=torch.float64)
     radius[40] = 46.0
-    fixed = repair(sightings(path(), radius_px=radius), SETTINGS)
+    fixed = fill_gaps(sightings(path(), radius_px=radius), SETTINGS)
     assert torch.nonzero(fixed.flags)[:, 0].tolist() == [40]
     assert abs(fixed.radius_px[40] - 39.0) < 0.5
 
@@ -63,7 +63,7 @@ def test_measured_values_stay_to_the_last_bit():
     wrong, lost = [30, 70], [50, 51]
     seen = sightings(without(with_outliers(path(), *wrong), *lost), radius_px=39 + 0.1 * torch.rand(N).double())
     before = [part.clone() for part in (seen.centre_px, seen.radius_px, seen.outline_rms_px, seen.flags)]
-    fixed = repair(seen, SETTINGS)
+    fixed = fill_gaps(seen, SETTINGS)
     kept = [k for k in range(N) if k not in wrong + lost]
     for name in ("centre_px", "radius_px", "outline_rms_px", "coverage", "flags"):
         assert torch.equal(getattr(fixed, name)[kept], getattr(seen, name)[kept]), name
@@ -76,7 +76,7 @@ def test_measured_values_stay_to_the_last_bit():
 @pytest.mark.parametrize("length", [1, 2, 3, 4])
 def test_short_gaps_are_filled_and_flagged(length):
     lost = list(range(60, 60 + length))
-    fixed = repair(sightings(without(path(), *lost)), SETTINGS)
+    fixed = fill_gaps(sightings(without(path(), *lost)), SETTINGS)
     assert torch.nonzero(fixed.flags)[:, 0].tolist() == lost
     assert (fixed.flags[lost] == INTERPOLATED).all()
     assert ((fixed.centre_px - path(noise_px=0.0)).norm(dim=1)[lost] < 0.8).all()
@@ -90,7 +90,7 @@ def test_short_gaps_are_filled_and_flagged(length):
 def test_longer_gaps_stay_empty(length):
     """The paper: under five frames."""
     lost = list(range(60, 60 + length))
-    fixed = repair(sightings(without(path(), *lost)), SETTINGS)
+    fixed = fill_gaps(sightings(without(path(), *lost)), SETTINGS)
     assert fixed.centre_px[lost].isnan().all()
     assert fixed.radius_px[lost].isnan().all()
     assert (fixed.flags == 0).all()
@@ -99,13 +99,13 @@ def test_longer_gaps_stay_empty(length):
 
 def test_the_longest_gap_is_a_setting():
     seen = sightings(without(path(), *range(60, 66)))
-    assert repair(seen, LocateSettings(gap_frames_max=6)).placed.all()
-    assert repair(sightings(without(path(), 60)), LocateSettings(gap_frames_max=0)).placed.sum() == N - 1
+    assert fill_gaps(seen, LocateSettings(gap_frames_max=6)).placed.all()
+    assert fill_gaps(sightings(without(path(), 60)), LocateSettings(gap_frames_max=0)).placed.sum() == N - 1
 
 
 def test_a_gap_is_filled_between_its_neighbours_without_overshoot():
     lost = [60, 61, 62]
-    fixed = repair(sightings(without(path(), *lost)), SETTINGS)
+    fixed = fill_gaps(sightings(without(path(), *lost)), SETTINGS)
     for axis in range(2):
         low, high = sorted(fixed.centre_px[[59, 63], axis].tolist())
         assert ((fixed.centre_px[lost, axis] >= low) & (fixed.centre_px[lost, axis] <= high)).all()
@@ -113,7 +113,7 @@ def test_a_gap_is_filled_between_its_neighbours_without_overshoot():
 
 def test_a_sphere_that_leaves_the_view_is_no_error():
     gone = [*range(10), *range(40, 70), *range(110, N)]
-    fixed = repair(sightings(without(path(), *gone)), SETTINGS)
+    fixed = fill_gaps(sightings(without(path(), *gone)), SETTINGS)
     assert fixed.centre_px[gone].isnan().all()
     assert fixed.placed.sum() == N - len(gone)
     assert (fixed.flags == 0).all()
@@ -121,7 +121,7 @@ def test_a_sphere_that_leaves_the_view_is_no_error():
 
 @pytest.mark.parametrize("frames", [0, 1, 5])
 def test_a_sphere_that_is_never_seen_is_no_error(frames):
-    fixed = repair(sightings(torch.full((frames, 2), torch.nan)), SETTINGS)
+    fixed = fill_gaps(sightings(torch.full((frames, 2), torch.nan)), SETTINGS)
     assert len(fixed) == frames
     assert not fixed.placed.any()
 
@@ -129,13 +129,13 @@ def test_a_sphere_that_is_never_seen_is_no_error(frames):
 @pytest.mark.parametrize("frames", [1, 2, 8, 15])
 def test_tracks_too_short_to_judge_are_untouched(frames):
     seen = sightings(with_outliers(path(frames), frames // 2, by=(30.0, 0.0)))
-    fixed = repair(seen, SETTINGS)
+    fixed = fill_gaps(seen, SETTINGS)
     assert torch.equal(fixed.centre_px, seen.centre_px)
     assert (fixed.flags == 0).all()
 
 
 def test_gaps_of_short_tracks_are_filled_nevertheless():
-    fixed = repair(sightings(without(path(8), 3, 4)), SETTINGS)
+    fixed = fill_gaps(sightings(without(path(8), 3, 4)), SETTINGS)
     assert fixed.flags.tolist() == [0, 0, 0, INTERPOLATED, INTERPOLATED, 0, 0, 0]
 
 
@@ -147,7 +147,7 @@ def test_fast_motion_makes_no_outliers(period, seed):
     omega = 2 * torch.pi / period
     wave = torch.stack([torch.sin(omega * k), torch.cos(omega * k)], dim=1) / omega**2
     noise = torch.randn(240, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    fixed = repair(sightings(300 + wave + 0.2 * noise), SETTINGS)
+    fixed = fill_gaps(sightings(300 + wave + 0.2 * noise), SETTINGS)
     assert (fixed.flags == 0).all()
 
 
@@ -155,18 +155,18 @@ def test_fast_motion_makes_no_outliers(period, seed):
 def test_steady_acceleration_makes_no_outliers(seed):
     k = torch.arange(40, dtype=torch.float64) - 20
     noise = torch.randn(40, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    fixed = repair(sightings(300 + torch.stack([0.5 * k**2, 3 * k], dim=1) + 0.2 * noise), SETTINGS)
+    fixed = fill_gaps(sightings(300 + torch.stack([0.5 * k**2, 3 * k], dim=1) + 0.2 * noise), SETTINGS)
     assert (fixed.flags == 0).all()
 
 
 def test_an_outlier_at_either_end_is_replaced():
-    fixed = repair(sightings(with_outliers(path(), 0, N - 1)), SETTINGS)
+    fixed = fill_gaps(sightings(with_outliers(path(), 0, N - 1)), SETTINGS)
     assert torch.nonzero(fixed.flags)[:, 0].tolist() == [0, N - 1]
     assert ((fixed.centre_px - path(noise_px=0.0)).norm(dim=1)[[0, N - 1]] < 2.0).all()
 
 
 def test_an_outlier_beside_a_gap_does_not_bend_what_fills_it():
-    fixed = repair(sightings(without(with_outliers(path(), 62), 60, 61)), SETTINGS)
+    fixed = fill_gaps(sightings(without(with_outliers(path(), 62), 60, 61)), SETTINGS)
     assert (fixed.flags[60:62] == INTERPOLATED).all()
     assert fixed.flags[62] == REPLACED
     assert ((fixed.centre_px - path(noise_px=0.0)).norm(dim=1)[60:63] < 1.0).all()
@@ -175,7 +175,7 @@ def test_an_outlier_beside_a_gap_does_not_bend_what_fills_it():
 def test_flags_that_were_there_stay():
     flags = torch.zeros(N, dtype=torch.int64)
     flags[5] = int(Flag.ONE_CAMERA)
-    assert repair(sightings(path(), flags=flags), SETTINGS).flags[5] == int(Flag.ONE_CAMERA)
+    assert fill_gaps(sightings(path(), flags=flags), SETTINGS).flags[5] == int(Flag.ONE_CAMERA)
 
 
 @given(st.lists(st.booleans(), max_size=40), st.integers(0, 5))

@@ -18,7 +18,7 @@ LARGEST_RATIO = 1200  # largest compression ratio: a dataset that claims more is
 
 
 @dataclass(frozen=True)
-class Column:
+class DatasetSpec:
     """One dataset of the file."""
 
     units: str
@@ -30,25 +30,25 @@ class Column:
     rows: str = "frames"  # or offsets (frames + 1), or candidates
 
 
-def column(units: str, description: str, *tail: int, **more: Any) -> Any:
+def stored(units: str, description: str, *tail: int, **more: Any) -> Any:
     """Declare a field of a record that is a dataset of the file."""
-    return field(metadata={KEY: Column(units, description, tail, **more)})
+    return field(metadata={KEY: DatasetSpec(units, description, tail, **more)})
 
 
-def columns(record: type[Any]) -> Iterator[tuple[str, Column]]:
-    """Yield field name and column of every dataset of a record, in the order of the table."""
+def stored_fields(record: type[Any]) -> Iterator[tuple[str, DatasetSpec]]:
+    """Yield field name and specification of every dataset of a record, in order."""
     return ((entry.name, entry.metadata[KEY]) for entry in fields(record) if KEY in entry.metadata)
 
 
-def blank(record: type[Any], frames: int) -> dict[str, NDArray[Any]]:
+def blank_datasets(record: type[Any], frames: int) -> dict[str, NDArray[Any]]:
     """Return every dataset of a record with nothing measured."""
     rows = {"frames": frames, "offsets": frames + 1, "candidates": 0}
-    return {name: np.full((rows[c.rows], *c.tail), c.fill, c.dtype) for name, c in columns(record)}
+    return {name: np.full((rows[c.rows], *c.tail), c.fill, c.dtype) for name, c in stored_fields(record)}
 
 
 def check_shapes(record: object, rows: Mapping[str, int]) -> None:
-    """Refuse a record in which a dataset has another shape than the table says."""
-    for name, c in columns(type(record)):
+    """Refuse a record in which a dataset has another shape than declared."""
+    for name, c in stored_fields(type(record)):
         expected, got = (rows[c.rows], *c.tail), np.shape(getattr(record, name))
         if got != expected:
             label = f"{type(record).__name__}.{name}"
@@ -56,31 +56,31 @@ def check_shapes(record: object, rows: Mapping[str, int]) -> None:
             raise ShapeError(refusal(label, expected=f"shape {expected}", got=str(got), do=do))
 
 
-def write_columns(record: Any, group: h5py.Group) -> None:
+def write_datasets(record: Any, group: h5py.Group) -> None:
     """Write all datasets of a record."""
-    for name, c in columns(type(record)):
-        write_column(group, _place(name), np.asarray(getattr(record, name), c.dtype), c)
+    for name, c in stored_fields(type(record)):
+        write_dataset(group, _place(name), np.asarray(getattr(record, name), c.dtype), c)
 
 
-def write_column(group: h5py.Group, place: str, values: NDArray[Any], column: Column) -> None:
+def write_dataset(group: h5py.Group, place: str, values: NDArray[Any], spec: DatasetSpec) -> None:
     """Write one dataset with unit and description; without times, so that equal arrays give equal bytes."""
     dataset = group.create_dataset(place, data=values, track_times=False)
-    dataset.attrs["units"], dataset.attrs["description"] = column.units, column.description
+    dataset.attrs["units"], dataset.attrs["description"] = spec.units, spec.description
 
 
-def read_columns(group: h5py.Group, record: type[Any]) -> dict[str, NDArray[Any]]:
+def read_datasets(group: h5py.Group, record: type[Any]) -> dict[str, NDArray[Any]]:
     """Return all datasets of a record by field name; those that an older version did not write are blank."""
     known = {
-        name: read_column(group, _place(name), c.dtype).astype(c.dtype)
-        for name, c in columns(record)
+        name: read_dataset(group, _place(name), c.dtype).astype(c.dtype)
+        for name, c in stored_fields(record)
         if not c.since or _place(name) in group
     }
-    if len(known) == sum(1 for _ in columns(record)):
+    if len(known) == sum(1 for _ in stored_fields(record)):
         return known
-    return blank(record, len(next(iter(known.values())))) | known
+    return blank_datasets(record, len(next(iter(known.values())))) | known
 
 
-def read_column(group: h5py.Group, place: str, dtype: str) -> NDArray[Any]:
+def read_dataset(group: h5py.Group, place: str, dtype: str) -> NDArray[Any]:
     """Return the values of a dataset; refuse, before reading, one in other files or of an impossible size."""
     dataset = inside(group, place)
     got = ""
