@@ -1,6 +1,6 @@
 """Which candidate is true: the paper's path and its two cameras; the second-order path; the same as a layer."""
 
-from sphereorient.assemble.differentiable import expected_orientation, soft_track
+from sphereorient.assemble.differentiable import SoftTrack, expected_orientation, soft_track
 from sphereorient.assemble.layer import PathLayer
 from sphereorient.assemble.path import Path, assemble_path, assemble_paths, edge_costs
 from sphereorient.assemble.second_order import Chosen, Hypotheses, physical_path
@@ -18,6 +18,7 @@ __all__ = [
     "PathSettings",
     "ShortestPath",
     "SoftPath",
+    "SoftTrack",
     "assemble_path",
     "assemble_paths",
     "edge_costs",

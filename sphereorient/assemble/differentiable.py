@@ -6,12 +6,24 @@ track to a camera, the light and the texture map.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble.trellis import SoftPath, soft_path
+from sphereorient.assemble.trellis import soft_path
 from sphereorient.errors import SettingsError, check_tail, refusal
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SoftTrack:
+    """Mean poses of N frames over their candidates, NaN in frames without any; differentiable."""
+
+    R_lab_body: Tensor  # (..., N, 3, 3)
+    position_lab_mm: Tensor  # (..., N, 3)
+    marginals: Tensor  # (..., N, C), probability of each candidate
+    free_energy: Tensor  # (...), of the soft path
 
 
 def soft_track(
@@ -22,7 +34,7 @@ def soft_track(
     *,
     turn_rad: float,
     temperature: float = 1.0,
-) -> tuple[Tensor, Tensor, SoftPath]:
+) -> SoftTrack:
     """Weigh candidates by their fit to the pictures and by the rotation from frame to frame; return their mean poses.
 
     Args:
@@ -32,10 +44,6 @@ def soft_track(
         mask: (..., N, C) bool, True for a candidate.
         turn_rad: standard deviation of the rotation from one frame to the next; over a gap it grows with the frames.
         temperature: of the soft path, in units of the costs.
-
-    Returns:
-        R_lab_body (..., N, 3, 3) and position_lab_mm (..., N, 3), NaN in frames without candidates, and the soft path;
-        differentiable in candidates and misfits.
 
     Raises:
         ShapeError: the parts are not of the same frames and candidates.
@@ -51,7 +59,12 @@ def soft_track(
     X = torch.where(mask[..., None], position_lab_mm, 0.0)
     soft = soft_path(turning_costs(R, mask, turn_rad), mask, temperature, torch.where(mask, misfit, 0.0))
     position = torch.where(mask.any(-1)[..., None], (soft.marginals[..., None] * X).sum(-2), torch.nan)
-    return expected_orientation(R, soft.marginals), position, soft
+    return SoftTrack(
+        R_lab_body=expected_orientation(R, soft.marginals),
+        position_lab_mm=position,
+        marginals=soft.marginals,
+        free_energy=soft.free_energy,
+    )
 
 
 def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
