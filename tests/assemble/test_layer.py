@@ -297,11 +297,8 @@ def test_learnt_settings_are_read_by_track_and_change_its_path(rng, tmp_path):
     nll[10:30, 0] = 4 * 2.0
     twin = R @ so3.exp(torch.tensor([0.0, 0.0, torch.pi], dtype=torch.float64))
     nll[:10, 1] = nll[30:, 1] = 4 * 1.5
-    every = movie(
-        R,
-        torch.where((torch.arange(40) % 2 == 0)[:, None, None], twin, so3.random_rotations(40, generator=rng)),
-        nll=nll,
-    )
+    anywhere = so3.random_rotations(40, generator=rng)
+    every = movie(R, torch.where((torch.arange(40) % 2 == 0)[:, None, None], twin, anywhere), nll=nll)
     hypotheses = Hypotheses(
         R_lab_body=every["R_lab_body"],
         nll=nll,
