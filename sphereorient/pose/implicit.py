@@ -1,12 +1,12 @@
 """A converged fit of poses with its derivatives, by the implicit function theorem (docs/differentiable.md).
 
 At the least sum r(pose, theta)^2 / 2 the gradient g(pose, theta) is 0, and stays 0 when theta changes: so
-d pose / d theta = -H^-1 dg/dtheta with H = dg/dpose. `implicit_pose` fits without a graph and then takes one Newton step
--H^-1 g with H a constant: its value is close to 0, its derivative that of the theorem. theta stands for all tensors with
-gradients from which the residuals are computed.
+d pose / d theta = -H^-1 dg/dtheta with H = dg/dpose. `implicit_pose` fits without a graph and then takes one Newton
+step -H^-1 g with H a constant: its value is close to 0, its derivative that of the theorem. theta stands for all
+tensors with gradients from which the residuals are computed.
 
-The fit of `track` cannot serve: it works in single precision and holds weights, light and slopes of the texture fixed in
-each step, so that its zero is not the zero of a function that autograd can differentiate.
+The fit of `track` cannot serve: it works in single precision and holds weights, light and slopes of the texture fixed
+in each step, so that its zero is not the zero of a function that autograd can differentiate.
 """
 
 from __future__ import annotations
@@ -128,8 +128,8 @@ def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: i
 def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
     """Apply small errors (B, 6), rad and mm, lab components, from the left, to poses (docs/conventions.md).
 
-    Cayley's rotation replaces the exponential: equal up to the third order, and smooth at 0, where so3.exp has no second
-    derivative.
+    Cayley's rotation replaces the exponential: equal up to the third order, and smooth at 0, where so3.exp has no
+    second derivative.
     """
     half = so3.hat(0.5 * delta[..., :3])
     scale = 2.0 / (1.0 + 0.25 * delta[..., :3].square().sum(-1))
