@@ -1,4 +1,4 @@
-"""How long the dynamic programming layer takes: both semirings, first and second order.
+"""Time the dynamic programming over candidates: shortest and soft path, first and second order.
 
     scripts/bench_assembly.py [--frames 15000] [--candidates 10] [--threads 2]
 
@@ -16,10 +16,8 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble import edge_costs, shortest_path
-from sphereorient.assemble.path_weights import PathWeights, Weights
-from sphereorient.assemble.second_order_layer import shortest_path_of_pairs, soft_path_of_pairs
-from sphereorient.assemble.soft_path import SoftPath, soft_path
+from sphereorient.assemble import PathLayer, PathSettings, SoftPath, edge_costs, shortest_path, soft_path
+from sphereorient.assemble.layer import triple_costs
 
 REPETITIONS = 3
 RATE_HZ = 600.0
@@ -49,18 +47,23 @@ def rows(frames: int, width: int) -> dict[str, tuple[float, ...]]:
     score = torch.rand(frames, width, generator=rng, dtype=torch.float64)
     time_s = torch.arange(frames, dtype=torch.float64) / RATE_HZ
     mask, variance = torch.ones(frames, width, dtype=torch.bool), torch.full_like(score, 1e-4)
-    weights = PathWeights(Weights(acceleration_rad_s2=1000.0)).requires_grad_(False)
+    parameters = PathLayer(settings=PathSettings(acceleration_rad_s2=1000.0)).requires_grad_(False).cost(R)
 
     def pairs() -> Tensor:
         return edge_costs(R, score, time_s)
 
     def triples() -> Tensor:
-        return weights.triple_costs(R, variance, time_s, mask)
+        return triple_costs(parameters, R, variance, time_s, mask)
 
     out = {}
     for name, costs, shortest, soft in (
         ("first", pairs, shortest_path, soft_path),
-        ("second", triples, shortest_path_of_pairs, soft_path_of_pairs),
+        (
+            "second",
+            triples,
+            lambda cost, mask: shortest_path(None, mask, triple_cost=cost),
+            lambda cost, mask: soft_path(None, mask, triple_cost=cost),
+        ),
     ):
         cost = costs()
         out[name] = (

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble.differentiable import SoftTrack, soft_track
+from sphereorient.assemble import SoftTrack, soft_track
 from sphereorient.cameras import PinholeCamera, Rays, triangulate
 from sphereorient.cameras.parameters import ROTATION, with_parameters
 from sphereorient.pose.implicit import ImplicitPose, implicit_pose

@@ -1,11 +1,12 @@
-"""Learn the weights of the path of pairs from synthetic movies, and compare them with hand-set ones on other movies.
+"""Learn the settings of the second-order path from synthetic movies; compare them with the defaults on other movies.
 
-    scripts/learn_path.py [--frames 240] [--movies 24] [--steps 120] [--honest]
+    scripts/learn_path.py [--frames 240] [--movies 24] [--steps 120] [--honest] [--out learnt.yaml]
 
 No pictures: true orientations with noise among false candidates, with likelihoods that overlap. The likelihoods claim
 three times the nats that they are worth and the orientations' sigmas are claimed 1.7 times too small, as fits to
 pictures do that leave out what neighbouring pixels share; with --honest both are worth what they claim. Learning:
-gradient through the soft path of the mean negative log probability of what is true, over whole movies. Prints Markdown.
+gradient through the soft path of the mean negative log probability of what is true, over whole movies. Prints Markdown;
+--out writes the learnt settings to a file that `sphereorient track --settings` reads.
 """
 
 from __future__ import annotations
@@ -13,15 +14,17 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
+import yaml
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble import Hypotheses, PathSettings, physical_path
-from sphereorient.assemble.path_weights import Frames, PathWeights, Weights
+from sphereorient.assemble import Hypotheses, PathLayer, PathSettings, physical_path
+from sphereorient.assemble.second_order_cost import PARAMETERS
 from sphereorient.statistics.reliability import reliability
 from sphereorient.synth.motion import random_motion
 
@@ -30,7 +33,7 @@ FALSE = 4  # false candidates beside the true one
 SIGMA_DEG, APART = 0.5, 1.5  # of the orientations; sigmas between the scores of right and wrong
 LOSS_BEGINS, LOSS_LASTS, EMPTY, STANDS = 0.03, 0.6, 0.01, 0.7
 HELD_OUT = 10_000  # first seed of the movies that are not learnt from
-HAND_SET = Weights(acceleration_rad_s2=math.radians(0.5) * RATE_HZ**2)  # PathSettings' numbers, START_DEG's middle
+DEFAULT = PathSettings(acceleration_rad_s2=math.radians(0.5) * RATE_HZ**2)  # START_DEG's middle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +48,7 @@ class Claims:
 class Labelled:
     """Movies with the place of the true candidate."""
 
-    frames: Frames
+    frames: dict[str, Tensor]  # arguments of PathLayer
     place: Tensor  # (B, N) int64, of C candidates; C where none is right, also in empty frames
 
 
@@ -94,79 +97,79 @@ def draw(seed: int, frames: int, claims: Claims) -> Labelled:
     row = torch.arange(frames)[:, None]
     place = torch.where(missing | ~there[:, 0], width, (order == 0).long().argmax(-1))
     nll = claims.nats * APART * score
-    parts = Frames(
-        R_lab_body=noisy(every, sigma, rng)[row, order][None],
-        nll=(nll - nll.amin(-1, keepdim=True))[row, order][None],
-        variance_rad2=(claims.sigma * sigma)[row, order].square()[None],
-        mask=there.expand(frames, width)[None],
-        time_s=(torch.arange(frames, dtype=torch.float64) / RATE_HZ)[None],
-    )
+    parts = {
+        "R_lab_body": noisy(every, sigma, rng)[row, order][None],
+        "score": -(nll - nll.amin(-1, keepdim=True))[row, order][None],
+        "variance_rad2": (claims.sigma * sigma)[row, order].square()[None],
+        "mask": there.expand(frames, width)[None],
+        "time_s": (torch.arange(frames, dtype=torch.float64) / RATE_HZ)[None],
+    }
     return Labelled(frames=parts, place=place[None])
 
 
 def movies(first_seed: int, count: int, frames: int, claims: Claims) -> Labelled:
     """Some movies as one batch."""
     each = [draw(first_seed + k, frames, claims) for k in range(count)]
-    parts = {entry.name: torch.cat([getattr(x.frames, entry.name) for x in each]) for entry in fields(Frames)}
-    return Labelled(frames=Frames(**parts), place=torch.cat([x.place for x in each]))
+    parts = {name: torch.cat([x.frames[name] for x in each]) for name in each[0].frames}
+    return Labelled(frames=parts, place=torch.cat([x.place for x in each]))
 
 
-def surprise(marginals: Tensor, known: Labelled) -> Tensor:
+def true_nll(marginals: Tensor, known: Labelled) -> Tensor:
     """Negative log probability of what is true, (B, N), nats; NaN in empty frames."""
     probability = marginals.gather(-1, known.place[..., None])[..., 0]
-    return torch.where(known.frames.mask.any(-1), -probability.clamp_min(1e-12).log(), torch.nan)
+    return torch.where(known.frames["mask"].any(-1), -probability.clamp_min(1e-12).log(), torch.nan)
 
 
-def learn(known: Labelled, begin: Weights, steps: int) -> Weights:
-    """Adam on the logarithms of the weights."""
-    model = PathWeights(begin)
+def learn(known: Labelled, begin: PathSettings, steps: int) -> PathSettings:
+    """Adam on the parameters of the layer."""
+    model = PathLayer(2, soft=1.0, settings=begin)
     optimizer = torch.optim.Adam(model.parameters(), lr=0.1)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
         optimizer.zero_grad()
-        loss = surprise(model.soft_path(known.frames).marginals, known).nanmean()
+        loss = true_nll(model(**known.frames).marginals, known).nanmean()
         loss.backward()
         optimizer.step()
         schedule.step()
-    return model.weights()
+    learnt = model.settings
+    assert isinstance(learnt, PathSettings)
+    return learnt
 
 
 @torch.no_grad()
-def answer(weights: Weights, known: Labelled) -> Answer:
-    """What the path of pairs says: the shortest path, and its places' marginals."""
-    model = PathWeights(weights)
-    marginals, choice = model.soft_path(known.frames).marginals, model.shortest_path(known.frames).choice
-    width = known.frames.mask.shape[-1]
+def answer(settings: PathSettings, known: Labelled) -> Answer:
+    """The shortest path of the layer, and the marginals of its places."""
+    marginals = PathLayer(2, soft=1.0, settings=settings)(**known.frames).marginals
+    choice = PathLayer(2, settings=settings)(**known.frames).choice
+    width = known.frames["mask"].shape[-1]
     choice = torch.where(choice < 0, width, choice)
     confidence = marginals.gather(-1, choice[..., None])[..., 0]
-    return Answer(choice=choice, confidence=confidence, nll=surprise(marginals, known))
+    return Answer(choice=choice, confidence=confidence, nll=true_nll(marginals, known))
 
 
-def physical_answer(known: Labelled) -> Answer:
-    """What `physical_path`, the pipeline's, says; it learns the acceleration from each movie."""
-    parts, width = known.frames, known.frames.mask.shape[-1]
+def physical_answer(settings: PathSettings, known: Labelled) -> Answer:
+    """The path of `track`."""
+    parts, width = known.frames, known.frames["mask"].shape[-1]
     choices, posteriors = [], []
-    for b in range(len(parts.mask)):
-        covariance = parts.variance_rad2[b][..., None, None] * torch.eye(3, dtype=torch.float64)
-        every = Hypotheses(
-            R_lab_body=parts.R_lab_body[b], nll=parts.nll[b], covariance_rad2=covariance, mask=parts.mask[b]
-        )
-        path = physical_path(every, parts.time_s[b], PathSettings())
+    for R, score, variance, mask, time_s in zip(*parts.values(), strict=True):
+        covariance = variance[..., None, None] * torch.eye(3, dtype=torch.float64)
+        every = Hypotheses(R_lab_body=R, nll=-score, covariance_rad2=covariance, mask=mask)
+        path = physical_path(every, time_s, settings)
         choices.append(torch.where(path.choice < 0, width, path.choice))
         posteriors.append(torch.cat([path.posterior, (1 - path.posterior.sum(-1, keepdim=True)).clamp_min(0)], -1))
     choice, marginals = torch.stack(choices), torch.stack(posteriors)
     confidence = marginals.gather(-1, choice[..., None])[..., 0]
-    return Answer(choice=choice, confidence=confidence, nll=surprise(marginals, known))
+    return Answer(choice=choice, confidence=confidence, nll=true_nll(marginals, known))
 
 
 def wrong_share(said: Answer, known: Labelled) -> Tensor:
     """Share of a movie's frames with candidates in which what is chosen is not what is true, (B,)."""
-    there = known.frames.mask.any(-1)
+    there = known.frames["mask"].any(-1)
     return ((said.choice != known.place) & there).sum(-1) / there.sum(-1)
 
 
 def row(name: str, said: Answer, known: Labelled) -> str:
-    there, width = known.frames.mask.any(-1), known.frames.mask.shape[-1]
+    there, width = known.frames["mask"].any(-1), known.frames["mask"].shape[-1]
     seen = there & (known.place < width)
     wrong = wrong_share(said, known)
     false = ((said.choice != known.place) & (said.choice < width) & there).sum() / there.sum()
@@ -198,26 +201,31 @@ def main() -> None:
     parser.add_argument("--movies", type=int, default=24)
     parser.add_argument("--steps", type=int, default=120)
     parser.add_argument("--honest", action="store_true")
+    parser.add_argument("--out", type=Path, help="settings file to write the learnt settings to")
     arguments = parser.parse_args()
     claims, count = Claims(nats=1.0, sigma=1.0) if arguments.honest else Claims(), arguments.movies
     known, other = (movies(*which, arguments.frames, claims) for which in ((0, count), (HELD_OUT, 2 * count)))
     begun = time.perf_counter()
-    learnt = learn(known, HAND_SET, arguments.steps)
+    learnt = learn(known, DEFAULT, arguments.steps)
     spent = time.perf_counter() - begun
     print(f"{count} movies of {arguments.frames} frames, {arguments.steps} steps, {spent:.0f} s\n")
-    print("| weight | hand-set | learnt |\n|---|---|---|")
-    for entry in fields(Weights):
-        print(f"| {entry.name} | {getattr(HAND_SET, entry.name):.4g} | {getattr(learnt, entry.name):.4g} |")
+    if arguments.out:
+        arguments.out.write_text(yaml.safe_dump({"path": learnt.model_dump()}))
+    print("| setting | default | learnt |\n|---|---|---|")
+    for name in PARAMETERS:
+        print(f"| {name} | {getattr(DEFAULT, name):.4g} | {getattr(learnt, name):.4g} |")
     print(f"\n{2 * count} other movies:\n")
     print("| path | wrong frames, % | false one taken, % | true one there and not taken, % | nats | ECE (chance) |")
     print("|---|---|---|---|---|---|")
-    quiet = replace(HAND_SET, acceleration_rad_s2=learnt.acceleration_rad_s2)
-    said = {name: answer(w, other) for name, w in (("hand-set", HAND_SET), ("hand-set, acceleration learnt", quiet))}
-    said |= {"learnt": answer(learnt, other), "`physical_path`": physical_answer(other)}
+    quiet = DEFAULT.model_copy(update={"acceleration_rad_s2": learnt.acceleration_rad_s2})
+    said = {name: answer(s, other) for name, s in (("default", DEFAULT), ("default, acceleration learnt", quiet))}
+    said["learnt"] = answer(learnt, other)
+    said["`track`, default"] = physical_answer(PathSettings(), other)
+    said["`track`, learnt"] = physical_answer(learnt, other)
     for name, each in said.items():
         print(row(name, each, other))
-    print(f"\nLearnt against hand-set: {compared(said['learnt'], said['hand-set'], other)}.")
-    print(f"Learnt against `physical_path`: {compared(said['learnt'], said['`physical_path`'], other)}.")
+    print(f"\nLearnt against default: {compared(said['learnt'], said['default'], other)}.")
+    print(f"`track`, learnt against default: {compared(said['`track`, learnt'], said['`track`, default'], other)}.")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""From fitted candidates to one soft track: the last link of a chain from cameras, paint and light to a track's error.
+"""From fitted candidates to one soft track: means over the candidates, by their probability on the soft path.
 
-The links: `cameras` (rays), `orient.soft_picture` (grey levels), `orient.implicit` (fit of each candidate),
-`assemble.soft_path` (which candidate), here (what the track then is). docs/differentiable.md puts them together.
+docs/differentiable.md joins it to cameras, `pose.soft_picture` and `pose.implicit`: gradients reach from the error of a
+track to a camera, the light and the texture map.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble.soft_path import expected_orientation, soft_path
+from sphereorient.assemble.trellis import soft_path
 from sphereorient.errors import SettingsError, check_tail, refusal
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SoftTrack:
-    """Poses of N frames, means over candidates by their probability; made by `soft_track`."""
+    """Mean poses of N frames over their candidates, NaN in frames without any; differentiable."""
 
-    R_lab_body: Tensor  # (..., N, 3, 3), NaN in frames without candidates
-    position_lab_mm: Tensor  # (..., N, 3), NaN in frames without candidates
+    R_lab_body: Tensor  # (..., N, 3, 3)
+    position_lab_mm: Tensor  # (..., N, 3)
     marginals: Tensor  # (..., N, C), probability of each candidate
     free_energy: Tensor  # (...), of the soft path
 
@@ -35,18 +35,15 @@ def soft_track(
     turn_rad: float,
     temperature: float = 1.0,
 ) -> SoftTrack:
-    """Weigh candidates by how well they fit the pictures and how little they turn from frame to frame.
+    """Weigh candidates by their fit to the pictures and by the rotation from frame to frame; return their mean poses.
 
     Args:
-        R_lab_body: (..., N, C, 3, 3), candidates; what stands at masked ones does not matter.
-        position_lab_mm: (..., N, C, 3), theirs.
+        R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.
+        position_lab_mm: (..., N, C, 3), of the candidates.
         misfit: (..., N, C), cost of each, such as half the mean squared residual.
-        mask: (..., N, C) bool, True where there is a candidate.
-        turn_rad: standard deviation of the turn from one frame to the next; over a gap it grows with the frames.
-        temperature: of the soft path, in units of the costs; above 0.
-
-    Returns:
-        The track, differentiable in candidates and misfits.
+        mask: (..., N, C) bool, True for a candidate.
+        turn_rad: standard deviation of the rotation from one frame to the next; over a gap it grows with the frames.
+        temperature: of the soft path, in units of the costs.
 
     Raises:
         ShapeError: the parts are not of the same frames and candidates.
@@ -56,31 +53,27 @@ def soft_track(
     check_tail("position_lab_mm", position_lab_mm, *mask.shape, 3)
     check_tail("misfit", misfit, *mask.shape)
     if not turn_rad > 0:
-        raise SettingsError(refusal("turn_rad", expected="above 0", got=f"{turn_rad:g}", do="give a typical turn"))
-    view = torch.eye(3, dtype=R_lab_body.dtype, device=R_lab_body.device)
-    R = torch.where(mask[..., None, None], R_lab_body, view)  # 0 times NaN would reach the gradients
+        raise SettingsError(refusal("turn_rad", expected="above 0", got=f"{turn_rad:g}", do="give a typical rotation"))
+    unit = torch.eye(3, dtype=R_lab_body.dtype, device=R_lab_body.device)
+    R = torch.where(mask[..., None, None], R_lab_body, unit)  # 0 times NaN would reach the gradients
     X = torch.where(mask[..., None], position_lab_mm, 0.0)
-    edges = turning_costs(R, mask, turn_rad)
-    soft = soft_path(edges, mask, temperature, torch.where(mask, misfit, 0.0))
-    there = mask.any(-1)[..., None]
+    soft = soft_path(turning_costs(R, mask, turn_rad), mask, temperature, torch.where(mask, misfit, 0.0))
+    position = torch.where(mask.any(-1)[..., None], (soft.marginals[..., None] * X).sum(-2), torch.nan)
     return SoftTrack(
         R_lab_body=expected_orientation(R, soft.marginals),
-        position_lab_mm=torch.where(there, (soft.marginals[..., None] * X).sum(-2), torch.nan),
+        position_lab_mm=position,
         marginals=soft.marginals,
         free_energy=soft.free_energy,
     )
 
 
 def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
-    """Return what `soft_path` takes: half the squared turn from one candidate to the next, in units of `turn_rad`.
+    """Return the edges (..., N - 1, C, C) of `soft_track`: half the squared rotation, in units of `turn_rad`.
 
     Args:
         R_lab_body: (..., N, C, 3, 3), finite everywhere.
         mask: (..., N, C) bool; an edge into a frame comes from the last frame before it that has candidates.
         turn_rad: as `soft_track`.
-
-    Returns:
-        (..., N - 1, C, C), from row to column.
     """
     frame = torch.arange(mask.shape[-2], device=mask.device)
     last = torch.where(mask.any(-1), frame, 0).cummax(-1).values[..., :-1]  # of the frames up to each one
@@ -88,3 +81,25 @@ def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
     turn = so3.geodesic_distance(R_before[..., :, None, :, :], R_lab_body[..., 1:, None, :, :, :])
     frames = (frame[1:] - last)[..., None, None]
     return 0.5 * (turn / (turn_rad * frames)).square()
+
+
+def expected_orientation(R_lab_body: Tensor, marginals: Tensor) -> Tensor:
+    """Return the rotation with the least mean squared chord to the candidates, weighted by their probabilities.
+
+    Args:
+        R_lab_body: (..., N, C, 3, 3), candidates; NaN does not count.
+        marginals: (..., N, C), not negative.
+
+    Returns:
+        (..., N, 3, 3), differentiable in both; NaN where all marginals are 0. Where several rotations are equally near,
+        it is one of them, with a finite gradient.
+
+    Raises:
+        ShapeError: candidates and marginals do not belong together.
+
+    Source: chordal mean, Hartley et al. 2013, Rotation averaging, 5.1; projected by `so3.nearest_rotation`.
+    """
+    check_tail("R_lab_body", R_lab_body, *marginals.shape[-1:], 3, 3)
+    known = torch.where(R_lab_body.isnan(), 0.0, R_lab_body)
+    mean = so3.nearest_rotation((marginals[..., None, None].to(known) * known).sum(-3))
+    return torch.where((marginals.sum(-1) > 0)[..., None, None], mean, torch.nan)

@@ -1,7 +1,8 @@
-"""From candidates to one orientation a frame: the cheapest path of each camera."""
+"""The paper's path of each camera: costs of links, the cheapest path, its spikes and segments."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
@@ -10,19 +11,19 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from sphereorient import so3
-from sphereorient.assemble.segments import find_spikes, number_segments
 from sphereorient.assemble.settings import AssembleSettings
-from sphereorient.assemble.trellis import edge_costs, shortest_path
+from sphereorient.assemble.trellis import shortest_path
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.search import Candidates
+
+PAIRS_AT_ONCE = 1 << 16  # candidate pairs whose 3 x 3 products are held at once, 5 MB
+DEVIATIONS_PER_MAD = 1.4826  # of a normal distribution
+Graph = Sequence[Tensor]  # R (N, C, 3, 3), score (N, C), mask (N, C)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Path:
-    """One camera's chosen orientations in N frames; made by assemble, read by the fusion and the pipeline.
-
-    xi belongs to a link between two frames; it stands at the frame that the link enters, and so does its spike.
-    """
+    """Chosen orientations of one camera in N frames; xi and spike of a link stand at the frame that it enters."""
 
     choice: Tensor  # (N,) int64, row within the frame's candidates; -1 where there is none
     R_lab_body: Tensor  # (N, 3, 3), NaN where there is none
@@ -43,24 +44,20 @@ class Path:
         return self.choice >= 0
 
 
-Graph = Sequence[Tensor]  # R (N, C, 3, 3), score (N, C), mask (N, C)
-
-
 def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings) -> dict[str, Path]:
-    """Choose one candidate a frame for each camera so that the whole movie's cost is least; all cameras in one batch.
+    """Choose one candidate of each frame for each camera, by the least cost over the whole movie.
+
+    Frames without candidates are skipped: the cost of the link over them is divided by its time.
 
     Args:
-        candidates: of each camera, N frames; those below `quality_min` do not take part.
+        candidates: of each camera, N frames.
         time_s: (N,), increasing.
-        settings: of the room.
-
-    Returns:
-        Name -> path. Frames without candidates are skipped: the link over them is divided by the time it takes.
+        settings: of the path; candidates below `quality_min` are left out.
 
     Raises:
         ShapeError: a camera has another number of frames than there are times.
 
-    Source: the paper's assembly of III (directed graph between direct neighbours); ERRATA A6 for its hole.
+    Source: the paper's assembly of III (directed graph between direct neighbours); docs/errata.md A6.
     """
     for name, each in candidates.items():
         if len(each) != len(time_s):
@@ -86,7 +83,7 @@ def graph_of(candidates: Candidates, quality_min: float) -> Graph:
 
 
 def _cheapest(graphs: Mapping[str, Graph], time_s: Tensor) -> list[Tensor]:
-    """Choices of each camera in the frames that it visits; its empty frames are left out and the rest is padded."""
+    """Return the choices of each camera in the frames with candidates; all cameras go in one padded batch."""
     visited = [torch.nonzero(mask.any(1))[:, 0] for _, _, mask in graphs.values()]
     steps = max(map(len, visited), default=0)
     if steps == 0:
@@ -100,7 +97,7 @@ def _cheapest(graphs: Mapping[str, Graph], time_s: Tensor) -> list[Tensor]:
         for part in range(3)
     )
     time = pad_sequence([time_s[frames] for frames in visited], batch_first=True)
-    # Behind a movie's end stand zeros, times too: the mask keeps these edges out, whatever their costs.
+    # Behind a movie's end stand zeros, times too: the mask keeps these edges out.
     choice = shortest_path(edge_costs(R, score, time), mask).choice
     return [row[: len(frames)] for row, frames in zip(choice, visited, strict=True)]
 
@@ -127,18 +124,100 @@ def _path(graph: Graph, choice: Tensor, time_s: Tensor, settings: AssembleSettin
 
 
 def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:
-    """Return cost xi (rad/s) and angle (rad) of the link that enters each frame, (N,) each; NaN where none does.
+    """Return cost xi (rad/s) and angle (rad) of the link that enters each frame, (N,) each, NaN without a link.
 
-    Args:
-        R_lab_body: (N, 3, 3), NaN in frames that are skipped.
-        score: (N,), T, NaN in the same frames.
-        time_s: (N,).
+    R_lab_body (N, 3, 3) and score (N,), the quality T, are NaN in frames that are skipped.
     """
     frame = torch.nonzero(torch.isfinite(score))[:, 0]
     xi = torch.full_like(score, torch.nan)
     turn = torch.full_like(score, torch.nan)
     R, T = R_lab_body[frame], score[frame]
-    dt = time_s[frame].diff().to(score)  # in this order: single precision does not tell apart late times
+    dt = time_s[frame].diff().to(score)  # in this order: single precision cannot separate late times
     turn[frame[1:]] = so3.geodesic_distance(R[:-1], R[1:])
     xi[frame[1:]] = turn[frame[1:]] * (2 - T[:-1] - T[1:]) / dt
     return xi, turn
+
+
+def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
+    """Return the paper's cost from each candidate of a step to each of the next, (..., N - 1, C, C), rad/s.
+
+    It is d(A, B) (2 - T_A - T_B) / dt, rows from, columns to, in the dtype of the rotations.
+
+    Args:
+        R_lab_body: (..., N, C, 3, 3), rotations, not checked.
+        score: (..., N, C), quality T, 0 .. 1.
+        time_s: (..., N), increasing.
+
+    Raises:
+        ShapeError: the inputs are not of the same steps and candidates.
+
+    Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
+    """
+    check_tail("R_lab_body", R_lab_body, 3, 3)
+    check_tail("score", score, *R_lab_body.shape[-4:-2])
+    check_tail("time_s", time_s, *score.shape[-2:-1])
+    batch, (steps, width) = score.shape[:-2], score.shape[-2:]
+    before, after = (
+        R.flatten(0, -4) for R in (R_lab_body[..., : max(steps - 1, 0), :, :, :], R_lab_body[..., 1:, :, :, :])
+    )
+    chunk = max(1, PAIRS_AT_ONCE // max(width, 1) ** 2)
+    parts = [
+        so3.geodesic_distance(a[:, :, None], b[:, None])
+        for a, b in zip(torch.split(before, chunk), torch.split(after, chunk), strict=True)
+    ]
+    distance = torch.cat(parts).reshape(*batch, max(steps - 1, 0), width, width)
+    doubt = 2 - score[..., : max(steps - 1, 0), :, None] - score[..., 1:, None, :]
+    return distance * doubt / time_s.diff().to(distance)[..., None, None]
+
+
+def moving(values: Tensor, window: int) -> Tensor:
+    """Return windows centred on each of (N,) values, (N, window); NaN beyond the ends. Even windows grow by one."""
+    half = window // 2
+    if not len(values):
+        return values.new_zeros(0, 2 * half + 1)
+    padded = torch.nn.functional.pad(values, (half, half), value=torch.nan)
+    return padded.unfold(0, 2 * half + 1, 1)
+
+
+def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
+    """Return the links (N,) bool with xi many robust deviations (MAD) above the moving median, and a large angle.
+
+    Spikes do not raise median and MAD. A multiple of the median would not do: that of a fast sphere is large.
+
+    Args:
+        xi: (N,), rad/s, cost of the link that enters each frame; NaN without a link.
+        turn: (N,), rad, angle of that link.
+        settings: window, factor, least angle.
+
+    Source: the paper's assembly of III (spikes of xi), which gives no numbers.
+    """
+    windows = moving(xi, settings.spike_window_frames)
+    usual = windows.nanmedian(-1, keepdim=True).values
+    deviation = DEVIATIONS_PER_MAD * (windows - usual).abs().nanmedian(-1).values
+    outstanding = xi > usual[:, 0] + settings.spike_factor * deviation
+    return outstanding & (turn > math.radians(settings.spike_min_deg))
+
+
+def number_segments(present: Tensor, spike: Tensor, gap_frames_max: int) -> Tensor:
+    """Number the segments, stretches of one motion: (N,) int64 from 0, -1 outside; gaps inside belong to them.
+
+    A single wrong frame has a spike into it and one out of it: it is a segment of one frame.
+
+    Args:
+        present: (N,) bool, frames with an orientation.
+        spike: (N,) bool, frames that a spike enters.
+        gap_frames_max: longest gap inside a segment, frames.
+    """
+    frame = torch.nonzero(present)[:, 0]
+    number = torch.full(present.shape, -1, dtype=torch.int64, device=present.device)
+    if not len(frame):
+        return number
+    breaks = (frame.diff() > gap_frames_max + 1) | spike[frame[1:]]
+    of_frame = torch.nn.functional.pad(breaks.cumsum(0), (1, 0))
+    # A gap takes the number of the segment that is on both sides of it.
+    every = torch.arange(len(present), device=present.device)
+    before = torch.searchsorted(frame, every, right=True) - 1
+    after = torch.searchsorted(frame, every)
+    inside = (before >= 0) & (after < len(frame))
+    left, right = of_frame[before.clamp_min(0)], of_frame[after.clamp_max(len(frame) - 1)]
+    return torch.where(inside & (left == right), left, number)

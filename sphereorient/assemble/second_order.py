@@ -1,31 +1,39 @@
-"""The path with physics: which candidate is right, judged by the pictures and by how omega may change."""
+"""The second-order path: which candidate is right, by the pictures and by how omega changes.
+
+The scale of the angular acceleration is estimated from the path itself, in turn with the search.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.assemble.acceleration import misfits, search_and_learn
-from sphereorient.assemble.beam import Histories, Movie
-from sphereorient.assemble.continuity import Motion
-from sphereorient.assemble.segments import number_segments
+from sphereorient.assemble.beam import Histories, search
+from sphereorient.assemble.path import number_segments
+from sphereorient.assemble.second_order_cost import SecondOrderCost
 from sphereorient.assemble.settings import PathSettings
+from sphereorient.assemble.states import CandidateRows, Floats, Ints, rotated, rotation_between
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.trajectory import Flag
 
-VARIANCE_MIN = 1e-10  # rad^2; what claims to be better than 0.0006 degrees is rounding
+VARIANCE_MIN = 1e-10  # rad^2; a smaller variance (0.0006 degrees) is rounding
+LINKS_MIN = 8  # fewer do not determine an acceleration
+ROUNDS_MAX = 4
+ROUND_ENOUGH = 0.3  # a scale that changes by less, as a logarithm, changes no choice
+START_DEG = (0.1, 0.5, 2.0)  # changes of the rotation from frame to frame, one of which is near enough to begin with
+CHANGE_MAX_DEG = 10.0
+SAMPLES, SAMPLE_FRAMES = 3, 100  # parts of the movie from which the start is chosen
+FLOOR_SIGMAS = 1.0  # of a single orientation: a smaller acceleration is not seen in one frame interval
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypotheses:
-    """Possible orientations of N frames from all cameras together; made by the joint refinement, read by the path.
-
-    C places a frame, best first; those not in use may hold anything.
-    """
+    """Candidate orientations of N frames, C places each, best first; masked places may hold anything."""
 
     R_lab_body: Tensor  # (N, C, 3, 3) float64
     nll: Tensor  # (N, C) float64, negative log-likelihood of the pictures, less that of the frame's best
@@ -51,19 +59,17 @@ class Hypotheses:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Chosen:
-    """The most probable history of N frames; made by `physical_path`, read by motion and the pipeline."""
+    """The most probable history of N frames; made by `physical_path`."""
 
     choice: Tensor  # (N,) int64, place of the candidate, -1 where none is right
     R_lab_body: Tensor  # (N, 3, 3) float64, NaN where none is
     covariance_rad2: Tensor  # (N, 3, 3), NaN where none is
-    probability: Tensor  # (N,) float64, of the choice among the frame's candidates and none; NaN where none is
+    probability: Tensor  # (N,) float64, of the choice among the frame's candidates and none; NaN for none
     posterior: Tensor  # (N, C) float64, the same of each candidate, 0 where there is none
-    turn_rad: (
-        Tensor  # (N, 3), rad, lab, from the last orientation before, may exceed half a turn; NaN where none enters
-    )
-    segment: Tensor  # (N,) int64, -1 outside any; holes inside a segment belong to it
+    turn_rad: Tensor  # (N, 3), rad, lab, from the orientation before, may exceed half a turn; NaN where a motion begins
+    segment: Tensor  # (N,) int64, -1 outside any; gaps inside a segment belong to it
     flags: Tensor  # (N,) int64, bits of trajectory.Flag
-    acceleration_rad_s2: float  # scale of the angular acceleration per axis that the choice was made with
+    acceleration_rad_s2: float  # scale per axis that the choice was made with
 
     @property
     def present(self) -> Tensor:
@@ -72,27 +78,25 @@ class Chosen:
 
 
 def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings) -> Chosen:
-    """Choose in each frame the right candidate, or none, so that the movie's history is the most probable one.
+    """Choose one candidate of each frame, or none, so that the history of the movie is the most probable one.
 
-    A history says which candidate of each frame is right, that none is, or that the motion breaks off and another
-    begins. Its probability is that of the pictures and of the changes of omega from one pair of orientations to the
-    next, whatever the time between them (Student's t; the scale is learnt from the history itself). A candidate that
-    is false stands anywhere, or where one stood just before.
+    A history names the right candidate of each frame, or none, and the frames where one motion breaks off and another
+    begins. Its probability is that of `SecondOrderCost`.
 
     Args:
         hypotheses: N frames.
-        time_s: (N,), increasing, need not be even.
+        time_s: (N,), increasing, even or not.
         settings: of the path.
 
     Returns:
         The choices with their probabilities. Flags: `AMBIGUOUS` where the choice is not sure, `RECOVERED` on the first
-        frame with an orientation after frames without or a break, `SPIKE` where a turn does not follow from the motion.
+        frame with an orientation after a gap or a break, `SPIKE` where a rotation does not follow from the motion.
 
     Raises:
         ShapeError: not one time a frame.
 
-    Source: ERRATA A6 (a prior on the change of omega has no hole for candidates that stand still); textbook hidden
-        Markov model of second order.
+    Source: textbook hidden Markov model of second order; unlike the paper's cost, a prior on the change of omega does
+        not favour candidates that stand still (docs/errata.md A6).
     """
     if tuple(time_s.shape) != (len(hypotheses),):
         do, got = "pass one time a frame", str(tuple(time_s.shape))
@@ -100,44 +104,49 @@ def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings
     frames = torch.nonzero(hypotheses.mask.any(1))[:, 0].cpu()
     if not len(frames):
         return _nothing(hypotheses)
-    movie = _movie(hypotheses, time_s, frames, settings.evidence_doubt)
-    frame_s = float(time_s.detach().double().diff().median()) if len(time_s) > 1 else 1.0
-    histories, motion = search_and_learn(movie, frame_s, settings)
-    return _chosen(hypotheses, frames, movie, histories, motion, settings)
+    first = SecondOrderCost.of(settings.model_copy(update={"acceleration_rad_s2": settings.acceleration_rad_s2 or 1.0}))
+    rows = _rows(hypotheses, time_s, frames, first)
+    histories, cost = _search(rows, first, settings)
+    return _chosen(hypotheses, frames, rows, histories, cost, settings)
 
 
-def _movie(hypotheses: Hypotheses, time_s: Tensor, frames: Tensor, doubt: float) -> Movie:
-    """Rows of the candidates there are; of a covariance its mean variance: false ones are degrees away, any axis."""
+def _rows(hypotheses: Hypotheses, time_s: Tensor, frames: Tensor, cost: SecondOrderCost) -> CandidateRows:
+    """Return the candidates as rows; the variance is the mean over axes: false candidates are degrees away."""
     mask = hypotheses.mask.cpu()
-    weight = torch.softmax(torch.where(mask, -hypotheses.nll.detach().cpu().double(), -torch.inf)[frames], -1)
-    counts = mask[frames].sum(-1)
-    weight = (1 - doubt) * weight + doubt / counts[:, None]
-    variance = hypotheses.covariance_rad2.detach().cpu().double().diagonal(dim1=-2, dim2=-1).mean(-1)
-    return Movie(
+    log_weight = cost.picture_log_weight(hypotheses.nll.detach().cpu().double()[frames], mask[frames])
+    covariance = float(cost.sigma_scale) ** 2 * hypotheses.covariance_rad2.detach().cpu().double()
+    variance = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
+    return CandidateRows(
         R_lab_body=hypotheses.R_lab_body.detach().cpu().double()[mask].numpy(),
         variance=variance[mask].clamp_min(VARIANCE_MIN).numpy(),
-        log_weight=weight.log()[mask[frames]].numpy(),
-        offset=np.concatenate([[0], counts.cumsum(0).numpy()]),
+        log_weight=log_weight[mask[frames]].numpy(),
+        offset=np.concatenate([[0], mask[frames].sum(-1).cumsum(0).numpy()]),
         time_s=time_s.detach().cpu().double()[frames].numpy(),
+        frame_s=float(time_s.detach().double().diff().median()) if len(time_s) > 1 else 1.0,
     )
 
 
 def _chosen(
     hypotheses: Hypotheses,
     frames: Tensor,
-    movie: Movie,
+    rows: CandidateRows,
     histories: Histories,
-    motion: Motion,
+    cost: SecondOrderCost,
     settings: PathSettings,
 ) -> Chosen:
-    """Bring what was found from rows back to frames and places."""
+    """Convert the best history from rows to frames and places."""
     device, mask, empty = hypotheses.mask.device, hypotheses.mask.cpu(), _nothing(hypotheses)
     place = torch.arange(mask.shape[1]).expand_as(mask)[mask]
     row = torch.from_numpy(histories.row)
     seen, choice = frames[row >= 0], place[row[row >= 0]]
     posterior = empty.posterior.cpu().masked_scatter(mask, torch.from_numpy(histories.posterior))
     probability = empty.probability.cpu().index_put((seen,), posterior[seen, choice])
-    begins, spike = _breaks(frames, len(mask), movie, histories, motion, settings)
+    into, off, variance, drift = _misfits(rows, histories, cost)
+    usual = np.sqrt(variance + (cost.acceleration_rad_s2 * drift) ** 2)
+    unlikely = histories.breaks.copy()
+    unlikely[into] |= (off > settings.spike_factor * usual) & (off > math.radians(settings.spike_min_deg))
+    nowhere = torch.zeros(len(mask), dtype=torch.bool)
+    begins, spike = (nowhere.index_put((frames,), torch.from_numpy(each)) for each in (histories.begins, unlikely))
     present = torch.isfinite(probability)
     recovered = torch.zeros_like(begins)
     recovered[seen[1:]] = (begins | spike)[seen[1:]] | (seen.diff() > 1)
@@ -157,21 +166,8 @@ def _chosen(
         turn_rad=empty.turn_rad.index_put((frames.to(device),), turn),
         segment=number_segments(present, begins | spike, len(mask)).to(device),
         flags=torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0).to(device),
-        acceleration_rad_s2=motion.acceleration_rad_s2,
+        acceleration_rad_s2=float(cost.acceleration_rad_s2),
     )
-
-
-def _breaks(
-    frames: Tensor, count: int, movie: Movie, histories: Histories, motion: Motion, settings: PathSettings
-) -> tuple[Tensor, Tensor]:
-    """Frames whose orientation begins a motion, and those that physics does not explain, (N,) bool each."""
-    into, off, variance, drift = misfits(movie, histories, motion)
-    usual = np.sqrt(variance + (motion.acceleration_rad_s2 * drift) ** 2)
-    spike = histories.breaks.copy()
-    spike[into] |= (off > settings.spike_factor * usual) & (off > math.radians(settings.spike_min_deg))
-    nowhere = torch.zeros(count, dtype=torch.bool)
-    begins, spikes = (nowhere.index_put((frames,), torch.from_numpy(each)) for each in (histories.begins, spike))
-    return begins, spikes
 
 
 def _nothing(hypotheses: Hypotheses) -> Chosen:
@@ -190,3 +186,90 @@ def _nothing(hypotheses: Hypotheses) -> Chosen:
         flags=torch.zeros_like(none),
         acceleration_rad_s2=math.nan,
     )
+
+
+def _search(rows: CandidateRows, cost: SecondOrderCost, settings: PathSettings) -> tuple[Histories, SecondOrderCost]:
+    """Search, estimate the acceleration from the best history, and repeat until it stays; a given one is kept."""
+    gap = settings.gap_frames_max
+    if settings.acceleration_rad_s2 is not None:
+        return search(rows, cost, gap), cost
+    cost = _start(rows, cost, gap)
+    histories = search(rows, cost, gap)
+    for _ in range(ROUNDS_MAX):
+        scale = _acceleration(rows, [(rows, histories)], cost)
+        if abs(math.log(scale / cost.acceleration_rad_s2)) < ROUND_ENOUGH:
+            break
+        cost = replace(cost, acceleration_rad_s2=scale)
+        histories = search(rows, cost, gap)
+    return histories, cost
+
+
+def _bounds(rows: CandidateRows) -> tuple[float, float]:
+    """Return the least and largest acceleration, rad/s^2."""
+    least = FLOOR_SIGMAS * float(np.sqrt(np.median(rows.variance)))
+    most = max(math.radians(CHANGE_MAX_DEG), least)
+    return least / rows.frame_s**2, most / rows.frame_s**2
+
+
+def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> SecondOrderCost:
+    """Return the cost with the acceleration under which some parts of the movie show a motion most clearly.
+
+    The best candidates by the pictures alone are no guide: they may stand still.
+    """
+    frames, parts = len(rows.time_s), [rows]
+    if frames > SAMPLES * SAMPLE_FRAMES:
+        firsts = np.linspace(0, frames - SAMPLE_FRAMES, SAMPLES).astype(np.int64).tolist()
+        parts = [rows.part(first, first + SAMPLE_FRAMES) for first in firsts]
+    least, most = _bounds(rows)
+    best, most_evidence = cost, -math.inf
+    for change_deg in START_DEG:
+        scale = float(np.clip(math.radians(change_deg) / rows.frame_s**2, least, most))
+        trial = replace(cost, acceleration_rad_s2=scale)
+        searched = [(part, search(part, trial, gap_frames_max)) for part in parts]
+        evidence = sum(histories.evidence for _, histories in searched)
+        if evidence > most_evidence:
+            best, most_evidence = replace(trial, acceleration_rad_s2=_acceleration(rows, searched, trial)), evidence
+    return best
+
+
+def _misfits(rows: CandidateRows, histories: Histories, cost: SecondOrderCost) -> tuple[Ints, Floats, Floats, Floats]:
+    """Compare each orientation of a history with the prediction from the two before it.
+
+    Returns:
+        Frames (L,) with a prediction; angle between orientation and prediction, rad (L,); its variance per axis by the
+        orientations' own errors, rad^2 (L,); its drift per unit of acceleration, s^2 (L,).
+    """
+    frame = np.flatnonzero(histories.row >= 0)
+    row, begins = histories.row[frame], histories.begins[frame]
+    before, here, after = row[:-2], row[1:-1], row[2:]
+    steps = np.diff(rows.time_s[frame])
+    span, dt = steps[:-1], steps[1:]
+    turn = np.nan_to_num(histories.turn_rad[frame[1:-1]])
+    expected = rotated(rows.R_lab_body[here], turn * (dt / span)[:, None])
+    off, _ = rotation_between(expected, rows.R_lab_body[after])
+    errors = (rows.variance[before], rows.variance[here], rows.variance[after])
+    variance = replace(cost, acceleration_rad_s2=0.0).predicted_variance(dt, span, *errors)
+    drift = (span + dt) / 2 * dt
+    whole = ~begins[1:-1] & ~begins[2:]
+    return frame[2:][whole], off[whole], variance[whole], drift[whole]
+
+
+def _acceleration(
+    rows: CandidateRows, searched: Sequence[tuple[CandidateRows, Histories]], cost: SecondOrderCost
+) -> float:
+    """Return the scale of the acceleration in the histories of some parts of a movie, rad/s^2.
+
+    Source: textbook, expectation and maximisation of Student's t; its weights make a few wrong links harmless.
+    """
+    links = [_misfits(part, histories, cost)[1:] for part, histories in searched]
+    off, variance, drift = (np.concatenate(each) for each in zip(*links, strict=True))
+    scale, tail = float(cost.acceleration_rad_s2), float(cost.tail)
+    if len(off) < LINKS_MIN:
+        return scale
+    least, most = _bounds(rows)
+    for _ in range(50):
+        distance = off**2 / ((scale * drift) ** 2 + variance)
+        weight = (tail + 3) / (tail + distance)
+        # The root of the ratio, not the ratio: where errors make most of the misfit, whole steps would overshoot.
+        scale = float(np.clip(scale * math.sqrt(np.mean(weight * distance) / 3), least, most))
+    return scale

@@ -10,33 +10,31 @@ class AssembleSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    quality_min: float = Field(
-        0.5, ge=0, le=1, description="candidates of lower T never enter the graph; the paper's 0.5"
-    )
-    gap_frames_max: int = Field(4, ge=0, description="longest hole inside a segment, frames; the paper: under 5")
+    quality_min: float = Field(0.5, ge=0, le=1, description="least quality T of a candidate; the paper's 0.5")
+    gap_frames_max: int = Field(4, ge=0, description="longest gap inside a segment, frames; the paper: under 5")
     spike_window_frames: int = Field(
-        41, ge=5, description="frames over which xi's usual size is taken (moving median): a few turns of the velocity"
+        41, ge=5, description="window of the moving median of xi, frames: a few turns of the velocity"
     )
     spike_factor: float = Field(
         6.0,
         gt=1,
-        description="a spike is this many robust deviations (1.48 MAD) above xi's moving median; noise stays below",
+        description="a spike is this many robust deviations (1.48 MAD) above the moving median of xi",
     )
     spike_min_deg: float = Field(
         15.0,
         gt=0,
-        description="a smaller turn between frames is never a spike, however still the sphere stood; 5 fine steps",
+        description="a smaller rotation between frames is never a spike, even of a sphere at rest; 5 fine steps",
     )
     repair_deg: float = Field(
         30.0,
         gt=0,
         le=180,
-        description="cameras further apart than this are repaired, one from the other; the paper's 30",
+        description="cameras that differ by more than this are repaired, one from the other; the paper's 30",
     )
     repair_margin: float = Field(
         0.02,
         ge=0,
-        description="mean T by which one camera must beat the other in a repair; below it, continuity decides",
+        description="difference of mean T that decides a repair; below it, continuity decides",
     )
     weight_window_frames: int = Field(
         25, ge=5, description="frames of the moving variance of xi that weighs the cameras; the paper gives no number"
@@ -44,50 +42,66 @@ class AssembleSettings(BaseModel):
 
 
 class PathSettings(BaseModel):
-    """How candidates of single frames become one history: the path with physics."""
+    """How candidates of single frames become one history: the second-order path."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     acceleration_rad_s2: float | None = Field(
         None,
         gt=0,
-        description="scale of the angular acceleration per axis, rad/s^2; null: learnt from the track itself",
+        description="scale of the angular acceleration per axis, rad/s^2; null estimates it from the movie",
     )
     tail: float = Field(
         4.0,
         gt=2,
-        description="degrees of freedom of the Student-t of omega's change; small: sudden changes are less unlikely",
+        description="degrees of freedom of the Student-t of omega's change; smaller makes sudden changes less unlikely",
     )
     miss_probability: float = Field(
-        0.01, gt=0, lt=1, description="that no candidate of a frame is right although one was in the frame before"
+        0.01, gt=0, lt=1, description="probability that no candidate of a frame is right after a frame in which one was"
     )
     miss_again_probability: float = Field(
-        0.5, gt=0, lt=1, description="that no candidate is right after a frame in which none was: misses come in bursts"
+        0.5,
+        gt=0,
+        lt=1,
+        description="probability that no candidate is right after a frame in which none was; misses come in bursts",
     )
     break_probability: float = Field(
-        1.0e-5, gt=0, lt=1, description="that the motion does not go on from one frame with an orientation to the next"
+        1.0e-5, gt=0, lt=1, description="probability that the motion breaks off between two frames with an orientation"
     )
     stuck_probability: float = Field(
-        0.3, gt=0, lt=0.5, description="that a false candidate stands where one stood in a frame before (glare, dirt)"
+        0.3,
+        gt=0,
+        lt=0.5,
+        description="probability that a false candidate stands where one stood in a frame before (glare, dirt)",
     )
     follow_probability: float = Field(
         2.0e-3,
         gt=0,
         lt=0.5,
-        description="that a false candidate moves on like the sphere (the twin of a symmetric map)",
+        description="probability that a false candidate follows the motion (the twin of a symmetric texture map)",
     )
     evidence_doubt: float = Field(
-        0.01, gt=0, lt=1, description="that the pictures say nothing on which of a frame's candidates is right"
+        0.01, gt=0, lt=1, description="probability that the pictures do not show which candidate of a frame is right"
+    )
+    evidence_scale: float = Field(
+        1.0, gt=0, description="factor on the nats that the pictures claim; below 1 where they claim too much"
+    )
+    sigma_scale: float = Field(
+        1.0, gt=0, description="factor on the sigmas that the orientations claim; above 1 where they claim too little"
     )
     gap_frames_max: int = Field(
-        16, ge=0, description="longest hole inside a segment, in usual frame intervals; beyond, a new segment begins"
+        16,
+        ge=0,
+        description="longest gap inside a segment, in usual frame intervals; a longer one begins a new segment",
     )
     probability_min: float = Field(
         0.9, ge=0, le=1, description="a chosen orientation that is less probable is flagged as ambiguous"
     )
     spike_factor: float = Field(
-        8.0, gt=1, description="a turn this many standard deviations off what the motion predicts is a spike"
+        8.0, gt=1, description="a rotation this many standard deviations off the prediction of the motion is a spike"
     )
     spike_min_deg: float = Field(
-        10.0, gt=0, description="a turn less than this off the prediction is never a spike, however smooth the motion"
+        10.0,
+        gt=0,
+        description="a rotation less than this off the prediction is never a spike, however smooth the motion",
     )

@@ -1,4 +1,8 @@
-"""The dynamic programming layer: the cheapest path through candidates, whole movies at once."""
+"""Dynamic programming over candidates of whole movies: the cheapest path, or the probabilities of all paths.
+
+A state is the last candidate (first order) or the last two (second order). Costs add along a path. Paths that meet in a
+state are combined by the least cost (min-plus semiring), or by -T log sum exp(-cost / T) (log semiring).
+"""
 
 from __future__ import annotations
 
@@ -7,175 +11,265 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sphereorient import so3
-from sphereorient.assemble.semiring import MIN_PLUS, Semiring
-from sphereorient.assemble.visits import Visits, visits_of
-from sphereorient.errors import ShapeError, check_tail, refusal
-
-PAIRS_AT_ONCE = 1 << 16  # candidate pairs whose 3 x 3 products are held at once, 5 MB
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Swept:
-    """What `sweep` carried along M steps; a state is the last one (C) or two (C, C) candidates of a path."""
-
-    totals: Tensor  # (..., M, *state), less the levels of the step and of all before it
-    level: Tensor  # (..., M), taken off in each step
-    origins: Tensor | None  # (..., M - 1, *state) int64, the oldest candidate of the state before; None: all of them
+from sphereorient.errors import SettingsError, ShapeError, refusal
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ShortestPath:
-    """One candidate in each step of each movie; made by `shortest_path`, read by path."""
+    """One candidate in each step of each movie."""
 
-    choice: Tensor  # (..., N) int64, -1 in steps without candidates
-    cost: Tensor  # (...), sum of the path's edges; differentiable in the edge costs
-
-
-def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
-    """Return the paper's cost of going from each candidate of a step to each of the next.
-
-    Args:
-        R_lab_body: (..., N, C, 3, 3), rotations, not checked.
-        score: (..., N, C), quality T, 0 .. 1.
-        time_s: (..., N), increasing.
-
-    Returns:
-        (..., N - 1, C, C), d(A, B) (2 - T_A - T_B) / dt, rad/s; row: from, column: to; dtype of
-        the rotations, whatever that of the times.
-
-    Raises:
-        ShapeError: the inputs are not of the same steps and candidates.
-
-    Source: the paper's assembly of III; ERRATA A6 for its hole (a standstill costs nothing).
-    """
-    check_tail("R_lab_body", R_lab_body, 3, 3)
-    check_tail("score", score, *R_lab_body.shape[-4:-2])
-    check_tail("time_s", time_s, *score.shape[-2:-1])
-    batch, (steps, width) = score.shape[:-2], score.shape[-2:]
-    before, after = (
-        R.flatten(0, -4) for R in (R_lab_body[..., : max(steps - 1, 0), :, :, :], R_lab_body[..., 1:, :, :, :])
-    )
-    chunk = max(1, PAIRS_AT_ONCE // max(width, 1) ** 2)
-    parts = [
-        so3.geodesic_distance(a[:, :, None], b[:, None])
-        for a, b in zip(torch.split(before, chunk), torch.split(after, chunk), strict=True)
-    ]
-    distance = torch.cat(parts).reshape(*batch, max(steps - 1, 0), width, width)
-    doubt = 2 - score[..., : max(steps - 1, 0), :, None] - score[..., 1:, None, :]
-    return distance * doubt / time_s.diff().to(distance)[..., None, None]
+    choice: Tensor  # (..., N) int64, -1 in steps without candidates, and in all where no path has a finite cost
+    cost: Tensor  # (...), of the path, inf where there is none; differentiable in all costs
 
 
-def shortest_path(edge_cost: Tensor, mask: Tensor) -> ShortestPath:
-    """Find the global minimum over all paths that visit one candidate in each step.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SoftPath:
+    """Probabilities of the candidates, each path weighing exp(-cost / temperature); differentiable in all costs."""
 
-    A step without candidates is skipped: an edge that leads into step k + 1 comes from the last step before it that
-    has candidates. So movies with different holes, or of different length (empty steps at the end), go in one batch.
+    free_energy: Tensor  # (...), -T log of the sum over all paths; inf where there is none, 0 without candidates
+    marginals: Tensor  # (..., N, C), sum 1 in steps with candidates, 0 in others and where there is no path
+    pair_marginals: Tensor  # (..., N - 1, C, C), of edge k into step k + 1, from the step visited last; 0 into others
+
+
+def shortest_path(
+    edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None = None, triple_cost: Tensor | None = None
+) -> ShortestPath:
+    """Find the cheapest path that visits one candidate in each step.
+
+    Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with candidates.
+    Movies with different gaps, or of different length (empty steps at the end), share a batch.
 
     Args:
-        edge_cost: (..., N - 1, C, C), from row to column, any sign, inf where there is no way; what stands on edges
-            of masked candidates does not matter.
-        mask: (..., N, C) bool, True where there is a candidate.
+        edge_cost: (..., N - 1, C, C), from row to column, any sign, inf for a wall; None: 0, with `triple_cost` only.
+        mask: (..., N, C) bool, True for a candidate; costs of masked candidates do not matter.
+        node_cost: (..., N, C), of a candidate by itself.
+        triple_cost: (..., N - 2, C, C, C), of three candidates in the order of time; makes the path of second order.
 
     Returns:
-        The path; of equally cheap ones the one that ends in, and then comes from, the lowest index. Where no path has
-        a finite cost, choice is -1 in all steps and the cost inf. A movie without candidates costs 0.
+        The path; of equally cheap ones the one that ends in, and then comes from, the lowest index.
 
     Raises:
         ShapeError: costs and mask do not belong together.
 
-    Source: Bellman 1957, Viterbi 1967; min-plus algebra.
+    Source: Bellman 1957, Viterbi 1967.
     """
-    check_edges(edge_cost, mask)
+    order = _checked_order(edge_cost, mask, node_cost, triple_cost)
     if 0 in mask.shape[-2:]:
-        choice = mask.new_full(mask.shape[:-1], -1, dtype=torch.int64)
-        return ShortestPath(choice=choice, cost=edge_cost.sum((-3, -2, -1)))
-    visits = visits_of(mask)
-    swept = sweep(*first_order(edge_cost.detach(), visits), MIN_PLUS)
-    assert swept.origins is not None
-    last = swept.totals[..., -1, :]
-    held = _walk_back(last.argmin(-1, keepdim=True), swept.origins).gather(-1, visits.rank)
-    blocked = torch.isinf(last).all(-1)
-    choice = torch.where(visits.visited & ~blocked[..., None], held, -1)
-    cost = torch.where(blocked, torch.inf, _cost_along(edge_cost, held, visits.visited))
-    return ShortestPath(choice=choice, cost=cost)
-
-
-def check_edges(edge_cost: Tensor, mask: Tensor) -> None:
-    """Refuse edges (..., N - 1, C, C) that do not belong to a mask (..., N, C).
-
-    Raises:
-        ShapeError: they do not.
-    """
-    *_, steps, width = mask.shape
-    if edge_cost.shape != (*mask.shape[:-2], max(steps - 1, 0), width, width):
-        got = f"{tuple(edge_cost.shape)} and {tuple(mask.shape)}"
-        do = "compute edges between neighbours"
-        raise ShapeError(refusal("edge_cost and mask", expected="(..., N - 1, C, C) and (..., N, C)", got=got, do=do))
-
-
-def first_order(edge_cost: Tensor, visits: Visits, node_cost: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return what `sweep` takes: totals of the first step (..., C) and edges (..., M - 1, C, C), without holes.
-
-    Args:
-        edge_cost: (..., N - 1, C, C), as `shortest_path`.
-        visits: of the mask.
-        node_cost: (..., N, C), what a candidate costs whatever comes before; None: nothing.
-    """
-    edges, start = visits.rows(edge_cost, back=1, first=1), edge_cost.new_zeros(visits.mask[..., 0, :].shape)
-    if node_cost is not None:
-        node = visits.rows(node_cost)
-        edges, start = edges + node[..., 1:, None, :], start + node[..., 0, :]
-    edges = torch.where(visits.real[..., 1:, None, None], edges, 0.0)
-    usable = visits.mask[..., :-1, :, None] & visits.mask[..., 1:, None, :]
-    start = torch.where(visits.real[..., :1], start, 0.0)
-    return torch.where(visits.mask[..., 0, :], start, torch.inf), torch.where(usable, edges, torch.inf)
-
-
-def sweep(start: Tensor, edges: Tensor, semiring: Semiring, order: int = 1) -> Swept:
-    """Carry totals from the first step to the last: the recursion, whatever the semiring and the order.
-
-    Args:
-        start: (..., *state), totals of the first step: of each candidate (C,) in the first order, of each pair of the
-            candidate before and this one (C, C) in the second; inf where there is none.
-        edges: (..., M - 1, *state, C), cost of going on from each state to each candidate of the next step, inf where
-            there is no way.
-        semiring: the sum over origins, the oldest candidates of the states; the product along the way.
-        order: 1 or 2, the number of candidates in a state.
-    """
-    axis = -order - 1  # of the origins, once the candidates of the next step stand behind the state
-    level = start.new_zeros(start.shape[: start.ndim - order])
-    total, totals, levels, origins = start, [start], [level], []
-    for edge in edges.unbind(axis - 1):  # a recursion: each step needs the one before
-        total, origin = semiring.sum(semiring.product(total.unsqueeze(-1), edge), axis)
-        if semiring.levelled:
-            level = total.amin(tuple(range(-order, 0)), keepdim=True).clamp_max(torch.finfo(total.dtype).max)
-            total, level = total - level, level.flatten(-order)[..., 0]
-        totals.append(total)
-        levels.append(level)
-        if origin is not None:
-            origins.append(origin)
-    none = edges.new_zeros((*start.shape[: start.ndim - order], 0, *start.shape[start.ndim - order :]))
-    known = torch.stack(origins, dim=axis) if origins else none.to(torch.int64)
-    return Swept(
-        totals=torch.stack(totals, dim=axis),
-        level=torch.stack(levels, dim=-1),
-        origins=None if semiring.levelled else known,
+        none = mask.new_full(mask.shape[:-1], -1, dtype=torch.int64)
+        return ShortestPath(choice=none, cost=_like(edge_cost, triple_cost).new_zeros(mask.shape[:-2]))
+    visits = _visits_of(mask)
+    start, edges = _laid_out(edge_cost, node_cost, triple_cost, visits)
+    total, origins = start.detach(), []
+    for edge in edges.detach().unbind(-order - 2):  # a recursion: each step needs the one before
+        arriving = total.unsqueeze(-1) + edge
+        # Not min(): it wakes all threads for the smallest tensor, which on busy cores takes ten times as long.
+        origin = arriving.argmin(-order - 1)
+        total = arriving.gather(-order - 1, origin.unsqueeze(-order - 1)).squeeze(-order - 1)
+        origins.append(origin)
+    walk = _walk_back(total, origins, order)
+    blocked = total.flatten(-order).amin(-1) >= _wall(total) / 2
+    held = walk[..., order - 1 :].gather(-1, visits.rank)
+    return ShortestPath(
+        choice=torch.where(visits.visited & ~blocked[..., None], held, -1),
+        cost=torch.where(blocked, torch.inf, _cost_along(start, edges, walk, order)),
     )
 
 
-def _walk_back(end: Tensor, origin: Tensor) -> Tensor:
-    """Follow the origins from the end (..., 1), (..., N): the index held in each step, also in empty ones."""
-    walk = [end]
-    for k in range(origin.shape[-2] - 1, -1, -1):
-        walk.append(origin[..., k, :].gather(-1, walk[-1]))
+def soft_path(
+    edge_cost: Tensor | None,
+    mask: Tensor,
+    temperature: float = 1.0,
+    node_cost: Tensor | None = None,
+    triple_cost: Tensor | None = None,
+) -> SoftPath:
+    """Weigh all paths that visit one candidate in each step; towards temperature 0 only `shortest_path` remains.
+
+    Args:
+        edge_cost: as `shortest_path`.
+        mask: as `shortest_path`.
+        temperature: above 0, unit of the costs.
+        node_cost: as `shortest_path`.
+        triple_cost: as `shortest_path`.
+
+    Raises:
+        ShapeError: costs and mask do not belong together.
+        SettingsError: the temperature is not above 0.
+
+    Source: Baum and others 1970 (forward-backward); Mensch and Blondel 2018, Differentiable dynamic programming.
+    """
+    order = _checked_order(edge_cost, mask, node_cost, triple_cost)
+    if not 0 < temperature < torch.inf:
+        do = "for temperature 0 take the shortest path"
+        raise SettingsError(refusal("temperature", expected="a number above 0", got=str(temperature), do=do))
+    like, width = _like(edge_cost, triple_cost), mask.shape[-1]
+    if 0 in mask.shape[-2:]:
+        pairs = like.new_zeros((*mask.shape[:-2], max(mask.shape[-2] - 1, 0), width, width))
+        return SoftPath(free_energy=pairs.sum((-3, -2, -1)), marginals=like.new_zeros(mask.shape), pair_marginals=pairs)
+    visits = _visits_of(mask)
+    free, first, links = _all_paths(*_laid_out(edge_cost, node_cost, triple_cost, visits), order, temperature)
+    if order == 2:
+        first, links = first.sum(-2), links.sum(-3)
+    nodes = torch.cat([first[..., None, :], links.sum(-2)], -2)
+    blocked = free >= _wall(free) / 2
+    nodes, links = (torch.where(blocked[(..., *[None] * tail)], 0.0, part) for tail, part in ((2, nodes), (3, links)))
+    # Behind its end a movie waits in place 0 with probability 1: `spread` leaves that out.
+    before = torch.zeros_like(nodes[..., :1, :, None] * nodes[..., :1, None, :])
+    return SoftPath(
+        free_energy=torch.where(blocked, torch.inf, free),
+        marginals=visits.spread(nodes),
+        pair_marginals=visits.spread(torch.cat([before, links], -3))[..., 1:, :, :],
+    )
+
+
+def _all_paths(start: Tensor, edges: Tensor, order: int, temperature: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Sum over all paths: free energy (...), probability of each first state, and of each edge, like `edges`."""
+    axis, state = -order - 1, tuple(range(-order, 0))  # of the origins in an edge; of a state
+    total, totals, levels = start, [start], [start.new_zeros(start.shape[: start.ndim - order])]
+    for edge in edges.unbind(axis - 1):
+        total = -temperature * torch.logsumexp((total.unsqueeze(-1) + edge) / -temperature, axis)
+        # Only differences count: less each step's least total, long movies keep their digits in single precision.
+        level = total.detach().amin(state, keepdim=True)
+        total = total - level
+        totals.append(total)
+        levels.append(level.flatten(-order)[..., 0])
+    free = -temperature * torch.logsumexp(total / -temperature, state) + torch.stack(levels).sum(0)
+    if len(totals) > 1:
+        shares = torch.softmax((torch.stack(totals[:-1], axis).unsqueeze(-1) + edges) / -temperature, axis)
+    else:
+        shares = edges
+    weight = torch.softmax((total / -temperature).flatten(-order), -1).reshape(total.shape)
+    weights = [weight]
+    for share in reversed(shares.unbind(axis - 1)):
+        weight = (share * weight.unsqueeze(axis)).sum(-1)
+        weights.append(weight)
+    links = shares * torch.stack(weights[-2::-1], axis).unsqueeze(axis) if len(weights) > 1 else edges
+    return free, weight, links
+
+
+def _laid_out(
+    edge_cost: Tensor | None, node_cost: Tensor | None, triple_cost: Tensor | None, visits: _Visits
+) -> tuple[Tensor, Tensor]:
+    """Return totals of the first step (..., *state) and edges (..., M - 1, *state, C) of the steps visited."""
+    mask, real = visits.mask, visits.real
+    start = _like(edge_cost, triple_cost).new_zeros(mask[..., 0, :].shape)
+    edges = start.new_zeros((*mask[..., 1:, :].shape, mask.shape[-1]))
+    if edge_cost is not None:
+        edges = edges + visits.rows(edge_cost, 1)
+    if node_cost is not None:
+        node = visits.rows(node_cost, 0)
+        edges, start = edges + node[..., 1:, None, :], start + node[..., 0, :]
+    start = torch.where(mask[..., 0, :], torch.where(real[..., :1], start, 0.0), torch.inf)
+    edges = torch.where(real[..., 1:, None, None], edges, 0.0)
+    edges = torch.where(mask[..., :-1, :, None] & mask[..., 1:, None, :], edges, torch.inf)
+    if triple_cost is not None:
+        # Before the first step stands place 0 alone.
+        alone = (torch.arange(mask.shape[-1], device=mask.device) == 0).expand_as(mask[..., :1, :])
+        start = torch.where(alone[..., 0, :, None], start[..., None, :], torch.inf)
+        triples = edges.new_zeros((*edges.shape[:-3], min(edges.shape[-3], 1), *[mask.shape[-1]] * 3))
+        if edges.shape[-3] > 1:
+            late = torch.where(real[..., 2:, None, None, None], visits.rows(triple_cost, 2), 0.0)
+            triples = torch.cat([triples, late], -4)
+        older = torch.cat([alone, mask[..., :-2, :]], -2)[..., : edges.shape[-3], :, None, None]
+        edges = torch.where(older, triples + edges[..., None, :, :], torch.inf)
+    # Finite walls: differences of infinities would be NaN. Costs are far smaller, and nothing passes a wall.
+    return start.clamp_max(_wall(start)), edges.clamp_max(_wall(edges))
+
+
+def _wall(like: Tensor) -> float:
+    return float(torch.finfo(like.dtype).max ** 0.5)
+
+
+def _walk_back(last: Tensor, origins: list[Tensor], order: int) -> Tensor:
+    """Follow the origins from the cheapest last state: (..., M), in the second order (..., M + 1)."""
+    width = last.shape[-1]
+    if order == 1:
+        walk = [last.argmin(-1, keepdim=True)]
+    else:
+        end = last.mT.flatten(-2).argmin(-1, keepdim=True)  # of equals the lowest last place, then the lowest before
+        walk = [end // width, end % width]
+    for origin in reversed(origins):
+        state = walk[-1] if order == 1 else walk[-1] * width + walk[-2]
+        walk.append(origin.flatten(-order).gather(-1, state))
     return torch.cat(walk[::-1], dim=-1)
 
 
-def _cost_along(edge_cost: Tensor, held: Tensor, visited: Tensor) -> Tensor:
-    """Sum of the edges of a path, (...): the minimum's subgradient is 1 on these edges and 0 elsewhere."""
-    width = edge_cost.shape[-1]
-    linked = visited[..., 1:] & (visited.cumsum(-1) > 0)[..., :-1]
-    flat = held[..., :-1] * width + held[..., 1:]
-    along = edge_cost.flatten(-2).gather(-1, flat[..., None])[..., 0]
-    return torch.where(linked, along, 0.0).sum(-1)
+def _cost_along(start: Tensor, edges: Tensor, walk: Tensor, order: int) -> Tensor:
+    """Return the cost (...) of a path; its gradient is the minimum's subgradient."""
+    power = edges.shape[-1] ** torch.arange(order, -1, -1, device=walk.device)
+    edge = (walk.unfold(-1, order + 1, 1) * power).sum(-1)
+    first = (walk[..., :order] * power[1:]).sum(-1, keepdim=True)
+    along = edges.flatten(-order - 1).gather(-1, edge[..., None])[..., 0]
+    return start.flatten(-order).gather(-1, first)[..., 0] + along.sum(-1)
+
+
+def _like(edge_cost: Tensor | None, triple_cost: Tensor | None) -> Tensor:
+    found = triple_cost if triple_cost is not None else edge_cost
+    if found is None:
+        raise ShapeError(refusal("edge_cost", expected="costs of edges or triples", got="none", do="pass one of them"))
+    return found
+
+
+def _checked_order(edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None, triple_cost: Tensor | None) -> int:
+    """Refuse costs that do not belong to the mask; return the order of the path."""
+    _like(edge_cost, triple_cost)
+    *batch, steps, width = mask.shape
+    for name, cost, back in (
+        ("node_cost", node_cost, 0),
+        ("edge_cost", edge_cost, 1),
+        ("triple_cost", triple_cost, 2),
+    ):
+        expected = (*batch, max(steps - back, 0), *[width] * (back + 1))
+        if cost is not None and cost.shape != expected:
+            got, do = str(tuple(cost.shape)), "compute the costs of all candidates of the mask"
+            raise ShapeError(refusal(name, expected=f"shape {expected} for this mask", got=got, do=do))
+    return 1 if triple_cost is None else 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Visits:
+    """The M steps that a movie visits at most; one that visits fewer waits behind its end in place 0, at no cost."""
+
+    step: Tensor  # (..., M) int64, of the N steps; behind the end any
+    real: Tensor  # (..., M) bool, False behind the end
+    mask: Tensor  # (..., M, C) bool, candidates; behind the end place 0 alone
+    rank: Tensor  # (..., N) int64, which of the M is the last one visited up to each step, 0 before the first
+    visited: Tensor  # (..., N) bool
+    whole: bool  # there is no hole in any movie
+
+    def rows(self, part: Tensor, back: int) -> Tensor:
+        """Return rows (..., M - back, *tail) of a part (..., N - back, *tail) whose row k belongs to step k + back."""
+        if self.whole:
+            return part
+        index = (self.step[..., back:] - back).clamp_min(0)
+        axis = self.step.ndim - 1
+        tail = part.shape[axis + 1 :]
+        return part.gather(axis, index[(..., *[None] * len(tail))].expand(*index.shape, *tail))
+
+    def spread(self, part: Tensor) -> Tensor:
+        """Return (..., N, *tail) of a part (..., M, *tail), 0 in the steps that are not visited."""
+        if self.whole:
+            return part
+        axis = self.step.ndim - 1
+        tail = part.shape[axis + 1 :]
+        shape = (..., *[None] * len(tail))
+        held = part.gather(axis, self.rank[shape].expand(*self.rank.shape, *tail))
+        return torch.where(self.visited[shape], held, 0)
+
+
+def _visits_of(mask: Tensor) -> _Visits:
+    """Return which steps each movie of a mask (..., N, C) visits; N and C at least 1."""
+    visited = mask.any(-1)
+    count = visited.sum(-1)
+    most = max(int(count.max()), 1) if count.numel() else mask.shape[-2]
+    step = torch.argsort(visited.logical_not().to(torch.uint8), dim=-1, stable=True)[..., :most]
+    real = torch.arange(most, device=mask.device) < count[..., None]
+    waiting = torch.arange(mask.shape[-1], device=mask.device) == 0
+    here = mask.gather(-2, step[..., None].expand(*step.shape, mask.shape[-1]))
+    return _Visits(
+        step=step,
+        real=real,
+        mask=torch.where(real[..., None], here, waiting),
+        rank=(visited.cumsum(-1) - 1).clamp_min(0),
+        visited=visited,
+        whole=bool(visited.all()),
+    )

@@ -1,7 +1,8 @@
-"""Two cameras, one sphere: repair of the one from the other, and the weighted mean on SO(3)."""
+"""Two cameras, one sphere: repair of stretches where they disagree, and the weighted mean on SO(3)."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -9,9 +10,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble.path import Path, graph_of, links
-from sphereorient.assemble.repair import Track, repair
-from sphereorient.assemble.segments import find_spikes, moving, number_segments
+from sphereorient.assemble.path import Graph, Path, find_spikes, graph_of, links, moving, number_segments
 from sphereorient.assemble.settings import AssembleSettings
 from sphereorient.errors import ExperimentError, ShapeError, refusal
 from sphereorient.search import Candidates
@@ -25,7 +24,7 @@ CAMERAS_RATIO_MAX = 100.0  # of typical variances: a track whose xi never change
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fused:
-    """The sphere's orientation in N frames from all cameras; made by assemble, read by motion and the pipeline."""
+    """The orientation of the sphere in N frames from all cameras."""
 
     R_lab_body: Tensor  # (N, 3, 3), NaN where no camera has one
     sigma_rad: Tensor  # (N,), standard deviation per axis; NaN where there is nothing to measure it by
@@ -41,28 +40,27 @@ class Fused:
 def fuse(
     paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings
 ) -> Fused:
-    """Join the cameras' paths, both in the lab frame, into one.
+    """Fuse the paths of one or two cameras, in the lab frame, into one.
 
-    Stretches in which they are more than `repair_deg` apart are repaired; then each frame is the mean of both,
-    weighted with the inverse moving variance of xi. These variances are relative; their common scale comes from how
-    far the cameras are apart over the whole movie, and with one camera there is none.
+    Stretches where they differ by more than `repair_deg` are repaired. Then each frame is the mean of both, weighted by
+    the inverse moving variance of xi. These variances are relative; their scale comes from the differences of the
+    cameras over the whole movie, so that there is none with one camera.
 
     Args:
         paths: of one or two cameras, N frames.
         candidates: of the same cameras.
         time_s: (N,).
-        settings: of the room.
+        settings: of the fusion.
 
     Returns:
-        The fused track. A frame that one camera only saw carries its orientation and `ONE_CAMERA`; so does every
-        frame of an experiment with one camera. Frames of a repair that was a guess carry `AMBIGUOUS`.
+        The fused track. Frames seen by one camera carry `ONE_CAMERA`; frames of an undecided repair `AMBIGUOUS`.
 
     Raises:
         ExperimentError: no camera, or more than two.
         ShapeError: paths, candidates and times are not of the same cameras and frames.
 
-    Source: the paper's two cameras; ERRATA A7 (which camera is right) and A8 (what the weights measure: xi's variance
-        holds the motion's too, so that a sphere that turns unevenly draws the weights towards equal ones).
+    Source: the paper's two cameras; docs/errata.md A7 (which camera is right) and A8 (the variance of xi contains the
+        motion's, so that uneven motion makes the weights more equal).
     """
     _check(paths, candidates, time_s)
     names = list(paths)
@@ -104,14 +102,10 @@ def fuse(
 
 
 def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tensor:
-    """Return the moving variance of each camera's xi, (K, N), above 0 everywhere; only their ratios mean something.
+    """Return the moving variance (K, N) of each camera's xi (N,), above 0; only ratios between cameras have a meaning.
 
-    It is kept within a factor of `VARIANCE_RANGE` of what is typical (the median) for the camera, which is taken
-    where fewer than `LINKS_MIN` links are near.
-
-    Args:
-        xi: (N,) of each camera, rad/s, NaN where no link enters the frame.
-        settings: the window.
+    It is clamped to within a factor of `VARIANCE_RANGE` of the camera's median, which also stands in where fewer than
+    `LINKS_MIN` links are near.
     """
     windows = [moving(each, settings.weight_window_frames) for each in xi]
     count = torch.stack([torch.isfinite(window).sum(-1) for window in windows])
@@ -119,7 +113,7 @@ def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tenso
     variance = torch.where(count >= LINKS_MIN, squares / (count - 1).clamp_min(1), torch.nan)
     typical = variance.nanmedian(-1, keepdim=True).values if variance.shape[1] else variance.new_ones(len(xi), 1)
     largest = typical.nan_to_num(0.0).max()
-    # A camera without links, or all of them perfectly still: nothing speaks for one or the other.
+    # A camera without links, or all of them at rest: no camera is preferred.
     typical = torch.where(typical.isnan() | (largest == 0), torch.where(largest > 0, largest, 1.0), typical)
     typical = typical.clamp_min(typical.max() / CAMERAS_RATIO_MAX)
     within = torch.minimum(torch.maximum(variance, typical / VARIANCE_RANGE), typical * VARIANCE_RANGE)
@@ -127,20 +121,20 @@ def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tenso
 
 
 def _calm(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
-    """Frames without a spike in the window of their variance, (N,) bool."""
+    """Return the frames (N,) bool without a spike in the window of their variance."""
     spike = find_spikes(xi, turn, settings)
     return moving(spike.to(xi), settings.weight_window_frames).nansum(-1) == 0
 
 
 def _shares(variance: Tensor, present: Tensor) -> Tensor:
-    """Inverse variances of the cameras that have an orientation, (K, N), scaled to the sum 1; 0 where none has."""
+    """Return the weights (K, N), inverse variances of the cameras with an orientation, of sum 1; 0 without any."""
     weight = torch.where(present, 1 / variance, 0.0)
     total = weight.sum(0)
     return weight / torch.where(total > 0, total, 1.0)
 
 
 def _mean(tracks: Sequence[Track], share: Tensor) -> Tensor:
-    """Weighted mean of the cameras, (N, 3, 3); exactly the one camera's where there is one; NaN where none."""
+    """Return the weighted mean (N, 3, 3) of the cameras; with one camera exactly its orientation; NaN without any."""
     present = torch.stack([track.present for track in tracks])[..., None, None]
     R = torch.stack([track.R_lab_body for track in tracks])
     view = torch.eye(3, dtype=R.dtype, device=R.device)
@@ -153,7 +147,7 @@ def _mean(tracks: Sequence[Track], share: Tensor) -> Tensor:
 
 
 def _apart(tracks: Sequence[Track]) -> Tensor:
-    """Distance of the two cameras' orientations, (N,), rad; NaN where fewer than two have one."""
+    """Return the angle (N,), rad, between the two cameras' orientations; NaN without both."""
     if len(tracks) == 1:
         return torch.full_like(tracks[0].score, torch.nan)
     first, second = tracks
@@ -162,11 +156,11 @@ def _apart(tracks: Sequence[Track]) -> Tensor:
 
 
 def _sigma(variance: Tensor, share: Tensor, apart: Tensor, calm: Tensor) -> Tensor:
-    """Standard deviation per axis of the mean, (N,), rad.
+    """Return the standard deviation per axis of the mean, (N,), rad.
 
-    Errors with the variances s^2 variance_i per axis make d^2 / (s^2 (variance_1 + variance_2)) the sum of three
-    squared standard normals. Its median gives s^2, blind to the few frames that the repair left wrong. Frames near a
-    spike are left out where there are others: it raises the variance of all frames about it, not their d.
+    With errors of variance s^2 variance_i per axis, d^2 / (s^2 (variance_1 + variance_2)) is chi-squared with three
+    degrees of freedom. Its median gives s^2 in spite of a few wrong frames. Frames near a spike are left out where
+    there are others: the spike raises their variance, not their d.
     """
     if not len(apart):
         return apart
@@ -188,3 +182,115 @@ def _check(paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time
             expected, got = f"{len(time_s)} frames", f"{len(path.choice)} in the path, {frames} in the candidates"
             do = "pass what assemble_paths was given and gave"
             raise ShapeError(refusal(f"camera {name!r}", expected=expected, got=got, do=do))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Track:
+    """Orientations of one camera in N frames, NaN where it has none."""
+
+    R_lab_body: Tensor  # (N, 3, 3)
+    score: Tensor  # (N,)
+
+    @property
+    def present(self) -> Tensor:
+        """Frames with an orientation, (N,) bool."""
+        return torch.isfinite(self.score)
+
+    def part(self, frames: Tensor) -> Track:
+        """Return some frames of the track."""
+        return Track(R_lab_body=self.R_lab_body[frames], score=self.score[frames])
+
+    def with_part(self, frames: Tensor, other: Track) -> Track:
+        """Return the track with some frames from another one."""
+        return Track(
+            R_lab_body=self.R_lab_body.index_copy(0, frames, other.R_lab_body),
+            score=self.score.index_copy(0, frames, other.score),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Repair:
+    """Tracks of both cameras after the repair."""
+
+    tracks: tuple[Track, Track]
+    repaired: Tensor  # (2, N) bool, replaced by the candidate nearest to the other camera
+    ambiguous: Tensor  # (N,) bool, the choice of the right camera was not decided by T
+
+
+def repair(tracks: tuple[Track, Track], graphs: tuple[Graph, Graph], settings: AssembleSettings) -> Repair:
+    """Repair each stretch where the cameras disagree; the better supported camera leads.
+
+    Each camera in turn is assumed right. The other then takes, in every frame, its candidate nearest to that
+    orientation, or none beyond `repair_deg`, which counts as T = 0. The assumption with the larger mean T of both
+    cameras holds. Where the two differ by less than `repair_margin`, or neither finds a candidate (T of different
+    cameras cannot be compared), the leader with the smaller largest rotation into, within and out of the stretch holds,
+    and the frames are ambiguous.
+
+    Source: the paper's two cameras, which does not say which camera is right; docs/errata.md A7.
+    """
+    limit = math.radians(settings.repair_deg)
+    first, second = tracks
+    both = first.present & second.present
+    apart = torch.where(both, so3.geodesic_distance(first.R_lab_body, second.R_lab_body), 0.0)
+    wrong = apart > limit
+    agreed = torch.nonzero(both & ~wrong)[:, 0]
+    result, repaired, ambiguous = [first, second], torch.zeros_like(torch.stack([both, both])), torch.zeros_like(both)
+    for frames in _stretches(wrong, both, settings.gap_frames_max):
+        followers = [_follow(tracks[leader], graphs[1 - leader], frames, limit) for leader in (0, 1)]
+        merits = [_merit(tracks[leader].part(frames), followers[leader]) for leader in (0, 1)]
+        matched = any(bool(follower.present.any()) for follower in followers)
+        guess = not matched or abs(merits[0] - merits[1]) < settings.repair_margin
+        if guess:
+            frames_beside = _beside(frames, agreed, settings.gap_frames_max)
+            rough = [_roughest_turn(track, frames_beside) for track in tracks]
+            leader = int(rough[1] < rough[0])
+        else:
+            leader = int(merits[1] > merits[0])
+        loser = 1 - leader
+        result[loser] = result[loser].with_part(frames, followers[leader])
+        repaired[loser, frames] = followers[leader].present
+        ambiguous[frames] = guess
+    return Repair(tracks=(result[0], result[1]), repaired=repaired, ambiguous=ambiguous)
+
+
+def _stretches(wrong: Tensor, both: Tensor, gap_frames_max: int) -> list[Tensor]:
+    """Return the runs of wrong frames, as frame numbers; a short gap of one camera does not end a run."""
+    seen = torch.nonzero(both)[:, 0]
+    place = torch.nonzero(wrong[seen])[:, 0]
+    frame = seen[place]
+    ends = (place.diff() > 1) | (frame.diff() > gap_frames_max + 1)
+    lengths = torch.nonzero(ends)[:, 0] + 1
+    return [run for run in torch.tensor_split(frame, lengths.cpu()) if len(run)]
+
+
+def _follow(leader: Track, graph: Graph, frames: Tensor, limit: float) -> Track:
+    """Return the candidates nearest to the leader's orientations in some frames; NaN without any within the limit."""
+    R_all, score_all, mask = (part[frames] for part in graph)
+    distance = so3.geodesic_distance(leader.R_lab_body[frames][:, None], R_all)
+    near, which = torch.where(mask, distance, torch.inf).min(-1)
+    row = torch.arange(len(frames), device=frames.device)
+    found = near <= limit
+    return Track(
+        R_lab_body=torch.where(found[:, None, None], R_all[row, which], torch.nan),
+        score=torch.where(found, score_all[row, which], torch.nan),
+    )
+
+
+def _merit(leader: Track, follower: Track) -> float:
+    """Return the mean T over both cameras and all frames of a stretch."""
+    return float((leader.score + follower.score.nan_to_num(0.0)).mean() / 2)
+
+
+def _beside(frames: Tensor, agreed: Tensor, gap_frames_max: int) -> Tensor:
+    """Return a stretch with the nearest frames on either side in which the cameras agree."""
+    reach = gap_frames_max + 1
+    before = agreed[(agreed < frames[0]) & (agreed >= frames[0] - reach)][-1:]
+    after = agreed[(agreed > frames[-1]) & (agreed <= frames[-1] + reach)][:1]
+    return torch.cat([before, frames, after])
+
+
+def _roughest_turn(track: Track, frames: Tensor) -> float:
+    """Return the largest rotation per frame, rad, of a track between successive ones of some frames."""
+    R = track.R_lab_body[frames]
+    turn = so3.geodesic_distance(R[:-1], R[1:]) / frames.diff()
+    return float(turn.max()) if len(turn) else 0.0

@@ -16,8 +16,7 @@ from sphereorient.experiment.recording import Recording
 from sphereorient.files.hdf5 import whole_hdf5
 from sphereorient.follow import Appearance
 from sphereorient.locate import Background, CameraScene
-from sphereorient.motion import Learnt as Motion
-from sphereorient.motion import Prior, ProcessNoise
+from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
 from sphereorient.pose import CameraView, Fitter, Light, Optics, base_table
 
 SCHEMA = "sphereorient-learnt/1"
@@ -140,7 +139,7 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
         group = file.create_group("process")
         group.attrs["frame_s"] = learnt.process.frame_s
         for part in ("place", "turn"):
-            motion: Motion | None = getattr(learnt.process, part)
+            motion: ProcessPrior | None = getattr(learnt.process, part)
             if motion is not None:
                 group.attrs[part] = np.array([motion.prior.pole, motion.prior.deviation, motion.scale])
 
@@ -172,11 +171,11 @@ def _read(file: h5py.File) -> Learnt:
 
 
 def _process(group: h5py.Group) -> ProcessNoise:
-    def motion(part: str) -> Motion | None:
+    def motion(part: str) -> ProcessPrior | None:
         if part not in group.attrs:
             return None
         pole, deviation, scale = (float(value) for value in group.attrs[part])
-        return Motion(prior=Prior(pole=pole, deviation=deviation), scale=scale)
+        return ProcessPrior(prior=Prior(pole=pole, deviation=deviation), scale=scale)
 
     return ProcessNoise(place=motion("place"), turn=motion("turn"), frame_s=float(group.attrs["frame_s"]))
 

@@ -89,16 +89,15 @@ def join(
         path = path.model_copy(update={"acceleration_rad_s2": given.acceleration_rad_s2})
     chosen = assemble.physical_path(hypotheses, clock, path)
     picked = table.rows(chosen.choice)
-    smoothed = motion.smooth_motion(
-        clock,
-        picked["position_lab_mm"],
-        picked["covariance"][:, 3:, 3:],
-        picked["R_lab_body"],
-        picked["covariance"][:, :3, :3],
-        chosen.segment,
-        settings.smooth,
-        None if given is None else given.process,
+    poses = motion.MeasuredPoses(
+        time_s=clock,
+        position_lab_mm=picked["position_lab_mm"],
+        position_cov_mm2=picked["covariance"][:, 3:, 3:],
+        R_lab_body=picked["R_lab_body"],
+        orientation_cov_rad2=picked["covariance"][:, :3, :3],
+        segment=chosen.segment,
     )
+    smoothed = motion.smooth_motion(poses, settings.smooth, None if given is None else given.process)
     track = results.precise_track(job.recording.experiment, clock, table, chosen, smoothed, follower.appearance)
     return track, with_motion(Learnt.of(follower.appearance), smoothed.process, chosen.acceleration_rad_s2)
 

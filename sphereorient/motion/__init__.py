@@ -3,18 +3,19 @@
 from sphereorient.motion.angular_velocity import omega_from_orientations, to_body
 from sphereorient.motion.derivative import gaussian_derivative, noise_gain
 from sphereorient.motion.kabsch import kabsch, omega_from_markers
-from sphereorient.motion.learn import Learnt, ProcessNoise
+from sphereorient.motion.learn import ProcessNoise, ProcessPrior
 from sphereorient.motion.matern import Prior
 from sphereorient.motion.measure import Motion, measure_motion
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
-from sphereorient.motion.smooth import Smoothed, smooth_motion
+from sphereorient.motion.smooth import MeasuredPoses, Smoothed, smooth_motion
 
 __all__ = [
-    "Learnt",
+    "MeasuredPoses",
     "Motion",
     "MotionSettings",
     "Prior",
     "ProcessNoise",
+    "ProcessPrior",
     "SmoothSettings",
     "Smoothed",
     "gaussian_derivative",

@@ -42,9 +42,9 @@ def omega_from_orientations(
 
     Raises:
         ShapeError: R_lab_body does not end in (N, 3, 3).
-        SettingsError: separations that are none.
+        SettingsError: no separation, one below 1, or one given twice.
 
-    Source: the paper, section III, angular velocity from the increment T; frames by ERRATA E4 and E6.
+    Source: the paper, section III, angular velocity from the increment T; frames by docs/errata.md E4 and E6.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     if R_lab_body.dim() < 3:
@@ -75,7 +75,7 @@ def to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
     Raises:
         ShapeError: wrong last axes.
 
-    Source: ERRATA E6; alpha_lab = R alpha_body, as printed.
+    Source: docs/errata.md E6; alpha_lab = R alpha_body, as printed.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     check_tail("x_lab", x_lab, 3)
@@ -97,7 +97,7 @@ def check_separations(separations: Sequence[int]) -> None:
 
 
 def usable_separations(there: Tensor, separations: Sequence[int], segment: Tensor | None) -> Tensor:
-    """Say in which frames which separations can be measured.
+    """Return in which frames which separations can be measured.
 
     Args:
         there: (..., N) bool, frames that hold an orientation.

@@ -1,4 +1,4 @@
-"""One kind of track, places or orientations: learning, outliers, and the states of every segment."""
+"""One kind of track, positions or orientations: estimate its process, reject outliers, smooth every segment."""
 
 from __future__ import annotations
 
@@ -8,50 +8,50 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.motion.kalman import States, run_filter, smooth
-from sphereorient.motion.learn import Learnt, learn
-from sphereorient.motion.path import DELTA, MEAN, SIZE, Path
+from sphereorient.motion.kalman import SmoothedStates, run_filter, smooth
+from sphereorient.motion.learn import ProcessPrior, estimate_process
+from sphereorient.motion.path import DELTA, MEAN, SIZE, SegmentTrack
 from sphereorient.motion.settings import SmoothSettings
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 ITERATIONS = 8  # of Gauss and Newton at most between two rejections; two or three do
-SETTLED = 0.03  # of a measurement's sigma: convergence is quadratic, so the step after such a one is nothing
-PIECE = 200  # instants of the pieces that are learnt from, many times the memory of the motion
-FEWEST = 5  # measurements of a piece that is learnt from
+SETTLED = 0.03  # of a measurement's sigma: convergence is quadratic, so the next step is negligible
+PIECE = 200  # instants of a piece, many times the memory of the motion
+FEWEST = 5  # measurements of a piece
 NEAR = 5  # frames over which a wrong measurement makes others look wrong
-ROUNDS = 3  # of learning
-JUDGEMENTS = 12  # of a segment's measurements; wrong ones near each other are found one after the other
-AGAIN = 0.5  # of the limit, below which a measurement is believed again; less than 1, lest it goes to and fro
-FAR_MOVED = 100.0  # sigmas; a reference that moved farther was no good place to learn at
+ROUNDS = 3  # of estimation
+JUDGEMENTS = 12  # rounds of rejection; outliers near each other are found one after the other
+AGAIN = 0.5  # of the limit, below which a measurement is used again; below 1 to avoid oscillation
+FAR_MOVED = 100.0  # sigmas; after a larger move of the reference the estimate is repeated
 VALUE, SPEED, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)  # in `Estimate.covariance`
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate:
-    """One segment's smooth motion at its M instants; made by `estimate`. NaN where there is none."""
+    """Smooth motion of one segment at its M instants; NaN where it is unknown."""
 
     value: Floats  # (M, 3) or (M, 3, 3)
     rate: Floats  # (M, 3), per frame
     change: Floats  # (M, 3), per frame^2
     covariance: Floats  # (M, 9, 9), of value, rate, change
-    rejected: Bools  # (M,), measurements that were not believed
+    rejected: Bools  # (M,), measurements that were rejected
 
 
 def estimate(
-    paths: Sequence[Path], band: float | None, settings: SmoothSettings, known: Learnt | None = None
-) -> tuple[list[Estimate], float, Learnt | None]:
-    """Learn from all segments of one kind, then smooth each by itself.
+    paths: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings, known: ProcessPrior | None = None
+) -> tuple[list[Estimate], float, ProcessPrior | None]:
+    """Estimate the process from all segments of one kind, then smooth each by itself.
 
     Args:
-        paths: one a segment.
-        band: cycles per frame, None learns it.
+        paths: one for each segment.
+        band: cycles per frame; None estimates it.
         settings: limits.
-        known: what was learnt before, of this track or another one; None learns.
+        known: the process of another track, or of this one; None estimates it.
 
     Returns:
-        The estimates, the true errors of the measurements over their sigmas, slow ones included, and what was learnt.
+        The estimates, the ratio of true errors to sigmas of the measurements, slow errors included, and the process.
     """
     if known is None:
         pieces = _pieces(paths, settings.learn_frames)
@@ -62,8 +62,8 @@ def estimate(
     return [_smoothed(path, known, settings) for path in paths], float(whole), known
 
 
-def _pieces(paths: Sequence[Path], most: int) -> list[Path]:
-    """Return pieces of the paths to learn from, spread evenly over all where there are too many."""
+def _pieces(paths: Sequence[SegmentTrack], most: int) -> list[SegmentTrack]:
+    """Return pieces of the segments for the estimation, distributed evenly where there are too many."""
     starts = [(path, k) for path in paths for k in range(0, len(path.time), PIECE)]
     total = sum(len(path.time) for path in paths)
     if total > most:
@@ -73,10 +73,10 @@ def _pieces(paths: Sequence[Path], most: int) -> list[Path]:
     return [piece for piece in pieces if piece.used.sum() >= FEWEST]
 
 
-def _learnt(pieces: Sequence[Path], band: float | None, settings: SmoothSettings) -> Learnt:
-    """Learn, look for wrong measurements, and learn again without them."""
+def _learnt(pieces: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings) -> ProcessPrior:
+    """Estimate the process, reject outliers, and estimate it again without them."""
     scales = settings.least_scale, settings.most_scale
-    learnt = learn(pieces, scales, band)
+    learnt = estimate_process(pieces, scales, band)
     for _ in range(ROUNDS):
         settled = [_settled(piece, learnt, settings) for piece in pieces]
         moved = any(farthest > FAR_MOVED for _, _, farthest in settled)
@@ -84,12 +84,14 @@ def _learnt(pieces: Sequence[Path], band: float | None, settings: SmoothSettings
         pieces = [new for new, _, _ in settled]
         if not (moved or judged):
             break
-        learnt = learn(pieces, scales, band, before=learnt)
+        learnt = estimate_process(pieces, scales, band, before=learnt)
     return learnt
 
 
-def _settled(path: Path, learnt: Learnt, settings: SmoothSettings) -> tuple[Path, States, float]:
-    """Return the path about its own smooth states, its measurements judged, and how far it moved, in sigmas."""
+def _settled(
+    path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings
+) -> tuple[SegmentTrack, SmoothedStates, float]:
+    """Return the segment about its smooth states, outliers rejected; the states; the largest move, in sigmas."""
     scale, limit = learnt.scale, settings.outlier_sigma**2
     path = replace(path, covariance=path.covariance * scale**2)
     farthest, tries, judgements = 0.0, 0, 0
@@ -107,27 +109,27 @@ def _settled(path: Path, learnt: Learnt, settings: SmoothSettings) -> tuple[Path
         path, tries, judgements = replace(path, used=used), 0, judgements + 1
 
 
-def _judged(path: Path, states: States, limit: float, share: float) -> Bools:
-    """Return which measurements are believed: the most surprising ones no more, unsurprising ones again."""
+def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: float) -> Bools:
+    """Return which measurements are used: outliers no longer, and those that fit again."""
     out = path.seen & ~path.used
     used = path.used.copy()
     if out.any():
         off = path.away()[out]
         whole = path.covariance[out] + states.covariance[out][:, VALUE, VALUE]
-        surprise = np.einsum("ni,nij,nj->n", off, np.linalg.inv(whole), off)
-        used[out] = surprise < AGAIN * limit
-    wrong = _stand_out(states.surprise, limit)
+        mahalanobis = np.einsum("ni,nij,nj->n", off, np.linalg.inv(whole), off)
+        used[out] = mahalanobis < AGAIN * limit
+    wrong = _stand_out(states.mahalanobis, limit)
     if (path.seen & ~(used & ~wrong)).sum() <= share * path.seen.sum():
         used &= ~wrong
     return used
 
 
-def _stand_out(surprise: Floats, limit: float) -> Bools:
-    """Say which frames are farther off than the limit and than all near them, which are judged again without them."""
-    wrong = surprise > limit
-    for k in range(1, min(NEAR, len(surprise) - 1) + 1):
-        wrong[k:] &= surprise[k:] >= surprise[:-k]
-        wrong[:-k] &= surprise[:-k] > surprise[k:]
+def _stand_out(mahalanobis: Floats, limit: float) -> Bools:
+    """Return the frames beyond the limit and beyond all near them; those near are judged again without them."""
+    wrong = mahalanobis > limit
+    for k in range(1, min(NEAR, len(mahalanobis) - 1) + 1):
+        wrong[k:] &= mahalanobis[k:] >= mahalanobis[:-k]
+        wrong[:-k] &= mahalanobis[:-k] > mahalanobis[k:]
     return wrong
 
 
@@ -141,7 +143,7 @@ def _wanted(pole: float) -> Floats:
     return wanted
 
 
-def _smoothed(path: Path, learnt: Learnt, settings: SmoothSettings) -> Estimate:
+def _smoothed(path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings) -> Estimate:
     """Return a segment's estimate; one measurement has no rate, two have no change of it."""
     count = int(path.used.sum())
     if count < 2:
@@ -149,7 +151,7 @@ def _smoothed(path: Path, learnt: Learnt, settings: SmoothSettings) -> Estimate:
     settled, states, _ = _settled(path, learnt, settings)
     rate, change = settled.mean + settled.rate[:, 0], settled.rate[:, 1] * settled.pole
     covariance = states.covariance.copy()
-    # slow errors pass the smoother as motion does; what it learns about noise is the fast rest
+    # slow errors pass the smoother like motion; the estimated noise is the fast rest
     slow = settings.slow_share / (1 - settings.slow_share) * learnt.scale**2
     own = np.where(path.seen[:, None, None], path.covariance, path.sigma**2 * np.eye(3))
     covariance[:, VALUE, VALUE] += slow * own
@@ -161,7 +163,7 @@ def _smoothed(path: Path, learnt: Learnt, settings: SmoothSettings) -> Estimate:
     )
 
 
-def _alone(path: Path) -> Estimate:
+def _alone(path: SegmentTrack) -> Estimate:
     """Return the measurements as they are, without derivatives."""
     unknown = np.full((len(path.time), 3), np.nan)
     covariance = np.full((len(path.time), 9, 9), np.nan)

@@ -32,7 +32,7 @@ def kabsch(points_a: Tensor, points_b: Tensor, weights: Tensor | None = None) ->
     Raises:
         ShapeError: wrong last axes.
 
-    Source: W. Kabsch, Acta Cryst. A32, 922 (1976); the paper's R_kabsch, ERRATA E8.
+    Source: W. Kabsch, Acta Cryst. A32, 922 (1976); the paper's R_kabsch, docs/errata.md E8.
     """
     check_tail("points_a", points_a, 3)
     check_tail("points_b", points_b, *points_a.shape[-2:])
@@ -68,9 +68,9 @@ def omega_from_markers(
 
     Raises:
         ShapeError: points_lab does not end in 3.
-        SettingsError: separations that are none.
+        SettingsError: no separation, one below 1, or one given twice.
 
-    Source: the paper, section III, R_kabsch; frame by ERRATA E8.
+    Source: the paper, section III, R_kabsch; frame by docs/errata.md E8.
     """
     check_tail("points_lab", points_lab, 3)
     check_separations(separations)

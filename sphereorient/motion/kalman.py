@@ -1,4 +1,4 @@
-"""Kalman's filter and the smoother of Bryson and Frazier: linear in time, no inverse of a covariance of states."""
+"""Kalman filter and modified Bryson-Frazier smoother: linear in time, no inverse of a covariance of states."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-EVERY = 64  # states; between them the smoother computes the covariances once more, to the same bits
+EVERY = 64  # states between stored covariances; the smoother computes the others again, to the same bits
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Chain:
+class StateSpace:
     """A linear problem of N states of size D whose first three numbers are measured.
 
     A step takes the first three numbers to `carried` times the whole state plus `drift`; what becomes of the others,
@@ -40,7 +40,7 @@ class Chain:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Filtered:
-    """What the past says, frame by frame; made by `run_filter`."""
+    """Estimates from the past, frame by frame; made by `run_filter`."""
 
     state: Floats  # (N, D), after the frame's own measurement
     covariance: Floats  # (M, D, D), of every EVERY-th state from the first on: all of them would be most of the memory
@@ -51,7 +51,7 @@ class Filtered:
     log_determinant: float  # sum over the innovations' covariances
 
 
-def run_filter(chain: Chain) -> Filtered:
+def run_filter(chain: StateSpace) -> Filtered:
     """Run Kalman's filter.
 
     Source: Kalman 1960.
@@ -71,7 +71,7 @@ def run_filter(chain: Chain) -> Filtered:
             gain = P[:, :3] @ inverse
             innovation = chain.measured[k] - x[:3]
             x = x + gain @ innovation
-            P = _told(P, gain)
+            P = _updated(P, gain)
             gains[k], innovations[k], inverses[k] = gain, innovation, inverse
         states[k] = x
         if k % EVERY == 0:
@@ -88,19 +88,19 @@ def run_filter(chain: Chain) -> Filtered:
     )
 
 
-def _carried(chain: Chain, k: int, P: Floats, F: Floats) -> Floats:
+def _carried(chain: StateSpace, k: int, P: Floats, F: Floats) -> Floats:
     """Return the covariance before the measurement of state k, from the one before it; F: the transition to k."""
     carried: Floats = F @ P @ F.T + chain.noise[chain.kind[k - 1]]
     return carried
 
 
-def _told(P: Floats, gain: Floats) -> Floats:
+def _updated(P: Floats, gain: Floats) -> Floats:
     """Return the covariance after a measurement."""
     P = P - gain @ P[:3]
     return 0.5 * (P + P.T)
 
 
-def _covariances(chain: Chain, filtered: Filtered, first: int) -> Floats:
+def _covariances(chain: StateSpace, filtered: Filtered, first: int) -> Floats:
     """Return the covariances of the states from a kept one to the next, once more."""
     count = min(EVERY, len(filtered.state) - first)
     P = filtered.covariance[first // EVERY]
@@ -110,21 +110,23 @@ def _covariances(chain: Chain, filtered: Filtered, first: int) -> Floats:
     for k in range(first + 1, first + count):
         P = _carried(chain, k, P, chain.transition(k - 1, F))
         if chain.used[k]:
-            P = _told(P, filtered.gain[k])
+            P = _updated(P, filtered.gain[k])
         found[k - first] = P
     return found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class States:
-    """What past and future say together; made by `smooth`."""
+class SmoothedStates:
+    """Estimates from past and future; made by `smooth`."""
 
     state: Floats  # (N, D)
     covariance: Floats  # (N, K, K), of the wanted combinations of each state
-    surprise: Floats  # (N,), squared distance of a used measurement from what all others say, in sigmas; else 0
+    mahalanobis: (
+        Floats  # (N,), squared Mahalanobis distance of a used measurement from the estimate of all others; else 0
+    )
 
 
-def smooth(chain: Chain, filtered: Filtered, wanted: Floats) -> States:
+def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedStates:
     """Run backwards over a filtered chain.
 
     Args:
@@ -132,12 +134,12 @@ def smooth(chain: Chain, filtered: Filtered, wanted: Floats) -> States:
         filtered: its forward pass.
         wanted: (K, D), rows whose covariance is asked for.
 
-    Source: Bierman 1973 (modified Bryson-Frazier); the distance from what the others say: de Jong 1988.
+    Source: Bierman 1973 (modified Bryson-Frazier); the distance from the others: de Jong 1988.
     """
     count, size = filtered.state.shape
     F = np.zeros((size, size))
     pull, hold = np.zeros(size), np.zeros((size, size))  # gradient and curvature that the future exerts
-    state, surprise = filtered.state.copy(), np.zeros(count)
+    state, mahalanobis = filtered.state.copy(), np.zeros(count)
     covariance = np.empty((count, len(wanted), len(wanted)))
     for k in range(count - 1, -1, -1):
         if k == count - 1 or k % EVERY == EVERY - 1:
@@ -151,7 +153,7 @@ def smooth(chain: Chain, filtered: Filtered, wanted: Floats) -> States:
             held = hold @ K
             whole = inverse @ filtered.innovation[k] + K.T @ pull
             own = inverse + K.T @ held
-            surprise[k] = whole @ np.linalg.solve(own, whole)
+            mahalanobis[k] = whole @ np.linalg.solve(own, whole)
             pull[:3] -= whole
             # C' hold C + H' S^-1 H with C = 1 - K H, written out: only three rows and columns change
             hold[:3] -= held.T
@@ -160,5 +162,5 @@ def smooth(chain: Chain, filtered: Filtered, wanted: Floats) -> States:
         if k:
             F = chain.transition(k - 1, F)
             pull, hold = F.T @ pull, F.T @ hold @ F
-            hold = 0.5 * (hold + hold.T)  # what the rounding leaves of asymmetry would grow
-    return States(state=state, covariance=covariance, surprise=surprise)
+            hold = 0.5 * (hold + hold.T)  # asymmetry from rounding would grow
+    return SmoothedStates(state=state, covariance=covariance, mahalanobis=mahalanobis)

@@ -1,4 +1,4 @@
-"""Prior and measurement noise learnt from the track itself, by marginal likelihood."""
+"""Process prior and measurement noise, estimated from the track itself by marginal likelihood."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ from scipy.optimize import minimize
 
 from sphereorient.motion.kalman import run_filter
 from sphereorient.motion.matern import Prior, prior_of_band
-from sphereorient.motion.path import Path
+from sphereorient.motion.path import SegmentTrack
 
 Floats = NDArray[np.float64]
 
 POLES = (0.02, 3.0)  # per frame, between which the prior's band is looked for
 SPREADS = (1e-3, 1e5)  # of the rate per frame, in sigmas of a measurement
-FREE = 6  # numbers that nothing is known of before: where the path starts, and its constant rate
+FREE = 6  # unknowns without a prior: the start of the segment and its constant rate
 FIRST_TRIES = (0.15, 0.45, 1.2)  # poles per frame from the best of which the search starts
 
 
 @dataclass(frozen=True, kw_only=True)
-class Learnt:
-    """What a track says about itself; made by `learn`."""
+class ProcessPrior:
+    """The prior of a track's rate and the scale of its sigmas; made by `estimate_process`."""
 
     prior: Prior  # per frame
     scale: float  # true errors of the measurements over their sigmas
 
-    def at_rate(self, ratio: float) -> Learnt:
+    def at_rate(self, ratio: float) -> ProcessPrior:
         """Return the same motion in frames that last `ratio` times as long."""
         prior = Prior(pole=self.prior.pole * ratio, deviation=self.prior.deviation * ratio)
-        return Learnt(prior=prior, scale=self.scale)
+        return ProcessPrior(prior=prior, scale=self.scale)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessNoise:
-    """What a track's smoothing learnt of its motion; made by `smooth_motion`, kept for other runs by the pipeline."""
+    """The processes of positions and orientations; made by `smooth_motion`, reused by other runs."""
 
-    place: Learnt | None  # None: too few frames to learn from
-    turn: Learnt | None
-    frame_s: float  # that `Learnt` counts in
+    place: ProcessPrior | None  # None: too few frames to estimate it
+    turn: ProcessPrior | None
+    frame_s: float  # that `ProcessPrior` counts in
 
 
-def learn(
-    paths: Sequence[Path], scales: tuple[float, float], band: float | None, before: Learnt | None = None
-) -> Learnt:
+def estimate_process(
+    paths: Sequence[SegmentTrack], scales: tuple[float, float], band: float | None, before: ProcessPrior | None = None
+) -> ProcessPrior:
     """Find the prior and the factor on the measurements' sigmas under which the measurements are most likely.
 
     Args:
-        paths: what to learn from, each with at least five measurements.
-        scales: least and largest factor that is believed.
+        paths: segments with at least five measurements each.
+        scales: least and largest factor accepted.
         band: cycles per frame; fixes the prior, so that only the factor is learnt. None learns both.
-        before: what was learnt about the same paths with other references or rejections, to start from.
+        before: the estimate of the same segments with other references or rejections, as a start.
 
     Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form, with FREE fewer
     degrees of freedom a path.
@@ -80,16 +80,16 @@ def learn(
         found = minimize(cost, start, method="Nelder-Mead", options=options)  # type: ignore[call-overload]
         prior = prior_at(found.x)
     scale = _cost(paths, prior, scales)[1]
-    return Learnt(prior=Prior(pole=prior.pole, deviation=prior.deviation * scale), scale=scale)
+    return ProcessPrior(prior=Prior(pole=prior.pole, deviation=prior.deviation * scale), scale=scale)
 
 
-def _rate_deviation(paths: Sequence[Path]) -> float:
-    """Return the standard deviation of the measured rates by axis, per frame, few wild ones left aside."""
+def _rate_deviation(paths: Sequence[SegmentTrack]) -> float:
+    """Return a robust standard deviation of the measured rates by axis, per frame."""
     away = np.concatenate([np.abs(rates - np.median(rates, axis=0)) for rates in (path.rates() for path in paths)])
     return float(1.48 * np.median(away))
 
 
-def _cost(paths: Sequence[Path], prior: Prior, scales: tuple[float, float]) -> tuple[float, float]:
+def _cost(paths: Sequence[SegmentTrack], prior: Prior, scales: tuple[float, float]) -> tuple[float, float]:
     """Return the negative log-likelihood, up to a constant, and the scale; all covariances in units of scale^2."""
     misfit, logs, number = 0.0, 0.0, 0
     for path in paths:

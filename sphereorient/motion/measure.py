@@ -17,7 +17,7 @@ from sphereorient.motion.angular_velocity import (
 )
 from sphereorient.motion.derivative import Order, gap_aware_stencil
 from sphereorient.motion.settings import MotionSettings
-from sphereorient.motion.stencil import apply, compose, spread
+from sphereorient.motion.stencil import apply, compose, propagated_sigma
 
 M_PER_MM = 1e-3
 
@@ -75,7 +75,7 @@ def measure_motion(
     Raises:
         ShapeError: wrong last axes, or unequal numbers of frames.
 
-    Source: the paper, section III; frames by ERRATA E4 and E6.
+    Source: the paper, section III; frames by docs/errata.md E4 and E6.
     """
     check_tail("position_mm", position_mm, 3)
     check_tail("R_lab_body", R_lab_body, 3, 3)
@@ -115,7 +115,7 @@ def _translation(
     width = {1: settings.velocity_sigma_frames, 2: settings.acceleration_sigma_frames}[order]
     stencil = _stencil(position_mm, segment, width, order, settings)
     scale = M_PER_MM / dt_s**order
-    return apply(stencil, position_mm) * scale, spread(stencil, _by_axis(sigma_mm, position_mm)) * scale
+    return apply(stencil, position_mm) * scale, propagated_sigma(stencil, _by_axis(sigma_mm, position_mm)) * scale
 
 
 def _rotation(
@@ -131,7 +131,10 @@ def _rotation(
         usable_separations(_oriented(R_lab_body), separations, segment), separations, fewest, omega.dtype
     )
     sigma = _by_axis(sigma_rad, omega)
-    return (omega, spread(turn, sigma) / dt_s), (alpha, spread(compose(slope, turn), sigma) / dt_s**2)
+    return (omega, propagated_sigma(turn, sigma) / dt_s), (
+        alpha,
+        propagated_sigma(compose(slope, turn), sigma) / dt_s**2,
+    )
 
 
 def _stencil(x: Tensor, segment: Tensor, sigma_frames: float, order: Order, settings: MotionSettings) -> Tensor:
@@ -156,7 +159,7 @@ def _by_axis(sigma: Tensor | None, like: Tensor) -> Tensor:
 
 
 def _oriented(R_lab_body: Tensor) -> Tensor:
-    """Say which frames have an orientation, (..., N)."""
+    """Return which frames have an orientation, (..., N)."""
     return R_lab_body.isfinite().all(-1).all(-1)
 
 

@@ -1,4 +1,4 @@
-"""Tracks as chains of small deviations from a reference: places on R^3, orientations on SO(3) whatever the turn.
+"""Segments as chains of small deviations from a reference: positions on R^3, orientations on SO(3) for any rotation.
 
 The state of an instant is 3 (2 + ORDER) numbers: the small deviation delta from the reference, the deviation of the
 constant rate from the reference's, and the random rate w, w' / pole, w'' / pole^2, ... itself. Time is in frames.
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from sphereorient.motion.kalman import Chain
+from sphereorient.motion.kalman import StateSpace
 from sphereorient.motion.matern import NODES, ORDER, STATIONARY, Prior, grown, grown_rate, integral, nodes
 
 Floats = NDArray[np.float64]
@@ -26,12 +26,12 @@ UNKNOWN = 100.0  # standard deviation of the start from its reference, in sigmas
 BY_INSTANT = ("time", "covariance", "seen", "used", "rate", "value", "reference")
 TOGETHER = 1024  # steps computed at once: the nodes of all of them would be most of the memory
 VOTES = 5  # neighbouring turns of which the median is typical
-LEFT_OUT = 6  # frames in a row that the first guess may leave out
+LEFT_OUT = 6  # frames in a row that the first estimate may leave out
 DELTA, MEAN, RATE = slice(0, 3), slice(3, 6), slice(6, SIZE)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Path:
+class SegmentTrack:
     """One segment: what was measured, and the reference that the states are deviations from."""
 
     time: Floats  # (N,), frames, increasing
@@ -46,15 +46,14 @@ class Path:
     reference: Floats  # like value
 
     def away(self) -> Floats:
-        """Return the measurements as deviations from the reference, (N, 3); anything where unused."""
+        """Return the measurements as deviations (N, 3) from the reference; anything where unused."""
         raise NotImplementedError
 
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
-        """Return how the reference's steps differ from what its rate says.
+        """Return rotations (N - 1, NODES + 1, 3, 3) and jumps (N - 1, 3) of the reference's steps.
 
-        Returns:
-            Rotations (N - 1, NODES + 1, 3, 3) that take a deviation from the nodes of a step, and from its begin, to
-            its end, and the reference's jumps (N - 1, 3) beyond its rate.
+        The rotations take a deviation from the nodes of a step, and from its begin, to its end. The jumps are what
+        remains of the steps after the integral of the reference's rate.
         """
         raise NotImplementedError
 
@@ -63,7 +62,7 @@ class Path:
         raise NotImplementedError
 
     def rates(self) -> Floats:
-        """Return the rates between neighbouring measurements, (M, 3), per frame."""
+        """Return the rates (M, 3), per frame, between neighbouring measurements."""
         raise NotImplementedError
 
     @property
@@ -80,7 +79,7 @@ class Path:
         return replace(self, **{name: getattr(self, name)[instants] for name in BY_INSTANT})
 
     def steps(self, prior: Prior, weight: Floats, by_rate: Floats) -> tuple[Floats, Floats]:
-        """Return what a step takes over from the state, (M, 3, SIZE), and its drift (M, 3).
+        """Return the transition of a step from the state, (M, 3, SIZE), and its drift (M, 3).
 
         Args:
             prior: of the rate.
@@ -95,8 +94,8 @@ class Path:
         drift = -jump - (from_rate @ self.scaled(prior)[:-1].reshape(count, -1, 1))[..., 0]
         return np.concatenate([carry[:, NODES], from_mean, from_rate], axis=2), drift
 
-    def chain(self, prior: Prior) -> Chain:
-        """Return the problem, linear about the reference.
+    def chain(self, prior: Prior) -> StateSpace:
+        """Return the state space model, linear about the reference.
 
         Source: Barfoot 2017, State Estimation for Robotics, sections 7.2 and 7.3: perturbations from the left.
         """
@@ -117,11 +116,11 @@ class Path:
         noise = np.zeros((len(lengths), SIZE, SIZE))
         noise[:, keep[:, None], keep] = _by_axis(prior.step_noise(lengths))
         start = np.zeros((SIZE, SIZE))
-        # weak beliefs about the reference, which follows the states: they damp a step and leave no bias when settled
+        # a weak prior about the reference, which follows the states: it damps a step and leaves no bias at convergence
         start[DELTA, DELTA] = (UNKNOWN * self.sigma) ** 2 * view
         start[MEAN, MEAN] = (self.unknown_rate + self.sigma) ** 2 * view
         start[RATE, RATE] = prior.deviation**2 * np.kron(STATIONARY, view)
-        return Chain(
+        return StateSpace(
             carried=carried,
             drift=drift,
             kind=kind,
@@ -141,12 +140,12 @@ def _by_axis(blocks: Floats) -> Floats:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Places(Path):
-    """Places of one segment: value and reference (N, 3), mm, lab."""
+class PositionTrack(SegmentTrack):
+    """Positions of one segment: value and reference (N, 3), mm, lab."""
 
     @classmethod
     def of(cls, time: Floats, value: Floats, covariance: Floats, seen: Bools) -> Self:
-        """Return the path about a first guess: the measurements themselves, gaps bridged evenly."""
+        """Return the segment about a first estimate: the measurements, gaps interpolated linearly."""
         frames = np.flatnonzero(seen)
         if len(frames) > 1:
             steps = np.diff(value[frames], axis=0)
@@ -179,7 +178,7 @@ class Places(Path):
         return np.where(self.seen[:, None], self.value - self.reference, 0.0)
 
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
-        """Return no rotation, and what is left of the reference's steps."""
+        """Return unit rotations, and the jumps."""
         step = np.diff(self.time)
         gone = (integral(step * prior.pole)[:, None] / prior.pole @ self.scaled(prior)[:-1])[:, 0]
         carry = np.broadcast_to(np.eye(3), (len(step), NODES + 1, 3, 3))
@@ -202,12 +201,12 @@ class Places(Path):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Turns(Path):
+class RotationTrack(SegmentTrack):
     """Orientations of one segment: value and reference R_lab_body (N, 3, 3), deviations delta in lab components."""
 
     @classmethod
     def of(cls, time: Floats, value: Floats, covariance: Floats, seen: Bools) -> Self:
-        """Return the path about a first guess: the measurements that follow from each other, gaps bridged."""
+        """Return the segment about a first estimate: measurements that follow from each other, gaps interpolated."""
         reference, omega, trusted = _first_guess(time, value, seen)
         mean = omega.mean(0)
         rate = np.zeros((len(time), ORDER, 3))
@@ -226,12 +225,12 @@ class Turns(Path):
         )
 
     def away(self) -> Floats:
-        """Return the turns from reference to measurement."""
+        """Return the rotation vectors from reference to measurement."""
         value = np.where(self.seen[:, None, None], self.value, self.reference)
-        return turn(self.reference, value)
+        return rotvec_between(self.reference, value)
 
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
-        """Return the reference's own turns, exact for any angle, and what they leave of its steps."""
+        """Return the reference's own rotations, exact for any angle, and the jumps."""
         step = np.diff(self.time)
         rate = self.scaled(prior)[:-1]
         at, _ = nodes(step)
@@ -240,35 +239,35 @@ class Turns(Path):
         over_step = integral(step * pole)[:, None]
         gone = np.concatenate([over_step - integral(at * pole), over_step], axis=1) / pole
         angle = to_end[..., None] * self.mean + gone @ rate
-        carry = exp(angle)
+        carry = rotation_of(angle)
         whole = propagated(self.mean, rate, pole, step)
         carry[:, NODES] = whole
-        return carry, turn(whole @ self.reference[:-1], self.reference[1:])
+        return carry, rotvec_between(whole @ self.reference[:-1], self.reference[1:])
 
     def rates(self) -> Floats:
         """Return angular velocities between neighbouring measurements."""
         seen = np.flatnonzero(self.used)
-        return turn(self.value[seen[:-1]], self.value[seen[1:]]) / np.diff(self.time[seen])[:, None]
+        return rotvec_between(self.value[seen[:-1]], self.value[seen[1:]]) / np.diff(self.time[seen])[:, None]
 
     def moved(self, state: Floats, prior: Prior) -> Self:
         """Return the path about the states."""
         return replace(
             self,
-            reference=exp(state[:, DELTA]) @ self.reference,
+            reference=rotation_of(state[:, DELTA]) @ self.reference,
             mean=self.mean + state[0, MEAN],
             rate=state[:, RATE].reshape(-1, ORDER, 3),
             pole=prior.pole,
         )
 
 
-def exp(rotvec: Floats) -> Floats:
-    """Return rotations (..., 3, 3) by rotation vectors (..., 3), rad."""
+def rotation_of(rotvec: Floats) -> Floats:
+    """Return the rotations (..., 3, 3) of rotation vectors (..., 3), rad."""
     matrices = Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_matrix()
     return np.asarray(matrices, dtype=np.float64).reshape(*rotvec.shape, 3)
 
 
-def turn(begin: Floats, end: Floats) -> Floats:
-    """Return the rotation vectors (M, 3) in lab components that lead from orientations (M, 3, 3) to others."""
+def rotvec_between(begin: Floats, end: Floats) -> Floats:
+    """Return the rotation vectors (M, 3), lab, from orientations (M, 3, 3) to others."""
     if len(begin) == 0:
         return np.zeros((0, 3))
     return np.asarray(Rotation.from_matrix(end @ begin.swapaxes(-1, -2)).as_rotvec(), dtype=np.float64)
@@ -282,7 +281,7 @@ def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int
     h = step[:, None] / parts
     begin = h * np.arange(parts)
     early, late = (mean + grown_rate((begin + h * (0.5 + side * np.sqrt(3) / 6)) * pole) @ rate for side in (-1, 1))
-    turns = exp(h[..., None] * (early + late) / 2 - np.sqrt(3) / 12 * h[..., None] ** 2 * np.cross(early, late))
+    turns = rotation_of(h[..., None] * (early + late) / 2 - np.sqrt(3) / 12 * h[..., None] ** 2 * np.cross(early, late))
     whole = turns[:, 0]
     for k in range(1, parts):
         whole = turns[:, k] @ whole
@@ -290,38 +289,38 @@ def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int
 
 
 def _first_guess(time: Floats, R: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
-    """Return orientations (N, 3, 3) at all instants, omega_lab (N, 3), rad per frame, and the frames they lead through.
+    """Return orientations (N, 3, 3) and omega_lab (N, 3), rad per frame, at all instants, and the frames trusted.
 
-    Over a gap, where more than half a turn may have passed, omega goes on smoothly from before to behind it; of the
-    turns that fit, the one nearest to that is meant.
+    Over a gap, where more than half a turn may have passed, omega is interpolated smoothly; of the rotations that fit,
+    the one nearest to it is taken.
     """
     frames = np.flatnonzero(seen)
     if len(frames) < 2:
         return np.broadcast_to(R[frames[0]], R.shape).copy(), np.zeros((len(time), 3)), seen
-    steps = turn(R[frames[:-1]], R[frames[1:]])
+    steps = rotvec_between(R[frames[:-1]], R[frames[1:]])
     omega = _typical(time, time[frames], steps / np.diff(time[frames])[:, None])
-    gone = np.concatenate([np.eye(3)[None], exp((omega[1:] + omega[:-1]) / 2 * np.diff(time)[:, None])])
+    gone = np.concatenate([np.eye(3)[None], rotation_of((omega[1:] + omega[:-1]) / 2 * np.diff(time)[:, None])])
     for k in range(1, len(time)):  # a product in order; it need not stay exact, it is compared over short spans only
         gone[k] = gone[k] @ gone[k - 1]
     still = gone[frames].mT @ R[frames]  # constant where the turning is typical
     way = float(np.median(np.linalg.norm(steps, axis=1)))
-    trusted = frames[_consistent(lambda lag: turn(still[:-lag], still[lag:]), len(frames), way)]
-    # what omega alone leaves between two trusted frames is spread evenly over the time between them
+    trusted = frames[_consistent(lambda lag: rotvec_between(still[:-lag], still[lag:]), len(frames), way)]
+    # distribute what omega leaves between two trusted frames evenly over the time between them
     at = np.interp(np.arange(len(time)), trusted, np.arange(len(trusted)))
     left = np.minimum(at.astype(int), max(len(trusted) - 2, 0))
     share = np.clip(at - left, 0.0, 1.0)
     right = np.minimum(left + 1, len(trusted) - 1)
     ahead = gone @ gone[trusted[left]].mT @ R[trusted[left]]
-    missed = turn(gone[trusted[right]] @ gone[trusted[left]].mT @ R[trusted[left]], R[trusted[right]])
-    carried = gone @ gone[trusted[right]].mT @ exp(missed)  # the correction grows in the frame that turns along
-    along = turn(ahead, carried @ gone[trusted[right]] @ gone[trusted[left]].mT @ R[trusted[left]])
-    reference = exp(share[:, None] * along) @ ahead
+    missed = rotvec_between(gone[trusted[right]] @ gone[trusted[left]].mT @ R[trusted[left]], R[trusted[right]])
+    carried = gone @ gone[trusted[right]].mT @ rotation_of(missed)  # the correction grows in the frame that turns along
+    along = rotvec_between(ahead, carried @ gone[trusted[right]] @ gone[trusted[left]].mT @ R[trusted[left]])
+    reference = rotation_of(share[:, None] * along) @ ahead
     reference[trusted] = R[trusted]
     return reference, omega, np.isin(np.arange(len(time)), trusted)
 
 
 def _typical(time: Floats, seen_time: Floats, rates: Floats) -> Floats:
-    """Return rates (N, 3) at all instants by those between neighbours, two wrong ones in five outvoted."""
+    """Return rates (N, 3) at all instants from those between neighbours, robust to two wrong ones in five."""
     step = np.diff(seen_time)
     near = np.flatnonzero(step <= 1.5 * np.median(step))
     rates, middle = rates[near], ((seen_time[:-1] + seen_time[1:]) / 2)[near]
@@ -335,22 +334,21 @@ def _typical(time: Floats, seen_time: Floats, rates: Floats) -> Floats:
 
 
 def _around(x: Floats, width: int) -> Floats:
-    """Return the neighbours (n, width, d) of every row (n, d), those of the ends all on one side."""
+    """Return the neighbours (n, width, d) of every row (n, d); at the ends all are on one side."""
     width = min(width, len(x))
     first = (np.arange(len(x)) - width // 2).clip(0, len(x) - width)
     return np.asarray(x[first[:, None] + np.arange(width)])
 
 
 def _consistent(kink: Callable[[int], Floats], count: int, way: float) -> NDArray[np.int64]:
-    """Return the longest chain of frames that follow from each other, frames left out at a price.
+    """Return the frames that follow from each other, by least cost; to leave out a frame has a cost, too.
 
     Args:
-        kink: gives for a lag what the typical rate leaves of the way from each frame to the one so much later,
-            (count - lag, 3).
+        kink: for a lag, the steps (count - lag, 3) from each frame to the one so much later, less the typical rate.
         count: of frames.
-        way: typical length of a step; what is typical is itself known to a few hundredths only.
+        way: typical length of a step; the typical rate is known to a few hundredths of it.
 
-    Source: dynamic programming over the frame before; kinks are measured by the median kink of the track.
+    Source: dynamic programming over the frame before; kinks are in units of the median kink.
     """
     reach = min(LEFT_OUT + 1, count - 1)
     kinks = [np.linalg.norm(kink(lag), axis=1) / lag for lag in range(1, reach + 1)]

@@ -1,4 +1,4 @@
-"""Motion from the precise track: smoothed place and orientation, their derivatives, with honest sigmas."""
+"""Motion from the precise track: smoothed position and orientation, their derivatives, with sigmas."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, estimate
 from sphereorient.motion.learn import ProcessNoise
-from sphereorient.motion.path import Places, Turns
+from sphereorient.motion.path import PositionTrack, RotationTrack
 from sphereorient.motion.settings import SmoothSettings
 
 Floats = NDArray[np.float64]
@@ -22,12 +22,12 @@ Bools = NDArray[np.bool_]
 M_PER_MM = 1e-3
 LONGEST_STEP = 1.5  # typical steps; longer ones are bridged by instants in between
 MOST_BETWEEN = 300  # instants that bridge one long step
-LOST_RAD = 0.5  # an orientation less certain than that is none
+LOST_RAD = 0.5  # an orientation with a larger sigma is discarded
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Smoothed:
-    """Smoothed motion of N frames; made by `smooth_motion`, read by the pipeline. float64, NaN where there is none."""
+    """Smoothed motion of N frames, float64, NaN where it is unknown."""
 
     position_lab_mm: Tensor  # (N, 3)
     position_cov_mm2: Tensor  # (N, 3, 3)
@@ -46,55 +46,68 @@ class Smoothed:
     alpha_body_rad_s2: Tensor
     alpha_body_sigma_rad_s2: Tensor
     extrapolated: Tensor  # (N,) bool, frames of a segment without a measurement of their own of either kind
-    rejected: Tensor  # (N,) bool, frames with a measurement too far off what all others say
-    position_scale: float  # true errors of the measured positions over their sigmas: the learnt, and slow ones
+    rejected: Tensor  # (N,) bool, frames with a rejected measurement
+    position_scale: float  # true errors of the measured positions over their sigmas, slow errors included
     orientation_scale: float  # the same of the orientations
-    process: ProcessNoise  # what was learnt
+    process: ProcessNoise
 
 
-def smooth_motion(
-    time_s: Tensor,
-    position_lab_mm: Tensor,
-    position_cov_mm2: Tensor,
-    R_lab_body: Tensor,
-    orientation_cov_rad2: Tensor,
-    segment: Tensor,
-    settings: SmoothSettings,
-    known: ProcessNoise | None = None,
-) -> Smoothed:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeasuredPoses:
+    """Measured poses of N frames, what `smooth_motion` smooths."""
+
+    time_s: Tensor  # (N,), increasing within a segment, even or not
+    position_lab_mm: Tensor  # (N, 3), NaN where not measured
+    position_cov_mm2: Tensor  # (N, 3, 3)
+    R_lab_body: Tensor  # (N, 3, 3), NaN where not measured
+    orientation_cov_rad2: Tensor  # (N, 3, 3), of delta in R_true = exp([delta]x) R_lab_body, lab components
+    segment: Tensor  # (N,) int64, number of the segment, -1 outside any
+
+    def __post_init__(self) -> None:
+        """Refuse parts of other shapes."""
+        check_tail("position_lab_mm", self.position_lab_mm, 3)
+        for name in ("position_cov_mm2", "R_lab_body", "orientation_cov_rad2"):
+            check_tail(name, getattr(self, name), 3, 3)
+        leading = [
+            self.time_s.shape,
+            self.position_lab_mm.shape[:-1],
+            *(part.shape[:-2] for part in (self.position_cov_mm2, self.R_lab_body, self.orientation_cov_rad2)),
+        ]
+        if self.time_s.dim() != 1 or any(shape != self.segment.shape for shape in leading):
+            got = ", ".join(str(tuple(shape)) for shape in [*leading, self.segment.shape])
+            do = "give all the same frames"
+            raise ShapeError(refusal("smooth_motion", expected="N frames in each", got=got, do=do))
+
+
+def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: ProcessNoise | None = None) -> Smoothed:
     """Smooth a track, segment by segment, and take its derivatives.
 
-    Velocity and omega_lab are a constant plus a stationary random process whose band and strength are learnt from the
-    whole track, once for positions and once for orientations, with one factor on the measurements' sigmas. Nothing
-    lags; the ends are included; frames of a segment without a measurement are filled from their neighbours. A
-    measurement that the others exclude is left out.
+    Velocity and omega_lab are a constant plus a stationary random process. Its band and strength are estimated from the
+    whole track, once for positions and once for orientations, with one factor on the sigmas of the measurements. There
+    is no lag; the ends are included; gaps inside a segment are filled; outliers are left out.
 
-    A segment with one measured frame has this measurement there and no derivatives; with two it has velocities, from
-    three on accelerations too. Where the whole track has too few frames to learn from, it is as if each were alone.
+    A segment with one measured frame has this measurement and no derivatives; with two it has velocities, from three on
+    accelerations too. A track with too few frames for the estimation is treated
+    as if each were alone.
 
     Args:
-        time_s: (N,), s, increasing within a segment, even or not.
-        position_lab_mm: (N, 3), mm, lab; NaN where not measured.
-        position_cov_mm2: (N, 3, 3), mm^2.
-        R_lab_body: (N, 3, 3), NaN where not measured.
-        orientation_cov_rad2: (N, 3, 3), rad^2, of delta in R_true = exp([delta]x) R_lab_body, lab components.
-        segment: (N,) int64, number of the segment, -1 outside any.
+        measured: N frames.
         settings: bands, limits.
-        known: the motion as another run learnt it; None learns it from this track.
+        known: the processes as another run estimated them; None estimates them from this track.
 
     Returns:
         The motion, on the CPU.
 
     Raises:
-        ShapeError: wrong last axes, unequal numbers of frames, or times that do not increase.
+        ShapeError: times that do not increase.
 
     Source: Gaussian-process regression as a smoother: Sarkka and Solin 2019, Applied Stochastic Differential Equations,
     chapter 12; on SO(3): Barfoot 2017, State Estimation for Robotics, chapters 7 and 8.
     """
-    _check(time_s, position_lab_mm, position_cov_mm2, R_lab_body, orientation_cov_rad2, segment)
-    parts = (time_s, position_lab_mm, position_cov_mm2, R_lab_body, orientation_cov_rad2)
+    names = ("time_s", "position_lab_mm", "position_cov_mm2", "R_lab_body", "orientation_cov_rad2")
+    parts = (getattr(measured, name) for name in names)
     t, X, X_cov, R, R_cov = (part.detach().cpu().to(torch.float64).numpy() for part in parts)
-    numbers = segment.cpu().numpy()
+    numbers = measured.segment.cpu().numpy()
     frame_s = _typical_step(t, numbers)
     rows = [np.flatnonzero(numbers == n) for n in np.unique(numbers[numbers >= 0])]
     if any((np.diff(t[k]) <= 0).any() for k in rows):
@@ -105,8 +118,8 @@ def smooth_motion(
     in_places = [_Instants.of(k, t[k] / frame_s, seen_X[k]) for k in rows if seen_X[k].any()]
     in_turns = [_Instants.of(k, t[k] / frame_s, seen_R[k]) for k in rows if seen_R[k].any()]
     unit = np.eye(3)
-    places = [Places.of(at.time, at.spread(X, np.zeros(3)), at.spread(X_cov, unit), at.used) for at in in_places]
-    turns = [Turns.of(at.time, at.spread(R, unit), at.spread(R_cov, unit), at.used) for at in in_turns]
+    places = [PositionTrack.of(at.time, at.spread(X, np.zeros(3)), at.spread(X_cov, unit), at.used) for at in in_places]
+    turns = [RotationTrack.of(at.time, at.spread(R, unit), at.spread(R_cov, unit), at.used) for at in in_turns]
     place, turn = (None, None) if known is None else (known.place, known.turn)
     ratio = 1.0 if known is None else frame_s / known.frame_s
     moving, position_scale, place = estimate(
@@ -128,23 +141,6 @@ def smooth_motion(
         orientation_scale=orientation_scale,
         process=ProcessNoise(place=place, turn=turn, frame_s=frame_s),
     )
-
-
-def _check(
-    time_s: Tensor, position: Tensor, position_cov: Tensor, R: Tensor, orientation_cov: Tensor, segment: Tensor
-) -> None:
-    """Refuse arguments of other shapes."""
-    check_tail("position_lab_mm", position, 3)
-    for name, tensor in (
-        ("position_cov_mm2", position_cov),
-        ("R_lab_body", R),
-        ("orientation_cov_rad2", orientation_cov),
-    ):
-        check_tail(name, tensor, 3, 3)
-    leading = [time_s.shape, position.shape[:-1], position_cov.shape[:-2], R.shape[:-2], orientation_cov.shape[:-2]]
-    if time_s.dim() != 1 or any(shape != segment.shape for shape in leading):
-        got = ", ".join(str(tuple(shape)) for shape in [*leading, segment.shape])
-        raise ShapeError(refusal("smooth_motion", expected="N frames in each", got=got, do="give all the same frames"))
 
 
 def _typical_step(time_s: Floats, numbers: NDArray[np.int64]) -> float:
@@ -178,7 +174,7 @@ class _Instants:
         return cls(rows=rows, frames=frames, time=instants, used=used)
 
     def spread(self, values: Floats, neutral: Floats) -> Floats:
-        """Return the track's values at the instants, something neutral where nothing was measured."""
+        """Return the values of the track at the instants, and a neutral one where nothing was measured."""
         out = np.broadcast_to(neutral, (len(self.time), *neutral.shape)).copy()
         out[self.used] = values[self.rows][self.used[self.frames]]
         return out
@@ -189,7 +185,7 @@ class _Instants:
 
 
 def _blank(frames: int) -> dict[str, Floats]:
-    """Every tensor before anything is known."""
+    """Return the arrays of `Smoothed`, NaN."""
     square = ("position_cov_mm2", "orientation_cov_rad2", "R_lab_body")
     other = ("extrapolated", "rejected", "position_scale", "orientation_scale", "process")
     names = [entry.name for entry in fields(Smoothed) if entry.name not in other]
@@ -202,7 +198,7 @@ def _sigma(covariance: Floats) -> Floats:
 
 
 def _put_places(out: dict[str, Floats], rows: NDArray[np.int64], at: Estimate, frame_s: float) -> None:
-    """Write one segment's places; mm per frame become m/s."""
+    """Write the positions of one segment; mm per frame become m/s."""
     speed, change = M_PER_MM / frame_s, M_PER_MM / frame_s**2
     out["position_lab_mm"][rows] = at.value
     out["position_cov_mm2"][rows] = at.covariance[:, VALUE, VALUE]
@@ -213,7 +209,7 @@ def _put_places(out: dict[str, Floats], rows: NDArray[np.int64], at: Estimate, f
 
 
 def _put_turns(out: dict[str, Floats], rows: NDArray[np.int64], at: Estimate, frame_s: float) -> None:
-    """Write one segment's orientations; turns per frame become rad/s, in the lab and in the body."""
+    """Write the orientations of one segment; rad per frame become rad/s, in the lab and in the body."""
     C = at.covariance.copy()
     lost = _sigma(C[:, VALUE, VALUE]).max(1) > LOST_RAD
     R, rate, change = (

@@ -12,15 +12,12 @@ from torch.nn.functional import pad
 
 
 def windows(x: Tensor, half: int, fill: float = torch.nan) -> Tensor:
-    """Return every frame's neighbours.
+    """Return the neighbours of every frame: (..., N, 2 half + 1), entry [k, half + j] is x[k + j].
 
     Args:
         x: (..., N), anything by frame.
-        half: how many neighbours to either side.
-        fill: what lies beyond the ends.
-
-    Returns:
-        (..., N, 2 half + 1); entry [k, half + j] is x[k + j].
+        half: number of neighbours on either side.
+        fill: value beyond the ends.
     """
     if x.shape[-1] == 0:
         return x.new_empty(*x.shape, 2 * half + 1)
@@ -28,7 +25,7 @@ def windows(x: Tensor, half: int, fill: float = torch.nan) -> Tensor:
 
 
 def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
-    """Say which neighbours of a frame were measured and belong to its segment.
+    """Return which neighbours of a frame were measured and belong to its segment.
 
     Args:
         there: (..., N) bool, frames that hold a measurement.
@@ -45,10 +42,9 @@ def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor
 
 
 def paired(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
-    """Say which neighbours of a frame can be used together with their mirror images.
+    """Return which neighbours of a frame can be used in pairs k - j, k + j.
 
-    Only pairs k - j, k + j are used, because their weights are then of one parity and no lower power of time leaks
-    into the result, whichever frames are missing.
+    The weights of pairs have one parity: no lower power of time enters the result, whichever frames are missing.
 
     Args:
         there: (..., N) bool, frames that hold a measurement.
@@ -63,15 +59,7 @@ def paired(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
 
 
 def apply(stencil: Tensor, x: Tensor) -> Tensor:
-    """Return the weighted sums.
-
-    Args:
-        stencil: (..., N, 2 h + 1), weights.
-        x: (..., N, D); values with weight zero may be NaN.
-
-    Returns:
-        (..., N, D), NaN where the stencil is.
-    """
+    """Return the weighted sums (..., N, D) of x (..., N, D), NaN where the stencil is; x of weight 0 may be NaN."""
     undetermined = stencil.isnan().any(-1)[..., None]
     # zeros in place of NaN first: the gradient of an unselected NaN is NaN, too
     weights = torch.where(undetermined, 0.0, stencil)[..., None, :]
@@ -80,29 +68,13 @@ def apply(stencil: Tensor, x: Tensor) -> Tensor:
     return torch.where(undetermined, torch.nan, sums)
 
 
-def spread(stencil: Tensor, sigma: Tensor) -> Tensor:
-    """Return the standard deviation of the weighted sums for independent errors.
-
-    Args:
-        stencil: (..., N, 2 h + 1), weights.
-        sigma: (..., N, D), standard deviation of every value; NaN where unknown.
-
-    Returns:
-        (..., N, D), NaN where the stencil is or where a sigma with weight is.
-    """
+def propagated_sigma(stencil: Tensor, sigma: Tensor) -> Tensor:
+    """Return the standard deviation (..., N, D) of the weighted sums, for independent errors of sigma (..., N, D)."""
     return apply(stencil.square(), sigma.square()).sqrt()
 
 
 def compose(outer: Tensor, inner: Tensor) -> Tensor:
-    """Return the stencil that acts like `outer` on the result of `inner`.
-
-    Args:
-        outer: (..., N, 2 a + 1), weights.
-        inner: (..., N, 2 b + 1), weights.
-
-    Returns:
-        (..., N, 2 (a + b) + 1), NaN where outer is.
-    """
+    """Return the stencil (..., N, 2 (a + b) + 1) of `outer` (2 a + 1) applied to the result of `inner` (2 b + 1)."""
     a = outer.shape[-1] // 2
     near = windows(inner.mT, a).movedim(-3, -1)  # (..., N, 2 a + 1, 2 b + 1)
     weights = outer[..., None]

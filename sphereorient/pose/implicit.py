@@ -1,12 +1,12 @@
-"""A converged fit of poses with its derivatives: by the implicit function theorem, not through the fit's steps.
+"""A converged fit of poses with its derivatives, by the implicit function theorem (docs/differentiable.md).
 
-Where sum r(pose, theta)^2 / 2 is least its gradient g(pose, theta) is 0, and stays 0 when theta changes: so
-d pose / d theta = -H^-1 dg/dtheta with H = dg/dpose. `implicit_pose` fits without a graph, and then takes one Newton
-step -H^-1 g from where it arrived, H a constant: the step is nothing (or mends the last digits), its derivative is
-the theorem's. theta is whatever tensors with gradients the residuals were computed from.
+At the least sum r(pose, theta)^2 / 2 the gradient g(pose, theta) is 0, and stays 0 when theta changes: so
+d pose / d theta = -H^-1 dg/dtheta with H = dg/dpose. `implicit_pose` fits without a graph and then takes one Newton
+step -H^-1 g with H a constant: its value is close to 0, its derivative that of the theorem. theta stands for all
+tensors with gradients from which the residuals are computed.
 
-`refine` cannot serve here: it is in single precision, and its weights, its light and the slopes of its paint are held
-fixed in each step, so that what it sets to 0 is no function that autograd could differentiate.
+The fit of `track` cannot serve: it works in single precision and holds weights, light and slopes of the texture fixed
+in each step, so that its zero is not the zero of a function that autograd can differentiate.
 """
 
 from __future__ import annotations
@@ -21,22 +21,21 @@ from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 
 Residual = Callable[[Tensor, Tensor], Tensor]  # R_lab_body (B, 3, 3), position_lab_mm (B, 3) -> (B, M)
-Curvature = Callable[[Callable[[Tensor], Tensor], Tensor], Tensor]  # residuals of delta, delta (B, 6) -> (B, 6, 6)
 
 START_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e9  # of Levenberg and Marquardt, relative to the diagonal
-EASE, STIFFEN = 0.2, 5.0  # what a step that was good or bad does to it
-FLAT = 1e-6  # 1/rad^2 and 1/mm^2: a direction known to no better than 1000 rad or 1 m is not determined
-ARRIVED_RAD, ARRIVED_MM = 1e-3, 1e-2  # of the Newton step: what is nearer, it takes there
+EASE, STIFFEN = 0.2, 5.0  # factors after a good and after a bad step
+FLAT = 1e-6  # 1/rad^2 and 1/mm^2: below, a direction (sigma 1000 rad or 1 m) is not determined
+ARRIVED_RAD, ARRIVED_MM = 1e-3, 1e-2  # largest Newton step of a converged fit
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImplicitPose:
-    """B fitted poses that carry gradients to what the residuals depend on; made by `implicit_pose`."""
+    """B fitted poses, differentiable in all that the residuals depend on."""
 
     R_lab_body: Tensor  # (B, 3, 3), NaN in frames not used
     position_lab_mm: Tensor  # (B, 3), NaN in frames not used
     cost: Tensor  # (B,), half the sum of squared residuals at these poses, differentiable too; 0 in frames not used
-    arrived: Tensor  # (B,) bool, fits that ended at a minimum; the others stay where they ended, with gradient 0
+    arrived: Tensor  # (B,) bool, converged fits; the others stay where they ended, with gradient 0
 
 
 def implicit_pose(
@@ -46,22 +45,19 @@ def implicit_pose(
     *,
     use: Tensor | None = None,
     iterations: int = 30,
-    curvature: Curvature | None = None,
 ) -> ImplicitPose:
-    """Fit poses by least squares and return them with gradients to all that the residuals were made of.
+    """Fit poses by least squares and return them with gradients to all tensors in the residuals.
 
     Args:
-        residual: (B, 3, 3) and (B, 3) to (B, M), row b of pose b alone, each in units of its standard deviation; twice
-            differentiable in the pose by torch.func (`expected_grey` is), once in the rest. What must not count is 0.
-        R_start_lab_body: (B, 3, 3), where the fit begins.
-        start_lab_mm: (B, 3).
-        use: (B,) bool, the frames that have anything to fit; others come back NaN, with gradient 0. What `residual`
-            gives for them does not matter as long as its derivatives are finite. None: all.
-        iterations: steps of Levenberg and Marquardt, the same for all. The graph does not grow with them.
-        curvature: `full_curvature` (None) or `gauss_newton_curvature`.
+        residual: (B, 3, 3) and (B, 3) to (B, M), row b of pose b alone, in standard deviations; twice differentiable in
+            the pose by torch.func (`expected_grey` is), once in the rest. Residuals that must not count are 0.
+        R_start_lab_body: (B, 3, 3), start.
+        start_lab_mm: (B, 3), start.
+        use: (B,) bool, frames to fit; the others are NaN, with gradient 0, if their residuals have finite derivatives.
+        iterations: Levenberg-Marquardt steps, the same for all. The graph does not grow with them.
 
     Returns:
-        The poses. A direction that nothing determines stays at the start, with gradient 0.
+        The poses. An undetermined direction stays at the start, with gradient 0.
 
     Raises:
         ShapeError: starts, `use` and residuals do not belong together.
@@ -71,7 +67,7 @@ def implicit_pose(
     """
     use = _checked(R_start_lab_body, start_lab_mm, use, iterations)
     known = use & R_start_lab_body.isfinite().all(-1).all(-1) & start_lab_mm.isfinite().all(-1)
-    # Frames that are not used stand where numbers are finite: 0 times NaN would reach the gradients.
+    # Unused frames get a finite pose: 0 times NaN would reach the gradients.
     place = torch.where(known[:, None], start_lab_mm, 0.0).sum(0) / known.sum().clamp_min(1)
     view = torch.eye(3, dtype=R_start_lab_body.dtype, device=R_start_lab_body.device)
     R = torch.where(known[:, None, None], R_start_lab_body, view).detach()
@@ -85,15 +81,15 @@ def implicit_pose(
         return torch.where(known[:, None], r, 0.0)
 
     with torch.no_grad():
-        R, X = levenberg_marquardt(counted, R, X, iterations)
+        R, X = _levenberg_marquardt(counted, R, X, iterations)
     still = torch.zeros(len(X), 6, dtype=X.dtype, device=X.device)
 
     def about(delta: Tensor) -> Tensor:
-        return counted(*moved(R, X, delta))
+        return counted(*_moved(R, X, delta))
 
     gradient = torch.func.grad(lambda delta: 0.5 * about(delta).square().sum())(still)
     with torch.no_grad():
-        inverse = _inverse((curvature or full_curvature)(about, still))
+        inverse = _inverse(_curvature(about, still))
     step = -(inverse @ gradient[..., None])[..., 0]
     arrived = known & (step[:, :3].norm(dim=-1) < ARRIVED_RAD) & (step[:, 3:].norm(dim=-1) < ARRIVED_MM)
     step = torch.where(arrived[:, None], step, 0.0)
@@ -107,27 +103,21 @@ def implicit_pose(
     )
 
 
-def levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
-    """Return the poses (B, 3, 3) and (B, 3) at which each row of the residuals has the least sum of squares.
-
-    Args:
-        residual: as `implicit_pose`.
-        R: (B, 3, 3), start.
-        X: (B, 3), start, mm.
-        iterations: steps; one that makes a pose worse is not taken, and the next one is shorter.
+def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
+    """Return the poses (B, 3, 3) and (B, 3) with the least sum of squares; a step that makes a pose worse is not taken.
 
     Source: Marquardt 1963, damping in units of the diagonal.
     """
     damping = torch.full_like(X[:, 0], START_DAMPING)
     still = torch.zeros(len(X), 6, dtype=X.dtype, device=X.device)
     for _ in range(iterations):
-        r, slopes = _linearised(lambda delta, R=R, X=X: residual(*moved(R, X, delta)), still)  # type: ignore[misc]
+        r, slopes = _linearised(lambda delta, R=R, X=X: residual(*_moved(R, X, delta)), still)  # type: ignore[misc]
         normal, pull = slopes @ slopes.mT, (slopes @ r[..., None])[..., 0]
         diagonal = normal.diagonal(dim1=-2, dim2=-1)
         floor = damping[:, None] * diagonal + FLAT  # a flat direction gets no step
         step: Tensor = torch.linalg.solve_ex(normal + torch.diag_embed(floor), -pull[..., None]).result[..., 0]
-        R_next, X_next = moved(R, X, step)
-        # Near the minimum sums of squares differ by rounding only, and steps go on being good.
+        R_next, X_next = _moved(R, X, step)
+        # Near the minimum sums of squares differ by rounding only.
         slack = 1.0 + 8.0 * torch.finfo(X.dtype).eps
         better = residual(R_next, X_next).square().sum(-1) <= r.square().sum(-1) * slack
         R, X = torch.where(better[:, None, None], R_next, R), torch.where(better[:, None], X_next, X)
@@ -135,16 +125,11 @@ def levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: in
     return so3.nearest_rotation(R), X
 
 
-def moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Return poses with small errors applied.
+def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
+    """Apply small errors (B, 6), rad and mm, lab components, from the left, to poses (docs/conventions.md).
 
-    Args:
-        R_lab_body: (B, 3, 3).
-        position_lab_mm: (B, 3).
-        delta: (B, 6), turn (rad, lab components, from the left) and move (mm).
-
-    Source: DESIGN section 1 (small errors). Cayley's rotation in place of the exponential: the same up to the third
-    order, and smooth at 0, where so3.exp has no second derivative.
+    Cayley's rotation replaces the exponential: equal up to the third order, and smooth at 0, where so3.exp has no
+    second derivative.
     """
     half = so3.hat(0.5 * delta[..., :3])
     scale = 2.0 / (1.0 + 0.25 * delta[..., :3].square().sum(-1))
@@ -152,40 +137,30 @@ def moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[T
     return turned, position_lab_mm + delta[..., 3:]
 
 
-def full_curvature(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> Tensor:
-    """Return the second derivatives (B, 6, 6) of half the sum of squares of residuals (B, M) at delta (B, 6).
+def _curvature(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> Tensor:
+    """Return the Hessian (B, 6, 6) of half the sum of squares of residuals (B, M) at delta (B, 6).
 
-    Exact whatever is left of the residuals: the one to take unless it is too slow.
+    J^T J would be biased where residuals remain, as with a wrong texture.
     """
     gradient = torch.func.grad(lambda delta: 0.5 * residuals(delta).square().sum())
     columns: Tensor = torch.func.vmap(lambda axis: torch.func.jvp(gradient, (delta,), (axis,))[1])(_axes(delta))
     return columns.movedim(0, -1)
 
 
-def gauss_newton_curvature(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> Tensor:
-    """Return J^T J (B, 6, 6): the second derivatives without those of the residuals themselves.
-
-    Biased where residuals are left and the model is curved: the gradient of the pose is then off by about the share of
-    the curvature that is missing, sum r d2r. With noise alone that is small, with wrong paint it is not.
-    """
-    _, slopes = _linearised(residuals, delta)
-    return slopes @ slopes.mT
-
-
 def _linearised(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the residuals (B, M) and their slopes (B, 6, M); row b depends on delta b alone, so six jvps do."""
+    """Return the residuals (B, M) and their slopes (B, 6, M); row b depends on delta b alone: six jvps suffice."""
     along = torch.func.vmap(lambda axis: torch.func.jvp(residuals, (delta,), (axis,))[:2])
     values, slopes = along(_axes(delta))
     return values[0], slopes.movedim(0, 1)
 
 
 def _axes(delta: Tensor) -> Tensor:
-    """One unit change each, of all poses at once, (6, B, 6)."""
+    """Return one unit change each of all poses at once, (6, B, 6)."""
     return torch.eye(6, dtype=delta.dtype, device=delta.device)[:, None].expand(6, *delta.shape)
 
 
 def _inverse(curvature: Tensor) -> Tensor:
-    """Invert symmetric (B, 6, 6); directions that nothing determines become 0."""
+    """Invert symmetric (B, 6, 6); undetermined directions become 0."""
     rounding = 10 * torch.finfo(curvature.dtype).eps
     symmetric = 0.5 * (curvature + curvature.mT)
     inverse: Tensor = torch.linalg.pinv(symmetric, atol=FLAT, rtol=rounding, hermitian=True)
@@ -193,7 +168,7 @@ def _inverse(curvature: Tensor) -> Tensor:
 
 
 def _checked(R: Tensor, X: Tensor, use: Tensor | None, iterations: int) -> Tensor:
-    """Refuse what does not belong together; return `use`."""
+    """Refuse parts of other shapes; return `use`."""
     check_tail("start_lab_mm", X, 3)
     if X.ndim != 2:
         got, do = str(tuple(X.shape)), "put all poses into one batch"

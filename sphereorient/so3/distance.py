@@ -22,7 +22,7 @@ def angle(R: Tensor) -> Tensor:
     Raises:
         ShapeError: the last axes are not (3, 3).
 
-    Source: ERRATA A3; acos((Tr - 1)/2), the paper's, loses half the digits near 0 and pi.
+    Source: docs/errata.md A3; acos((Tr - 1)/2), the paper's, loses half the digits near 0 and pi.
     """
     check_tail("R", R, 3, 3)
     cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
@@ -43,7 +43,7 @@ def geodesic_distance(A: Tensor, B: Tensor) -> Tensor:
     Raises:
         ShapeError: the last axes are not (3, 3).
 
-    Source: the paper's d(A, B), worked out by ERRATA A3; the cosine from Tr((A-B)(A-B)^T) = 4 (1 - cos d).
+    Source: the paper's d(A, B), worked out by docs/errata.md A3; the cosine from Tr((A-B)(A-B)^T) = 4 (1 - cos d).
     """
     check_tail("A", A, 3, 3)
     check_tail("B", B, 3, 3)

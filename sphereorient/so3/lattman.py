@@ -60,7 +60,7 @@ def lattman_steps(theta_y: Tensor, delta: float) -> tuple[Tensor, Tensor]:
         angle does not turn anything.
 
     Source: d^2 = dtheta^2 + sin^2(pi/4 + theta/2) dtheta_plus^2 + sin^2(pi/4 - theta/2) dtheta_minus^2, the paper's
-        own metric; the steps that it prints are not of it (ERRATA E5).
+        own metric; the steps that it prints are not of it (docs/errata.md E5).
     """
     quarter = math.pi / 4
     return delta / (quarter + theta_y / 2).sin(), delta / (quarter - theta_y / 2).sin()
@@ -69,7 +69,7 @@ def lattman_steps(theta_y: Tensor, delta: float) -> tuple[Tensor, Tensor]:
 def lattman_grid(
     step_rad: float, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> Tensor:
-    """Return rotations spread evenly over SO(3).
+    """Return a grid of rotations, evenly over SO(3).
 
     Every rotation is within (1/2 + 1/sqrt 2) step_rad of one of them: half a step to the nearest row, then half a step
     in each of two orthogonal directions along it. Random rotations are within sqrt(3)/2 step_rad, as in a cubic lattice
@@ -88,7 +88,7 @@ def lattman_grid(
     Raises:
         SettingsError: the step is not in 0 .. pi.
 
-    Source: Lattman 1972 as in the paper, with the steps of ERRATA E5.
+    Source: Lattman 1972 as in the paper, with the steps of docs/errata.md E5.
     """
     if not 0 < step_rad <= math.pi:
         raise SettingsError(refusal("step_rad", expected="0 .. pi", got=f"{step_rad}", do="give the step in rad"))

@@ -25,8 +25,7 @@ def weighted_mean(R: Tensor, weights: Tensor) -> Tensor:
 
     Returns:
         (..., 3, 3), frames of R; NaN where all weights are 0. Where the rotations are so far apart that several means
-        are equally good (two of them by pi) one of them comes, always the same: for two a rotation on one of the two
-        half circles between them, divided by the weights.
+        are equally good (two of them by pi) the result is one of them, always the same.
 
     Raises:
         ShapeError: the last axes of R are not (K, 3, 3).

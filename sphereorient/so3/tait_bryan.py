@@ -22,8 +22,8 @@ def from_tait_bryan(theta: Tensor) -> Tensor:
     Raises:
         ShapeError: the last axis is not 3.
 
-    Source: the paper's R(theta). In words (ERRATA E9): turns about the fixed z, then the fixed y, then the fixed x;
-        or about the body's x, then its new y, then its new z.
+    Source: the paper's R(theta). In words (docs/errata.md E9): rotations about the fixed z, then y, then x; or about
+        the body's x, then its new y, then its new z.
     """
     check_tail("theta", theta, 3)
     (sx, sy, sz), (cx, cy, cz) = theta.sin().unbind(-1), theta.cos().unbind(-1)
@@ -48,8 +48,8 @@ def to_tait_bryan(R: Tensor) -> Tensor:
     Raises:
         ShapeError: the last axes are not (3, 3).
 
-    Source: ERRATA E1. theta_y and theta_x come from other elements than there, equal for a rotation, because asin
-        loses half the digits near theta_y = ± pi/2, and -R23, R33 lose all.
+    Source: docs/errata.md E1, with other elements for theta_y and theta_x, equal for a rotation: asin loses half the
+        digits near theta_y = ± pi/2, and -R23, R33 lose all.
     """
     check_tail("R", R, 3, 3)
     cos_y = torch.linalg.vector_norm(R[..., 0, :2], dim=-1)
@@ -74,7 +74,7 @@ def second_triplet(theta: Tensor) -> Tensor:
     Raises:
         ShapeError: the last axis is not 3.
 
-    Source: the paper's second triplet with sign(0) = 1, ERRATA E2.
+    Source: the paper's second triplet with sign(0) = 1, docs/errata.md E2.
     """
     check_tail("theta", theta, 3)
     x, y, z = theta.unbind(-1)
@@ -94,7 +94,7 @@ def rate_matrix_lab(theta: Tensor) -> Tensor:
     Raises:
         ShapeError: the last axis is not 3.
 
-    Source: the paper's H, which it takes for the body's (ERRATA E3).
+    Source: the paper's H, which it takes for the body's (docs/errata.md E3).
     """
     check_tail("theta", theta, 3)
     x, y, _ = theta.unbind(-1)
@@ -115,7 +115,7 @@ def rate_matrix_body(theta: Tensor) -> Tensor:
     Raises:
         ShapeError: the last axis is not 3.
 
-    Source: ERRATA E3.
+    Source: docs/errata.md E3.
     """
     check_tail("theta", theta, 3)
     _, y, z = theta.unbind(-1)

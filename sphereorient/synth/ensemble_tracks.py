@@ -11,7 +11,14 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient import so3
-from sphereorient.motion import MotionSettings, ProcessNoise, SmoothSettings, measure_motion, smooth_motion
+from sphereorient.motion import (
+    MeasuredPoses,
+    MotionSettings,
+    ProcessNoise,
+    SmoothSettings,
+    measure_motion,
+    smooth_motion,
+)
 from sphereorient.synth.ensemble import TrueTracks
 from sphereorient.trajectory import Flag, Trajectory
 
@@ -60,16 +67,15 @@ def smoothed_track(
     track = _noisy(true, noise_deg, noise_mm, seed, "precise")
     if silent:
         track = replace(track, position=true.position_mm, orientation=true.R_lab_body)
-    found = smooth_motion(
-        torch.from_numpy(track.time),
-        torch.from_numpy(track.position),
-        torch.from_numpy(track.position_cov),
-        torch.from_numpy(track.orientation),
-        torch.from_numpy(track.orientation_cov),
-        torch.from_numpy(track.segment),
-        SmoothSettings(),
-        known,
+    poses = MeasuredPoses(
+        time_s=torch.from_numpy(track.time),
+        position_lab_mm=torch.from_numpy(track.position),
+        position_cov_mm2=torch.from_numpy(track.position_cov),
+        R_lab_body=torch.from_numpy(track.orientation),
+        orientation_cov_rad2=torch.from_numpy(track.orientation_cov),
+        segment=torch.from_numpy(track.segment),
     )
+    found = smooth_motion(poses, SmoothSettings(), known)
     parts = {
         "position_smooth": found.position_lab_mm,
         "position_smooth_cov": found.position_cov_mm2,

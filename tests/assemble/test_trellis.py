@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.assemble import edge_costs, shortest_path
-from sphereorient.assemble import trellis as trellis_module
+from sphereorient.assemble import path as path_module
 from sphereorient.errors import ShapeError
 
 SEEDS = range(6)
@@ -231,7 +231,7 @@ def test_a_movie_without_candidates_costs_nothing_and_chooses_nothing():
 
 
 def test_costs_that_do_not_fit_the_mask_are_refused():
-    with pytest.raises(ShapeError, match="edge_cost and mask: expected"):
+    with pytest.raises(ShapeError, match="edge_cost: expected"):
         shortest_path(torch.ones(4, 3, 3), torch.ones(4, 3, dtype=torch.bool))
 
 
@@ -304,7 +304,7 @@ def test_edge_costs_do_not_depend_on_how_many_are_computed_at_once(rng, monkeypa
     score = torch.rand(2, 6, 3, generator=rng, dtype=torch.float64)
     time = torch.arange(6.0, dtype=torch.float64).expand(2, 6)
     whole = edge_costs(R, score, time)
-    monkeypatch.setattr(trellis_module, "PAIRS_AT_ONCE", 1)
+    monkeypatch.setattr(path_module, "PAIRS_AT_ONCE", 1)
     assert_close(edge_costs(R, score, time), whole)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.assemble import AssembleSettings, Fused, assemble_path, assemble_paths, fuse
-from sphereorient.assemble.repair import Track, _roughest_turn
+from sphereorient.assemble.two_cameras import Track, _roughest_turn
 from sphereorient.errors import ExperimentError, ShapeError
 from sphereorient.trajectory import Flag
 

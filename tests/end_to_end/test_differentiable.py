@@ -14,7 +14,8 @@ from conftest import REPO, assert_close
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble.differentiable import SoftTrack, soft_track, turning_costs
+from sphereorient.assemble import SoftTrack, soft_track
+from sphereorient.assemble.differentiable import turning_costs
 from sphereorient.cameras import PinholeCamera, Rays
 from sphereorient.cameras.parameters import with_parameters
 from sphereorient.errors import SettingsError, ShapeError

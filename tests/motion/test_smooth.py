@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError
-from sphereorient.motion import Smoothed, SmoothSettings, smooth_motion
+from sphereorient.motion import MeasuredPoses, Smoothed, SmoothSettings, smooth_motion
 from sphereorient.synth.motion import Motion6D, random_motion
 
 RATE = 600.0
@@ -43,7 +43,15 @@ def smoothed(
     unit = torch.eye(3, dtype=torch.float64).expand(frames, 3, 3)
     segment = torch.zeros(frames, dtype=torch.long) if segment is None else segment
     covariances = POSITION_MM**2 * unit, ORIENTATION_RAD**2 * unit
-    return smooth_motion(truth.time_s, position, covariances[0], R, covariances[1], segment, settings)
+    poses = MeasuredPoses(
+        time_s=truth.time_s,
+        position_lab_mm=position,
+        position_cov_mm2=covariances[0],
+        R_lab_body=R,
+        orientation_cov_rad2=covariances[1],
+        segment=segment,
+    )
+    return smooth_motion(poses, settings)
 
 
 def rel_rms(got: Tensor, true: Tensor) -> float:
@@ -365,3 +373,21 @@ def test_unequal_numbers_of_frames_and_times_that_stand_still_are_refused(rng: t
 
 def test_every_setting_is_described() -> None:
     assert all(entry.description for entry in SmoothSettings.model_fields.values())
+
+
+def test_a_slow_share_adds_its_part_of_the_measured_variance_to_the_covariances_of_the_poses():
+    # Of a variance c^2 s^2 the smoother estimates the fast part f; the slow one is f share / (1 - share).
+    truth, share = planted(), 0.25
+    without, with_slow = (
+        smoothed(truth, *measured(truth, torch.Generator().manual_seed(7)), settings=each)
+        for each in (WHITE, SmoothSettings(slow_share=share))
+    )
+    unit = torch.eye(3, dtype=torch.float64).expand(len(truth.time_s), 3, 3)
+    for name, sigma, scale in (
+        ("position_cov_mm2", POSITION_MM, without.position_scale),
+        ("orientation_cov_rad2", ORIENTATION_RAD, without.orientation_scale),
+    ):
+        added = getattr(with_slow, name) - getattr(without, name)
+        assert_close(added, share / (1 - share) * scale**2 * sigma**2 * unit, 1e-9 * sigma**2)
+    assert with_slow.position_scale == pytest.approx(without.position_scale / math.sqrt(1 - share))
+    assert_close(with_slow.velocity_sigma_m_s, without.velocity_sigma_m_s)

@@ -7,9 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from sphereorient.motion.kalman import Chain, run_filter, smooth
+from sphereorient.motion.kalman import StateSpace, run_filter, smooth
 from sphereorient.motion.matern import _M, ORDER, STATIONARY, Prior, grown, grown_rate, integral, nodes, prior_of_band
-from sphereorient.motion.path import Turns, exp, propagated, turn
+from sphereorient.motion.path import RotationTrack, propagated, rotation_of, rotvec_between
 
 
 def test_growth_agrees_with_the_matrix_exponential() -> None:
@@ -52,7 +52,7 @@ def test_filter_and_smoother_agree_with_dense_least_squares(hidden: tuple[int, .
     count, size = 10, 7
     spread = lambda n: (lambda A: A @ A.swapaxes(-1, -2) + 0.1 * np.eye(n))(rng.standard_normal((n, n)))  # noqa: E731
     used = ~np.isin(np.arange(count), hidden)
-    chain = Chain(
+    chain = StateSpace(
         carried=0.3 * rng.standard_normal((count - 1, 3, size)),
         drift=rng.standard_normal((count - 1, 3)),
         kind=rng.integers(0, 2, count - 1),
@@ -92,11 +92,11 @@ def test_filter_and_smoother_agree_with_dense_least_squares(hidden: tuple[int, .
         np.testing.assert_allclose(result.covariance[k], covariance[part, part], atol=1e-8)
     assert filtered.misfit == pytest.approx(off @ np.linalg.solve(S, off))
     assert filtered.log_determinant == pytest.approx(np.linalg.slogdet(S)[1])
-    # the surprise of one measurement is its distance from what all others say
+    # the mahalanobis of one measurement is its distance from what all others say
     others, doubt, _, _ = believed(np.flatnonzero(used & (np.arange(count) != 6)))
     away = chain.measured[6] - others[6 * size : 6 * size + 3]
     whole = doubt[6 * size : 6 * size + 3, 6 * size : 6 * size + 3] + chain.covariance[6]
-    assert result.surprise[6] == pytest.approx(away @ np.linalg.solve(whole, away))
+    assert result.mahalanobis[6] == pytest.approx(away @ np.linalg.solve(whole, away))
 
 
 def test_a_turn_about_a_moving_axis_agrees_with_the_differential_equation() -> None:
@@ -116,11 +116,11 @@ def test_the_linear_problem_of_turns_has_the_derivatives_of_the_true_one() -> No
     rng = np.random.default_rng(2)
     time, prior = np.arange(3.0), Prior(pole=0.4, deviation=0.1)
     omega = np.array([0.6, 0.3, -0.4])
-    R = exp(time[:, None] * omega)
-    path = Turns.of(time, R, np.tile(1e-6 * np.eye(3), (3, 1, 1)), np.ones(3, dtype=bool))
+    R = rotation_of(time[:, None] * omega)
+    path = RotationTrack.of(time, R, np.tile(1e-6 * np.eye(3), (3, 1, 1)), np.ones(3, dtype=bool))
     F = path.chain(prior).transition(0, np.zeros((6 + 3 * ORDER, 6 + 3 * ORDER)))
     small = 1e-6 * rng.standard_normal(6 + 3 * ORDER)
     delta, mean, rate = small[:3], path.mean + small[3:6], path.scaled(prior)[:1] + small[6:].reshape(1, ORDER, 3)
     still = propagated(path.mean, path.scaled(prior)[:1], prior.pole, np.ones(1))[0] @ R[0]
-    moved = propagated(mean, rate, prior.pole, np.ones(1))[0] @ exp(delta[None])[0] @ R[0]
-    np.testing.assert_allclose(turn(still[None], moved[None])[0], F[:3] @ small, atol=1e-9)
+    moved = propagated(mean, rate, prior.pole, np.ones(1))[0] @ rotation_of(delta[None])[0] @ R[0]
+    np.testing.assert_allclose(rotvec_between(still[None], moved[None])[0], F[:3] @ small, atol=1e-9)

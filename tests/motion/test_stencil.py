@@ -65,4 +65,4 @@ def test_composed_stencils_act_as_one_after_the_other(rng: torch.Generator) -> N
 
 def test_the_spread_adds_variances() -> None:
     weights, sigma = torch.tensor([[3.0, 0.0, 4.0]]).expand(3, 3), torch.tensor([[1.0], [torch.nan], [1.0]])
-    assert stencil.spread(weights, sigma)[1, 0] == 5.0
+    assert stencil.propagated_sigma(weights, sigma)[1, 0] == 5.0

@@ -10,12 +10,26 @@ from conftest import assert_close
 from torch import Tensor
 from trellis_examples import all_paths, enumerated, random_costs
 
-from sphereorient.assemble import shortest_path
-from sphereorient.assemble.second_order_layer import shortest_path_of_pairs, soft_path_of_pairs
-from sphereorient.assemble.soft_path import SoftPath, soft_path
+from sphereorient.assemble import ShortestPath, SoftPath, shortest_path, soft_path
 from sphereorient.errors import ShapeError
 
 SEEDS = range(8)
+
+
+def shortest_path_of_pairs(
+    triple: Tensor, mask: Tensor, pair_cost: Tensor | None = None, node_cost: Tensor | None = None
+) -> ShortestPath:
+    return shortest_path(pair_cost, mask, node_cost, triple)
+
+
+def soft_path_of_pairs(
+    triple: Tensor,
+    mask: Tensor,
+    temperature: float = 1.0,
+    pair_cost: Tensor | None = None,
+    node_cost: Tensor | None = None,
+) -> SoftPath:
+    return soft_path(pair_cost, mask, temperature, node_cost, triple)
 
 
 @pytest.mark.parametrize("temperature", [0.3, 1.0, 5.0])
@@ -213,7 +227,12 @@ def test_movies_without_steps_links_or_choice_are_data(steps, width):
 def test_costs_that_do_not_fit_the_mask_are_refused():
     with pytest.raises(ShapeError, match="triple_cost: expected"):
         soft_path_of_pairs(torch.ones(4, 3, 3, 3), torch.ones(4, 3, dtype=torch.bool))
-    with pytest.raises(ShapeError, match="edge_cost and mask: expected"):
+    with pytest.raises(ShapeError, match="edge_cost: expected"):
         shortest_path_of_pairs(
             torch.ones(2, 3, 3, 3), torch.ones(4, 3, dtype=torch.bool), pair_cost=torch.ones(2, 3, 3)
         )
+
+
+def test_a_path_without_edges_and_triples_is_refused():
+    with pytest.raises(ShapeError, match="edge_cost: expected costs of edges or triples"):
+        shortest_path(None, torch.ones(4, 3, dtype=torch.bool))

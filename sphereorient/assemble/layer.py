@@ -1,0 +1,258 @@
+"""The path as a layer: candidates in, the cheapest path or all probabilities out; its parameters can be learnt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from sphereorient import so3
+from sphereorient.assemble.path import edge_costs
+from sphereorient.assemble.second_order_cost import PARAMETERS, VARIANCE_MAX, SecondOrderCost
+from sphereorient.assemble.settings import AssembleSettings, PathSettings
+from sphereorient.assemble.trellis import ShortestPath, SoftPath, shortest_path, soft_path
+from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
+
+Values = Tensor | NDArray[np.floating]
+
+TRIPLES_AT_ONCE = 1 << 20  # whose misfits are held at once, 8 MB each array
+EVEN = 1e-9  # of a ratio of times: the expected rotation is off by less than 4e-9 rad
+LOST_RAD2 = 1e6  # variance of the place for none: a prediction with it says nothing
+LEAST = {"tail": 2.0}  # bounds of parameters, as in PathSettings
+MOST = {name: 1.0 for name in PARAMETERS if name.endswith("probability") or name == "evidence_doubt"}
+MOST |= {"stuck_probability": 0.5, "follow_probability": 0.5}
+
+
+class PathLayer(nn.Module):
+    """Choose among candidate orientations along time.
+
+    The first order is the paper's: the cost of an edge is d(A, B) (2 - T_A - T_B) / dt. The second order is that of
+    `track`, `SecondOrderCost`: a candidate is compared with the rotation between the two before it, and place C, none,
+    stands for frames in which no candidate is right. Unlike in `track`, a candidate that breaks the motion is a mixture
+    and no state, rotations between frames visited are below half a turn, and omega is forgotten after none.
+
+    Args:
+        order: 1 or 2.
+        soft: temperature of the soft path, in units of the costs; None: the cheapest path.
+        settings: AssembleSettings (order 1) or PathSettings with an acceleration (order 2), whose other cost settings
+            become parameters of the module: logarithms, or logits of probabilities. `settings` returns them as learnt.
+    """
+
+    def __init__(
+        self, order: int = 2, *, soft: float | None = None, settings: AssembleSettings | PathSettings | None = None
+    ) -> None:
+        super().__init__()
+        if order not in (1, 2):
+            raise SettingsError(refusal("order", expected="1 or 2", got=str(order), do="take 2"))
+        kind = AssembleSettings if order == 1 else PathSettings
+        self._settings = kind() if settings is None else settings
+        if not isinstance(self._settings, kind):
+            got, do = type(settings).__name__, "pass the settings of this order"
+            raise SettingsError(refusal("settings", expected=f"{kind.__name__} for order {order}", got=got, do=do))
+        self.order, self.soft = order, soft
+        if isinstance(self._settings, PathSettings):
+            cost = SecondOrderCost.of(self._settings)
+            for name in PARAMETERS:
+                value = torch.tensor(float(getattr(cost, name)), dtype=torch.float64)
+                raw = torch.logit(value / MOST[name]) if name in MOST else (value - LEAST.get(name, 0.0)).log()
+                self.register_parameter(name, nn.Parameter(raw))
+
+    @property
+    def settings(self) -> AssembleSettings | PathSettings:
+        """Return the settings with the parameters as they are now; `track` reads them under the key `path`."""
+        if self.order == 1:
+            return self._settings
+        learnt = {name: float(self._value(name).detach()) for name in PARAMETERS}
+        return PathSettings(**{**self._settings.model_dump(), **learnt})
+
+    def cost(self, like: Tensor) -> SecondOrderCost:
+        """Return the second-order cost, differentiable in the parameters, in the type and on the device of a tensor."""
+        return SecondOrderCost(**{name: self._value(name).to(like) for name in PARAMETERS})
+
+    def forward(
+        self,
+        R_lab_body: Values,
+        score: Values,
+        time_s: Values,
+        variance_rad2: Values | None = None,
+        mask: Values | None = None,
+    ) -> ShortestPath | SoftPath:
+        """Return the cheapest path, or the probabilities where `soft` is set; arrays may be of numpy.
+
+        Args:
+            R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.
+            score: (..., N, C), the quality T, 0 .. 1 (order 1), or the log-likelihood of the pictures, nats (order 2).
+            time_s: (..., N), increasing; frames without candidates are skipped.
+            variance_rad2: (..., N, C), of the orientations, per axis; read by order 2. None: 0.
+            mask: (..., N, C) bool, True for a candidate; None: all. Order 1 drops those below `quality_min`.
+
+        Returns:
+            The path, of order 2 with C + 1 places, the last of which is none. Cost, free energy and probabilities are
+            differentiable in candidates, scores, variances and parameters.
+
+        Raises:
+            ShapeError: the parts do not belong together.
+            SettingsError: the temperature is not above 0.
+        """
+        R, time = torch.as_tensor(R_lab_body), torch.as_tensor(time_s)
+        check_tail("R_lab_body", R, *R.shape[-4:-2], 3, 3)
+        score = torch.as_tensor(score).to(R)
+        variance = torch.zeros_like(score) if variance_rad2 is None else torch.as_tensor(variance_rad2).to(R)
+        there = torch.ones_like(score, dtype=torch.bool) if mask is None else torch.as_tensor(mask)
+        for name, part in (("score", score), ("variance_rad2", variance), ("mask", there), ("time_s", time)):
+            shape = tuple(R.shape[:-3] if name == "time_s" else R.shape[:-2])
+            if tuple(part.shape) != shape or R.ndim < 4:
+                do, got = "give one value for each candidate, and one time for each frame", str(tuple(part.shape))
+                raise ShapeError(refusal(name, expected=f"shape {shape}", got=got, do=do))
+        if isinstance(self._settings, AssembleSettings):
+            there = there & (score >= self._settings.quality_min)
+        unit = torch.eye(3, dtype=R.dtype, device=R.device)
+        R = torch.where(there[..., None, None], R, unit)  # 0 times NaN would reach the gradients
+        score, variance = torch.where(there, score, 0.0), torch.where(there, variance, 0.0)
+        node: Tensor | None = None
+        triple: Tensor | None = None
+        if self.order == 1:
+            edge = _edges_over_gaps(R, score, time, there)
+        else:
+            edge, there, node, triple = self._second_order_costs(R, score, time, variance, there)
+        if self.soft is None:
+            return shortest_path(edge, there, node, triple)
+        return soft_path(edge, there, self.soft, node, triple)
+
+    def _second_order_costs(
+        self, R: Tensor, score: Tensor, time_s: Tensor, variance: Tensor, mask: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the costs of edges, the mask, and the costs of candidates and triples, with the place for none."""
+        cost, visited = self.cost(score), mask.any(-1, keepdim=True)
+        (hit_again, hit), (miss_again, miss) = cost.presence()
+        right = hit - cost.picture_log_weight(-score, mask)
+        node = torch.cat([right, miss.expand_as(right[..., :1])], -1)
+        with_none = torch.cat([mask, visited], -1)
+        none = torch.arange(with_none.shape[-1], device=mask.device) == mask.shape[-1]
+        after_none = torch.where(none, miss_again - miss, hit_again - hit)
+        edge = torch.where(none[:, None], after_none, 0.0).expand(*with_none[..., 1:, 0].shape, *[len(none)] * 2)
+        unit = torch.eye(3, dtype=R.dtype, device=R.device)
+        R = torch.cat([R, unit.expand_as(R[..., :1, :, :])], -3)
+        lost = torch.full_like(variance[..., :1], LOST_RAD2)
+        triple = triple_costs(cost, R, torch.cat([variance, lost], -1), time_s, with_none)
+        return edge, with_none, node, triple
+
+    def _value(self, name: str) -> Tensor:
+        raw: Tensor = getattr(self, name)
+        return MOST[name] * torch.sigmoid(raw) if name in MOST else raw.exp() + LEAST.get(name, 0.0)
+
+
+def _edges_over_gaps(R: Tensor, score: Tensor, time_s: Tensor, mask: Tensor) -> Tensor:
+    """Return the paper's edges (..., N - 1, C, C), each from the last frame before it that has candidates."""
+    frame = torch.arange(mask.shape[-2], device=mask.device)
+    last = torch.where(mask.any(-1), frame, 0).cummax(-1).values[..., :-1]
+    pairs = [
+        torch.stack([_taken(part, last, tail), part.narrow(-tail - 1, 1, len(frame) - 1)], -tail - 1)
+        for part, tail in ((R, 3), (score, 1), (time_s, 0))
+    ]
+    return edge_costs(*pairs)[..., 0, :, :]
+
+
+def triple_costs(
+    cost: SecondOrderCost, R_lab_body: Tensor, variance_rad2: Tensor, time_s: Tensor, mask: Tensor
+) -> Tensor:
+    """Return the cost that three candidates in a row are right: how badly the third follows from the first two.
+
+    The rotation between the last two frames visited, at the same omega, predicts the orientation.
+
+    Args:
+        cost: with tensors for parameters.
+        R_lab_body: (..., N, C, 3, 3), rotations.
+        variance_rad2: (..., N, C), per axis, as claimed; `LOST_RAD2`: says nothing.
+        time_s: (..., N), increasing; rotations between frames visited are below half a turn.
+        mask: (..., N, C) bool; frames without candidates are skipped.
+
+    Returns:
+        (..., N - 2, C, C, C), nats, as `soft_path` takes it.
+    """
+    variance = cost.sigma_scale**2 * variance_rad2
+    links, steps, width = _links_of(R_lab_body, time_s, mask), mask.shape[-2], max(mask.shape[-1], 1)
+    still = _still(cost, links, R_lab_body, variance)
+    chunk = max(1, TRIPLES_AT_ONCE // (width**3 * max(math.prod(mask.shape[:-2]), 1)))
+    parts = [_chunk(cost, links, variance, still, slice(at, min(at + chunk, steps))) for at in range(2, steps, chunk)]
+    none = R_lab_body.new_zeros((*mask.shape[:-2], 0, *[mask.shape[-1]] * 3))
+    return torch.cat(parts, -4) if parts else none
+
+
+def _chunk(cost: SecondOrderCost, links: _Links, variance: Tensor, still: Tensor, steps: slice) -> Tensor:
+    """Return the costs of entering some steps, (..., K, C, C, C)."""
+    before = links.before[..., steps]
+    earlier = links.before.gather(-1, before)
+    dt, span = (each[..., None, None, None] for each in (links.dt_s[..., steps], links.dt_s.gather(-1, before)))
+    expected = scaled_rotations(_taken(links.turn, before, 4), dt / span)
+    expected = expected.flatten(-2).transpose(-3, -2)  # (..., j, i, 9)
+    misfit = _squared_chord(expected, links.turn[..., steps, :, :, :, :].flatten(-2)).transpose(-3, -2)
+    predicted = cost.predicted_variance(
+        dt,
+        span,
+        _taken(variance, earlier, 1)[..., :, None, None],
+        _taken(variance, before, 1)[..., None, :, None],
+        variance[..., steps, None, None, :],
+    )
+    broken = torch.as_tensor(cost.break_probability)
+    follows = torch.logaddexp(torch.log1p(-broken) + _log_ratio(cost, misfit, predicted), broken.log())
+    return cost.candidate(follows, still[..., steps, None, None, :])
+
+
+def _still(cost: SecondOrderCost, links: _Links, R_lab_body: Tensor, variance: Tensor) -> Tensor:
+    """Return the log ratio (..., N, C) of each candidate if one of the frame before stays."""
+    misfit = _squared_chord(_taken(R_lab_body, links.before, 3).flatten(-2), R_lab_body.flatten(-2))
+    here = _taken(variance, links.before, 1)[..., :, None]
+    rest = cost.rest_variance(links.dt_s[..., None, None], here, variance[..., None, :])
+    return _log_ratio(cost, misfit, rest).amax(-2)
+
+
+def _log_ratio(cost: SecondOrderCost, misfit: Tensor, variance: Tensor) -> Tensor:
+    """Return the log density ratio; 0, uniform, where the variance is so large that no motion is followed."""
+    return torch.where(variance < VARIANCE_MAX, cost.log_ratio(misfit, variance), 0.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Links:
+    """How each step is reached from the one visited before it."""
+
+    turn: Tensor  # (..., N, C, C, 3, 3), lab, from each candidate there to each here
+    dt_s: Tensor  # (..., N), the time between, 1 where there is none before
+    before: Tensor  # (..., N) int64, the step visited before, 0 where there is none
+
+
+def _links_of(R_lab_body: Tensor, time_s: Tensor, mask: Tensor) -> _Links:
+    """Return the rotations between all candidates of steps that follow each other; those into empty steps are any."""
+    step = torch.arange(mask.shape[-2], device=mask.device)
+    held = torch.where(mask.any(-1), step, 0).cummax(-1).values
+    before = torch.cat([torch.zeros_like(held[..., :1]), held[..., :-1]], -1)
+    dt = time_s - time_s.gather(-1, before)  # in this order: single precision cannot separate late times
+    # One product of (3C, 3) and (3, 3C) a step, not C^2 small ones, which take ten times as long.
+    width = mask.shape[-1]
+    after, first = R_lab_body.flatten(-3, -2), _taken(R_lab_body, before, 3).flatten(-3, -2)
+    every = (after @ first.mT).reshape(*mask.shape[:-1], width, 3, width, 3)  # (..., to, 3, from, 3)
+    turn = every.permute(*range(mask.ndim - 1), -2, -4, -3, -1)
+    return _Links(turn=turn, dt_s=torch.where(dt > 0, dt, 1.0).to(R_lab_body), before=before)
+
+
+def _squared_chord(expected: Tensor, found: Tensor) -> Tensor:
+    """Return (2 sin(angle / 2))^2 between rotations (..., A, 9) and (..., B, 9): like angle^2, but smooth at pi."""
+    # Differences, not products: small misfits keep their digits in single precision.
+    return torch.cdist(expected, found, compute_mode="donot_use_mm_for_euclid_dist").square() / 2
+
+
+def _taken(part: Tensor, step: Tensor, tail: int) -> Tensor:
+    """Return rows (..., K, *tail) of a part (..., N, *tail) at some steps (..., K)."""
+    index = step[(..., *[None] * tail)]
+    return part.gather(-tail - 1, index.expand(*step.shape, *part.shape[part.ndim - tail :]))
+
+
+def scaled_rotations(turn: Tensor, ratio: Tensor) -> Tensor:
+    """Return rotations (..., 3, 3) about the same axes by `ratio` (..., 1) times the angle, below half a turn."""
+    if bool(((ratio - 1).abs() < EVEN).all()):
+        return turn
+    return so3.exp(so3.log(turn) * ratio)

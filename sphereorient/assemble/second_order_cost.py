@@ -1,0 +1,148 @@
+"""The second-order path cost, stated once: what pictures, motion, misses and breaks cost a path, in nats.
+
+The hard path of `track` (beam.py, numpy) and the dense layer (layer.py, torch) both take their costs from here.
+Densities of orientations are ratios to the uniform density on SO(3).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient.assemble.settings import PathSettings
+from sphereorient.errors import SettingsError, refusal
+
+Floats = NDArray[np.float64]
+Values = TypeVar("Values", Floats, Tensor)
+
+TURNS_RAD3 = 8 * math.pi**2  # volume of SO(3) in rotation vectors' rad^3
+VARIANCE_MAX = 1.0  # rad^2; a wider density has wrapped around SO(3) and is as good as uniform
+PARAMETERS = (
+    "acceleration_rad_s2",
+    "tail",
+    "miss_probability",
+    "miss_again_probability",
+    "break_probability",
+    "stuck_probability",
+    "follow_probability",
+    "evidence_doubt",
+    "evidence_scale",
+    "sigma_scale",
+)  # the keys of `PathSettings` that the cost depends on; `PathLayer` learns them
+
+
+@dataclass(frozen=True, kw_only=True)
+class SecondOrderCost:
+    """The parameters of the cost: floats, or 0-dimensional tensors where they are learnt. Described in PathSettings."""
+
+    acceleration_rad_s2: float | Tensor
+    tail: float | Tensor
+    miss_probability: float | Tensor
+    miss_again_probability: float | Tensor
+    break_probability: float | Tensor
+    stuck_probability: float | Tensor
+    follow_probability: float | Tensor
+    evidence_doubt: float | Tensor
+    evidence_scale: float | Tensor
+    sigma_scale: float | Tensor
+
+    @classmethod
+    def of(cls, settings: PathSettings) -> SecondOrderCost:
+        """Take the parameters from settings with a number for the acceleration."""
+        if settings.acceleration_rad_s2 is None:
+            do = "set it; only `track` estimates it from the movie"
+            raise SettingsError(refusal("path.acceleration_rad_s2", expected="a number", got="null", do=do))
+        return cls(**{name: getattr(settings, name) for name in PARAMETERS})
+
+    def picture_log_weight(self, nll: Tensor, mask: Tensor) -> Tensor:
+        """Return the log probability (..., C) of each candidate of a frame by the pictures alone; 0 where masked."""
+        claimed = torch.where(mask, -self.evidence_scale * nll, -torch.inf)
+        # A frame without candidates has no share: zeros keep the gradient clear of inf - inf.
+        weight = torch.softmax(torch.where(mask.any(-1, keepdim=True), claimed, 0.0), -1)
+        count = mask.sum(-1)[..., None].clamp_min(1)
+        weight = (1 - self.evidence_doubt) * weight + self.evidence_doubt / count
+        return torch.where(mask, weight, 1.0).log()
+
+    def presence(self) -> tuple[list[Any], list[Any]]:
+        """Return the costs that a candidate of a frame is right, and that none is: after a miss, and after none."""
+        each = self.miss_again_probability, self.miss_probability
+        return [-_library(p).log1p(-p) for p in each], [-_library(p).log(p) for p in each]
+
+    def log_ratio(self, misfit: Values, variance: Values) -> Values:
+        """Return the log density of Student's t in three dimensions, over the uniform one.
+
+        Args:
+            misfit: (...), rad^2, squared angle to the expected rotation, or the smooth (2 sin(angle / 2))^2.
+            variance: (...), rad^2, scale per axis.
+        """
+        lib, tail = _library(variance), self.tail
+        within = lib.minimum(variance, lib.asarray(VARIANCE_MAX))
+        fall = (tail + 3) / 2 * lib.log1p(misfit / (tail * within))
+        result: Values = math.log(TURNS_RAD3) + _log_peak(tail) - 1.5 * lib.log(within) - fall
+        return result
+
+    def predicted_variance(
+        self, dt_s: Values, span_s: Values, before: Values, here: Values, after: Values | float
+    ) -> Values:
+        """Return the variance per axis, rad^2, of an orientation about the one that the mean omega of a span predicts.
+
+        Omega's mean changes by the acceleration times the time between the midpoints of span and step; the step carries
+        on the errors of both ends of the span.
+
+        Args:
+            dt_s: (...), step from the span's end to the predicted orientation.
+            span_s: (...), time over which omega was measured.
+            before: (...), rad^2 per axis, of the span's first orientation.
+            here: (...), of its last.
+            after: (...), of the one compared with the prediction.
+        """
+        ratio = dt_s / span_s
+        drift = self.acceleration_rad_s2 * (span_s + dt_s) / 2 * dt_s
+        result: Values = drift**2 + after + (1 + ratio) ** 2 * here + ratio**2 * before
+        return result
+
+    def rest_variance(self, dt_s: Values, here: Values, after: Values) -> Values:
+        """Return the same for a sphere at rest; as wide as `predicted_variance` of even steps, so that both compare."""
+        result: Values = (self.acceleration_rad_s2 * dt_s**2) ** 2 + 3 * (here + after)
+        return result
+
+    def candidate(self, log_ratio: Values, still: Values) -> Values:
+        """Return the cost of a candidate: log density where it stands if it is false, less that if it is right.
+
+        A false candidate stands anywhere; or where one stood before; or it follows the motion, so that following proves
+        no more than that this is rare. Standing still never explains better what the motion explains: otherwise noise
+        would lose a sphere at rest.
+
+        Args:
+            log_ratio: (...), by the motion.
+            still: (...), by a candidate that stayed since a frame before; -inf where there is no such frame.
+        """
+        lib = _library(still)
+        shares = 1 - self.stuck_probability - self.follow_probability, self.stuck_probability, self.follow_probability
+        anywhere, stuck, follow = (_log(share, still) for share in shares)
+        false = lib.logaddexp(lib.logaddexp(anywhere, stuck + lib.minimum(still, log_ratio)), follow + log_ratio)
+        result: Values = false - log_ratio
+        return result
+
+
+def _library(values: Floats | Tensor | float) -> Any:
+    return torch if isinstance(values, Tensor) else np
+
+
+def _log(number: float | Tensor, like: Floats | Tensor) -> Any:
+    if isinstance(like, Tensor):
+        return torch.as_tensor(number, dtype=like.dtype, device=like.device).log()
+    return np.log(number)
+
+
+def _log_peak(tail: float | Tensor) -> Any:
+    """Return the log of the normalisation of Student's t in three dimensions."""
+    if isinstance(tail, Tensor):
+        return torch.lgamma((tail + 3) / 2) - torch.lgamma(tail / 2) - 1.5 * (tail * math.pi).log()
+    return math.lgamma((tail + 3) / 2) - math.lgamma(tail / 2) - 1.5 * math.log(tail * math.pi)

@@ -1,0 +1,142 @@
+"""Records of the beam search: candidates as rows, ends of histories, and the edges that lead to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+# The sweep is sequential, each step a hundred operations on few numbers: numpy's cost a quarter of torch's.
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+NOT_YET, LOST = -1, -2  # in place of the frame of the last orientation
+SMALL = 1e-12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CandidateRows:
+    """Candidates of the F frames that have any, as rows; made by `physical_path`."""
+
+    R_lab_body: Floats  # (M, 3, 3)
+    variance: Floats  # (M,), rad^2 per axis
+    log_weight: Floats  # (M,), of the candidate among those of its frame, by the pictures alone
+    offset: Ints  # (F + 1,), rows of each frame
+    time_s: Floats  # (F,)
+    frame_s: float  # usual time between frames of the movie
+
+    @property
+    def frame(self) -> Ints:
+        """Frame of each row, (M,)."""
+        return np.repeat(np.arange(len(self.time_s)), np.diff(self.offset))
+
+    def part(self, first: int, last: int) -> CandidateRows:
+        """Return some frames in a row."""
+        rows = slice(self.offset[first], self.offset[last])
+        return CandidateRows(
+            R_lab_body=self.R_lab_body[rows],
+            variance=self.variance[rows],
+            log_weight=self.log_weight[rows],
+            offset=self.offset[first : last + 1] - self.offset[first],
+            time_s=self.time_s[first:last],
+            frame_s=self.frame_s,
+        )
+
+    def zones(self, dt_s: Floats) -> Ints:
+        """Return the number of possible rotations over a time: below half a turn in each frame interval."""
+        return np.maximum(np.rint(dt_s / self.frame_s).astype(np.int64), 1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PathStates:
+    """Ends of histories at one frame, S of them."""
+
+    frame: Ints  # of the last orientation; LOST or NOT_YET where there is none to go on from
+    row: Ints  # of the last orientation
+    omega: Floats  # (S, 3), rad/s, mean over the span
+    turn: Floats  # (S, 3), rad, over the span
+    span: Floats  # s, between the last two orientations; 0 where a motion begins
+    before: Floats  # rad^2 per axis, of the last but one
+
+    @classmethod
+    def begin(cls, frame: int, row: Ints) -> PathStates:
+        """Return states without a motion."""
+        nothing, vectors = np.zeros(len(row)), np.zeros((len(row), 3))
+        return cls(frame=np.full(len(row), frame), row=row, omega=vectors, turn=vectors, span=nothing, before=nothing)
+
+    def take(self, which: Ints) -> PathStates:
+        """Return some of the states."""
+        return PathStates(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BeamStep:
+    """One frame of the sweep: its states and the edges that lead to them."""
+
+    frame: int
+    states: PathStates
+    source: Ints  # (E,), among the states of the step before
+    target: Ints  # (E,), among these
+    cost: Floats  # (E,)
+    best: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (S,), edge of the cheapest history
+
+
+def merge_equal(step: BeamStep, least: Floats) -> BeamStep:
+    """Merge states of equal key, which stands in `target`; the cheapest way gives the state."""
+    order = np.argsort(least[step.source] + step.cost, kind="stable")  # so that the first of equal keys is the cheapest
+    _, first, target = np.unique(step.target[order], return_index=True, return_inverse=True)
+    states = step.states.take(order[first])
+    return BeamStep(frame=step.frame, states=states, source=step.source[order], target=target, cost=step.cost[order])
+
+
+def concatenated(ways: list[BeamStep], *, shared_targets: bool = False) -> BeamStep:
+    """Put several ways side by side; their targets are numbered on unless they are keys that the ways share."""
+    sizes = np.cumsum([0, *(0 if shared_targets else len(way.states.row) for way in ways)])
+    parts = {e.name: np.concatenate([getattr(way.states, e.name) for way in ways]) for e in fields(PathStates)}
+    return BeamStep(
+        frame=ways[0].frame,
+        states=PathStates(**parts),
+        source=np.concatenate([way.source for way in ways]),
+        target=np.concatenate([way.target + size for way, size in zip(ways, sizes[:-1], strict=True)]),
+        cost=np.concatenate([way.cost for way in ways]),
+    )
+
+
+def soft_min(values: Floats, group: Ints, size: int) -> Floats:
+    """Return -log sum exp(-values) of each group, (size,); inf where it is empty."""
+    low = np.full(size, np.inf)
+    np.minimum.at(low, group, values)
+    finite = np.isfinite(values)
+    share = np.bincount(group[finite], np.exp(low[group[finite]] - values[finite]), size)
+    return np.where(share > 0, low - np.log(np.maximum(share, 1e-300)), np.inf)
+
+
+def rotation_between(R_from: Floats, R_to: Floats) -> tuple[Floats, Floats]:
+    """Return angle (...), rad, 0 .. pi, and lab axis (..., 3) of the shortest rotation; the axis of no rotation is 0.
+
+    Args:
+        R_from: (..., 3, 3), rotations.
+        R_to: (..., 3, 3), broadcasts against R_from.
+    """
+    turn = R_to @ np.swapaxes(R_from, -1, -2)
+    twice = np.stack(
+        [turn[..., 2, 1] - turn[..., 1, 2], turn[..., 0, 2] - turn[..., 2, 0], turn[..., 1, 0] - turn[..., 0, 1]], -1
+    )
+    sine = np.sqrt((twice**2).sum(-1)) / 2
+    cosine = (turn[..., 0, 0] + turn[..., 1, 1] + turn[..., 2, 2] - 1) / 2
+    return np.arctan2(sine, cosine), twice / np.maximum(2 * sine, SMALL)[..., None]
+
+
+def rotated(R: Floats, rotvec: Floats) -> Floats:
+    """Return orientations (..., 3, 3) after rotations by lab vectors (..., 3), rad (Rodrigues' formula)."""
+    angle = np.sqrt((rotvec**2).sum(-1))[..., None]
+    axis = rotvec / np.maximum(angle, SMALL)
+    along = (axis[..., None, :] @ R)[..., 0, :]  # axis . column, of the three columns
+    x, y, z = (axis[..., i, None] for i in range(3))
+    a, b, c = R[..., 0, :], R[..., 1, :], R[..., 2, :]
+    across = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], -2)
+    cosine, sine = np.cos(angle)[..., None], np.sin(angle)[..., None]
+    result: Floats = R * cosine + across * sine + axis[..., None] * along[..., None, :] * (1 - cosine)
+    return result
