@@ -110,7 +110,7 @@ def draw(cell: Any, row: Degradation, level: int) -> None:
         grey(cell, crop(path, name, FRAME, half))
         if row.name == "spin":
             grey(cell, np.hstack([crop(path, name, FRAME + k, half) for k in (0, 1)]))
-        if row.where == "told":
+        if row.where == "reported":
             compare(cell, path, name, half)
 
 

@@ -217,10 +217,10 @@ class DegradedFilming(Filming):
         for name in names:
             row = DEGRADATIONS[name]
             value = self.values.get(name, row.nothing)
-            if value is None or value == row.nothing or not (row.still or view.frame is not None):
+            if value is None or value == row.nothing or (row.where == "frame" and view.frame is None):
                 continue
             # What is still has the same random numbers in every frame.
-            rng = self._generator(name, view.name, *([] if row.still else [view.frame or 0]))
+            rng = self._generator(name, view.name, *([] if row.where != "frame" else [view.frame or 0]))
             # One exposure throughout a movie: its gain was found before.
             light = light * self.gains[view.name] if name == "saturation" else OPERATIONS[name](light, value, disk, rng)
         return light

@@ -17,6 +17,8 @@ from sphereorient.synth import random_texture
 from sphereorient.synth.textures import map_directions
 
 WHITE = torch.ones(32, 64)
+GREY = {grey: Sampling(outside=grey, supersampling=6) for grey in (0.5, 2.0)}  # backgrounds
+COARSE = Sampling()
 # Of the optics' Gaussian and the pixel's square together, as one Gaussian: right to 1 % of the information.
 BLUR_PX = math.hypot(0.55, math.sqrt(1 / 12))
 EDGE = 1 / (2 * math.sqrt(math.pi) * BLUR_PX)  # integral over the squared slope of a blurred step of height 1, 1/px
@@ -55,9 +57,7 @@ def test_one_straight_border_across_the_disk_has_the_information_worked_out_by_h
     radius = 30.0
     east = (map_directions(512)[..., 1] > 0).float()
     tilt = so3.exp(torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64))
-    tilted = cramer_rao_bound(
-        east, tilt @ face(), diameter_px=2 * radius, noise_share=1.0, sampling=Sampling(outside=0.5, supersampling=6)
-    )
+    tilted = cramer_rao_bound(east, tilt @ face(), diameter_px=2 * radius, noise_share=1.0, sampling=GREY[0.5])
     about = (tilt.mT @ tilted.information[:3, :3] @ tilt).diagonal()
     hand = torch.tensor([0.0, 4 / 3, 2 / 3], dtype=torch.float64) * EDGE * radius**3
     assert_close(about / hand[1], hand / hand[1], atol=0.04)
@@ -65,16 +65,14 @@ def test_one_straight_border_across_the_disk_has_the_information_worked_out_by_h
 
 def test_rotations_about_view_x_move_a_horizontal_border():  # convention
     north = (map_directions(512)[..., 2] > 0).float()
-    found = cramer_rao_bound(
-        north, face(), diameter_px=60, sampling=Sampling(outside=0.5, supersampling=6)
-    ).information.diagonal()
+    found = cramer_rao_bound(north, face(), diameter_px=60, sampling=GREY[0.5]).information.diagonal()
     assert float(found[0]) > 50 * float(found[1])  # a horizontal line rolls up and down about x, and not about y
     assert float(found[4]) > 1.5 * float(found[3])  # v sees the line and the outline, u the outline alone
 
 
 def test_the_scatter_of_least_squares_is_the_bound(patches):  # oracle
     noise, draws, radius_px = 0.05, 300, 12.0
-    disk = disk_renderer(patches.double(), 2 * radius_px, Sampling())
+    disk = disk_renderer(patches.double(), 2 * radius_px, COARSE)
     at = face()[None], torch.zeros(1, 3).double(), torch.full((1,), radius_px).double()
     gain = torch.linalg.pinv(jacobian(disk, at[0])[0])  # (6, S^2)
     rng = torch.Generator().manual_seed(5)
@@ -93,9 +91,7 @@ def test_the_scatter_of_least_squares_is_the_bound(patches):  # oracle
         left.append(step[:, :3].norm(dim=-1))
     rms = [float(torch.cat(errors).square().mean().sqrt()) for errors in (turned, shifted, swollen, left)]
     assert rms[3] < 0.05 * rms[0]  # they have arrived
-    bound = cramer_rao_bound(
-        patches, face(), diameter_px=2 * radius_px, noise_share=noise, sampling=Sampling(supersampling=4)
-    )
+    bound = cramer_rao_bound(patches, face(), diameter_px=2 * radius_px, noise_share=noise, sampling=COARSE)
     for got, least in zip(rms, (bound.orientation_rms_rad, bound.centre_rms_px, bound.radius_rms_px), strict=False):
         assert got == pytest.approx(float(least), rel=0.1)
 
@@ -120,10 +116,7 @@ def test_the_bound_falls_as_the_specified_power_of_the_diameter():
     texture = random_texture("blobs", 3)
     R = so3.random_rotations(6, generator=torch.Generator().manual_seed(6), dtype=torch.float32)
     small, large = (
-        cramer_rao_bound(texture, R, diameter_px=d, sampling=Sampling(supersampling=4))
-        .orientation_rms_rad.square()
-        .mean()
-        .sqrt()
+        cramer_rao_bound(texture, R, diameter_px=d, sampling=COARSE).orientation_rms_rad.square().mean().sqrt()
         for d in (30, 75)
     )
     power = math.log(float(large / small)) / math.log(75 / 30)
@@ -136,7 +129,7 @@ def test_a_known_place_helps_and_a_bright_background_too(patches, attitudes):
     known = torch.linalg.inv(dark.information[:, :3, :3]).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
     assert_close(dark.orientation_known_place_rms_rad, known, atol=1e-9)
     # Before a background twice as bright as white paint all of the outline shows.
-    bright = cramer_rao_bound(patches, attitudes, diameter_px=24, sampling=Sampling(outside=2.0, supersampling=6))
+    bright = cramer_rao_bound(patches, attitudes, diameter_px=24, sampling=GREY[2.0])
     assert (bright.centre_rms_px < dark.centre_rms_px).all()
 
 
@@ -210,7 +203,7 @@ def test_what_is_no_picture_is_refused(patches):
 def test_the_experiments_map_has_the_specified_bound():  # docs/errata.md, The bound
     texture = load_texture(SHARED / "experiment" / "texture.png")
     R = so3.random_rotations(12, generator=torch.Generator().manual_seed(9), dtype=torch.float32)
-    bound = cramer_rao_bound(texture, R, diameter_px=80, sampling=Sampling(supersampling=4))
+    bound = cramer_rao_bound(texture, R, diameter_px=80, sampling=COARSE)
     rms = [
         float(part.square().mean().sqrt())
         for part in (bound.orientation_rms_rad, bound.orientation_known_place_rms_rad, bound.centre_rms_px)

@@ -351,7 +351,7 @@ def test_a_cell_of_the_direction_table_holds_the_paint_at_its_middle():
     north = torch.zeros(32, 64)
     north[:16] = 1.0
     view = orthographic_view(60)
-    upright = f64([[0, 1, 0], [0, 0, -1], [-1, 0, 0]]).float()[None]
+    upright = torch.tensor([[[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]])
     up = torch.where(view.normal_view[:, 1] < 0, 1, -1).to(torch.int8)
     assert torch.equal(DirectionTable(north, 64).render(upright, view.normal_view)[0], up)
     assert torch.equal(DirectionTable(1 - north, 64).render(upright, view.normal_view)[0], -up)
