@@ -102,7 +102,7 @@ _ROWS: tuple[tuple[tuple[str, Place, float | None, str, Values], str, str], ...]
     (
         ("defocus", "picture", 0.0, "px of sigma", (0.7, 1.5, 3.0, 6.0, 10.0)),
         "The lens is out of focus: a Gaussian on top of the optics' own.",
-        "focus set by view; at 10 patches of 16 px, the default ball's, keep a sixth of their contrast",
+        "focus set by eye; at 10 patches of 16 px, the default ball's, keep a sixth of their contrast",
     ),
     (
         ("saturation", "picture", 0.0, "share of white paint clipped", (0.05, 0.2, 0.5, 0.8, 0.98)),

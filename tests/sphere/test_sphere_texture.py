@@ -44,7 +44,7 @@ def test_float64_is_not_rounded_to_float32_on_a_map_of_full_size(rng):
 def test_the_middle_of_a_texel_shows_that_texel(rng):
     texture = random_map(
         rng, 4
-    )  # DESIGN: column u is longitude 360 (u + 0.5)/8 - 180, row v latitude 90 - 180 (v + 0.5)/4
+    )  # docs/conventions.md: column u is longitude 360 (u + 0.5)/8 - 180, row v latitude 90 - 180 (v + 0.5)/4
     assert_close(sample_texture(texture, body_direction(-157.5, 67.5)), texture[0, 0])
     assert_close(sample_texture(texture, body_direction(22.5, 67.5)), texture[0, 4])
     assert_close(sample_texture(texture, body_direction(112.5, -22.5)), texture[2, 6])

@@ -328,7 +328,7 @@ def test_worn_paint_is_on_the_filmed_ball_only():
 # What the method is told.
 
 
-def test_the_told_diameter_is_too_large_by_px_at_the_rim(tmp_path):
+def test_the_reported_diameter_is_too_large_by_px_at_the_rim(tmp_path):
     path = write_with_values(tmp_path, SETTINGS, {"radius_error": 2.0})
     told = load_experiment(path)
     assert told.diameter_mm == pytest.approx(18.0 * (20 + 2) / 20)
