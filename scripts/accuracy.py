@@ -20,7 +20,7 @@ from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.methods.settings import DEFAULT_METHOD
 from sphereorient.run.stages import track_movies
-from sphereorient.synth import SynthSettings, write_experiment
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 COLUMNS = (
     "movie",
@@ -50,7 +50,7 @@ def main() -> None:
     if not arguments.no_synth:
         for seed, texture in enumerate(("blobs", "patches", "dots"), 1):
             with tempfile.TemporaryDirectory() as name:
-                write_experiment(Path(name), SynthSettings.model_validate({"texture": texture, "seed": seed}))
+                write_synthetic_experiment(Path(name), SynthSettings.model_validate({"texture": texture, "seed": seed}))
                 print(row(Path(name), f"synthetic, {texture}", ("cam1", "cam2"), arguments.method), flush=True)
 
 

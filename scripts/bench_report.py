@@ -15,8 +15,7 @@ import sys
 import time
 from pathlib import Path
 
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
-from sphereorient.synth.ensemble_tracks import filtered_track
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 from sphereorient.trajectory import Trajectory
 
 

@@ -37,7 +37,7 @@ from sphereorient.pose import CameraView, base_table
 from sphereorient.pose.defocus import FIRST_BLUR_PX
 from sphereorient.pose.fitter import first_fitter, widest_px
 from sphereorient.search import GreySearch, crop_disk, extract_paint
-from sphereorient.sphere import SphereRenderer, load_texture, orthographic_view, reduced_texture
+from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
 
 FOLLOWED = 48  # frames over which one prediction after the other is timed
 TOLD = """
@@ -166,14 +166,13 @@ def literal(bench: Bench, mean_s: float) -> None:
     size_px = round(2 * outline.radius_px)
     view = orthographic_view(size_px)
     texture = reduced_texture(load_texture(bench.experiment.texture_path), size_px)
-    renderer = SphereRenderer(texture, view)
     disk = torch.from_numpy(crop_disk(frame, outline.u_px, outline.v_px, outline.radius_px, size_px))[None]
     signs = extract_paint(disk, view.inside, settings)[0][view.inside]
     coarse = so3.lattman_grid(math.radians(12.0)).float()
     fine = so3.local_grid(math.radians(3.0), math.radians(12.0)).float()
 
     def quality(R: torch.Tensor) -> torch.Tensor:
-        parts = [torch.sign(renderer.disk(part) - 0.5) @ signs / len(signs) for part in torch.split(R, 64)]
+        parts = [torch.sign(view.paint(texture, part) - 0.5) @ signs / len(signs) for part in torch.split(R, 64)]
         return 0.5 + 0.5 * torch.cat(parts)
 
     def once() -> None:

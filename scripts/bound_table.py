@@ -26,7 +26,7 @@ from torch.nn.functional import normalize
 
 from sphereorient import so3
 from sphereorient.evaluate import cramer_rao_bound
-from sphereorient.sphere import load_texture
+from sphereorient.sphere import Sampling, load_texture
 from sphereorient.synth import random_texture
 from sphereorient.synth.textures import map_directions
 
@@ -77,7 +77,7 @@ def rms(textures: Sequence[Tensor], diameter_px: float) -> tuple[float, float, f
             texture,
             so3.random_rotations(attitudes, generator=rng, dtype=torch.float32),
             diameter_px=diameter_px,
-            supersampling=8 if diameter_px < 40 else 4,
+            sampling=Sampling(supersampling=8 if diameter_px < 40 else 4),
         )
         for texture in textures
     ]

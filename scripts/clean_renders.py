@@ -2,9 +2,9 @@
 
     scripts/clean_renders.py [--count 200] [--experiment FOLDER]
 
-Exact perspective of a near camera, the ball anywhere in the picture, even light, no rounding (`synth.clean`). Each fit
-starts about 2 degrees, 0.5 px and 0.5 px of radius off the truth. The bound is computed for the same attitudes in the
-same run, light known, from far away. Prints Markdown, one row a paint: rms errors and their ratios to the bound.
+Exact perspective of a near camera, the ball anywhere in the picture, even light, no rounding. Each fit starts about 2
+degrees, 0.5 px and 0.5 px of radius off the truth. The bound is computed for the same attitudes in the same run, light
+known, from far away. Prints Markdown, one row a paint: rms errors and their ratios to the bound.
 """
 
 from __future__ import annotations
@@ -21,18 +21,31 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras import R_cam_view
+from sphereorient.cameras import PinholeCamera, R_cam_view
 from sphereorient.evaluate import Bound, cramer_rao_bound
 from sphereorient.locate import Background
 from sphereorient.pose.fitter import CameraView, Fitter, Optics, base_table
 from sphereorient.pose.light import Light
 from sphereorient.pose.pixels import LinesOfSight
-from sphereorient.sphere import load_texture
+from sphereorient.sphere import Sampling, SphereRenderer, load_texture
 from sphereorient.synth import random_texture
-from sphereorient.synth.clean import CleanSet, clean_set
 
 START_RAD, START_PX = math.radians(1.2), 0.35  # standard deviation of each component of the starts' errors
 FITTED_AT_ONCE = 20
+
+
+DIAMETER_PX, DIAMETER_MM, DISTANCE_MM = 80.0, 18.0, 260.0  # near, so that perspective counts
+BLACK, WHITE, NOISE_SHARE, SIGMA_PX = 40.0, 200.0, 0.05, 0.55  # grey levels; noise over their step; optics
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CleanSet:
+    """N pictures of a ball at random positions in random attitudes, with the truth."""
+
+    pictures: Tensor  # (N, H, W) float32, grey levels, not rounded
+    camera: PinholeCamera
+    R_lab_body: Tensor  # (N, 3, 3) float64
+    position_lab_mm: Tensor  # (N, 3) float64
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,7 +75,7 @@ def main() -> None:
 
 def row(name: str, texture: Tensor, count: int, estimator: Estimator) -> str:
     """Render, fit, compare."""
-    seen = clean_set(texture, count, seed=1)
+    seen = clean_set(texture, count, 1)
     start = starts(seen, torch.Generator().manual_seed(2))
     begin = time.perf_counter()
     found = estimator(texture, seen, start)
@@ -84,15 +97,39 @@ def row(name: str, texture: Tensor, count: int, estimator: Estimator) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
+def clean_set(texture: Tensor, count: int, seed: int) -> CleanSet:
+    """Draw positions and attitudes and render them, the ball wholly inside a picture four times as wide."""
+    rng = torch.Generator().manual_seed(seed)
+    side = 4 * math.ceil(DIAMETER_PX)
+    f_px = DIAMETER_PX / DIAMETER_MM * DISTANCE_MM
+    camera = PinholeCamera(
+        image_size=(side, side),
+        R_cam_lab=torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64),
+        T_cam_lab_mm=torch.tensor([0.0, 0.0, DISTANCE_MM], dtype=torch.float64),
+        centre_px=torch.full((2,), 0.5 * (side - 1), dtype=torch.float64),
+        f_px=torch.tensor(f_px, dtype=torch.float64),
+    )
+    # Off the axis the picture is a little longer than the diameter, and the blur needs room.
+    reach_mm = (0.5 * side - 0.55 * DIAMETER_PX - 5 - 4 * SIGMA_PX) / f_px * DISTANCE_MM
+    aside = reach_mm * (2 * torch.rand(count, 2, generator=rng, dtype=torch.float64) - 1)
+    position = torch.stack([aside[:, 0], torch.zeros(count, dtype=torch.float64), aside[:, 1]], dim=-1)
+    R = so3.random_rotations(count, generator=rng)
+    render = SphereRenderer(texture, radius_mm=DIAMETER_MM / 2, camera=camera, sampling=Sampling(blur_px=SIGMA_PX))
+    clean = torch.cat([render(r, x) for r, x in zip(R.split(8), position.split(8), strict=True)])
+    pictures = (BLACK + (WHITE - BLACK) * clean).float()
+    pictures = pictures + NOISE_SHARE * (WHITE - BLACK) * torch.randn(pictures.shape, generator=rng)
+    return CleanSet(pictures=pictures, camera=camera, R_lab_body=R, position_lab_mm=position)
+
+
 def starts(seen: CleanSet, rng: torch.Generator) -> Poses:
     """The truth with errors of rotation, centre and radius."""
     count = len(seen.R_lab_body)
     turn, shift = (torch.randn(count, 3, generator=rng, dtype=torch.float64) for _ in range(2))
     x_cam_mm = in_camera(seen, seen.position_lab_mm)
-    depth_mm, f_px = x_cam_mm[:, 2], seen.diameter_px / seen.diameter_mm * x_cam_mm[:, 2]
+    depth_mm, f_px = x_cam_mm[:, 2], DIAMETER_PX / DIAMETER_MM * x_cam_mm[:, 2]
     aside_mm = START_PX * shift[:, :2] * (depth_mm / f_px)[:, None]
     # A radius too small by some pixels is a ball too far by the same share.
-    farther_mm = START_PX * shift[:, 2] / (seen.diameter_px / 2) * depth_mm
+    farther_mm = START_PX * shift[:, 2] / (DIAMETER_PX / 2) * depth_mm
     error_cam_mm = torch.cat([aside_mm, farther_mm[:, None]], dim=-1)
     return Poses(
         R_lab_body=so3.exp(START_RAD * turn) @ seen.R_lab_body,
@@ -108,7 +145,7 @@ def place_errors(seen: CleanSet, found: Poses) -> tuple[Tensor, Tensor]:
     """Errors of centre and radius, px, (N,) each."""
     centre_px = (seen.camera.project(found.position_lab_mm) - seen.camera.project(seen.position_lab_mm)).norm(dim=-1)
     true_mm, found_mm = (in_camera(seen, each.position_lab_mm).norm(dim=-1) for each in (seen, found))
-    return centre_px, (true_mm / found_mm - 1) * (seen.diameter_px / 2)
+    return centre_px, (true_mm / found_mm - 1) * (DIAMETER_PX / 2)
 
 
 def bound_of(texture: Tensor, seen: CleanSet) -> Bound:
@@ -118,10 +155,9 @@ def bound_of(texture: Tensor, seen: CleanSet) -> Bound:
     return cramer_rao_bound(
         texture,
         R_view_body.float(),
-        diameter_px=seen.diameter_px,
-        noise_share=seen.optics.noise_share,
-        optics_sigma_px=seen.optics.sigma_px,
-        supersampling=4,
+        diameter_px=DIAMETER_PX,
+        noise_share=NOISE_SHARE,
+        sampling=Sampling(blur_px=SIGMA_PX),
     )
 
 
@@ -131,23 +167,21 @@ def root_mean(values: Tensor) -> float:
 
 def refined(texture: Tensor, seen: CleanSet, start: Poses) -> Poses:
     """The project's refinement: two widths of detail, light and noise learnt from the fits, the finest once more."""
-    step = seen.optics.white - seen.optics.black
-    noise = seen.optics.noise_share * step
+    step = WHITE - BLACK
+    noise = NOISE_SHARE * step
     width, height = seen.camera.image_size
-    behind = np.full((height, width), seen.optics.black, np.float32)
+    behind = np.full((height, width), BLACK, np.float32)
     view = CameraView(
         name="cam1",
         camera=seen.camera,
         background=Background(mean=behind, noise=np.full_like(behind, noise), full_scale=255.0),
-        diameter_px=seen.diameter_px,
+        diameter_px=DIAMETER_PX,
         sight=LinesOfSight(seen.camera),
     )
     fitter = Fitter(
         views=[view],
-        radius_mm=seen.diameter_mm / 2,
-        optics=Optics(
-            base_table(texture, seen.diameter_px), math.hypot(seen.optics.sigma_px, math.sqrt(1 / 12)), seen.diameter_px
-        ),
+        radius_mm=DIAMETER_MM / 2,
+        optics=Optics(base_table(texture, DIAMETER_PX), math.hypot(SIGMA_PX, math.sqrt(1 / 12)), DIAMETER_PX),
         light=Light.unknown(1, torch.tensor([[noise**2, 0.0, 0.0, 0.0]])),
     )
     pose = fitted(fitter, seen, start, coarse=True)

@@ -25,8 +25,7 @@ from sphereorient.statistics.density import fit_stretched
 from sphereorient.statistics.moments import moments, noise_let_through
 from sphereorient.statistics.segments import UNITS, Ensemble, ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings, SegmentSettings
-from sphereorient.synth.ensemble import EnsembleSpec, Nominal, draw_ensemble, nominal
-from sphereorient.synth.ensemble_tracks import exact_track, smoothed_track
+from sphereorient.synth.ensemble import EnsembleSpec, Nominal, draw_ensemble, exact_track, nominal, smoothed_track
 from sphereorient.trajectory import Trajectory
 
 NOISE_DEG, ROUGH_DEG, NOISE_MM = 0.1, 2.0, 0.05

@@ -27,7 +27,7 @@ from sphereorient.assemble import SoftTrack, soft_track
 from sphereorient.cameras import PinholeCamera, Rays, triangulate
 from sphereorient.cameras.parameters import ROTATION, with_parameters
 from sphereorient.pose.implicit import ImplicitPose, implicit_pose
-from sphereorient.pose.soft_picture import PaintedBall, expected_grey
+from sphereorient.sphere.renderer import PaintedBall, expected_grey
 from sphereorient.synth import random_texture
 from sphereorient.synth.scene import LAMPS, make_scene, render_frame
 from sphereorient.synth.settings import SynthSettings

@@ -30,7 +30,7 @@ from sphereorient.methods.learnt import Learnt
 from sphereorient.methods.settings import load_settings
 from sphereorient.movies import open_movie, write_ffv1
 from sphereorient.run import MemoryStore, Request, run
-from sphereorient.synth import SynthSettings, write_experiment
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
 from sphereorient.trajectory import Trajectory
 
 BLOCK = 16  # frames; short, so that a short movie has blocks without the fault
@@ -230,7 +230,7 @@ def rendered(folder: Path, frames: int, turn_deg: float) -> Scene:
         seed=5,
         omega_rms=float(np.deg2rad(turn_deg) * RATE / np.sqrt(8 / np.pi)),
     )
-    write_experiment(folder, settings)
+    write_synthetic_experiment(folder, settings)
     pictures: Pictures = {}
     for name in CAMERAS:
         with open_movie(folder / f"{name}.mkv") as movie:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.sphere import SphereRenderer, orthographic_view
+from sphereorient.sphere import orthographic_view
 
 REPO = Path(__file__).resolve().parents[1]
 HEIGHT = 180  # rows of the map, one a degree
@@ -101,7 +101,7 @@ def draw_picture(axes: Any) -> None:
     """What the camera of the first panel sees of that map."""
     size = 240
     view = orthographic_view(size)
-    picture = SphereRenderer(letter_map(), view)(R_CAM_LAB @ R_LAB_BODY).reshape(size, size)
+    picture = view.render(letter_map(), R_CAM_LAB @ R_LAB_BODY)
     seen = np.ma.masked_array(picture.numpy(), ~view.inside.numpy())
     axes.imshow(seen, cmap="gray", vmin=0, vmax=1)
     arrow = {"arrowprops": {"arrowstyle": "<-", "color": "black", "lw": 1.5}, "va": "center", "ha": "center"}

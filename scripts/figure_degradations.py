@@ -42,17 +42,17 @@ HEAD = """\
 # Degradations
 
 What can be wrong with pictures and with what is known of them, for the robustness benchmark and for training: torch
-operations on batches (`sphereorient/synth/degrade.py`), changes of the scene and of what the method is told
+operations on batches (`sphereorient/synth/degrade.py`), changes of the scene and of what the method is given
 (`sphereorient/synth/degrade_scene.py`). `synth.write_degraded(folder, settings, {"defocus": 3, "spin": 2})` renders an
 experiment with exact truth and any number of them at once; `synth.degrade` applies those of pictures to a batch.
 Level 1 is a good lab on a bad day, level 5 is where failure is expected. They are applied in the order of the table,
 which is that of the light: scene, paint, light, what is behind and before the ball, liquid, lens, sensor, memory; last
-comes what the method is told. "Default" means the scene of `sphereorient synth` ([parameters](parameters.md)).
+comes what the method is given. "Default" means the scene of `sphereorient synth` ([parameters](parameters.md)).
 Table and figure are made by `scripts/figure_degradations.py`.
 
 ![each degradation without, and at levels 1, 3 and 5](degradations.png)
 
-Blue is true, orange is what the method is told. Dropped frames: 50 of each camera, lost ones black.
+Blue is true, orange is what the method is given. Dropped frames: 50 of each camera, lost ones black.
 
 | name | unit | nothing | 1 | 2 | 3 | 4 | 5 | what it does | why these values |
 |---|---|---|---|---|---|---|---|---|---|
@@ -110,7 +110,7 @@ def draw(cell: Any, row: Degradation, level: int) -> None:
         grey(cell, crop(path, name, FRAME, half))
         if row.name == "spin":
             grey(cell, np.hstack([crop(path, name, FRAME + k, half) for k in (0, 1)]))
-        if row.where == "told":
+        if row.where == "reported":
             compare(cell, path, name, half)
 
 

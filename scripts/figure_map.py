@@ -22,7 +22,7 @@ from torch import Tensor
 
 from sphereorient.report.map_files import write_texture
 from sphereorient.sphere import load_texture, sample_texture
-from sphereorient.synth import SynthSettings, write_experiment
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
 from sphereorient.synth.textures import map_directions
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -55,7 +55,7 @@ def main() -> None:
 
 def draw(folder: Path) -> None:
     """Make all files in a folder."""
-    path = write_experiment(folder / "scene", SCENE)
+    path = write_synthetic_experiment(folder / "scene", SCENE)
     document = yaml.safe_load(path.read_text())
     true = load_texture(path.parent / document["sphere"].pop("texture"))
     path.write_text(yaml.safe_dump(document))

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from sphereorient.report.plots.style import COMPONENTS, WIDTH_IN, in_style, new_figure
-from sphereorient.sphere import SphereRenderer, orthographic_view
+from sphereorient.sphere import orthographic_view
 from sphereorient.tools.design.figure import write_design
 from sphereorient.tools.design.judge import DesignSettings, Judgement, judge_paint
 from sphereorient.tools.design.paint import PAINTS, facing, scaled_paint
@@ -107,7 +107,7 @@ def balls(part: Any, rows: list[Row]) -> None:
     """One view of each map."""
     R = facing(torch.tensor([1.0, 0.3, 0.2]))
     for axes, row in zip(part.subplots(1, len(rows)), rows, strict=True):
-        picture = SphereRenderer(row.texture, orthographic_view(SIDE_PX), outside=0.75)(R)
+        picture = orthographic_view(SIDE_PX).render(row.texture, R, 0.75)
         axes.imshow(picture.numpy(), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axes.set_axis_off()
         axes.set_title(f"{row.kind}\n{row.size_deg:g}°", fontsize=7)

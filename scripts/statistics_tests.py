@@ -25,8 +25,7 @@ from sphereorient.statistics.attitude import uniformity
 from sphereorient.statistics.isotropy import anisotropic_frame, isotropy
 from sphereorient.statistics.segments import ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
-from sphereorient.synth.ensemble_tracks import exact_track
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, exact_track
 
 Floats = NDArray[np.float64]
 Attitudes = tuple[Floats, NDArray[np.int64] | None]

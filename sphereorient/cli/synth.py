@@ -20,7 +20,7 @@ def synth(
     """Render an experiment of two cameras with exact truth."""
     check_writable(out)
     from sphereorient.methods.settings import load_synth_settings
-    from sphereorient.synth import write_experiment
+    from sphereorient.synth import write_synthetic_experiment
 
     chosen = load_synth_settings(settings, set_ or [])
     total = 2 * chosen.frames
@@ -32,6 +32,6 @@ def synth(
             done += count
             advance("render", done, total)
 
-        path = write_experiment(out, chosen, rendered)
+        path = write_synthetic_experiment(out, chosen, rendered)
     if not quiet:
         typer.echo(f"Wrote {path}. Next: sphereorient track {path} --out {out / 'track.h5'}")

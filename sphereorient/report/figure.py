@@ -19,7 +19,7 @@ from sphereorient.errors import ExperimentError, refusal
 from sphereorient.evaluate import Score
 from sphereorient.experiment import Experiment, open_movies
 from sphereorient.experiment.timeline import timeline
-from sphereorient.sphere import SphereRenderer, load_texture, orthographic_view, reduced_texture
+from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
 from sphereorient.trajectory import Reason, Trajectory
 
 # Okabe and Ito's colours: told apart by colour-blind readers, and in grey print.
@@ -108,12 +108,11 @@ def _draw_sighting(axes: Any, picture: NDArray[Any], track: Trajectory, camera: 
 def _draw_render(axes: Any, texture: torch.Tensor, track: Trajectory, camera: Camera, name: str, k: int) -> None:
     seen = track.cameras[name]
     size = max(16, round(2 * float(np.nan_to_num(seen.radius_px[k], nan=40.0))))
-    renderer = SphereRenderer(reduced_texture(texture, size), orthographic_view(size))
     ray_lab = camera.rays(torch.from_numpy(seen.centre_px[k])).direction_lab
     R_view_cam = R_cam_view(camera.R_cam_lab @ ray_lab).mT
     R_view_body = R_view_cam @ camera.R_cam_lab @ torch.from_numpy(track.orientation[k])
     if torch.isfinite(R_view_body).all():
-        picture = renderer(R_view_body.float()).numpy()
+        picture = orthographic_view(size).render(reduced_texture(texture, size), R_view_body.float()).numpy()
         half = size / 2
         axes.imshow(picture, cmap="gray", vmin=0, vmax=1.2, extent=(-half, half, half, -half), interpolation="nearest")
         axes.set(xlim=(-1.25 * half, 1.25 * half), ylim=(1.25 * half, -1.25 * half))

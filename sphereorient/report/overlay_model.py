@@ -16,7 +16,7 @@ from sphereorient.errors import TextureError, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.movies import Grey
 from sphereorient.preflight.cameras import expected_outline_px
-from sphereorient.sphere import sample_texture, sphere_normals
+from sphereorient.sphere import see_sphere
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -122,12 +122,11 @@ class Model:
         uv = torch.from_numpy(window.grid_px(FINE))
         rays = self.camera.rays(uv)
         centre, R = torch.from_numpy(self.path.position_mm[k]), torch.from_numpy(self.path.R_lab_body[k])
-        normal, hit = sphere_normals(rays.origin_lab_mm, rays.direction_lab, centre, self.path.radius_mm)
-        paint = sample_texture(self.texture, (normal @ R).float())
-        across = normal @ self.camera.R_cam_lab.mT
-        sight = -(normal * rays.direction_lab).sum(-1, keepdim=True)
-        parts = torch.cat([paint[..., None], torch.ones_like(sight), across[..., :2], sight], dim=-1)
-        parts = torch.where(hit[..., None], parts, torch.full_like(parts, torch.nan))
+        seen = see_sphere(rays, centre, R, self.texture, self.path.radius_mm)
+        across = seen.normal @ self.camera.R_cam_lab.mT
+        sight = -(seen.normal * rays.direction_lab).sum(-1, keepdim=True)
+        parts = torch.cat([seen.paint[..., None], torch.ones_like(sight), across[..., :2], sight], dim=-1)
+        parts = torch.where(seen.depth2[..., None] > 0, parts, torch.full_like(parts, torch.nan))
         side = window.side
         mean = parts.reshape(side, FINE, side, FINE, 5).mean((1, 3)).numpy().astype(np.float32)
         return Seen(paint=mean[..., 0], basis=mean[..., 1:])

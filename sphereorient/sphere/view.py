@@ -1,4 +1,4 @@
-"""The canonical view: which direction of the sphere each pixel of a disk shows."""
+"""Geometry of the view: where lines of sight meet a sphere, and the canonical disk that a sphere fills."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from sphereorient.errors import check_tail
+from sphereorient.sphere.texture import sample_texture
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DiskView:
-    """A square picture that the disk of a sphere just fills; made by the functions below, read by the renderers.
+    """Pixels of a square picture that the disk of a sphere just fills.
 
     View frame: x right, y down, z from the camera to the sphere's centre.
     """
@@ -27,6 +28,16 @@ class DiskView:
         picture[..., self.inside] = values
         return picture
 
+    def paint(self, texture: Tensor, R_view_body: Tensor) -> Tensor:
+        """Look up a map (H, 2 H) at the disk's pixels, (..., P), for orientations (..., 3, 3); differentiable."""
+        check_tail("R_view_body", R_view_body, 3, 3)
+        # Rows: n_view @ R_view_body is R_view_body^T n_view, the normal in body components.
+        return sample_texture(texture.to(R_view_body.dtype), self.normal_view.to(R_view_body.dtype) @ R_view_body)
+
+    def render(self, texture: Tensor, R_view_body: Tensor, outside: float = 0.0) -> Tensor:
+        """Render one sample a pixel, (..., S, S); `SphereRenderer` integrates over the pixels."""
+        return self.picture(self.paint(texture, R_view_body), outside)
+
 
 def disk_offsets(size_px: int, dtype: torch.dtype = torch.float64) -> Tensor:
     """Return the pixel centres of a square in units of the disk's radius, (S, S, 2) as (right, down)."""
@@ -36,30 +47,25 @@ def disk_offsets(size_px: int, dtype: torch.dtype = torch.float64) -> Tensor:
 
 
 def orthographic_view(size_px: int, dtype: torch.dtype = torch.float32) -> DiskView:
-    """View a sphere from infinitely far: a pixel at (x, y) radii shows the normal (x, y, -sqrt(1 - x^2 - y^2)).
+    """Return the view from infinity: the pixel at (x, y) radii shows the normal (x, y, -sqrt(1 - x^2 - y^2)).
 
-    Args:
-        size_px: side of the picture, px; the disk fills it.
-        dtype: of the normals.
-
-    Source: paper section III (templates); ERRATA A4 says what it neglects.
+    Source: paper section III (templates); docs/errata.md A4 says what it neglects.
     """
-    offset = disk_offsets(size_px)
-    depth2 = 1.0 - offset.square().sum(-1)
+    origin = torch.nn.functional.pad(disk_offsets(size_px), (0, 1))
+    normal, depth2 = sphere_normals(origin, origin.new_tensor([0.0, 0.0, 1.0]), origin.new_zeros(3), 1.0)
     inside = depth2 > 0
-    normal = torch.cat([offset[inside], -depth2[inside].sqrt()[:, None]], dim=-1)
-    return DiskView(size_px=size_px, inside=inside, normal_view=normal.to(dtype))
+    return DiskView(size_px=size_px, inside=inside, normal_view=normal[inside].to(dtype))
 
 
 def perspective_view(size_px: int, distance_radii: float, dtype: torch.dtype = torch.float32) -> DiskView:
-    """View a sphere from a finite distance along the line to its centre; the visible cap fills the disk.
+    """Return the view from a finite distance along the line to the centre; the visible cap fills the disk.
 
     Args:
-        size_px: side of the picture, px; the limb touches its edges.
-        distance_radii: distance of the projection centre from the sphere's centre, in radii, above 1.
+        size_px: side of the picture; the limb touches its edges.
+        distance_radii: from the projection centre to the sphere's centre, in radii, above 1.
         dtype: of the normals.
 
-    Source: ERRATA A4 (the rim lies asin(1 / distance) before the great circle).
+    Source: docs/errata.md A4 (the rim lies asin(1 / distance) before the great circle).
     """
     offset = disk_offsets(size_px)
     inside = offset.square().sum(-1) < 1
@@ -69,27 +75,44 @@ def perspective_view(size_px: int, distance_radii: float, dtype: torch.dtype = t
     return DiskView(size_px=size_px, inside=inside, normal_view=normal.to(dtype))
 
 
-def sphere_normals(origin: Tensor, direction: Tensor, centre: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """Intersect rays with a sphere and return the outward unit normals at the near side.
+def sphere_normals(
+    origin: Tensor, direction: Tensor, centre: Tensor, radius: float | Tensor, corner: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Intersect rays with a sphere at the near side.
 
     Args:
         origin: (..., 3), start of the rays, any one frame and unit.
         direction: (..., 3), same frame, any length.
         centre: (..., 3), of the sphere, same frame and unit.
-        radius: of the sphere, same unit.
+        radius: () or (...), same unit.
+        corner: width, in radii squared, over which the depth fades to 0 at the limb; above 0 the normals are twice
+            differentiable, and those within about sqrt(corner) of the limb lie a little inside their true place.
 
     Returns:
-        Normals (..., 3), and whether the ray hits (...) bool; where it misses, the normal at the nearest approach.
+        Outward unit normals (..., 3), at the nearest approach where a ray misses; and 1 - (distance of the ray from the
+        centre, in radii)^2, (...): above 0 where it hits.
     """
     check_tail("direction", direction, 3)
+    radius = torch.as_tensor(radius, dtype=direction.dtype, device=direction.device)[..., None]
     direction = direction / direction.norm(dim=-1, keepdim=True)
     to_centre = centre - origin
     along = (to_centre * direction).sum(-1, keepdim=True)
     nearest = along * direction - to_centre  # from the sphere's centre to the ray's nearest point
     depth2 = radius**2 - nearest.square().sum(-1, keepdim=True)
-    hit = depth2 > 0
-    # The square root's gradient is infinite at the limb: a floor keeps it finite, and misses have no depth.
-    depth = torch.where(hit, depth2, torch.ones_like(depth2)).clamp_min(1e-12 * radius**2).sqrt()
-    normal = nearest - torch.where(hit, depth, torch.zeros_like(depth)) * direction
-    normal = normal / normal.norm(dim=-1, keepdim=True).clamp_min(1e-12 * radius)
-    return normal, hit[..., 0]
+    if corner > 0:
+        depth = radius * smooth_positive(depth2 / radius**2, corner).sqrt()
+    else:
+        hit = depth2 > 0
+        # The square root's gradient is infinite at the limb: a floor keeps it finite, and misses have no depth.
+        depth = torch.where(hit, depth2, 1.0).maximum(1e-12 * radius**2).sqrt()
+        depth = torch.where(hit, depth, 0.0)
+    normal = nearest - depth * direction
+    normal = normal / normal.norm(dim=-1, keepdim=True).maximum(1e-12 * radius)
+    return normal, (depth2 / radius**2)[..., 0]
+
+
+def smooth_positive(x: Tensor, width: float) -> Tensor:
+    """Return max(x, 0) with its corner rounded over about `width`; always above 0."""
+    root = (x * x + width * width).sqrt()
+    # The second form is the same without the difference of two nearly equal numbers.
+    return torch.where(x > 0, 0.5 * (x + root), 0.5 * width * width / (root + x.abs()))

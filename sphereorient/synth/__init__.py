@@ -1,18 +1,19 @@
-"""Movies with truth: random motion, random paint, the scene that two cameras see, and what spoils it."""
+"""Synthetic movies with exact truth: random motion and paint, the scene of two cameras, degradations."""
 
-from sphereorient.synth.degrade import DEGRADATIONS, degrade, severity
+from sphereorient.synth.degrade import degrade
 from sphereorient.synth.degrade_scene import write_degraded
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion
-from sphereorient.synth.scene import Scene, make_scene, render_frame
+from sphereorient.synth.scene import RenderedScene, make_scene, render_frame
 from sphereorient.synth.settings import SynthSettings
+from sphereorient.synth.severities import DEGRADATIONS, severity
 from sphereorient.synth.textures import random_texture
-from sphereorient.synth.write import write_experiment
+from sphereorient.synth.write import write_synthetic_experiment
 
 __all__ = [
     "DEGRADATIONS",
     "Motion6D",
     "RandomMotion",
-    "Scene",
+    "RenderedScene",
     "SynthSettings",
     "degrade",
     "make_scene",
@@ -21,5 +22,5 @@ __all__ = [
     "render_frame",
     "severity",
     "write_degraded",
-    "write_experiment",
+    "write_synthetic_experiment",
 ]

@@ -1,9 +1,8 @@
 """Degradations of pictures: torch operations on batches, for benchmarks and for training alike.
 
-Every operation takes pictures in grey levels before noise and rounding, a physical value (`severities`), where the
-ball is, and a generator, and returns pictures in the same dtype. At the value at which nothing happens the pictures
-come back unchanged. All random numbers come from the generator, item by item: a batch is the stack of its singles.
-That is why Kornia's filters are used here and its augmentations are not, which draw from torch's global generator.
+An operation takes grey levels before noise and rounding, a physical value (`severities`), the ball's disk and a
+generator, and returns pictures in the same dtype. All random numbers come from the generator, picture by picture: a
+batch is the stack of its singles. Kornia's augmentations draw from torch's global generator and are not used.
 """
 
 from __future__ import annotations
@@ -18,13 +17,11 @@ from kornia.filters import filter2d, gaussian_blur2d
 from torch import Tensor
 
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
-from sphereorient.synth.severities import DEGRADATIONS, Degradation, degradation, severity
-
-__all__ = ["DEGRADATIONS", "OPERATIONS", "Degradation", "Disk", "degradation", "degrade", "severity", "to_bytes"]
+from sphereorient.synth.severities import DEGRADATIONS, degradation
 
 WHITE_LEVEL = 255  # of 8 bits
 VEIL = 95.0  # grey level of turbid liquid
-OCCLUDER, SPECK, GLINT = 30.0, 12.0, 120.0  # grey levels of what passes before the ball, of dirt, of a bubble's glint
+OCCLUDER, SPECK, GLINT = 30.0, 12.0, 120.0  # grey levels of an occluder, of dirt, of a bubble's glint
 LOBES, LOBE_RADII = 2, 0.12  # highlights: how many, and their sigma in radii of the ball
 BUBBLE_RADII = 0.12  # radius of a bubble in radii of the ball
 SPECKS_PER_PX2 = 6e-4  # three before the paper's ball
@@ -34,14 +31,14 @@ DARKEST = 1.0  # grey level below which shot noise grows no smaller: its root ha
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Disk:
-    """Where the ball is in pictures (..., H, W); given by who rendered them, read by the operations."""
+    """Where the ball is in pictures (..., H, W)."""
 
     centre_px: Tensor  # (..., 2) as (u, v)
     radius_px: Tensor  # (...)
     cover: Tensor | None = None  # (..., H, W), the share of each pixel that the ball fills; None: a round disk's
 
     def __post_init__(self) -> None:
-        """Refuse centres that are none."""
+        """Refuse centres of another shape."""
         check_tail("centre_px", self.centre_px, 2)
 
     def offset(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
@@ -72,7 +69,7 @@ def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torc
     Args:
         pictures: (..., H, W), grey levels, not rounded; float32 or float64.
         disk: where the ball is.
-        values: name of an operation -> physical value; `severity(name, level)` gives those of the levels.
+        values: name of an operation -> physical value; see `severity`.
         rng: of all that is random.
 
     Returns:
@@ -80,7 +77,7 @@ def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torc
 
     Raises:
         SettingsError: an unknown name, one that does not act on pictures, or an impossible value.
-        ShapeError: no pictures.
+        ShapeError: not pictures.
     """
     if pictures.ndim < 2 or not pictures.is_floating_point():
         got, do = f"{tuple(pictures.shape)} {pictures.dtype}", "pass grey levels as floats"
@@ -98,7 +95,7 @@ def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torc
 
 
 def to_bytes(pictures: Tensor) -> Tensor:
-    """Round grey levels to 8 bits, (..., H, W) uint8; what exceeds 255 is clipped, as a sensor does."""
+    """Round grey levels to 8 bits and clip them, as a sensor does."""
     return pictures.round().clamp(0, WHITE_LEVEL).to(torch.uint8)
 
 
@@ -121,8 +118,8 @@ def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) 
     right, down = disk.offset(pictures)
     light = torch.zeros_like(pictures)
     for lobe in range(LOBES):
-        # Spread around the middle, so that they do not fall on each other; a lamp beside the camera is mirrored near
-        # the middle, one at right angles to it at 0.7 radii.
+        # Spread around the middle, apart from each other; a lamp beside the camera is mirrored near the middle, one at
+        # right angles to it at 0.7 radii.
         angle = 2 * math.pi * (draw[..., 0, :, :] + lobe / LOBES)
         away = (0.2 + 0.5 * draw[..., 1 + lobe, :, :]) * radius
         square = (right - away * angle.cos()).square() + (down - away * angle.sin()).square()
@@ -136,7 +133,7 @@ def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) 
 def background_clutter(pictures: Tensor, rms: float, disk: Disk, rng: torch.Generator) -> Tensor:
     """Add structure behind the ball, at least 0, evenly distributed, with this standard deviation in grey levels."""
     field = blurred(_normal(pictures, rng), CLUTTER_PX)
-    field = (field - _mean(field)) / _spread(field)
+    field = (field - field.mean((-2, -1), keepdim=True)) / _spread(field)
     even = torch.special.ndtr(field)
     even = even - even.amin((-2, -1), keepdim=True)
     clutter: Tensor = (rms / _spread(even)) * even
@@ -205,10 +202,10 @@ def defocus(pictures: Tensor, sigma_px: float, disk: Disk, rng: torch.Generator)
 
 
 def saturation(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Give every picture as much light that this share of its white paint exceeds 255; `to_bytes` clips.
+    """Brighten every picture until this share of its white paint exceeds 255; `to_bytes` clips.
 
-    White paint is what is brighter than the middle between the disk's darkest and brightest pixels. A movie has one
-    exposure throughout: there `degrade_scene` finds the gain from a ball that is white all over.
+    White paint is brighter than the middle between the disk's darkest and brightest pixels. For a movie, which has one
+    exposure, `degrade_scene` finds the gain from a white ball.
     """
     if share == 0:
         return pictures
@@ -220,16 +217,7 @@ def saturation(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator)
 
 
 def gain_to_clip(grey: Tensor, white: Tensor, share: float) -> Tensor:
-    """Return the factor that takes a share of white pixels above 255, 1 where more are already.
-
-    Args:
-        grey: (..., P), grey levels.
-        white: (..., P) bool, which of them show white paint.
-        share: in 0 .. 1.
-
-    Returns:
-        (...), no unit.
-    """
+    """Return the factor (...), 1 at least, that takes a share of the white pixels above 255; both (..., P)."""
     count = white.sum(-1, keepdim=True)
     falling = grey.masked_fill(~white, -math.inf).sort(-1, descending=True).values
     limit = (share * count).round().long().minimum((count - 1).clamp_min(0))
@@ -266,23 +254,7 @@ OPERATIONS: Mapping[str, Operation] = MappingProxyType(
 )
 
 
-# Movies, and what is told of the disk.
-
-
-def drop_frames(movie: Tensor, share: float, rng: torch.Generator) -> Tensor:
-    """Make frames of movies black.
-
-    Args:
-        movie: (..., N, H, W), grey levels.
-        share: of the N frames, rounded to a whole number of them.
-        rng: draws which.
-
-    Returns:
-        (..., N, H, W).
-    """
-    degradation("dropped_frames").check(share)
-    lost = lost_frames(movie[..., 0, 0], share, rng)
-    return torch.where(lost[..., None, None], torch.zeros_like(movie), movie)
+# Movies, and errors of the disk.
 
 
 def lost_frames(like: Tensor, share: float, rng: torch.Generator) -> Tensor:
@@ -293,7 +265,7 @@ def lost_frames(like: Tensor, share: float, rng: torch.Generator) -> Tensor:
 
 
 def centre_error(disk: Disk, error_px: float, rng: torch.Generator) -> Disk:
-    """Return the disk that a method is told whose centre is off by this many px, in any direction."""
+    """Return the disk with its centre off by this many px, in a random direction."""
     degradation("centre_error").check(error_px)
     centre = disk.centre_px
     draw = torch.rand((*centre.shape[:-1], 1), generator=rng, dtype=centre.dtype, device=rng.device).to(centre)
@@ -303,7 +275,7 @@ def centre_error(disk: Disk, error_px: float, rng: torch.Generator) -> Disk:
 
 
 def radius_error(disk: Disk, error_px: float) -> Disk:
-    """Return the disk that a method is told whose radius is too large by this many px."""
+    """Return the disk with its radius too large by this many px."""
     degradation("radius_error").check(error_px)
     return Disk(centre_px=disk.centre_px, radius_px=disk.radius_px + error_px)
 
@@ -312,7 +284,7 @@ def radius_error(disk: Disk, error_px: float) -> Disk:
 
 
 def blurred(pictures: Tensor, sigma_px: float) -> Tensor:
-    """Blur pictures (..., H, W) with a Gaussian, px; beyond the border they go on as they end."""
+    """Blur pictures (..., H, W) with a Gaussian, px; the border is continued."""
     if sigma_px == 0 or pictures.numel() == 0:
         return pictures
     size = 2 * math.ceil(4 * sigma_px) + 1
@@ -322,7 +294,7 @@ def blurred(pictures: Tensor, sigma_px: float) -> Tensor:
 
 
 def _round(right: Tensor, down: Tensor, radius_px: Tensor) -> Tensor:
-    """Share of each pixel inside a circle, the border one pixel wide."""
+    """Return the share of each pixel inside a circle, the border one pixel wide."""
     square = right.square() + down.square()
     # The root has no slope at the middle of the circle, where the share does not change either.
     distance = square.clamp_min(1e-6).sqrt()
@@ -330,7 +302,7 @@ def _round(right: Tensor, down: Tensor, radius_px: Tensor) -> Tensor:
 
 
 def _distance_of_overlap(share: float) -> float:
-    """Distance, in radii, of two equal circles of which one hides this share of the other (bisection)."""
+    """Return the distance, in radii, at which a circle hides this share of an equal one (bisection)."""
     near, far = 0.0, 2.0
     for _ in range(50):
         middle = 0.5 * (near + far)
@@ -340,7 +312,7 @@ def _distance_of_overlap(share: float) -> float:
 
 
 def _uniform(pictures: Tensor, rng: torch.Generator, *tail: int) -> Tensor:
-    """Numbers in 0 .. 1 for each picture, (..., *tail): those of one picture are drawn together."""
+    """Draw numbers in 0 .. 1, (..., *tail), those of one picture together."""
     shape = (*pictures.shape[:-2], *tail)
     return torch.rand(shape, generator=rng, dtype=pictures.dtype, device=rng.device).to(pictures.device)
 
@@ -350,10 +322,6 @@ def _normal(pictures: Tensor, rng: torch.Generator) -> Tensor:
     return draw.to(pictures.device)
 
 
-def _mean(field: Tensor) -> Tensor:
-    return field.mean((-2, -1), keepdim=True)
-
-
 def _spread(field: Tensor) -> Tensor:
     """Standard deviation over each picture, (..., 1, 1)."""
-    return (field - _mean(field)).square().mean((-2, -1), keepdim=True).sqrt()
+    return (field - field.mean((-2, -1), keepdim=True)).square().mean((-2, -1), keepdim=True).sqrt()

@@ -1,7 +1,4 @@
-"""Degraded experiments on disk: what is wrong with the scene, the paint, the pictures, and with what is told of them.
-
-The truth stays exact: truth.h5 is of the scene that was filmed.
-"""
+"""Degraded experiments on disk: scene, paint, pictures, and wrong reports of map and cameras; truth.h5 stays exact."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ import math
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -21,21 +17,13 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import Camera, TsaiCamera
 from sphereorient.sphere import sample_texture
-from sphereorient.synth.degrade import (
-    DEGRADATIONS,
-    OPERATIONS,
-    Disk,
-    Operation,
-    degradation,
-    gain_to_clip,
-    lost_frames,
-    severity,
-)
-from sphereorient.synth.filming import Filming, Shown
+from sphereorient.sphere.renderer import rim_directions
+from sphereorient.synth.degrade import OPERATIONS, Disk, gain_to_clip, lost_frames
 from sphereorient.synth.scene import expose, make_scene
 from sphereorient.synth.settings import SynthSettings
+from sphereorient.synth.severities import DEGRADATIONS, degradation, severity
 from sphereorient.synth.textures import map_directions
-from sphereorient.synth.write import default_cameras, write_experiment
+from sphereorient.synth.write import FilmedView, Filming, default_cameras, write_synthetic_experiment
 
 BARE = 0.5  # grey of the map where the paint is gone
 WAVES, WAVE_RATES = 24, (6.0, 12.0)  # patches: a sum of waves over the body's directions, periods of 30 to 60 degrees
@@ -49,17 +37,17 @@ def write_degraded(
     applied: Mapping[str, int],
     progress: Callable[[int], None] = lambda done: None,
 ) -> Path:
-    """Render an experiment with exact truth as `write_experiment` does, with any number of degradations.
+    """Render an experiment as `write_synthetic_experiment` does, with any number of degradations.
 
     Args:
-        folder: made where it is missing; files of an older run are replaced.
+        folder: created if missing; files of an older run are replaced.
         base: the scene, and the seed of all that is random.
-        applied: name -> level 1 .. 5; in any order. With none the files are those of `write_experiment`.
+        applied: name -> level 1 .. 5, in any order.
         progress: called with the number of frames rendered since the last call.
 
     Returns:
-        Path of experiment.yaml. cameras.yaml, texture.png and sphere.diameter are what the method is told; truth.h5
-        and its centre_px are of the cameras and the ball that were filmed.
+        Path of experiment.yaml. cameras.yaml, texture.png and sphere.diameter may be wrong; truth.h5 and its centre_px
+        are of the cameras and the ball that were filmed.
 
     Raises:
         SettingsError: an unknown name or level, or a scene that cannot be.
@@ -75,18 +63,18 @@ def write_with_values(
     values: Mapping[str, float],
     progress: Callable[[int], None] = lambda done: None,
 ) -> Path:
-    """Do what `write_degraded` does, with physical values instead of levels."""
+    """Render as `write_degraded` does, with physical values instead of levels."""
     for name, value in values.items():
         degradation(name).check(value)
     settings = degraded_settings(base, values)
-    return write_experiment(folder, settings, progress, DegradedFilming(settings, values))
+    return write_synthetic_experiment(folder, settings, progress, DegradedFilming(settings, values))
 
 
 # The scene.
 
 
 def degraded_settings(base: SynthSettings, values: Mapping[str, float]) -> SynthSettings:
-    """Return the scene with those degradations that act on it: ball_size, spin, motion_blur, in this order."""
+    """Apply the degradations of the scene: ball_size, spin, motion_blur, in this order."""
     settings = base
     for name, change in SCENE.items():
         if name in values:
@@ -95,16 +83,16 @@ def degraded_settings(base: SynthSettings, values: Mapping[str, float]) -> Synth
 
 
 def with_ball_size(base: SynthSettings, diameter_px: float) -> SynthSettings:
-    """Return the same scene with pixels of another size: the whole picture grows or shrinks with the ball."""
+    """Change the size of the pixels: the whole picture grows or shrinks with the ball."""
     scale = diameter_px / base.diameter_px
     width, height = (max(8, round(side * scale)) for side in base.image_size)
     return _changed(base, diameter_px=diameter_px, image_size=(width, height))
 
 
 def with_spin(base: SynthSettings, degrees_per_frame: float) -> SynthSettings:
-    """Return the scene whose ball turns by this much in a frame, rms of |omega| over time.
+    """Change the rotation in a frame, rms of |omega| over time.
 
-    The exposure is shortened as the spin grows, so that the turn within it does not: smear is motion_blur's.
+    The exposure shrinks as the spin grows, so that the smear stays: that is motion_blur's.
     """
     omega_rms = math.radians(degrees_per_frame) * base.frame_rate / math.sqrt(3)
     shorter = min(1.0, base.omega_rms / omega_rms) if omega_rms > 0 else 1.0
@@ -112,10 +100,7 @@ def with_spin(base: SynthSettings, degrees_per_frame: float) -> SynthSettings:
 
 
 def with_motion_blur(base: SynthSettings, degrees_per_exposure: float) -> SynthSettings:
-    """Return the scene whose ball turns by this much while the shutter is open, rms of |omega| over time.
-
-    First the exposure is changed, up to the whole frame; what is then missing is made up by more spin.
-    """
+    """Change the rotation in an exposure, rms of |omega| over time: a longer exposure first, then more spin."""
     turn = math.radians(degrees_per_exposure)
     spin = base.omega_rms * math.sqrt(3)  # rad/s
     exposure = min(turn / spin, 1 / base.frame_rate) if spin > 0 else 1 / base.frame_rate
@@ -143,32 +128,31 @@ def _changed(base: SynthSettings, **update: object) -> SynthSettings:
 
 
 def worn(texture: Tensor, share: float, rng: torch.Generator) -> Tensor:
-    """Return maps whose paint is gone in patches.
-
-    Args:
-        texture: (..., H, 2 H), 0 black .. 1 white.
-        share: of the sphere's area.
-        rng: draws where.
-
-    Returns:
-        (..., H, 2 H), `BARE` in the patches.
-    """
+    """Return maps (..., H, 2 H) whose paint is gone (`BARE`) in patches that cover a share of the sphere's area."""
     degradation("paint_wear").check(share)
-    return torch.where(patches(texture, share, rng), torch.full_like(texture, BARE), texture)
+    return torch.where(random_patches(texture, share, rng), torch.full_like(texture, BARE), texture)
 
 
 def misdrawn(texture: Tensor, share: float, rng: torch.Generator) -> Tensor:
-    """Return maps with black and white exchanged in patches; arguments as those of `worn`."""
+    """Return maps (..., H, 2 H) with black and white exchanged in patches that cover a share of the sphere's area."""
     degradation("texture_error").check(share)
-    return torch.where(patches(texture, share, rng), 1 - texture, texture)
+    return torch.where(random_patches(texture, share, rng), 1 - texture, texture)
 
 
-def patches(texture: Tensor, share: float, rng: torch.Generator) -> Tensor:
-    """Draw patches that cover a share of the sphere's area, seamless, (..., H, 2 H) bool for maps of this shape."""
+def random_patches(texture: Tensor, share: float, rng: torch.Generator) -> Tensor:
+    """Draw seamless patches that cover a share of the sphere's area, bool in the shape of the maps (..., H, 2 H)."""
     if share == 0:
         return torch.zeros_like(texture, dtype=torch.bool)
     height, lead = texture.shape[-2], texture.shape[:-2]
-    fields = _waves(lead, rng)
+    # Random smooth functions of the body's direction, on a map of MASK_ROWS: a sum of waves.
+    draw = torch.rand((*lead, WAVES, 4), generator=rng, dtype=torch.float64, device=rng.device).cpu()
+    up = 2 * draw[..., 0] - 1
+    around, phase = 2 * math.pi * draw[..., 1], 2 * math.pi * draw[..., 2]
+    rate = WAVE_RATES[0] + (WAVE_RATES[1] - WAVE_RATES[0]) * draw[..., 3]
+    level = (1 - up.square()).sqrt()
+    wave = rate[..., None] * torch.stack([level * around.cos(), level * around.sin(), up], dim=-1)
+    angle = map_directions(MASK_ROWS) @ wave.mT[..., None, :, :] + phase[..., None, None, :]
+    fields = angle.cos().sum(-1)
     if height != MASK_ROWS:
         body = map_directions(height)
         finer = [sample_texture(field, body) for field in fields.reshape(-1, *fields.shape[-2:])]
@@ -180,18 +164,6 @@ def patches(texture: Tensor, share: float, rng: torch.Generator) -> Tensor:
     return (fields <= rising.values.gather(-1, last)[..., None]).to(texture.device)
 
 
-def _waves(lead: tuple[int, ...], rng: torch.Generator) -> Tensor:
-    """Random smooth functions of the body's direction, (..., MASK_ROWS, 2 MASK_ROWS) float64, on the map."""
-    draw = torch.rand((*lead, WAVES, 4), generator=rng, dtype=torch.float64, device=rng.device).cpu()
-    up = 2 * draw[..., 0] - 1
-    around, phase = 2 * math.pi * draw[..., 1], 2 * math.pi * draw[..., 2]
-    rate = WAVE_RATES[0] + (WAVE_RATES[1] - WAVE_RATES[0]) * draw[..., 3]
-    level = (1 - up.square()).sqrt()
-    wave = rate[..., None] * torch.stack([level * around.cos(), level * around.sin(), up], dim=-1)
-    angle = map_directions(MASK_ROWS) @ wave.mT[..., None, :, :] + phase[..., None, None, :]
-    return angle.cos().sum(-1)
-
-
 # The pictures.
 
 
@@ -200,7 +172,7 @@ class DegradedFilming(Filming):
 
     Args:
         settings: of the scene, already degraded.
-        values: name -> physical value; those that act elsewhere are not looked at.
+        values: name -> physical value; degradations of the scene are ignored.
     """
 
     def __init__(self, settings: SynthSettings, values: Mapping[str, float]) -> None:
@@ -215,21 +187,21 @@ class DegradedFilming(Filming):
         """Return the map with its paint worn."""
         return worn(texture, self.values.get("paint_wear", 0.0), self._generator("paint_wear"))
 
-    def told_texture(self, texture: Tensor) -> Tensor:
-        """Return the map that the method is given."""
+    def reported_texture(self, texture: Tensor) -> Tensor:
+        """Return the map with patches exchanged."""
         return misdrawn(texture, self.values.get("texture_error", 0.0), self._generator("texture_error"))
 
-    def told_cameras(self, cameras: Mapping[str, Camera]) -> Mapping[str, Camera]:
-        """Return the cameras that the method is given."""
-        return told_cameras(cameras, self.values)
+    def reported_cameras(self, cameras: Mapping[str, Camera]) -> Mapping[str, Camera]:
+        """Return the cameras, wrong by centre_error, camera_rotation and camera_shift."""
+        return wrong_cameras(cameras, self.values)
 
-    def told_diameter_mm(self, diameter_mm: float) -> float:
-        """Return the diameter that the method is given."""
+    def reported_diameter_mm(self, diameter_mm: float) -> float:
+        """Return the diameter, wrong by radius_error."""
         return diameter_mm * (1 + self.values.get("radius_error", 0.0) / (self.settings.diameter_px / 2))
 
-    def picture(self, picture: NDArray[np.float32], shown: Shown) -> NDArray[np.float32]:
-        """Return the picture degraded; without the ball only what stays throughout a movie is applied."""
-        light = self._through(torch.from_numpy(picture), shown, tuple(OPERATIONS))
+    def picture(self, picture: NDArray[np.float32], view: FilmedView) -> NDArray[np.float32]:
+        """Degrade the picture; the one without the ball only by what stays throughout a movie."""
+        light = self._through(torch.from_numpy(picture), view, tuple(OPERATIONS))
         return cast("NDArray[np.float32]", light.numpy())
 
     def lost(self, name: str, frames: int) -> frozenset[int]:
@@ -238,73 +210,55 @@ class DegradedFilming(Filming):
         lost = lost_frames(torch.empty(frames), share, self._generator("dropped_frames", name))
         return frozenset(lost.nonzero()[:, 0].tolist())
 
-    def _through(self, light: Tensor, shown: Shown, names: tuple[str, ...]) -> Tensor:
+    def _through(self, light: Tensor, view: FilmedView, names: tuple[str, ...]) -> Tensor:
         """Apply some of the degradations of pictures."""
-        disk = self._disk(shown)
+        centre_px, radius_px = picture_of_ball(view.camera, view.position_lab_mm, self.settings.diameter_mm / 2)
+        disk = Disk(centre_px=centre_px, radius_px=radius_px, cover=torch.from_numpy(view.cover))
         for name in names:
             row = DEGRADATIONS[name]
             value = self.values.get(name, row.nothing)
-            if value is None or value == row.nothing or not (row.still or shown.frame is not None):
+            if value is None or value == row.nothing or (row.where == "frame" and view.frame is None):
                 continue
             # What is still has the same random numbers in every frame.
-            rng = self._generator(name, shown.name, *([] if row.still else [shown.frame or 0]))
-            light = self._operation(name, shown.name)(light, value, disk, rng)
+            rng = self._generator(name, view.name, *([] if row.where != "frame" else [view.frame or 0]))
+            # One exposure throughout a movie: its gain was found before.
+            light = light * self.gains[view.name] if name == "saturation" else OPERATIONS[name](light, value, disk, rng)
         return light
 
-    def _operation(self, name: str, camera: str) -> Operation:
-        if name == "saturation":
-            return partial(_brighter, gain=self.gains[camera])
-        return OPERATIONS[name]
-
-    def _disk(self, shown: Shown) -> Disk:
-        centre_px, radius_px = picture_of_ball(shown.camera, shown.position_lab_mm, self.settings.diameter_mm / 2)
-        return Disk(centre_px=centre_px, radius_px=radius_px, cover=torch.from_numpy(shown.cover))
-
     def _gain(self, name: str, camera: Camera) -> float:
-        """Find the exposure of a camera by a ball that is white all over, under all that dims or lights it."""
+        """Return the exposure at which a white ball saturates, under all degradations that dim or light it."""
         origin = torch.zeros(1, 3, dtype=torch.float64)
         scene = make_scene(torch.ones(8, 16), self.settings)
         picture, cover = expose(scene, camera, origin, torch.eye(3, dtype=torch.float64)[None])
-        shown = Shown(name=name, camera=camera, frame=None, cover=cover, position_lab_mm=origin[0])
+        view = FilmedView(name=name, camera=camera, frame=None, cover=cover, position_lab_mm=origin[0])
         before = tuple(OPERATIONS)[: tuple(OPERATIONS).index("saturation")]
-        light = self._through(torch.from_numpy(picture), shown, before)
+        light = self._through(torch.from_numpy(picture), view, before)
         white = torch.from_numpy(cover) > 0.99
         return float(gain_to_clip(light.flatten(), white.flatten(), self.values["saturation"]))
 
     def _generator(self, *what: str | int) -> torch.Generator:
-        # By name, so that one degradation more changes nothing of the others.
+        # By name: one more degradation leaves the random numbers of the others.
         words = [zlib.crc32(word.encode()) if isinstance(word, str) else word for word in what]
         state = np.random.SeedSequence([self.settings.seed, *words]).generate_state(1, np.uint64)
         return torch.Generator().manual_seed(int(state[0]) >> 1)
 
 
-def _brighter(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator, gain: float) -> Tensor:
-    return pictures * gain
-
-
 def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
-    """Return where balls (..., 3) appear: the picture of the centre (..., 2), and the mean radius (...), px."""
+    """Return the pictures of the centres of balls (..., 3), (..., 2), and the mean radii of their rims (...), px."""
     centre_px = camera.project(position_lab_mm)
-    sight = camera.rays(centre_px).direction_lab
-    across = torch.linalg.cross(sight, camera.R_cam_lab[0].to(sight).expand_as(sight))
-    across = across / across.norm(dim=-1, keepdim=True)
-    second = torch.linalg.cross(sight, across)
-    beside = torch.stack([across, second, -across, -second], dim=-2)
-    rim_px = camera.project(position_lab_mm[..., None, :] + radius_mm * beside)
+    rim, _ = rim_directions(camera, position_lab_mm, 4)
+    rim_px = camera.project(position_lab_mm[..., None, :] + radius_mm * rim)
     return centre_px, (rim_px - centre_px[..., None, :]).norm(dim=-1).mean(-1)
 
 
-# What the method is told.
-
-
-def told_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float]) -> Mapping[str, Camera]:
-    """Return the cameras that the method is given, wrong by centre_error, camera_rotation and camera_shift."""
+def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float]) -> Mapping[str, Camera]:
+    """Apply centre_error, opposite in the two cameras, and camera_rotation and camera_shift of the second."""
     if not any(values.get(name) for name in ("centre_error", "camera_rotation", "camera_shift")):
         return cameras
-    told = {name: _shifted_centre(camera, k, values) for k, (name, camera) in enumerate(cameras.items())}
-    second = list(told)[-1]
-    told[second] = _displaced(told[second], values)
-    return told
+    wrong = {name: _shifted_centre(camera, k, values) for k, (name, camera) in enumerate(cameras.items())}
+    second = list(wrong)[-1]
+    wrong[second] = _displaced(wrong[second], values)
+    return wrong
 
 
 def _shifted_centre(camera: Camera, index: int, values: Mapping[str, float]) -> Camera:
@@ -318,7 +272,7 @@ def _shifted_centre(camera: Camera, index: int, values: Mapping[str, float]) -> 
 
 
 def _displaced(camera: Camera, values: Mapping[str, float]) -> Camera:
-    """Turn a camera about the lab's origin, which keeps its pixel, and shift it along its own x."""
+    """Rotate a camera about the lab's origin, which keeps its pixel, and shift it along its own x."""
     angle, shift_mm = math.radians(values.get("camera_rotation", 0.0)), values.get("camera_shift", 0.0)
     if angle == 0 and shift_mm == 0:
         return camera

@@ -1,4 +1,4 @@
-"""Pictures of single balls, cropped as a proposer wants them, by the thousand: for training and for its benchmark."""
+"""Cropped pictures of single balls by the thousand: for the training of a proposer and for its benchmark."""
 
 from __future__ import annotations
 
@@ -10,21 +10,24 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.cameras import Rays
 from sphereorient.errors import SettingsError, refusal
-from sphereorient.sphere import reduced_texture, sample_texture
+from sphereorient.sphere import reduced_texture, see_sphere
+from sphereorient.sphere.renderer import lambert
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.synth.degrade import OPERATIONS, Disk, blurred, centre_error, degrade, radius_error
+from sphereorient.synth.scene import LIT
 from sphereorient.synth.severities import DEGRADATIONS
 from sphereorient.synth.textures import random_directions
 
-MARGIN = 0.2  # of the radius: what is filmed beside the ball
+MARGIN = 0.2  # filmed beside the ball, radii
 BLUR_INSTANTS = 8  # of an exposure during which the ball turns
-LEVELS = (120.0, 200.0), (8.0, 30.0), (8.0, 40.0)  # grey of white paint, of black paint, of what is behind, drawn
-AMBIENT = (0.3, 1.0)  # share of the light that comes evenly from everywhere, drawn
+LEVELS = (120.0, 200.0), (8.0, 30.0), (8.0, 40.0)  # ranges of grey levels: white paint, black paint, background
+AMBIENT = (0.3, 1.0)  # range of the share of even light
 LAMPS = 2
-READ_NOISE, SHOT_NOISE, BLUR_PX = 1.5, 0.3, 0.55  # as `SynthSettings`: there always
+READ_NOISE, SHOT_NOISE, BLUR_PX = 1.5, 0.3, 0.55  # as `SynthSettings`, always there
 IN_PX = ("dirt", "defocus", "centre_error", "radius_error")  # values that shrink with the picture
-# One picture of one ball: what acts on movies, and what two cameras disagree about, has no place here.
+# Without those of movies and of two cameras.
 DISK_DEGRADATIONS = tuple(
     name
     for name in DEGRADATIONS
@@ -50,18 +53,17 @@ class DiskSettings(BaseModel):
 def film_disks(
     texture: Tensor, R_view_body: Tensor, values: Mapping[str, float], rng: torch.Generator, settings: DiskSettings
 ) -> Tensor:
-    """Film a ball in several attitudes under light that is drawn anew each time, and crop the disks.
+    """Film a ball under light drawn anew for each picture, and crop the disks as `crop_disk` does.
 
     Args:
-        texture: (H, 2 H), the paint that is on the ball, worn where it is.
+        texture: (H, 2 H), the map on the ball, already worn.
         R_view_body: (F, 3, 3), the attitudes.
-        values: name of `DISK_DEGRADATIONS` -> physical value; `paint_wear` and `texture_error`, which change maps, are
-            not looked at.
+        values: name of `DISK_DEGRADATIONS` -> physical value; those of maps are ignored.
         rng: of all that is random.
         settings: of the pictures.
 
     Returns:
-        (F, S, S) float32, grey levels in whole numbers before resampling, as `crop_disk` gives them.
+        (F, S, S) float32, grey levels, rounded before resampling.
 
     Raises:
         SettingsError: an unknown name, or an impossible value.
@@ -70,7 +72,7 @@ def film_disks(
     scale = settings.scale
     diameter = values.get("ball_size", settings.diameter_px)
     if diameter < settings.diameter_px:
-        scale = max(scale, min(1.0, settings.size_px / diameter))  # what is coarse already stays as it is
+        scale = max(scale, min(1.0, settings.size_px / diameter))  # coarse pictures stay
     radius = diameter * scale / 2
     count = len(R_view_body)
     side = 2 * math.ceil(radius * (1 + MARGIN)) + 2
@@ -78,10 +80,10 @@ def film_disks(
     disk = Disk(centre_px=middle, radius_px=torch.full((count,), radius))
     grey = _lit(texture, R_view_body.float(), values, disk, side, rng)
     within = {name: value * (scale if name in IN_PX else 1.0) for name, value in values.items() if name in OPERATIONS}
-    grey = degrade(_optics(grey, scale), disk, within, rng)
+    grey = degrade(blurred(grey, max(BLUR_PX * scale, 0.3)), disk, within, rng)  # coarse pixels blur by themselves
     noise = (READ_NOISE**2 + SHOT_NOISE**2 * grey.clamp_min(0)).sqrt()
     grey = (grey + noise * torch.randn(grey.shape, generator=rng)).round().clamp(0, 255)
-    return _cropped(grey, _told(disk, values, scale, rng, settings), settings.size_px)
+    return _cropped(grey, _outline(disk, values, scale, rng, settings), settings.size_px)
 
 
 def _check(values: Mapping[str, float]) -> None:
@@ -95,52 +97,42 @@ def _check(values: Mapping[str, float]) -> None:
 def _lit(
     texture: Tensor, R: Tensor, values: Mapping[str, float], disk: Disk, side: int, rng: torch.Generator
 ) -> Tensor:
-    """Grey levels (F, side, side) of balls before what is behind them."""
+    """Return grey levels (F, side, side) of balls and background."""
     count, radius = len(R), float(disk.radius_px.amax()) if len(R) else 1.0  # all have the same
     right, down = disk.offset(torch.empty(count, side, side))
-    x, y = (right / radius).expand(-1, side, -1), (down / radius).expand(-1, -1, side)
-    depth = (1 - x.square() - y.square()).clamp_min(1e-6).sqrt()
-    normal = torch.stack([x, y, -depth], -1).flatten(1, 2)
-    normal = torch.nn.functional.normalize(normal, dim=-1)
-    paint = _turning_paint(texture, R, normal, radius, values.get("motion_blur", 0.0), rng)
+    origin = torch.nn.functional.pad(torch.stack(torch.broadcast_tensors(right, down), -1).flatten(1, 2), (0, 1))
+    rays = Rays(origin_lab_mm=origin, direction_lab=origin.new_tensor([0.0, 0.0, 1.0]))
+    seen = see_sphere(rays, torch.zeros(3), _instants(R, values, rng), reduced_texture(texture, 2 * radius), radius)
     levels = [low + (high - low) * torch.rand((count, 1), generator=rng) for low, high in LEVELS]
     white, black, behind = levels
-    grey = ((black + (white - black) * paint) * _light(normal, rng)).reshape(count, side, side)
-    cover = disk.covered(grey)
-    return behind[..., None] + cover * (grey - behind[..., None])
+    grey = (black + (white - black) * seen.paint.mean(0)) * _light(seen.normal, rng)
+    grey = grey.reshape(count, side, side)
+    return behind[..., None] + disk.covered(grey) * (grey - behind[..., None])
 
 
-def _turning_paint(
-    texture: Tensor, R: Tensor, normal: Tensor, radius: float, degrees: float, rng: torch.Generator
-) -> Tensor:
-    """Paint at normals (F, P, 3) in the view frame, the mean over an exposure, (F, P)."""
-    reduced = reduced_texture(texture, 2 * radius)
+def _instants(R: Tensor, values: Mapping[str, float], rng: torch.Generator) -> Tensor:
+    """Return the orientations (E, F, 3, 3) during an exposure; rotation vectors are normally distributed."""
+    degrees = values.get("motion_blur", 0.0)
     if degrees == 0:
-        return sample_texture(reduced, normal @ R)
-    # Components normally distributed, as those of a sphere in turbulence.
-    turn = math.radians(degrees) / math.sqrt(3) * torch.randn((len(R), 3), generator=rng)
+        return R[None]
+    rotation = math.radians(degrees) / math.sqrt(3) * torch.randn((len(R), 3), generator=rng)
     at = (torch.arange(BLUR_INSTANTS) + 0.5) / BLUR_INSTANTS - 0.5
-    instants = so3.exp(at[:, None, None] * turn) @ R
-    return torch.stack([sample_texture(reduced, normal @ each) for each in instants]).mean(0)
+    return so3.exp(at[:, None, None] * rotation) @ R
 
 
 def _light(normal: Tensor, rng: torch.Generator) -> Tensor:
-    """Light on normals (F, P, 3): an even part and lamps anywhere on the camera's side, 1 at most nearly everywhere."""
+    """Return the light on normals (F, P, 3): an even part, and lamps anywhere on the camera's side."""
     count = len(normal)
     ambient = AMBIENT[0] + (AMBIENT[1] - AMBIENT[0]) * torch.rand((count, 1), generator=rng)
     lamps = random_directions(count * LAMPS, rng).float().reshape(count, LAMPS, 3)
     lamps = torch.cat([lamps[..., :2], -lamps[..., 2:].abs()], -1)
-    lit = (normal @ lamps.mT).clamp_min(0).mean(-1) / 0.75
-    return ambient + (1 - ambient) * lit
+    return ambient + (1 - ambient) * lambert(normal, lamps, 1 / LAMPS) / LIT
 
 
-def _optics(grey: Tensor, scale: float) -> Tensor:
-    """Blur of the lens; of coarser pixels a floor, below which their own is all there is."""
-    return blurred(grey, max(BLUR_PX * scale, 0.3))
-
-
-def _told(disk: Disk, values: Mapping[str, float], scale: float, rng: torch.Generator, settings: DiskSettings) -> Disk:
-    """Where an outline says that the disks are."""
+def _outline(
+    disk: Disk, values: Mapping[str, float], scale: float, rng: torch.Generator, settings: DiskSettings
+) -> Disk:
+    """Return the disks that a measured outline would give."""
     count = len(disk.radius_px)
     if "centre_error" in values:
         disk = centre_error(disk, values["centre_error"] * scale, rng)
@@ -152,7 +144,7 @@ def _told(disk: Disk, values: Mapping[str, float], scale: float, rng: torch.Gene
 
 
 def _cropped(grey: Tensor, disk: Disk, size_px: int) -> Tensor:
-    """Resample disks to a common size, bilinear, as `crop_disk` does, (F, S, S)."""
+    """Resample disks to a common size, bilinear, as `crop_disk` does."""
     side = grey.shape[-1]
     at = disk.centre_px[:, None, None, :] + disk.radius_px[:, None, None, None] * disk_offsets(size_px).float()
     place = (2 * at + 1) / side - 1

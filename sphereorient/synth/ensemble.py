@@ -1,29 +1,150 @@
-"""Ensembles of six-dimensional tracks without pictures, whose true statistics are those of the paper's Table I."""
+"""Ensembles of six-dimensional tracks without pictures, whose true statistics are those of the paper's Table I.
+
+A component is a smooth stationary random rate with known rms and flatness, its derivative's too:
+rate = rms (sqrt(1 - b) g1 + sqrt(b / <A^2>) A g2): two independent Gaussian processes, the second amplified in bursts
+by A, whose logarithm is a sum of DEPTH cos(phase) over phases that turn evenly from random starts. Given the phases
+everything is Gaussian: all moments are means over them. A is nearly the log-normal factor of turbulence, but bounded:
+otherwise the flatness of 300 segments would depend on the largest event in them.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import i0e, ndtri
 
 from sphereorient import so3
-from sphereorient.synth.intermittent import Draw, Law
+from sphereorient.motion import MeasuredPoses, (
+    Motion,
+    MotionSettings,
+    ProcessNoise,
+    Smoothed,
+    SmoothSettings,
+    measure_motion,
+    smooth_motion,
+)
+from sphereorient.synth.motion import magnus_rotation
+from sphereorient.trajectory import Flag, Trajectory
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Three = tuple[float, float, float]
 
+TURNS = (0.25, 0.4)  # rates of the phases over that of g2: a burst holds a few oscillations
+DEPTH = 0.66  # of each phase's part in ln A; 0.63 would not reach a flatness of 7.6 in the derivative
+WAVES = 24  # sines of each Gaussian process
+GAUSSIAN = 3.0  # its flatness
+NODES = 64  # of each phase: means over so many are exact to rounding for these smooth periodic functions
 REST = 10  # steps between the end of a segment and the start of the next
 BOX_MM = 40.0  # segments start within this distance of the origin, by component
+_UNITS = {  # of motion's names
+    "velocity": "m_s",
+    "acceleration": "m_s2",
+    "omega_lab": "rad_s",
+    "omega_body": "rad_s",
+    "alpha_lab": "rad_s2",
+    "alpha_body": "rad_s2",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Law:
+    """Statistics of one component; made by `Law.of`."""
+
+    rms: float
+    share: float  # b, of the bursts in the variance
+    slow: float  # rms rate of g1, rad/s
+    fast: float  # rms rate of g2, rad/s
+
+    @classmethod
+    def of(cls, rms: float, derivative_rms: float, flatness: float = 3.0, derivative_flatness: float = 3.0) -> Self:
+        """Find the process with these statistics.
+
+        Args:
+            rms: of the rate, any unit.
+            derivative_rms: the same unit / s.
+            flatness: of the rate, 3 or more.
+            derivative_flatness: of its derivative; 3 where the flatness is 3, else up to about 9.
+        """
+        modulation, growth, flat = _burst()
+        share = math.sqrt(max(flatness - GAUSSIAN, 0.0) / (modulation - GAUSSIAN))
+        steep = math.sqrt(max(derivative_flatness - GAUSSIAN, 0.0) / (flat - GAUSSIAN))
+        whole = (derivative_rms / rms) ** 2
+        slow = math.sqrt((1 - steep) * whole / (1 - share))
+        fast = math.sqrt(steep * whole / (max(share, 1e-12) * growth))
+        return cls(rms=rms, share=share, slow=slow, fast=fast)
+
+    def draw(self, segments: int, rng: np.random.Generator) -> Draw:
+        """Draw independent realisations, one a segment."""
+        coefficients = rng.standard_normal((segments, 2, 2, WAVES)) / math.sqrt(WAVES)
+        return Draw(law=self, coefficients=coefficients, phase=rng.uniform(0.0, 2 * np.pi, (segments, len(TURNS))))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Draw:
+    """Realisations of a `Law` in S segments."""
+
+    law: Law
+    coefficients: Floats  # (S, 2 processes, cosine and sine, WAVES)
+    phase: Floats  # (S, 2), of the bursts at time 0
+
+    def at(self, time_s: Floats, segment: NDArray[np.int64]) -> tuple[Floats, Floats]:
+        """Return the rate and its derivative, (M,) each, at times (M,) since the start of their segments."""
+        law = self.law
+        g1, g1_slope = self._gaussian(0, law.slow, time_s, segment)
+        g2, g2_slope = self._gaussian(1, law.fast, time_s, segment)
+        turn = law.fast * np.array(TURNS)
+        angle = self.phase[segment] + turn * time_s[:, None]
+        burst = np.exp(DEPTH * np.cos(angle).sum(1))
+        rise = -DEPTH * burst * (np.sin(angle) @ turn)
+        calm = law.rms * math.sqrt(1 - law.share)
+        strong = law.rms * math.sqrt(law.share) / float(i0e(2 * DEPTH) * math.exp(2 * DEPTH)) ** (len(TURNS) / 2)
+        return calm * g1 + strong * burst * g2, calm * g1_slope + strong * (rise * g2 + burst * g2_slope)
+
+    def integral(self, time_s: Floats, segment: NDArray[np.int64]) -> Floats:
+        """Return the integral of the calm part from each segment's start, (M,); for laws without bursts."""
+        rate = self.law.slow * _spectrum()
+        cosine, sine = self.coefficients[segment, 0, 0], self.coefficients[segment, 0, 1]
+        angle = rate * time_s[:, None]
+        whole = (cosine * np.sin(angle) + sine * (1 - np.cos(angle))) / rate
+        return np.asarray(self.law.rms * math.sqrt(1 - self.law.share) * whole.sum(1))
+
+    def _gaussian(self, which: int, rate: float, time_s: Floats, segment: NDArray[np.int64]) -> tuple[Floats, Floats]:
+        """Return a Gaussian process of unit variance and its derivative."""
+        rates = rate * _spectrum()
+        angle = rates * time_s[:, None]
+        cosine, sine = self.coefficients[segment, which, 0], self.coefficients[segment, which, 1]
+        c, s = np.cos(angle), np.sin(angle)
+        return (cosine * c + sine * s).sum(1), ((sine * c - cosine * s) * rates).sum(1)
+
+
+def _spectrum() -> Floats:
+    """Return the rates of the sines, mean square 1, by the quantiles of a half normal law: C(t) near exp(-t^2/2)."""
+    rates = ndtri(0.5 + (np.arange(WAVES) + 0.5) / (2 * WAVES))
+    return np.asarray(rates / np.sqrt((rates**2).mean()))
+
+
+@cache
+def _burst() -> tuple[float, float, float]:
+    """Return the flatness of A g2, the mean square of its derivative over that of A g2' alone, and its flatness."""
+    angle = np.linspace(0.0, 2 * np.pi, NODES, endpoint=False)
+    phases = np.meshgrid(*(angle for _ in TURNS), indexing="ij")
+    var = np.exp(2 * DEPTH * sum(np.cos(phase) for phase in phases))
+    own = DEPTH * sum(turn * np.sin(phase) for turn, phase in zip(TURNS, phases, strict=True))  # A' / A
+    slope_var = var * (1 + own**2)
+    flat, slope_flat = (GAUSSIAN * float((v**2).mean() / v.mean() ** 2) for v in (var, slope_var))
+    return flat, float(slope_var.mean() / var.mean()), slope_flat
 
 
 @dataclass(frozen=True, kw_only=True)
 class EnsembleSpec:
-    """What an ensemble is like; the defaults are Table I's. Components in `frame` are independent."""
+    """Parameters of an ensemble; the defaults are Table I's. Components in `frame` are independent."""
 
     segments: int = 300
     shortest_frames: int = 50
@@ -38,7 +159,7 @@ class EnsembleSpec:
     frame: Literal["lab", "body"] = "lab"  # where omega's components are independent; in the other they are isotropic
 
     def velocity_laws(self) -> list[Law]:
-        """Return the laws of the velocity's components, Gaussian ones."""
+        """Return the Gaussian laws of the velocity's components."""
         return [Law.of(rms, slope) for rms, slope in zip(self.velocity_rms, self.acceleration_rms, strict=True)]
 
     def omega_laws(self) -> list[Law]:
@@ -56,31 +177,28 @@ class Nominal:
 
 
 def nominal(spec: EnsembleSpec) -> dict[str, Nominal]:
-    """Return the true moments of every quantity, closed forms.
+    """Return the true moments of every quantity in closed form.
 
-    In the frame where the components are not independent, the vector points anywhere alike: with R uniform and
+    In the frame where the components depend on each other, the vector's direction is uniform: with R uniform and
     independent of it, <(n x)^2> = |x|^2 / 3 and <(n x)^4> = |x|^4 / 5.
     """
-    turning, other = spec.frame, {"lab": "body", "body": "lab"}[spec.frame]
-    out = {
-        "velocity": _law(spec.velocity_rms, 3.0),
-        "acceleration": _law(spec.acceleration_rms, 3.0),
-        f"omega_{turning}": _law(spec.omega_rms, spec.omega_flatness),
-        f"alpha_{turning}": _law(spec.alpha_rms, spec.alpha_flatness),
-    }
-    return out | {f"{name}_{other}": _turned(out[f"{name}_{turning}"]) for name in ("omega", "alpha")}
-
-
-def _law(rms: Three, flatness: float) -> Nominal:
-    return Nominal(rms=np.array(rms), flatness=np.full(3, flatness))
-
-
-def _turned(x: Nominal) -> Nominal:
-    """Return the moments of a vector seen from a frame that points anywhere alike."""
-    var = x.rms**2
-    square = var.sum()
-    fourth = (x.flatness * var**2).sum() + square**2 - (var**2).sum()
-    return Nominal(rms=np.full(3, math.sqrt(square / 3)), flatness=np.full(3, fourth / 5 / (square / 3) ** 2))
+    other = {"lab": "body", "body": "lab"}[spec.frame]
+    out = {}
+    for name, rms, flatness in (
+        ("velocity", spec.velocity_rms, GAUSSIAN),
+        ("acceleration", spec.acceleration_rms, GAUSSIAN),
+        (f"omega_{spec.frame}", spec.omega_rms, spec.omega_flatness),
+        (f"alpha_{spec.frame}", spec.alpha_rms, spec.alpha_flatness),
+    ):
+        out[name] = Nominal(rms=np.array(rms), flatness=np.full(3, flatness))
+        if name.endswith(spec.frame):
+            var = out[name].rms ** 2
+            square = var.sum()
+            fourth = flatness * (var**2).sum() + square**2 - (var**2).sum()
+            out[f"{name[:5]}_{other}"] = Nominal(
+                rms=np.full(3, math.sqrt(square / 3)), flatness=np.full(3, fourth / 5 / (square / 3) ** 2)
+            )
+    return out
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,14 +219,9 @@ class TrueTracks:
 
 
 def draw_ensemble(spec: EnsembleSpec, seed: int) -> TrueTracks:
-    """Draw independent segments with exponentially distributed durations.
+    """Draw independent segments with exponentially distributed durations, without noise; same seed, same ensemble.
 
-    Args:
-        spec: what they are like.
-        seed: same seed, same ensemble.
-
-    Returns:
-        The motion without noise; orientations by a fourth-order Magnus step per frame, exact to 1e-6 rad per segment.
+    Orientations are exact to 1e-6 rad per segment.
     """
     rng = np.random.default_rng(seed)
     extra = rng.exponential(spec.mean_frames - spec.shortest_frames, spec.segments)
@@ -124,11 +237,9 @@ def draw_ensemble(spec: EnsembleSpec, seed: int) -> TrueTracks:
     path = np.stack([draw.integral(since_s, segment) for draw in moves], axis=1)
     R_start = so3.random_rotations(spec.segments, generator=torch.Generator().manual_seed(int(rng.integers(2**31))))
     R = _orientations(turns, frames, since_s, segment, R_start.numpy(), spec)
-    by_frame = {spec.frame: (omega, alpha)}
-    if spec.frame == "lab":
-        by_frame["body"] = _seen(R.swapaxes(1, 2), omega), _seen(R.swapaxes(1, 2), alpha)
-    else:
-        by_frame["lab"] = _seen(R, omega), _seen(R, alpha)
+    to_other = R.swapaxes(1, 2) if spec.frame == "lab" else R
+    seen = [np.asarray(np.einsum("nij,nj->ni", to_other, x)) for x in (omega, alpha)]
+    lab, body = ((omega, alpha), seen) if spec.frame == "lab" else (seen, (omega, alpha))
     return TrueTracks(
         spec=spec,
         time_s=(np.arange(len(segment)) + REST * segment) / spec.frame_rate_hz,
@@ -137,15 +248,11 @@ def draw_ensemble(spec: EnsembleSpec, seed: int) -> TrueTracks:
         R_lab_body=R,
         velocity=velocity,
         acceleration=acceleration,
-        omega_lab=by_frame["lab"][0],
-        omega_body=by_frame["body"][0],
-        alpha_lab=by_frame["lab"][1],
-        alpha_body=by_frame["body"][1],
+        omega_lab=lab[0],
+        omega_body=body[0],
+        alpha_lab=lab[1],
+        alpha_body=body[1],
     )
-
-
-def _seen(R: Floats, x: Floats) -> Floats:
-    return np.asarray(np.einsum("nij,nj->ni", R, x))
 
 
 def _rates(draws: list[Draw], since_s: Floats, segment: Rows) -> tuple[Floats, Floats]:
@@ -157,16 +264,14 @@ def _rates(draws: list[Draw], since_s: Floats, segment: Rows) -> tuple[Floats, F
 def _orientations(
     turns: list[Draw], frames: Rows, since_s: Floats, segment: Rows, R_start: Floats, spec: EnsembleSpec
 ) -> Floats:
-    """Integrate omega from random starts, all segments side by side.
-
-    Source: Magnus expansion of fourth order at the two Gauss nodes (Iserles and Norsett 1999).
-    """
+    """Integrate omega from random starts, all segments side by side."""
     h = 1 / spec.frame_rate_hz
     early, late = (_rates(turns, since_s + h * (0.5 + sign * math.sqrt(3) / 6), segment)[0] for sign in (-1, 1))
-    # in the body dR^T/dt = -[omega_body]x R^T: the same equation for the transpose
+    # In the body dR^T/dt = -[omega_body]x R^T: the same equation for the transpose.
     sign = 1.0 if spec.frame == "lab" else -1.0
-    twist = sign * h * (early + late) / 2 - math.sqrt(3) / 12 * h**2 * np.cross(early, late)
-    step = so3.exp(torch.from_numpy(twist)).numpy()
+    step = magnus_rotation(
+        torch.from_numpy(sign * early), torch.from_numpy(sign * late), torch.tensor(h, dtype=torch.float64)
+    ).numpy()
     R = np.empty((len(segment), 3, 3))
     start = np.concatenate([[0], np.cumsum(frames)[:-1]])
     now = R_start if spec.frame == "lab" else R_start.swapaxes(1, 2)
@@ -177,3 +282,112 @@ def _orientations(
         now = now.copy()
         now[alive] = step[rows] @ now[alive]
     return R if spec.frame == "lab" else R.swapaxes(1, 2)
+
+
+def exact_track(true: TrueTracks) -> Trajectory:
+    """Return the track of a perfect measurement; its sigmas are zero."""
+    blank = _measured(true, true.position_mm, true.R_lab_body, 0.0, 0.0, "precise")
+    parts: dict[str, Any] = {"position_smooth": true.position_mm, "orientation_smooth": true.R_lab_body}
+    for name in _UNITS:
+        parts |= {name: getattr(true, name), f"{name}_sigma": np.zeros((len(true.time_s), 3))}
+    return replace(blank, **parts)
+
+
+def smoothed_track(
+    true: TrueTracks,
+    noise_deg: float,
+    noise_mm: float,
+    seed: int,
+    known: ProcessNoise | None = None,
+    silent: bool = False,
+) -> tuple[Trajectory, ProcessNoise]:
+    """Measure an ensemble with white noise and smooth it with `motion.smooth_motion`.
+
+    Args:
+        true: the motion.
+        noise_deg: standard deviation of each component of the orientation's error, degrees.
+        noise_mm: of each coordinate of the position.
+        seed: of the noise.
+        known: process noise learnt from an earlier ensemble; None learns from this one.
+        silent: measure without noise but smooth as if there were: shows the bias of smoothing alone.
+
+    Returns:
+        The track as the precise method writes it, and the process noise.
+    """
+    track = _noisy(true, noise_deg, noise_mm, seed, "precise")
+    if silent:
+        track = replace(track, position=true.position_mm, orientation=true.R_lab_body)
+    poses = MeasuredPoses(
+        time_s=torch.from_numpy(track.time),
+        position_lab_mm=torch.from_numpy(track.position),
+        position_cov_mm2=torch.from_numpy(track.position_cov),
+        R_lab_body=torch.from_numpy(track.orientation),
+        orientation_cov_rad2=torch.from_numpy(track.orientation_cov),
+        segment=torch.from_numpy(track.segment),
+    )
+    found = smooth_motion(poses, SmoothSettings(), known)
+    parts = {
+        "position_smooth": found.position_lab_mm,
+        "position_smooth_cov": found.position_cov_mm2,
+        "orientation_smooth": found.R_lab_body,
+        "orientation_smooth_cov": found.orientation_cov_rad2,
+    }
+    flags = np.where(found.extrapolated.numpy(), np.uint32(Flag.EXTRAPOLATED), np.uint32(0))
+    arrays = {name: tensor.numpy() for name, tensor in parts.items()}
+    return replace(track, **arrays, **_rates_of(found), flags=flags), found.process
+
+
+def filtered_track(
+    true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, settings: MotionSettings | None = None
+) -> Trajectory:
+    """Measure an ensemble with white noise and differentiate it with Gaussian kernels, `motion.measure_motion`.
+
+    The track is as the paper's method writes it; the kernels' low-pass bias stays in. Arguments as `smoothed_track`'s;
+    `settings` are the widths, None for the paper's.
+    """
+    track = _noisy(true, noise_deg, noise_mm, seed, "paper")
+    sigma_mm, sigma_rad = (torch.full((len(track),), x) for x in (noise_mm, math.radians(noise_deg)))
+    found = measure_motion(
+        torch.from_numpy(track.position),
+        torch.from_numpy(track.orientation),
+        torch.from_numpy(track.segment),
+        true.spec.frame_rate_hz,
+        settings or MotionSettings(),
+        position_sigma_mm=sigma_mm.double(),
+        orientation_sigma_rad=sigma_rad.double(),
+    )
+    return replace(track, position_smooth=track.position, orientation_smooth=track.orientation, **_rates_of(found))
+
+
+def _rates_of(found: Smoothed | Motion) -> dict[str, Any]:
+    """Return the rates of `motion` and their sigmas under the names of a track."""
+    values = {name: getattr(found, f"{name}_{unit}").numpy() for name, unit in _UNITS.items()}
+    return values | {f"{name}_sigma": getattr(found, f"{name}_sigma_{unit}").numpy() for name, unit in _UNITS.items()}
+
+
+def _noisy(true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, method: str) -> Trajectory:
+    """Return positions and orientations with white noise."""
+    rng = np.random.default_rng([seed, 1])
+    noise_rad = math.radians(noise_deg)
+    delta = torch.from_numpy(noise_rad * rng.standard_normal(true.position_mm.shape))
+    R = (so3.exp(delta) @ torch.from_numpy(true.R_lab_body)).numpy()
+    position = true.position_mm + noise_mm * rng.standard_normal(true.position_mm.shape)
+    return _measured(true, position, R, noise_mm, noise_rad, method)
+
+
+def _measured(
+    true: TrueTracks, position_mm: Floats, R: Floats, noise_mm: float, noise_rad: float, method: str
+) -> Trajectory:
+    """Return a track of positions and orientations alone."""
+    count, unit = len(true.time_s), np.eye(3)
+    blank = Trajectory.empty(true.time_s, frame_rate=true.spec.frame_rate_hz, method=method, experiment="synthetic")
+    return replace(
+        blank,
+        valid=np.ones(count, dtype=bool),
+        position=position_mm,
+        position_cov=np.tile(noise_mm**2 * unit, (count, 1, 1)),
+        orientation=R,
+        orientation_cov=np.tile(noise_rad**2 * unit, (count, 1, 1)),
+        segment=true.segment,
+        confidence=np.ones(count),
+    )

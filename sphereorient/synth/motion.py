@@ -13,7 +13,7 @@ from sphereorient import so3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion6D:
-    """Exact motion at N instants; made by `RandomMotion.at`, read by the scene and the truth file. SI but for mm."""
+    """Exact motion at N instants; made by `RandomMotion.at`. SI but for mm."""
 
     time_s: Tensor  # (N,)
     position_lab_mm: Tensor  # (N, 3)
@@ -33,13 +33,13 @@ class _Waves:
     phase: Tensor  # (M, 3)
 
     def __call__(self, time_s: Tensor, derivative: int = 0) -> Tensor:
-        """Value or derivative at instants (...), giving (..., 3); derivative -1 is the integral without constant."""
+        """Return the value or a derivative at instants (...), (..., 3); derivative -1 is the integral."""
         angle = self.rate[:, None] * time_s[..., None, None] + self.phase + derivative * math.pi / 2
         return (self.amplitude * self.rate[:, None] ** derivative * torch.sin(angle)).sum(-2)
 
 
 def _random_waves(rms: float, correlation_time: float, rng: torch.Generator, count: int = 24) -> _Waves:
-    """Waves whose rms per component is `rms` and whose rates spread up to a few inverse correlation times."""
+    """Draw waves of this rms per component, their rates spread up to a few inverse correlation times."""
     share = (torch.arange(count, dtype=torch.float64) + 0.5) / count
     rate = (0.2 + 2.0 * share) / correlation_time
     weight = torch.exp(-0.5 * (rate * correlation_time) ** 2).sqrt()
@@ -51,7 +51,7 @@ def _random_waves(rms: float, correlation_time: float, rng: torch.Generator, cou
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RandomMotion:
-    """A smooth motion that can be asked at any instants; made by `random_motion`."""
+    """A smooth motion, known at any instant; made by `random_motion`."""
 
     path: _Waves  # velocity, mm/s; its integral is the path
     omega: _Waves  # omega_lab, rad/s
@@ -83,8 +83,7 @@ def random_motion(
         velocity_time: correlation time of the velocity, s.
         omega_rms: rad/s per component of omega_lab.
         omega_time: correlation time of omega_lab, s.
-        volume_mm: the path stays within this distance of the origin: where its rms radius is above half of it, path
-            and velocity are scaled down.
+        volume_mm: the path stays about this near to the origin: a rms radius above half of it is scaled down.
         seed: same seed, same motion.
     """
     rng = torch.Generator().manual_seed(seed)
@@ -97,17 +96,12 @@ def random_motion(
 
 
 def _integrate(omega: _Waves, time_s: Tensor, R_start: Tensor, substeps: int = 8) -> Tensor:
-    """Orientations with dR/dt = [omega_lab]x R, R(time 0) = R_start, at every instant.
-
-    Source: Magnus expansion of fourth order at the two Gauss nodes (Iserles and Norsett 1999).
-    """
+    """Return orientations with dR/dt = [omega_lab]x R, R(time 0) = R_start, at every instant."""
     start = torch.cat([time_s.new_zeros(1), time_s[:-1]])
     step = ((time_s - start) / substeps)[:, None]
     begin = start[:, None] + step * torch.arange(substeps, dtype=time_s.dtype)
     early, late = (begin + step * (0.5 + sign * math.sqrt(3) / 6) for sign in (-1, 1))
-    a, b = omega(early), omega(late)
-    h = step[..., None]
-    turn = so3.exp(h * (a + b) / 2 - math.sqrt(3) / 12 * h**2 * torch.linalg.cross(a, b))
+    turn = magnus_rotation(omega(early), omega(late), step[..., None])
     R = R_start
     out = []
     for per_frame in turn:  # a product in order: nothing to batch
@@ -116,3 +110,12 @@ def _integrate(omega: _Waves, time_s: Tensor, R_start: Tensor, substeps: int = 8
         R = so3.nearest_rotation(R)
         out.append(R)
     return torch.stack(out)
+
+
+def magnus_rotation(early: Tensor, late: Tensor, step_s: Tensor) -> Tensor:
+    """Return the rotations (..., 3, 3) of steps from omega (..., 3), rad/s, at the steps' two Gauss nodes.
+
+    Source: Magnus expansion of fourth order (Iserles and Norsett 1999).
+    """
+    h = step_s
+    return so3.exp(h * (early + late) / 2 - math.sqrt(3) / 12 * h**2 * torch.linalg.cross(early, late))

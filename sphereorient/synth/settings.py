@@ -1,4 +1,4 @@
-"""Settings of the room synth."""
+"""Settings of a synthetic experiment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random maps of paint, seamless on the sphere, of three kinds."""
+"""Random texture maps of three kinds, seamless on the sphere."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def map_directions(height: int) -> Tensor:
-    """Body direction of every texel of a map, (H, 2 H, 3) float64 (docs/conventions.md)."""
+    """Return the body direction of every texel of a map, (H, 2 H, 3) float64 (docs/conventions.md)."""
     latitude = math.pi / 2 - math.pi * (torch.arange(height, dtype=torch.float64) + 0.5) / height
     longitude = math.pi * (torch.arange(2 * height, dtype=torch.float64) + 0.5) / height - math.pi
     lat, lon = torch.meshgrid(latitude, longitude, indexing="ij")
@@ -17,28 +17,28 @@ def map_directions(height: int) -> Tensor:
 
 
 def random_directions(count: int, rng: torch.Generator) -> Tensor:
-    """Draw directions, (count, 3) float64, evenly over the sphere."""
+    """Draw directions uniformly over the sphere, (count, 3) float64."""
     draw = torch.randn(count, 3, generator=rng, dtype=torch.float64)
     return torch.nn.functional.normalize(draw, dim=-1)
 
 
 def blobs(height: int, rng: torch.Generator) -> Tensor:
-    """Smooth blobs: the sign of a random function of body direction, half the sphere white."""
+    """Draw smooth blobs: the sign of a random function of body direction, half the sphere white."""
     wave = random_directions(60, rng) * (5 + 5 * torch.rand(60, 1, generator=rng, dtype=torch.float64))
     phase = 2 * math.pi * torch.rand(60, generator=rng, dtype=torch.float64)
     value = torch.cos(map_directions(height) @ wave.T + phase).sum(-1)
     return _edge(value - value.median(), 0.25)
 
 
-def patches(height: int, rng: torch.Generator) -> Tensor:
-    """Polygons: the regions nearest to random points, painted black or white in turn."""
+def polygons(height: int, rng: torch.Generator) -> Tensor:
+    """Draw polygons: the regions nearest to random points, black or white in turn."""
     points = random_directions(60, rng)
     owner = (map_directions(height) @ points.T).argmax(-1)
     return (owner % 2).float()
 
 
 def dots(height: int, rng: torch.Generator) -> Tensor:
-    """Black dots of 8 to 14 degrees radius on white, scattered."""
+    """Draw scattered black dots of 8 to 14 degrees radius on white."""
     points = random_directions(34, rng)
     radius = torch.deg2rad(8 + 6 * torch.rand(34, generator=rng, dtype=torch.float64))
     outside = (torch.acos((map_directions(height) @ points.T).clamp(-1, 1)) - radius).amin(-1)
@@ -46,11 +46,11 @@ def dots(height: int, rng: torch.Generator) -> Tensor:
 
 
 def _edge(value: Tensor, width: float) -> Tensor:
-    """White where positive, black where negative, soft over `width`."""
+    """Return white where positive, black where negative, soft over `width`."""
     return (0.5 + value / width).clamp(0, 1).float()
 
 
-KINDS = {"blobs": blobs, "patches": patches, "dots": dots}
+KINDS = {"blobs": blobs, "patches": polygons, "dots": dots}
 
 
 def random_texture(kind: str, seed: int, height: int = 512) -> Tensor:

@@ -1,8 +1,9 @@
-"""A whole synthetic experiment on disk, in the format that `sphereorient track` reads."""
+"""A synthetic experiment on disk, in the format that `sphereorient track` reads."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +18,55 @@ from torch import Tensor
 from sphereorient.cameras import Camera, TsaiCamera, save_cameras
 from sphereorient.errors import OutputError, refusal
 from sphereorient.movies import write_ffv1
-from sphereorient.synth.filming import Filming, Shown
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion
-from sphereorient.synth.scene import Scene, digitise, expose, make_scene
+from sphereorient.synth.scene import RenderedScene, digitise, expose, make_scene
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.textures import random_texture
 
 PIXEL_PITCH_MM = 0.02
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FilmedView:
+    """The ball in one picture, for `Filming.picture`."""
+
+    name: str  # of the camera
+    camera: Camera
+    frame: int | None  # its number; None for the picture without the ball
+    cover: NDArray[np.float32]  # (H, W), share of each pixel that the ball fills
+    position_lab_mm: Tensor  # (3,) float64, its centre in the middle of the exposure
+
+
+class Filming:
+    """What changes between the scene and its files, and what the files report of it: here nothing, and the truth."""
+
+    def paint(self, texture: Tensor) -> Tensor:
+        """Return the map on the filmed ball, (H, 2 H), from a new one."""
+        return texture
+
+    def picture(self, picture: NDArray[np.float32], view: FilmedView) -> NDArray[np.float32]:
+        """Return grey levels (H, W) before noise, from those of camera and optics."""
+        return picture
+
+    def lost(self, name: str, frames: int) -> frozenset[int]:
+        """Return which of the frames 0 .. frames - 1 of a camera come out black."""
+        return frozenset()
+
+    def reported_texture(self, texture: Tensor) -> Tensor:
+        """Return the map, (H, 2 H), that the experiment's files hold."""
+        return texture
+
+    def reported_cameras(self, cameras: Mapping[str, Camera]) -> Mapping[str, Camera]:
+        """Return the cameras that the experiment's files hold."""
+        return cameras
+
+    def reported_diameter_mm(self, diameter_mm: float) -> float:
+        """Return the sphere's diameter that the experiment's files hold."""
+        return diameter_mm
+
+
 def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
-    """Two Tsai cameras at right angles: cam1 looks along lab +y, cam2 along lab -z; slight distortion."""
+    """Return two Tsai cameras at right angles: cam1 looks along lab +y, cam2 along lab -z; slight distortion."""
     focal_mm = settings.diameter_px * PIXEL_PITCH_MM * settings.distance_mm / settings.diameter_mm
     width, height = settings.image_size
 
@@ -53,7 +92,7 @@ def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
     }
 
 
-def write_experiment(
+def write_synthetic_experiment(
     folder: Path,
     settings: SynthSettings,
     progress: Callable[[int], None] = lambda done: None,
@@ -62,14 +101,14 @@ def write_experiment(
     """Render a two-camera experiment with exact truth.
 
     Args:
-        folder: made where it is missing; files of an older run are replaced.
+        folder: created if missing; files of an older run are replaced.
         settings: the scene.
         progress: called with the number of frames rendered since the last call.
-        filming: what befalls the pictures, and what the files tell of the scene; nothing, and the truth, if None.
+        filming: changes of the pictures and of what the files report; None for neither.
 
     Returns:
-        Path of experiment.yaml. Beside it: cam1.mkv, cam2.mkv, pictures of the scene without the
-        sphere, texture.png, cameras.yaml, truth.h5.
+        Path of experiment.yaml; beside it cam1.mkv, cam2.mkv, pictures of the scene without the sphere, texture.png,
+        cameras.yaml and truth.h5.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -84,21 +123,24 @@ def write_experiment(
     # In whole grey levels, as the file holds it.
     texture = _as_file(random_texture(settings.texture, settings.seed)) / np.float32(255)
     cameras = default_cameras(settings)
-    time_s = torch.arange(settings.frames, dtype=torch.float64) / settings.frame_rate
-    motion = motion_of(settings)
     scene = make_scene(filming.paint(torch.from_numpy(texture)), settings)
     for index, (name, camera) in enumerate(cameras.items()):
-        frames = _frames(scene, (name, camera), motion, filming, np.random.default_rng([settings.seed, index]))
-        write_ffv1(folder / f"{name}.mkv", _told(frames, progress), settings.frame_rate)
+        frames = _frames(scene, (name, camera), filming, np.random.default_rng([settings.seed, index]), progress)
+        write_ffv1(folder / f"{name}.mkv", frames, settings.frame_rate)
         _write_picture(folder / f"empty_{name}.png", _without_the_ball(settings, name, camera, filming))
-    _write_picture(folder / "texture.png", _as_file(filming.told_texture(torch.from_numpy(texture))))
-    told = filming.told_cameras(cameras)
-    exact = "exact cameras" if told is cameras else "cameras, wrong on purpose"
-    save_cameras(folder / "cameras.yaml", told, comment=f"{exact}; X_cam = R X_lab + T, mm")
-    _write_truth(folder / "truth.h5", motion.at(time_s), cameras)
+    _write_picture(folder / "texture.png", _as_file(filming.reported_texture(torch.from_numpy(texture))))
+    reported = filming.reported_cameras(cameras)
+    exact = "exact cameras" if reported is cameras else "cameras, wrong on purpose"
+    save_cameras(folder / "cameras.yaml", reported, comment=f"{exact}; X_cam = R X_lab + T, mm")
+    _write_truth(folder / "truth.h5", motion_of(settings).at(frame_times_s(settings)), cameras)
     path = folder / "experiment.yaml"
     path.write_text(yaml.safe_dump(_experiment(settings, cameras, filming), sort_keys=False), encoding="utf-8")
     return path
+
+
+def frame_times_s(settings: SynthSettings) -> Tensor:
+    """Return the middles of the exposures, (N,) float64."""
+    return torch.arange(settings.frames, dtype=torch.float64) / settings.frame_rate
 
 
 def motion_of(settings: SynthSettings) -> RandomMotion:
@@ -125,36 +167,34 @@ def _write_picture(path: Path, grey: NDArray[np.uint8]) -> None:
 
 
 def _frames(
-    scene: Scene, named: tuple[str, Camera], motion: RandomMotion, filming: Filming, rng: np.random.Generator
+    scene: RenderedScene,
+    named: tuple[str, Camera],
+    filming: Filming,
+    rng: np.random.Generator,
+    progress: Callable[[int], None],
 ) -> Iterator[NDArray[np.uint8]]:
     """Render the movie of one camera, frame by frame."""
     settings, (name, camera) = scene.settings, named
     count = settings.exposure_samples
     within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
-    time_s = torch.arange(settings.frames, dtype=torch.float64) / settings.frame_rate
-    now = motion.at((time_s[:, None] + within).reshape(-1))
+    now = motion_of(settings).at((frame_times_s(settings)[:, None] + within).reshape(-1))
     lost = filming.lost(name, settings.frames)
     for k in range(settings.frames):
         position, R_lab_body = (x[k * count : (k + 1) * count] for x in (now.position_lab_mm, now.R_lab_body))
         picture, cover = expose(scene, camera, position, R_lab_body)
-        shown = Shown(name=name, camera=camera, frame=k, cover=cover, position_lab_mm=position.mean(0))
-        # Noise is drawn for lost frames too, so that all others stay what they would be without the loss.
-        frame = digitise(filming.picture(picture, shown), settings, rng)
+        view = FilmedView(name=name, camera=camera, frame=k, cover=cover, position_lab_mm=position.mean(0))
+        # Noise is drawn for lost frames too: a loss does not change the other frames.
+        frame = digitise(filming.picture(picture, view), settings, rng)
         yield np.zeros_like(frame) if k in lost else frame
-
-
-def _told(frames: Iterator[NDArray[np.uint8]], progress: Callable[[int], None]) -> Iterator[NDArray[np.uint8]]:
-    for frame in frames:
-        yield frame
         progress(1)
 
 
 def _without_the_ball(settings: SynthSettings, name: str, camera: Camera, filming: Filming) -> NDArray[np.uint8]:
-    """Return a picture of the scene before the ball is let in, as a careful lab takes: averaged, without noise."""
+    """Return the picture of the scene without the ball, averaged over many frames: without noise."""
     size = camera.image_size[::-1]
     cover, origin = np.zeros(size, np.float32), torch.zeros(3, dtype=torch.float64)
-    shown = Shown(name=name, camera=camera, frame=None, cover=cover, position_lab_mm=origin)
-    empty = filming.picture(np.full(size, settings.background, np.float32), shown)
+    view = FilmedView(name=name, camera=camera, frame=None, cover=cover, position_lab_mm=origin)
+    empty = filming.picture(np.full(size, settings.background, np.float32), view)
     rounded: NDArray[np.uint8] = np.clip(np.rint(empty), 0, 255).astype(np.uint8)
     return rounded
 
@@ -182,14 +222,14 @@ def _write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> 
 
 
 def _experiment(settings: SynthSettings, cameras: Mapping[str, Camera], filming: Filming) -> dict[str, Any]:
-    # A momentary exposure is written as none: the experiment's key is a duration above 0.
+    # A momentary exposure is left out: the experiment's key is a duration above 0.
     exposure = {"exposure": settings.exposure} if settings.exposure > 0 else {}
     return {
         "schema": "sphereorient-experiment/1",
         "name": settings.name,
         "frame_rate": settings.frame_rate,
         **exposure,
-        "sphere": {"diameter": filming.told_diameter_mm(settings.diameter_mm), "texture": "texture.png"},
+        "sphere": {"diameter": filming.reported_diameter_mm(settings.diameter_mm), "texture": "texture.png"},
         "cameras": "cameras.yaml",
         "backgrounds": {name: f"empty_{name}.png" for name in cameras},
         "movies": {name: f"{name}.mkv" for name in cameras},

@@ -19,7 +19,7 @@ from sphereorient import so3
 from sphereorient.methods.settings import Settings, load_settings
 from sphereorient.movies import open_movie
 from sphereorient.run.stages import track_movies
-from sphereorient.synth import SynthSettings, write_experiment
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
 from sphereorient.trajectory import Trajectory
 
 CAMERAS = ("cam1", "cam2")
@@ -77,7 +77,7 @@ class Movies:
 def render(folder: Path, **changed: Any) -> Movies:
     """Render an experiment and read it into memory; changed: settings of synth."""
     settings = SynthSettings(**{**SMALL, **changed})
-    write_experiment(folder, settings)
+    write_synthetic_experiment(folder, settings)
     pictures = {}
     for name in CAMERAS:
         with open_movie(folder / f"{name}.mkv") as movie:

@@ -20,7 +20,7 @@ from sphereorient.cameras import PinholeCamera, Rays
 from sphereorient.cameras.parameters import with_parameters
 from sphereorient.errors import SettingsError, ShapeError
 from sphereorient.pose.implicit import implicit_pose
-from sphereorient.pose.soft_picture import PaintedBall, expected_grey
+from sphereorient.sphere.renderer import PaintedBall, expected_grey
 
 FRAMES, SIDE, NOISE = 4, 19, 3.0
 EMPTY = 2  # a frame without a picture

@@ -11,13 +11,14 @@ from conftest import SHARED, assert_close
 from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError
 from sphereorient.evaluate import Bound, cramer_rao_bound
-from sphereorient.evaluate.bound import DiskPicture
-from sphereorient.sphere import load_texture
+from sphereorient.evaluate.bound import disk_renderer, jacobian
+from sphereorient.sphere import Sampling, load_texture
 from sphereorient.synth import random_texture
-from sphereorient.synth.aperture import aperture_matrix
 from sphereorient.synth.textures import map_directions
 
 WHITE = torch.ones(32, 64)
+GREY = {grey: Sampling(outside=grey, supersampling=6) for grey in (0.5, 2.0)}  # backgrounds
+COARSE = Sampling()
 # Of the optics' Gaussian and the pixel's square together, as one Gaussian: right to 1 % of the information.
 BLUR_PX = math.hypot(0.55, math.sqrt(1 / 12))
 EDGE = 1 / (2 * math.sqrt(math.pi) * BLUR_PX)  # integral over the squared slope of a blurred step of height 1, 1/px
@@ -56,7 +57,7 @@ def test_one_straight_border_across_the_disk_has_the_information_worked_out_by_h
     radius = 30.0
     east = (map_directions(512)[..., 1] > 0).float()
     tilt = so3.exp(torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64))
-    tilted = cramer_rao_bound(east, tilt @ face(), diameter_px=2 * radius, noise_share=1.0, background=0.5)
+    tilted = cramer_rao_bound(east, tilt @ face(), diameter_px=2 * radius, noise_share=1.0, sampling=GREY[0.5])
     about = (tilt.mT @ tilted.information[:3, :3] @ tilt).diagonal()
     hand = torch.tensor([0.0, 4 / 3, 2 / 3], dtype=torch.float64) * EDGE * radius**3
     assert_close(about / hand[1], hand / hand[1], atol=0.04)
@@ -64,40 +65,41 @@ def test_one_straight_border_across_the_disk_has_the_information_worked_out_by_h
 
 def test_rotations_about_view_x_move_a_horizontal_border():  # convention
     north = (map_directions(512)[..., 2] > 0).float()
-    found = cramer_rao_bound(north, face(), diameter_px=60, background=0.5).information.diagonal()
+    found = cramer_rao_bound(north, face(), diameter_px=60, sampling=GREY[0.5]).information.diagonal()
     assert float(found[0]) > 50 * float(found[1])  # a horizontal line rolls up and down about x, and not about y
     assert float(found[4]) > 1.5 * float(found[3])  # v sees the line and the outline, u the outline alone
 
 
 def test_the_scatter_of_least_squares_is_the_bound(patches):  # oracle
     noise, draws, radius_px = 0.05, 300, 12.0
-    disk = DiskPicture(
-        texture=patches.double(), radius_px=radius_px, optics_sigma_px=0.55, background=0.0, supersampling=4
-    )
-    at = face()[None], torch.zeros(1, 2).double(), torch.full((1,), radius_px).double()
-    gain = torch.linalg.pinv(disk.jacobian(at[0])[0])  # (6, S^2)
+    disk = disk_renderer(patches.double(), 2 * radius_px, COARSE)
+    at = face()[None], torch.zeros(1, 3).double(), torch.full((1,), radius_px).double()
+    gain = torch.linalg.pinv(jacobian(disk, at[0])[0])  # (6, S^2)
     rng = torch.Generator().manual_seed(5)
-    noisy = disk(*at).flatten(1) + noise * torch.randn(draws, disk.size_px**2, generator=rng, dtype=torch.float64)
+    clean = disk(*at).flatten(1)
+    noisy = clean + noise * torch.randn(draws, clean.shape[1], generator=rng, dtype=torch.float64)
     turned, shifted, swollen, left = [], [], [], []
     for part in noisy.split(10):
         R, centre, radius = (start.expand(len(part), *start.shape[1:]) for start in at)
         for _ in range(3):
             step = (part - disk(R, centre, radius).flatten(1)) @ gain.mT
-            R, centre, radius = so3.exp(step[:, :3]) @ R, centre + step[:, 3:5], radius + step[:, 5]
+            centre = centre + torch.nn.functional.pad(step[:, 3:5], (0, 1))
+            R, radius = so3.exp(step[:, :3]) @ R, radius + step[:, 5]
         turned.append(so3.geodesic_distance(R, face()))
         shifted.append(centre.norm(dim=-1))
         swollen.append(radius - radius_px)
         left.append(step[:, :3].norm(dim=-1))
     rms = [float(torch.cat(errors).square().mean().sqrt()) for errors in (turned, shifted, swollen, left)]
     assert rms[3] < 0.05 * rms[0]  # they have arrived
-    bound = cramer_rao_bound(patches, face(), diameter_px=2 * radius_px, noise_share=noise, supersampling=4)
+    bound = cramer_rao_bound(patches, face(), diameter_px=2 * radius_px, noise_share=noise, sampling=COARSE)
     for got, least in zip(rms, (bound.orientation_rms_rad, bound.centre_rms_px, bound.radius_rms_px), strict=False):
         assert got == pytest.approx(float(least), rel=0.1)
 
 
 def test_finer_samples_and_wider_steps_do_not_move_the_bound(patches, attitudes, monkeypatch):
     usual, finer = (
-        cramer_rao_bound(patches, attitudes[:2], diameter_px=40, supersampling=s).orientation_rms_rad for s in (6, 12)
+        cramer_rao_bound(patches, attitudes[:2], diameter_px=40, sampling=Sampling(supersampling=s)).orientation_rms_rad
+        for s in (6, 12)
     )
     monkeypatch.setattr("sphereorient.evaluate.bound.STEP_PX", 0.05)
     halved = cramer_rao_bound(patches, attitudes[:2], diameter_px=40).orientation_rms_rad
@@ -114,11 +116,11 @@ def test_the_bound_falls_as_the_specified_power_of_the_diameter():
     texture = random_texture("blobs", 3)
     R = so3.random_rotations(6, generator=torch.Generator().manual_seed(6), dtype=torch.float32)
     small, large = (
-        cramer_rao_bound(texture, R, diameter_px=d, supersampling=4).orientation_rms_rad.square().mean().sqrt()
+        cramer_rao_bound(texture, R, diameter_px=d, sampling=COARSE).orientation_rms_rad.square().mean().sqrt()
         for d in (30, 75)
     )
     power = math.log(float(large / small)) / math.log(75 / 30)
-    assert -1.9 < power < -1.4  # ERRATA: -1.6 to -1.9 over 20 to 160 px; six attitudes scatter by 0.1
+    assert -1.9 < power < -1.4  # docs/errata.md: -1.6 to -1.9 over 20 to 160 px; six attitudes scatter by 0.1
 
 
 def test_a_known_place_helps_and_a_bright_background_too(patches, attitudes):
@@ -127,7 +129,7 @@ def test_a_known_place_helps_and_a_bright_background_too(patches, attitudes):
     known = torch.linalg.inv(dark.information[:, :3, :3]).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
     assert_close(dark.orientation_known_place_rms_rad, known, atol=1e-9)
     # Before a background twice as bright as white paint all of the outline shows.
-    bright = cramer_rao_bound(patches, attitudes, diameter_px=24, background=2.0)
+    bright = cramer_rao_bound(patches, attitudes, diameter_px=24, sampling=GREY[2.0])
     assert (bright.centre_rms_px < dark.centre_rms_px).all()
 
 
@@ -170,13 +172,13 @@ def test_a_ball_of_rings_about_an_axis_leaves_that_rotation_open(attitudes):
 
 def test_the_bound_of_a_batch_is_the_stack_of_single_bounds(batch, dtype, patches):
     R = so3.random_rotations(batch, generator=torch.Generator().manual_seed(7), dtype=dtype)
-    bound = cramer_rao_bound(patches, R, diameter_px=20, supersampling=2)
+    bound = cramer_rao_bound(patches, R, diameter_px=20, sampling=Sampling(supersampling=2))
     assert bound.information.shape == (*batch, 6, 6)
     assert bound.covariance.shape == (*batch, 6, 6)
     assert bound.orientation_rms_rad.shape == batch
     assert bound.information.dtype == bound.orientation_rms_rad.dtype == dtype
     for one, whole in zip(R.reshape(-1, 3, 3), bound.information.reshape(-1, 6, 6), strict=True):
-        alone = cramer_rao_bound(patches, one, diameter_px=20, supersampling=2).information
+        alone = cramer_rao_bound(patches, one, diameter_px=20, sampling=Sampling(supersampling=2)).information
         # Relative: the sums of products run in another order.
         assert_close(whole / alone.abs().max(), alone / alone.abs().max(), atol=1e-4 if dtype.itemsize == 4 else 1e-12)
 
@@ -190,17 +192,6 @@ def test_covariance_is_the_inverse_of_information_in_any_units():
     assert_close(covariance @ information, torch.eye(6, dtype=torch.float64), atol=1e-9)
 
 
-def test_aperture_keeps_light_and_has_the_width_of_optics_and_pixel():
-    A = aperture_matrix(15, 12, 0.55)
-    at = (torch.arange(15 * 12, dtype=torch.float64) + 0.5) / 12 - 0.5
-    middle = A[7]
-    assert float(middle.sum()) == pytest.approx(1, abs=1e-4)
-    assert float((middle * at).sum()) == pytest.approx(7, abs=1e-9)
-    assert float((middle * (at - 7) ** 2).sum()) == pytest.approx(0.55**2 + 1 / 12, rel=0.01)
-    box = aperture_matrix(3, 4, 0.0)
-    assert_close(box[1], torch.tensor([0, 0, 0, 0, 1, 1, 1, 1, 0, 0, 0, 0]).double() / 4)
-
-
 def test_what_is_no_picture_is_refused(patches):
     with pytest.raises(SettingsError, match="noise_share: expected a number above 0, got 0"):
         cramer_rao_bound(patches, face(), diameter_px=24, noise_share=0.0)
@@ -209,10 +200,10 @@ def test_what_is_no_picture_is_refused(patches):
 
 
 @pytest.mark.shared
-def test_the_experiments_map_has_the_specified_bound():  # ERRATA, The bound
+def test_the_experiments_map_has_the_specified_bound():  # docs/errata.md, The bound
     texture = load_texture(SHARED / "experiment" / "texture.png")
     R = so3.random_rotations(12, generator=torch.Generator().manual_seed(9), dtype=torch.float32)
-    bound = cramer_rao_bound(texture, R, diameter_px=80, supersampling=4)
+    bound = cramer_rao_bound(texture, R, diameter_px=80, sampling=COARSE)
     rms = [
         float(part.square().mean().sqrt())
         for part in (bound.orientation_rms_rad, bound.orientation_known_place_rms_rad, bound.centre_rms_px)

@@ -25,7 +25,7 @@ from sphereorient.methods.method import Job
 from sphereorient.methods.precise import learn
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import Fitter
-from sphereorient.synth import SynthSettings, write_experiment
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 
 def scattered(trials: int, count: int, seed: int = 4) -> tuple[Tensor, Tensor]:
@@ -78,7 +78,7 @@ def in_its_place(folder: Path) -> Path:
         frames=40, image_size=(150, 150), diameter_px=56.0, volume_mm=8.0, velocity_rms=0.0, exposure=1e-4,
         exposure_samples=1, omega_rms=40.0, seed=5,
     )  # fmt: skip
-    return write_experiment(folder, settings)
+    return write_synthetic_experiment(folder, settings)
 
 
 def truth(path: Path) -> tuple[Tensor, Tensor]:

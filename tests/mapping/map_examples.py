@@ -11,7 +11,7 @@ import yaml
 from torch import Tensor
 
 from sphereorient.sphere import sample_texture
-from sphereorient.synth import SynthSettings, write_experiment
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
 from sphereorient.synth.textures import map_directions
 
 # 4.6 degrees a frame: both cameras together have seen the whole ball after a few dozen frames.
@@ -30,7 +30,7 @@ QUICK = ["--set", "paint.rounds=4", "--set", "paint.pixels=600", "--set", "paint
 
 def unpainted(folder: Path, **changed: object) -> Path:
     """Render an experiment and take its map away; the map stays beside it as texture.png."""
-    path = write_experiment(folder, SynthSettings(**{**SMALL, **changed}))
+    path = write_synthetic_experiment(folder, SynthSettings(**{**SMALL, **changed}))
     rewrite(path, texture=None)
     return path
 

@@ -21,7 +21,7 @@ from sphereorient.mapping.grid import (
 )
 from sphereorient.mapping.joint import Part, joint_step
 from sphereorient.mapping.sharpen import blur_matrix, sharpened
-from sphereorient.sphere.spline_texture import sample_spline
+from sphereorient.sphere.texture import sample_spline
 from sphereorient.synth.textures import map_directions, random_directions, random_texture
 
 

@@ -17,9 +17,9 @@ from sphereorient.pose.fit import FittedPoses, PoseStart, refine
 from sphereorient.pose.light import LATER, Light, Shading
 from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
+from sphereorient.sphere import Sampling, SphereRenderer
 from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
 from sphereorient.synth import random_texture
-from sphereorient.synth.clean import CleanOptics, render_clean
 
 RADIUS_MM, DISTANCE_MM = 9.0, 260.0
 OPTICS_PX = 0.55
@@ -98,11 +98,11 @@ def balls(count: int, seed: int, reach_mm: float = 4.0) -> tuple[Tensor, Tensor]
 
 def share_pictures(rig: Rig, kind: str, X: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
     """White paint's and the ball's share of every pixel, (B, C, H, W) each: linear, so that any light can be put on."""
-    optics = CleanOptics(black=0.0, white=1.0, sigma_px=OPTICS_PX)
+    sampling = Sampling(blur_px=OPTICS_PX)
     shares = []
     for paint in (paint_of(kind), torch.ones(32, 64)):
-        pictures = [render_clean(paint, one, X, R, diameter_mm=2 * RADIUS_MM, optics=optics) for one in rig.cameras]
-        shares.append(torch.stack(pictures, dim=1))
+        renderers = [SphereRenderer(paint, radius_mm=RADIUS_MM, camera=one, sampling=sampling) for one in rig.cameras]
+        shares.append(torch.stack([render(R, X).float() for render in renderers], dim=1))
     return shares[0], shares[1]
 
 

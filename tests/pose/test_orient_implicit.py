@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
-
 import pytest
 import torch
 from conftest import assert_close
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras import PinholeCamera, Rays
 from sphereorient.errors import SettingsError, ShapeError
 from sphereorient.pose.implicit import ImplicitPose, _moved, implicit_pose
-from sphereorient.pose.soft_picture import PaintedBall, expected_grey, lambert, smooth_positive, soft_normals
-from sphereorient.sphere import sample_texture, sphere_normals
-from sphereorient.sphere.spline_texture import sample_spline
-from sphereorient.synth import random_texture
-from sphereorient.synth.scene import LAMPS, expose, make_scene
-from sphereorient.synth.settings import SynthSettings
-from sphereorient.synth.textures import map_directions
 
 
 def f64(value: object) -> Tensor:
@@ -186,158 +175,3 @@ def test_what_does_not_belong_together_is_refused(points):
         implicit_pose(lambda R, X: X, view, zero, use=torch.ones(3, dtype=torch.bool))
     with pytest.raises(SettingsError, match="iterations"):
         implicit_pose(lambda R, X: X, view, zero, iterations=0)
-
-
-# --- the picture model
-
-
-def a_ball(texture: Tensor, edge_mm: float = 0.4) -> PaintedBall:
-    lamps = f64([[-0.4, -0.5, 0.3], [0.3, -0.2, 0.2]])
-    return PaintedBall(
-        texture=texture,
-        radius_mm=9.0,
-        edge_mm=edge_mm,
-        ambient=f64(0.5),
-        lamps_lab=lamps,
-        black=f64(20.0),
-        white=f64(170.0),
-        behind=f64(15.0),
-    )
-
-
-def sight(side: int = 25) -> tuple[PinholeCamera, Rays]:
-    camera = PinholeCamera(
-        image_size=(side, side),
-        R_cam_lab=f64([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-        T_cam_lab_mm=f64([0, 0, 300.0]),
-        centre_px=f64([0.5 * (side - 1)] * 2),
-        f_px=f64(side / 25 * 350.0),
-    )
-    v, u = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
-    return camera, camera.rays(torch.stack([u, v], dim=-1).reshape(-1, 2).double())
-
-
-def test_inside_the_ball_the_picture_is_the_renderers(rng):
-    # A map linear in the latitude is reproduced by the spline and by the bilinear look-up alike.
-    texture = torch.linspace(1, 0, 16, dtype=torch.float64)[:, None].expand(16, 32)
-    _, rays = sight()
-    R, place = so3.random_rotations(4, generator=rng).double(), f64([[0.5, 3.0, -0.4]])
-    normal, hit = sphere_normals(rays.origin_lab_mm, rays.direction_lab, place[:, None], 9.0)
-    inner = hit & ((normal * rays.direction_lab).sum(-1) < -0.6)
-    body = normal @ R
-    flat = (body[..., 2].abs() < 0.9) & inner  # beyond, the map is continued over the pole
-    light = 0.5 + lambert(normal, a_ball(texture).lamps_lab)
-    expected = (20.0 + 150.0 * sample_texture(texture, body)) * light
-    got = expected_grey(rays, place, R, a_ball(texture))
-    assert int(flat.sum()) > 300
-    assert_close(got[flat], expected[flat], 0.1)  # grey levels; the rim's rounding reaches in by so much
-
-
-def test_the_picture_is_the_synthetic_movies_one():
-    settings = SynthSettings(diameter_px=60.0, image_size=(75, 75), blur_px=0.8)
-    texture = random_texture("blobs", 3, 48)
-    camera = replace(sight(75)[0], f_px=f64(1000.0))
-    v, u = torch.meshgrid(torch.arange(75), torch.arange(75), indexing="ij")
-    rays = camera.rays(torch.stack([u, v], dim=-1).reshape(-1, 2).double())
-    R, place = so3.exp(f64([0.4, -0.8, 0.5])), f64([0.5, 3.0, -0.4])
-    lamps = f64(LAMPS)
-    unit = lamps[:, :3] / lamps[:, :3].norm(dim=-1, keepdim=True)
-    ball = replace(a_ball(texture.double(), 0.25), lamps_lab=unit * lamps[:, 3:] * (0.5 / 0.75))
-    got = expected_grey(rays, place, R, ball).reshape(75, 75)
-    expected, cover = expose(make_scene(texture, settings), camera, place[None], R[None])
-    miss = got - torch.from_numpy(expected)
-    full = torch.from_numpy(cover) > 0.99
-    assert miss.square().mean().sqrt() < 4.0  # of 150 grey levels from black to white
-    assert miss[full].mean().abs() < 0.5
-    # East for west, or a turn by the inverse, is another picture.
-    for other in (
-        expected_grey(rays, place, R.mT, ball),
-        expected_grey(rays, place, R, replace(ball, texture=ball.texture.flip(1))),
-    ):
-        assert (other.reshape(75, 75) - torch.from_numpy(expected)).square().mean().sqrt() > 20.0
-
-
-def test_coverage_is_the_gaussian_share_of_a_straight_edge():
-    _, rays = sight()
-    place = f64([0.0, 0.0, 0.0])
-    _, coverage = soft_normals(rays, place, 9.0, 0.4)
-    off = torch.linalg.cross(place - rays.origin_lab_mm, rays.direction_lab).norm(dim=-1)  # of the line of sight
-    near = (off - 9.0).abs() < 1.0
-    assert int(near.sum()) > 40
-    assert_close(coverage[near], torch.special.ndtr((9.0 - off) / 0.4)[near], 0.02)
-    assert coverage[off < 7].min() > 0.999
-    assert coverage[off > 11].max() < 0.001
-
-
-def test_the_picture_is_smooth_to_the_second_order_limb_included(rng):
-    texture = torch.rand(4, 8, generator=rng, dtype=torch.float64)
-    _, rays = sight(7)
-    R = so3.exp(f64([0.4, -0.8, 0.5]))
-
-    def picture(delta: Tensor, texture: Tensor) -> Tensor:
-        turned, place = _moved(R, f64([0.3, 0.1, -0.2]), delta)
-        return expected_grey(rays, place, turned, a_ball(texture, 0.8))
-
-    still = torch.zeros(6, dtype=torch.float64).requires_grad_()
-    texture.requires_grad_()
-    assert torch.autograd.gradcheck(picture, (still, texture), check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(lambda delta: picture(delta, texture.detach())[::5], (still,), rtol=1e-2)
-
-
-def test_any_leading_shape_and_both_types(rng, dtype):
-    texture = torch.rand(4, 8, generator=rng, dtype=torch.float64)
-    _, rays = sight(5)
-    R, place = (
-        so3.random_rotations((2, 3), generator=rng).double(),
-        torch.randn(2, 3, 3, generator=rng, dtype=torch.float64),
-    )
-    whole = expected_grey(rays, place, R, a_ball(texture))
-    assert whole.shape == (2, 3, 25)
-    assert_close(expected_grey(rays, place[1, 2], R[1, 2], a_ball(texture)), whole[1, 2])
-    looked = sample_spline(texture.to(dtype), place.to(dtype))
-    assert looked.dtype == dtype
-    assert_close(looked.double(), sample_spline(texture, place), {torch.float32: 1e-5, torch.float64: 0.0}[dtype])
-    with pytest.raises(ShapeError, match="position_lab_mm"):
-        expected_grey(rays, place[..., :2], R, a_ball(texture))
-
-
-def test_a_positive_part_has_a_round_corner_and_is_never_0(dtype):
-    x = torch.tensor([-1e4, -1.0, 0.0, 1.0, 1e4], dtype=dtype)
-    got = smooth_positive(x, 0.02)
-    assert (got > 0).all()
-    assert_close(
-        got, torch.tensor([0.0, 1e-4, 0.01, 1.0001, 1e4], dtype=dtype), 2e-8 if dtype == torch.float64 else 1e-3
-    )
-
-
-# --- the spline's map
-
-
-def test_a_lone_texel_is_the_cubic_b_spline():
-    texture = torch.zeros(8, 16, dtype=torch.float64)
-    texture[3, 5] = 1.0
-    middle = map_directions(8)
-    assert_close(sample_spline(texture, middle[3, 5]), f64(4 / 9))  # 2/3 along the row, 2/3 along the column
-    assert_close(sample_spline(texture, middle[3, 6]), f64(2 / 3 * 1 / 6))
-    assert_close(sample_spline(texture, middle[4, 6]), f64(1 / 36))
-    assert_close(sample_spline(texture, middle[3, 7]), f64(0.0))
-
-
-def test_the_spline_agrees_with_the_bilinear_map_where_it_is_smooth(rng):
-    directions = torch.randn(2000, 3, generator=rng, dtype=torch.float64)
-    body = map_directions(256)
-    texture = 0.5 + 0.3 * body[..., 0] - 0.2 * body[..., 1] * body[..., 2]
-    assert_close(sample_spline(texture, directions), sample_texture(texture, directions), 2e-4)
-
-
-def test_date_line_and_poles_are_no_edges(rng):
-    texture = torch.rand(8, 16, generator=rng, dtype=torch.float64)
-    for latitude in (-80, -20, 0, 50, 85):
-        lat, lon = math.radians(latitude), math.pi
-        sides = f64([[math.cos(lat) * math.cos(lon), s * 1e-9, math.sin(lat)] for s in (1, -1)])
-        first, second = sample_spline(texture, sides)
-        assert_close(first, second, 1e-7)
-    over = f64([[1e-9, 1e-9, 1.0], [-1e-9, -1e-9, 1.0]])  # along one meridian over the pole
-    assert_close(*sample_spline(texture, over), 1e-7)
-    with pytest.raises(ShapeError, match="texture"):
-        sample_spline(texture[:, :8], over)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sphereorient.movies import open_movie
 from sphereorient.preflight import Finding, Preflight, Severity, preflight
-from sphereorient.synth import SynthSettings, write_experiment
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 PLAIN = {"diameter": 18.0}  # the map costs a second: only where the test is of it
 PAINTED = {"diameter": 18.0, "texture": "texture.png"}
@@ -49,7 +49,7 @@ class Example:
 
 
 def render(folder: Path) -> Example:
-    write_experiment(folder, SynthSettings(**SMALL))
+    write_synthetic_experiment(folder, SynthSettings(**SMALL))
     pictures = {}
     for name in CAMERAS:
         with open_movie(folder / f"{name}.mkv") as movie:

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from sphereorient.cli import main
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
-from sphereorient.synth.ensemble_tracks import exact_track, filtered_track
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, exact_track, filtered_track
 from sphereorient.trajectory import Trajectory
 
 QUICK = ["--set", "statistics.resamples=100"]

@@ -11,8 +11,7 @@ from sphereorient.report import tables
 from sphereorient.report.tables import tables_of, write_tables
 from sphereorient.statistics import StatisticsSettings, Surroundings, ensemble_of, summarise
 from sphereorient.statistics.cameras import camera_distances
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
-from sphereorient.synth.ensemble_tracks import filtered_track
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 from sphereorient.trajectory import CameraTrack, Reason
 
 

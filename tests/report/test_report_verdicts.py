@@ -8,8 +8,7 @@ import pytest
 from sphereorient.report.verdicts import Grade, verdicts
 from sphereorient.statistics import StatisticsSettings, summarise
 from sphereorient.statistics.cameras import CameraDistance
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
-from sphereorient.synth.ensemble_tracks import exact_track, filtered_track
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, exact_track, filtered_track
 
 FEW = StatisticsSettings(resamples=100)
 

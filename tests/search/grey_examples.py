@@ -10,7 +10,7 @@ from orient_examples import KINDS, texture_of
 from torch import Tensor
 
 from sphereorient.search import GreySearch, GreySearchSettings, crop_disk
-from sphereorient.sphere import SphereRenderer, orthographic_view, reduced_texture
+from sphereorient.sphere import orthographic_view, reduced_texture
 
 SIZE = GreySearchSettings().size_px
 REAL, MARGIN = 80, 8  # diameter of the ball and room about it in the camera's picture, px
@@ -30,8 +30,8 @@ def camera_disks(
     """(F, SIZE, SIZE): disks of 80 px, noisy, cut out with a wrong centre and up to 1 % off in radius."""
     rng = torch.Generator().manual_seed(seed)
     view = orthographic_view(REAL)
-    render = SphereRenderer(reduced_texture(texture_of(kind), REAL), view)
-    grey = BLACK + (WHITE - BLACK) * render.disk(R_view_body.float())
+    paint = view.paint(reduced_texture(texture_of(kind), REAL), R_view_body.float())
+    grey = BLACK + (WHITE - BLACK) * paint
     if light is not None:
         grey = grey * (view.normal_view @ light).clamp_min(0.05)
     pictures = torch.nn.functional.pad(view.picture(grey, outside=15.0), (MARGIN,) * 4, value=15.0)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.search import OrientSettings, Proposals, TemplateSearch
-from sphereorient.sphere import SphereRenderer, orthographic_view, reduced_texture
+from sphereorient.sphere import orthographic_view, reduced_texture
 from sphereorient.synth import random_texture
 
 SIZE = 48
@@ -33,8 +33,8 @@ def attitudes(count: int, seed: int = 1) -> Tensor:
 
 def clean_disks(kind: str, R_view_body: Tensor, size_px: int = SIZE) -> Tensor:
     """Grey levels 20 (black paint) to 170 (white), orthographic."""
-    render = SphereRenderer(reduced_texture(texture_of(kind), size_px), orthographic_view(size_px))
-    return 20 + 150 * render(R_view_body.float())
+    texture = reduced_texture(texture_of(kind), size_px)
+    return 20 + 150 * orthographic_view(size_px).render(texture, R_view_body.float())
 
 
 def of_disk(found: Proposals, disk: int) -> tuple[Tensor, Tensor]:

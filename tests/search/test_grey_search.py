@@ -14,7 +14,7 @@ from sphereorient import so3
 from sphereorient.errors import ShapeError
 from sphereorient.search import GreySearch, GreySearchSettings, Proposals
 from sphereorient.search.grey_search import BATCH, DEVIATIONS, _steps
-from sphereorient.sphere import SphereRenderer, perspective_view, reduced_texture
+from sphereorient.sphere import perspective_view, reduced_texture
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.trajectory import Reason
 
@@ -74,8 +74,8 @@ def test_one_pixel_of_80_off_is_found():
 
 def test_a_near_camera_sees_less_of_the_ball_and_says_so_by_its_distance():
     R_view_body = attitudes(10)
-    render = SphereRenderer(reduced_texture(texture_of("blobs"), SIZE), perspective_view(SIZE, 4.0))
-    disks = 20 + 150 * render(R_view_body.float())
+    texture = reduced_texture(texture_of("blobs"), SIZE)
+    disks = 20 + 150 * perspective_view(SIZE, 4.0).render(texture, R_view_body.float())
     near = GreySearch(texture_of("blobs"), GreySearchSettings(distance_radii=4.0)).propose(disks)
     far = grey_search_of("blobs").propose(disks)
     assert best_errors_deg(near, R_view_body).max() < 0.5

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-# The camera of DESIGN section 1's check: it looks along lab +y, lab z is up, so x right is lab x, y down is lab -z.
+# The camera of docs/conventions.md's check: it looks along lab +y, lab z is up, so x right is lab x, y down is lab -z.
 R_CAM_LAB_ALONG_Y = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 
 
@@ -18,7 +18,7 @@ def f64(value: object) -> Tensor:
 
 
 def body_direction(longitude_deg: float, latitude_deg: float) -> Tensor:
-    """DESIGN section 1, texture map, written out."""
+    """docs/conventions.md, texture map, written out."""
     lon, lat = math.radians(longitude_deg), math.radians(latitude_deg)
     return f64([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
 
@@ -62,5 +62,5 @@ def map_with_three_dots(height: int = 256) -> Tensor:
 
 
 def template_score(picture: Tensor, template: Tensor, inside: Tensor) -> float:
-    """The paper's T of ERRATA A2: the share of the disk's pixels whose paint agrees."""
+    """The paper's T of docs/errata.md A2: the share of the disk's pixels whose paint agrees."""
     return float(((picture[inside] > 0.5) == (template[inside] > 0.5)).double().mean())

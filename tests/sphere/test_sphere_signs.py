@@ -1,8 +1,9 @@
-"""All signs between map and picture: DESIGN section 1's check, handedness, the sense of the perspective (ERRATA A1)."""
+"""All signs between map and picture: docs/conventions.md, handedness, sense of the perspective (docs/errata.md A1)."""
 
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from sphere_examples import R_CAM_LAB_ALONG_Y, f64, map_with_three_dots, templat
 from sphereorient import so3
 from sphereorient.cameras import PinholeCamera, R_cam_view
 from sphereorient.search import crop_disk
-from sphereorient.sphere import SphereRenderer, orthographic_view, perspective_view, sample_texture, sphere_normals
+from sphereorient.sphere import orthographic_view, perspective_view, sample_texture, sphere_normals
 from sphereorient.synth import random_texture
 
 SIZE = 101
@@ -26,7 +27,7 @@ def grey_at(picture: torch.Tensor, right: float, down: float) -> float:
 
 
 def test_the_map_faces_the_camera_with_north_up_and_east_to_the_right():
-    render = SphereRenderer(map_with_three_dots(), orthographic_view(SIZE, torch.float64))
+    render = partial(orthographic_view(SIZE, torch.float64).render, map_with_three_dots())
     picture = render(R_CAM_LAB_ALONG_Y @ R_LAB_BODY)
     aside = math.sin(math.radians(50))
     assert grey_at(picture, 0, 0) == pytest.approx(1.0)
@@ -36,7 +37,7 @@ def test_the_map_faces_the_camera_with_north_up_and_east_to_the_right():
 
 
 def test_each_other_reading_of_the_signs_shows_something_else():
-    render = SphereRenderer(map_with_three_dots(), orthographic_view(SIZE, torch.float64))
+    render = partial(orthographic_view(SIZE, torch.float64).render, map_with_three_dots())
     right = render(R_CAM_LAB_ALONG_Y @ R_LAB_BODY)
     half_turn_about_x = f64([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
     for wrong in (
@@ -52,15 +53,15 @@ def test_each_other_reading_of_the_signs_shows_something_else():
 def test_a_mirrored_map_and_a_mirrored_picture_agree_worse_than_the_right_one(rng, kind, seed):
     view, texture = orthographic_view(48), random_texture(kind, seed, 128)
     R_view_body = so3.random_rotations(12, generator=rng, dtype=torch.float32)
-    right = SphereRenderer(texture, view)(R_view_body)
-    mirrored_map = SphereRenderer(texture.flip(1), view)(R_view_body)
+    right = view.render(texture, R_view_body)
+    mirrored_map = view.render(texture.flip(1), R_view_body)
     for picture, mirrored in zip(right, mirrored_map, strict=True):
         assert template_score(picture, picture, view.inside) == 1.0
         assert template_score(picture, mirrored, view.inside) < 0.9
         assert template_score(picture, picture.flip(1), view.inside) < 0.9
     # Together they are one mirror: the map's about the plane y = 0, the picture's about x = 0.
     plane_y, plane_x = torch.diag(f64([1, -1, 1])).float(), torch.diag(f64([-1, 1, 1])).float()
-    both = SphereRenderer(texture.flip(1), view)(plane_x @ R_view_body @ plane_y).flip(-1)
+    both = view.render(texture.flip(1), plane_x @ R_view_body @ plane_y).flip(-1)
     assert (both - right).abs().mean() < 1e-3
 
 
@@ -86,9 +87,9 @@ def photograph(
     centre_lab = R_cam_lab.T @ (160.0 * slope - camera.T_cam_lab_mm)
     v, u = torch.meshgrid(*(torch.arange(480, dtype=torch.float64),) * 2, indexing="ij")
     rays = camera.rays(torch.stack([u, v], dim=-1))
-    normal_lab, hit = sphere_normals(rays.origin_lab_mm, rays.direction_lab, centre_lab, RADIUS_MM)
+    normal_lab, depth2 = sphere_normals(rays.origin_lab_mm, rays.direction_lab, centre_lab, RADIUS_MM)
     paint = sample_texture(TEXTURE, normal_lab @ R_lab_body)
-    return torch.where(hit, paint, 0.0).numpy(), camera, centre_lab
+    return torch.where(depth2 > 0, paint, 0.0).numpy(), camera, centre_lab
 
 
 TEXTURE = random_texture("blobs", 1, 128).double()
@@ -104,7 +105,7 @@ def test_off_the_axis_the_sphere_shows_the_side_that_R_cam_view_says(rng, right_
     limb_px = 600.0 * float(distance / centre_cam[2]) * RADIUS_MM / math.sqrt(distance**2 - RADIUS_MM**2)
     disk = torch.from_numpy(crop_disk(picture, u, v, limb_px, 64))
     view = perspective_view(64, distance / RADIUS_MM, torch.float64)
-    render = SphereRenderer(TEXTURE, view)
+    render = partial(view.render, TEXTURE)
     R_persp = R_cam_view(centre_cam)
     R_cam_body = camera.R_cam_lab @ R_lab_body
 

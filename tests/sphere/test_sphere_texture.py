@@ -13,7 +13,8 @@ from sphere_examples import body_direction, f64, looked_up, random_map
 
 from sphereorient.errors import ShapeError, TextureError
 from sphereorient.sphere import load_texture, reduced_texture, sample_texture
-from sphereorient.sphere.texture import texture_coordinates
+from sphereorient.sphere.texture import sample_spline, texture_coordinates
+from sphereorient.synth.textures import map_directions
 
 
 def saved(folder, picture, name="texture.png"):
@@ -43,7 +44,7 @@ def test_float64_is_not_rounded_to_float32_on_a_map_of_full_size(rng):
 def test_the_middle_of_a_texel_shows_that_texel(rng):
     texture = random_map(
         rng, 4
-    )  # DESIGN: column u is longitude 360 (u + 0.5)/8 - 180, row v latitude 90 - 180 (v + 0.5)/4
+    )  # docs/conventions.md: column u is longitude 360 (u + 0.5)/8 - 180, row v latitude 90 - 180 (v + 0.5)/4
     assert_close(sample_texture(texture, body_direction(-157.5, 67.5)), texture[0, 0])
     assert_close(sample_texture(texture, body_direction(22.5, 67.5)), texture[0, 4])
     assert_close(sample_texture(texture, body_direction(112.5, -22.5)), texture[2, 6])
@@ -217,3 +218,36 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
     for path, got in ((tmp_path / "texture.png", "no such file"), (tmp_path, "a folder")):
         with pytest.raises(TextureError, match=f"got {got}"):
             load_texture(path)
+
+
+# --- the spline
+
+
+def test_a_lone_texel_is_the_cubic_b_spline():
+    texture = torch.zeros(8, 16, dtype=torch.float64)
+    texture[3, 5] = 1.0
+    middle = map_directions(8)
+    assert_close(sample_spline(texture, middle[3, 5]), f64(4 / 9))  # 2/3 along the row, 2/3 along the column
+    assert_close(sample_spline(texture, middle[3, 6]), f64(2 / 3 * 1 / 6))
+    assert_close(sample_spline(texture, middle[4, 6]), f64(1 / 36))
+    assert_close(sample_spline(texture, middle[3, 7]), f64(0.0))
+
+
+def test_the_spline_agrees_with_the_bilinear_map_where_it_is_smooth(rng):
+    directions = torch.randn(2000, 3, generator=rng, dtype=torch.float64)
+    body = map_directions(256)
+    texture = 0.5 + 0.3 * body[..., 0] - 0.2 * body[..., 1] * body[..., 2]
+    assert_close(sample_spline(texture, directions), sample_texture(texture, directions), 2e-4)
+
+
+def test_date_line_and_poles_are_no_edges(rng):
+    texture = torch.rand(8, 16, generator=rng, dtype=torch.float64)
+    for latitude in (-80, -20, 0, 50, 85):
+        lat, lon = math.radians(latitude), math.pi
+        sides = f64([[math.cos(lat) * math.cos(lon), s * 1e-9, math.sin(lat)] for s in (1, -1)])
+        first, second = sample_spline(texture, sides)
+        assert_close(first, second, 1e-7)
+    over = f64([[1e-9, 1e-9, 1.0], [-1e-9, -1e-9, 1.0]])  # along one meridian over the pole
+    assert_close(*sample_spline(texture, over), 1e-7)
+    with pytest.raises(ShapeError, match="texture"):
+        sample_spline(texture[:, :8], over)

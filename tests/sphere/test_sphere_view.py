@@ -1,20 +1,24 @@
-"""The canonical view: which normal a pixel shows (ERRATA A4)."""
+"""The canonical view: which normal a pixel shows, and its pictures (docs/errata.md A4)."""
 
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
 from conftest import assert_close
-from sphere_examples import f64
+from sphere_examples import f64, looked_up, random_map
 
+from sphereorient import so3
 from sphereorient.cameras import PinholeCamera
 from sphereorient.errors import ShapeError
 from sphereorient.sphere import orthographic_view, perspective_view, sphere_normals
 from sphereorient.sphere.view import disk_offsets
 
 TO_CAMERA = f64([0, 0, -1])
+# Body +z, a pole, towards the camera: view z points away from it.
+NORTH_TO_CAMERA = f64([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
 
 
 def test_offsets_are_pixel_centres_in_radii_right_and_down():
@@ -87,7 +91,7 @@ def test_from_very_far_the_perspective_view_is_the_orthographic_one():
 
 
 def test_off_the_axis_the_outline_is_longer_and_its_centre_is_not_the_projected_centre():
-    # ERRATA A4's numbers: 15 degrees off the axis, diameter / depth 0.035, 80 px: 3.5 % longer, 0.2 px beside.
+    # docs/errata.md A4's numbers: 15 degrees off the axis, diameter / depth 0.035, 80 px: 3.5 % longer, 0.2 px beside.
     focal_px, aside = 80 / 0.035, math.radians(15)
     camera = PinholeCamera(
         image_size=(2000, 400),
@@ -102,8 +106,8 @@ def test_off_the_axis_the_outline_is_longer_and_its_centre_is_not_the_projected_
 
     def extent(along: torch.Tensor) -> tuple[float, float]:
         rays = camera.rays(torch.stack([u, v]) + steps[:, None] * along)
-        _, hit = sphere_normals(rays.origin_lab_mm, rays.direction_lab, centre, radius)
-        return float(steps[hit].min()), float(steps[hit].max())
+        _, depth2 = sphere_normals(rays.origin_lab_mm, rays.direction_lab, centre, radius)
+        return float(steps[depth2 > 0].min()), float(steps[depth2 > 0].max())
 
     left, right = extent(f64([1, 0]))
     top, bottom = extent(f64([0, 1]))
@@ -116,17 +120,17 @@ def test_off_the_axis_the_outline_is_longer_and_its_centre_is_not_the_projected_
 
 
 def test_a_ray_meets_the_near_side():
-    normal, hit = sphere_normals(f64([0, 0, 0]), f64([0, 0, 7]), f64([0, 0, 10]), 2.0)
-    assert hit
+    normal, depth2 = sphere_normals(f64([0, 0, 0]), f64([0, 0, 7]), f64([0, 0, 10]), 2.0)
+    assert depth2 > 0
     assert_close(normal, f64([0, 0, -1]))
-    normal, hit = sphere_normals(f64([0, 1.2, 0]), f64([0, 0, 1]), f64([0, 0, 10]), 2.0)
-    assert hit
+    normal, depth2 = sphere_normals(f64([0, 1.2, 0]), f64([0, 0, 1]), f64([0, 0, 10]), 2.0)
+    assert depth2 > 0
     assert_close(normal, f64([0, 0.6, -0.8]), atol=1e-15)
 
 
 def test_a_ray_that_misses_gets_the_normal_nearest_to_it():
-    normal, hit = sphere_normals(f64([3, 0, 0]), f64([0, 0, 1]), f64([0, 0, 10]), 2.0)
-    assert not hit
+    normal, depth2 = sphere_normals(f64([3, 0, 0]), f64([0, 0, 1]), f64([0, 0, 10]), 2.0)
+    assert depth2 < 0
     assert_close(normal, f64([1, 0, 0]))
 
 
@@ -134,12 +138,12 @@ def test_normals_lead_from_the_centre_to_a_point_of_the_ray(rng, dtype):
     origin = torch.randn(200, 3, generator=rng, dtype=torch.float64).to(dtype)
     centre = origin.new_tensor([2.0, 1.0, 14.0])
     direction = centre + 1.5 * torch.randn(200, 3, generator=rng, dtype=torch.float64).to(dtype) - origin
-    normal, hit = sphere_normals(origin, direction, centre, 2.5)
-    assert 20 < int(hit.sum()) < 200
-    point = (centre + 2.5 * normal - origin)[hit]
-    off = torch.linalg.cross(point, direction[hit] / direction[hit].norm(dim=-1, keepdim=True))
+    normal, depth2 = sphere_normals(origin, direction, centre, 2.5)
+    assert 20 < int((depth2 > 0).sum()) < 200
+    point = (centre + 2.5 * normal - origin)[depth2 > 0]
+    off = torch.linalg.cross(point, direction[depth2 > 0] / direction[depth2 > 0].norm(dim=-1, keepdim=True))
     assert off.abs().max() < {torch.float64: 1e-12, torch.float32: 5e-5}[dtype]
-    assert ((normal * direction)[hit].sum(-1) <= 0).all()
+    assert ((normal * direction)[depth2 > 0].sum(-1) <= 0).all()
 
 
 def test_gradients_in_the_centre_are_right_inside_the_disk(rng):
@@ -162,15 +166,101 @@ def test_gradients_are_finite_at_the_limb_and_in_the_middle(dtype, aside):
 def test_a_batch_of_rays_is_the_stack_of_its_singles(rng, dtype, tolerance, batch):
     direction = torch.randn(*batch, 3, generator=rng, dtype=torch.float64).to(dtype)
     origin, centre = direction.new_zeros(3), direction.new_tensor([0, 0, 3.0])
-    normal, hit = sphere_normals(origin, direction, centre, 2.5)
+    normal, depth2 = sphere_normals(origin, direction, centre, 2.5)
     assert normal.shape == (*batch, 3)
-    assert hit.shape == batch
+    assert depth2.shape == batch
     for k, single in enumerate(direction.reshape(-1, 3)):
-        one, one_hit = sphere_normals(origin, single, centre, 2.5)
+        one, one_depth2 = sphere_normals(origin, single, centre, 2.5)
         assert_close(one, normal.reshape(-1, 3)[k], atol=10 * tolerance)
-        assert one_hit == hit.reshape(-1)[k]
+        assert (one_depth2 > 0) == (depth2.reshape(-1)[k] > 0)
 
 
 def test_rays_without_three_components_are_refused():
     with pytest.raises(ShapeError, match=r"direction: expected shape \(\.\.\., 3\)"):
         sphere_normals(torch.zeros(3), torch.zeros(4, 2), torch.zeros(3), 1.0)
+
+
+# --- pictures
+
+
+@pytest.mark.parametrize("view_of", [orthographic_view, lambda s, dtype: perspective_view(s, 3.0, dtype)])
+def test_it_agrees_with_a_lookup_in_numpy_pixel_by_pixel(rng, dtype, view_of):
+    texture, view = random_map(rng), view_of(24, dtype=dtype)
+    R_view_body = so3.random_rotations(6, generator=rng)
+    picture = view.render(texture.to(dtype), R_view_body.to(dtype), outside=-1.0)
+    assert picture.dtype == dtype
+    assert picture.shape == (6, 24, 24)
+    atol = {torch.float64: 1e-12, torch.float32: 3e-5}[dtype]
+    for got, R in zip(picture, R_view_body, strict=True):
+        assert (got[~view.inside] == -1.0).all()
+        expected = looked_up(texture, torch.stack([R.T @ n for n in view.normal_view.double()]))
+        assert_close(got[view.inside].double(), torch.from_numpy(expected), atol=atol)
+        # The transpose is another attitude, and seen.
+        transposed = torch.from_numpy(looked_up(texture, view.normal_view.double() @ R.T))
+        assert (got[view.inside].double() - transposed).abs().mean() > 0.1
+
+
+def test_turning_the_body_about_the_line_of_sight_turns_the_picture(rng):
+    view = orthographic_view(20, torch.float64)
+    render = partial(view.render, random_map(rng))
+    R_view_body = so3.random_rotations((), generator=rng)
+    # z points away from the camera, y down: a turn by +90 degrees takes right to down, clockwise for the view.
+    turned = render(so3.exp(f64([0, 0, math.pi / 2])) @ R_view_body)
+    assert_close(turned, render(R_view_body).rot90(-1), atol=1e-12)
+
+
+def test_gradients_are_right_in_the_orientation_and_in_the_map(rng):
+    view = orthographic_view(6, torch.float64)
+    texture = random_map(rng, 4)
+    R_view_body = so3.random_rotations(2, generator=rng).requires_grad_()
+    assert torch.autograd.gradcheck(view.render, (texture.clone().requires_grad_(), R_view_body))
+
+
+def test_the_pictures_slope_is_the_turning_of_the_map(rng):
+    # Grey = latitude: turning about the view's x axis by a small angle moves the paint along the meridian through the
+    # disk's middle by that angle, whatever the interpolation.
+    height = 180
+    latitude = math.pi / 2 - math.pi * (torch.arange(height, dtype=torch.float64) + 0.5) / height
+    texture = latitude[:, None].expand(height, 2 * height)
+    render = partial(orthographic_view(11, torch.float64).render, texture)
+    # Body x towards the camera, body z up.
+    R_view_body = f64([[0, 1, 0], [0, 0, -1], [-1, 0, 0]])
+    delta = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    middle = render(so3.exp(delta) @ R_view_body)[5, 5]
+    (gradient,) = torch.autograd.grad(middle, delta)
+    # A turn about x right takes y down to z away: what faces the camera (-z) moves down (+y), what lay north comes in.
+    assert_close(gradient, f64([1, 0, 0]), atol=1e-6)
+
+
+@pytest.mark.parametrize("pole", [1.0, -1.0])
+def test_gradients_are_finite_where_a_pixel_shows_a_pole(rng, dtype, pole):
+    view = orthographic_view(7, dtype)
+    R = (NORTH_TO_CAMERA * f64([1, pole, pole])).to(dtype).requires_grad_()
+    picture = view.render(random_map(rng).to(dtype), R)
+    (gradient,) = torch.autograd.grad(picture.sum(), R)
+    assert torch.isfinite(gradient).all()
+    assert gradient.abs().max() < 1e3
+
+
+def test_gradients_are_finite_at_the_limb(rng, dtype):
+    for view in (orthographic_view(41, dtype), perspective_view(41, 1.5, dtype)):
+        R = so3.random_rotations((), generator=rng, dtype=dtype).requires_grad_()
+        texture = random_map(rng, 8).to(dtype).requires_grad_()
+        picture = view.render(texture, R)
+        for gradient in torch.autograd.grad(picture.square().sum(), (R, texture)):
+            assert torch.isfinite(gradient).all()
+
+
+def test_a_batch_is_the_stack_of_its_singles(rng, dtype, tolerance, batch):
+    render = partial(orthographic_view(9, dtype).render, random_map(rng, 8).to(dtype))
+    R_view_body = so3.random_rotations(batch, generator=rng, dtype=dtype)
+    picture = render(R_view_body)
+    assert picture.shape == (*batch, 9, 9)
+    assert picture.dtype == dtype
+    for R, expected in zip(R_view_body.reshape(-1, 3, 3), picture.reshape(-1, 9, 9), strict=True):
+        assert_close(render(R), expected, atol=20 * tolerance)
+
+
+def test_what_is_no_rotation_matrix_is_refused(rng):
+    with pytest.raises(ShapeError, match=r"R_view_body: expected shape \(\.\.\., 3, 3\)"):
+        orthographic_view(8).render(random_map(rng), torch.zeros(3, 4))

@@ -11,8 +11,7 @@ from conftest import REPO
 
 from sphereorient.statistics.segments import ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
-from sphereorient.synth.ensemble_tracks import exact_track, smoothed_track
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, exact_track, smoothed_track
 
 
 @pytest.fixture(scope="module")

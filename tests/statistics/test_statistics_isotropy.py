@@ -7,8 +7,7 @@ from statistics_examples import ensemble
 from sphereorient.statistics.isotropy import anisotropic_frame, frame_of_omega, isotropy, zero_mean_p_value
 from sphereorient.statistics.segments import ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
-from sphereorient.synth.ensemble_tracks import exact_track
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, exact_track
 
 FEW = BootstrapSettings(resamples=100)
 UNEQUAL = {"omega_rms": (6.0, 8.0, 10.0)}

@@ -17,19 +17,26 @@ from sphereorient.cameras import TsaiCamera
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
-from sphereorient.synth import DEGRADATIONS, SynthSettings, random_texture, severity, write_degraded, write_experiment
+from sphereorient.synth import (
+    DEGRADATIONS,
+    SynthSettings,
+    random_texture,
+    severity,
+    write_degraded,
+    write_synthetic_experiment,
+)
 from sphereorient.synth.degrade_scene import (
     DegradedFilming,
     degraded_settings,
     misdrawn,
-    patches,
     picture_of_ball,
-    told_cameras,
+    random_patches,
     with_ball_size,
     with_motion_blur,
     with_spin,
     worn,
     write_with_values,
+    wrong_cameras,
 )
 from sphereorient.synth.textures import map_directions
 from sphereorient.synth.write import default_cameras, motion_of
@@ -73,7 +80,7 @@ def tsai(path: Path, name: str) -> TsaiCamera:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_experiment(tmp_path_factory.mktemp("plain"), SETTINGS)
+    return write_synthetic_experiment(tmp_path_factory.mktemp("plain"), SETTINGS)
 
 
 def test_without_degradations_the_files_are_those_of_synth(plain, tmp_path):
@@ -211,7 +218,7 @@ def test_the_ball_in_a_picture_is_where_and_as_large_as_it_is_seen(plain):
 def test_the_ball_has_its_size_and_the_scene_stays_the_same(tmp_path):
     for diameter in (20.0, 32.0):
         settings = with_ball_size(SETTINGS.model_copy(update={"frames": 2, "black": 150.0, "white": 150.0}), diameter)
-        path = write_experiment(tmp_path / str(diameter), settings)
+        path = write_synthetic_experiment(tmp_path / str(diameter), settings)
         ball = np.sqrt((frames_of(path)["cam1"] > 60).sum((1, 2)) * 4 / np.pi)
         assert ball == pytest.approx(diameter, rel=0.06)
         scale = diameter / 40
@@ -253,7 +260,10 @@ def test_motion_blur_smears_the_picture_of_the_ball(tmp_path):
         flash = open_long.model_copy(update={"exposure": 0.0, "exposure_samples": 1})
         steps = [
             sum(np.square(np.diff(movie[:, 5:85, 5:91])).sum() for movie in frames_of(path).values())
-            for path in (write_experiment(tmp_path / "a", open_long), write_experiment(tmp_path / "b", flash))
+            for path in (
+                write_synthetic_experiment(tmp_path / "a", open_long),
+                write_synthetic_experiment(tmp_path / "b", flash),
+            )
         ]
         left.append(steps[0] / steps[1])
     assert 1.0 > left[0] > 1.02 * left[1]
@@ -284,13 +294,13 @@ def test_worn_and_misdrawn_maps_differ_in_their_share_of_the_area(share, height)
 
 def test_patches_are_patches_seamless_and_anywhere():
     rng = torch.Generator().manual_seed(3)
-    many = patches(torch.empty(30, 64, 128), 0.2, rng)
+    many = random_patches(torch.empty(30, 64, 128), 0.2, rng)
     beside = (many != many.roll(1, -1)).double().mean((0, 1))
     assert beside[0] < 2 * beside.mean()  # the date line is no border
     assert beside.mean() < 0.08  # single texels would differ in 32 %
     assert many.double().mean((0, 2)) == pytest.approx(0.2, abs=0.12)  # at all latitudes alike
     again = torch.Generator().manual_seed(3)
-    assert torch.equal(torch.stack([patches(torch.empty(64, 128), 0.2, again) for _ in range(3)]), many[:3])
+    assert torch.equal(torch.stack([random_patches(torch.empty(64, 128), 0.2, again) for _ in range(3)]), many[:3])
 
 
 def test_the_given_map_differs_from_the_filmed_one_by_its_share(plain, tmp_path):
@@ -306,7 +316,7 @@ def test_the_given_map_differs_from_the_filmed_one_by_its_share(plain, tmp_path)
 def test_worn_paint_is_on_the_filmed_ball_only():
     filming = DegradedFilming(SETTINGS, {"paint_wear": 0.25})
     texture = random_texture("blobs", 6)
-    assert torch.equal(filming.told_texture(texture), texture)
+    assert torch.equal(filming.reported_texture(texture), texture)
     area = map_directions(512)[..., :2].norm(dim=-1)
     bare = filming.paint(texture) == 0.5
     assert float((area * bare).sum() / area.sum()) == pytest.approx(0.25, abs=5e-3)
@@ -315,7 +325,7 @@ def test_worn_paint_is_on_the_filmed_ball_only():
 # What the method is told.
 
 
-def test_the_told_diameter_is_too_large_by_px_at_the_rim(tmp_path):
+def test_the_reported_diameter_is_too_large_by_px_at_the_rim(tmp_path):
     path = write_with_values(tmp_path, SETTINGS, {"radius_error": 2.0})
     told = load_experiment(path)
     assert told.diameter_mm == pytest.approx(18.0 * (20 + 2) / 20)
@@ -347,6 +357,6 @@ def test_the_told_second_camera_is_turned_by_degrees_about_the_origin_and_moved_
     assert_close(told.T_cam_lab_mm - true.T_cam_lab_mm, torch.tensor([0.3, 0.0, 0.0]).double(), atol=1e-6)
     for part in ("R_cam_lab", "T_cam_lab_mm", "centre_px"):
         assert torch.equal(getattr(tsai(path, "cam1"), part), getattr(tsai(plain, "cam1"), part))
-    only_turned = told_cameras(default_cameras(SETTINGS), {"camera_rotation": 5.0})["cam2"]
+    only_turned = wrong_cameras(default_cameras(SETTINGS), {"camera_rotation": 5.0})["cam2"]
     origin = torch.zeros(3, dtype=torch.float64)
     assert_close(only_turned.project(origin), true.project(origin), atol=1e-9)

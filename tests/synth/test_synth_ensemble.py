@@ -13,9 +13,15 @@ from sphereorient.motion import omega_from_orientations
 from sphereorient.statistics.moments import moments
 from sphereorient.statistics.segments import ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, nominal
-from sphereorient.synth.ensemble_tracks import exact_track, filtered_track, smoothed_track
-from sphereorient.synth.intermittent import Law
+from sphereorient.synth.ensemble import (
+    EnsembleSpec,
+    Law,
+    draw_ensemble,
+    exact_track,
+    filtered_track,
+    nominal,
+    smoothed_track,
+)
 
 FEW = BootstrapSettings(resamples=100)
 
@@ -45,16 +51,6 @@ def test_a_laws_derivative_is_its_derivative_and_its_integral_its_integral():
     rate, slope = draw.at(t, segment)
     np.testing.assert_allclose(np.gradient(rate, t)[1:-1], slope[1:-1], atol=1e-4)
     np.testing.assert_allclose(np.gradient(draw.integral(t, segment), t)[1:-1], rate[1:-1], atol=1e-6)
-
-
-def test_a_laws_autocorrelation_is_that_of_its_samples():
-    law = Law.of(7.8, 560.0, 4.0, 7.6)
-    draw = law.draw(200_000, np.random.default_rng(3))
-    segment = np.arange(200_000)
-    now, _ = draw.at(np.zeros(200_000), segment)
-    for lag in (0.004, 0.01, 0.03):
-        later, _ = draw.at(np.full(200_000, lag), segment)
-        assert (now * later).mean() / 7.8**2 == pytest.approx(float(law.correlation(np.array(lag))), abs=0.012)
 
 
 @pytest.mark.slow

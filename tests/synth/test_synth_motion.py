@@ -51,7 +51,7 @@ def test_omega_is_what_turns_R_in_lab_components(around):
     before, now, after = around
     turn_lab = so3.log(after.R_lab_body @ before.R_lab_body.mT) / (2 * STEP_S)
     assert_close(turn_lab, now.omega_lab_rad_s, atol=2e-3)
-    # ERRATA E4: R^T R' are the body's components, another vector.
+    # docs/errata.md E4: R^T R' are the body's components, another vector.
     turn_body = so3.log(before.R_lab_body.mT @ after.R_lab_body) / (2 * STEP_S)
     assert_close(turn_body, in_body(now, now.omega_lab_rad_s), atol=2e-3)
     assert (turn_body - now.omega_lab_rad_s).norm(dim=-1).min() > 0.1

@@ -10,12 +10,11 @@ from synth_examples import WHITE_MAP, behind_wall, camera, f64, on_the_sphere, o
 
 from sphereorient import so3
 from sphereorient.errors import CameraError
+from sphereorient.sphere import Sampling, SphereRenderer
+from sphereorient.sphere.renderer import reach_px
 from sphereorient.synth import random_texture, render_frame
-from sphereorient.synth.clean import CleanOptics, render_clean
 from sphereorient.synth.textures import map_directions
-from sphereorient.synth.window import reach_px
 
-OPTICS = CleanOptics(black=0.0, white=1.0)
 RADIUS_MM = 9.0
 LENSES = {
     "near": behind_wall(camera()),  # the ball 120 mm behind the wall
@@ -31,16 +30,9 @@ TURN = so3.exp(f64([0.9, -1.3, 0.4]))
 
 
 def clean(name: str, texture: torch.Tensor, R_lab_body: torch.Tensor = TURN, supersampling: int = 4) -> torch.Tensor:
-    rendered = render_clean(
-        texture,
-        LENSES[name],
-        PLACE[name][None],
-        R_lab_body[None],
-        diameter_mm=2 * RADIUS_MM,
-        optics=OPTICS,
-        supersampling=supersampling,
-    )
-    return rendered[0].double()
+    sampling = Sampling(supersampling=supersampling)
+    render = SphereRenderer(texture, radius_mm=RADIUS_MM, camera=LENSES[name], sampling=sampling)
+    return render(R_lab_body, PLACE[name])
 
 
 def mass(grey: torch.Tensor) -> tuple[float, torch.Tensor]:
@@ -98,14 +90,10 @@ def test_scene_and_clean_picture_show_the_same_paint(name):
     frame = render_frame(
         scene(texture, black=0.0, white=200.0), LENSES[name], PLACE[name][None], TURN[None], np.random.default_rng(0)
     )
-    sharp = render_clean(
-        texture,
-        LENSES[name],
-        PLACE[name][None],
-        TURN[None],
-        diameter_mm=2 * RADIUS_MM,
-        optics=CleanOptics(black=0.0, white=200.0, sigma_px=0.0),
-    )[0]
+    sampling = Sampling(blur_px=0.0)
+    sharp = 200 * SphereRenderer(texture, radius_mm=RADIUS_MM, camera=LENSES[name], sampling=sampling)(
+        TURN, PLACE[name]
+    )
     assert float((torch.from_numpy(frame).double() - sharp).square().mean().sqrt()) < 1.5
     assert float((torch.from_numpy(frame).flip(-1).double() - sharp).square().mean().sqrt()) > 10
 

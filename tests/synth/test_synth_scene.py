@@ -26,7 +26,7 @@ def centre_of_mass(grey: np.ndarray) -> tuple[float, float]:
 
 @pytest.mark.parametrize("beside", [(0.0, 0.0), (4.0, -2.3), (-3.1, 2.0), (0.7, 3.3)], ids=str)
 def test_a_small_white_sphere_is_where_the_camera_projects_its_centre(beside):
-    # 10 px: the ellipse's centre differs from the projection by 1e-3 px only (ERRATA A4).
+    # 10 px: the ellipse's centre differs from the projection by 1e-3 px only (docs/errata.md A4).
     lens = camera()
     place = seen_at(lens, *beside)
     u, v = centre_of_mass(picture(scene(diameter_mm=5.0, diameter_px=10.0), place, lens=lens))

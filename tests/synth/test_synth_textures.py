@@ -1,4 +1,4 @@
-"""Random maps: seamless on the sphere, in DESIGN's layout."""
+"""Random maps: seamless on the sphere, in the layout of docs/conventions.md."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_directions_of_texels_are_where_the_lookup_finds_them(rng):
     assert_close(direction.norm(dim=-1), torch.ones(6, 12, dtype=torch.float64))
     noise = torch.rand(6, 12, generator=rng, dtype=torch.float64)
     assert_close(sample_texture(noise, direction), noise, atol=1e-13)
-    # By hand (DESIGN section 1): row 0 is at latitude 75, column 0 at longitude -165 degrees.
+    # By hand (docs/conventions.md): row 0 is at latitude 75, column 0 at longitude -165 degrees.
     longitude, latitude = texture_coordinates(direction[0, 0])
     assert_close(longitude.rad2deg(), torch.tensor(-165.0, dtype=torch.float64), atol=1e-11)
     assert_close(latitude.rad2deg(), torch.tensor(75.0, dtype=torch.float64), atol=1e-11)

@@ -66,7 +66,7 @@ def test_the_axis_and_the_sense_of_a_turn_are_found_in_the_lab(name):
     # Two frames apart 4 x 9 degrees; the mean over the pairs averages the grid's 2 degrees.
     omega_lab = so3.log(R_lab_body[4:] @ R_lab_body[:-4].mT).mean(0) / 4
     assert (omega_lab - STEP_RAD * axis_lab).norm() < 0.12 * STEP_RAD
-    # The paper calls R_{k+m} R_k^T the particle's (ERRATA E4, E6): then R omega would be the lab's, and is not.
+    # The paper calls R_{k+m} R_k^T the particle's (docs/errata.md E4, E6): then R omega would be the lab's, and is not.
     as_printed = (R_lab_body[:-4] @ omega_lab[:, None])[..., 0].mean(0)
     assert (as_printed - STEP_RAD * axis_lab).norm() > 0.5 * STEP_RAD
     # Nor are the body's components, R_k^T R_{k+m}.

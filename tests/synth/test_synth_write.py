@@ -16,7 +16,7 @@ from sphereorient.cameras import TsaiCamera
 from sphereorient.errors import OutputError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
-from sphereorient.synth import SynthSettings, make_scene, random_motion, render_frame, write_experiment
+from sphereorient.synth import SynthSettings, make_scene, random_motion, render_frame, write_synthetic_experiment
 from sphereorient.synth.write import default_cameras
 
 FRAMES = 6
@@ -53,7 +53,7 @@ TRUTH = {
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_experiment(tmp_path_factory.mktemp("synth") / "new" / "folder", SETTINGS)
+    return write_synthetic_experiment(tmp_path_factory.mktemp("synth") / "new" / "folder", SETTINGS)
 
 
 def truth_of(path: Path) -> dict[str, torch.Tensor]:
@@ -148,8 +148,8 @@ def test_the_pictures_of_the_empty_scene_are_its_background(written):
 
 
 def test_the_same_seed_gives_the_same_movies_and_truth_and_another_others(written, tmp_path):
-    again = write_experiment(tmp_path / "again", SETTINGS)
-    other = write_experiment(tmp_path / "other", SETTINGS.model_copy(update={"seed": 3}))
+    again = write_synthetic_experiment(tmp_path / "again", SETTINGS)
+    other = write_synthetic_experiment(tmp_path / "other", SETTINGS.model_copy(update={"seed": 3}))
     for name, frames in frames_of(written).items():
         assert np.array_equal(frames_of(again)[name], frames)
         assert not np.array_equal(frames_of(other)[name], frames)
@@ -163,20 +163,20 @@ def test_progress_counts_the_frames_of_both_cameras_and_old_files_are_replaced(t
     few = SETTINGS.model_copy(update={"frames": 2, "image_size": (64, 60)})
     for _ in range(2):
         steps.clear()
-        path = write_experiment(tmp_path, few, steps.append)
+        path = write_synthetic_experiment(tmp_path, few, steps.append)
         assert sum(steps) == 4
     assert {len(frames) for frames in frames_of(path).values()} == {2}
 
 
 def test_a_momentary_exposure_gives_an_experiment_that_loads(tmp_path):
     few = SETTINGS.model_copy(update={"frames": 2, "image_size": (64, 60), "exposure": 0.0})
-    assert load_experiment(write_experiment(tmp_path, few)).exposure_s is None
+    assert load_experiment(write_synthetic_experiment(tmp_path, few)).exposure_s is None
 
 
 def test_the_exposure_lies_about_the_frames_time_also_in_frame_0(tmp_path):
     noiseless = {"frames": 2, "exposure": 0.004, "exposure_samples": 2, "read_noise": 0.0, "shot_noise": 0.0}
     settings = SETTINGS.model_copy(update=noiseless)
-    path = write_experiment(tmp_path, settings)
+    path = write_synthetic_experiment(tmp_path, settings)
     scene = make_scene(load_texture(path.parent / "texture.png"), settings)
     motion = random_motion(
         settings.velocity_rms,
@@ -198,7 +198,7 @@ def test_the_exposure_lies_about_the_frames_time_also_in_frame_0(tmp_path):
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="expected a folder that can be made"):
-        write_experiment(tmp_path / "file" / "folder", SETTINGS)
+        write_synthetic_experiment(tmp_path / "file" / "folder", SETTINGS)
 
 
 @pytest.mark.parametrize(

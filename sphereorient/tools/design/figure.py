@@ -16,7 +16,7 @@ from torch import Tensor
 from sphereorient.errors import OutputError, refusal
 from sphereorient.files.outputs import put_aside
 from sphereorient.report.plots.style import DPI, GREY, SHADE, WIDTH_IN, in_style, new_figure
-from sphereorient.sphere import SphereRenderer, orthographic_view, reduced_texture
+from sphereorient.sphere import orthographic_view, reduced_texture
 from sphereorient.tools.design.gores import Gores, painted_gore
 from sphereorient.tools.design.judge import Judgement, lon_lat
 from sphereorient.tools.design.paint import facing
@@ -207,7 +207,7 @@ def _named_views(judgement: Judgement) -> list[tuple[str, Tensor, str]]:
 
 def _views_part(part: Any, texture: Tensor, judgement: Judgement) -> None:
     size = max(16, SIDE_PX)
-    renderer = SphereRenderer(reduced_texture(texture, size), orthographic_view(size), outside=math.nan)
+    texture, view = reduced_texture(texture, size), orthographic_view(size)
     worst = judgement.bound_rad.argsort(descending=True)[:3]
     at = judgement.direction_body
     shown = [(("W", "", "")[n], facing(at[k]), judgement.bound_rad[k], WORST) for n, k in enumerate(worst.tolist())]
@@ -215,7 +215,9 @@ def _views_part(part: Any, texture: Tensor, judgement: Judgement) -> None:
     drawn = [(f"{name + ': ' if name else ''}{_degrees(float(bound))}", R, colour) for name, R, bound, colour in shown]
     drawn += [(f"{n + 1}: alike {judgement.alike:.2f}", R, ALIKE) for n, R in enumerate(judgement.alike_views)]
     for axes, (text, R, colour) in zip(part.subplots(1, len(drawn)), drawn, strict=True):
-        axes.imshow(renderer(R.float()).numpy(), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes.imshow(
+            view.render(texture, R.float(), math.nan).numpy(), cmap="gray", vmin=0, vmax=1, interpolation="nearest"
+        )
         circle = matplotlib.patches.Circle(
             (size / 2 - 0.5, size / 2 - 0.5), size / 2, fill=False, color=SHADE, lw=0.6, clip_on=False
         )

@@ -16,7 +16,7 @@ from sphereorient.errors import PaintError, refusal
 from sphereorient.evaluate.bound import cramer_rao_bound
 from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.settings import GreySearchSettings
-from sphereorient.sphere import DiskView, SphereRenderer, orthographic_view, reduced_texture
+from sphereorient.sphere import Sampling, orthographic_view, reduced_texture
 from sphereorient.tools.design.paint import border_length, facing, scaled_paint, stroke_deg, view_directions
 
 SEARCH = GreySearchSettings()  # normalisation and size of the views, as the search on grey values sees them
@@ -219,12 +219,15 @@ class _Look:
 
     def __init__(self, texture: Tensor) -> None:
         size = SEARCH.size_px
-        self._renderer = SphereRenderer(reduced_texture(texture.float(), size), orthographic_view(size))
+        self._texture, self._view = reduced_texture(texture.float(), size), orthographic_view(size)
         self._normalise = LocalNormalisation(size, detail=SEARCH.detail, window=SEARCH.window, clip=SEARCH.clip)
 
     def __call__(self, R_view_body: Tensor) -> Tensor:
         """Vectors (K, P) of length 1."""
-        parts = [self._normalise(self._renderer(some.float())) for some in torch.split(R_view_body, RENDERED)]
+        parts = [
+            self._normalise(self._view.render(self._texture, some.float()))
+            for some in torch.split(R_view_body, RENDERED)
+        ]
         return torch.cat(parts)
 
 
@@ -252,9 +255,8 @@ def _drafts(kinds: Sequence[str], stroke: float, tries: int, seed: int) -> list[
 
 def _white(texture: Tensor, R_view_body: Tensor) -> Tensor:
     """Share of each view (V,) that is white."""
-    view: DiskView = orthographic_view(SEARCH.size_px)
-    renderer = SphereRenderer(reduced_texture(texture.float(), SEARCH.size_px), view)
-    return renderer.disk(R_view_body.float()).mean(-1).double()
+    texture = reduced_texture(texture.float(), SEARCH.size_px)
+    return orthographic_view(SEARCH.size_px).paint(texture, R_view_body.float()).mean(-1).double()
 
 
 def _bounds(texture: Tensor, R_view_body: Tensor, settings: DesignSettings) -> Tensor:
@@ -263,7 +265,7 @@ def _bounds(texture: Tensor, R_view_body: Tensor, settings: DesignSettings) -> T
         R_view_body.float(),
         diameter_px=settings.diameter_px,
         noise_share=settings.noise_share,
-        supersampling=6 if settings.diameter_px < 40 else 4,
+        sampling=Sampling(supersampling=6 if settings.diameter_px < 40 else 4),
     )
     return bound.orientation_rms_rad.double()
 

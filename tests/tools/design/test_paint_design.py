@@ -118,7 +118,7 @@ def test_the_judgement_is_that_of_the_bound_and_knows_the_view_without_paint():
     texture = scaled_paint("dots", 15.0, 1, 128)
     texture = torch.where(direction[..., 0] > 0, texture, torch.ones_like(texture))
     judged = judge_paint(texture, FEW)
-    expected = cramer_rao_bound(texture, facing(judged.direction_body).float(), diameter_px=24, supersampling=6)
+    expected = cramer_rao_bound(texture, facing(judged.direction_body).float(), diameter_px=24)
     assert_close(judged.bound_rad, expected.orientation_rms_rad.double(), atol=1e-9)
     assert float(judged.direction_body[judged.worst, 0]) < -0.5 < 0.2 < float(judged.direction_body[judged.best, 0])
     assert float(judged.white.max()) > 0.97

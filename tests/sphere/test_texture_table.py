@@ -11,7 +11,7 @@ from conftest import assert_close
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.sphere import sample_texture
+from sphereorient.sphere import DirectionTable, orthographic_view, sample_texture
 from sphereorient.sphere.texture_table import (
     BASE_RAD,
     TextureTable,
@@ -296,3 +296,62 @@ def test_each_direction_is_looked_up_as_if_it_were_alone(shape):
 
 def test_the_same_map_gives_the_same_table():
     assert texture_table(map_of("dots"), 0.02, 128).rows.equal(texture_table(map_of("dots"), 0.02, 128).rows)
+
+
+# --- black and white, for banks
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("blobs", 1), ("patches", 2), ("dots", 3)])
+def test_the_table_differs_from_the_renderer_only_at_borders_of_paint(rng, kind, seed):
+    texture, view = random_texture(kind, seed, 128), orthographic_view(60)
+    R_view_body = so3.random_rotations(8, generator=rng, dtype=torch.float32)
+    table = DirectionTable(texture).render(R_view_body, view.normal_view)
+    assert table.dtype == torch.int8
+    assert set(table.unique().tolist()) == {-1, 1}
+    exact = view.paint(texture, R_view_body) >= 0.5
+    differs = (table > 0) != exact
+    assert 0 < differs.float().mean() < 0.03
+    # The middle of a cell of 1/64 lies within sqrt(3)/128 rad = 0.78 degrees: both paints must be that near.
+    direction = (view.normal_view @ R_view_body)[differs]
+    near = direction[:, None] + 0.01 * torch.randn(len(direction), 60, 3, generator=rng)
+    white = sample_texture(texture, near) >= 0.5
+    assert (white.any(1) & ~white.all(1)).all()
+
+
+def test_a_finer_table_differs_less(rng):
+    texture, view = random_texture("blobs", 1, 128), orthographic_view(60)
+    R_view_body = so3.random_rotations(10, generator=rng, dtype=torch.float32)
+    exact = view.paint(texture, R_view_body) >= 0.5
+    share = [
+        float(((DirectionTable(texture, cells).render(R_view_body, view.normal_view) > 0) != exact).float().mean())
+        for cells in (32, 64, 128)
+    ]
+    assert share[0] > 1.5 * share[1] > 2.25 * share[2]
+
+
+def test_the_direction_tables_answer_does_not_depend_on_the_others(rng):
+    table, view = DirectionTable(random_texture("blobs", 1, 32), 32), orthographic_view(20)
+    R_view_body = so3.random_rotations(70, generator=rng, dtype=torch.float32)  # more than two chunks
+    together = table.render(R_view_body, view.normal_view)
+    for k in (0, 31, 32, 69):
+        assert torch.equal(table.render(R_view_body[k : k + 1], view.normal_view)[0], together[k])
+    assert table.render(R_view_body[:0], view.normal_view).shape == (0, len(view.normal_view))
+
+
+def test_axes_of_the_cube_stay_within_the_table():
+    # Components of exactly 1, and a little above it, must not fall out of the last cell.
+    table = DirectionTable(random_texture("blobs", 1, 32), 16)
+    axes = torch.eye(3)
+    assert table.render(axes[None] * (1 + 5e-7), torch.cat([axes, -axes])).abs().eq(1).all()
+
+
+def test_a_cell_of_the_direction_table_holds_the_paint_at_its_middle():
+    # The equator is a border between cells: with the middles' paint the table of a half-white sphere is exact, and
+    # that of its negative is its negative. With the corners' paint one of the two is off by a cell.
+    north = torch.zeros(32, 64)
+    north[:16] = 1.0
+    view = orthographic_view(60)
+    upright = torch.tensor([[[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]])
+    up = torch.where(view.normal_view[:, 1] < 0, 1, -1).to(torch.int8)
+    assert torch.equal(DirectionTable(north, 64).render(upright, view.normal_view)[0], up)
+    assert torch.equal(DirectionTable(1 - north, 64).render(upright, view.normal_view)[0], -up)
