@@ -56,11 +56,12 @@ def train(
 def _draw(trained: Trained, out: Path) -> None:
     """Write the learning curve and the sheet of examples."""
     from sphereorient.learn.examples import make_examples
-    from sphereorient.report.learning import examples_figure, learning_curve_figure, write_png
+    from sphereorient.report.learning import examples_figure, learning_curve_figure
+    from sphereorient.report.plots.style import write_figure
 
     best_step = int(trained.checkpoint.about["best_step"])
-    write_png(learning_curve_figure(trained.rows, best_step), out / "learning_curve.png")
-    write_png(examples_figure(make_examples(trained.checkpoint, EXAMPLES)), out / "examples.png")
+    write_figure(learning_curve_figure(trained.rows, best_step), out / "learning_curve.png")
+    write_figure(examples_figure(make_examples(trained.checkpoint, EXAMPLES)), out / "examples.png")
 
 
 @app.command()

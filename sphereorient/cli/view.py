@@ -27,7 +27,7 @@ def view(
     if save is not None:
         check_writable(save)
     from sphereorient.experiment import load_experiment
-    from sphereorient.report.recording_view import view_track
+    from sphereorient.report.recording import view_track
     from sphereorient.trajectory import Trajectory
 
     measured = Trajectory.load(track)

@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from sphereorient.files.outputs import put_aside
 from sphereorient.learn.examples import Example
 from sphereorient.learn.judge import WITHIN_DEG
-from sphereorient.report.plots.marks import note
-from sphereorient.report.plots.style import ALL, DPI, GREY, SECOND, SHADE, WIDTH_IN, X, in_style, new_figure
+from sphereorient.report.plots.style import ALL, GREY, SECOND, SHADE, WIDTH_IN, X, in_style, new_figure, note
 
-RIGHT, WRONG = "#1A7F37", "#B42318"  # of frames about proposals; titles say it too
+RIGHT, WRONG = "#1A7F37", "#B42318"  # frames of proposals; the titles have a tick too
 SIDE_IN = 1.12  # of a picture of the sheet
-UNLIKELY = 0.005  # proposals of less are not shown
+UNLIKELY = 0.005  # proposals with a lower probability are not shown
 
 
 @in_style
 def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -> Figure:
-    """Draw loss and recall against the steps.
-
-    Args:
-        rows: of metrics.csv, the first before any step.
-        best_step: whose weights were kept.
-    """
+    """Draw loss and recall against the steps, of the rows of metrics.csv; the weights of `best_step` were kept."""
     figure = new_figure(WIDTH_IN, 2.7)
     left, right = figure.subplots(1, 2)
     _curve(left, rows, "train_nll", "training", {**SECOND.drawn, "marker": "x"})
@@ -46,8 +37,8 @@ def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -
         axes.legend(loc=corner, frameon=True, framealpha=0.9, edgecolor="none")
     note(
         figure,
-        "Validation: pictures of balls that training never sees. The loss cannot come to 0: right answers are spread "
-        "over the grid. That of the training is the mean of an epoch, while the weights change.",
+        "Validation: pictures of spheres that are not in the training data. The loss does not reach 0: right answers "
+        "are spread over the grid. The training loss is the mean of an epoch, while the weights change.",
     )
     return figure
 
@@ -55,7 +46,7 @@ def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -
 def _curve(axes: Axes, rows: Sequence[Mapping[str, float]], key: str, label: str, look: dict[str, Any]) -> None:
     there = [(row["step"], row[key]) for row in rows if key in row]
     steps, values = np.array(there, np.float64).reshape(-1, 2).T
-    # A marker a row, but no chain of them where there are many.
+    # A marker for each row, fewer if there are many.
     axes.plot(steps, values, label=label, markevery=max(len(steps) // 12, 1), **look)
 
 
@@ -71,7 +62,8 @@ def examples_figure(examples: Sequence[Example]) -> Figure:
             axes.grid(visible=False)
             axes.set_frame_on(False)
         row[0].imshow(example.disk.numpy(), cmap="gray", vmin=0, vmax=255)
-        row[0].set_xlabel(_wrapped(example.degradations), fontsize=5.5, labelpad=2)
+        names = "\n".join(name.replace("_", " ") for name in example.degradations) or "nothing"
+        row[0].set_xlabel(names, fontsize=5.5, labelpad=2)
         _paint(row[1], example.true_view)
         for k, axes in enumerate(row[2:]):
             _proposal(axes, example, k)
@@ -79,8 +71,8 @@ def examples_figure(examples: Sequence[Example]) -> Figure:
     panels[0, 1].set_title("true view", fontsize=7)
     note(
         figure,
-        f"Above proposals: their probability, and the angle to the truth; framed green with a tick where it is below "
-        f"{WITHIN_DEG:g}°, red where it is not. Below pictures: what spoils them. Proposals of less than "
+        f"Above proposals: probability and angle to the truth; framed green with a tick if it is below "
+        f"{WITHIN_DEG:g}°, else red. Below pictures: their degradations. Proposals of less than "
         f"{100 * UNLIKELY:g} % are left out.",
     )
     return figure
@@ -101,24 +93,10 @@ def _proposal(axes: Axes, example: Example, k: int) -> None:
 
 
 def _paint(axes: Axes, view: Tensor) -> None:
-    """Show paint as it is; grey beside the ball, or white paint would run into the page."""
+    """Show a view, grey outside the sphere to separate white paint from the page."""
     axes.set_facecolor(SHADE)
     axes.patch.set_visible(True)
     axes.set_frame_on(True)
     for side in axes.spines.values():
         side.set_visible(False)
     axes.imshow(np.ma.masked_invalid(view.numpy()), cmap="gray", vmin=0, vmax=1)
-
-
-def _wrapped(names: Sequence[str]) -> str:
-    return "\n".join(name.replace("_", " ") for name in names) if names else "nothing"
-
-
-def write_png(figure: Figure, path: Path) -> None:
-    """Write a figure; the same figure gives the same bytes.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    with put_aside(path) as aside, matplotlib.rc_context():
-        figure.savefig(aside, dpi=DPI, metadata={"Software": None})

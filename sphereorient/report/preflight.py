@@ -1,4 +1,4 @@
-"""The picture that comes with a check: what the cameras show, how they agree, the paint, and all findings."""
+"""The picture of a check: the cameras' views, their agreement, the texture map, and all findings."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -19,70 +17,68 @@ from sphereorient.preflight.diameter import expected_outline_px
 from sphereorient.preflight.gap import gaps_between
 from sphereorient.preflight.look import Look
 from sphereorient.preflight.offset import REACH
+from sphereorient.report.plots.style import AXIS_COLOURS, GREY, in_style, new_figure, say_empty, write_figure
 
-FOUND, EXPECTED, USED = "#009E73", "#D55E00", "#0072B2"  # Okabe and Ito's
-# Shape and colour both: readable without colours, and by colour-blind readers.
-MARKS = {
-    Severity.OK: ("\u25cf", "#009E73"),
-    Severity.WARNING: ("\u25b2", "#E69F00"),
-    Severity.FAULT: ("\u2716", "#D55E00"),
-}
+EXPECTED, FOUND, USED = AXIS_COLOURS
+# Shape and colour: readable without colours, and by colour-blind readers.
+MARKS = {Severity.OK: ("\u25cf", FOUND), Severity.WARNING: ("\u25b2", "#E69F00"), Severity.FAULT: ("\u2716", EXPECTED)}
 WIDTH, PICTURE, LINE = 13.0, 3.3, 0.165  # inches: of the figure, of a row of pictures, of a line of text
 CHARACTERS = 145  # in a line of the list
 
 
+@in_style
 def preflight_figure(result: Preflight, path: Path) -> None:
-    """Draw a frame of each camera with outlines, the gap against the frame offset, the paint, and the findings.
+    """Draw a frame of each camera with outlines, the gap against the frame offset, the texture map, and the findings.
 
     Args:
         result: of `preflight`.
         path: of the PNG or PDF to write.
     """
     lines = _lines(result)
-    heights = [PICTURE, PICTURE if result.steps is not None or result.texture is not None else 0.01]
-    heights.append(LINE * (len(lines) + 2))
-    figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
-    FigureCanvasAgg(figure)
+    compared = result.steps is not None or result.texture is not None
+    heights = [PICTURE, PICTURE if compared else 0.01, LINE * (len(lines) + 2)]
+    figure = new_figure(WIDTH, sum(heights))
     top, middle, bottom = np.ravel(figure.subfigures(3, 1, height_ratios=heights, squeeze=False))
     _cameras_part(top, result)
-    _agreement_part(middle, result)
-    _list_part(bottom, lines, heights[2])
+    if compared:
+        gap, balance, pair = middle.subplots(1, 3, width_ratios=[1.1, 1.5, 1.4])
+        _draw_gap(gap, result)
+        _draw_balance(balance, result)
+        _draw_alike(pair, result)
+    for k, (severity, title, text, advice) in enumerate(lines):
+        y = 1 - LINE * (k + 0.8) / heights[2]
+        if severity is not None:
+            mark, colour = MARKS[severity]
+            bottom.text(0.012, y, mark, color=colour, fontsize=9, va="center")
+            bottom.text(0.03, y, title, weight="bold", va="center")
+        bottom.text(0.18, y, text, va="center", style="italic" if advice else "normal")
     figure.suptitle(str(result.experiment.path), fontsize=10)
-    figure.savefig(path, dpi=110)
+    write_figure(figure, path, dpi=110)
 
 
 def _cameras_part(part: Any, result: Preflight) -> None:
-    """Per camera the whole frame and the ball, with the outline found and the one expected."""
-    looks = result.looks
-    chosen = _clearest(looks)
-    expected = _expected(result, chosen)
+    """Draw for each camera the whole frame and the sphere, with the outline found and the one expected."""
+    looks, expected, k = result.looks, {}, 0
+    if looks:  # the frame with the clearest outlines in all cameras
+        coverage = torch.stack([torch.nan_to_num(look.sightings.coverage, nan=-1.0) for look in looks]).amin(0)
+        k = int(coverage.argmax())
+    diameter_mm = result.experiment.diameter_mm
+    if len(looks) == 2 and diameter_mm is not None:
+        gaps = gaps_between([look.camera for look in looks], [look.sightings.centre_px[k : k + 1] for look in looks])
+        position = gaps.position_lab_mm[0]
+        if bool(torch.isfinite(position).all()):
+            outlines = {look.name: expected_outline_px(look.camera, position, diameter_mm / 2) for look in looks}
+            expected = {name: outline.numpy() for name, outline in outlines.items()}
     axes = part.subplots(1, 4)
-    for k, ax in enumerate(axes):
-        if k // 2 >= len(looks):
+    for place, ax in enumerate(axes):
+        ax.grid(visible=False)
+        if place // 2 >= len(looks):
             ax.set_axis_off()
             continue
-        look = looks[k // 2]
-        _draw_frame(ax, look, chosen, expected.get(look.name), near=k % 2 == 1)
-    if looks:
-        axes[0].legend(loc="lower left", fontsize=7, framealpha=0.8) if axes[0].lines else None
-
-
-def _clearest(looks: tuple[Look, ...]) -> int:
-    """The frame in which the outlines of all cameras are found best; the first where there is none."""
-    coverage = torch.stack([torch.nan_to_num(look.sightings.coverage, nan=-1.0) for look in looks]).amin(0)
-    return int(coverage.argmax())
-
-
-def _expected(result: Preflight, k: int) -> dict[str, NDArray[np.float64]]:
-    """Outlines where two cameras and the diameter say that they are, (n, 2) px."""
-    looks, diameter_mm = result.looks, result.experiment.diameter_mm
-    if len(looks) != 2 or diameter_mm is None:
-        return {}
-    gaps = gaps_between([look.camera for look in looks], [look.sightings.centre_px[k : k + 1] for look in looks])
-    place = gaps.position_lab_mm[0]
-    if not bool(torch.isfinite(place).all()):
-        return {}
-    return {look.name: expected_outline_px(look.camera, place, diameter_mm / 2).numpy() for look in looks}
+        look = looks[place // 2]
+        _draw_frame(ax, look, k, expected.get(look.name), near=place % 2 == 1)
+    if looks and axes[0].lines:
+        axes[0].legend(loc="lower left", frameon=True, framealpha=0.8)
 
 
 def _draw_frame(ax: Any, look: Look, k: int, expected: NDArray[np.float64] | None, near: bool) -> None:
@@ -109,49 +105,30 @@ def _draw_frame(ax: Any, look: Look, k: int, expected: NDArray[np.float64] | Non
     ax.set_title(f"{look.name}: {2 * outline.radius_px:.1f} px across", fontsize=9)
 
 
-def _agreement_part(part: Any, result: Preflight) -> None:
-    """Gap against frame offset, brightness of the views, the two views that look most alike."""
-    if result.steps is None and result.texture is None:
-        return
-    gap, balance, pair = part.subplots(1, 3, width_ratios=[1.1, 1.5, 1.4])
-    _draw_gap(gap, result)
-    _draw_balance(balance, result)
-    pair.set_axis_off()
-    if result.alike is None:
-        return
-    pair.set_title(
-        f"most alike, {math.degrees(result.alike.angle_rad):.0f} degrees apart: "
-        f"{100 * result.alike.score:.0f} % explained",
-        fontsize=9,
-    )
-    for k, view in enumerate(result.alike.pictures.numpy()):
-        inset = pair.inset_axes((0.02 + 0.5 * k, 0.0, 0.46, 0.98))
-        inset.imshow(view, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-        inset.set_axis_off()
-
-
 def _draw_gap(ax: Any, result: Preflight) -> None:
     steps = result.steps
     if steps is None:
         ax.set_axis_off()
-        ax.text(0.5, 0.5, "one camera: no gap", ha="center", va="center", transform=ax.transAxes, fontsize=9)
+        say_empty(ax, "one camera: no gap")
         return
     ax.plot(steps.offset, steps.gap_px, "o-", ms=4, lw=1.2, color=USED, label="gap")
-    ax.plot(steps.offset, steps.varying_px, ".:", ms=4, lw=1, color="#777777", label="without its constant part")
+    ax.plot(steps.offset, steps.varying_px, ".:", ms=4, lw=1, color=GREY, label="without its constant part")
     ax.axvline(0, lw=0.8, color="#444444")
     if not math.isnan(steps.best):
         ax.axvline(steps.best, ls="--", lw=1.2, color=EXPECTED, label=f"least at {steps.best:+.2f}")
     ax.set(xlabel=f"frames later in {steps.names[1]}", ylabel="gap of the lines of sight (px)")
     ax.set(xlim=(-REACH - 0.5, REACH + 0.5), ylim=(0, None))
     ax.xaxis.set_major_locator(MaxNLocator(9, integer=True))
-    ax.legend(fontsize=7, framealpha=0.8)
-    ax.set_title("are the movies in step", fontsize=9)
+    ax.legend(frameon=True, framealpha=0.8)
+    ax.set_title("synchronisation of the movies", fontsize=9)
 
 
 def _draw_balance(ax: Any, result: Preflight) -> None:
+    """Draw the texture map with the brightness of the views."""
+    ax.grid(visible=False)
     if result.texture is None or result.paint is None:
         ax.set_axis_off()
-        ax.text(0.5, 0.5, "no map of the paint", ha="center", va="center", transform=ax.transAxes, fontsize=9)
+        say_empty(ax, "no map of the paint")
         return
     span = (-180, 180, -90, 90)
     ax.imshow(result.texture.numpy(), cmap="gray", vmin=0, vmax=1, extent=span, interpolation="nearest")
@@ -162,17 +139,28 @@ def _draw_balance(ax: Any, result: Preflight) -> None:
         drawn = ax.contour(longitude, latitude, 100 * seen, levels=6, colors=EXPECTED, linewidths=1.2)
         ax.clabel(drawn, fmt="%.0f %%", fontsize=7)
     ax.set(xticks=[-180, -90, 0, 90, 180], yticks=[-90, 0, 90])
-    ax.tick_params(labelsize=7)
-    ax.set_xlabel("longitude on the ball (degrees)", fontsize=8)
-    ax.set_ylabel("latitude", fontsize=8)
+    ax.set(xlabel="longitude on the ball (degrees)", ylabel="latitude (degrees)")
     ax.set_title(
         f"the map; lines: brightness of the view from there, {100 * seen.min():.0f} to {100 * seen.max():.0f} %",
         fontsize=9,
     )
 
 
+def _draw_alike(ax: Any, result: Preflight) -> None:
+    """Draw the two views that look most alike."""
+    ax.set_axis_off()
+    if (alike := result.alike) is None:
+        return
+    title = f"most alike, {math.degrees(alike.angle_rad):.0f} degrees apart: {100 * alike.score:.0f} % explained"
+    ax.set_title(title, fontsize=9)
+    for k, view in enumerate(alike.pictures.numpy()):
+        inset = ax.inset_axes((0.02 + 0.5 * k, 0.0, 0.46, 0.98))
+        inset.imshow(view, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        inset.set_axis_off()
+
+
 def _lines(result: Preflight) -> list[tuple[Severity | None, str, str, bool]]:
-    """The list of findings, line by line: mark, title, text, whether it says what to do; faults first."""
+    """Return the findings line by line, faults first: mark, title, text, whether it is the remedy."""
     lines: list[tuple[Severity | None, str, str, bool]] = []
     order = list(Severity)
     for finding in sorted(result.findings, key=lambda one: -order.index(one.severity)):
@@ -184,13 +172,3 @@ def _lines(result: Preflight) -> list[tuple[Severity | None, str, str, bool]]:
         if finding.advice:
             lines += [(None, "", text, True) for text in textwrap.wrap(f"do: {finding.advice}", CHARACTERS)]
     return lines
-
-
-def _list_part(part: Any, lines: list[tuple[Severity | None, str, str, bool]], height: float) -> None:
-    for k, (severity, title, text, advice) in enumerate(lines):
-        y = 1 - LINE * (k + 0.8) / height
-        if severity is not None:
-            mark, colour = MARKS[severity]
-            part.text(0.012, y, mark, color=colour, fontsize=9, va="center")
-            part.text(0.03, y, title, fontsize=8, weight="bold", va="center")
-        part.text(0.18, y, text, fontsize=8, va="center", style="italic" if advice else "normal")

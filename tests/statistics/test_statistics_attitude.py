@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from statistics_examples import ensemble
 
-from sphereorient.statistics.attitude import euler_densities, five_dimensional, uniformity
+from sphereorient.statistics.isotropy import euler_densities, five_dimensional, uniformity
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
 

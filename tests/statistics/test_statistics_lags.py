@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from statistics_examples import STEP_S, ensemble, without
 
-from sphereorient.statistics.correlation import correlation, integral_time
-from sphereorient.statistics.increments import increment_density, increments
-from sphereorient.statistics.lags import Pairs
+from sphereorient.statistics.lags import Pairs, correlation, increment_density, increments, integral_time
 from sphereorient.statistics.settings import BootstrapSettings
 
 FEW = BootstrapSettings(resamples=200)

@@ -8,9 +8,8 @@ import torch
 
 from sphereorient.errors import TrackError
 from sphereorient.motion import gaussian_derivative, noise_gain
-from sphereorient.statistics.noise import multi_lag
+from sphereorient.statistics.noise import multi_lag, width_curve
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.statistics.widths import width_curve
 from sphereorient.synth.ensemble import EnsembleSpec, TrueTracks, draw_ensemble
 from sphereorient.synth.ensemble_tracks import filtered_track
 

@@ -11,10 +11,9 @@ from statistics_examples import ensemble, track
 from sphereorient.cameras import PinholeCamera
 from sphereorient.errors import TrackError
 from sphereorient.statistics.cameras import camera_distances, without_perspective
-from sphereorient.statistics.durations import durations
-from sphereorient.statistics.flow import comparisons, flow_scales
-from sphereorient.statistics.lift import lift
+from sphereorient.statistics.flow import comparisons, flow_scales, lift
 from sphereorient.statistics.moments import table_of_moments
+from sphereorient.statistics.segments import durations
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import CameraTrack
 
