@@ -18,11 +18,11 @@ def export(
     track: TrackPath,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")],
     to: Annotated[
-        str | None, typer.Option(help="csv, parquet or mat; without it the name's suffix tells.", metavar="FORMAT")
+        str | None, typer.Option(help="csv, parquet or mat; default: by the suffix of the name.", metavar="FORMAT")
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
 ) -> None:
-    """Write a track for other programs: a table, or arrays for MATLAB, units in the names."""
+    """Write a track for other programs: a table, or arrays for MATLAB, with units in the names."""
     from sphereorient.report.export import export_track, format_of
     from sphereorient.trajectory import Trajectory
 

@@ -29,7 +29,7 @@ def seen_path(texture: Path) -> Path:
 
 
 def write_texture(texture: Tensor, path: Path) -> None:
-    """Write a map (H, 2 H), 0 .. 1, NaN where unknown, as 8-bit picture: mid-grey where unknown; may raise OutputError."""
+    """Write a map (H, 2 H), 0 .. 1 or NaN, as 8-bit picture, mid-grey for NaN; may raise OutputError."""
     grey = torch.where(torch.isfinite(texture), 255 * texture, float(UNSEEN))
     _write_picture(grey.round().clamp(0, 255).byte().numpy(), path)
 

@@ -183,10 +183,7 @@ def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[dict[str,
         (f"{frames:,}", "frames"),
         (f"{100 * valid / max(frames, 1):.4g} %", "valid"),
         (f"{summary.ensemble.segments:,}", "segment" if summary.ensemble.segments == 1 else "segments"),
-        (
-            f"{np.rad2deg(np.median(sigma)):.2g}\u00b0" if len(sigma) else "unknown",
-            "stated error of the orientation, median",
-        ),
+        (median, "stated error of the orientation, median"),
     ]
     for quantity in ("velocity", "omega_lab"):
         part = summary.table[quantity]
