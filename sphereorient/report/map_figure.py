@@ -183,7 +183,7 @@ def _draw_arrows(axes: Axes, comparison: MapComparison) -> float:
     times = max([step for step in (1, 2, 5, 10, 20, 50) if step * largest <= 2 * LEAST_ARROW_DEG], default=1)
     # The map stretches longitudes away from the equator.
     along = moved[:, 0] / latitude.cos().clamp_min(0.1)
-    style = {"angles": "xy", "scale_units": "xy", "scale": 1, "color": ARROW, "width": 0.0022}
+    style: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "color": ARROW, "width": 0.0022}
     axes.quiver(
         *(torch.rad2deg(part).numpy() for part in (longitude, latitude)),
         *(times * part.numpy() for part in (along, moved[:, 1])),

@@ -51,7 +51,7 @@ class OverlayView:
 
     def centre_px(self, seen: CameraTrack, k: int) -> NDArray[np.float64]:
         """Return the track's centre in frame k, or what the camera alone sees without one; NaN if neither is known."""
-        return self.trail_px[k] if self.placed(k) else seen.centre_px[k]
+        return np.asarray(self.trail_px[k] if self.placed(k) else seen.centre_px[k])
 
     def placed(self, k: int) -> bool:
         """Whether the track has a position in frame k."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -125,7 +125,7 @@ def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"
     for i, style in enumerate(COMPONENTS):
         at = np.arange(len(shares)) + (i - 1) * BAR
         value, low, high = (np.array([float(getattr(s, key)[i]) for s in shares]) for key in ("value", "low", "high"))
-        drawn = {"color": style.colour, "edgecolor": "white", "hatch": style.hatch}
+        drawn: dict[str, Any] = {"color": style.colour, "edgecolor": "white", "hatch": style.hatch}
         bars.append(axes.bar(at, value - floor, BAR, bottom=floor, label=style.name, **drawn))
         there = np.isfinite(low) & np.isfinite(high)
         axes.vlines(at[there], np.maximum(low[there], floor), high[there], color="black", linewidth=1.0)
