@@ -88,7 +88,7 @@ def test_increments_of_independent_values_have_half_the_excess():
     assert found.flatness.value[0, 3] == pytest.approx(4.5, rel=0.05)
 
 
-def test_increments_over_one_frame_have_the_accelerations_tails():  # ERRATA E7
+def test_increments_over_one_frame_have_the_accelerations_tails():  # docs/errata.md E7
     alpha = np.random.default_rng(5).laplace(size=(60_000, 3))
     omega = np.cumsum(alpha, axis=0)
     found = increments(ensemble([200] * 300, omega_lab=omega), lags_s=[STEP_S, 100 * STEP_S], settings=FEW)
