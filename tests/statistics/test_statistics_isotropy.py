@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from statistics_examples import ensemble
 
 from sphereorient.statistics.isotropy import (
