@@ -34,7 +34,7 @@ def ready():
 
 
 def looking_along_y(tmp_path):
-    """The check of signs of docs/conventions.md: a camera that looks along lab +y, lab z up, 200 mm before the origin."""
+    """The check of signs of docs/conventions.md: a camera looks along lab +y, lab z up, 200 mm before the origin."""
     text = """schema: sphereorient-cameras/1
 cameras:
   cam: {model: pinhole, f_px: 1000.0, centre: [100, 100], image_size: [201, 201],
