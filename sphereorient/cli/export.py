@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable, progress_bar
-from sphereorient.files.outputs import put_aside
 
 TrackPath = Annotated[Path, typer.Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")]
 
@@ -29,7 +28,7 @@ def export(
     to = format_of(out, to)
     check_writable(out)
     loaded = Trajectory.load(track)
-    with progress_bar(quiet) as advance, put_aside(out) as aside:
-        export_track(loaded, aside, to, lambda done, total: advance("export", done, total))
+    with progress_bar(quiet) as advance:
+        export_track(loaded, out, to, lambda done, total: advance("export", done, total))
     if not quiet:
         typer.echo(f"Wrote {out}: {len(loaded)} frames")

@@ -9,7 +9,6 @@ import typer
 
 from sphereorient.cli.app import ExperimentPath, app, camera_names, check_writable, frame_range, progress_bar
 from sphereorient.errors import OutputError, SettingsError, refusal
-from sphereorient.files.outputs import put_aside
 
 
 @app.command()
@@ -47,10 +46,7 @@ def overlay(
             chosen = FrameSelection(cameras=names, first=span[0], last=span[1], every=every)
             shown = overlay_movie(seen, loaded, out, chosen, fps, lambda *at: advance("overlay", *at))
         if worst is not None:
-            with put_aside(worst) as aside:
-                bad = worst_frames(
-                    seen, loaded, aside, count, cameras=names, progress=lambda *at: advance("worst", *at)
-                )
+            bad = worst_frames(seen, loaded, worst, count, cameras=names, progress=lambda *at: advance("worst", *at))
     if not quiet and out is not None:
         typer.echo(f"Wrote {out}: {shown} frames")
     if not quiet and worst is not None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sphereorient.errors import OutputError, refusal
+from sphereorient.files.outputs import put_aside
 from sphereorient.report.export_columns import (
     REASON,
     Dataset,
@@ -38,7 +39,7 @@ def export_track(track: Trajectory, path: Path, to: str, progress: Advance = lam
 
     Args:
         track: what to write.
-        path: written in place; pass a temporary name if an old file matters.
+        path: written whole or not at all.
         to: csv, parquet or mat.
         progress: called with frames done and all frames.
 
@@ -48,12 +49,8 @@ def export_track(track: Trajectory, path: Path, to: str, progress: Advance = lam
     if to not in WRITERS:
         do = f"choose one of {', '.join(WRITERS)}"
         raise OutputError(refusal("--to", expected="a known format", got=repr(to)[:60], do=do))
-    try:
-        WRITERS[to](track, path, progress)
-    except OSError as error:
-        do = "choose a folder that exists, may be written and has room"
-        got = f"'{error.strerror or error}'"
-        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
+    with put_aside(path) as aside:
+        WRITERS[to](track, aside, progress)
 
 
 def format_of(path: Path, to: str | None) -> str:

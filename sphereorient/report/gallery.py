@@ -17,6 +17,7 @@ from PIL import Image
 
 from sphereorient.errors import OutputError, refusal
 from sphereorient.experiment import Experiment
+from sphereorient.files.outputs import put_aside
 from sphereorient.movies import Grey
 from sphereorient.report import overlay_canvas as ink
 from sphereorient.report.frame_warnings import BadFrame, choose_worst, frame_warnings
@@ -200,12 +201,8 @@ def worst_frames(
         for done, (k, pictures) in enumerate(pictures_by_row(streams, np.array(sorted(places), np.int64)), start=1):
             _tile(canvas, page, bad[places[k]], places[k], pictures)
             progress(done, len(bad))
-    try:
-        Image.fromarray(canvas.finished()).save(path)
-    except OSError as error:
-        do = "choose a folder that exists, may be written and has room"
-        got = f"'{error.strerror or error}'"
-        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
+    with put_aside(path) as aside:
+        Image.fromarray(canvas.finished()).save(aside)
     return bad
 
 
