@@ -96,29 +96,43 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> QualityStrip:
         track: what was measured.
         numbers: (N,), the experiment's numbers of the frames; None: by their times.
     """
-    bins = _Bins(len(track), max(1, -(-len(track) // MOST_BINS)))
+    size = max(1, -(-len(track) // MOST_BINS))
+    rows, starts = np.arange(len(track)), np.arange(0, len(track), size)
     numbers = frame_numbers(track) if numbers is None else numbers
     status = status_of(track)
     codes, words = _reason_codes(track)
-    row = bins.row_of(status)
     seen = [camera.orientation for camera in track.cameras.values()]
+
+    def first(wanted: NDArray[np.bool_]) -> Ints:
+        """Return the first such frame of every bin; the bin's first frame if there is none."""
+        found = np.minimum.reduceat(np.where(wanted, rows, len(track)), starts)
+        return np.where(found < len(track), found, starts)
+
+    def largest(values: Floats) -> Floats:
+        return np.asarray(np.fmax.reduceat(values, starts), np.float64)
+
+    row = first(status == np.repeat(np.maximum.reduceat(status, starts), size)[: len(track)])
     return QualityStrip(
         name=track.experiment,
         frames=len(track),
-        per_bin=bins.size,
+        per_bin=size,
         counts=_counted(status),
         row=tuple(row.tolist()),
         number=tuple(numbers[row].tolist()),
         time_s=_short(track.time[row], 9),
         status=tuple(status[row].tolist()),
-        orientation_error_deg=_short(bins.largest(np.rad2deg(stated_error(track.orientation_cov)))),
-        position_error_mm=_short(bins.largest(stated_error(track.position_cov))),
+        orientation_error_deg=_short(largest(np.rad2deg(stated_error(track.orientation_cov)))),
+        position_error_mm=_short(largest(stated_error(track.position_cov))),
         cameras=tuple(
-            CameraStrip(name=name, score=_short(-bins.largest(-camera.score)), reason=bins.first_not_zero(codes[name]))
+            CameraStrip(
+                name=name,
+                score=_short(-largest(-camera.score)),
+                reason=tuple(codes[name][first(codes[name] != 0)].tolist()),
+            )
             for name, camera in track.cameras.items()
         ),
-        apart_deg=_short(bins.largest(distance_deg(*seen))) if len(seen) == 2 else None,
-        flags=bins.any_bit(_shown_flags(track)),
+        apart_deg=_short(largest(distance_deg(*seen))) if len(seen) == 2 else None,
+        flags=tuple(np.bitwise_or.reduceat(_shown_flags(track), starts).tolist()),
         status_words=STATUS_WORDS,
         reason_words=words,
         flag_words=tuple((int(flag), words) for flag, words in FLAG_WORDS.items()),
@@ -175,38 +189,6 @@ def frame_numbers(track: Trajectory) -> Ints:
     # Times of a table or a camera's clock do not give numbers.
     even = bool((np.abs(at - number) < 0.1).all() and (np.diff(number) > 0).all())
     return number if even else rows
-
-
-class _Bins:
-    """Bins of `size` frames."""
-
-    def __init__(self, frames: int, size: int) -> None:
-        self.frames, self.size, self.count = frames, size, -(-frames // size)
-
-    def _split(self, values: NDArray[Any], fill: Any) -> NDArray[Any]:
-        """Return (count, size), the last bin filled up."""
-        padded = np.full(self.count * self.size, fill, values.dtype)
-        padded[: self.frames] = values
-        return padded.reshape(self.count, self.size)
-
-    def row_of(self, status: Ints) -> Ints:
-        """Return the first frame of the worst status of every bin."""
-        within = self._split(status, -1).argmax(1) if self.count else np.zeros(0, np.int64)
-        return np.asarray(np.arange(self.count) * self.size + within, np.int64)
-
-    def largest(self, values: Floats) -> Floats:
-        """Return the largest value of every bin; NaN if all are."""
-        return np.asarray(np.fmax.reduce(self._split(values, np.nan), axis=1, initial=np.nan), np.float64)
-
-    def first_not_zero(self, codes: Ints) -> tuple[int, ...]:
-        """Return the first code of every bin that is not 0; 0 if all are."""
-        split = self._split(codes, 0)
-        at = (split != 0).argmax(1) if self.count else np.zeros(0, np.int64)
-        return tuple(split[np.arange(self.count), at].tolist())
-
-    def any_bit(self, flags: Ints) -> tuple[int, ...]:
-        """Return the bits of all frames of every bin."""
-        return tuple(np.bitwise_or.reduce(self._split(flags, 0), axis=1).tolist())
 
 
 def _groups(track: Trajectory) -> tuple[Ints, list[list[str]]]:
