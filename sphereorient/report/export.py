@@ -34,23 +34,23 @@ ROWS = 50_000  # written at once
 Advance = Callable[[int, int], None]
 
 
-def export_track(track: Trajectory, path: Path, to: str, progress: Advance = lambda done, total: None) -> None:
+def export_track(
+    track: Trajectory, path: Path, to: str | None = None, progress: Advance = lambda done, total: None
+) -> None:
     """Write all frame-wise datasets of a track, with units in their names, and its metadata; NaN stays NaN.
 
     Args:
         track: what to write.
         path: written whole or not at all.
-        to: csv, parquet or mat.
+        to: csv, parquet or mat; None: by the suffix.
         progress: called with frames done and all frames.
 
     Raises:
         OutputError: an unknown format, a package that is not installed, or a file that cannot be written.
     """
-    if to not in WRITERS:
-        do = f"choose one of {', '.join(WRITERS)}"
-        raise OutputError(refusal("--to", expected="a known format", got=repr(to)[:60], do=do))
+    write = WRITERS[format_of(path, to)]
     with put_aside(path) as aside:
-        WRITERS[to](track, aside, progress)
+        write(track, aside, progress)
 
 
 def format_of(path: Path, to: str | None) -> str:
