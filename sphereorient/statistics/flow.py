@@ -18,29 +18,23 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class FlowScales:
-    """Kolmogorov's scales with viscosity and dissipation; made by `flow_scales`."""
-
-    viscosity_m2_s: float
-    dissipation_w_kg: float
-    eta_m: float
-    tau_eta_s: float
-
-
-def flow_scales(viscosity_m2_s: float, dissipation_w_kg: float) -> FlowScales:
-    """Return eta = (nu^3 / epsilon)^(1/4) and tau_eta = (nu / epsilon)^(1/2).
-
-    Args:
-        viscosity_m2_s: kinematic viscosity of the liquid in use, for example of water-glycerol.
-        dissipation_w_kg: energy dissipated per mass, W/kg.
+    """Kolmogorov's scales of a liquid in use, for example of water-glycerol.
 
     Source: Kolmogorov 1941; docs/errata.md A5 for the paper's values, which are water's.
     """
-    return FlowScales(
-        viscosity_m2_s=viscosity_m2_s,
-        dissipation_w_kg=dissipation_w_kg,
-        eta_m=(viscosity_m2_s**3 / dissipation_w_kg) ** 0.25,
-        tau_eta_s=(viscosity_m2_s / dissipation_w_kg) ** 0.5,
-    )
+
+    viscosity_m2_s: float  # kinematic
+    dissipation_w_kg: float  # energy dissipated per mass
+
+    @property
+    def eta_m(self) -> float:
+        """Length, (nu^3 / epsilon)^(1/4)."""
+        return float((self.viscosity_m2_s**3 / self.dissipation_w_kg) ** 0.25)
+
+    @property
+    def tau_eta_s(self) -> float:
+        """Time, (nu / epsilon)^(1/2)."""
+        return float((self.viscosity_m2_s / self.dissipation_w_kg) ** 0.5)
 
 
 @dataclass(frozen=True, kw_only=True)

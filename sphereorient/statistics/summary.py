@@ -14,7 +14,7 @@ import numpy as np
 from sphereorient.errors import TrackError
 from sphereorient.statistics.bootstrap import FEWEST
 from sphereorient.statistics.density import Density, density
-from sphereorient.statistics.flow import Comparison, FlowScales, Lift, comparisons, flow_scales, lift
+from sphereorient.statistics.flow import Comparison, FlowScales, Lift, comparisons, lift
 from sphereorient.statistics.isotropy import (
     EulerDensity,
     FrameOfRow,
@@ -62,7 +62,7 @@ class Surroundings:
         """The flow's scales; None if viscosity or dissipation is unknown."""
         if self.viscosity_m2_s is None or self.dissipation_w_kg is None:
             return None
-        return flow_scales(self.viscosity_m2_s, self.dissipation_w_kg)
+        return FlowScales(viscosity_m2_s=self.viscosity_m2_s, dissipation_w_kg=self.dissipation_w_kg)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from statistics_examples import ensemble
 
-from sphereorient.statistics.flow import comparisons, flow_scales, lift
+from sphereorient.statistics.flow import FlowScales, comparisons, lift
 from sphereorient.statistics.moments import table_of_moments
 from sphereorient.statistics.settings import BootstrapSettings
 
@@ -15,7 +15,7 @@ FEW = BootstrapSettings(resamples=200)
     ("viscosity", "dissipation", "eta_um", "tau_ms"), [(1e-6, 1.0, 31.6, 1.0), (8e-6, 1.7, 131.7, 2.17)]
 )
 def test_kolmogorovs_scales_of_water_and_of_the_mix(viscosity, dissipation, eta_um, tau_ms):  # docs/errata.md A5
-    found = flow_scales(viscosity, dissipation)
+    found = FlowScales(viscosity_m2_s=viscosity, dissipation_w_kg=dissipation)
     assert found.eta_m * 1e6 == pytest.approx(eta_um, rel=1e-3)
     assert found.tau_eta_s * 1e3 == pytest.approx(tau_ms, rel=2e-3)
 
@@ -26,7 +26,7 @@ def test_dimensionless_numbers_that_a_person_works_out_by_hand():
         name: scale * rng.choice([-1.0, 1.0], (1000, 3)) for name, scale in (("velocity", 0.36), ("omega_lab", 8.0))
     }
     table = table_of_moments(ensemble([100] * 10, **values), FEW)
-    flow = flow_scales(8e-6, 1.7)
+    flow = FlowScales(viscosity_m2_s=8e-6, dissipation_w_kg=1.7)
     rows = comparisons(table, 18.0, flow, u_rms_m_s=0.6, integral_length_m=0.03)
     found = {row.formula: row.value for row in rows}
     assert found["u_rms / D"] == pytest.approx(33.333, rel=1e-3)
