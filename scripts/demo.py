@@ -8,13 +8,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from demo_figure import demo_figure
 from rich.console import Console
 
 from sphereorient.cli.app import progress_bar
 from sphereorient.cli.score import error_table
 from sphereorient.evaluate import score_track
 from sphereorient.experiment import load_experiment
-from sphereorient.report import demo_figure
 from sphereorient.run.stages import track_movies
 
 REPO = Path(__file__).resolve().parents[1]

@@ -33,8 +33,9 @@ from sphereorient.mapping.chain import find_chain
 from sphereorient.mapping.cut import disks_of
 from sphereorient.methods.results import map_track
 from sphereorient.methods.settings import Settings, load_settings
-from sphereorient.report.map_figure import compare_pictures, map_figure, write_figure
+from sphereorient.report.map_figure import compare_pictures, map_figure
 from sphereorient.report.map_files import write_learnt, write_texture
+from sphereorient.report.plots.style import write_figure
 from sphereorient.trajectory import Trajectory
 
 REPO = Path(__file__).resolve().parents[1]

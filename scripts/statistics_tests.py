@@ -21,8 +21,7 @@ from rich.progress import track as shown
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from sphereorient.statistics.attitude import uniformity
-from sphereorient.statistics.isotropy import anisotropic_frame, isotropy
+from sphereorient.statistics.isotropy import anisotropic_frame, isotropy, uniformity
 from sphereorient.statistics.segments import ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, exact_track

@@ -60,6 +60,7 @@ def compare_maps_(
 def _compare_two(new: Path, old: Path, out: Path | None, *, turned: bool, as_json: bool) -> None:
     from sphereorient.mapping.compare import CHANGED, compare_maps, paint_change, turned_map, without_changed
     from sphereorient.report import map_figure
+    from sphereorient.report.plots.style import write_figure
     from sphereorient.so3 import angle
 
     after, before = _known_map(new), _known_map(old)
@@ -69,7 +70,7 @@ def _compare_two(new: Path, old: Path, out: Path | None, *, turned: bool, as_jso
     known = change[change.isfinite()]
     changed = float((known.abs() > CHANGED).float().mean()) if len(known) else math.nan
     if out is not None:
-        map_figure.write_figure(map_figure.moved_figure(before, comparison, change), out)
+        write_figure(map_figure.moved_figure(before, comparison, change), out)
     if as_json:
         typer.echo(json.dumps(_numbers(comparison, changed)))
         return
@@ -84,7 +85,7 @@ def _compare_two(new: Path, old: Path, out: Path | None, *, turned: bool, as_jso
 
 
 def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
-    from sphereorient.report import map_figure
+    from sphereorient.report.plots.style import write_figure
     from sphereorient.tools.wear import figure as wear_figure
     from sphereorient.tools.wear.series import wear_series
 
@@ -92,7 +93,7 @@ def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json
     found = wear_series(known, turned)
     names = _short(maps)
     if out is not None:
-        map_figure.write_figure(wear_figure.wear_figure(known[0], found, names), out)
+        write_figure(wear_figure.wear_figure(known[0], found, names), out)
     if as_json:
         typer.echo(json.dumps(_series_numbers(found, [str(path) for path in maps])))
         return

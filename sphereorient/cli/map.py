@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sphereorient.mapping import LearntMap
     from sphereorient.mapping.correct import Correction
     from sphereorient.methods.settings import Settings
-    from sphereorient.report.map_figure import Example
+    from sphereorient.report.map_figure import MapExample
     from sphereorient.trajectory import Trajectory
 
 OFTEN = 10  # pictures from which on a place counts as well seen
@@ -142,21 +142,22 @@ def _learn(path: Path, names: list[str] | None, settings: Settings, old: Tensor 
         )
 
 
-def _write(made: Made, old: Tensor | None, paths: MapPaths) -> list[Example]:
+def _write(made: Made, old: Tensor | None, paths: MapPaths) -> list[MapExample]:
     """Write all files; return how well re-rendered pictures match."""
     from sphereorient.report import map_figure, map_files
+    from sphereorient.report.plots.style import write_figure
 
     map_files.write_texture(made.learnt.texture, paths.texture)
     map_files.write_seen(made.learnt.seen, paths.seen)
     map_files.write_learnt(made.learnt, made.track, paths.learnt)
     compared = map_figure.compare_pictures(made.track, made.experiment, paths.texture)
-    map_figure.write_figure(map_figure.map_figure(made.learnt, compared), paths.figure)
+    write_figure(map_figure.map_figure(made.learnt, compared), paths.figure)
     if made.correction is not None and old is not None:
-        map_figure.write_figure(map_figure.moved_figure(old, made.correction.comparison), paths.moved)
+        write_figure(map_figure.moved_figure(old, made.correction.comparison), paths.moved)
     return compared
 
 
-def _print(learnt: LearntMap, compared: list[Example]) -> None:
+def _print(learnt: LearntMap, compared: list[MapExample]) -> None:
     """Say what was learnt from what, and whether to believe it."""
     import numpy as np
 

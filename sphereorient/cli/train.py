@@ -37,7 +37,7 @@ def train(
     settings = load_proposer_settings(config, set_ or [])
     from sphereorient.learn.benchmark import make_examples
     from sphereorient.learn.train import CHECKPOINT, prepare, train_proposer
-    from sphereorient.report.learning import examples_figure, learning_curve_figure, write_png
+    from sphereorient.report.learning import examples_figure, learning_curve_figure
 
     prepare(settings, out, resume)
     with put_aside(out / "settings.yaml") as aside:
@@ -45,8 +45,8 @@ def train(
     with progress_bar(quiet, unit="steps") as advance:
         trained = train_proposer(settings, out, resume=resume, progress=advance)
     curve = learning_curve_figure(trained.rows, int(trained.checkpoint.about["best_step"]))
-    write_png(curve, out / "learning_curve.png")
-    write_png(examples_figure(make_examples(trained.checkpoint, EXAMPLES)), out / "examples.png")
+    write_figure(curve, out / "learning_curve.png")
+    write_figure(examples_figure(make_examples(trained.checkpoint, EXAMPLES)), out / "examples.png")
     if not quiet:
         metrics = trained.metrics
         typer.echo(

@@ -16,18 +16,18 @@ from sphereorient.files.outputs import put_aside
 def view(
     track: Annotated[Path, typer.Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")],
     experiment: Annotated[
-        Path | None, typer.Option(help="experiment.yaml it was measured from: adds cameras, paint and pictures.")
+        Path | None, typer.Option(help="experiment.yaml of the track: adds cameras, texture and pictures.")
     ] = None,
     save: Annotated[Path | None, typer.Option(help="Write this .rrd instead of opening a window.")] = None,
-    every: Annotated[int, typer.Option(min=1, help="Put in the pictures of one of so many frames.")] = 1,
-    pictures: Annotated[bool, typer.Option(help="Put in the pictures of the movies.")] = True,
+    every: Annotated[int, typer.Option(min=1, help="Include the pictures of one of so many frames.")] = 1,
+    pictures: Annotated[bool, typer.Option(help="Include the pictures of the movies.")] = True,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
 ) -> None:
-    """Show a track in space and time with Rerun: cameras, pictures, the sphere, its motion, its doubts."""
+    """Show a track in space and time with Rerun: cameras, pictures, the sphere, its motion, its warnings."""
     if save is not None:
         check_writable(save)
     from sphereorient.experiment import load_experiment
-    from sphereorient.report.recording_view import view_track
+    from sphereorient.report.recording import view_track
     from sphereorient.trajectory import Trajectory
 
     measured = Trajectory.load(track)

@@ -1,7 +1,6 @@
-"""Pictures of tracks and calibrations."""
+"""Pictures of tracks and calibrations; figures, tables and the page of a report; export to other programs."""
 
 from sphereorient.report.calibration import calibration_figure
-from sphereorient.report.figure import demo_figure
 from sphereorient.report.preflight import preflight_figure
 
-__all__ = ["calibration_figure", "demo_figure", "preflight_figure"]
+__all__ = ["calibration_figure", "preflight_figure"]

@@ -9,23 +9,27 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from sphereorient.errors import OutputError, refusal
+from sphereorient.errors import ExperimentError, OutputError, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.report import plots
-from sphereorient.report.belonging import experiments_of, surroundings_of
 from sphereorient.report.gallery import gallery
-from sphereorient.report.page import Drawn, page_html
-from sphereorient.report.strip import stretches
-from sphereorient.report.strip_html import strip_html
+from sphereorient.report.page import DrawnFigure, Report, page_html, strip_html
+from sphereorient.report.strip import bad_stretches
 from sphereorient.report.tables import tables_of, write_tables
 from sphereorient.report.verdicts import Verdict, verdicts
-from sphereorient.statistics import StatisticsSettings, Summary, summarise
+from sphereorient.statistics import StatisticsSettings, Summary, Surroundings, summarise
 from sphereorient.statistics.cameras import CameraDistance, camera_distances, without_perspective
 from sphereorient.trajectory import Trajectory
 
 PARTS = ("index.html", "figures", "tables")
 MOST_STRIPS = 8  # tracks shown frame by frame
-PICTURES = 120  # frames of a report whose pictures are embedded
+PICTURES = 120  # frames of a report with pictures
+FLOW_KEYS = {
+    "viscosity": "viscosity_m2_s",
+    "dissipation": "dissipation_w_kg",
+    "u_rms": "u_rms_m_s",
+    "integral_length": "integral_length_m",
+}
 Progress = Callable[[str, int, int], None]
 
 
@@ -42,63 +46,97 @@ def write_report(
 
     Args:
         tracks: by the name of their file.
-        out: folder; it is made, or replaced where it holds an older report and nothing else.
+        out: folder; it is made, or replaced if it contains only an older report.
         experiments: those of the tracks, for the pictures, the sphere's diameter and the flow.
         settings: of the statistics.
         progress: called with stage, steps done and all steps.
         command: as the user gave it.
 
     Returns:
-        What the numbers say, as it stands on the page.
+        The findings in words, as on the page.
 
     Raises:
-        TrackError: no usable frame, or tracks that do not go together.
-        ExperimentError: an experiment of no track, or experiments that contradict each other.
-        OutputError: `out` cannot be written, or holds something else.
+        TrackError: no usable frame, or tracks of kernels and of smoothers together.
+        ExperimentError: an experiment without a track, or experiments that contradict each other.
+        OutputError: `out` cannot be written, or contains something else.
     """
-    known = experiments_of(tracks, experiments)
+    known = match_experiments(tracks, experiments)
     around = surroundings_of(experiments)
+    names = list(tracks)
+    name = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
     summary = summarise(
-        list(tracks.values()), settings, around, lambda done, total: progress("numbers", done, total), _named(tracks)
+        list(tracks.values()), settings, around, lambda done, total: progress("numbers", done, total), name
     )
-    distances = _distances(tracks, known)
+    rough = [None if (e := known[key]) is None else without_perspective(tracks[key], e.cameras) for key in tracks]
+    distances = camera_distances(list(tracks.values()), rough)
     words = verdicts(summary, tracks, distances)
     with _folder(out) as aside:
         tables = tables_of(summary, tracks, distances)
-        suffixes = write_tables(tables, aside / "tables")
-        figures = _draw_all(summary, tracks, distances, aside / "figures", progress)
-        page = page_html(
-            summary,
-            tracks,
-            words,
-            figures,
-            tables,
-            suffixes,
-            list(_strips(tracks, known, progress)),
-            command,
+        report = Report(
+            summary=summary,
+            tracks=tracks,
+            verdicts=words,
+            tables=tables,
+            suffixes=write_tables(tables, aside / "tables"),
+            figures=_draw_all(list(_figures(summary, tracks, distances)), aside / "figures", progress),
+            strips=list(_strips(tracks, known, progress)),
+            command=command,
         )
-        (aside / "index.html").write_text(page, "utf-8")
+        (aside / "index.html").write_text(page_html(report), "utf-8")
     return words
 
 
-def _named(tracks: Mapping[str, Trajectory]) -> str:
-    names = list(tracks)
-    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+def match_experiments(
+    tracks: Mapping[str, Trajectory], experiments: Sequence[Experiment]
+) -> dict[str, Experiment | None]:
+    """Return the experiment of each track by its name, None without one; a single one belongs to a single track.
+
+    Raises:
+        ExperimentError: an experiment without a track, or two of one name.
+    """
+    if len(tracks) == 1 and len(experiments) == 1:
+        return dict.fromkeys(tracks, experiments[0])
+    known: dict[str, Experiment] = {}
+    wanted = {track.experiment for track in tracks.values()}
+    for experiment in experiments:
+        name = experiment.name
+        if name in known:
+            do = "give them different names (key `name`), or report them one by one"
+            got = f"{known[name].path} and {experiment.path}"
+            raise ExperimentError(refusal(f"--experiment '{name}'", expected="one of a name", got=got, do=do))
+        known[name] = experiment
+    for name, experiment in known.items():
+        if name not in wanted:
+            do = "pass the experiment.yaml that the track was measured from"
+            expected = f"the name of one of {', '.join(sorted(wanted)[:5])}"
+            raise ExperimentError(refusal(str(experiment.path), expected=expected, got=name, do=do))
+    return {name: known.get(track.experiment) for name, track in tracks.items()}
 
 
-def _distances(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment | None]) -> list[CameraDistance]:
-    rough = [
-        None if (known := experiments[name]) is None else without_perspective(track, known.cameras)
-        for name, track in tracks.items()
-    ]
-    return camera_distances(list(tracks.values()), rough)
+def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
+    """Return the properties of sphere and flow of the experiments of a report.
+
+    Raises:
+        ExperimentError: they contradict each other.
+    """
+    known: dict[str, float] = {}
+    for experiment in experiments:
+        found = {FLOW_KEYS[key]: value for key, value in experiment.flow.items() if key in FLOW_KEYS}
+        if experiment.diameter_mm is not None:
+            found["diameter_mm"] = experiment.diameter_mm
+        for key, value in found.items():
+            if known.setdefault(key, value) != value:
+                do = "report spheres and flows of one kind together, the others by themselves"
+                label, got = f"{experiment.path}, {key}", f"{value:g}"
+                raise ExperimentError(refusal(label, expected=f"{known[key]:g} as before", got=got, do=do))
+    return Surroundings(**known)
 
 
-Plan = tuple[str, str, Callable[[], Figure], bool]  # name, caption, how it is drawn, two beside each other
+Plan = tuple[str, str, Callable[[], Figure], bool]  # name, caption, function, two beside each other
 
 
-def _plans(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> Iterator[Plan]:
-    """Yield the figures in the order of the page."""
+def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> Iterator[Plan]:
+    """Yield the figures in the order of the page; a new figure is a line here and a function in `plots`."""
     name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
     of = "" if len(tracks) == 1 else f" of {name}"
     yield "track", f"Track{of}, with bands of two standard errors.", lambda: plots.track_figure(track), False
@@ -106,24 +144,23 @@ def _plans(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequen
     if any(len(one.distance_rad) for one in distances):
         caption = "Distance of the cameras' own orientations."
         yield "camera_distance", caption, lambda: plots.camera_distance_figure(distances), True
-    yield (
-        "noise",
-        "What of each variance is noise, or was smoothed away.",
-        lambda: plots.noise_figure(summary.table, summary.ensemble.error),
-        True,
-    )
-    more = summary.distributions
-    if more is None:
+    caption = "Share of each variance that is noise, or was smoothed away."
+    yield "noise", caption, lambda: plots.noise_figure(summary.table, summary.ensemble.error), True
+    if (more := summary.distributions) is None:
         return
     caption = "PDFs of the components in their standard deviations, the stretched exponential and the Gaussian."
     yield "densities", caption, lambda: plots.densities_figure(summary, list(more.densities)), False
     caption = "Increments of omega over lags: PDFs, shifted by decades, and flatness."
     yield "increments", caption, lambda: plots.increments_figure(more, summary.table), False
-    caption = "Autocorrelations and integral times."
-    yield "correlations", caption, lambda: plots.correlations_figure(more.correlations), False
+    yield (
+        "correlations",
+        "Autocorrelations and integral times.",
+        lambda: plots.correlations_figure(more.correlations),
+        False,
+    )
     caption = "Euler angles against the law of uniform attitudes."
     yield "angles", caption, lambda: plots.angles_figure(more.angles, more.uniformity), False
-    caption = "Rms and flatness by the width of a Gaussian kernel; a plateau, if there is one, is the motion's."
+    caption = "Rms and flatness by the width of a Gaussian kernel; a plateau is the motion's value."
     yield "kernel_widths", caption, lambda: plots.widths_figure(more.widths), False
     caption = "Shares of the components in the variance, in the lab and in the body."
     yield "isotropy", caption, lambda: plots.isotropy_figure(more.isotropies), True
@@ -131,20 +168,12 @@ def _plans(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequen
         yield "durations", "Durations of the segments.", lambda: plots.durations_figure(found), True
 
 
-def _draw_all(
-    summary: Summary,
-    tracks: Mapping[str, Trajectory],
-    distances: Sequence[CameraDistance],
-    folder: Path,
-    progress: Progress,
-) -> list[Drawn]:
-    plans = list(_plans(summary, tracks, distances))
+def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[DrawnFigure]:
     drawn = []
     for k, (name, caption, draw, half) in enumerate(plans):
         progress("figures", k, len(plans))
-        figure = draw()
-        plots.write_figure(figure, folder / name)
-        drawn.append(Drawn(name=name, caption=caption, png=(folder / f"{name}.png").read_bytes(), half=half))
+        plots.write_figure(draw(), folder / name)
+        drawn.append(DrawnFigure(name=name, caption=caption, png=(folder / f"{name}.png").read_bytes(), half=half))
     progress("figures", len(plans), len(plans))
     return drawn
 
@@ -152,8 +181,8 @@ def _draw_all(
 def _strips(
     tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment | None], progress: Progress
 ) -> Iterator[str]:
-    """Yield the quality strips of the tracks, those with the most frames in doubt where there are too many."""
-    bad = {name: sum(one.frames for one in stretches(track)) for name, track in tracks.items()}
+    """Yield the quality strips of the tracks; of too many those with the most bad frames."""
+    bad = {name: sum(one.frames for one in bad_stretches(track)) for name, track in tracks.items()}
     worst = sorted(tracks, key=lambda name: -bad[name])[:MOST_STRIPS]
     chosen = [name for name in tracks if name in worst]
     pictured = sum(experiments[name] is not None for name in chosen)
@@ -168,7 +197,7 @@ def _strips(
 
 @contextmanager
 def _folder(out: Path) -> Iterator[Path]:
-    """Give a folder to write in; at the end it takes the report's place, or vanishes where something failed."""
+    """Yield a temporary folder; it becomes the report at the end, or is removed after an error."""
     if out.exists() and (not out.is_dir() or {path.name for path in out.iterdir()} - set(PARTS)):
         do = "choose a new folder"
         expected = "a new folder, or one that holds an older report only"

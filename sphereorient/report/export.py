@@ -6,54 +6,58 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sphereorient.errors import OutputError, refusal
-from sphereorient.report.export_columns import Column, as_text, columns, metadata, package
-from sphereorient.report.export_mat import write_mat
-from sphereorient.report.export_xarray import to_xarray
-from sphereorient.trajectory import Trajectory
+from sphereorient.files.outputs import put_aside
+from sphereorient.report.export_columns import (
+    REASON,
+    Dataset,
+    as_text,
+    columns,
+    frame_wise,
+    metadata,
+    package,
+    quaternions_wxyz,
+    reasons,
+    safe_names,
+    with_unit,
+)
+from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-__all__ = ["export_track", "format_of", "to_arrow", "to_xarray"]
+    import xarray as xr
 
 SUFFIXES = {".csv": "csv", ".parquet": "parquet", ".pq": "parquet", ".mat": "mat"}
 ROWS = 50_000  # written at once
 Advance = Callable[[int, int], None]
 
 
-def export_track(track: Trajectory, path: Path, to: str, progress: Advance = lambda done, total: None) -> None:
-    """Write all frame-wise datasets of a track, with their units in the names and what the track says of itself.
+def export_track(
+    track: Trajectory, path: Path, to: str | None = None, progress: Advance = lambda done, total: None
+) -> None:
+    """Write all frame-wise datasets of a track, with units in their names, and its metadata; NaN stays NaN.
 
     Args:
-        track: what to write; NaN stays NaN.
-        path: the file; it is written in place, so pass a name aside where an old one matters.
-        to: csv, parquet or mat.
+        track: what to write.
+        path: written whole or not at all.
+        to: csv, parquet or mat; None: by the suffix.
         progress: called with frames done and all frames.
 
     Raises:
         OutputError: an unknown format, a package that is not installed, or a file that cannot be written.
     """
-    if to not in WRITERS:
-        do = f"choose one of {', '.join(WRITERS)}"
-        raise OutputError(refusal("--to", expected="a known format", got=repr(to)[:60], do=do))
-    try:
-        WRITERS[to](track, path, progress)
-    except OSError as error:
-        do = "choose a folder that exists, may be written and has room"
-        got = f"'{error.strerror or error}'"
-        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
+    write = WRITERS[format_of(path, to)]
+    with put_aside(path) as aside:
+        write(track, aside, progress)
 
 
 def format_of(path: Path, to: str | None) -> str:
-    """Return the format that a name and an option ask for together.
-
-    Args:
-        path: the file to write.
-        to: csv, parquet or mat; None: what the name's suffix says.
+    """Return the format of a file: csv, parquet or mat, by the option `to`, or by the name's suffix if it is None.
 
     Raises:
-        OutputError: neither says it, or they contradict each other.
+        OutputError: neither gives a format, or they contradict each other.
     """
     by_name = SUFFIXES.get(path.suffix.lower())
     if to is not None and to not in WRITERS:
@@ -70,31 +74,38 @@ def format_of(path: Path, to: str | None) -> str:
 
 
 def to_arrow(track: Trajectory) -> pa.Table:
-    """Return a track as an Arrow table, one row a frame, each field with `units` and `description`.
+    """Return a track as an Arrow table, a row for each frame, each field with `units` and `description`.
 
     Raises:
         OutputError: pyarrow is not installed.
     """
     arrow = package("pyarrow", "table")
     parts = list(columns(track))
+    text = arrow.string()
+    arrays = [arrow.array(c.values, type=text if c.values.dtype == object else None, from_pandas=False) for c in parts]
     schema = arrow.schema(
-        [arrow.field(c.name, _arrow_values(arrow, c).type, metadata=_described(c)) for c in parts],
+        [arrow.field(c.name, array.type, metadata=c.about) for c, array in zip(parts, arrays, strict=True)],
         metadata={key: as_text(value) for key, value in metadata(track).items()},
     )
-    return arrow.table([_arrow_values(arrow, c) for c in parts], schema=schema)
+    return arrow.table(arrays, schema=schema)
 
 
 def _write_csv(track: Trajectory, path: Path, progress: Advance) -> None:
-    """Comment lines, the names, one line a frame."""
+    """Write the metadata as comment lines, the names, and a line for each frame."""
     package("pyarrow", "table")
     import pyarrow.csv as arrow_csv
 
     table = to_arrow(track)
     valid = table.schema.get_field_index("valid")
-    table = table.set_column(valid, "valid", table["valid"].cast("int8"))  # 1 and 0 are read by every program
+    table = table.set_column(valid, "valid", table["valid"].cast("int8"))  # every program reads 1 and 0
+    about = metadata(track)
+    settings = about.pop("settings")
+    lines = [f"{key}: {' '.join(as_text(value).split())}" for key, value in about.items()]
+    lines += ["quaternions_wxyz: of R_lab_body, w first; units stand at the end of the names", "settings:"]
+    lines += [f"  {line}" for line in settings.splitlines()]
     plain = arrow_csv.WriteOptions(include_header=False, quoting_style="none")
     with path.open("wb") as file:
-        for line in _comments(track):
+        for line in lines:
             file.write(f"# {line}".rstrip().encode() + b"\n")
         file.write(",".join(table.column_names).encode() + b"\n")
         for first in range(0, len(table), ROWS):
@@ -103,17 +114,7 @@ def _write_csv(track: Trajectory, path: Path, progress: Advance) -> None:
             progress(first + len(part), len(table))
 
 
-def _comments(track: Trajectory) -> list[str]:
-    """What a track says of itself, line by line."""
-    about = metadata(track)
-    settings = about.pop("settings")
-    lines = [f"{key}: {' '.join(as_text(value).split())}" for key, value in about.items()]
-    lines += ["quaternions: of R_lab_body, w first; units stand at the end of the names", "settings:"]
-    return lines + [f"  {line}" for line in settings.splitlines()]
-
-
 def _write_parquet(track: Trajectory, path: Path, progress: Advance) -> None:
-    """A Parquet file with the schema's metadata."""
     table = to_arrow(track)
     import pyarrow.parquet as arrow_parquet
 
@@ -124,17 +125,77 @@ def _write_parquet(track: Trajectory, path: Path, progress: Advance) -> None:
             progress(first + len(part), len(table))
 
 
+def _write_mat(track: Trajectory, path: Path, progress: Advance) -> None:
+    """Write MATLAB 5: arrays with the frames along their first axis, structs for cameras and metadata."""
+    from scipy.io import savemat
+
+    progress(0, len(track))  # SciPy writes in one step
+    content = _mat_arrays(track)
+    content["cameras"] = {name: _mat_arrays(camera) for name, camera in safe_names(track).items()}
+    about = metadata(track)
+    content["metadata"] = {
+        **{key: about[key] for key in ("experiment", "method", "frame_rate_hz", "settings", "flags")},
+        "cameras": np.array(about["cameras"], dtype=object),
+        "provenance": as_text(about["provenance"]),
+        "units": {with_unit(each.name, each.units): each.units for each in frame_wise(track)},
+    }
+    savemat(path, content, long_field_names=True, do_compression=True, oned_as="column")
+    progress(len(track), len(track))
+
+
+def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
+    """Return arrays by name with unit; rotations as matrices and as quaternions_wxyz (quat_wxyz for orientation)."""
+    arrays: dict[str, Any] = {}
+    for dataset in frame_wise(record):
+        arrays[with_unit(dataset.name, dataset.units)] = dataset.values
+        if dataset.rotation:
+            arrays[dataset.name.replace("orientation", "quat_wxyz", 1)] = quaternions_wxyz(dataset.values)
+    if isinstance(record, CameraTrack):
+        arrays["reason"] = reasons(record)
+    return arrays
+
+
 WRITERS: dict[str, Callable[[Trajectory, Path, Advance], None]] = {
     "csv": _write_csv,
     "parquet": _write_parquet,
-    "mat": write_mat,
+    "mat": _write_mat,
 }
 
 
-def _arrow_values(arrow: Any, column: Column) -> Any:
-    text = column.values.dtype == object
-    return arrow.array(column.values, type=arrow.string() if text else None, from_pandas=False)
+def to_xarray(track: Trajectory) -> xr.Dataset:
+    """Return a track as an xarray dataset: named axes, units and descriptions as attributes; NaN stays NaN.
+
+    Returns:
+        Dimensions time (coordinate, s), axis (x, y, z of lab or body by the description), axis_2 of covariances,
+        body_axis of orientations (its columns), camera, image_axis (u, v); the cameras' own measurements as camera_*.
+        The candidates stay in the file. Attributes as in the track's file, provenance as JSON.
+
+    Raises:
+        OutputError: xarray is not installed.
+    """
+    xarray = package("xarray", "table")
+    own = {dataset.name: dataset for dataset in frame_wise(track)}
+    time = own.pop("time")
+    made = {name: (_dims(dataset), dataset.values, dataset.about) for name, dataset in own.items()}
+    for same in zip(*(frame_wise(camera) for camera in track.cameras.values()), strict=True):
+        values = np.stack([each.values for each in same])
+        made[f"camera_{same[0].name}"] = (("camera", *_dims(same[0])), values, same[0].about)
+    if track.cameras:
+        reason = np.array([[str(why) for why in camera.reason] for camera in track.cameras.values()])
+        made["camera_reason"] = (("camera", "time"), reason, {"units": "1", "description": REASON})
+    coordinates = {
+        "time": (("time",), track.time, time.about),
+        "axis": list("xyz"),
+        "axis_2": list("xyz"),
+        "body_axis": list("xyz"),
+        **({"camera": list(track.cameras), "image_axis": list("uv")} if track.cameras else {}),
+    }
+    about = {key: value if isinstance(value, str | float) else as_text(value) for key, value in metadata(track).items()}
+    named: xr.Dataset = xarray.Dataset(made, coords=coordinates, attrs=about)
+    return named
 
 
-def _described(column: Column) -> dict[str, str]:
-    return {"units": column.units, "description": column.description}
+def _dims(dataset: Dataset) -> tuple[str, ...]:
+    second = "body_axis" if dataset.rotation else "axis_2"
+    named = {(): (), (2,): ("image_axis",), (3,): ("axis",), (3, 3): ("axis", second)}
+    return ("time", *named[dataset.tail])

@@ -1,11 +1,11 @@
-"""A track as named columns: one value a frame each, the unit in the name (docs/export.md)."""
+"""A track as named columns: one value for each frame, the unit in the name (docs/export.md)."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from itertools import combinations_with_replacement
 from typing import Any
@@ -22,23 +22,13 @@ PAIRS = tuple(combinations_with_replacement(range(3), 2))  # of a symmetric matr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Column:
-    """One value a frame; made by `columns`, read by the writers of CSV and Parquet."""
-
-    name: str
-    units: str
-    description: str
-    values: NDArray[Any]  # (N,)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Dataset:
-    """One dataset of the file with a row a frame; made by `frame_wise`."""
+    """One dataset of the file with a row for each frame, or one column of it; made by `frame_wise` and `columns`."""
 
     name: str
     units: str
     description: str
-    values: NDArray[Any]  # (N, ...)
+    values: NDArray[Any]  # (N, ...); of a column (N,)
 
     @property
     def tail(self) -> tuple[int, ...]:
@@ -50,13 +40,14 @@ class Dataset:
         """Whether the values are rotations, which tables hold as quaternions."""
         return self.tail == (3, 3) and self.units == "1"
 
+    @property
+    def about(self) -> dict[str, str]:
+        """Units and description, for the attributes of other formats."""
+        return {"units": self.units, "description": self.description}
+
 
 def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
-    """Yield the datasets of a track, or of one of its cameras, that have one row a frame, in the order of the file.
-
-    Args:
-        record: a `Trajectory` or a `CameraTrack`; the candidates of a camera have another count and are left out.
-    """
+    """Yield the datasets of a track or of a camera with a row for each frame, in the order of the file."""
     for entry in fields(record):
         column = entry.metadata.get("column")
         if column is not None and column.rows == "frames":
@@ -64,27 +55,41 @@ def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
             yield Dataset(name=entry.name, units=column.units, description=column.description, values=values)
 
 
-def columns(track: Trajectory) -> Iterator[Column]:
-    """Yield every frame-wise dataset of a track as columns, N frames; names as in `Trajectory.to_pandas`.
+def columns(track: Trajectory) -> Iterator[Dataset]:
+    """Yield every frame-wise dataset of a track as columns; names as in `Trajectory.to_pandas`.
 
-    Args:
-        track: any; NaN stays NaN.
-
-    Returns:
-        Vectors by component (position_x_mm), covariances by pair (position_cov_xy_mm2: they are symmetric), rotations
-        as quaternions with w first and w >= 0 (quat_w ..), then the same of every camera with its name before it.
+    Vectors come by component (position_x_mm), covariances by pair (position_cov_xy_mm2: they are symmetric), rotations
+    as quaternions with w first and w >= 0 (quat_w ..), then the same of every camera with its name before it.
     """
     for dataset in frame_wise(track):
         yield from _split(dataset, "")
     for prefix, camera in safe_names(track).items():
         for dataset in frame_wise(camera):
             yield from _split(dataset, f"{prefix}_")
-        reason = np.array([str(reason) for reason in camera.reason], dtype=object)
-        yield Column(name=f"{prefix}_reason", units="1", description=REASON, values=reason)
+        yield Dataset(name=f"{prefix}_reason", units="1", description=REASON, values=reasons(camera))
+
+
+def _split(dataset: Dataset, prefix: str) -> Iterator[Dataset]:
+    name, values = f"{prefix}{dataset.name}", dataset.values
+    parts = {name: values}
+    if dataset.rotation:
+        stem = prefix + dataset.name.replace("orientation", "quat", 1)
+        parts = {f"{stem}_{axis}": column for axis, column in zip("wxyz", quaternions_wxyz(values).T, strict=True)}
+    elif dataset.tail == (3, 3):
+        parts = {f"{name}_{'xyz'[i]}{'xyz'[j]}": values[:, i, j] for i, j in PAIRS}
+    elif dataset.tail in AXES:
+        parts = {f"{name.removesuffix('_px')}_{axis}": values[:, k] for k, axis in enumerate(AXES[dataset.tail])}
+    for stem, column in parts.items():
+        yield replace(dataset, name=with_unit(stem, dataset.units), values=column)
+
+
+def reasons(camera: CameraTrack) -> NDArray[Any]:
+    """Return a camera's reasons as text, (N,)."""
+    return np.array([str(reason) for reason in camera.reason], dtype=object)
 
 
 def safe_names(track: Trajectory) -> dict[str, CameraTrack]:
-    """Return the cameras by names that tables and programs take: letters, digits and _, told apart by a number."""
+    """Return the cameras by names that all programs accept: letters, digits and _, made unique by a number."""
     safe: dict[str, CameraTrack] = {}
     for name, camera in track.cameras.items():
         plain = re.sub(r"\W", "_", name, flags=re.ASCII)
@@ -98,7 +103,7 @@ def safe_names(track: Trajectory) -> dict[str, CameraTrack]:
 
 
 def metadata(track: Trajectory) -> dict[str, Any]:
-    """Return what a track says of itself: what the root attributes of its file hold, and the names of the flags."""
+    """Return the root attributes of a track's file, with the names of the flags."""
     return {
         "experiment": track.experiment,
         "method": track.method,
@@ -111,7 +116,7 @@ def metadata(track: Trajectory) -> dict[str, Any]:
 
 
 def as_text(value: Any) -> str:
-    """Return text as it is and anything else as JSON."""
+    """Return text unchanged and anything else as JSON."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
@@ -125,33 +130,10 @@ def package(name: str, extra: str) -> Any:
     """Import a package of an extra.
 
     Raises:
-        OutputError: it is not installed; the message says how it is.
+        OutputError: it is not installed; the message gives the command.
     """
     try:
         return import_module(name)
     except ImportError as error:
-        do = f"install it with `pip install sphereorient[{extra}]`"
-        raise OutputError(
-            refusal(f"sphereorient[{extra}]", expected=f"the package {name}", got="none", do=do)
-        ) from error
-
-
-def _split(dataset: Dataset, prefix: str) -> Iterator[Column]:
-    """Yield a dataset's columns."""
-    name, units = f"{prefix}{dataset.name}", dataset.units
-
-    def column(stem: str, values: NDArray[Any]) -> Column:
-        return Column(name=with_unit(stem, units), units=units, description=dataset.description, values=values)
-
-    if dataset.rotation:
-        stem = prefix + dataset.name.replace("orientation", "quat", 1)
-        for axis, values in zip("wxyz", quaternions_wxyz(dataset.values).T, strict=True):
-            yield column(f"{stem}_{axis}", values)
-    elif dataset.tail == (3, 3):
-        for i, j in PAIRS:
-            yield column(f"{name}_{'xyz'[i]}{'xyz'[j]}", dataset.values[:, i, j])
-    elif dataset.tail in AXES:
-        for k, axis in enumerate(AXES[dataset.tail]):
-            yield column(f"{name.removesuffix('_px')}_{axis}", dataset.values[:, k])
-    else:
-        yield column(name, dataset.values)
+        label, do = f"sphereorient[{extra}]", f"install it with `pip install sphereorient[{extra}]`"
+        raise OutputError(refusal(label, expected=f"the package {name}", got="none", do=do)) from error

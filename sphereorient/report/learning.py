@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from sphereorient.files.outputs import put_aside
 from sphereorient.learn.benchmark import Example
 from sphereorient.learn.metrics import WITHIN_DEG
-from sphereorient.report.plots.marks import note
-from sphereorient.report.plots.style import ALL, DPI, GREY, SECOND, SHADE, WIDTH_IN, X, in_style, new_figure
+from sphereorient.report.plots.style import ALL, GREY, SECOND, SHADE, WIDTH_IN, X, in_style, new_figure, note
 
-RIGHT, WRONG = "#1A7F37", "#B42318"  # frames of proposals, beside the tick
+RIGHT, WRONG = "#1A7F37", "#B42318"  # frames of proposals; the titles have a tick too
 SIDE_IN = 1.12  # of a picture of the sheet
-UNLIKELY = 0.005  # least probability that is shown
+UNLIKELY = 0.005  # proposals with a lower probability are not shown
 
 
 @in_style
 def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -> Figure:
-    """Draw loss and recall against the steps; `rows` are those of metrics.csv, `best_step` that of the kept weights."""
+    """Draw loss and recall against the steps, of the rows of metrics.csv; the weights of `best_step` were kept."""
     figure = new_figure(WIDTH_IN, 2.7)
     left, right = figure.subplots(1, 2)
     _curve(left, rows, "train_nll", "training", {**SECOND.drawn, "marker": "x"})
@@ -41,8 +37,8 @@ def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -
         axes.legend(loc=corner, frameon=True, framealpha=0.9, edgecolor="none")
     note(
         figure,
-        "Validation: pictures of balls that training never sees. The loss cannot reach 0: the target is spread over "
-        "the grid. The training loss is the mean of an epoch, while the weights change.",
+        "Validation: pictures of spheres that are not in the training data. The loss does not reach 0: right answers "
+        "are spread over the grid. The training loss is the mean of an epoch, while the weights change.",
     )
     return figure
 
@@ -50,7 +46,7 @@ def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -
 def _curve(axes: Axes, rows: Sequence[Mapping[str, float]], key: str, label: str, look: dict[str, Any]) -> None:
     there = [(row["step"], row[key]) for row in rows if key in row]
     steps, values = np.array(there, np.float64).reshape(-1, 2).T
-    # Not more than a dozen markers.
+    # A marker for each row, fewer if there are many.
     axes.plot(steps, values, label=label, markevery=max(len(steps) // 12, 1), **look)
 
 
@@ -67,7 +63,8 @@ def examples_figure(examples: Sequence[Example]) -> Figure:
             axes.set_frame_on(False)
         names = "\n".join(name.replace("_", " ") for name in example.degradations)
         row[0].imshow(example.disk.numpy(), cmap="gray", vmin=0, vmax=255)
-        row[0].set_xlabel(names or "nothing", fontsize=5.5, labelpad=2)
+        names = "\n".join(name.replace("_", " ") for name in example.degradations) or "nothing"
+        row[0].set_xlabel(names, fontsize=5.5, labelpad=2)
         _paint(row[1], example.true_view)
         for k, axes in enumerate(row[2:]):
             _proposal(axes, example, k)
@@ -75,8 +72,9 @@ def examples_figure(examples: Sequence[Example]) -> Figure:
     panels[0, 1].set_title("true view", fontsize=7)
     note(
         figure,
-        f"Above proposals: probability and angle to the truth; green frame and tick: below {WITHIN_DEG:g}°, red frame: "
-        f"above. Below pictures: degradations. Proposals of less than {100 * UNLIKELY:g} % are left out.",
+        f"Above proposals: probability and angle to the truth; framed green with a tick if it is below "
+        f"{WITHIN_DEG:g}°, else red. Below pictures: their degradations. Proposals of less than "
+        f"{100 * UNLIKELY:g} % are left out.",
     )
     return figure
 
@@ -96,20 +94,10 @@ def _proposal(axes: Axes, example: Example, k: int) -> None:
 
 
 def _paint(axes: Axes, view: Tensor) -> None:
-    """Draw a clean view on grey, or white paint would merge with the page."""
+    """Show a view, grey outside the sphere to separate white paint from the page."""
     axes.set_facecolor(SHADE)
     axes.patch.set_visible(True)
     axes.set_frame_on(True)
     for side in axes.spines.values():
         side.set_visible(False)
     axes.imshow(np.ma.masked_invalid(view.numpy()), cmap="gray", vmin=0, vmax=1)
-
-
-def write_png(figure: Figure, path: Path) -> None:
-    """Write a figure; the same figure gives the same bytes.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    with put_aside(path) as aside, matplotlib.rc_context():
-        figure.savefig(aside, dpi=DPI, metadata={"Software": None})

@@ -1,8 +1,7 @@
-"""A learnt map on disk: the picture that tracking reads, how often each texel was seen, and all the rest."""
+"""A learnt map on disk: the picture that tracking reads, the number of pictures of each texel, and all the rest."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import fields
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from sphereorient.errors import OutputError, TextureError, refusal
 from sphereorient.files.outputs import put_aside
 from sphereorient.files.picture import decoded_grey
 from sphereorient.mapping import LearntMap
+from sphereorient.mapping.grid import texel_areas
 from sphereorient.trajectory import Trajectory
 
 UNSEEN = 128  # grey of texels that no picture shows
@@ -24,34 +24,32 @@ MOST = 255  # counts beyond are written as this
 
 
 def seen_path(texture: Path) -> Path:
-    """Return where the counts of a map lie: texture_seen.png beside texture.png."""
+    """Return the path of a map's counts: texture_seen.png beside texture.png."""
     return texture.with_name(f"{texture.stem}_seen.png")
 
 
 def write_texture(texture: Tensor, path: Path) -> None:
-    """Write a map (H, 2 H), 0 .. 1, NaN where unknown, as 8-bit picture: mid-grey where unknown.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write a map (H, 2 H), 0 .. 1 or NaN, as 8-bit picture, mid-grey for NaN; may raise OutputError."""
     grey = torch.where(torch.isfinite(texture), 255 * texture, float(UNSEEN))
     _write_picture(grey.round().clamp(0, 255).byte().numpy(), path)
 
 
 def write_seen(seen: Tensor, path: Path) -> None:
-    """Write counts (H, 2 H) as 8-bit picture, 255 for 255 or more.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write counts (H, 2 H) as 8-bit picture, 255 for 255 or more; may raise OutputError."""
     _write_picture(seen.clamp(0, MOST).byte().numpy(), path)
 
 
+def _write_picture(grey: NDArray[np.uint8], path: Path) -> None:
+    with put_aside(path) as aside:
+        if not cv2.imwrite(str(aside), grey):
+            raise OSError("the picture could not be written")
+
+
 def read_seen(path: Path) -> Tensor | None:
-    """Read the counts beside a map, (H, 2 H); None where there are none.
+    """Read the counts beside a map, (H, 2 H); None without a file.
 
     Raises:
-        TextureError: the file is no grey picture twice as wide as high.
+        TextureError: the file is not an 8-bit picture twice as wide as high.
     """
     if not path.is_file():
         return None
@@ -64,11 +62,7 @@ def read_seen(path: Path) -> Tensor | None:
 
 
 def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:
-    """Write the attitudes as a track, and in its group `map` everything else that was learnt.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the attitudes as a track, and in its group `map` everything else that was learnt; may raise OutputError."""
     with put_aside(path, also=(RuntimeError,)) as aside:
         track.save(aside)
         with h5py.File(aside, "a") as file:
@@ -94,18 +88,8 @@ def _put(group: h5py.Group, name: str, values: NDArray[np.generic], units: str, 
     dataset.attrs["units"], dataset.attrs["description"] = units, description
 
 
-def _write_picture(grey: NDArray[np.uint8], path: Path) -> None:
-    with put_aside(path) as aside:
-        if not cv2.imwrite(str(aside), grey):
-            raise OSError("the picture could not be written")
-
-
 def check_picture_name(path: Path) -> None:
-    """Refuse a name that is no picture's.
-
-    Raises:
-        OutputError: not .png, .tif or .tiff: others lose grey values.
-    """
+    """Refuse a suffix other than .png, .tif or .tiff with an OutputError: other formats lose grey values."""
     if path.suffix.lower() not in (".png", ".tif", ".tiff"):
         do = "choose a name such as texture.png"
         raise OutputError(refusal(f"--out {path}", expected=".png or .tif", got=path.suffix or "no ending", do=do))
@@ -113,7 +97,5 @@ def check_picture_name(path: Path) -> None:
 
 def shares_seen(seen: Tensor, counts: tuple[int, ...]) -> list[float]:
     """Return the shares of the sphere that at least so many pictures show."""
-    rows = len(seen)
-    edge = torch.linspace(0, math.pi, rows + 1, dtype=torch.float64).cos()
-    area = (edge[:-1] - edge[1:])[:, None].expand(rows, 2 * rows)
+    area = texel_areas(len(seen))
     return [float((area * (seen >= count)).sum() / area.sum()) for count in counts]

@@ -2,58 +2,86 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
+import av
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sphereorient.errors import ExperimentError, TrackError, refusal
+from sphereorient.errors import ExperimentError, OutputError, TrackError, refusal
 from sphereorient.experiment import Experiment, open_movies
 from sphereorient.experiment.given import given_mask
 from sphereorient.experiment.stream import CameraStream, pictures_of
 from sphereorient.experiment.timeline import NONE, timeline
+from sphereorient.files.outputs import put_aside
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Grey, Movie
 from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of, radius_of
-from sphereorient.report.overlay_page import Page, crop_side
-from sphereorient.report.overlay_video import check_video_name, write_video
-from sphereorient.report.overlay_view import View
+from sphereorient.report.overlay_page import OverlayView, Page, crop_side
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Trajectory
 
 SAMPLE = 16  # frames from which light and brightness are taken
-NEAR_FRAMES = 0.5  # of the time between frames: a frame of the track further from all of the movie's has no picture
+NEAR_FRAMES = 0.5  # of the time between frames: largest distance of a picture's time from that of the track's frame
 DARK, BRIGHT = 0.5, 99.8  # percentiles of the sampled pictures that are shown black and white
+FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
+H264 = {"crf": "19", "preset": "veryfast"}
 Rows = NDArray[np.int64]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSelection:
+    """The frames and cameras of an overlay; made by the command."""
+
+    cameras: Sequence[str] | None = None  # names; None: those of the track
+    first: int | None = None  # the experiment's number; None: from the first frame
+    last: int | None = None  # + 1; None: to the last frame of the track
+    every: int = 1  # one of so many frames is shown
+
+    def rows(self, numbers: Rows) -> Rows:
+        """Return the rows of the track's frames, whose numbers are given.
+
+        Raises:
+            TrackError: no frame of the track is in the range.
+        """
+        wanted = np.ones(len(numbers), bool)
+        if self.first is not None:
+            wanted &= numbers >= self.first
+        if self.last is not None:
+            wanted &= numbers < self.last
+        chosen = np.flatnonzero(wanted)[:: self.every]
+        if not len(chosen):
+            expected, do = f"frames within {numbers[0]}:{numbers[-1] + 1}", "correct --frames"
+            got = f"{'' if self.first is None else self.first}:{'' if self.last is None else self.last}"
+            raise TrackError(refusal("--frames", expected=expected, got=got, do=do))
+        return chosen
 
 
 def overlay_movie(
     track: Trajectory,
     experiment: Experiment,
     path: Path,
-    *,
-    cameras: Sequence[str] | None = None,
-    frames: tuple[int | None, int | None] = (None, None),
-    every: int = 1,
+    selection: FrameSelection | None = None,
     fps: float = 25.0,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
 ) -> int:
     """Write a movie with outline, body axes and trail, and beside it crop, re-rendered sphere and residual.
 
-    Frames are read, drawn and written one by one: a long movie needs no more memory than a short one.
+    Frames are read, drawn and written one by one: the memory does not depend on the length.
 
     Args:
         track: what was measured.
-        experiment: what it was measured from; movies and texture are opened.
+        experiment: of the track; movies and texture are opened.
         path: .mp4, .mov or .mkv; an old one is replaced at the end.
-        cameras: names; None: those of the track.
-        frames: first, last + 1 by the experiment's numbers; None: from the first, to the last of the track.
-        every: of so many frames one is shown.
-        fps: frames shown a second.
+        selection: of cameras and frames; None: all.
+        fps: frames a second of the player.
         progress: called with frames done and all frames.
 
     Returns:
@@ -61,29 +89,36 @@ def overlay_movie(
 
     Raises:
         ExperimentError: a camera that track or experiment do not have.
-        TrackError: no frame of the track lies in the range.
-        OutputError: a name that is no movie's, or a file that cannot be written.
+        TrackError: no frame of the track is in the range.
+        OutputError: a suffix that is not a movie's, or a file that cannot be written.
     """
-    check_video_name(path)
+    _check_video_name(path)
+    selection = selection or FrameSelection()
     with ExitStack() as opened:
-        page, streams = prepared(track, experiment, cameras, opened)
-        chosen = _chosen(page.numbers, frames, every)
-        return write_video(path, _pictures(page, streams, chosen, progress), fps)
+        page, streams = prepared(track, experiment, selection.cameras, opened)
+        chosen = selection.rows(page.numbers)
+
+        def drawn() -> Iterator[NDArray[np.uint8]]:
+            for done, (k, pictures) in enumerate(pictures_by_row(streams, chosen), start=1):
+                yield page.draw(k, pictures)
+                progress(done, len(chosen))
+
+        return write_video(path, drawn(), fps)
 
 
 def prepared(
     track: Trajectory, experiment: Experiment, cameras: Sequence[str] | None, opened: ExitStack
 ) -> tuple[Page, dict[str, CameraStream]]:
-    """Open the movies and learn what all pictures share: light, brightness, sizes.
+    """Open the movies and estimate what all pictures share: light, brightness, sizes.
 
     Args:
         track: what was measured.
-        experiment: what it was measured from.
+        experiment: of the track.
         cameras: names; None: those of the track.
         opened: closes the movies.
 
     Returns:
-        The page, and for each camera its movie with the picture of every frame of the track.
+        The page, and of each camera the stream with the picture of every frame of the track.
     """
     names = _names(track, experiment, cameras)
     texture = None if experiment.texture_path is None else load_texture(experiment.texture_path)
@@ -109,10 +144,10 @@ def frames_of(track: Trajectory, experiment: Experiment, movies: Mapping[str, Mo
     """Find the frames of a track, which may be of a part of the experiment, by their times.
 
     Returns:
-        The experiment's numbers (N,), and the pictures of each camera (N,), NONE where it has none.
+        The experiment's numbers (N,), and the pictures of each camera (N,), NONE for missing ones.
 
     Raises:
-        TrackError: no frame of the track lies in the experiment.
+        TrackError: no frame of the track is in the experiment.
     """
     known = timeline(experiment, movies)
     after = np.searchsorted(known.time_s, track.time).clip(1, max(len(known) - 1, 1))
@@ -143,37 +178,15 @@ def _names(track: Trajectory, experiment: Experiment, cameras: Sequence[str] | N
     return names
 
 
-def _chosen(numbers: Rows, frames: tuple[int | None, int | None], every: int) -> Rows:
-    first, last = frames
-    wanted = np.ones(len(numbers), bool)
-    if first is not None:
-        wanted &= numbers >= first
-    if last is not None:
-        wanted &= numbers < last
-    chosen = np.flatnonzero(wanted)[::every]
-    if not len(chosen):
-        expected, do = f"frames within {numbers[0]}:{numbers[-1] + 1}", "correct --frames"
-        got = f"{'' if first is None else first}:{'' if last is None else last}"
-        raise TrackError(refusal("--frames", expected=expected, got=got, do=do))
-    return chosen
+def pictures_by_row(streams: Mapping[str, CameraStream], rows: Rows) -> Iterator[tuple[int, dict[str, Grey | None]]]:
+    """Yield increasing rows of a track with the picture of each camera, None for missing ones."""
+    readers = [pictures_of(stream.movie, stream.rows[rows]) for stream in streams.values()]
+    for k, *pictures in zip(rows.tolist(), *readers, strict=True):
+        yield k, dict(zip(streams, pictures, strict=True))
 
 
-def _pictures(
-    page: Page, streams: Mapping[str, CameraStream], chosen: Rows, progress: Callable[[int, int], None]
-) -> Iterator[NDArray[np.uint8]]:
-    readers = [pictures_at(stream, chosen) for stream in streams.values()]
-    for done, (k, *pictures) in enumerate(zip(chosen.tolist(), *readers, strict=True), start=1):
-        yield page.draw(k, dict(zip(streams, pictures, strict=True)))
-        progress(done, len(chosen))
-
-
-def pictures_at(stream: CameraStream, chosen: Rows) -> Iterator[Grey | None]:
-    """Return a camera's pictures of some frames of the track, in increasing order; None where there is none."""
-    return pictures_of(stream.movie, stream.rows[chosen])
-
-
-def _view(track: Trajectory, model: Model, stream: CameraStream) -> View:
-    """Learn light and brightness from frames spread over the track."""
+def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
+    """Estimate light and brightness from frames spread over the track."""
     seen = track.cameras[stream.name]
     position = torch.from_numpy(model.path.position_mm)
     radius = seen.radius_px[np.isfinite(seen.radius_px)]
@@ -182,16 +195,17 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> View:
     good = np.flatnonzero(readable & track.valid & model.path.whole)
     sampled = good if len(good) else np.flatnonzero(readable)
     sampled = np.unique(sampled[np.linspace(0, len(sampled) - 1, min(SAMPLE, len(sampled))).round().astype(int)])
-    pictures = [(int(k), p) for k, p in zip(sampled, pictures_at(stream, sampled), strict=True) if p is not None]
-    greys = np.concatenate([np.zeros(0), *(p[::3, ::3].ravel() for _, p in pictures)])
+    pictures = [(k, found[stream.name]) for k, found in pictures_by_row({stream.name: stream}, sampled)]
+    known = [(k, picture) for k, picture in pictures if picture is not None]
+    greys = np.concatenate([np.zeros(0), *(picture[::3, ::3].ravel() for _, picture in known)])
     black, white = np.percentile(greys, (DARK, BRIGHT)) if len(greys) else (0.0, 1.0)
     light: LightFit | None = None
     if len(good) and np.isfinite(half_px) and model.texture is not None:
         side = crop_side(half_px)
         model = replace(model, texture=reduced_texture(model.texture, side / MARGIN))
-        windows = [(k, model.window(k, half_px, side), picture) for k, picture in pictures]
+        windows = [(k, model.window(k, half_px, side), picture) for k, picture in known]
         light = fit_light([(model.look(k, window), crop(picture, window)) for k, window, picture in windows])
-    return View(
+    return OverlayView(
         name=stream.name,
         model=model,
         light=light,
@@ -200,3 +214,46 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> View:
         half_px=half_px,
         trail_px=model.camera.project(position).numpy(),
     )
+
+
+def _check_video_name(path: Path) -> None:
+    if path.suffix.lower() not in FORMATS:
+        do = "end the name in .mp4"
+        raise OutputError(refusal(f"--out {path}", expected=" ".join(FORMATS), got=f"'{path.suffix}'", do=do))
+
+
+def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -> int:
+    """Write pictures as H.264 (yuv420p), whole or not at all, and return their number.
+
+    Args:
+        path: .mp4, .mov or .mkv; an old one is replaced.
+        pictures: (H, W, 3) each, red green blue, of equal size, H and W even; taken one by one.
+        fps: pictures a second of the player.
+
+    Raises:
+        OutputError: another suffix, no picture, or the file cannot be written; an old one is still there.
+    """
+    _check_video_name(path)
+    kind = FORMATS[path.suffix.lower()]
+    with put_aside(path, also=(av.FFmpegError,)) as aside, av.open(str(aside), "w", format=kind) as container:
+        count = _encode(container, pictures, Fraction(fps).limit_denominator(1000))
+        if not count:
+            raise OutputError(refusal(str(path), expected="pictures to write", got="none", do="ask for more frames"))
+    return count
+
+
+def _encode(container: Any, pictures: Iterable[NDArray[np.uint8]], rate: Fraction) -> int:
+    stream = None
+    count = 0
+    for picture in pictures:
+        if stream is None:
+            stream = container.add_stream("libx264", rate=rate, options=dict(H264))
+            stream.height, stream.width = picture.shape[:2]
+            stream.pix_fmt = "yuv420p"
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+        frame.pts, frame.time_base = count, 1 / rate
+        container.mux(stream.encode(frame))
+        count += 1
+    if stream is not None:
+        container.mux(stream.encode(None))
+    return count

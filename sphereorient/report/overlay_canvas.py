@@ -1,4 +1,4 @@
-"""A picture to draw on: lines to a fraction of a pixel, text in a font, panels."""
+"""A picture to draw on: antialiased lines, text, panels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Colour = tuple[int, int, int]
 BACKGROUND: Colour = (18, 18, 22)
 INK: Colour = (235, 235, 235)
 FAINT: Colour = (165, 165, 170)
-# Okabe and Ito's, on dark pictures; the axes are those of report.figure, x y z.
+# Okabe and Ito's hues for dark pictures; the axes x, y, z as in plots.style.
 OUTLINE: Colour = (240, 228, 66)
 AXES: tuple[Colour, Colour, Colour] = ((255, 140, 59), (43, 224, 168), (99, 195, 255))
 TRAIL: Colour = (224, 150, 195)
@@ -27,12 +27,7 @@ DOT, SPACE = 3.0, 3.5  # px, of dotted lines
 
 
 class Canvas:
-    """An (H, W, 3) picture, red green blue; what is drawn within a panel is cut at its edges.
-
-    Args:
-        width: px.
-        height: px.
-    """
+    """An (H, W, 3) picture, red green blue; panels clip what is drawn in them."""
 
     def __init__(self, width: int, height: int) -> None:
         self.pixels = np.full((height, width, 3), BACKGROUND, np.uint8)
@@ -41,7 +36,7 @@ class Canvas:
     def text(
         self, at: tuple[float, float], words: str, size: int = 15, colour: Colour = INK, anchor: str = "ls"
     ) -> None:
-        """Write words; `anchor` as Pillow has it: ls is left and baseline, mm the middle."""
+        """Write words; `anchor` is Pillow's: ls is left and baseline, mm the middle."""
         self._texts.append((at, words, size, colour, anchor))
 
     def finished(self) -> NDArray[np.uint8]:
@@ -51,20 +46,20 @@ class Canvas:
         image = Image.fromarray(self.pixels)
         draw = ImageDraw.Draw(image)
         for at, words, size, colour, anchor in self._texts:
-            # A dark rim keeps words readable on bright pictures.
+            # A dark outline keeps text readable on bright pictures.
             draw.text(at, words, fill=colour, font=_font(size), anchor=anchor, stroke_width=1, stroke_fill=(0, 0, 0))
         return np.asarray(image)
 
 
 class Panel:
-    """A rectangle of a canvas that shows a part of a picture; lines in it are given in that picture's pixels.
+    """A rectangle of a canvas with a part of a picture; lines are in that picture's pixels.
 
     Args:
-        canvas: where it lies.
-        corner: column and row of its top left corner, px.
+        canvas: to draw on.
+        corner: column and row of the top left corner, px.
         size: width and height, px.
         first_px: (u, v) of the picture at the panel's top left edge.
-        scale: pixels of the canvas in one of the picture.
+        scale: pixels of the canvas for one of the picture.
     """
 
     def __init__(
@@ -76,36 +71,36 @@ class Panel:
         self.first_px, self.scale = np.asarray(first_px, np.float64), scale
 
     def show(self, picture: NDArray[np.uint8]) -> None:
-        """Fill the panel with a picture, (h, w) grey or (h, w, 3) colours, stretched to it."""
+        """Fill the panel with a picture, (h, w) grey or (h, w, 3) colours, resized."""
         shrinks = picture.shape[0] > self.size[1]
         fitted = cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
         self.pixels[:] = fitted if fitted.ndim == 3 else fitted[..., None]
 
     def place(self, uv_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where pixels (..., 2) of the picture lie in the panel; whole numbers are the middle of its pixels."""
+        """Return the positions in the panel of pixels (..., 2) of the picture; integers are pixel centres."""
         return np.asarray((uv_px - self.first_px) * self.scale - 0.5, np.float64)
 
     def line(self, uv_px: NDArray[np.float64], colour: Colour, width: int = 1, dotted: bool = False) -> None:
-        """Draw a line through points (n, 2) of the picture; it is interrupted where one is NaN."""
+        """Draw a line through points (n, 2) of the picture, interrupted at NaN."""
         for run in _runs(self.place(uv_px)):
             for piece in _dots(run) if dotted else [run]:
                 points = np.round(piece * (1 << SHIFT)).astype(np.int32)
                 cv2.polylines(self.pixels, [points], False, colour, width, cv2.LINE_AA, SHIFT)
 
     def text(self, uv_px: NDArray[np.float64], words: str, size: int, colour: Colour) -> None:
-        """Write words around a place of the picture, where that lies in the panel."""
+        """Write words around a point of the picture, if it is inside the panel."""
         x, y = self.place(uv_px).tolist()
         if 0 <= x < self.size[0] and 0 <= y < self.size[1]:
             self.canvas.text((self.corner[0] + x, self.corner[1] + y), words, size, colour, "mm")
 
     def border(self, colour: Colour, width: int) -> None:
-        """Draw a frame just inside of the edges."""
+        """Draw a frame along the edges."""
         for edge in (np.s_[:width], np.s_[-width:], np.s_[:, :width], np.s_[:, -width:]):
             self.pixels[edge] = colour
 
 
 def _runs(points: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    """Yield the parts of a line between NaN and points so far away that whole numbers cannot hold them."""
+    """Yield the parts of a line between NaN and points too far away for integers."""
     good = (np.abs(np.nan_to_num(points, nan=1e9)) < 1e5).all(-1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
     for first, last in edges.reshape(-1, 2):
@@ -114,7 +109,6 @@ def _runs(points: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
 
 
 def _dots(points: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    """Yield the dots of a dotted line."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
     for start in np.arange(0, along[-1], DOT + SPACE):
@@ -124,7 +118,7 @@ def _dots(points: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
 
 @cache
 def _font(size: int) -> Any:
-    """Return the font that comes with matplotlib: the same on every machine."""
+    """Return the font of matplotlib, which is the same on every machine."""
     import matplotlib
     from PIL import ImageFont
 

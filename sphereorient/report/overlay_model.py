@@ -74,7 +74,7 @@ def axes_px(camera: Camera, path: Path3D, k: int) -> tuple[Floats, NDArray[np.bo
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Window:
+class CropWindow:
     """A square of a camera's picture; made by `window`, sampled by `crop` and `Model`."""
 
     centre_px: Floats  # (2,)
@@ -89,7 +89,7 @@ class Window:
         return np.stack([u, v], axis=-1)
 
 
-def crop(picture: Grey, window: Window) -> NDArray[np.float32]:
+def crop(picture: Grey, window: CropWindow) -> NDArray[np.float32]:
     """Return a picture within a window, (side, side) grey levels; NaN outside of the picture."""
     at = window.grid_px().astype(np.float32)
     u, v, nan = at[..., 0], at[..., 1], float("nan")
@@ -99,7 +99,7 @@ def crop(picture: Grey, window: Window) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Seen:
+class SeenDisk:
     """The paint in a window and the basis of the light there, (side, side, ...); made by `Model.look`."""
 
     paint: NDArray[np.float32]  # 0 black .. 1 white; NaN outside of the ball
@@ -114,7 +114,7 @@ class Model:
     texture: Tensor | None  # (H, 2 H), as fine as the window shows it; None: nothing can be rendered
     path: Path3D
 
-    def look(self, k: int, window: Window) -> Seen:
+    def look(self, k: int, window: CropWindow) -> SeenDisk:
         """Return paint and light's basis in a window of frame k, the mean of finer samples; through ports too."""
         if self.texture is None:
             do = "draw the track of an experiment with a texture"
@@ -129,12 +129,12 @@ class Model:
         parts = torch.where(seen.depth2[..., None] > 0, parts, torch.full_like(parts, torch.nan))
         side = window.side
         mean = parts.reshape(side, FINE, side, FINE, 5).mean((1, 3)).numpy().astype(np.float32)
-        return Seen(paint=mean[..., 0], basis=mean[..., 1:])
+        return SeenDisk(paint=mean[..., 0], basis=mean[..., 1:])
 
-    def window(self, k: int, half_px: float, side: int) -> Window:
+    def window(self, k: int, half_px: float, side: int) -> CropWindow:
         """Return the window around the ball in frame k."""
         centre = self.camera.project(torch.from_numpy(self.path.position_mm[k])).numpy()
-        return Window(centre_px=centre, half_px=half_px, side=side)
+        return CropWindow(centre_px=centre, half_px=half_px, side=side)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -149,7 +149,7 @@ class LightFit:
         """White less black paint in the middle of the disk, grey levels."""
         return float(max(self.gain[0] + self.gain[3], 1e-6))
 
-    def picture(self, seen: Seen, filmed: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    def picture(self, seen: SeenDisk, filmed: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
         """Return the grey levels expected, (side, side); NaN outside of the ball.
 
         Args:
@@ -164,7 +164,7 @@ class LightFit:
         return np.asarray(grey, np.float32)
 
 
-def fit_light(pairs: Sequence[tuple[Seen, NDArray[np.float32]]]) -> LightFit | None:
+def fit_light(pairs: Sequence[tuple[SeenDisk, NDArray[np.float32]]]) -> LightFit | None:
     """Match the light roughly: gain and offset, each a plane plus the fall to the rim, by least squares.
 
     One light for all frames, but for a factor (`LightFit.picture`): fitted frame by frame, it would explain a part of

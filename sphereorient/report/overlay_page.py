@@ -1,4 +1,4 @@
-"""One picture of the overlay: for each camera the frame, the crop, the re-rendered sphere and the residual."""
+"""The pictures of the overlay: of each camera the frame, the crop, the re-rendered sphere and the residual."""
 
 from __future__ import annotations
 
@@ -11,44 +11,66 @@ from numpy.typing import NDArray
 
 from sphereorient.movies import Grey
 from sphereorient.report import overlay_canvas as ink
-from sphereorient.report.doubts import flag_words, lost_cameras
+from sphereorient.report.frame_warnings import flag_words, lost_cameras
 from sphereorient.report.overlay_canvas import Canvas, Panel
-from sphereorient.report.overlay_model import Window, crop
-from sphereorient.report.overlay_view import (
-    View,
-    draw_own,
-    draw_track,
-    own_distance_px,
-    residual_colours,
-    scale_bar,
-    shown,
-)
-from sphereorient.trajectory import Trajectory
+from sphereorient.report.overlay_model import CropWindow, LightFit, Model, axes_px, crop, outline_px
+from sphereorient.trajectory import CameraTrack, Flag, Trajectory
 
 HEAD, FOOT, GAP, TITLE, SIDE = 62, 56, 10, 24, 310  # px: bands above and below, between panels, titles, square panels
 FRAME_HEIGHT = 440  # px, of a camera's frame
 WIDEST = 1.4  # of a frame's height
 TRAIL_FRAMES = 40
-OWN_PX = 1.5  # a camera that by itself sees the centre further off than this is shown
+OWN_PX = 1.5  # a camera's own centre further off than this is drawn
 LINE, LETTER = 18, 8  # px, of text: from line to line, and a letter's usual width
+LABEL_AT = 1.16  # of the sphere's radius: letters of the axes
+RESIDUAL_REACH = 0.5  # of the contrast of white and black: the ends of the residual's scale
+BLANK = 45  # grey of pixels without a residual
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OverlayView:
+    """What all pictures of one camera share; made by `overlay.prepared`, read by the page."""
+
+    name: str
+    model: Model
+    light: LightFit | None  # None: no frame to fit it to
+    black: float  # grey level shown black
+    white: float
+    half_px: float  # of the crop
+    trail_px: NDArray[np.float64]  # (N, 2), the sphere's centre in the picture
+
+    @property
+    def why_unlit(self) -> str:
+        """Why nothing can be rendered, if there is no light."""
+        return "no map of the paint" if self.model.texture is None else "no valid frame"
+
+    def shown(self, grey: NDArray[np.generic]) -> NDArray[np.uint8]:
+        """Return grey levels (H, W) on the scale of the display, 0 .. 255; NaN is black."""
+        share = (np.asarray(grey, np.float32) - self.black) / (self.white - self.black)
+        return np.asarray(np.clip(np.nan_to_num(share), 0, 1) * 255, np.uint8)
+
+    def centre_px(self, seen: CameraTrack, k: int) -> NDArray[np.float64]:
+        """Return the track's centre in frame k, or what the camera alone sees without one; NaN if neither is known."""
+        return np.asarray(self.trail_px[k] if self.placed(k) else seen.centre_px[k])
+
+    def placed(self, k: int) -> bool:
+        """Whether the track has a position in frame k."""
+        return bool(np.isfinite(self.model.path.position_mm[k]).all())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Page:
-    """Draws frames of a track, all in one layout; made by overlay.views and the command."""
+    """Draws frames of a track, all in one layout; made by `overlay.prepared`."""
 
     track: Trajectory
     numbers: NDArray[np.int64]  # (N,), the experiment's numbers of the frames
-    views: Sequence[View]
+    views: Sequence[OverlayView]
 
     def draw(self, k: int, pictures: Mapping[str, Grey | None]) -> NDArray[np.uint8]:
-        """Return frame k of the track, (H, W, 3) with H and W even.
-
-        Args:
-            k: row of the track.
-            pictures: (h, w) of each camera; None where it has none.
-        """
-        height, widths = FRAME_HEIGHT, [_frame_width(view, FRAME_HEIGHT) for view in self.views]
+        """Return frame k (a row of the track) with the pictures (h, w) of each camera, (H, W, 3) with H and W even."""
+        height = FRAME_HEIGHT
+        sizes = [view.model.camera.image_size for view in self.views]
+        widths = [round(min(width / rows, WIDEST) * height) for width, rows in sizes]
         width = max(widths) + 3 * (SIDE + GAP) + 2 * GAP
         canvas = Canvas(width + width % 2, HEAD + len(self.views) * (height + GAP) + FOOT)
         self._head(canvas, k)
@@ -59,57 +81,58 @@ class Page:
         return canvas.finished()
 
     def _head(self, canvas: Canvas, k: int) -> None:
-        segment = int(self.track.segment[k])
+        segment, width = int(self.track.segment[k]), canvas.pixels.shape[1]
         place = f"segment {segment}" if segment >= 0 else "outside any segment"
         words = f"frame {int(self.numbers[k])}    t = {self.track.time[k]:.4f} s    {place}"
         canvas.text((GAP, 24), words, 18)
-        about = f"{self.track.experiment}, {self.track.method}"
-        canvas.text((canvas.pixels.shape[1] - GAP, 24), about, 15, ink.FAINT, "rs")
-        told, colour = self.state(k)
-        canvas.text(
-            (GAP, 50),
-            textwrap.shorten(told, (canvas.pixels.shape[1] - 2 * GAP) // LETTER, placeholder=" ..."),
-            15,
-            colour,
-        )
+        canvas.text((width - GAP, 24), f"{self.track.experiment}, {self.track.method}", 15, ink.FAINT, "rs")
+        state, colour = self.state(k)
+        canvas.text((GAP, 50), textwrap.shorten(state, (width - 2 * GAP) // LETTER, placeholder=" ..."), 15, colour)
 
     def state(self, k: int) -> tuple[str, ink.Colour]:
-        """Return in words what a frame is, with a mark that needs no colour, and its colour."""
+        """Return the state of a frame as text, with a mark for readers without colours, and its colour."""
         flags = ", ".join(flag_words(self.track, k))
         if not self.track.valid[k]:
             return f"\u2716 not valid{': ' + flags if flags else ''}", ink.LOST
         return (f"\u25b2 doubt: {flags}", ink.DOUBT) if flags else ("\u25cf valid", ink.GOOD)
 
     def _camera(
-        self, canvas: Canvas, view: View, k: int, picture: Grey | None, corner: tuple[int, int], size: tuple[int, int]
+        self,
+        canvas: Canvas,
+        view: OverlayView,
+        k: int,
+        picture: Grey | None,
+        corner: tuple[int, int],
+        size: tuple[int, int],
     ) -> None:
-        path, camera = view.model.path, view.model.camera
-        grey = None if picture is None else shown(picture, view)
-        frame = Panel(canvas, corner, size, (-0.5, -0.5), size[1] / camera.image_size[1])
-        placed = bool(np.isfinite(path.position_mm[k]).all())
-        centre = view.trail_px[k] if placed else self.track.cameras[view.name].centre_px[k]
+        seen = self.track.cameras[view.name]
+        frame = Panel(canvas, corner, size, (-0.5, -0.5), size[1] / view.model.camera.image_size[1])
+        frame.pixels[:] = 0
+        if picture is not None:
+            frame.show(view.shown(picture))
+        centre, half = view.centre_px(seen, k), view.half_px
         left = corner[0] + size[0] + GAP
-        titles = ("crop", "re-rendered", "residual")
         panels = []
-        window = Window(centre_px=centre, half_px=view.half_px, side=crop_side(view.half_px))
-        scale = SIDE / (2 * view.half_px)
-        for column, title in enumerate(titles):
+        for column, title in enumerate(("crop", "re-rendered", "residual")):
             at = (left + column * (SIDE + GAP), corner[1] + TITLE)
             canvas.text((at[0], at[1] - 7), title, 14, ink.FAINT)
-            panels.append(Panel(canvas, at, (SIDE, SIDE), centre - view.half_px, scale))
+            panels.append(Panel(canvas, at, (SIDE, SIDE), centre - half, SIDE / (2 * half)))
             panels[-1].pixels[:] = 0
-        frame.pixels[:] = 0
-        if grey is not None:
-            frame.show(grey)
-        here = bool(np.isfinite(centre).all()) and np.isfinite(view.half_px)
+        here = bool(np.isfinite(centre).all()) and np.isfinite(half)
+        window = CropWindow(centre_px=centre, half_px=half, side=crop_side(half))
         blank = _fill(panels, view, k, picture, window) if here else "no position"
-        for panel, words in zip(panels, _why_blank(blank, here, picture is not None), strict=True):
+        no_crop = "no picture" if picture is None else "" if here else blank
+        no_residual = blank or ("no picture" if picture is None else "")
+        for panel, words in zip(panels, (no_crop, blank, no_residual), strict=True):
             canvas.text((panel.corner[0] + SIDE / 2, panel.corner[1] + SIDE / 2), words, 15, ink.FAINT, "mm")
         for panel, letters in ((frame, False), (panels[0], True)):
-            if placed and np.isfinite(panel.first_px).all():
-                draw_track(panel, view, k, letters)
-        if own_distance_px(view, self.track.cameras[view.name], k) > OWN_PX:
-            draw_own(panels[0], self.track.cameras[view.name], k)
+            if view.placed(k) and np.isfinite(panel.first_px).all():
+                draw_outline(panel, view, k)
+                draw_axes(panel, view, k, letters)
+        if own_distance_px(view, seen, k) > OWN_PX:
+            angle = np.linspace(0, 2 * np.pi, 73)
+            around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            panels[0].line(seen.centre_px[k] + seen.radius_px[k] * around, ink.INK, 1, dotted=True)
         frame.line(view.trail_px[max(0, k - TRAIL_FRAMES) : k + 1], ink.TRAIL, 1)
         canvas.text((corner[0] + 8, corner[1] + 20), view.name, 16)
         if picture is None:
@@ -119,12 +142,15 @@ class Page:
             frame.border(mark, 3)
         self._words(canvas, view, k, (left, corner[1] + TITLE + SIDE + 24), size[1] - SIDE - TITLE)
 
-    def _words(self, canvas: Canvas, view: View, k: int, at: tuple[int, int], room: int) -> None:
-        """What this camera says of the frame, and the scale of the residual."""
+    def _words(self, canvas: Canvas, view: OverlayView, k: int, at: tuple[int, int], room: int) -> None:
+        """Write this camera's warnings and numbers, and the scale of the residual."""
         seen = self.track.cameras[view.name]
         lost = lost_cameras(self.track, k).get(view.name)
         lines = [(f"{view.name}: {lost}", ink.DOUBT) if lost else (f"{view.name}: measured", ink.GOOD)]
-        lines.append((_numbers(seen.score[k], seen.radius_px[k]), ink.INK))
+        numbers = [f"score {seen.score[k]:.3f}" if np.isfinite(seen.score[k]) else "no score"]
+        if np.isfinite(seen.radius_px[k]):
+            numbers.append(f"radius {seen.radius_px[k]:.1f} px")
+        lines.append((", ".join(numbers), ink.INK))
         sigma = np.sqrt(np.trace(self.track.orientation_cov[k]) / 3)
         if np.isfinite(sigma):
             lines.append((f"error of the orientation, stated: {np.rad2deg(sigma):.3f}\u00b0 an axis", ink.INK))
@@ -155,8 +181,8 @@ class Page:
         canvas.text((width - GAP, top + 16), f"{words}{len(self.track)} valid)", 13, ink.FAINT, "rs")
 
     def _strip(self, width: int) -> NDArray[np.uint8]:
-        """The states of all frames side by side, (width, 3); of the frames of one pixel the worst."""
-        flags = self.track.flags if len(self.track.cameras) > 1 else self.track.flags & ~np.uint32(4)
+        """Return the states of all frames side by side, (width, 3); of the frames of one pixel the worst."""
+        flags = self.track.flags if len(self.track.cameras) > 1 else self.track.flags & ~np.uint32(Flag.ONE_CAMERA)
         state = np.where(self.track.valid, np.where(flags != 0, 1, 0), 2)
         edges = np.linspace(0, len(state), width + 1)
         first = edges[:-1].astype(int)
@@ -166,35 +192,63 @@ class Page:
 
 
 def crop_side(half_px: float) -> int:
-    """Return how many samples a crop has along each side: the picture's own pixels, as far as they can be shown."""
+    """Return the samples along each side of a crop: the picture's own pixels, as far as the panel shows them."""
     return max(48, min(SIDE, round(2 * half_px))) if np.isfinite(half_px) else SIDE
 
 
-def _fill(panels: Sequence[Panel], view: View, k: int, picture: Grey | None, window: Window) -> str:
-    """Crop, re-rendered sphere, residual; say why the sphere is not rendered, where it is not."""
+def _fill(panels: Sequence[Panel], view: OverlayView, k: int, picture: Grey | None, window: CropWindow) -> str:
+    """Show crop, re-rendered sphere and residual; return why the sphere is not rendered, or ''."""
     grey = None if picture is None else crop(picture, window)
     if grey is not None:
-        panels[0].show(shown(grey, view))
+        panels[0].show(view.shown(grey))
     if view.light is None or not view.model.path.whole[k]:
         return "no orientation" if view.light is not None else view.why_unlit
     model = view.light.picture(view.model.look(k, window), grey)
-    panels[1].show(shown(model, view))
+    panels[1].show(view.shown(model))
     if grey is not None:
         panels[2].show(residual_colours((grey - model) / view.light.contrast))
     return ""
 
 
-def _why_blank(blank: str, here: bool, filmed: bool) -> tuple[str, str, str]:
-    """What is written into the crop, the re-rendered sphere and the residual where they are empty."""
-    no_crop = "no picture" if not filmed else "" if here else blank
-    return no_crop, blank, blank or ("" if filmed else "no picture")
+def residual_colours(residual: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return a residual relative to the contrast as colours: blue too dark, black equal, orange too bright."""
+    share = np.clip(np.nan_to_num(residual) / RESIDUAL_REACH, -1, 1)[..., None]
+    ends = np.where(share < 0, np.array(ink.AXES[2], np.float32), np.array(ink.AXES[0], np.float32))
+    colours: NDArray[np.uint8] = np.asarray(np.abs(share) * ends, np.uint8)
+    colours[np.isnan(residual)] = BLANK
+    return colours
 
 
-def _numbers(score: float, radius_px: float) -> str:
-    told = [f"score {score:.3f}"] if np.isfinite(score) else ["no score"]
-    return ", ".join([*told, *([f"radius {radius_px:.1f} px"] if np.isfinite(radius_px) else [])])
+def draw_outline(panel: Panel, view: OverlayView, k: int) -> None:
+    """Draw the outline of frame k; dotted if it is the smoother's."""
+    path = view.model.path
+    panel.line(outline_px(view.model.camera, path, k), ink.OUTLINE, 1, dotted=bool(path.smoothed[k]))
 
 
-def _frame_width(view: View, height: int) -> int:
-    width, rows = view.model.camera.image_size
-    return round(min(width / rows, WIDEST) * height)
+def draw_axes(panel: Panel, view: OverlayView, k: int, letters: bool = True) -> None:
+    """Draw the body axes of frame k: solid towards the camera, dotted away; nothing without an orientation."""
+    path, centre = view.model.path, view.trail_px[k]
+    if not path.whole[k]:
+        return
+    tips, near = axes_px(view.model.camera, path, k)
+    for tip, towards, colour, letter in zip(tips, near, ink.AXES, "xyz", strict=True):
+        panel.line(np.stack([centre, tip]), colour, 2, dotted=not towards)
+        if letters:
+            panel.text(centre + LABEL_AT * (tip - centre), letter, 15, colour)
+
+
+def own_distance_px(view: OverlayView, seen: CameraTrack, k: int) -> float:
+    """Return the distance of a camera's own centre from the track's, px; NaN if either is missing."""
+    return float(np.linalg.norm(seen.centre_px[k] - view.trail_px[k]))
+
+
+def scale_bar(canvas: Canvas, at: tuple[int, int], width: int, light: LightFit | None) -> None:
+    """Draw the residual's scale, `width` px wide."""
+    bar = canvas.pixels[at[1] : at[1] + 10, at[0] : at[0] + width]
+    ramp = np.linspace(-RESIDUAL_REACH, RESIDUAL_REACH, width, dtype=np.float32)
+    bar[:] = residual_colours(np.broadcast_to(ramp, bar.shape[:2]))
+    reach = f"{100 * RESIDUAL_REACH:.0f} %"
+    for share, words, anchor in ((0, f"-{reach}", "ls"), (0.5, "filmed less model", "ms"), (1, f"+{reach}", "rs")):
+        canvas.text((at[0] + share * width, at[1] + 26), words, 13, ink.FAINT, anchor)
+    words = "of white less black paint" + ("" if light is None else f" ({light.contrast:.0f} levels)")
+    canvas.text((at[0] + 0.5 * width, at[1] + 44), words, 13, ink.FAINT, "ms")

@@ -1,4 +1,4 @@
-"""The page of a report: one HTML file that needs nothing beside it."""
+"""The page of a report: one HTML file without external parts."""
 
 from __future__ import annotations
 
@@ -7,30 +7,25 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 import yaml
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, StrictUndefined, Template
 
 from sphereorient.files.provenance import versions
-from sphereorient.report.strip_html import strip_assets
+from sphereorient.report.frame_warnings import stated_error
+from sphereorient.report.gallery import Gallery, GalleryFrame
+from sphereorient.report.plots.style import SYMBOLS, decimals
+from sphereorient.report.strip import STATUS_WORDS, BadStretch, bad_stretches, strip_of
 from sphereorient.report.tables import Table
 from sphereorient.report.verdicts import Verdict
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.moments import COMPONENTS
 from sphereorient.trajectory import Trajectory
 
-NAMES = {
-    "velocity": "v",
-    "acceleration": "a",
-    "omega_lab": "\u03c9 lab",
-    "omega_body": "\u03c9 body",
-    "alpha_lab": "\u03b1 lab",
-    "alpha_body": "\u03b1 body",
-}
-UNITS = {"m/s": "m/s", "m/s^2": "m/s\u00b2", "rad/s": "rad/s", "rad/s^2": "rad/s\u00b2"}
 CONTENTS = (
     ("summary", "Summary"),
     ("numbers", "Numbers"),
@@ -39,11 +34,13 @@ CONTENTS = (
     ("tables", "Tables"),
     ("settings", "Settings and provenance"),
 )
+MOST_STRETCHES = 200  # rows of the table
+UNFOLDED = 12  # pictures that are visible without JavaScript
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drawn:
-    """A figure that was written; made by build, shown by the page."""
+class DrawnFigure:
+    """A figure that was written; made by `build`, shown by the page."""
 
     name: str
     caption: str
@@ -51,15 +48,23 @@ class Drawn:
     half: bool = False  # two beside each other
 
     @property
-    def shown(self) -> dict[str, Any]:
-        """What the template asks for."""
-        return {
-            "name": self.name,
-            "caption": self.caption,
-            "png": base64.b64encode(self.png).decode(),
-            "half": self.half,
-            "files": f"figures/{self.name}.png, .pdf",
-        }
+    def base64(self) -> str:
+        """The picture as text."""
+        return base64.b64encode(self.png).decode()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Report:
+    """The contents of the page; made by `build`."""
+
+    summary: Summary
+    tracks: Mapping[str, Trajectory]  # by the name of their file
+    verdicts: Sequence[Verdict]
+    figures: Sequence[DrawnFigure]  # in the order of the page
+    tables: Sequence[Table]  # that were written
+    suffixes: Sequence[str]  # of the tables' files
+    strips: Sequence[str]  # HTML of the tracks' quality strips, of `strip_html`
+    command: str  # that made the report
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +77,7 @@ class Cell:
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """A table to read; the files hold all digits."""
+    """A table of the page; the files have all digits."""
 
     title: str
     about: str
@@ -80,60 +85,90 @@ class Grid:
     rows: Sequence[Sequence[str | Cell]]
 
 
-def page_html(
-    summary: Summary,
-    tracks: Mapping[str, Trajectory],
-    words: Sequence[Verdict],
-    figures: Sequence[Drawn],
-    tables: Sequence[Table],
-    suffixes: Sequence[str],
-    strips: Sequence[str],
-    command: str,
-) -> str:
-    """Return the page.
-
-    Args:
-        summary: the statistics.
-        tracks: by the name of their file.
-        words: what the numbers say.
-        figures: in the order of the page.
-        tables: that were written.
-        suffixes: of their files.
-        strips: HTML of the tracks' quality strips, of `strip_html`.
-        command: that made the report.
-    """
+def page_html(report: Report) -> str:
+    """Return the page of a report."""
+    summary, tracks = report.summary, report.tracks
     css, js = strip_assets()
-    environment = Environment(
-        loader=PackageLoader("sphereorient.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=False,
-    )
-    own = files("sphereorient.report").joinpath("page.css").read_text("utf-8")
     names = sorted({track.experiment for track in tracks.values() if track.experiment})
     page = {
         "title": f"Motion of a sphere: {_some(names)}" if names else "Motion of a sphere",
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
         "contents": CONTENTS,
         "tiles": _tiles(summary, tracks),
-        "verdicts": words,
         "numbers_about": _numbers_about(summary),
         "grids": [grid for grid in (*_moments(summary), _flow(summary)) if grid.rows],
-        "figures": [figure.shown for figure in figures],
-        "frames_about": _frames_about(len(strips), tracks),
-        "strips": strips,
-        "tables_about": _tables_about(suffixes),
-        "tables": tables,
-        "suffixes": suffixes,
+        "frames_about": _frames_about(len(report.strips), tracks),
+        "tables_about": _tables_about(report.suffixes),
         "settings": _settings(summary),
         "provenance": [_provenance(name, track) for name, track in tracks.items()],
-        "footer": f"sphereorient {versions()['sphereorient']}; {command}",
+        "footer": f"sphereorient {versions()['sphereorient']}; {report.command}",
     }
-    return environment.get_template("page.html.j2").render(page=page, css=own + css, js=js)
+    return _template("page.html.j2").render(page=page, report=report, css=_asset("page.css") + css, js=js)
+
+
+@cache
+def _template(name: str) -> Template:
+    """Compile a template; it refuses numbers that JSON does not have."""
+    trimmed = name == "strip.html.j2"
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=trimmed, lstrip_blocks=trimmed)
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    return environment.from_string(_asset(name))
+
+
+def _asset(name: str) -> str:
+    return files("sphereorient.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def strip_assets() -> tuple[str, str]:
+    """Return style and script of the strips, for the head of a page."""
+    return _asset("strip.css"), _asset("strip.js")
+
+
+def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
+    """Return the section of the page with the quality of every frame of a track.
+
+    Without JavaScript it is a table of the bad stretches, and the pictures; with it, strips that react to the mouse.
+    Style and script are those of `strip_assets`.
+
+    Args:
+        name: of the track on the page.
+        track: what was measured.
+        gallery: pictures of some of its frames; None: none.
+
+    Returns:
+        HTML, all text escaped.
+    """
+    numbers = None if gallery is None else gallery.numbers
+    strip, found = strip_of(track, numbers), bad_stretches(track, numbers)
+    ranked = [] if gallery is None else sorted(gallery.frames, key=lambda frame: frame.rank)
+    return _template("strip.html.j2").render(
+        name=name,
+        data=strip.as_json(),
+        strip=strip,
+        stretches=found[:MOST_STRETCHES],
+        more=found[MOST_STRETCHES:],
+        reasons=_reasons,
+        gallery=gallery,
+        unfolded=ranked[:UNFOLDED],
+        folded=sorted(ranked[UNFOLDED:], key=lambda frame: frame.k),
+        caption=_caption,
+    )
+
+
+def _reasons(stretch: BadStretch) -> str:
+    """Return the warnings of a stretch with their numbers of frames."""
+    return "; ".join(f"{words} ({count})" for words, count in stretch.reasons) or "no reason given"
+
+
+def _caption(frame: GalleryFrame) -> str:
+    """Return status and reasons of a picture."""
+    status = STATUS_WORDS[frame.status]
+    words = [words for words in frame.words if words != status]
+    return "; ".join(words if words and words[0].startswith(status) else [status, *words])
 
 
 def _some(names: Sequence[str], most: int = 4) -> str:
-    """Return names in a row, the many cut short."""
+    """Return names in a row, many of them shortened."""
     shown = ", ".join(names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
@@ -141,106 +176,80 @@ def _some(names: Sequence[str], most: int = 4) -> str:
 def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[dict[str, str]]:
     frames = sum(len(track) for track in tracks.values())
     valid = sum(int(track.valid.sum()) for track in tracks.values())
+    sigma = np.concatenate([stated_error(track.orientation_cov) for track in tracks.values()])
+    sigma = sigma[np.isfinite(sigma)]
+    median = f"{np.rad2deg(np.median(sigma)):.2g}\u00b0" if len(sigma) else "unknown"
     found = [
         (f"{frames:,}", "frames"),
         (f"{100 * valid / max(frames, 1):.4g} %", "valid"),
         (f"{summary.ensemble.segments:,}", "segment" if summary.ensemble.segments == 1 else "segments"),
-        (_median_error(tracks), "stated error of the orientation, median"),
+        (median, "stated error of the orientation, median"),
     ]
     for quantity in ("velocity", "omega_lab"):
         part = summary.table[quantity]
         rms = float(np.sqrt(np.square(part.rms.value[:3]).sum()))
-        found.append((f"{rms:.3g} {UNITS[part.units]}", f"rms of {NAMES[quantity]}, all components"))
+        found.append((f"{rms:.3g} {_unit(part.units)}", f"rms of {SYMBOLS[quantity]}, all components"))
     return [{"number": number, "words": words} for number, words in found]
 
 
-def _median_error(tracks: Mapping[str, Trajectory]) -> str:
-    parts = [np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2) / 3) for track in tracks.values()]
-    sigma = np.concatenate(parts)
-    sigma = sigma[np.isfinite(sigma)]
-    return f"{np.rad2deg(np.median(sigma)):.2g}\u00b0" if len(sigma) else "unknown"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Shown:
-    """A statistic of Table I on the page."""
-
-    name: str  # a field of Moments
-    title: str
-    about: str
-    percent: bool = False
-    of_norm: bool = True  # whether it is known of the norm, too
-
-
-def _statistics(error: str) -> list[Shown]:
-    """Return what is shown, and in words what the track's own errors do to it."""
-    lost, done = {
-        "added": ("noise that the filter let through", "taken off"),
-        "removed": ("motion that the smoother could not follow", "put back"),
-    }[error]
-    by_errors = f"With {lost} {done}, by the track's own error bars."
-    return [
-        Shown(name="mean", title="Mean", about="Of components and norm."),
-        Shown(name="rms", title="Rms", about="About the mean, as measured."),
-        Shown(name="corrected_rms", title="Rms, corrected", about=by_errors, of_norm=False),
-        Shown(
-            name="noise_share",
-            title="Share of the errors, %",
-            about=f"Of the variance: {lost}.",
-            percent=True,
-            of_norm=False,
-        ),
-        Shown(name="flatness", title="Flatness", about="3 for a Gaussian."),
-        Shown(name="corrected_flatness", title="Flatness, corrected", about=by_errors, of_norm=False),
-        Shown(name="skewness", title="Skewness", about="0 where x and -x are as likely."),
-    ]
+def _unit(units: str) -> str:
+    return units.replace("^2", "\u00b2")
 
 
 def _moments(summary: Summary) -> list[Grid]:
-    """Return a grid for each statistic, a row for each quantity."""
+    """Return a grid for each statistic of Table I, a row for each quantity."""
+    lost, done = {
+        "added": ("noise that the filter let through", "subtracted"),
+        "removed": ("motion that the smoother could not follow", "added"),
+    }[summary.ensemble.error]
+    by_errors = f"With {lost} {done}, by the track's own error bars."
+    shown = {  # by field of Moments; those by the errors are unknown for the norm
+        "mean": ("Mean", "Of components and norm."),
+        "rms": ("Rms", "About the mean, as measured."),
+        "corrected_rms": ("Rms, corrected", by_errors),
+        "noise_share": ("Share of the errors, %", f"Of the variance: {lost}."),
+        "flatness": ("Flatness", "3 for a Gaussian."),
+        "corrected_flatness": ("Flatness, corrected", by_errors),
+        "skewness": ("Skewness", "0 for a symmetric distribution."),
+    }
     grids = []
-    for shown in _statistics(summary.ensemble.error):
+    for name, (title, about) in shown.items():
+        columns = COMPONENTS[:3] if name.startswith(("corrected", "noise")) else COMPONENTS
+        factor, most = (100.0, 3) if name == "noise_share" else (1.0, 6)
         rows: list[list[str | Cell]] = []
-        columns = COMPONENTS if shown.of_norm else COMPONENTS[:3]
         for quantity, part in summary.table.items():
-            with_unit = shown.name in ("mean", "rms", "corrected_rms")
-            found = getattr(part, shown.name).scaled(100.0 if shown.percent else 1.0)
-            symbol = f"{NAMES[quantity]}, {UNITS[part.units]}" if with_unit else NAMES[quantity]
-            rows.append([symbol, *(_cell(found, i, 3 if shown.percent else 6) for i in range(len(columns)))])
-        grids.append(Grid(title=shown.title, about=shown.about, head=["", *columns], rows=rows))
+            found = getattr(part, name).scaled(factor)
+            unit = f", {_unit(part.units)}" if name in ("mean", "rms", "corrected_rms") else ""
+            rows.append([f"{SYMBOLS[quantity]}{unit}", *(_cell(found.part(i), most) for i in range(len(columns)))])
+        grids.append(Grid(title=title, about=about, head=["", *columns], rows=rows))
     return grids
 
 
 def _numbers_about(summary: Summary) -> str:
     if summary.distributions is None:
-        return "Of one segment: without intervals, since nothing says how much another one would differ."
+        return "One segment: without intervals, since the scatter between segments is unknown."
     level = f"{100 * summary.settings.level:g} %"
     return f"In small print {level} intervals from resampled segments."
 
 
-def _cell(found: Interval, i: int, most: int = 6) -> Cell:
-    """Return a number with its interval, of at most so many decimals."""
-    value, low, high = (float(np.asarray(x)[i]) for x in (found.value, found.low, found.high))
+def _cell(of: Interval, most: int) -> Cell:
+    """Return a scalar with its interval, of at most so many decimals."""
+    value, low, high = float(of.value), float(of.low), float(of.high)
     if not math.isfinite(value):
         return Cell(value="\u2013")
     if not math.isfinite(low + high):
         return Cell(value=f"{value:.4g}")
-    digits = min(_digits(high - low), most)
+    digits = min(decimals(high - low), most)
     return Cell(value=f"{value:.{digits}f}", range=f"{low:.{digits}f} to {high:.{digits}f}")
-
-
-def _digits(width: float) -> int:
-    """Return how many decimals a number with an interval of this width deserves."""
-    return 4 if width <= 0 else min(max(1 - math.floor(math.log10(width)), 0), 6)
 
 
 def _flow(summary: Summary) -> Grid:
     flow = summary.surroundings.flow
     rows: list[list[str | Cell]] = []
-    about = "Components' rms, corrected where the errors are known."
+    about = "Components' rms, corrected if the errors are known."
     if flow is not None:
-        about += f" Of the viscosity {flow.viscosity_m2_s:.4g} m\u00b2/s and the dissipation "
-        about += f"{flow.dissipation_w_kg:.4g} W/kg that the experiment names."
+        about += f" With the viscosity {flow.viscosity_m2_s:.4g} m\u00b2/s and the dissipation "
+        about += f"{flow.dissipation_w_kg:.4g} W/kg of the experiment."
         rows += [["Kolmogorov's length, m", "eta = (nu^3 / epsilon)^(1/4)", f"{flow.eta_m:.4g}"]]
         rows += [["Kolmogorov's time, s", "tau_eta = (nu / epsilon)^(1/2)", f"{flow.tau_eta_s:.4g}"]]
     rows += [[one.name, one.formula, f"{one.value:.4g}"] for one in summary.comparisons]
@@ -260,17 +269,15 @@ def _tables_about(suffixes: Sequence[str]) -> str:
 
 
 def _settings(summary: Summary) -> str:
-    tree = summary.settings.model_dump() | {
-        "surroundings": {key: value for key, value in vars(summary.surroundings).items() if value is not None}
-    }
-    return str(yaml.safe_dump(tree, sort_keys=False)).rstrip()
+    around = {key: value for key, value in vars(summary.surroundings).items() if value is not None}
+    return str(yaml.safe_dump(summary.settings.model_dump() | {"surroundings": around}, sort_keys=False)).rstrip()
 
 
 def _provenance(name: str, track: Trajectory) -> dict[str, Any]:
     entries = [("experiment", track.experiment), ("method", track.method), ("frame rate, Hz", f"{track.frame_rate:g}")]
     for key, value in track.provenance.items():
         if isinstance(value, Mapping):
-            text = ", ".join(f"{inner} {told}" for inner, told in value.items())
+            text = ", ".join(f"{inner} {entry}" for inner, entry in value.items())
         elif isinstance(value, list | tuple):
             text = "; ".join(map(str, value))
         else:

@@ -1,4 +1,4 @@
-"""Quality of every frame of a track, as a page shows it, and the stretches of frames that are not good."""
+"""Quality of every frame of a track for the page, and the stretches of bad frames."""
 
 from __future__ import annotations
 
@@ -7,14 +7,19 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from sphereorient import so3
-from sphereorient.report.doubts import FLAG_WORDS, doubts, flag_words, reason_words
+from sphereorient.report.frame_warnings import (
+    FLAG_WORDS,
+    distance_deg,
+    flag_words,
+    frame_warnings,
+    reason_words,
+    stated_error,
+)
 from sphereorient.trajectory import Reason, Trajectory
 
-MOST_BINS = 20_000  # frames of longer tracks are taken together: the page stays small enough for a browser
+MOST_BINS = 20_000  # frames of longer tracks are binned, so that a browser can show the page
 APART_FRAMES = 10  # stretches with fewer frames between them are one
 DIGITS = 4  # of the numbers on the page
 GOOD, DOUBTFUL, NOT_VALID = range(3)
@@ -26,18 +31,18 @@ Numbers = tuple[float | None, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class CameraStrip:
-    """What one camera says, n bins; a part of `Strip`."""
+    """Scores and reasons of one camera, n bins; a part of `QualityStrip`."""
 
     name: str
     score: Numbers  # the lowest of the bin
-    reason: tuple[int, ...]  # place in Strip.reason_words; 0: measured; of a bin the first that is not
+    reason: tuple[int, ...]  # index in QualityStrip.reason_words; 0: measured; of a bin the first other one
 
 
 @dataclass(frozen=True, kw_only=True)
-class Strip:
-    """Quality of all frames, or of n bins of `per_bin` frames each, the worst of a bin standing for it.
+class QualityStrip:
+    """Quality of all frames, or of n bins of `per_bin` frames each, represented by the worst frame.
 
-    Made by `strip_of`, read by the page. What is not known is None: JSON has no NaN.
+    Made by `strip_of`, read by the page. Unknown numbers are None: JSON has no NaN.
     """
 
     name: str  # of the experiment
@@ -47,7 +52,7 @@ class Strip:
     row: tuple[int, ...]  # (n), row of the track: the first of those of the bin's status
     number: tuple[int, ...]  # the experiment's number of that frame
     time_s: Numbers  # of that frame
-    status: tuple[int, ...]  # place in status_words
+    status: tuple[int, ...]  # index in status_words
     orientation_error_deg: Numbers  # stated, one standard deviation about an axis; the largest of the bin
     position_error_mm: Numbers  # the same along an axis
     cameras: tuple[CameraStrip, ...]
@@ -55,94 +60,104 @@ class Strip:
     flags: tuple[int, ...]  # bits, those of all frames of the bin
     status_words: tuple[str, str, str]
     reason_words: tuple[str, ...]
-    flag_words: tuple[tuple[int, str], ...]  # bit and what it means
+    flag_words: tuple[tuple[int, str], ...]  # bit and its meaning
 
     def as_json(self) -> dict[str, Any]:
-        """Return the strip as `json` takes it, without NaN."""
+        """Return the strip for `json`, without NaN."""
         return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stretch:
-    """Frames that are doubtful or not valid, with at most nine good ones in a row between them; made by `stretches`."""
+class BadStretch:
+    """Frames that are doubtful or not valid, with at most nine good ones in a row among them."""
 
     first: int  # row of the track
-    last: int  # row, itself in it
+    last: int  # row, included
     first_number: int  # the experiment's
     last_number: int
     start_s: float
     end_s: float  # of the last frame
     doubtful: int  # frames
     not_valid: int  # frames
-    reasons: tuple[tuple[str, int], ...]  # in words, and of how many frames that is said; the most frequent first
+    reasons: tuple[tuple[str, int], ...]  # warning, and its number of frames; the most frequent first
 
     @property
     def frames(self) -> int:
-        """Number of frames, the good ones between the others counted too."""
+        """Number of frames, including the good ones among the others."""
         return self.last - self.first + 1
 
 
-def strip_of(track: Trajectory, numbers: Ints | None = None) -> Strip:
-    """Collect what a page shows of the quality of every frame.
+def strip_of(track: Trajectory, numbers: Ints | None = None) -> QualityStrip:
+    """Collect the quality of every frame for the page.
 
-    Up to 20,000 frames each stands for itself; of longer tracks equal numbers of frames are taken together, and what
-    is shown is the worst of them: no bad frame gets lost.
+    Tracks of more than 20,000 frames are binned. A bin shows the worst of its frames, so that no bad frame is lost.
 
     Args:
         track: what was measured.
-        numbers: (N,), the experiment's numbers of the frames; None: as their times say.
-
-    Returns:
-        The strip; what is doubtful in a frame is what `report.doubts` says.
+        numbers: (N,), the experiment's numbers of the frames; None: by their times.
     """
-    bins = _Bins(len(track), max(1, -(-len(track) // MOST_BINS)))
+    size = max(1, -(-len(track) // MOST_BINS))
+    rows, starts = np.arange(len(track)), np.arange(0, len(track), size)
     numbers = frame_numbers(track) if numbers is None else numbers
     status = status_of(track)
     codes, words = _reason_codes(track)
-    row = bins.row_of(status)
-    seen = track.cameras.items()
-    return Strip(
+    seen = [camera.orientation for camera in track.cameras.values()]
+
+    def first(wanted: NDArray[np.bool_]) -> Ints:
+        """Return the first such frame of every bin; the bin's first frame if there is none."""
+        found = np.minimum.reduceat(np.where(wanted, rows, len(track)), starts)
+        return np.where(found < len(track), found, starts)
+
+    def largest(values: Floats) -> Floats:
+        return np.asarray(np.fmax.reduceat(values, starts), np.float64)
+
+    row = first(status == np.repeat(np.maximum.reduceat(status, starts), size)[: len(track)])
+    return QualityStrip(
         name=track.experiment,
         frames=len(track),
-        per_bin=bins.size,
+        per_bin=size,
         counts=_counted(status),
-        row=_whole(row),
-        number=_whole(numbers[row]),
+        row=tuple(row.tolist()),
+        number=tuple(numbers[row].tolist()),
         time_s=_short(track.time[row], 9),
-        status=_whole(status[row]),
-        orientation_error_deg=_short(bins.largest(np.rad2deg(_stated_error(track.orientation_cov)))),
-        position_error_mm=_short(bins.largest(_stated_error(track.position_cov))),
+        status=tuple(status[row].tolist()),
+        orientation_error_deg=_short(largest(np.rad2deg(stated_error(track.orientation_cov)))),
+        position_error_mm=_short(largest(stated_error(track.position_cov))),
         cameras=tuple(
             CameraStrip(
-                name=name, score=_short(-bins.largest(-camera.score)), reason=_whole(bins.first_not_zero(codes[name]))
+                name=name,
+                score=_short(-largest(-camera.score)),
+                reason=tuple(codes[name][first(codes[name] != 0)].tolist()),
             )
-            for name, camera in seen
+            for name, camera in track.cameras.items()
         ),
-        apart_deg=_short(bins.largest(_cameras_apart(track))) if len(track.cameras) == 2 else None,
-        flags=_whole(bins.any_bit(_told_flags(track))),
+        apart_deg=_short(largest(distance_deg(*seen))) if len(seen) == 2 else None,
+        flags=tuple(np.bitwise_or.reduceat(_shown_flags(track), starts).tolist()),
         status_words=STATUS_WORDS,
         reason_words=words,
         flag_words=tuple((int(flag), words) for flag, words in FLAG_WORDS.items()),
     )
 
 
-def stretches(track: Trajectory, numbers: Ints | None = None) -> list[Stretch]:
+def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStretch]:
     """Find the runs of frames that are doubtful or not valid; runs fewer than ten frames apart are one.
 
     Args:
         track: what was measured.
-        numbers: (N,), the experiment's numbers of the frames; None: as their times say.
+        numbers: (N,), the experiment's numbers of the frames; None: by their times.
 
     Returns:
-        Longest first; of equally long ones those with more frames that are not valid.
+        Longest first; of equal length first those with more frames that are not valid.
     """
     numbers = frame_numbers(track) if numbers is None else numbers
-    kind, said = _kinds(track)
+    group, warnings = _groups(track)
     status = status_of(track)
-    found = []
-    for first, last in _merged_runs(np.flatnonzero(status)):
+    bad, found = np.flatnonzero(status), []
+    breaks = np.flatnonzero(np.diff(bad) > APART_FRAMES)
+    firsts, lasts = bad[np.concatenate([[0], breaks + 1])[: len(bad)]], bad[np.append(breaks, -1)[: len(bad)]]
+    for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
         _, doubtful, not_valid = _counted(status[first : last + 1])
-        stretch = Stretch(
+        stretch = BadStretch(
             first=first,
             last=last,
             first_number=int(numbers[first]),
@@ -151,132 +166,76 @@ def stretches(track: Trajectory, numbers: Ints | None = None) -> list[Stretch]:
             end_s=float(track.time[last]),
             doubtful=doubtful,
             not_valid=not_valid,
-            reasons=_reasons(kind[first : last + 1], said),
+            reasons=_reasons(group[first : last + 1], warnings),
         )
         found.append(stretch)
     return sorted(found, key=lambda stretch: (-stretch.frames, -stretch.not_valid, stretch.first))
 
 
 def status_of(track: Trajectory) -> Ints:
-    """Return of every frame whether it is GOOD, DOUBTFUL or NOT_VALID, (N,)."""
-    kind, said = _kinds(track)
-    doubtful = np.array([bool(words) for words in said], dtype=bool)[kind]
+    """Return the status of every frame, GOOD, DOUBTFUL or NOT_VALID, (N,)."""
+    group, warnings = _groups(track)
+    doubtful = np.array([bool(words) for words in warnings], dtype=bool)[group]
     return np.where(track.valid, np.where(doubtful, DOUBTFUL, GOOD), NOT_VALID)
 
 
 def frame_numbers(track: Trajectory) -> Ints:
-    """Return the experiment's numbers of the frames as their times say, (N,); the rows where those are uneven."""
+    """Return the experiment's numbers of the frames by their times, (N,); the rows if the times are irregular."""
     rows = np.arange(len(track))
     at = track.time * track.frame_rate
     if not np.isfinite(at).all():
         return rows
     number = np.rint(at).astype(np.int64)
-    # A table of times or a camera's own stamps: they say when, not which.
+    # Times of a table or a camera's clock do not give numbers.
     even = bool((np.abs(at - number) < 0.1).all() and (np.diff(number) > 0).all())
     return number if even else rows
 
 
-class _Bins:
-    """Takes frames together, `size` at a time."""
-
-    def __init__(self, frames: int, size: int) -> None:
-        self.frames, self.size, self.count = frames, size, -(-frames // size)
-
-    def _split(self, values: NDArray[Any], fill: Any) -> NDArray[Any]:
-        """Return (count, size), the last bin filled up."""
-        padded = np.full(self.count * self.size, fill, values.dtype)
-        padded[: self.frames] = values
-        return padded.reshape(self.count, self.size)
-
-    def row_of(self, status: Ints) -> Ints:
-        """Return the first frame of the worst status of every bin."""
-        within = self._split(status, -1).argmax(1) if self.count else np.zeros(0, np.int64)
-        return np.asarray(np.arange(self.count) * self.size + within, np.int64)
-
-    def largest(self, values: Floats) -> Floats:
-        """Return the largest value of every bin; NaN where there is none."""
-        return np.asarray(np.fmax.reduce(self._split(values, np.nan), axis=1, initial=np.nan), np.float64)
-
-    def first_not_zero(self, codes: Ints) -> Ints:
-        """Return the first code of every bin that is not 0, and 0 where all are."""
-        split = self._split(codes, 0)
-        at = (split != 0).argmax(1) if self.count else np.zeros(0, np.int64)
-        return np.asarray(split[np.arange(self.count), at], np.int64)
-
-    def any_bit(self, flags: Ints) -> Ints:
-        """Return the bits that any frame of a bin has."""
-        return np.asarray(np.bitwise_or.reduce(self._split(flags, 0), axis=1), np.int64)
-
-
-def _kinds(track: Trajectory) -> tuple[Ints, list[list[str]]]:
-    """Return the kind of every frame, (N,), and what is said of each kind: frames of one kind are said the same of."""
+def _groups(track: Trajectory) -> tuple[Ints, list[list[str]]]:
+    """Group frames with the same warnings; return each frame's group, (N,), and the warnings of each group."""
     codes, _ = _reason_codes(track)
-    kind = np.asarray(track.valid, np.int64)
+    group = np.asarray(track.valid, np.int64)
     for values in (track.flags.astype(np.int64), *codes.values()):
         _, part = np.unique(values, return_inverse=True)
-        _, kind = np.unique(kind * (part.max(initial=0) + 1) + part, return_inverse=True)
-    _, first = np.unique(kind, return_index=True)
-    return kind, [doubts(track, int(k)) for k in first]
+        _, group = np.unique(group * (part.max(initial=0) + 1) + part, return_inverse=True)
+    _, first = np.unique(group, return_index=True)
+    return group, [frame_warnings(track, int(k)) for k in first]
 
 
 def _reason_codes(track: Trajectory) -> tuple[dict[str, Ints], tuple[str, ...]]:
-    """Return each camera's reasons as small numbers, (N,), 0 where it measured, and what the numbers mean."""
+    """Return each camera's reasons as small numbers, (N,), 0 if measured, and the meaning of the numbers."""
     known: dict[str, int] = {Reason.OK: 0}
     words = {0: "measured"}
     codes = {}
     for name, camera in track.cameras.items():
-        told = (known.setdefault(reason, len(known)) for reason in camera.reason)
-        codes[name] = np.fromiter(told, np.int64, len(track))
+        numbered = (known.setdefault(reason, len(known)) for reason in camera.reason)
+        codes[name] = np.fromiter(numbered, np.int64, len(track))
         for code, k in zip(*np.unique(codes[name], return_index=True), strict=True):
             words[int(code)] = reason_words(track, int(k))[name]
     return codes, tuple(words[code] for code in range(len(known)))
 
 
-def _told_flags(track: Trajectory) -> Ints:
-    """Return the bits of every frame that are told, (N,)."""
+def _shown_flags(track: Trajectory) -> Ints:
+    """Return the bits of every frame that `flag_words` shows, (N,)."""
     bit = {words: int(flag) for flag, words in FLAG_WORDS.items()}
     _, first, which = np.unique(track.flags, return_index=True, return_inverse=True)
-    told = [sum(bit[words] for words in flag_words(track, int(k))) for k in first]
-    return np.array(told, np.int64)[which]
+    shown = [sum(bit[words] for words in flag_words(track, int(k))) for k in first]
+    return np.array(shown, np.int64)[which]
 
 
-def _merged_runs(bad: Ints) -> list[tuple[int, int]]:
-    """Return first and last of the runs of rows, fewer than ten others between two rows of one run."""
-    if not len(bad):
-        return []
-    breaks = np.flatnonzero(np.diff(bad) > APART_FRAMES)
-    firsts, lasts = bad[np.concatenate([[0], breaks + 1])], bad[np.concatenate([breaks, [len(bad) - 1]])]
-    return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
-
-
-def _reasons(kind: Ints, said: Sequence[Sequence[str]]) -> tuple[tuple[str, int], ...]:
-    """Count in how many frames each thing is said; that a frame is not valid is told apart from the reasons."""
+def _reasons(group: Ints, warnings: Sequence[Sequence[str]]) -> tuple[tuple[str, int], ...]:
+    """Count the frames of each warning, without "not valid", which is counted apart."""
     counted: dict[str, int] = {}
-    for which, frames in zip(*np.unique(kind, return_counts=True), strict=True):
-        for words in said[which]:
+    for which, frames in zip(*np.unique(group, return_counts=True), strict=True):
+        for words in warnings[which]:
             counted[words] = counted.get(words, 0) + int(frames)
     counted.pop("not valid", None)
     return tuple(sorted(counted.items(), key=lambda entry: -entry[1]))
 
 
-def _stated_error(cov: Floats) -> Floats:
-    """Return the standard deviation along or about an axis, the mean of three, (N,)."""
-    return np.asarray(np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3), np.float64)
-
-
-def _cameras_apart(track: Trajectory) -> Floats:
-    """Return the distance of the two cameras' own orientations, (N,), degrees."""
-    one, other = (torch.from_numpy(camera.orientation) for camera in track.cameras.values())
-    return np.asarray(np.rad2deg(so3.geodesic_distance(one, other).numpy()), np.float64)
-
-
 def _counted(status: Ints) -> tuple[int, int, int]:
     good, doubtful, not_valid = np.bincount(status, minlength=3).tolist()
     return good, doubtful, not_valid
-
-
-def _whole(values: Ints) -> tuple[int, ...]:
-    return tuple(values.tolist())
 
 
 def _short(values: Floats, digits: int = DIGITS) -> Numbers:

@@ -1,9 +1,9 @@
-"""The numbers of a report as tables, one row a value with its interval; CSV and Parquet."""
+"""The numbers of a report as tables, one row for each value with its interval; CSV and Parquet."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from sphereorient.statistics.moments import COMPONENTS, STATISTICS
 from sphereorient.statistics.summary import Distributions
 from sphereorient.trajectory import Reason, Trajectory
 
-TOGETHER = ("x", "y", "z", "all")
+POOLED = ("x", "y", "z", "all")
 VECTOR = ("x", "y", "z", "vector")
 Row = dict[str, Any]
 
@@ -29,7 +29,7 @@ class Table:
     """Rows of equal keys under a file's name; made by `tables_of`."""
 
     name: str  # of the file, without suffix
-    about: str  # what it holds, one line
+    about: str  # its content, one line
     rows: Sequence[Row]
 
     @property
@@ -39,7 +39,7 @@ class Table:
 
 
 def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> list[Table]:
-    """Return all numbers of a report; tables without rows are left out.
+    """Return all numbers of a report, without empty tables; a new table is a line here and a function.
 
     Args:
         summary: the statistics.
@@ -47,40 +47,33 @@ def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Seq
         distances: between the cameras of all tracks.
     """
     level = f"{100 * summary.settings.level:g} % intervals"
-    found = [
-        Table(name="tracks", about="the tracks, and the frames that each camera lost", rows=list(_tracks(tracks))),
-        Table(name="segments", about="segments that count", rows=list(_segments(summary, list(tracks)))),
-        Table(name="moments", about=f"Table I of the paper, {level}", rows=list(_moments(summary))),
-        Table(name="comparisons", about="the sphere against its flow", rows=list(_comparisons(summary))),
-        Table(name="camera_distance", about="distance of the cameras' orientations", rows=list(_distances(distances))),
+    found: list[tuple[str, str, Iterable[Row]]] = [
+        ("tracks", "the tracks, and the frames that each camera lost", _tracks(tracks)),
+        ("segments", "segments that count", _segments(summary, list(tracks))),
+        ("moments", f"Table I of the paper, {level}", _moments(summary)),
+        ("comparisons", "the sphere against its flow", _comparisons(summary)),
+        ("camera_distance", "distance of the cameras' orientations", _distances(distances)),
     ]
     if (more := summary.distributions) is not None:
         found += [
-            Table(name="densities", about=f"PDFs in standard deviations, {level}", rows=list(_densities(more))),
-            Table(name="fits", about=f"stretched exponential, {level}", rows=list(_fits(more))),
-            Table(name="increments", about=f"omega_lab(t + lag) - omega_lab(t), {level}", rows=list(_increments(more))),
-            Table(name="autocorrelations", about=f"autocorrelations, {level}", rows=list(_correlations(more))),
-            Table(name="integral_times", about=f"to the first zero, {level}", rows=list(_integral_times(more))),
-            Table(name="durations", about="histogram of segment durations", rows=list(_durations(more))),
-            Table(name="angles", about=f"PDFs of the Euler angles, {level}", rows=list(_angles(more))),
-            Table(name="isotropy", about=f"shares of the variance, {level}", rows=list(_isotropy(more))),
-            Table(name="kernel_widths", about=f"rms and flatness by kernel width, {level}", rows=list(_widths(more))),
-            Table(name="multi_lag", about=f"rms without noise by many lags, {level}", rows=list(_multi_lag(more))),
-            Table(name="lift", about=f"a against omega x v, {level}", rows=list(_lift(more))),
+            ("densities", f"PDFs in standard deviations, {level}", _densities(more)),
+            ("fits", f"stretched exponential, {level}", _fits(more)),
+            ("increments", f"omega_lab(t + lag) - omega_lab(t), {level}", _increments(more)),
+            ("autocorrelations", f"autocorrelations, {level}", _correlations(more)),
+            ("integral_times", f"to the first zero, {level}", _integral_times(more)),
+            ("durations", "histogram of segment durations", _durations(more)),
+            ("angles", f"PDFs of the Euler angles, {level}", _angles(more)),
+            ("isotropy", f"shares of the variance, {level}", _isotropy(more)),
+            ("kernel_widths", f"rms and flatness by kernel width, {level}", _widths(more)),
+            ("multi_lag", f"rms without noise by many lags, {level}", _multi_lag(more)),
+            ("lift", f"a against omega x v, {level}", _lift(more)),
         ]
-    return [table for table in found if table.rows]
+    tables = [Table(name=name, about=about, rows=list(rows)) for name, about, rows in found]
+    return [table for table in tables if table.rows]
 
 
 def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:
-    """Write each table as NAME.csv and, where pyarrow is installed, as NAME.parquet.
-
-    Args:
-        tables: of `tables_of`.
-        folder: exists.
-
-    Returns:
-        The suffixes that were written.
-    """
+    """Write each table as NAME.csv and, if pyarrow is installed, as NAME.parquet; return the suffixes written."""
     for table in tables:
         with (folder / f"{table.name}.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, table.columns, lineterminator="\n")
@@ -88,7 +81,7 @@ def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:
             writer.writerows(table.rows)
     try:
         arrow = package("pyarrow", "table")
-    except OutputError:  # said on the page; CSV holds the same numbers
+    except OutputError:  # the page says so; CSV has the same numbers
         return ["csv"]
     import pyarrow.parquet as arrow_parquet
 
@@ -98,18 +91,18 @@ def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:
     return ["csv", "parquet"]
 
 
-def _values(name: str, found: Interval, key: Any) -> Row:
-    """Return value and interval as three columns."""
-    parts = {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
-    return {column: float(np.asarray(values)[key]) for column, values in parts.items()}
+def _values(key: Any, **found: Interval) -> Row:
+    """Return values and their intervals as three columns each."""
+    row = {}
+    for name, of in found.items():
+        for column, values in ((name, of.value), (f"{name}_low", of.low), (f"{name}_high", of.high)):
+            row[column] = float(np.asarray(values)[key])
+    return row
 
 
 def _tracks(tracks: Mapping[str, Trajectory]) -> Iterator[Row]:
     for name, track in tracks.items():
-        lost = {
-            f"lost_{camera}": sum(reason != Reason.OK for reason in seen.reason)
-            for camera, seen in track.cameras.items()
-        }
+        lost = {camera: sum(why != Reason.OK for why in seen.reason) for camera, seen in track.cameras.items()}
         time = track.time[np.isfinite(track.time)]
         yield {
             "file": name,
@@ -118,7 +111,7 @@ def _tracks(tracks: Mapping[str, Trajectory]) -> Iterator[Row]:
             "frames": len(track),
             "valid": int(track.valid.sum()),
             "duration_s": float(time[-1] - time[0]) if len(time) else float("nan"),
-            "lost": "; ".join(f"{camera.removeprefix('lost_')}: {count}" for camera, count in lost.items()),
+            "lost": "; ".join(f"{camera}: {count}" for camera, count in lost.items()),
         }
 
 
@@ -138,16 +131,14 @@ def _moments(summary: Summary) -> Iterator[Row]:
     for quantity, part in summary.table.items():
         for i, component in enumerate(COMPONENTS):
             row: Row = {"quantity": quantity, "component": component, "units": part.units}
-            for name in STATISTICS:
-                row |= _values(name, getattr(part, name), i)
+            row |= _values(i, **{name: getattr(part, name) for name in STATISTICS})
             yield row | {"samples": part.samples, "segments": part.segments}
 
 
 def _comparisons(summary: Summary) -> Iterator[Row]:
     flow = summary.surroundings.flow
     if flow is not None:
-        nu, epsilon = flow.viscosity_m2_s, flow.dissipation_w_kg
-        inputs = f"nu = {nu:.4g} m^2/s, epsilon = {epsilon:.4g} W/kg"
+        inputs = f"nu = {flow.viscosity_m2_s:.4g} m^2/s, epsilon = {flow.dissipation_w_kg:.4g} W/kg"
         yield {"name": f"eta, m, of {inputs}", "formula": "(nu^3 / epsilon)^(1/4)", "value": flow.eta_m}
         yield {"name": f"tau_eta, s, of {inputs}", "formula": "(nu / epsilon)^(1/2)", "value": flow.tau_eta_s}
     for one in summary.comparisons:
@@ -156,51 +147,50 @@ def _comparisons(summary: Summary) -> Iterator[Row]:
 
 def _distances(distances: Sequence[CameraDistance]) -> Iterator[Row]:
     for one in distances:
-        for k, (low, high) in enumerate(zip(one.edges_rad[:-1], one.edges_rad[1:], strict=True)):
-            row = {
-                "cameras": " ".join(one.cameras),
-                "from_deg": float(np.rad2deg(low)),
-                "to_deg": float(np.rad2deg(high)),
-                "pdf_per_deg": float(np.deg2rad(one.pdf[k])),
-            }
-            rough = float("nan") if one.uncorrected_pdf is None else float(np.deg2rad(one.uncorrected_pdf[k]))
-            yield row | {"without_perspective_pdf_per_deg": rough}
+        edges = np.rad2deg(one.edges_rad).tolist()
+        pdf = np.deg2rad(one.pdf).tolist()
+        rough = np.full(len(pdf), np.nan) if one.uncorrected_pdf is None else np.deg2rad(one.uncorrected_pdf)
+        names = ("cameras", "from_deg", "to_deg", "pdf_per_deg", "without_perspective_pdf_per_deg")
+        for values in zip(edges[:-1], edges[1:], pdf, rough.tolist(), strict=True):
+            yield dict(zip(names, (" ".join(one.cameras), *values), strict=True))
 
 
 def _densities(more: Distributions) -> Iterator[Row]:
+    for quantity, component, part in _by_component(more):
+        yield from _density({"quantity": quantity, "component": component}, part)
+    for lag, part in more.increment_densities.items():
+        yield from _density({"quantity": f"increment of omega_lab over {lag} frames", "component": "x"}, part)
+
+
+def _by_component(more: Distributions) -> Iterator[tuple[str, str, Density]]:
     for quantity, parts in more.densities.items():
         for component, part in zip("xyz", parts, strict=True):
-            head = {"quantity": quantity, "component": component}
-            yield from (head | row for row in _density(part))
-    for lag, part in more.increment_densities.items():
-        head = {"quantity": f"increment of omega_lab over {lag} frames", "component": "x"}
-        yield from (head | row for row in _density(part))
+            yield quantity, component, part
 
 
-def _density(part: Density) -> Iterator[Row]:
+def _density(head: Row, part: Density) -> Iterator[Row]:
     law = stretched_exponential(part.centres, float(part.fit.a.value))
     for k, centre in enumerate(part.centres.tolist()):
-        row = {"standard_deviations": centre, "count": int(part.counts[k])} | _values("pdf", part.pdf, k)
+        row = head | {"standard_deviations": centre, "count": int(part.counts[k])} | _values(k, pdf=part.pdf)
         gauss = float(np.exp(-(centre**2) / 2) / np.sqrt(2 * np.pi))
         yield row | {"stretched_exponential": float(law[k]), "gaussian": gauss}
 
 
 def _fits(more: Distributions) -> Iterator[Row]:
-    for quantity, parts in more.densities.items():
-        for component, part in zip("xyz", parts, strict=True):
-            fit = part.fit
-            row: Row = {"quantity": quantity, "component": component}
-            row |= _values("a", fit.a, ()) | _values("flatness_of_fit", fit.flatness, ())
-            row |= {"log_likelihood": fit.log_likelihood, "log_likelihood_gaussian": fit.log_likelihood_gaussian}
-            yield row | {"better_than_gaussian": fit.better_than_gaussian}
+    for quantity, component, part in _by_component(more):
+        fit = part.fit
+        row: Row = {"quantity": quantity, "component": component}
+        row |= _values((), a=fit.a, flatness_of_fit=fit.flatness)
+        row |= {"log_likelihood": fit.log_likelihood, "log_likelihood_gaussian": fit.log_likelihood_gaussian}
+        yield row | {"better_than_gaussian": fit.better_than_gaussian}
 
 
 def _increments(more: Distributions) -> Iterator[Row]:
     found = more.increments
     for k, lag_s in enumerate(found.lag_s.tolist()):
-        for i, component in enumerate(TOGETHER):
+        for i, component in enumerate(POOLED):
             row: Row = {"lag_s": lag_s, "pairs": int(found.pairs[k]), "component": component}
-            yield row | _values("rms", found.rms, (k, i)) | _values("flatness", found.flatness, (k, i))
+            yield row | _values((k, i), rms=found.rms, flatness=found.flatness)
 
 
 def _correlations(more: Distributions) -> Iterator[Row]:
@@ -208,43 +198,38 @@ def _correlations(more: Distributions) -> Iterator[Row]:
         for k, lag_s in enumerate(found.lag_s.tolist()):
             for i, component in enumerate(VECTOR):
                 row: Row = {"quantity": quantity, "lag_s": lag_s, "pairs": int(found.pairs[k]), "component": component}
-                yield row | _values("correlation", found.value, (k, i))
+                yield row | _values((k, i), correlation=found.value)
 
 
 def _integral_times(more: Distributions) -> Iterator[Row]:
     for quantity, found in more.correlations.items():
         for i, component in enumerate(VECTOR):
             row: Row = {"quantity": quantity, "component": component}
-            row |= _values("integral_time_s", found.integral_time_s, i)
+            row |= _values(i, integral_time_s=found.integral_time_s)
             yield row | {"reached_zero": bool(found.reached_zero[i])}
 
 
 def _durations(more: Distributions) -> Iterator[Row]:
-    found = more.durations
-    if found is None:
-        return
-    for k, count in enumerate(found.counts.tolist()):
-        row: Row = {"from_s": float(found.edges_s[k]), "to_s": float(found.edges_s[k + 1]), "segments": count}
-        yield row | {"expected": float(found.expected[k])}
+    if (found := more.durations) is not None:
+        for k, (count, expected) in enumerate(zip(found.counts.tolist(), found.expected.tolist(), strict=True)):
+            row: Row = {"from_s": float(found.edges_s[k]), "to_s": float(found.edges_s[k + 1])}
+            yield row | {"segments": count, "expected": expected}
 
 
 def _angles(more: Distributions) -> Iterator[Row]:
     for one in more.angles:
         edges = np.rad2deg(one.edges_rad)
-        for k in range(len(one.uniform)):
+        for k, uniform in enumerate(one.uniform.tolist()):
             row: Row = {"angle": one.name, "from_deg": float(edges[k]), "to_deg": float(edges[k + 1])}
-            row |= _values("pdf_per_rad", one.pdf, k)
-            yield row | {"uniform_pdf_per_rad": float(one.uniform[k])}
+            yield row | _values(k, pdf_per_rad=one.pdf) | {"uniform_pdf_per_rad": uniform}
 
 
 def _isotropy(more: Distributions) -> Iterator[Row]:
     for quantity, found in more.isotropies.items():
-        for i, component in enumerate("xyz"):
-            pair = ("xy", "xz", "yz")[i]
+        for i, (component, pair) in enumerate(zip("xyz", ("xy", "xz", "yz"), strict=True)):
             row: Row = {"quantity": quantity, "component": component}
-            row |= _values("variance_share", found.variance_share, i) | {"pair": pair}
-            row |= _values("cross_correlation", found.cross_correlation, i)
-            yield row | {"p_value": found.p_value}
+            row |= _values(i, variance_share=found.variance_share) | {"pair": pair}
+            yield row | _values(i, cross_correlation=found.cross_correlation) | {"p_value": found.p_value}
 
 
 def _widths(more: Distributions) -> Iterator[Row]:
@@ -253,19 +238,17 @@ def _widths(more: Distributions) -> Iterator[Row]:
         for k, width_s in enumerate(found.width_s.tolist()):
             for i, component in enumerate("xyz"):
                 row: Row = {"quantity": quantity, "width_s": width_s, "component": component}
-                for name in names:
-                    row |= _values(name, getattr(found, name), (k, i))
-                yield row
+                yield row | _values((k, i), **{name: getattr(found, name) for name in names})
 
 
 def _multi_lag(more: Distributions) -> Iterator[Row]:
     for quantity, found in more.multi_lag.items():
         for i, component in enumerate("xyz"):
             row: Row = {"quantity": quantity, "component": component, "rms": float(found.rms[i])}
-            yield row | _values("variance", found.variance, i) | _values("noise_variance", found.noise_variance, i)
+            yield row | _values(i, variance=found.variance, noise_variance=found.noise_variance)
 
 
 def _lift(more: Distributions) -> Iterator[Row]:
     for i, component in enumerate(VECTOR):
-        row: Row = {"component": component}
-        yield row | _values("correlation", more.lift.correlation, i) | _values("coefficient", more.lift.coefficient, i)
+        found = more.lift
+        yield {"component": component} | _values(i, correlation=found.correlation, coefficient=found.coefficient)

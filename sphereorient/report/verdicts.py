@@ -1,4 +1,4 @@
-"""What the numbers of a report say, in words."""
+"""The findings of a report in words."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from sphereorient.statistics import Interval, Summary
+from sphereorient.report.plots.style import interval_text
+from sphereorient.statistics import Summary
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.statistics.isotropy import anisotropic_frame
 from sphereorient.statistics.summary import Distributions
@@ -21,7 +22,7 @@ CLEAR, WEAK = 0.001, 0.05  # p-values below which a finding is clear, or worth a
 
 
 class Grade(StrEnum):
-    """How a verdict is marked."""
+    """The mark of a verdict."""
 
     GOOD = "good"
     NEUTRAL = "neutral"
@@ -38,13 +39,7 @@ class Verdict:
 
 
 def verdicts(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> list[Verdict]:
-    """Return what there is to say, the tracks themselves first.
-
-    Args:
-        summary: the statistics.
-        tracks: by the name of their file.
-        distances: between the cameras of all tracks.
-    """
+    """Return the findings, those on the measurement first; arguments as of `tables.tables_of`."""
     found = [*_measured(tracks), *_segments(summary), *_noise(summary), *_apart(distances)]
     if (more := summary.distributions) is not None:
         found += [*_tails(summary, more), *_attitude(more), *_frames(more), *_isotropy(more), *_lift(more)]
@@ -65,15 +60,15 @@ def _measured(tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
     if len(tracks) > 1 and valid < frames:
         words += f"; fewest in {worst}, {100 * float(tracks[worst].valid.mean()):.4g} %"
     yield _say("Measured", words, share >= 1 - LOST_SHARE)
-    told = dict.fromkeys(remark for track in tracks.values() for remark in track.provenance.get("remarks", ()))
-    for remark in list(told)[:5]:
+    remarks = dict.fromkeys(remark for track in tracks.values() for remark in track.provenance.get("remarks", ()))
+    for remark in list(remarks)[:5]:
         yield _say("Remark", str(remark), good=False)
 
 
 def _segments(summary: Summary) -> Iterator[Verdict]:
     count = summary.ensemble.segments
     if summary.distributions is None:
-        words = "one segment only: no intervals and no distributions, since nothing says how another one would differ; "
+        words = "one segment only: no intervals and no distributions, since the scatter between segments is unknown; "
         words += "pass more tracks, or cut a long record with --set statistics.max_duration_s=SECONDS"
         yield _say("Segments", words, good=False)
         return
@@ -82,7 +77,7 @@ def _segments(summary: Summary) -> Iterator[Verdict]:
         least = summary.settings.min_integral_times * summary.integral_time_s
         words += f", each longer than {least:.3g} s (integral time of the velocity {summary.integral_time_s:.3g} s)"
     if count < FEW_SEGMENTS:
-        words += "; so few tell little of the tails, and intervals of the flatness are too narrow"
+        words += "; with so few, tails are not well known and intervals of the flatness are too narrow"
     yield _say("Segments", words, None if count >= FEW_SEGMENTS else False)
 
 
@@ -115,23 +110,15 @@ def _tails(summary: Summary, more: Distributions) -> Iterator[Verdict]:
         flat = summary.table[quantity].corrected_flatness
         flat = flat if np.isfinite(flat.value[:3]).all() else summary.table[quantity].flatness
         fits = more.densities[quantity]
-        told = ", ".join(told_interval(flat, i) for i in range(3))
+        values = ", ".join(interval_text(flat.part(i)) for i in range(3))
         heavy = all(flat.low[i] > GAUSSIAN for i in range(3))
         light = all(flat.high[i] < GAUSSIAN for i in range(3))
-        kind = "heavier tails than" if heavy else "lighter tails than" if light else "not told from"
-        words = f"flatness of x, y, z: {told}: {kind} a Gaussian"
+        kind = "heavier tails than" if heavy else "lighter tails than" if light else "not distinguishable from"
+        words = f"flatness of x, y, z: {values}: {kind} a Gaussian"
         if heavy and all(part.fit.better_than_gaussian for part in fits):
-            a = ", ".join(told_interval(part.fit.a, ()) for part in fits)
+            a = ", ".join(interval_text(part.fit.a) for part in fits)
             words += f"; the stretched exponential fits better, a = {a}"
         yield _say(f"Tails of {quantity}", words)
-
-
-def told_interval(found: Interval, key: int | tuple[()]) -> str:
-    """Return value and interval as text."""
-    value, low, high = (float(np.asarray(x)[key]) for x in (found.value, found.low, found.high))
-    if not np.isfinite(low + high):
-        return f"{value:.3g}"
-    return f"{value:.3g} ({low:.3g} to {high:.3g})"
 
 
 def _attitude(more: Distributions) -> Iterator[Verdict]:
@@ -148,12 +135,12 @@ def _attitude(more: Distributions) -> Iterator[Verdict]:
 def _frames(more: Distributions) -> Iterator[Verdict]:
     for name, row in more.rows.items():
         own = name.removeprefix("omega_")
-        sizes = f"off the turns by {100 * row.lab_residual:.3g} % in lab, {100 * row.body_residual:.3g} % in body"
+        sizes = f"off the rotations by {100 * row.lab_residual:.3g} % in lab, {100 * row.body_residual:.3g} % in body"
         if row.frame in (own, "both"):
             yield _say(f"Frame of {name}", f"written in {own} components ({sizes})", good=True)
         else:
-            told = "no frame's components" if row.frame == "none" else f"components of the {row.frame}"
-            yield _say(f"Frame of {name}", f"{told} ({sizes}): see ERRATA E6 in docs/paper-map.md", good=False)
+            found = "not in lab or body components" if row.frame == "none" else f"written in {row.frame} components"
+            yield _say(f"Frame of {name}", f"{found} ({sizes}): see docs/errata.md E6", good=False)
 
 
 def _isotropy(more: Distributions) -> Iterator[Verdict]:
@@ -180,4 +167,4 @@ def _lift(more: Distributions) -> Iterator[Verdict]:
     found = more.lift.correlation
     clear = bool(found.low[3] > 0 or found.high[3] < 0)
     seen = "the acceleration follows omega x v" if clear else "no correlation of the acceleration with omega x v"
-    yield _say("Lift", f"{seen}: cosine {told_interval(found, 3)}")
+    yield _say("Lift", f"{seen}: cosine {interval_text(found.part(3))}")

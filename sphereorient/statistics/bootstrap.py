@@ -1,4 +1,4 @@
-"""Error bars from independent segments: the bootstrap, with bias and acceleration corrected."""
+"""Intervals from independent segments: the BCa bootstrap, and the studentized one for skewed statistics."""
 
 from __future__ import annotations
 
@@ -13,15 +13,19 @@ from scipy.special import ndtr, ndtri
 from sphereorient.statistics.settings import BootstrapSettings
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
 Statistic = Callable[[Floats], Floats]  # sums (..., K) over segments to values (..., Q)
 
-FEWEST = 2  # segments; of one nothing is known about the scatter
+FEWEST = 2  # segments; one alone has no scatter
 AT_ONCE = 4_000_000  # numbers of a block of weights
+ENOUGH = 20  # segments of the studentized bootstrap; with fewer the resampled errors are too rough
+STEP = 0.01  # of a derivative by differences, relative to the root of the sum of squares over the segments
+RESAMPLES_AT_ONCE = 200
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Interval:
-    """Values with their intervals, any one shape; made by `bootstrap`."""
+    """Values with their intervals, all of one shape; made by `bootstrap` and `studentized`."""
 
     value: Floats
     low: Floats
@@ -29,37 +33,22 @@ class Interval:
     error: Floats  # standard deviation of the resampled values
 
     def part(self, key: Any) -> Interval:
-        """Return some of the values, by an index as an array takes it."""
+        """Return some of the values, by an index of an array."""
         value, low, high, error = (np.asarray(x)[key] for x in (self.value, self.low, self.high, self.error))
         return Interval(value=value, low=low, high=high, error=error)
 
     def scaled(self, factor: Floats | float, shift: Floats | float = 0.0) -> Interval:
-        """Return factor (positive) times the values, plus a shift: other units."""
+        """Return factor (positive) times the values, plus a shift."""
         value, low, high = (np.asarray(x * factor + shift) for x in (self.value, self.low, self.high))
         return Interval(value=value, low=low, high=high, error=np.asarray(self.error * factor))
 
     def holds(self, truth: Floats | float) -> NDArray[np.bool_]:
-        """Say which intervals hold the truth."""
+        """Return which intervals contain the truth."""
         return np.asarray((self.low <= truth) & (truth <= self.high))
 
 
-def per_segment(values: Floats, segment: NDArray[np.int64], segments: int) -> Floats:
-    """Return the sums over each segment's rows.
-
-    Args:
-        values: (M, ...).
-        segment: (M,), 0 .. segments - 1, increasing.
-        segments: their number.
-
-    Returns:
-        (segments, ...).
-    """
-    starts = np.searchsorted(segment, np.arange(segments))
-    return np.add.reduceat(values, starts, axis=0)
-
-
-def scattered(values: Floats, segment: NDArray[np.int64], segments: int) -> Floats:
-    """Return the sums over each segment's rows where some segments may have none; arguments as of `per_segment`."""
+def segment_sums(values: Floats, segment: Rows, segments: int) -> Floats:
+    """Return the sums (S, ...) over the rows (M, ...) of each segment; `segment` (M,) is increasing, 0 .. S - 1."""
     out = np.zeros((segments, *values.shape[1:]))
     if len(values):
         there = np.unique(segment)
@@ -68,18 +57,18 @@ def scattered(values: Floats, segment: NDArray[np.int64], segments: int) -> Floa
 
 
 def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | None = None) -> Interval:
-    """Return a statistic of sums over segments, with intervals from resampled segments.
+    """Return a statistic of sums over segments, with BCa intervals from resampled segments.
 
-    Long segments weigh as much as they have samples, since the statistic sees sums. Intervals are corrected for bias
-    and skewness (BCa), the latter from leaving out each segment in turn.
+    A segment weighs as much as it has samples, since the statistic is of sums. The acceleration of BCa comes from
+    leaving out each segment in turn.
 
     Args:
-        sums: (S, ...), what each independent segment contributes.
-        statistic: takes total sums (..., *sums.shape[1:]) to values with any leading shape.
+        sums: (S, ...), contribution of each independent segment.
+        statistic: maps total sums (..., *sums.shape[1:]) to values with the same leading shape.
         settings: resamples, level, seed.
 
     Returns:
-        Values and intervals, of the statistic's shape; NaN where the statistic is. One segment has no intervals.
+        Values and intervals of the statistic's shape; NaN where the statistic is. One segment has no intervals.
 
     Source: Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 14.
     """
@@ -95,38 +84,23 @@ def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | 
     if len(sums) < FEWEST:
         unknown = np.full_like(value, np.nan)
         return Interval(value=value, low=unknown, high=unknown, error=unknown)
-    drawn = _by_blocks(lambda rows: at(_resampled(flat, rows, settings)), settings.resamples, len(flat))
+    drawn = _by_blocks(lambda rows: at(_weights(len(flat), rows, settings) @ flat), settings.resamples, len(flat))
     without = _by_blocks(lambda rows: at(total - flat[rows]), len(flat), len(flat) + flat.shape[1])
     low, high = _bca(value, drawn, without, settings.level)
-    return Interval(value=value, low=low, high=high, error=_deviation(drawn))
+    return Interval(value=value, low=low, high=high, error=np.asarray(drawn.std(0, ddof=1), np.float64))
 
 
-def _deviation(drawn: Floats) -> Floats:
-    """Return the standard deviation of the resampled values; NaN where one of them is."""
-    return np.asarray(drawn.std(0, ddof=1), np.float64)
-
-
-def _by_blocks(part: Callable[[NDArray[np.int64]], Floats], count: int, width: int) -> Floats:
-    """Compute row by row in blocks that fit into memory."""
+def _by_blocks(part: Callable[[Rows], Floats], count: int, width: int) -> Floats:
+    """Compute rows in blocks that fit into memory."""
     size = max(1, AT_ONCE // max(width, 1))
     return np.concatenate([part(np.arange(k, min(k + size, count))) for k in range(0, count, size)])
 
 
-def _resampled(flat: Floats, rows: NDArray[np.int64], settings: BootstrapSettings) -> Floats:
-    """Return the total sums of some of the resampled ensembles."""
-    return np.asarray(resampled_weights(len(flat), rows, settings) @ flat, np.float64)
-
-
-def resampled_weights(segments: int, rows: NDArray[np.int64], settings: BootstrapSettings) -> Floats:
-    """Return how often each segment is in some of the resampled ensembles, (B, segments).
-
-    Args:
-        segments: their number.
-        rows: (B,), numbers of the resamples; each has its own seed, so that blocks do not change the numbers.
-        settings: the seed.
-    """
+def _weights(segments: int, rows: Rows, settings: BootstrapSettings) -> Floats:
+    """Return how often each segment is in the resamples of these numbers (B,), (B, segments)."""
     weights = np.empty((len(rows), segments))
     for place, row in enumerate(rows.tolist()):
+        # A seed for each resample, so that the size of the blocks does not change the numbers.
         draw = np.random.default_rng([settings.seed, row]).integers(0, segments, segments)
         weights[place] = np.bincount(draw, minlength=segments)
     return weights
@@ -149,10 +123,101 @@ def _bca(value: Floats, drawn: Floats, without: Floats, level: float) -> tuple[F
 
 
 def _quantiles(drawn: Floats, share: Floats) -> Floats:
-    """Return each column's own quantile; NaN where a drawn value is none."""
+    """Return the quantile of each column at its own share; NaN where a drawn value is not finite."""
     ordered = np.sort(drawn, axis=0)
     place = np.clip(share * (len(drawn) - 1), 0, len(drawn) - 1)
     left = np.floor(place).astype(np.int64)
     right = np.minimum(left + 1, len(drawn) - 1)
     a, b = (np.take_along_axis(ordered, k[None], axis=0)[0] for k in (left, right))
     return np.where(np.isfinite(drawn).all(0), a + (place - left) * (b - a), np.nan)
+
+
+def studentized(
+    sums: Floats, statistic: Statistic, positive: NDArray[np.bool_], settings: BootstrapSettings | None = None
+) -> Interval:
+    """Return a statistic of sums over segments, with studentized bootstrap intervals.
+
+    The resampled quantity is t = (resampled value - value) / (resampled error), of logarithms for positive values. For
+    a statistic whose sampling is skewed by a few large events, such as the flatness, percentiles of the values end too
+    low. Errors come from the derivative by each segment's weight. With fewer than 20 segments the intervals are those
+    of `bootstrap`.
+
+    Args:
+        sums: (S, G, K), contributions of each independent segment to G groups.
+        statistic: maps totals (..., G, K) to values (..., G, Q), group by group, and is the same for twice the totals.
+        positive: (Q,), which values are positive by definition.
+        settings: resamples, level, seed.
+
+    Returns:
+        Values and intervals, (G, Q); NaN where the statistic is.
+
+    Source: Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapters 12 and 14.
+    """
+    settings = settings or BootstrapSettings()
+    if len(sums) < ENOUGH:
+        return bootstrap(sums, statistic, settings)
+
+    def at(totals: Floats) -> Floats:
+        with np.errstate(all="ignore"):
+            values = np.asarray(statistic(totals), np.float64)
+            return np.where(positive, np.log(values), values)
+
+    value = at(sums.sum(0))
+    error = _error(at, sums.sum(0), np.einsum("sgk,sgl->gkl", sums, sums))
+    drawn, drawn_error = _drawn(at, sums, settings)
+    with np.errstate(all="ignore"):
+        t = (drawn - value) / drawn_error
+    t = np.where(drawn_error > 0, t, 0.0)
+    known = np.isfinite(drawn).all(0) & np.isfinite(value)
+    tail = (1 - settings.level) / 2
+    late, early = (np.quantile(np.where(known, t, 0.0), share, axis=0) for share in (1 - tail, tail))
+
+    def back(x: Floats) -> Floats:
+        with np.errstate(over="ignore"):
+            return np.where(known, np.where(positive, np.exp(x), x), np.nan)
+
+    plain = np.where(positive, np.exp(value), value)
+    spread = np.where(known, np.where(positive, plain * error, error), np.nan)
+    return Interval(value=plain, low=back(value - late * error), high=back(value - early * error), error=spread)
+
+
+def _drawn(at: Statistic, sums: Floats, settings: BootstrapSettings) -> tuple[Floats, Floats]:
+    """Return the values of the resampled ensembles and their errors, (B, G, Q) each."""
+    segments, groups, size = sums.shape
+    flat = sums.reshape(segments, -1)
+    products = (sums[..., :, None] * sums[..., None, :]).reshape(segments, -1)
+    parts = []
+    for first in range(0, settings.resamples, RESAMPLES_AT_ONCE):
+        rows = np.arange(first, min(first + RESAMPLES_AT_ONCE, settings.resamples))
+        weights = _weights(segments, rows, settings)
+        totals = (weights @ flat).reshape(-1, groups, size)
+        squares = (weights @ products).reshape(-1, groups, size, size)
+        parts.append((at(totals), _error(at, totals, squares)))
+    values, errors = zip(*parts, strict=True)
+    return np.concatenate(values), np.concatenate(errors)
+
+
+def _error(at: Statistic, totals: Floats, squares: Floats) -> Floats:
+    """Return the standard deviation of a statistic (..., G, Q) from the scatter of the segments' contributions.
+
+    A segment's weight changes the statistic by its gradient times the segment's sums. Twice the totals give the same
+    value, so the gradient is orthogonal to the totals and these contributions have mean zero.
+
+    Args:
+        at: the statistic.
+        totals: (..., G, K).
+        squares: (..., G, K, K), products of the segments' sums, summed over the segments.
+    """
+    squares = np.nan_to_num(squares)  # unknown sums of a group enter only statistics that are NaN
+    slopes = []
+    for k in range(totals.shape[-1]):
+        step = STEP * np.sqrt(squares[..., k, k])
+        step = np.where(step > 0, step, 1.0)  # no segment contributes: the slope is multiplied by 0 below
+        moved = np.zeros_like(totals)
+        moved[..., k] = step
+        with np.errstate(all="ignore"):
+            slopes.append((at(totals + moved) - at(totals - moved)) / (2 * step[..., None]))
+    gradient = np.stack(slopes, axis=-1)  # (..., G, Q, K)
+    with np.errstate(all="ignore"):
+        variance = np.einsum("...gqk,...gkl,...gql->...gq", gradient, squares, gradient)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

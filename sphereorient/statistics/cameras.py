@@ -1,4 +1,4 @@
-"""How far the orientations of two cameras, each by itself, lie apart."""
+"""Distance between the orientations of two cameras, each measured without the other."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class CameraDistance:
     """Distance between the orientations of two cameras; made by `camera_distances`, drawn by the report."""
 
     cameras: tuple[str, str]
-    distance_rad: Floats  # (K,), frames in which both have one
+    distance_rad: Floats  # (K,), frames with both orientations
     edges_rad: Floats  # (B + 1,)
     pdf: Floats  # (B,), 1/rad
-    uncorrected_rad: Floats | None  # (K',), the same without the correction of perspective, where it is given
+    uncorrected_rad: Floats | None  # (K',), the same without the correction of perspective, if given
     uncorrected_pdf: Floats | None  # (B,)
 
     @property
     def median_rad(self) -> float:
-        """The middle distance; NaN where there is none."""
+        """The median distance; NaN without frames."""
         return float(np.median(self.distance_rad)) if len(self.distance_rad) else float("nan")
 
 
@@ -37,15 +37,14 @@ def camera_distances(
     uncorrected: Sequence[Mapping[str, Floats] | None] = (),
     bins: int = 60,
 ) -> list[CameraDistance]:
-    """Return the distances for every pair of cameras, frames of all tracks together; none with one camera.
+    """Return the distances for every pair of cameras, frames of all tracks together; empty for one camera.
 
     Args:
-        tracks: each camera's own R_lab_body, in which perspective is corrected.
-        uncorrected: of each track (N, 3, 3) by camera, the same without this correction, as `without_perspective`
-            returns it; None, or nothing at all, where it is not known.
+        tracks: with each camera's own R_lab_body, corrected for perspective.
+        uncorrected: of each track (N, 3, 3) by camera, of `without_perspective`; None or missing: unknown.
         bins: of the PDF, from 0 to the largest distance or 180 degrees.
 
-    Source: the paper, section III, distance of the two cameras; the angle by ERRATA A3.
+    Source: the paper, section III, distance of the two cameras; the angle by docs/errata.md A3.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
     rough = [*uncorrected, *[None] * (len(many) - len(uncorrected))]
@@ -76,16 +75,16 @@ def _pooled(pair: tuple[str, str], parts: list[Floats], rough_parts: list[Floats
 
 
 def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, Floats]:
-    """Return what each camera's orientation would be with its sight taken for parallel to its axis.
+    """Return each camera's orientations as if its line of sight were parallel to its axis.
 
     Args:
-        track: each camera's own R_lab_body (N, 3, 3) and the projected centre.
-        cameras: by name; those of the track that are missing here are left out.
+        track: with each camera's own R_lab_body (N, 3, 3) and the projected centre.
+        cameras: by name; others of the track are left out.
 
     Returns:
-        R_lab_cam R_cam_view^T R_cam_lab R_lab_body, (N, 3, 3) by camera; NaN where the camera has none.
+        R_lab_cam R_cam_view^T R_cam_lab R_lab_body, (N, 3, 3) by camera; NaN for frames without an orientation.
 
-    Source: the paper, section III, R_persp; its sign by ERRATA A1.
+    Source: the paper, section III, R_persp; its sign by docs/errata.md A1.
     """
     import torch
 
@@ -94,8 +93,8 @@ def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dic
         if name in cameras:
             to_cam = cameras[name].R_cam_lab
             direction_cam = cameras[name].rays(torch.from_numpy(seen.centre_px)).direction_lab @ to_cam.mT
-            turn = to_cam.mT @ R_cam_view(direction_cam).mT @ to_cam
-            found[name] = (turn @ torch.from_numpy(seen.orientation)).numpy()
+            rotation = to_cam.mT @ R_cam_view(direction_cam).mT @ to_cam
+            found[name] = (rotation @ torch.from_numpy(seen.orientation)).numpy()
     return found
 
 
@@ -105,7 +104,7 @@ def _pdf(x: Floats, edges: Floats) -> Floats:
 
 
 def _distance(A: Floats, B: Floats) -> Floats:
-    """Return the geodesic distances where both are known."""
+    """Return the geodesic distances of the frames with both orientations."""
     there = np.isfinite(A).all((1, 2)) & np.isfinite(B).all((1, 2))
     half = np.linalg.norm(A[there] - B[there], axis=(1, 2)) / np.sqrt(8)
     return np.asarray(2 * np.arcsin(np.minimum(half, 1.0)))

@@ -1,4 +1,4 @@
-"""Probability densities of normalised components, with the stretched exponential beside the Gaussian."""
+"""Probability densities of normalised components, the stretched exponential fitted to them, and the Gaussian."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfcx, log_ndtr, logsumexp
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, per_segment
+from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
 from sphereorient.statistics.moments import noise_let_through
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
@@ -16,46 +16,56 @@ from sphereorient.statistics.settings import BootstrapSettings
 Floats = NDArray[np.float64]
 
 ROOT3 = np.sqrt(3.0)
-WIDEST_S = 1.5  # flatness 14,000: beyond it the fit looks no further
+WIDEST_S = 1.5  # upper limit of the fit: flatness 14,000
 NARROWEST_S = 0.02  # nearly the uniform law, flatness 1.8
 NODES = 120  # values of a at which the likelihood is tabulated
-FINE_BINS = 2000  # of ln|x|, for the likelihood: its rounding of x is 0.5 %
-SMALLEST, LARGEST = 1e-4, 1e3  # |x| that the likelihood tells apart
+FINE_BINS = 2000  # of ln|x|, for the likelihood: they round x by 0.5 %
+SMALLEST, LARGEST = 1e-4, 1e3  # limits of |x| in the likelihood
 TINY = 1e-300
 HERMITE = 24  # nodes for the noise
+REACH = 10.0  # of the PDF to either side, standard deviations
 
 
 def stretched_exponential(x: Floats, a: Floats | float) -> Floats:
     """Return the density of unit variance that the paper fits to accelerations.
 
-    It is that of a uniform number times a log-normal one: p(x) = exp(3 a^2 / 2) / (4 sqrt 3)
-    erfc((ln|x / sqrt 3| + 2 a^2) / (sqrt 2 a)). By erfc and in logarithms, since 1 - erf is 0 from |x| = 30 on.
+    It is the density of the product of a uniform and a log-normal number: p(x) = exp(3 a^2 / 2) / (4 sqrt 3)
+    erfc((ln|x / sqrt 3| + 2 a^2) / (sqrt 2 a)). It is computed with erfc in logarithms: 1 - erf is 0 from |x| = 30 on.
 
     Args:
         x: (...), in standard deviations.
         a: width of the logarithm; flatness is 9/5 exp(4 a^2). Broadcasts against x.
-
-    Returns:
-        (...), density.
 
     Source: Mordant, Crawford and Bodenschatz 2004, Physica D 193, 245; the paper, section IV.
     """
     return np.asarray(np.exp(log_stretched_exponential(x, a)))
 
 
-def log_stretched_exponential(x: Floats, a: Floats | float) -> Floats:
-    """Return the logarithm of `stretched_exponential`, finite wherever a float holds it."""
+def log_stretched_exponential(x: Floats, a: Floats | float, noise_share: float = 0.0) -> Floats:
+    """Return the logarithm of `stretched_exponential`, finite for all floats.
+
+    Args:
+        x: (...), in standard deviations, of the sum where there is noise.
+        a: width of the logarithm; broadcasts against x.
+        noise_share: share of normal noise in the variance, 0 .. below 1; by Gauss-Hermite quadrature.
+    """
+    if noise_share > 0:
+        place, weight = np.polynomial.hermite_e.hermegauss(HERMITE)
+        clean = np.sqrt(1 - noise_share)
+        logs = np.stack(
+            [
+                np.log(w / np.sqrt(2 * np.pi)) + log_stretched_exponential((x - np.sqrt(noise_share) * z) / clean, a)
+                for z, w in zip(place, weight, strict=True)
+            ]
+        )
+        return np.asarray(logsumexp(logs, axis=0) - np.log(clean), np.float64)
     a = np.asarray(a, np.float64)
     size = np.maximum(np.abs(x), TINY)
     z = (np.log(size / ROOT3) + 2 * a**2) / (np.sqrt(2) * a)
-    return np.asarray(1.5 * a**2 - np.log(4 * ROOT3) + _log_erfc(z))
-
-
-def _log_erfc(z: Floats) -> Floats:
-    """Return ln erfc(z) without underflow."""
     far = np.maximum(z, 0.0)
     near = np.log(2.0) + log_ndtr(-np.sqrt(2) * np.minimum(z, 0.0))
-    return np.asarray(np.where(z > 0, np.log(erfcx(far)) - far**2, near), np.float64)
+    log_erfc = np.where(z > 0, np.log(erfcx(far)) - far**2, near)  # without underflow
+    return np.asarray(1.5 * a**2 - np.log(4 * ROOT3) + log_erfc, np.float64)
 
 
 def flatness_of(a: Floats | float) -> Floats:
@@ -65,7 +75,7 @@ def flatness_of(a: Floats | float) -> Floats:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StretchedFit:
-    """The stretched exponential nearest to the data; made by `fit_stretched`."""
+    """The stretched exponential of maximum likelihood; made by `fit_stretched`."""
 
     a: Interval  # scalar
     flatness: Interval  # 9/5 exp(4 a^2)
@@ -74,29 +84,8 @@ class StretchedFit:
 
     @property
     def better_than_gaussian(self) -> bool:
-        """Whether the data are likelier under it than under the Gaussian."""
+        """Whether its likelihood is above the Gaussian's."""
         return self.log_likelihood > self.log_likelihood_gaussian
-
-
-def log_noisy_stretched(x: Floats, a: Floats | float, noise_share: float) -> Floats:
-    """Return the logarithm of the density of unit variance of which a share is normal noise; Gauss-Hermite's rule.
-
-    Args:
-        x: (...), in standard deviations of the sum.
-        a: of the stretched exponential beneath; broadcasts against x.
-        noise_share: of the variance, 0 .. below 1.
-    """
-    if noise_share <= 0:
-        return log_stretched_exponential(x, a)
-    place, weight = np.polynomial.hermite_e.hermegauss(HERMITE)
-    clean = np.sqrt(1 - noise_share)
-    logs = np.stack(
-        [
-            np.log(w / np.sqrt(2 * np.pi)) + log_stretched_exponential((x - np.sqrt(noise_share) * z) / clean, a)
-            for z, w in zip(place, weight, strict=True)
-        ]
-    )
-    return np.asarray(logsumexp(logs, axis=0) - np.log(clean), np.float64)
 
 
 def fit_stretched(
@@ -108,19 +97,16 @@ def fit_stretched(
 ) -> StretchedFit:
     """Fit the stretched exponential by maximum likelihood, with intervals from resampled segments.
 
-    Mean and standard deviation are the sample's own; one sample one vote, so that the fit asks where most of the data
-    lie and not, as the flatness does, for the few largest.
+    Mean and standard deviation are the sample's own. The fit depends on where most of the data are; the flatness
+    depends on the few largest values.
 
     Args:
         x: (M,), one component, any unit.
         segment: (M,), 0 .. segments - 1, increasing.
         segments: their number.
         settings: of the bootstrap.
-        noise_share: of the variance, as `moments.noise_let_through` knows it: the fit is of what lies beneath it. Noise
-            fills the peak of a density, and would make a smaller.
-
-    Returns:
-        The fit.
+        noise_share: of the variance, of `moments.noise_let_through`: the fit is of the motion without this noise, which
+            would fill the peak of the density and lower a.
     """
     normal = (x - x.mean()) / x.std()
     edges = np.linspace(np.log(SMALLEST), np.log(LARGEST), FINE_BINS + 1)
@@ -129,16 +115,14 @@ def fit_stretched(
     middle = (edges[1:] + edges[:-1]) / 2
     used = np.flatnonzero(np.bincount(bins, minlength=FINE_BINS))
     counts = np.bincount(segment * FINE_BINS + bins, minlength=segments * FINE_BINS).reshape(segments, FINE_BINS)
-    squares = per_segment(np.stack([normal, normal**2], axis=1), segment, segments)
+    squares = segment_sums(np.stack([normal, normal**2], axis=1), segment, segments)
     sums = np.concatenate([counts[:, used].astype(np.float64), squares], axis=1)
-    likelihood = _Likelihood(middle[used], noise_share)
-    found = bootstrap(sums, likelihood.fit, settings)
-    best = float(found.value[0])
+    found = bootstrap(sums, _Likelihood(middle[used], noise_share).fit, settings)
+    logs = log_stretched_exponential(np.exp(middle[used]), float(found.value[0]), noise_share)
     return StretchedFit(
         a=found.part(0),
         flatness=found.part(1),
-        log_likelihood=float(counts.sum(0)[used] @ log_noisy_stretched(np.exp(middle[used]), best, noise_share))
-        / len(x),
+        log_likelihood=float(counts.sum(0)[used] @ logs) / len(x),
         log_likelihood_gaussian=float(-0.5 * np.log(2 * np.pi) - 0.5 * (normal**2).mean()),
     )
 
@@ -149,10 +133,12 @@ class _Likelihood:
     def __init__(self, log_x: Floats, noise_share: float) -> None:
         """Tabulate it for the bins' ln|x|, (K,)."""
         self.nodes = np.linspace(NARROWEST_S, WIDEST_S, NODES)
-        self.table = log_noisy_stretched(np.exp(log_x)[:, None], self.nodes, noise_share)
-        # d/d ln|x|: a resampled ensemble has another standard deviation, by which its values are to be divided
+        self.table = log_stretched_exponential(np.exp(log_x)[:, None], self.nodes, noise_share)
+        # d/d ln|x|: a resampled ensemble has its own standard deviation, by which its values are divided
         step = 1e-3
-        up, down = (log_noisy_stretched(np.exp(log_x + s)[:, None], self.nodes, noise_share) for s in (step, -step))
+        up, down = (
+            log_stretched_exponential(np.exp(log_x + s)[:, None], self.nodes, noise_share) for s in (step, -step)
+        )
         self.slope = (up - down) / (2 * step)
 
     def fit(self, totals: Floats) -> Floats:
@@ -166,7 +152,7 @@ class _Likelihood:
 
 
 def _peak(value: Floats) -> Floats:
-    """Return the place of the largest value along the last axis, between the nodes, by a parabola."""
+    """Return the index of the largest value along the last axis, interpolated by a parabola."""
     k = np.clip(value.argmax(-1), 1, value.shape[-1] - 2)[..., None]
     left, mid, right = (np.take_along_axis(value, k + j, axis=-1)[..., 0] for j in (-1, 0, 1))
     bend = left - 2 * mid + right
@@ -189,30 +175,11 @@ class Density:
         return np.asarray((self.edges[1:] + self.edges[:-1]) / 2)
 
 
-def density(
-    ensemble: Ensemble,
-    quantity: str,
-    component: int,
-    *,
-    bins: int = 61,
-    reach: float = 10.0,
-    settings: BootstrapSettings | None = None,
-) -> Density:
-    """Return the PDF of a component as measured, its error bars, and the fit to what lies beneath the noise.
-
-    Args:
-        ensemble: the samples.
-        quantity: a name in UNITS.
-        component: 0, 1, 2.
-        bins: their number.
-        reach: of the bins to either side, standard deviations.
-        settings: of the bootstrap.
-    """
+def density(ensemble: Ensemble, quantity: str, component: int, *, settings: BootstrapSettings | None = None) -> Density:
+    """Return the PDF of a component as measured, with intervals, and the fit to the motion without noise."""
     x = ensemble.values[quantity][:, component]
     share = noise_let_through(ensemble, quantity, component)
-    return density_of(
-        x, ensemble.segment, ensemble.segments, bins=bins, reach=reach, settings=settings, noise_share=share
-    )
+    return density_of(x, ensemble.segment, ensemble.segments, settings=settings, noise_share=share)
 
 
 def density_of(
@@ -221,19 +188,17 @@ def density_of(
     segments: int,
     *,
     bins: int = 61,
-    reach: float = 10.0,
     settings: BootstrapSettings | None = None,
     noise_share: float = 0.0,
 ) -> Density:
-    """Return the PDF of numbers (M,) in rows of segments, as `density` does."""
+    """Return the PDF of numbers (M,) sorted by segment, over 10 standard deviations to either side; as `density`."""
     normal = (x - x.mean()) / x.std()
-    edges = np.linspace(-reach, reach, bins + 1)
+    edges = np.linspace(-REACH, REACH, bins + 1)
     place = np.searchsorted(edges, normal, side="right") - 1
     inside = (place >= 0) & (place < bins)
     flat = np.bincount(segment[inside] * bins + place[inside], minlength=segments * bins).reshape(segments, bins)
     sums = np.concatenate([flat, np.bincount(segment, minlength=segments)[:, None]], axis=1).astype(np.float64)
     width = edges[1] - edges[0]
     pdf = bootstrap(sums, lambda totals: totals[..., :-1] / (totals[..., -1:] * width), settings)
-    return Density(
-        edges=edges, pdf=pdf, counts=flat.sum(0), fit=fit_stretched(x, segment, segments, settings, noise_share)
-    )
+    fit = fit_stretched(x, segment, segments, settings, noise_share)
+    return Density(edges=edges, pdf=pdf, counts=flat.sum(0), fit=fit)

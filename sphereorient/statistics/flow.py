@@ -1,41 +1,40 @@
-"""The flow's own scales, and the dimensionless numbers that compare the sphere with it."""
+"""The flow around the sphere: its scales, dimensionless numbers, and the lift of a spinning sphere."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
 from sphereorient.statistics.moments import Moments
+from sphereorient.statistics.segments import Ensemble
+from sphereorient.statistics.settings import BootstrapSettings
 
 M_PER_MM = 1e-3
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlowScales:
-    """Kolmogorov's scales and what they were computed from; made by `flow_scales`."""
+    """Kolmogorov's scales of a liquid in use, for example of water-glycerol.
 
-    viscosity_m2_s: float
-    dissipation_w_kg: float
-    eta_m: float
-    tau_eta_s: float
-
-
-def flow_scales(viscosity_m2_s: float, dissipation_w_kg: float) -> FlowScales:
-    """Return eta = (nu^3 / epsilon)^(1/4) and tau_eta = (nu / epsilon)^(1/2).
-
-    Args:
-        viscosity_m2_s: kinematic viscosity of the liquid in use: water-glycerol is not water.
-        dissipation_w_kg: energy dissipated per mass, W/kg.
-
-    Source: Kolmogorov 1941; ERRATA A5 for the paper's values, which are water's.
+    Source: Kolmogorov 1941; docs/errata.md A5 for the paper's values, which are water's.
     """
-    return FlowScales(
-        viscosity_m2_s=viscosity_m2_s,
-        dissipation_w_kg=dissipation_w_kg,
-        eta_m=(viscosity_m2_s**3 / dissipation_w_kg) ** 0.25,
-        tau_eta_s=(viscosity_m2_s / dissipation_w_kg) ** 0.5,
-    )
+
+    viscosity_m2_s: float  # kinematic
+    dissipation_w_kg: float  # energy dissipated per mass
+
+    @property
+    def eta_m(self) -> float:
+        """Length, (nu^3 / epsilon)^(1/4)."""
+        return float((self.viscosity_m2_s**3 / self.dissipation_w_kg) ** 0.25)
+
+    @property
+    def tau_eta_s(self) -> float:
+        """Time, (nu / epsilon)^(1/2)."""
+        return float((self.viscosity_m2_s / self.dissipation_w_kg) ** 0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,19 +56,19 @@ def comparisons(
 ) -> list[Comparison]:
     """Return the dimensionless numbers that the given inputs allow.
 
-    The sphere's rms values are corrected ones, root mean square over the three components.
+    The sphere's rms values are corrected for noise, root mean square over the three components.
 
     Args:
         table: moments by quantity.
         diameter_mm: of the sphere.
-        flow: the flow's scales, where viscosity and dissipation are known.
-        u_rms_m_s: rms velocity of the flow by component.
+        flow: the flow's scales, if viscosity and dissipation are known.
+        u_rms_m_s: rms of a component of the flow's velocity.
         integral_length_m: of the flow.
 
-    Source: the paper, section IV: omega_rms against u_rms / D; ERRATA A5.
+    Source: the paper, section IV: omega_rms against u_rms / D; docs/errata.md A5.
     """
     diameter_m = diameter_mm * M_PER_MM
-    v, a, omega, alpha = (_per_component(table[q]) for q in ("velocity", "acceleration", "omega_lab", "alpha_lab"))
+    v, a, omega, alpha = (_component_rms(table[q]) for q in ("velocity", "acceleration", "omega_lab", "alpha_lab"))
     rows = [
         ("sphere's rate of shear, rad/s", "v_rms / D", v / diameter_m),
         ("rotation against translation", "omega_rms D / v_rms", omega * diameter_m / v),
@@ -93,8 +92,37 @@ def comparisons(
     return [Comparison(name=name, formula=formula, value=float(value)) for name, formula, value in rows]
 
 
-def _per_component(moments: Moments) -> float:
-    """Return the rms of one component, the mean square over the three; as measured where nothing is known of noise."""
+def _component_rms(moments: Moments) -> float:
+    """Return the rms of one component, the mean square over the three; as measured if the noise is unknown."""
     corrected = moments.corrected_rms.value[:3]
     rms = corrected if np.isfinite(corrected).all() else moments.rms.value[:3]
     return float(np.sqrt((rms**2).mean()))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lift:
+    """Correlation of omega x v with a, lab; made by `lift`. Columns: x, y, z, and the vectors' (their sum)."""
+
+    correlation: Interval  # (4,), cosine: <a . l> / sqrt(<a^2> <l^2>) with l = omega x v
+    coefficient: Interval  # (4,), least squares of a = C omega x v
+
+
+def lift(ensemble: Ensemble, settings: BootstrapSettings | None = None) -> Lift:
+    """Return the correlation of the acceleration with omega x v, the direction of the Magnus force.
+
+    The velocity is the sphere's in the lab, as in the paper: the liquid's velocity is unknown.
+
+    Source: the paper, section IV, lift.
+    """
+    v, a = (ensemble.values[q] - ensemble.values[q].mean(0) for q in ("velocity", "acceleration"))
+    force = np.cross(ensemble.values["omega_lab"], v)
+    products = np.stack([a * force, a * a, force * force], axis=-1)
+    found = bootstrap(segment_sums(products, ensemble.segment, ensemble.segments), _lift_statistics, settings)
+    return Lift(correlation=found.part(0), coefficient=found.part(1))
+
+
+def _lift_statistics(totals: Floats) -> Floats:
+    """Return correlation and coefficient, (..., 2, 4), of sums (..., 3, 3)."""
+    whole = np.concatenate([totals, totals.sum(-2, keepdims=True)], axis=-2)
+    both, a2, l2 = np.moveaxis(whole, -1, 0)
+    return np.stack([both / np.sqrt(a2 * l2), both / l2], axis=-2)

@@ -1,4 +1,4 @@
-"""Is a vector's scatter the same in all directions, in the lab and in the body; and does a row belong to a frame."""
+"""Tests of isotropy: of vectors in lab and body, and of attitudes on SO(3); Euler angles; the frame of a dataset."""
 
 from __future__ import annotations
 
@@ -8,64 +8,65 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, per_segment
+from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
 from sphereorient.statistics.lags import Pairs
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
 
 Floats = NDArray[np.float64]
 
-ALIKE = 0.3  # of a row's own size: what the turns of the orientation may differ from it
+ALIKE = 0.3  # largest residual of a row against the rotations, relative to the row
+DRAWS = 20_000  # of the null distribution; its 5 % point is then known to 0.2 %
+SEED = 2011
+AT_ONCE = 50_000  # rotations of a block
+# Orthonormal symmetric traceless matrices; R acts on them as the five-dimensional representation
+_TENSORS = np.array(
+    [
+        [[0, 1, 0], [1, 0, 0], [0, 0, 0]],
+        [[0, 0, 1], [0, 0, 0], [1, 0, 0]],
+        [[0, 0, 0], [0, 0, 1], [0, 1, 0]],
+        [[1, 0, 0], [0, -1, 0], [0, 0, 0]],
+        [[-1 / np.sqrt(3), 0, 0], [0, -1 / np.sqrt(3), 0], [0, 0, 2 / np.sqrt(3)]],
+    ]
+) / np.sqrt(2.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Isotropy:
-    """Whether a quantity is isotropic; made by `isotropy`."""
+    """Result of the test of a quantity's isotropy; made by `isotropy`."""
 
     quantity: str
-    variance_share: Interval  # (3,), of x, y, z in the sum; a third each where isotropic
-    cross_correlation: Interval  # (3,), xy, xz, yz; none where isotropic
+    variance_share: Interval  # (3,), of x, y, z in the sum; 1/3 each if isotropic
+    cross_correlation: Interval  # (3,), xy, xz, yz; 0 if isotropic
     p_value: float
 
     @property
     def isotropic(self) -> bool:
-        """Whether the data do not contradict isotropy at 5 %."""
+        """Whether the test does not reject isotropy at 5 %."""
         return self.p_value >= 0.05
 
 
 def isotropy(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Isotropy:
-    """Test whether the covariance of a quantity is the same in all directions of its frame.
+    """Test whether the covariance of a quantity (a name in UNITS) is the same in all directions of its frame.
 
-    Isotropy says that the five numbers of the covariance's traceless part are zero. Each segment contributes their
-    sums; Hotelling's test asks whether all segments together differ from zero by more than they differ among
-    themselves, so that correlation along a track does no harm.
+    Isotropy means that the five numbers of the covariance's traceless part are zero. Each segment contributes their
+    sums; Hotelling's test compares their mean with their scatter over segments, so that the correlation along a track
+    does not matter. With six segments or fewer the p-value is NaN.
 
-    Args:
-        ensemble: the samples; more than six segments.
-        quantity: a name in UNITS.
-        settings: of the bootstrap for the intervals.
-
-    Returns:
-        Shares, correlations, and the p-value (NaN with six segments or fewer).
-
-    Source: Hotelling 1931; the paper, Table I, with ERRATA E6.
+    Source: Hotelling 1931; the paper, Table I, with docs/errata.md E6.
     """
     x = ensemble.values[quantity] - ensemble.values[quantity].mean(0)
     xy, xz, yz = x[:, 0] * x[:, 1], x[:, 0] * x[:, 2], x[:, 1] * x[:, 2]
     products = np.column_stack([x * x, xy, xz, yz])
-    sums = per_segment(products, ensemble.segment, ensemble.segments)
-    found = bootstrap(sums, _shares, settings)
+    sums = segment_sums(products, ensemble.segment, ensemble.segments)
+    found = bootstrap(sums, _variance_shares, settings)
     xx, yy, zz = sums[:, :3].T
     traceless = np.column_stack([xx - yy, (2 * zz - xx - yy) / np.sqrt(3), 2 * sums[:, 3:]])
-    return Isotropy(
-        quantity=quantity,
-        variance_share=found.part(0),
-        cross_correlation=found.part(1),
-        p_value=zero_mean_p_value(traceless),
-    )
+    p_value = zero_mean_p_value(traceless)
+    return Isotropy(quantity=quantity, variance_share=found.part(0), cross_correlation=found.part(1), p_value=p_value)
 
 
-def _shares(totals: Floats) -> Floats:
+def _variance_shares(totals: Floats) -> Floats:
     """Return shares of the variance and correlations, (..., 2, 3), of sums (..., 6)."""
     var, cross = totals[..., :3], totals[..., 3:]
     pairs = np.sqrt(var[..., [0, 0, 1]] * var[..., [1, 2, 2]])
@@ -73,7 +74,7 @@ def _shares(totals: Floats) -> Floats:
 
 
 def zero_mean_p_value(rows: Floats) -> float:
-    """Return Hotelling's p-value for independent rows (S, P) to have mean zero; NaN where S is not above P + 1."""
+    """Return Hotelling's p-value for independent rows (S, P) to have mean zero; NaN if S is not above P + 1."""
     from scipy.stats import f as fisher
 
     count, size = rows.shape
@@ -87,15 +88,10 @@ def zero_mean_p_value(rows: Floats) -> float:
 
 
 def anisotropic_frame(lab: Isotropy, body: Isotropy, level: float = 0.05) -> Literal["lab", "body", "both", "neither"]:
-    """Say in which frame a vector prefers directions.
+    """Return the frame in which a vector is anisotropic, by the tests on lab and body components at a level.
 
-    A flow that has axes shows in the lab and is averaged out in a body that tumbles; a body whose axes differ shows in
-    the body.
-
-    Args:
-        lab: the test on lab components.
-        body: the test on body components.
-        level: p-values below it count.
+    A flow with axes is anisotropic in the lab; in a body that tumbles it averages out. A body with unequal axes is
+    anisotropic in the body.
     """
     if lab.p_value >= level:
         return "neither" if body.p_value >= level else "body"
@@ -104,26 +100,19 @@ def anisotropic_frame(lab: Isotropy, body: Isotropy, level: float = 0.05) -> Lit
 
 @dataclass(frozen=True, kw_only=True)
 class FrameOfRow:
-    """Which frame an angular velocity is written in; made by `frame_of_omega`."""
+    """The frame of the components of an angular velocity; made by `frame_of_omega`."""
 
-    lab_residual: float  # rms difference from the turns' own lab components over the row's rms
+    lab_residual: float  # rms difference from the rotations' lab components over the row's rms
     body_residual: float
     frame: Literal["lab", "body", "none", "both"]
 
 
 def frame_of_omega(ensemble: Ensemble, omega: Floats) -> FrameOfRow:
-    """Find out in which frame the components of an angular velocity are written.
+    """Find the frame of the components of an angular velocity (M, 3), rad/s, by the ensemble's orientations.
 
-    From frame to frame the sphere turns by R_{k+1} R_k^T in lab components and by R_k^T R_{k+1} in body components
-    (ERRATA E4); the mean of the row's two values is compared with both. A row of the paper's Table I, R omega_lab,
-    fits neither (E6).
-
-    Args:
-        ensemble: gives the orientations.
-        omega: (M, 3), rad/s, the row in question.
-
-    Returns:
-        The residuals and the verdict.
+    From frame to frame the sphere rotates by R_{k+1} R_k^T in lab components and by R_k^T R_{k+1} in body components
+    (docs/errata.md E4); the mean of the row's two values is compared with both. A row of the paper's Table I,
+    R omega_lab, fits neither (E6).
     """
     from scipy.spatial.transform import Rotation
 
@@ -132,13 +121,115 @@ def frame_of_omega(ensemble: Ensemble, omega: Floats) -> FrameOfRow:
     step_s = (ensemble.time_s[second] - ensemble.time_s[first])[:, None]
     middle = (omega[first] + omega[second]) / 2
     size = np.sqrt(np.square(middle).mean())
-    turns = {"lab": after * before.inv(), "body": before.inv() * after}
-    residual = {
-        name: float(np.sqrt(np.square(turn.as_rotvec() / step_s - middle).mean()) / size)
-        for name, turn in turns.items()
-    }
-    fits = [name for name in ("lab", "body") if residual[name] < ALIKE]
-    verdict: Literal["lab", "body", "none", "both"] = "both" if len(fits) == 2 else "none"
-    if len(fits) == 1:
-        verdict = "lab" if fits[0] == "lab" else "body"
-    return FrameOfRow(lab_residual=residual["lab"], body_residual=residual["body"], frame=verdict)
+    lab, body = (
+        float(np.sqrt(np.square(rotation.as_rotvec() / step_s - middle).mean()) / size)
+        for rotation in (after * before.inv(), before.inv() * after)
+    )
+    frame: Literal["lab", "body", "none", "both"] = "lab" if lab < ALIKE else "none"
+    if body < ALIKE:
+        frame = "both" if lab < ALIKE else "body"
+    return FrameOfRow(lab_residual=lab, body_residual=body, frame=frame)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uniformity:
+    """Result of the test of uniform attitudes; made by `uniformity`."""
+
+    statistic: float
+    p_value: float
+    samples: int
+    effective: float  # number of independent attitudes with the same scatter
+    segments: int
+
+    @property
+    def uniform(self) -> bool:
+        """Whether the test does not reject a uniform distribution at 5 %."""
+        return self.p_value >= 0.05
+
+
+def uniformity(R_lab_body: Floats, segment: NDArray[np.int64] | None = None) -> Uniformity:
+    """Test whether rotations are uniform on SO(3).
+
+    The statistic is the squared norm of the mean of the first two representations: 3 n |<R>|^2 + 5 n |<D>|^2,
+    chi-squared with 9 + 25 degrees of freedom for independent attitudes. It sees deviations in the first and second
+    moments of the axes' directions. Attitudes along a track are correlated, so the units of the null distribution are
+    segments: a segment is as likely after any rotation in the body. The sum over segments then has the covariance of
+    the segments' own sums; many segments make it normal, and the statistic a weighted sum of chi-squares.
+
+    Args:
+        R_lab_body: (M, 3, 3).
+        segment: (M,), increasing, equal within a segment; None: all rotations are independent.
+
+    Returns:
+        Statistic and p-value. Twenty segments are few; with two the test has no power.
+
+    Source: Rayleigh's and Gine's tests on SO(3): Mardia and Jupp 2000, Directional Statistics, 13.2.
+    """
+    count = len(R_lab_body)
+    number = np.arange(count) if segment is None else np.unique(segment, return_inverse=True)[1]
+    segments = int(number[-1]) + 1
+    first, second = np.zeros((segments, 3, 3)), np.zeros((segments, 5, 5))  # sums of R and of D by segment
+    for k in range(0, count, AT_ONCE):
+        block, near = R_lab_body[k : k + AT_ONCE], number[k : k + AT_ONCE]
+        here = slice(near[0], near[-1] + 1)
+        first[here] += segment_sums(block, near - near[0], here.stop - here.start)
+        second[here] += segment_sums(five_dimensional(block), near - near[0], here.stop - here.start)
+    statistic = (3 * np.square(first.sum(0)).sum() + 5 * np.square(second.sum(0)).sum()) / count
+    spread = [np.linalg.eigvalsh(np.einsum("sij,skj->ik", x, x)) / count for x in (first, second)]
+    rng = np.random.default_rng(SEED)
+    # E[(Y Q)(Y Q)^T] over rotations Q is Y Y^T / (2 l + 1) in each column
+    null = sum(rng.chisquare(len(w), (DRAWS, len(w))) @ w for w in spread)
+    mean = float(3 * spread[0].sum() + 5 * spread[1].sum())
+    return Uniformity(
+        statistic=float(statistic),
+        p_value=float((1 + np.sum(null >= statistic)) / (DRAWS + 1)),
+        samples=count,
+        effective=count * (9.0 + 25.0) / mean,
+        segments=segments,
+    )
+
+
+def five_dimensional(R: Floats) -> Floats:
+    """Return (..., 5, 5), the action of rotations (..., 3, 3) on symmetric traceless tensors."""
+    rotated = R[..., None, :, :] @ _TENSORS @ R[..., None, :, :].swapaxes(-1, -2)  # (..., 5, 3, 3)
+    flat = rotated.reshape(*rotated.shape[:-2], 9)
+    return np.asarray((flat @ _TENSORS.reshape(5, 9).T).swapaxes(-1, -2))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EulerDensity:
+    """PDF of one Euler angle; made by `euler_densities`, drawn by the report."""
+
+    name: str  # theta_x, theta_y, theta_z
+    edges_rad: Floats  # (B + 1,)
+    pdf: Interval  # (B,), 1/rad
+    uniform: Floats  # (B,), mean density of uniform rotations in each bin
+
+
+def euler_densities(
+    ensemble: Ensemble, bins: int = 24, settings: BootstrapSettings | None = None
+) -> list[EulerDensity]:
+    """Return the PDFs of theta_x, theta_y, theta_z beside those of uniform rotations.
+
+    Uniform rotations have theta_x and theta_z uniform over 2 pi and theta_y with density cos(theta_y) / 2.
+
+    Source: the paper, section II; the angles by docs/errata.md E1.
+    """
+    import torch
+
+    from sphereorient import so3
+
+    theta = so3.to_tait_bryan(torch.from_numpy(ensemble.R_lab_body)).numpy()
+    out = []
+    for i, name in enumerate(("theta_x", "theta_y", "theta_z")):
+        half = np.pi / 2 if i == 1 else np.pi
+        edges = np.linspace(-half, half, bins + 1)
+        width = edges[1] - edges[0]
+        place = np.clip(((theta[:, i] + half) / width).astype(np.int64), 0, bins - 1)
+        each = np.zeros((len(theta), bins))
+        each[np.arange(len(theta)), place] = 1.0
+        sums = segment_sums(each, ensemble.segment, ensemble.segments)
+        share = bootstrap(sums, lambda totals: np.asarray(totals / totals.sum(-1, keepdims=True)), settings)
+        law = np.diff(np.sin(edges)) / 2 / width if i == 1 else np.full(bins, 1 / (2 * np.pi))
+        out.append(EulerDensity(name=name, edges_rad=edges, pdf=share.scaled(1 / width), uniform=law))
+    return out

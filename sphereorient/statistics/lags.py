@@ -1,20 +1,31 @@
-"""Pairs of samples of one segment that lie a lag apart; gaps are honoured."""
+"""Autocorrelations with integral times, and increments, over lags within segments."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums, studentized
+from sphereorient.statistics.density import Density, density_of
 from sphereorient.statistics.segments import Ensemble
+from sphereorient.statistics.settings import BootstrapSettings
 
+Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
+
+LEAST_PAIRS = 0.02  # of the samples: longer lags have pairs in too few segments
+EVERY_LAG, MORE_LAGS = 40, 40  # the first lags, and how many sparser ones follow
+FEWEST_SEGMENTS = 10  # of a lag; with fewer its error bar means little
 
 
 class Pairs:
-    """Finds pairs of rows; made once for an ensemble, asked for many lags."""
+    """Pairs of samples of one segment at a given lag; gaps are respected. Made once for an ensemble."""
 
     def __init__(self, ensemble: Ensemble) -> None:
-        """Give every frame between a segment's first and last a place, empty where there is no sample."""
+        """Make a regular grid of the frames of each segment, with empty places for lost frames."""
         frames = np.maximum.reduceat(ensemble.frame, ensemble.starts[:-1]) + 1
         self.longest = int(frames.max()) - 1  # lag, frames
         begin = np.concatenate([[0], np.cumsum(frames)[:-1]])
@@ -30,3 +41,173 @@ class Pairs:
         later = self._row[self._place + lag]
         there = (later >= 0) & (self._segment[later] == self._segment)
         return np.flatnonzero(there), later[there]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Correlation:
+    """Autocorrelation of one quantity; made by `correlation`. Columns: x, y, z, and the vector's (their sum)."""
+
+    quantity: str
+    lag_s: Floats  # (L,), from 0
+    value: Interval  # (L, 4)
+    pairs: Rows  # (L,)
+    integral_time_s: Interval  # (4,), of the curve up to its first zero
+    reached_zero: NDArray[np.bool_]  # (4,); False: the segments are too short, the time is a lower bound
+
+
+def correlation(
+    ensemble: Ensemble, quantity: str, longest_s: float | None = None, settings: BootstrapSettings | None = None
+) -> Correlation:
+    """Return the autocorrelation of a quantity about its mean over the ensemble.
+
+    A value is the mean product of the pairs at this lag over the mean square of the same pairs: unbiased by the lengths
+    of the segments, and 1 for a constant. Pairs over a gap count at their true lag.
+
+    Args:
+        ensemble: the samples.
+        quantity: a name in UNITS.
+        longest_s: longest lag, s; None: the longest at which a fiftieth of the samples has a partner.
+        settings: of the bootstrap.
+
+    Returns:
+        The curve and the integral times, to the first zero (trapezoids, the last one cut at the zero).
+
+    Source: textbook; the paper's T_L is the integral time of `velocity`.
+    """
+    pairs = Pairs(ensemble)
+    x = ensemble.values[quantity] - ensemble.values[quantity].mean(0)
+    sums, counts, lags = [], [], _correlation_lags(pairs, ensemble, longest_s)
+    for lag in lags.tolist():
+        first, second = pairs.at(lag)
+        a, b = x[first], x[second]
+        products = np.stack([a * b, (a * a + b * b) / 2], axis=-1)
+        sums.append(segment_sums(products, ensemble.segment[first], ensemble.segments))
+        counts.append(len(first))
+    lag_s = np.asarray(lags * ensemble.step_s, np.float64)
+    found = bootstrap(np.stack(sums, axis=1), lambda totals: _curve_and_times(totals, lag_s), settings)
+    curve = found.part(slice(0, -1))
+    return Correlation(
+        quantity=quantity,
+        lag_s=lag_s,
+        value=curve,
+        pairs=np.array(counts),
+        integral_time_s=found.part(-1),
+        reached_zero=np.asarray((curve.value <= 0).any(0)),
+    )
+
+
+def _correlation_lags(pairs: Pairs, ensemble: Ensemble, longest_s: float | None) -> Rows:
+    """Return lags in frames: each one at first, then ever sparser."""
+    most = pairs.longest if longest_s is None else min(pairs.longest, int(longest_s / ensemble.step_s))
+    if longest_s is None:
+        length = np.sort(np.bincount(ensemble.segment))
+        reached = np.array([np.maximum(length - k, 0).sum() for k in range(most + 1)])
+        most = max(1, int(np.flatnonzero(reached >= LEAST_PAIRS * len(ensemble))[-1]))
+    sparse = np.geomspace(EVERY_LAG, max(most, EVERY_LAG), MORE_LAGS).round().astype(np.int64)
+    lags = np.unique(np.concatenate([np.arange(EVERY_LAG), sparse]))
+    return np.asarray(lags[lags <= most], np.int64)
+
+
+def _curve_and_times(totals: Floats, lag_s: Floats) -> Floats:
+    """Return the curve and in a last row the integral times, (..., L + 1, 4), of sums (..., L, 3, 2)."""
+    whole = np.concatenate([totals, totals.sum(-2, keepdims=True)], axis=-2)
+    curve = whole[..., 0] / whole[..., 1]
+    return np.concatenate([curve, integral_time(curve, lag_s)[..., None, :]], axis=-2)
+
+
+def integral_time(curve: Floats, lag_s: Floats) -> Floats:
+    """Return the integral up to the first zero, (..., C), of curves (..., L, C) at lags (L,); it ends before a NaN."""
+    a, b = curve[..., :-1, :], curve[..., 1:, :]
+    step = np.diff(lag_s)[:, None]
+    before = np.logical_and.accumulate((a > 0) & np.isfinite(b), axis=-2)
+    share = np.where(b > 0, 1.0, a / np.where(b > 0, 1.0, np.maximum(a - b, 1e-300)))  # of the step before the zero
+    area = share * step * np.where(b > 0, a + b, a) / 2
+    return np.asarray(np.where(before, area, 0.0).sum(-2))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Increments:
+    """Increments x(t + lag) - x(t) of one quantity; made by `increments`. Columns: x, y, z, and all three pooled."""
+
+    quantity: str
+    lag_s: Floats  # (L,)
+    lag_frames: Rows  # (L,)
+    rms: Interval  # (L, 4); pooled: of one component
+    flatness: Interval  # (L, 4)
+    pairs: Rows  # (L,)
+
+
+def increments(
+    ensemble: Ensemble,
+    quantity: str = "omega_lab",
+    lags_s: Sequence[float] | None = None,
+    integral_time_s: float | None = None,
+    settings: BootstrapSettings | None = None,
+) -> Increments:
+    """Return rms and flatness of increments over lags.
+
+    At short lags an increment is the derivative times the lag, with its flatness; far beyond the integral time it is
+    the difference of two independent values, with flatness 3 + (F - 3) / 2.
+
+    Args:
+        ensemble: the samples.
+        quantity: a name in UNITS.
+        lags_s: lags, s, rounded to frames; None: twelve, from a frame to the integral time, geometric.
+        integral_time_s: the longest of these twelve; None: half the median segment.
+        settings: of the bootstrap.
+
+    Returns:
+        Statistics by lag, without lags that fewer than ten segments reach.
+
+    Source: the paper, section IV, with docs/errata.md E7.
+    """
+    pairs = Pairs(ensemble)
+    if lags_s is None:
+        longest = (integral_time_s or float(np.median(ensemble.span_s)) / 2) / ensemble.step_s
+        frames = np.geomspace(1, max(longest, 1), 12)
+    else:
+        frames = np.asarray(lags_s) / ensemble.step_s
+    wanted = np.unique(np.clip(np.rint(frames).astype(np.int64), 1, max(pairs.longest, 1)))
+    x = ensemble.values[quantity]
+    sums, counts, lags = [], [], []
+    for lag in wanted.tolist():
+        first, second = pairs.at(lag)
+        segment = ensemble.segment[first]
+        if len(np.unique(segment)) < min(FEWEST_SEGMENTS, ensemble.segments):
+            continue
+        d2 = np.square(x[second] - x[first])
+        sums.append(segment_sums(np.stack([np.ones_like(d2), d2, d2 * d2], axis=-1), segment, ensemble.segments))
+        counts.append(len(first))
+        lags.append(lag)
+    whole = np.stack(sums, axis=1)  # (S, L, 3, 3)
+    found = studentized(whole.reshape(*whole.shape[:2], 9), _rms_and_flatness, np.ones(8, bool), settings)
+    return Increments(
+        quantity=quantity,
+        lag_s=np.asarray(np.array(lags, dtype=np.int64) * ensemble.step_s, np.float64),
+        lag_frames=np.array(lags, dtype=np.int64),
+        rms=found.part((..., slice(0, 4))),
+        flatness=found.part((..., slice(4, 8))),
+        pairs=np.array(counts),
+    )
+
+
+def _rms_and_flatness(totals: Floats) -> Floats:
+    """Return rms, then flatness, (..., L, 8), of sums (..., L, 9): number, square, fourth power of each component."""
+    parts = totals.reshape(*totals.shape[:-1], 3, 3)
+    whole = np.concatenate([parts, parts.sum(-2, keepdims=True)], axis=-2)
+    count, second, fourth = np.moveaxis(whole, -1, 0)
+    return np.concatenate([np.sqrt(second / count), fourth * count / second**2], axis=-1)
+
+
+def increment_density(
+    ensemble: Ensemble,
+    lag_frames: int,
+    quantity: str = "omega_lab",
+    component: int = 0,
+    settings: BootstrapSettings | None = None,
+) -> Density:
+    """Return the PDF of the increments over one lag, in their standard deviations; some segment must be longer."""
+    first, second = Pairs(ensemble).at(lag_frames)
+    x = ensemble.values[quantity][:, component]
+    there, segment = np.unique(ensemble.segment[first], return_inverse=True)
+    return density_of(x[second] - x[first], segment, len(there), settings=settings)

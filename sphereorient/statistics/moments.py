@@ -8,20 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.statistics.bootstrap import Interval, per_segment
+from sphereorient.statistics.bootstrap import Interval, segment_sums, studentized
 from sphereorient.statistics.segments import UNITS, Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.statistics.studentized import studentized
 
 Floats = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "z", "norm")
 STATISTICS = ("mean", "rms", "skewness", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
 POSITIVE = np.array([False, True, False, True, True, True, True])
-LET_THROUGH = (
-    0.65  # of the variance of a smoother's error: scripts/ensemble_coverage.py measures it for alpha and omega
-)
-WARN_SHARE = 0.1  # of a variance; more noise than that is worth a warning
+LET_THROUGH = 0.65  # of the variance of a smoother's error is noise; measured by scripts/ensemble_coverage.py
+WARN_SHARE = 0.1  # of a variance; more noise gets a warning
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,7 +33,7 @@ class Moments:
     flatness: Interval
     corrected_rms: Interval  # of the motion itself, by the track's own sigmas; NaN for the norm
     corrected_flatness: Interval
-    noise_share: Interval  # of the variance: what is noise, or what the smoother lost
+    noise_share: Interval  # of the variance: noise, or motion that the smoother lost
     samples: int
     segments: int
 
@@ -52,48 +49,30 @@ def table_of_moments(ensemble: Ensemble, settings: BootstrapSettings | None = No
 
 
 def moments(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Moments:
-    """Return the moments of one quantity.
+    """Return the moments of one quantity (a name in UNITS), by component and of the norm, with intervals.
 
-    Args:
-        ensemble: the samples.
-        quantity: a name in UNITS.
-        settings: of the bootstrap over segments.
-
-    Returns:
-        Moments by component and of the norm, with intervals.
-
-    Source: the paper, Table I; the rows called lab there belong to no frame (ERRATA E6).
+    Source: the paper, Table I; its lab rows are in no frame (docs/errata.md E6).
     """
-    x = with_norm(ensemble.values[quantity])
+    x = ensemble.values[quantity]
+    x = np.concatenate([x, np.linalg.norm(x, axis=1, keepdims=True)], axis=1)
     sigma = np.concatenate([ensemble.sigmas[quantity], np.full((len(x), 1), np.nan)], axis=1)
     sign = 1.0 if ensemble.error == "added" else -1.0
-    centre, scale = x.mean(0), _scale(x)
-    sums = _sums((x - centre) / scale, sigma / scale, ensemble)
+    centre, deviation = x.mean(0), x.std(0)
+    scale = np.where(deviation > 1e-12 * np.abs(x).max(0), deviation, 1.0)  # 1 for values equal to rounding
+    x, sigma = (x - centre) / scale, sigma / scale
+    x2, s2 = x * x, sigma * sigma
+    powers = np.stack([np.ones_like(x), x, x2, x2 * x, x2 * x2, s2, s2 * s2, x2 * s2], axis=-1)
+    sums = segment_sums(powers, ensemble.segment, ensemble.segments)  # (S, 4, 8)
     found = studentized(sums, lambda totals: _statistics(totals, sign), POSITIVE, settings)
-    parts = {name: _in_units(found, k, name, centre, scale) for k, name in enumerate(STATISTICS)}
+    parts = {}
+    for k, name in enumerate(STATISTICS):  # back to the quantity's own units
+        factor = scale if name in ("mean", "rms", "corrected_rms") else 1.0
+        parts[name] = found.part((slice(None), k)).scaled(factor, centre if name == "mean" else 0.0)
     return Moments(quantity=quantity, units=UNITS[quantity], **parts, samples=len(ensemble), segments=ensemble.segments)
 
 
-def with_norm(x: Floats) -> Floats:
-    """Return (M, 4): x, y, z, norm of (M, 3)."""
-    return np.concatenate([x, np.linalg.norm(x, axis=1, keepdims=True)], axis=1)
-
-
-def _scale(x: Floats) -> Floats:
-    """Return a size of each column; 1 where all values are equal, a rounding's width included."""
-    deviation = x.std(0)
-    return np.where(deviation > 1e-12 * np.abs(x).max(0), deviation, 1.0)
-
-
-def _sums(x: Floats, sigma: Floats, ensemble: Ensemble) -> Floats:
-    """Return what each segment contributes, (S, 4, 8): number, four powers of x, and what corrects for noise."""
-    x2, s2 = x * x, sigma * sigma
-    powers = np.stack([np.ones_like(x), x, x2, x2 * x, x2 * x2, s2, s2 * s2, x2 * s2], axis=-1)
-    return per_segment(powers, ensemble.segment, ensemble.segments)
-
-
 def _statistics(totals: Floats, sign: float) -> Floats:
-    """Return STATISTICS of total sums (..., 4, 8), as (..., 4, 7), of normalised values."""
+    """Return STATISTICS (..., 4, 7) of total sums (..., 4, 8) of normalised values."""
     mean, m2, m3, m4, s2, s4, x2s2 = np.moveaxis(totals[..., 1:] / totals[..., :1], -1, 0)
     var = m2 - mean**2
     third = m3 - 3 * mean * m2 + 2 * mean**3
@@ -110,23 +89,20 @@ def _statistics(totals: Floats, sign: float) -> Floats:
 def without_noise(
     var: Floats, fourth: Floats, s2: Floats, s4: Floats, mixed: Floats, sign: float
 ) -> tuple[Floats, Floats]:
-    """Return variance and fourth moment of the motion itself from those of what was measured.
+    """Return variance and fourth moment (...) of the motion from those that were measured.
 
-    Noise that a kernel let through is independent of the motion and normal, with a variance of its own in every frame:
-    it is taken off (sign 1). A smoother's estimate lacks what it could not follow: its variance is put back (sign -1).
-    Of its error the greater part is noise that it let through all the same (LET_THROUGH); what it lost is taken to be
-    as intermittent as what it followed, so that the flatness is that of the estimate without this noise.
+    Noise that a kernel let through is independent of the motion and normal, with its own variance in every frame; it
+    is subtracted (sign 1). A smoother's estimate lacks the motion that it could not follow; its variance is added
+    (sign -1). The share LET_THROUGH of a smoother's error is noise; the lost motion is assumed to be as intermittent as
+    the rest, so that the flatness is that of the estimate without this noise.
 
     Args:
-        var: (...), variance that was measured.
-        fourth: (...), fourth central moment that was measured.
+        var: (...), measured variance.
+        fourth: (...), measured fourth central moment.
         s2: (...), mean of sigma^2.
         s4: (...), mean of sigma^4.
         mixed: (...), mean of (x - mean)^2 sigma^2.
-        sign: 1 takes noise off, -1 puts back what was smoothed away.
-
-    Returns:
-        Variance and fourth moment, (...) each.
+        sign: 1 subtracts noise, -1 adds what was smoothed away.
     """
     part = 1.0 if sign > 0 else LET_THROUGH
     clean_var = var - part * s2
@@ -138,25 +114,9 @@ def without_noise(
 
 
 def noise_let_through(ensemble: Ensemble, quantity: str, component: int) -> float:
-    """Return what share of a component's measured variance is noise that a kernel or the smoother let through.
-
-    Args:
-        ensemble: the samples.
-        quantity: a name in UNITS.
-        component: 0, 1, 2.
-
-    Returns:
-        0 .. 0.9; 0 where the errors are not known.
-    """
+    """Return the share of noise in a component's measured variance, 0 .. 0.9; 0 where the errors are unknown."""
     var = float(ensemble.values[quantity][:, component].var())
     noise = float(np.square(ensemble.sigmas[quantity][:, component]).mean())
     if not (np.isfinite(noise) and var > 0):
         return 0.0
     return min((1.0 if ensemble.error == "added" else LET_THROUGH) * noise / var, 0.9)
-
-
-def _in_units(found: Interval, k: int, name: str, centre: Floats, scale: Floats) -> Interval:
-    """Return one statistic in the quantity's own units."""
-    shift = centre if name == "mean" else 0.0
-    factor = scale if name in ("mean", "rms", "corrected_rms") else 1.0
-    return found.part((slice(None), k)).scaled(factor, shift)

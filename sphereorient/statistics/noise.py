@@ -1,22 +1,27 @@
-"""How much of a quantity is noise: by the track's own sigmas, and by increments over many lags."""
+"""How much of a quantity is noise: by the track's sigmas, by increments over many lags, by the kernel's width."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import TrackError, refusal
-from sphereorient.statistics.bootstrap import Interval, bootstrap, scattered
-from sphereorient.statistics.moments import WARN_SHARE, Moments
+from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums, studentized
+from sphereorient.statistics.moments import WARN_SHARE, Moments, without_noise
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
 
-RATES = {"acceleration": ("position", 1e-3), "alpha_lab": ("orientation", 1.0)}  # source, and its unit in SI
-LAGS = (1, 2, 3, 4, 5, 6)  # frames; on Table I's motion longer ones are past the fit's reach
+SI = 1e-3  # m per mm
+RATES = {"acceleration": ("position", SI), "alpha_lab": ("orientation", 1.0)}  # source, and its unit in SI
+LAGS = (1, 2, 3, 4, 5, 6)  # frames; on Table I's motion the fit does not hold for longer ones
+WIDTHS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # sigma of the Gaussian, frames
+CENTRAL = np.array([0.5, 0.0, -0.5])  # omega from the rotation of frame k - 1 to k + 1, for np.convolve
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,12 +35,7 @@ class NoiseWarning:
 
 
 def noise_warnings(table: dict[str, Moments], error: str) -> list[NoiseWarning]:
-    """Return a record for each component of which too much is noise.
-
-    Args:
-        table: moments by quantity.
-        error: the ensemble's, "added" or "removed".
-    """
+    """Return a record for each component with too much noise; `error` is the ensemble's, "added" or "removed"."""
     what = {"added": "noise", "removed": "smoothed away"}[error]
     found = []
     for quantity, part in table.items():
@@ -69,12 +69,11 @@ def multi_lag(
     lags: tuple[int, ...] = LAGS,
     settings: BootstrapSettings | None = None,
 ) -> MultiLag:
-    """Estimate the variance of acceleration or alpha from the raw measurements, without their noise.
+    """Estimate the variance of acceleration or alpha from the raw measurements, without their white noise.
 
     The second difference over n frames has the variance of the motion, (n dt)^4 <a^2> (1 - c n^2), plus 6 times the
-    noise variance, which does not depend on n. A straight fit of the two and of the loss separates them: neither a
-    filter nor the track's own sigmas enter. Noise must be white. For alpha the difference is that of two turns,
-    R_{k+n} R_k^T and R_k R_{k-n}^T.
+    noise variance, which does not depend on n. A linear fit separates the two and the loss c; it uses neither a filter
+    nor the track's sigmas. For alpha the difference is that of the rotations R_{k+n} R_k^T and R_k R_{k-n}^T.
 
     Args:
         tracks: with `position` and `orientation` as measured.
@@ -82,11 +81,8 @@ def multi_lag(
         lags: n, frames; at least four.
         settings: of the bootstrap over segments.
 
-    Returns:
-        Variances with intervals.
-
     Raises:
-        TrackError: too few segments or lags to fit.
+        TrackError: too few segments or lags for the fit.
 
     Source: second-order statistics of increments over several time steps: Machicoane, Lopez-Caballero, Bourgoin,
     Aliseda and Volk 2017, Meas. Sci. Technol. 28, 107002.
@@ -122,26 +118,25 @@ def _second_differences(track: Trajectory, quantity: str, n: int, step_s: float)
     even = np.abs(track.time[k + n] + track.time[k - n] - 2 * track.time[k]) < 0.1 * step_s
     even &= np.abs(track.time[k + n] - track.time[k - n] - 2 * n * step_s) < 0.1 * step_s
     k = k[same & even & (track.segment[k] >= 0)]
-    difference = _turn_difference(values, k, n) if source == "orientation" else _bend(values, k, n) * unit
+    if source == "orientation":
+        difference = _rotation(values, k, k + n) - _rotation(values, k - n, k)
+    else:
+        difference = np.asarray(values[k + n] - 2 * values[k] + values[k - n]) * unit
     there = np.isfinite(difference).all(1)
     square, segment = np.square(difference[there]), track.segment[k[there]]
     order = np.argsort(segment, kind="stable")
-    return scattered(np.stack([square, np.ones_like(square)], axis=-1)[order], segment[order], segments)
+    return segment_sums(np.stack([square, np.ones_like(square)], axis=-1)[order], segment[order], segments)
 
 
-def _bend(x: Floats, k: NDArray[np.int64], n: int) -> Floats:
-    return np.asarray(x[k + n] - 2 * x[k] + x[k - n])
-
-
-def _turn_difference(R: Floats, k: NDArray[np.int64], n: int) -> Floats:
-    """Return the later turn's vector less the earlier one's, lab."""
+def _rotation(R: Floats, first: Rows, second: Rows) -> Floats:
+    """Return the rotation vectors from some rows to others in lab components, (K, 3); NaN where either is."""
     from scipy.spatial.transform import Rotation
 
-    there = np.isfinite(R[k + n] + R[k] + R[k - n]).all((1, 2))
-    out = np.full((len(k), 3), np.nan)
+    there = np.isfinite(R[first] + R[second]).all((1, 2))
+    out = np.full((len(first), 3), np.nan)
     if there.any():
-        before, now, after = (Rotation.from_matrix(R[k[there] + j]) for j in (-n, 0, n))
-        out[there] = (after * now.inv()).as_rotvec() - (now * before.inv()).as_rotvec()
+        before, after = (Rotation.from_matrix(R[rows[there]]) for rows in (first, second))
+        out[there] = (after * before.inv()).as_rotvec()
     return out
 
 
@@ -158,3 +153,133 @@ def _extrapolated(square: Floats, lag_s: Floats) -> Floats:
     right = np.einsum("...lp,...li->...pi", design, square * weight)
     found = np.linalg.solve(normal, right)
     return np.stack([found[..., 1, :] / lag_s[-1] ** 4, found[..., 0, :]], axis=-2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WidthCurve:
+    """Rms and flatness by kernel width; made by `width_curve`, drawn by the report. Columns: x, y, z."""
+
+    quantity: str
+    width_s: Floats  # (W,), sigma of the Gaussian
+    rms: Interval  # (W, 3)
+    flatness: Interval  # (W, 3)
+    corrected_rms: Interval  # (W, 3), without the noise expected from the measurements' sigmas
+    corrected_flatness: Interval  # (W, 3)
+    noise_share: Interval  # (W, 3), of the variance
+
+
+def width_curve(
+    tracks: Trajectory | Sequence[Trajectory],
+    quantity: str,
+    widths_frames: Sequence[float] = WIDTHS,
+    settings: BootstrapSettings | None = None,
+) -> WidthCurve:
+    """Differentiate the measured positions or orientations with kernels of many widths.
+
+    Narrow kernels let noise through, wide ones lose the motion; without a plateau between them the rms is not well
+    known. All widths use the frames that the widest one reaches. White noise and regular times within a segment are
+    assumed. Alpha is the derivative of omega from the rotations over two frames.
+
+    Args:
+        tracks: with positions, orientations and their covariances.
+        quantity: velocity, acceleration or alpha_lab.
+        widths_frames: sigma of the Gaussian, frames.
+        settings: of the bootstrap over segments.
+
+    Returns:
+        The curve; NaN where all segments are shorter than the widest kernel.
+
+    Source: Voth, La Porta, Crawford, Alexander and Bodenschatz 2002, J. Fluid Mech. 469, 121; the paper, section III.
+    """
+    many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
+    sums = np.concatenate([_by_width(track, quantity, widths_frames) for track in many])
+    if not len(sums):
+        sums = np.zeros((1, len(widths_frames), 3, 6))  # 0 / 0 is NaN
+    found = studentized(sums.reshape(len(sums), -1, 6), _width_statistics, np.ones(5, bool), settings)
+    names = ("rms", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
+    rows = np.arange(3 * len(widths_frames)).reshape(-1, 3)
+    return WidthCurve(
+        quantity=quantity,
+        width_s=np.array(widths_frames) * _step(many[0]),
+        **{name: found.part((rows, k)) for k, name in enumerate(names)},
+    )
+
+
+def _step(track: Trajectory) -> float:
+    """Return the time between frames, s."""
+    return float(np.median(np.diff(track.time)))
+
+
+def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floats:
+    """Return by segment (S, W, 3, 6): number, x^2, x^4, sigma^2, sigma^4, x^2 sigma^2."""
+    rows, place, number = _grid(track)
+    rotating = quantity == "alpha_lab"
+    cov = (track.orientation_cov if rotating else track.position_cov * SI**2)[rows]
+    noise, values = np.full((2, len(number), 3), np.nan)
+    noise[place] = np.diagonal(cov, axis1=1, axis2=2)
+    if rotating:
+        row = np.full(len(number) + 2, -1, dtype=np.int64)
+        row[place + 1] = np.arange(len(rows))
+        there = np.flatnonzero((row[:-2] >= 0) & (row[2:] >= 0))
+        values[there] = _rotation(track.orientation[rows], row[there], row[there + 2]) / 2  # omega
+    else:
+        values[place] = track.position[rows] * SI
+    order = 2 if quantity == "acceleration" else 1
+    scale = _step(track) ** -(2 if quantity != "velocity" else 1)
+    parts = []
+    for width in widths:
+        kernel = _kernel(width, order)
+        x2 = np.square(_convolved(values, kernel) * scale)
+        s2 = _convolved(noise, np.square(np.convolve(kernel, CENTRAL) if rotating else kernel)) * scale**2
+        parts.append(np.stack([np.ones_like(x2), x2, x2 * x2, s2, s2 * s2, x2 * s2], axis=-1))
+    whole = np.stack(parts, axis=1)
+    known = np.isfinite(whole).all((1, 2, 3)) & (number >= 0)
+    sums = segment_sums(whole[known], number[known], int(number.max(initial=-1)) + 1)
+    return sums[sums[:, 0, 0, 0] > 0]
+
+
+def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
+    """Return the rows of segments, their places on a regular grid, and every place's segment, -1 for empty places.
+
+    At least one place between segments is empty, so that no kernel spans two segments.
+    """
+    rows = np.flatnonzero(track.segment >= 0)
+    rows = rows[np.lexsort((track.time[rows], track.segment[rows]))]
+    _, segment = np.unique(track.segment[rows], return_inverse=True)
+    begin = np.searchsorted(segment, np.arange(segment.max(initial=-1) + 1))
+    frame = np.rint((track.time[rows] - track.time[rows][begin][segment]) / _step(track)).astype(np.int64)
+    lengths = np.maximum.reduceat(frame, begin) + 2 if len(rows) else frame
+    place = frame + np.concatenate([[0], np.cumsum(lengths)])[:-1][segment]
+    number = np.full(int(lengths.sum()), -1, dtype=np.int64)
+    number[place] = segment
+    return rows, place, number
+
+
+def _kernel(width: float, order: int) -> Floats:
+    """Return the weights of the project's Gaussian derivative, per frame^order, for np.convolve."""
+    import torch
+
+    from sphereorient.motion import gaussian_derivative
+
+    half = max(1, int(np.ceil(3.0 * width)))
+    impulse = torch.zeros(4 * half + 1, 1, dtype=torch.float64)
+    impulse[2 * half] = 1.0
+    answer = gaussian_derivative(impulse, 1.0, width, 2 if order == 2 else 1)[:, 0].numpy()
+    return np.asarray(answer[half : 3 * half + 1], np.float64)
+
+
+def _convolved(x: Floats, kernel: Floats) -> Floats:
+    """Return each column's convolution, NaN where the kernel reaches an empty place, (K, 3)."""
+    out = np.full_like(x, np.nan)
+    half = len(kernel) // 2
+    if len(x) >= len(kernel):
+        for i in range(x.shape[1]):
+            out[half : len(x) - half, i] = np.convolve(x[:, i], kernel, mode="valid")
+    return out
+
+
+def _width_statistics(totals: Floats) -> Floats:
+    """Return rms, flatness, both corrected, and the share of noise, (..., 3 W, 5), of sums (..., 3 W, 6)."""
+    var, fourth, s2, s4, mixed = np.moveaxis(totals[..., 1:] / totals[..., :1], -1, 0)
+    true_var, true_fourth = without_noise(var, fourth, s2, s4, mixed, 1.0)
+    return np.stack([np.sqrt(var), fourth / var**2, np.sqrt(true_var), true_fourth / true_var**2, s2 / var], axis=-1)

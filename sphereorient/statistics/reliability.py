@@ -1,4 +1,4 @@
-"""Do probabilities keep what they promise: how often what is said with a probability is so."""
+"""Calibration of probabilities: the observed frequency of outcomes against their predicted probability."""
 
 from __future__ import annotations
 
@@ -18,39 +18,40 @@ Z95 = 1.959964  # normal quantile of a two-sided interval of 95 %
 class Reliability:
     """A reliability curve in B bins of increasing probability; made by `reliability`."""
 
-    probability: Floats  # (B,), mean of what was said
-    share: Floats  # (B,), of the outcomes that were so
+    probability: Floats  # (B,), mean of the predictions
+    share: Floats  # (B,), of the outcomes that are true
     low: Floats  # (B,), of the 95 % interval of the share
     high: Floats  # (B,)
     count: NDArray[np.int64]  # (B,), outcomes in the bin
-    error: float  # expected calibration error: mean distance of share and probability, each outcome alike; NaN of none
-    chance: float  # the error that probabilities without fault would show by the scatter of as many outcomes
+    error: float  # expected calibration error: mean distance of share and probability over outcomes; NaN of none
+    chance: float  # the error expected of perfect probabilities by the scatter of as many outcomes
 
 
 def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> Reliability:
-    """Compare probabilities with what came of them, in bins of equal count.
+    """Compare probabilities with outcomes, in bins of equal count.
 
     Args:
-        probability: (N,), 0 .. 1; those that are NaN are left out.
-        outcome: (N,) bool, whether it was so.
-        bins: at most so many; equal probabilities stay in one bin, so there may be fewer.
+        probability: (N,), 0 .. 1; NaN is left out.
+        outcome: (N,) bool.
+        bins: at most; equal probabilities stay in one bin.
 
     Raises:
-        ShapeError: not one outcome a probability, probabilities outside 0 .. 1, or no bin.
+        ShapeError: unequal numbers of outcomes and probabilities, probabilities outside 0 .. 1, or no bin.
 
     Source: Naeini et al. 2015 (expected calibration error) with bins of equal count; interval: Wilson 1927.
     """
     said, came = np.asarray(probability, np.float64), np.asarray(outcome, np.bool_)
     if said.ndim != 1 or said.shape != came.shape:
-        got, do = f"{said.shape} and {came.shape}", "pass one outcome a probability"
+        got, do = f"{said.shape} and {came.shape}", "pass one outcome for each probability"
         raise ShapeError(refusal("probability and outcome", expected="shapes (N,) and (N,)", got=got, do=do))
     known = np.isfinite(said)
     said, came = said[known], came[known]
     if bins < 1 or np.any((said < 0) | (said > 1 + 1e-9)):
-        got = f"{bins} bins, probabilities to {said.max(initial=0.0):g}"
-        raise ShapeError(
-            refusal("reliability", expected="a bin or more, probabilities in 0 .. 1", got=got, do="mend it")
+        expected, got = (
+            "a bin or more, probabilities in 0 .. 1",
+            f"{bins} bins, probabilities to {said.max(initial=0.0):g}",
         )
+        raise ShapeError(refusal("reliability", expected=expected, got=got, do="correct the arguments"))
     order = np.argsort(said, kind="stable")
     said, came = said[order], came[order]
     edges = _edges(said, bins)
@@ -59,6 +60,8 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
     share = _means(came.astype(np.float64), edges)
     low, high = wilson(share, count)
     weight = count / max(len(said), 1)
+    # The mean absolute deviation of a normal variable is sqrt(2 / pi) sigma.
+    by_chance = float((weight * np.sqrt(2 / math.pi * np.maximum(spread, 0) / count)).sum())
     return Reliability(
         probability=mean,
         share=share,
@@ -66,20 +69,19 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
         high=high,
         count=count,
         error=float((weight * np.abs(share - mean)).sum()) if len(said) else math.nan,
-        # Mean distance of a normal number from its mean: sqrt(2 / pi) sigmas.
-        chance=float((weight * np.sqrt(2 / math.pi * np.maximum(spread, 0) / count)).sum()) if len(said) else math.nan,
+        chance=by_chance if len(said) else math.nan,
     )
 
 
 def _edges(said: Floats, bins: int) -> NDArray[np.int64]:
-    """First outcome of each bin, and the end, (B + 1,); moved on to where the sorted probabilities change."""
+    """Return the first outcome of each bin, and the end, (B + 1,), moved to where the sorted probabilities change."""
     wanted = said[np.rint(np.linspace(0, len(said), bins + 1)[1:-1]).astype(np.int64)] if len(said) >= bins else said
     inner = np.searchsorted(said, wanted, side="left")
     return np.unique(np.concatenate([[0], inner, [len(said)]])).astype(np.int64)
 
 
 def _means(values: Floats, edges: NDArray[np.int64]) -> Floats:
-    """Mean of each bin."""
+    """Return the mean of each bin."""
     sums = np.add.reduceat(values, edges[:-1]) if len(edges) > 1 else np.zeros(0)
     return np.asarray(sums / np.diff(edges), np.float64)
 

@@ -1,4 +1,4 @@
-"""The usable segments of one or many tracks, as flat arrays."""
+"""The usable segments of one or many tracks, as flat arrays; how long segments last."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import TrackError, refusal
-from sphereorient.statistics.bootstrap import FEWEST
+from sphereorient.statistics.bootstrap import FEWEST, Interval
 from sphereorient.statistics.settings import SegmentSettings
 from sphereorient.trajectory import Flag, Trajectory
 
@@ -29,19 +29,19 @@ UNITS = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ensemble:
-    """M samples in S segments; made by `ensemble_of`, read by all statistics. Rows of a segment follow each other."""
+    """M samples in S segments; made by `ensemble_of`, read by all statistics. Rows are sorted by segment."""
 
     time_s: Floats  # (M,)
     frame: Rows  # (M,), time in typical steps from the segment's first frame, rounded; a gap is a jump
     segment: Rows  # (M,), 0 .. S - 1, increasing
-    track: Rows  # (S,), which of the tracks a segment comes from
+    track: Rows  # (S,), number of the track of a segment
     span_s: Floats  # (S,), from a segment's first frame to its last, one step included
     step_s: float  # typical time between frames
     position_mm: Floats  # (M, 3), smooth, lab
     R_lab_body: Floats  # (M, 3, 3), smooth
     values: Mapping[str, Floats]  # (M, 3) by name, UNITS
     sigmas: Mapping[str, Floats]  # (M, 3), standard deviations of the same; NaN where unknown
-    error: Literal["added", "removed"]  # what a sigma is: noise on top of the motion, or motion that was smoothed away
+    error: Literal["added", "removed"]  # a sigma is noise on top of the motion, or motion that was smoothed away
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -65,12 +65,11 @@ class Ensemble:
         """
         _refuse_few(int(kept.sum()), "the segments kept")
         rows = kept[self.segment]
-        number = np.cumsum(kept) - 1
         by_row = ("time_s", "frame", "position_mm", "R_lab_body")
         parts: dict[str, Any] = {name: getattr(self, name)[rows] for name in by_row}
         parts |= {name: {q: x[rows] for q, x in getattr(self, name).items()} for name in ("values", "sigmas")}
-        parts |= {"segment": number[self.segment[rows]], "track": self.track[kept], "span_s": self.span_s[kept]}
-        return replace(self, **parts)
+        segment = (np.cumsum(kept) - 1)[self.segment[rows]]
+        return replace(self, **parts, segment=segment, track=self.track[kept], span_s=self.span_s[kept])
 
 
 def ensemble_of(
@@ -81,49 +80,40 @@ def ensemble_of(
 ) -> Ensemble:
     """Collect the usable segments of tracks.
 
-    A frame is usable where all six quantities and the smoother's position and orientation are there, and it was not
-    extrapolated; a segment, where enough usable frames are in it. Of a segment that counts, the frames at its ends,
-    known from one side only and so with larger errors, are then left out: what they say is noise first.
+    A frame is usable if all six quantities and the smoother's position and orientation are finite, and it was not
+    extrapolated. A segment counts if it has enough usable frames. Frames at the ends of a segment with larger errors,
+    which the smoother knows from one side only, are then left out.
 
     Args:
         tracks: one or many.
-        settings: which frames and segments count; None takes the paper's.
-        name: what the tracks are called in a message.
-        fewest: segments that must be left; of one, statistics have no intervals.
+        settings: which frames and segments count; None: the paper's.
+        name: of the tracks in a message.
+        fewest: least number of segments.
 
     Returns:
-        The ensemble. Its `error` is "removed" where the tracks come from a smoother, whose sigma is that of the motion
-        it could not follow; "added" where from a kernel, whose sigma is that of the noise it let through.
+        The ensemble. Its `error` is "removed" for a smoother's tracks, whose sigma is the motion it could not follow,
+        and "added" for a kernel's, whose sigma is the noise it let through.
 
     Raises:
-        TrackError: no usable frame, too few segments, or tracks of kinds that do not go together.
+        TrackError: no usable frame, too few segments, or tracks of kernels and of smoothers together.
 
-    Source: the paper, section IV: segments above 0.25 T_L; ERRATA, settings of the paper: 50 frames.
+    Source: the paper, section IV: segments above 0.25 T_L; docs/errata.md, settings of the paper: 50 frames.
     """
     settings = settings or SegmentSettings()
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
     methods = {track.method for track in many}
-    if len({_error(method) for method in methods}) > 1:
+    if "paper" in methods and len(methods) > 1:
         got, do = ", ".join(sorted(methods)), "report each kind by itself"
         raise TrackError(refusal(name, expected="tracks of one method", got=got, do=do))
-    step_s = _step([track for track in many if len(track)])
+    steps = [np.diff(t.time)[(t.segment[1:] == t.segment[:-1]) & (t.segment[1:] >= 0)] for t in many if len(t)]
+    step = np.concatenate([*steps, np.empty(0)])
     pieces = [_pieces(track, number, settings) for number, track in enumerate(many)]
     if not sum(len(piece["time_s"]) for piece in pieces):
         do = "look at the track's reasons with `sphereorient check`"
         raise TrackError(refusal(name, expected="frames with a motion", got="no valid frame", do=do))
     whole = {key: np.concatenate([piece[key] for piece in pieces]) for key in pieces[0]}
-    return _chosen(whole, step_s, _error(many[0].method), settings, name, fewest)
-
-
-def _error(method: str) -> Literal["added", "removed"]:
-    return "added" if method == "paper" else "removed"
-
-
-def _step(tracks: Sequence[Trajectory]) -> float:
-    """Return the median time between neighbouring frames of one segment, s."""
-    steps = [np.diff(t.time)[(t.segment[1:] == t.segment[:-1]) & (t.segment[1:] >= 0)] for t in tracks]
-    whole = np.concatenate([*steps, np.empty(0)])
-    return float(np.median(whole)) if len(whole) else 1.0
+    error: Literal["added", "removed"] = "added" if many[0].method == "paper" else "removed"
+    return _numbered(whole, float(np.median(step)) if len(step) else 1.0, error, settings, name, fewest)
 
 
 def _pieces(track: Trajectory, number: int, settings: SegmentSettings) -> dict[str, NDArray[Any]]:
@@ -136,6 +126,12 @@ def _pieces(track: Trajectory, number: int, settings: SegmentSettings) -> dict[s
         usable &= (track.flags & np.uint32(Flag.EXTRAPOLATED)) == 0
     rows = np.flatnonzero(usable)
     rows = rows[np.lexsort((track.time[rows], track.segment[rows]))]
+    sure = np.ones(len(track), dtype=bool)  # errors are not larger than usual, or unknown
+    for name in ("acceleration_sigma", "alpha_lab_sigma"):
+        size = np.linalg.norm(getattr(track, name), axis=1)
+        known = rows[np.isfinite(size[rows])]
+        if len(known):
+            sure &= ~(size > settings.max_sigma * np.median(size[known]))
     parts = {
         "time_s": track.time,
         "position_mm": track.position_smooth,
@@ -143,23 +139,12 @@ def _pieces(track: Trajectory, number: int, settings: SegmentSettings) -> dict[s
         "label": track.segment,
         **{quantity: getattr(track, quantity) for quantity in UNITS},
         **{f"{quantity}_sigma": getattr(track, f"{quantity}_sigma") for quantity in UNITS},
+        "sure": sure,
     }
-    parts["sure"] = _sure(track, rows, settings.max_sigma)
     return {key: values[rows] for key, values in parts.items()} | {"track": np.full(len(rows), number)}
 
 
-def _sure(track: Trajectory, rows: NDArray[np.int64], most: float) -> NDArray[np.bool_]:
-    """Return which frames (N,) have errors of no more than `most` times the usual ones; unknown ones are taken."""
-    sure = np.ones(len(track), dtype=bool)
-    for name in ("acceleration_sigma", "alpha_lab_sigma"):
-        size = np.linalg.norm(getattr(track, name), axis=1)
-        known = rows[np.isfinite(size[rows])]
-        if len(known):
-            sure &= ~(size > most * np.median(size[known]))
-    return sure
-
-
-def _chosen(
+def _numbered(
     whole: dict[str, NDArray[Any]],
     step_s: float,
     error: Literal["added", "removed"],
@@ -180,11 +165,9 @@ def _chosen(
     least_s = settings.min_integral_times * (settings.integral_time_s or 0.0)
     kept = (frames >= settings.min_frames) & (span_s >= least_s)
     _refuse_few(int(kept.sum()), name, f"of at least {settings.min_frames} frames and {least_s:.3g} s", fewest)
-    some = np.bincount(number, weights=whole["sure"], minlength=len(kept)) > 0
-    kept &= some
-    _refuse_few(
-        int(kept.sum()), name, "with frames whose errors are not larger than usual (statistics.max_sigma)", fewest
-    )
+    kept &= np.bincount(number, weights=whole["sure"], minlength=len(kept)) > 0
+    which = "with frames whose errors are not larger than usual (statistics.max_sigma)"
+    _refuse_few(int(kept.sum()), name, which, fewest)
     rows = kept[number] & whole["sure"]
     return Ensemble(
         time_s=time_s[rows],
@@ -202,7 +185,7 @@ def _chosen(
 
 
 def _piece(time_s: Floats, first: NDArray[np.bool_], longest_s: float) -> Rows:
-    """Return the number of the piece of its segment that each row is in, (M,): pieces equal, none above longest_s."""
+    """Return the number of the piece of its segment of each row, (M,): equal pieces, none above longest_s."""
     number, begin = np.cumsum(first) - 1, np.flatnonzero(first)
     end = np.append(begin[1:], len(time_s)) - 1
     span_s = time_s[end] - time_s[begin]
@@ -212,8 +195,64 @@ def _piece(time_s: Floats, first: NDArray[np.bool_], longest_s: float) -> Rows:
 
 
 def _refuse_few(count: int, name: str, which: str = "", fewest: int = FEWEST) -> None:
-    """Refuse an ensemble without scatter."""
     if count < fewest:
         expected = " ".join([f"at least {'two segments' if fewest > 1 else 'one segment'}", which]).strip()
         do = "pass more tracks, lower statistics.min_frames, or cut long ones with statistics.max_duration_s"
         raise TrackError(refusal(name, expected=expected, got=str(count), do=do))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Durations:
+    """Histogram of segment durations; made by `durations`, drawn by the report."""
+
+    edges_s: Floats  # (B + 1,)
+    counts: Rows  # (B,)
+    truncated_s: float  # shorter ones do not count
+    decay_time_s: Interval  # scalar; exponential law beyond the truncation
+    segments: int
+
+    def law(self, decay_s: float) -> Floats:
+        """Return the counts (B,) of an exponential law with this decay time."""
+        return np.asarray(self.segments * -np.diff(np.exp(-(self.edges_s - self.truncated_s) / max(decay_s, 1e-300))))
+
+    @property
+    def expected(self) -> Floats:
+        """(B,), counts of the fitted law."""
+        return self.law(float(self.decay_time_s.value))
+
+
+def durations(span_s: Floats, truncated_s: float, *, bins: int = 20, level: float = 0.95) -> Durations:
+    """Return the histogram of durations and their exponential decay time by maximum likelihood.
+
+    Beyond the truncation the mean excess is the decay time. Twice the sum of the excesses over the decay time follows
+    chi-squared with two degrees of freedom a segment, so the interval is exact.
+
+    Args:
+        span_s: (S,), durations, s.
+        truncated_s: shorter ones do not count.
+        bins: of the histogram.
+        level: of the interval.
+
+    Raises:
+        TrackError: fewer than two segments are long enough.
+
+    Source: textbook (Epstein and Sobel 1953); the paper, section IV.
+    """
+    from scipy.stats import chi2
+
+    kept = span_s[span_s >= truncated_s * (1 - 1e-9)]
+    if len(kept) < 2:
+        do = "pass more tracks, or lower statistics.min_frames"
+        expected = f"at least two segments of {truncated_s:.3g} s"
+        raise TrackError(refusal("durations", expected=expected, got=str(len(kept)), do=do))
+    excess = float((kept - truncated_s).sum())
+    mean, tail = excess / len(kept), (1 - level) / 2
+    low, high = (np.array(2 * excess / float(chi2.ppf(share, 2 * len(kept)))) for share in (1 - tail, tail))
+    edges = np.linspace(truncated_s, float(kept.max()) * (1 + 1e-9) + 1e-12, bins + 1)
+    return Durations(
+        edges_s=edges,
+        counts=np.histogram(kept, edges)[0],
+        truncated_s=truncated_s,
+        decay_time_s=Interval(value=np.array(mean), low=low, high=high, error=np.array(mean / np.sqrt(len(kept)))),
+        segments=len(kept),
+    )

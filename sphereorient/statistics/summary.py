@@ -1,4 +1,8 @@
-"""Everything that section IV of the paper shows, of one or many tracks, in one record."""
+"""All statistics of the paper's section IV, of one or many tracks, in one record.
+
+A new statistic is a module with a record and a function, and two lines here: its field of `Distributions`, and its call
+in `_distributions`.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +12,36 @@ from dataclasses import dataclass
 import numpy as np
 
 from sphereorient.errors import TrackError
-from sphereorient.statistics.attitude import EulerDensity, Uniformity, euler_densities, uniformity
 from sphereorient.statistics.bootstrap import FEWEST
-from sphereorient.statistics.correlation import Correlation, correlation
 from sphereorient.statistics.density import Density, density
-from sphereorient.statistics.durations import Durations, durations
-from sphereorient.statistics.flow import Comparison, FlowScales, comparisons, flow_scales
-from sphereorient.statistics.increments import Increments, increment_density, increments
-from sphereorient.statistics.isotropy import FrameOfRow, Isotropy, frame_of_omega, isotropy
-from sphereorient.statistics.lift import Lift, lift
+from sphereorient.statistics.flow import Comparison, FlowScales, Lift, comparisons, lift
+from sphereorient.statistics.isotropy import (
+    EulerDensity,
+    FrameOfRow,
+    Isotropy,
+    Uniformity,
+    euler_densities,
+    frame_of_omega,
+    isotropy,
+    uniformity,
+)
+from sphereorient.statistics.lags import Correlation, Increments, correlation, increment_density, increments
 from sphereorient.statistics.moments import Moments, table_of_moments
-from sphereorient.statistics.noise import RATES, MultiLag, NoiseWarning, multi_lag, noise_warnings
-from sphereorient.statistics.segments import UNITS, Ensemble, ensemble_of
+from sphereorient.statistics.noise import (
+    RATES,
+    MultiLag,
+    NoiseWarning,
+    WidthCurve,
+    multi_lag,
+    noise_warnings,
+    width_curve,
+)
+from sphereorient.statistics.segments import UNITS, Durations, Ensemble, durations, ensemble_of
 from sphereorient.statistics.settings import StatisticsSettings
-from sphereorient.statistics.widths import WidthCurve, width_curve
 from sphereorient.trajectory import Trajectory
 
 CORRELATED = ("velocity", "acceleration", "omega_lab", "alpha_lab")
-SHOWN_LAGS = 5  # increments whose densities are shown, from one frame to the integral time
+SHOWN_LAGS = 5  # increments with a density, from one frame to the integral time
 STEPS = 10  # of the progress
 
 Progress = Callable[[int, int], None]
@@ -33,7 +49,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
-    """What a track does not say of itself: the sphere's size and its flow; all of it may be unknown."""
+    """Properties of the sphere and its flow that are not in a track; None where unknown."""
 
     diameter_mm: float | None = None
     viscosity_m2_s: float | None = None
@@ -43,27 +59,27 @@ class Surroundings:
 
     @property
     def flow(self) -> FlowScales | None:
-        """The flow's own scales; None where viscosity or dissipation is not known."""
+        """The flow's scales; None if viscosity or dissipation is unknown."""
         if self.viscosity_m2_s is None or self.dissipation_w_kg is None:
             return None
-        return flow_scales(self.viscosity_m2_s, self.dissipation_w_kg)
+        return FlowScales(viscosity_m2_s=self.viscosity_m2_s, dissipation_w_kg=self.dissipation_w_kg)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Distributions:
-    """What needs two segments or more, since its error bars come from them; a part of `Summary`."""
+    """The statistics that need two segments or more; a part of `Summary`."""
 
     densities: Mapping[str, tuple[Density, ...]]  # by quantity: x, y, z
     increments: Increments  # of omega_lab
     increment_densities: Mapping[int, Density]  # by lag in frames, x component
     correlations: Mapping[str, Correlation]  # by quantity, CORRELATED
-    durations: Durations | None  # None where only pieces of one segment are there
+    durations: Durations | None  # None if all segments are pieces of one
     angles: Sequence[EulerDensity]
     uniformity: Uniformity
     isotropies: Mapping[str, Isotropy]  # by quantity
-    rows: Mapping[str, FrameOfRow]  # omega_lab, omega_body: in which frame they are written
+    rows: Mapping[str, FrameOfRow]  # omega_lab, omega_body: the frame of their components
     lift: Lift
-    multi_lag: Mapping[str, MultiLag]  # acceleration, alpha_lab; without a quantity that cannot be fitted
+    multi_lag: Mapping[str, MultiLag]  # acceleration, alpha_lab; without those that cannot be fitted
     widths: Mapping[str, WidthCurve]  # velocity, acceleration, alpha_lab
 
 
@@ -74,14 +90,14 @@ class Summary:
     settings: StatisticsSettings  # with the integral time that was used
     surroundings: Surroundings
     ensemble: Ensemble
-    table: Mapping[str, Moments]  # Table I; of one segment without intervals
+    table: Mapping[str, Moments]  # Table I; without intervals for one segment
     warnings: Sequence[NoiseWarning]
     comparisons: Sequence[Comparison]
     distributions: Distributions | None  # None with fewer than two segments
 
     @property
     def integral_time_s(self) -> float:
-        """Integral time of the velocity that was given or measured; NaN where neither."""
+        """Integral time of the velocity, given or measured; NaN if unknown."""
         return self.settings.integral_time_s or float("nan")
 
 
@@ -94,24 +110,20 @@ def summarise(
 ) -> Summary:
     """Compute all statistics of tracks.
 
-    Where no integral time of the velocity is given, it is measured on all segments that have enough frames; the short
-    ones are then left out. Of a single segment only the table is given, without intervals: nothing says how much
-    another one would differ.
+    If the integral time of the velocity is not given, it is measured on all segments with enough frames; the short ones
+    are then left out. A single segment gives the table only, without intervals, since its scatter is unknown.
 
     Args:
         tracks: one or many, of one kind of method.
         settings: which segments count, and the bootstrap.
         surroundings: the sphere's diameter and the flow, for the comparisons.
         progress: called with steps done and all steps.
-        name: what the tracks are called in a message.
-
-    Returns:
-        The summary.
+        name: of the tracks in a message.
 
     Raises:
-        TrackError: no usable frame, or tracks of kinds that do not go together.
+        TrackError: no usable frame, or tracks of kernels and of smoothers together.
 
-    Source: the paper, section IV, with ERRATA A5, E6, E7.
+    Source: the paper, section IV, with docs/errata.md A5, E6, E7.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
     settings = settings or StatisticsSettings()
@@ -126,19 +138,23 @@ def summarise(
     if ensemble.segments >= FEWEST:
         more = _distributions(many, ensemble, settings, lambda done: progress(2 + done, STEPS))
     progress(STEPS, STEPS)
+    compared: list[Comparison] = []
+    if around.diameter_mm is not None:
+        flow = {"u_rms_m_s": around.u_rms_m_s, "integral_length_m": around.integral_length_m}
+        compared = comparisons(table, around.diameter_mm, around.flow, **flow)
     return Summary(
         settings=settings,
         surroundings=around,
         ensemble=ensemble,
         table=table,
         warnings=noise_warnings(table, ensemble.error),
-        comparisons=_comparisons(table, around),
+        comparisons=compared,
         distributions=more,
     )
 
 
 def _long_enough(ensemble: Ensemble, settings: StatisticsSettings) -> tuple[Ensemble, StatisticsSettings]:
-    """Leave out segments that are short against the integral time that all of them show."""
+    """Leave out segments that are short against the integral time of all of them."""
     measured = float(correlation(ensemble, "velocity", settings=settings).integral_time_s.value[3])
     if not measured > 0:
         return ensemble, settings
@@ -159,8 +175,7 @@ def _distributions(
     longest_s = float(curves["omega_lab"].integral_time_s.value[3])
     steps = increments(ensemble, integral_time_s=longest_s if longest_s > 0 else None, settings=settings)
     chosen = np.unique(np.linspace(0, len(steps.lag_frames) - 1, SHOWN_LAGS).round().astype(int))
-    shown = [int(lag) for lag in steps.lag_frames[chosen]]
-    lagged = {lag: increment_density(ensemble, lag, settings=settings) for lag in shown}
+    lagged = {int(lag): increment_density(ensemble, int(lag), settings=settings) for lag in steps.lag_frames[chosen]}
     progress(4)
     angles = euler_densities(ensemble, settings=settings)
     uniform = uniformity(ensemble.R_lab_body, ensemble.segment)
@@ -187,7 +202,7 @@ def _distributions(
 
 
 def _durations(tracks: Sequence[Trajectory], ensemble: Ensemble, settings: StatisticsSettings) -> Durations | None:
-    """Return the histogram beyond what was left out: by number of frames or by integral times."""
+    """Return the histogram of uncut segments, truncated at the least number of frames or of integral times."""
     whole = ensemble
     if settings.max_duration_s is not None:
         whole = ensemble_of(tracks, settings.model_copy(update={"max_duration_s": None}), fewest=1)
@@ -202,18 +217,6 @@ def _multi_lag(tracks: Sequence[Trajectory], settings: StatisticsSettings) -> di
     for quantity in RATES:
         try:
             found[quantity] = multi_lag(list(tracks), quantity, settings=settings)
-        except TrackError:  # too few neighbouring frames: it is left out, and the page says so
+        except TrackError:  # too few neighbouring frames: left out, and the page says so
             continue
     return found
-
-
-def _comparisons(table: dict[str, Moments], around: Surroundings) -> list[Comparison]:
-    if around.diameter_mm is None:
-        return []
-    return comparisons(
-        table,
-        around.diameter_mm,
-        around.flow,
-        u_rms_m_s=around.u_rms_m_s,
-        integral_length_m=around.integral_length_m,
-    )

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from scipy.special import i0e, ndtri
 
 from sphereorient import so3
-from sphereorient.motion import MeasuredPoses, (
+from sphereorient.motion import (
+    MeasuredPoses,
     Motion,
     MotionSettings,
     ProcessNoise,

@@ -33,7 +33,9 @@ def path(tmp_path):
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    monkeypatch.setattr(
+        "sphereorient.report.contact_sheet.write_figure", lambda figure, *_, **__: figures.append(figure)
+    )
     return figures
 
 

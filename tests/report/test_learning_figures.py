@@ -7,7 +7,8 @@ import torch
 from matplotlib.colors import to_hex
 
 from sphereorient.learn.benchmark import Example
-from sphereorient.report.learning import RIGHT, WRONG, examples_figure, learning_curve_figure, write_png
+from sphereorient.report.learning import RIGHT, WRONG, examples_figure, learning_curve_figure
+from sphereorient.report.plots.style import write_figure
 
 ROWS = [
     {"step": 0.0, "validation_nll": 8.0, "validation_recall_1": 0.0, "validation_recall_5": 0.1},
@@ -64,5 +65,5 @@ def test_curves_are_those_of_the_rows_where_they_have_a_value():
                                   lambda: examples_figure([example([1.0], [1.0])])])  # fmt: skip
 def test_the_same_figure_gives_the_same_bytes(tmp_path, draw):
     for name in ("a.png", "b.png"):
-        write_png(draw(), tmp_path / name)
+        write_figure(draw(), tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()

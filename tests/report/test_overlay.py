@@ -14,12 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from sphereorient.cameras import load_cameras
 from sphereorient.errors import ExperimentError, OutputError, TrackError
-from sphereorient.report.doubts import FLAG_WORDS, REASON_WORDS, doubts, flag_words
-from sphereorient.report.overlay import overlay_movie, pictures_at, prepared
+from sphereorient.report.frame_warnings import FLAG_WORDS, REASON_WORDS, flag_words, frame_warnings
+from sphereorient.report.overlay import FrameSelection, overlay_movie, pictures_by_row, prepared, write_video
 from sphereorient.report.overlay_canvas import AXES, DOUBT, LOST, OUTLINE, Canvas, Panel
-from sphereorient.report.overlay_model import LightFit, Model, Seen, axes_px, crop, fit_light, outline_px, path_of
-from sphereorient.report.overlay_video import write_video
-from sphereorient.report.overlay_view import BLANK, own_distance_px, residual_colours
+from sphereorient.report.overlay_model import LightFit, Model, SeenDisk, axes_px, crop, fit_light, outline_px, path_of
+from sphereorient.report.overlay_page import BLANK, own_distance_px, residual_colours
 from sphereorient.trajectory import Flag, Reason
 
 K = 20  # a frame
@@ -30,12 +29,12 @@ def ready():
     """The page of the true track, the pictures of frame 20, and the model of each camera."""
     with ExitStack() as opened:
         page, streams = prepared(true_track(), excerpt(), None, opened)
-        pictures = {name: next(pictures_at(stream, np.array([K]))) for name, stream in streams.items()}
+        _, pictures = next(pictures_by_row(streams, np.array([K])))
         yield page, pictures
 
 
 def looking_along_y(tmp_path):
-    """DESIGN's check of signs: a camera that looks along lab +y, lab z up, 200 mm before the origin."""
+    """The check of signs of docs/conventions.md: a camera looks along lab +y, lab z up, 200 mm before the origin."""
     text = """schema: sphereorient-cameras/1
 cameras:
   cam: {model: pinhole, f_px: 1000.0, centre: [100, 100], image_size: [201, 201],
@@ -109,7 +108,7 @@ def planted(rng, gain, offset):
     with np.errstate(invalid="ignore"):
         depth = np.sqrt(1 - x**2 - y**2)
     basis = np.stack([np.where(np.isnan(depth), np.nan, 1.0), x, y, depth], axis=-1)
-    seen = Seen(paint=rng.random(x.shape).round().astype(np.float32), basis=basis.astype(np.float32))
+    seen = SeenDisk(paint=rng.random(x.shape).round().astype(np.float32), basis=basis.astype(np.float32))
     return seen, (seen.paint * (basis @ gain) + basis @ offset).astype(np.float32)
 
 
@@ -180,11 +179,11 @@ def test_every_flag_and_reason_has_words():
 
 def test_doubts_are_told_in_words():
     track = true_track()
-    assert doubts(track, 3) == []
+    assert frame_warnings(track, 3) == []
     bad = changed(track, 3, flags=Flag.SPIKE | Flag.ONE_CAMERA, valid=False)
     bad = camera_changed(bad, "cam2", 3, reason=Reason.DARK)
-    assert doubts(bad, 3) == ["not valid", "one camera only", "the orientation jumps", "cam2: too dark"]
-    assert doubts(camera_changed(track, "cam2", 3, reason="of_tomorrow"), 3) == ["cam2: of_tomorrow"]
+    assert frame_warnings(bad, 3) == ["not valid", "one camera only", "the orientation jumps", "cam2: too dark"]
+    assert frame_warnings(camera_changed(track, "cam2", 3, reason="of_tomorrow"), 3) == ["cam2: of_tomorrow"]
 
 
 def test_one_camera_is_no_news_where_there_is_no_other():
@@ -242,7 +241,12 @@ def test_the_movie_is_h264_that_players_show(tmp_path):
     out = tmp_path / "overlay.mp4"
     steps = []
     count = overlay_movie(
-        true_track(), excerpt(), out, frames=(10, 16), every=2, fps=12, progress=lambda *at: steps.append(at)
+        true_track(),
+        excerpt(),
+        out,
+        FrameSelection(first=10, last=16, every=2),
+        fps=12,
+        progress=lambda *at: steps.append(at),
     )
     facts, pictures = read(out)
     assert facts == ("h264", "yuv420p", 12.0)
@@ -259,10 +263,13 @@ def test_a_part_of_the_track_shows_its_own_frames(tmp_path):
         part, of_part = prepared(true_track(("cam1",), 12, 30), excerpt(), None, opened)
         assert part.numbers.tolist() == list(range(12, 30))
         assert whole.numbers.tolist() == list(range(40))
-        first = next(pictures_at(of_part["cam1"], np.array([0])))
-        np.testing.assert_array_equal(first, next(pictures_at(streams["cam1"], np.array([12]))))
+        (_, first), (_, same) = (
+            next(pictures_by_row(of_part, np.array([0]))),
+            next(pictures_by_row(streams, np.array([12]))),
+        )
+        np.testing.assert_array_equal(first["cam1"], same["cam1"])
     with pytest.raises(TrackError, match=r"--frames: expected frames within 12:30, got 30:; correct --frames"):
-        overlay_movie(true_track(("cam1",), 12, 30), excerpt(), tmp_path / "o.mp4", frames=(30, None))
+        overlay_movie(true_track(("cam1",), 12, 30), excerpt(), tmp_path / "o.mp4", FrameSelection(first=30))
 
 
 def test_a_movie_that_fails_leaves_the_old_one(tmp_path):
@@ -302,13 +309,13 @@ def test_pictures_are_taken_one_by_one(tmp_path):
         ({"cameras": ["cam3"]}, ExperimentError, "cam3"),
         ({"cameras": []}, ExperimentError, "--cameras"),
         ({"path": "overlay.gif"}, OutputError, "expected .mp4"),
-        ({"frames": (90, 99)}, TrackError, "within 0:40, got 90:99"),
+        ({"first": 90, "last": 99}, TrackError, "within 0:40, got 90:99"),
     ],
 )
 def test_refusals_are_one_line(tmp_path, arguments, error, words):
     path = tmp_path / arguments.pop("path", "overlay.mp4")
     with pytest.raises(error, match=words) as caught:
-        overlay_movie(true_track(), excerpt(), path, **arguments)
+        overlay_movie(true_track(), excerpt(), path, FrameSelection(**arguments))
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
@@ -323,9 +330,9 @@ def test_without_a_map_outline_and_axes_are_shown(tmp_path):
     """A ball whose paint is not known yet is drawn on all the same."""
     with ExitStack() as opened:
         page, streams = prepared(true_track(("cam1",)), replace(excerpt(), texture_path=None), None, opened)
-        picture = next(pictures_at(streams["cam1"], np.array([K])))
+        _, pictures = next(pictures_by_row(streams, np.array([K])))
     assert page.views[0].light is None
-    drawn = page.draw(K, {"cam1": picture})
+    drawn = page.draw(K, pictures)
     assert (np.abs(drawn.astype(int) - OUTLINE) < 40).all(-1).sum() > 300
     assert page.views[0].why_unlit == "no map of the paint"
 

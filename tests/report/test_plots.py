@@ -23,18 +23,15 @@ from scipy.spatial.transform import Rotation
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.report import plots
 from sphereorient.report.plots import style
-from sphereorient.report.plots.marks import chance, three_digits, told
-from sphereorient.report.plots.part import shown_part
+from sphereorient.report.plots.style import interval_text, p_value_text, three_digits
+from sphereorient.report.plots.track import shown_part
 from sphereorient.statistics import Interval, Moments, Summary
-from sphereorient.statistics.attitude import EulerDensity, Uniformity
 from sphereorient.statistics.cameras import CameraDistance, camera_distances
-from sphereorient.statistics.correlation import Correlation
 from sphereorient.statistics.density import Density, StretchedFit, density_of
-from sphereorient.statistics.durations import durations
-from sphereorient.statistics.increments import Increments
-from sphereorient.statistics.isotropy import Isotropy
-from sphereorient.statistics.segments import UNITS
-from sphereorient.statistics.widths import WidthCurve
+from sphereorient.statistics.isotropy import EulerDensity, Isotropy, Uniformity
+from sphereorient.statistics.lags import Correlation, Increments
+from sphereorient.statistics.noise import WidthCurve
+from sphereorient.statistics.segments import UNITS, durations
 from sphereorient.trajectory import CameraTrack, Trajectory
 
 RATE_HZ = 500.0
@@ -637,7 +634,7 @@ def test_durations_are_counted_in_milliseconds_with_their_decay():
     assert edges[0] == pytest.approx(100.0)
     assert not (counts == 0).any()  # none on a logarithmic axis
     law = named(axes, "exponential")
-    assert law.get_label() == f"exponential, decay time {told(found.decay_time_s, 'ms', 1e3)}"
+    assert law.get_label() == f"exponential, decay time {interval_text(found.decay_time_s, 'ms', 1e3)}"
     assert 200 < float(re.search(r"time (\d+) ms", law.get_label())[1]) < 350
     x, y = law.get_data()
     slope = np.polyfit(x, np.log(y), 1)[0]
@@ -805,14 +802,19 @@ def test_without_any_noise_the_axis_is_linear():
 )
 def test_an_interval_is_told_with_the_digits_it_deserves(value, low, high, words):
     of = Interval(value=np.array(value), low=np.array(low), high=np.array(high), error=np.array(0.1))
-    assert told(of) == words
+    assert interval_text(of) == words
     if np.isfinite(low):
-        assert told(of, "ms", 1e3).startswith(words if np.isnan(value) else f"{1e3 * value:.0f}"[:2])
+        assert interval_text(of, "ms", 1e3).startswith(words if np.isnan(value) else f"{1e3 * value:.0f}"[:2])
 
 
 def test_numbers_have_three_digits_and_p_values_no_false_ones():
     assert [three_digits(x) for x in (3.2, 10.06, 14_000.0, np.nan)] == ["3.20", "10.1", "14000", "unknown"]
-    assert [chance(p) for p in (0.731, 0.0456, 0.0001, np.nan)] == ["p = 0.73", "p = 0.046", "p < 0.001", "p unknown"]
+    assert [p_value_text(p) for p in (0.731, 0.0456, 0.0001, np.nan)] == [
+        "p = 0.73",
+        "p = 0.046",
+        "p < 0.001",
+        "p unknown",
+    ]
 
 
 # awkward input

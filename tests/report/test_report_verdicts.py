@@ -41,7 +41,7 @@ def test_rows_that_belong_to_no_frame_are_told(lab):
     good = said(lab)
     assert good["Frame of omega_lab"].grade == Grade.GOOD
     assert good["Frame of omega_body"].grade == Grade.GOOD
-    printed = np.einsum("nij,nj->ni", lab.orientation_smooth, lab.omega_lab)  # ERRATA E6: R omega_lab
+    printed = np.einsum("nij,nj->ni", lab.orientation_smooth, lab.omega_lab)  # docs/errata.md E6: R omega_lab
     wrong = said(replace(lab, omega_lab=printed, omega_body=lab.omega_lab))
     assert wrong["Frame of omega_lab"].grade == Grade.DOUBT
     assert "no frame's components" in wrong["Frame of omega_lab"].words

@@ -15,10 +15,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sphereorient.errors import SphereOrientError
-from sphereorient.report.gallery import chosen_frames, gallery
-from sphereorient.report.strip import frame_numbers, stretches, strip_of
-from sphereorient.report.strip_html import strip_assets, strip_html
-from sphereorient.report.worst import GAP, TILE
+from sphereorient.report.gallery import GAP, TILE, chosen_frames, gallery
+from sphereorient.report.page import strip_assets, strip_html
+from sphereorient.report.strip import bad_stretches, frame_numbers, strip_of
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 TURN = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
@@ -52,7 +51,7 @@ def troubled() -> Trajectory:
 
 
 def test_stretches_are_the_planted_ones_longest_first_with_their_reasons_counted():
-    found = stretches(troubled())
+    found = bad_stretches(troubled())
     assert [(one.first, one.last, one.doubtful, one.not_valid) for one in found] == [
         (60, 85, 1, 20),  # five good frames between the gap and the spike
         (120, 122, 3, 0),
@@ -69,12 +68,12 @@ def test_stretches_are_the_planted_ones_longest_first_with_their_reasons_counted
 @pytest.mark.parametrize(("second", "count"), [(19, 1), (20, 1), (21, 2)])
 def test_ten_good_frames_between_part_two_stretches_and_nine_do_not(second, count):
     track = changed(changed(good_track(40), 10, flags=Flag.SPIKE), second, flags=Flag.SPIKE)
-    assert len(stretches(track)) == count
+    assert len(bad_stretches(track)) == count
 
 
 def test_of_equally_long_stretches_the_one_that_is_not_valid_is_first():
     track = changed(changed(good_track(60), 10, flags=Flag.SPIKE), 40, valid=False)
-    assert [one.first for one in stretches(track)] == [40, 10]
+    assert [one.first for one in bad_stretches(track)] == [40, 10]
 
 
 def test_the_strip_says_of_every_frame_what_was_planted():
@@ -129,7 +128,7 @@ def test_one_bad_frame_of_a_million_survives(frames):
     assert strip.flags[place] == Flag.AMBIGUOUS
     assert strip.apart_deg is not None
     assert strip.apart_deg[place] == pytest.approx(np.rad2deg(0.1), rel=1e-3)
-    assert [(one.first, one.frames) for one in stretches(track)] == [(bad, 1)]
+    assert [(one.first, one.frames) for one in bad_stretches(track)] == [(bad, 1)]
 
 
 def test_the_last_bin_may_be_shorter_and_a_gap_in_a_bin_hides_no_error():
@@ -144,22 +143,22 @@ def test_numbers_are_the_experiments():
     assert strip_of(good_track(30, first=100)).number[:2] == (100, 101)
     uneven = replace(good_track(4), time=np.array([0.0, 0.0013, 0.0022, 0.0051]))
     assert frame_numbers(uneven).tolist() == [0, 1, 2, 3]
-    given = stretches(changed(good_track(30), 3, valid=False), np.arange(1000, 1030))
+    given = bad_stretches(changed(good_track(30), 3, valid=False), np.arange(1000, 1030))
     assert (given[0].first, given[0].first_number) == (3, 1003)
 
 
 def test_one_camera_only_is_no_doubt_where_there_is_no_other():
     alone = changed(good_track(30, ("cam1",)), slice(None), flags=Flag.ONE_CAMERA)
-    assert stretches(alone) == []
+    assert bad_stretches(alone) == []
     assert set(strip_of(alone).flags) == {0}
     assert strip_of(alone).apart_deg is None
     of_two = changed(good_track(30), slice(None), flags=Flag.ONE_CAMERA)
-    assert stretches(of_two)[0].reasons == (("one camera only", 30),)
+    assert bad_stretches(of_two)[0].reasons == (("one camera only", 30),)
 
 
 def test_a_reason_of_a_newer_file_is_shown_as_it_is():
     track = camera_changed(good_track(30), "cam1", 4, reason="eaten")
-    assert stretches(track)[0].reasons == (("cam1: eaten", 1),)
+    assert bad_stretches(track)[0].reasons == (("cam1: eaten", 1),)
 
 
 @pytest.mark.parametrize("frames", [0, 1, 50])

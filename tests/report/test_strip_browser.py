@@ -11,7 +11,7 @@ from overlay_examples import camera_changed, changed, excerpt, true_track
 from test_strip import troubled
 
 from sphereorient.report.gallery import gallery
-from sphereorient.report.strip_html import strip_assets, strip_html
+from sphereorient.report.page import strip_assets, strip_html
 from sphereorient.trajectory import Flag, Reason
 
 pytest_plugins = ["browser_examples"]

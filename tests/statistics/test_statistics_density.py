@@ -10,7 +10,6 @@ from sphereorient.statistics.density import (
     density,
     fit_stretched,
     flatness_of,
-    log_noisy_stretched,
     log_stretched_exponential,
     stretched_exponential,
 )
@@ -102,7 +101,7 @@ def test_a_noisy_density_is_the_convolution():
     clean, noise = np.sqrt(1 - share), np.sqrt(share)
     kernel = np.exp(-((x / noise) ** 2) / 2) / (noise * np.sqrt(2 * np.pi))
     expected = np.convolve(stretched_exponential(x / clean, a) / clean, kernel, mode="same") * step
-    found = np.exp(log_noisy_stretched(x, a, share))
+    found = np.exp(log_stretched_exponential(x, a, share))
     inner = np.abs(x) < 8
     np.testing.assert_allclose(found[inner], expected[inner], rtol=2e-3)
 

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from statistics_examples import STEP_S, ensemble, without
 
-from sphereorient.statistics.correlation import correlation, integral_time
-from sphereorient.statistics.increments import increment_density, increments
-from sphereorient.statistics.lags import Pairs
+from sphereorient.statistics.lags import Pairs, correlation, increment_density, increments, integral_time
 from sphereorient.statistics.settings import BootstrapSettings
 
 FEW = BootstrapSettings(resamples=200)
@@ -90,7 +88,7 @@ def test_increments_of_independent_values_have_half_the_excess():
     assert found.flatness.value[0, 3] == pytest.approx(4.5, rel=0.05)
 
 
-def test_increments_over_one_frame_have_the_accelerations_tails():  # ERRATA E7
+def test_increments_over_one_frame_have_the_accelerations_tails():  # docs/errata.md E7
     alpha = np.random.default_rng(5).laplace(size=(60_000, 3))
     omega = np.cumsum(alpha, axis=0)
     found = increments(ensemble([200] * 300, omega_lab=omega), lags_s=[STEP_S, 100 * STEP_S], settings=FEW)

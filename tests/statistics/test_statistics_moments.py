@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from statistics_examples import ensemble
 
-from sphereorient.statistics.bootstrap import bootstrap, per_segment
+from sphereorient.statistics.bootstrap import bootstrap, segment_sums
 from sphereorient.statistics.moments import LET_THROUGH, moments, table_of_moments
 from sphereorient.statistics.noise import noise_warnings
 from sphereorient.statistics.settings import BootstrapSettings
@@ -77,7 +77,7 @@ def test_interval_agrees_with_scipys_bca():
 
 def test_sums_by_segment_add_up():
     x = np.arange(10.0)
-    assert per_segment(x, np.array([0, 0, 1, 1, 1, 2, 2, 2, 2, 2]), 3).tolist() == [1, 9, 35]
+    assert segment_sums(x, np.array([0, 0, 1, 1, 1, 2, 2, 2, 2, 2]), 3).tolist() == [1, 9, 35]
 
 
 def noisy(share: float) -> tuple[np.ndarray, np.ndarray, float]:

@@ -7,7 +7,7 @@ import pytest
 from statistics_examples import STEP_S, track
 
 from sphereorient.errors import TrackError
-from sphereorient.statistics.segments import ensemble_of
+from sphereorient.statistics.segments import durations, ensemble_of
 from sphereorient.statistics.settings import SegmentSettings
 from sphereorient.trajectory import Flag, Trajectory
 
@@ -118,3 +118,28 @@ def test_of_one_segment_an_ensemble_only_where_it_is_asked_for():
     assert ensemble_of(track([60]), fewest=1).segments == 1
     with pytest.raises(TrackError, match="at least one segment"):
         ensemble_of(track([40]), fewest=1)
+
+
+def test_decay_time_of_truncated_durations_and_its_interval():
+    rng = np.random.default_rng(1)
+    held, means = 0, []
+    for _ in range(500):
+        found = durations(0.08 + rng.exponential(0.15, 40), 0.08)
+        held += bool(found.decay_time_s.holds(0.15))
+        means.append(float(found.decay_time_s.value))
+    assert 0.92 <= held / 500 <= 0.98
+    assert np.mean(means) == pytest.approx(0.15, rel=0.02)
+
+
+def test_every_duration_is_counted_and_the_law_expects_nearly_as_many():
+    span = 0.08 + np.random.default_rng(2).exponential(0.15, 3000)
+    found = durations(span, 0.08)
+    assert found.counts.sum() == found.segments == 3000
+    assert found.expected.sum() == pytest.approx(3000, rel=0.01)
+    assert np.abs(found.counts - found.expected)[:5].max() < 5 * np.sqrt(found.expected[0])
+
+
+def test_shorter_durations_do_not_count():
+    assert durations(np.array([0.01, 0.2, 0.3]), 0.1).segments == 2
+    with pytest.raises(TrackError, match="two segments"):
+        durations(np.array([0.01, 0.2]), 0.1)

@@ -7,7 +7,7 @@ import pytest
 from statistics_examples import STEP_S, track
 
 from sphereorient.statistics import StatisticsSettings, Surroundings, summarise
-from sphereorient.statistics.correlation import correlation
+from sphereorient.statistics.lags import correlation
 from sphereorient.statistics.segments import UNITS, ensemble_of
 from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 

@@ -1,8 +1,10 @@
-"""How all figures of a report look: colours, lines, sizes, and how they are written."""
+"""The style of all figures: colours and lines, marks with intervals, legends, numbers as text, and the writer."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import textwrap
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -10,20 +12,31 @@ from typing import Any, Final, ParamSpec, TypeVar
 
 import matplotlib
 import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from numpy.typing import NDArray
 
 from sphereorient.files.outputs import put_aside
-from sphereorient.report.figure import AXIS_COLOURS
+from sphereorient.statistics import Interval
 
 P = ParamSpec("P")
 R = TypeVar("R")
+Floats = NDArray[np.float64]
 
 WIDTH_IN = 7.0  # of a page with margins: 178 mm
 DPI = 150  # of the PNG
+# Okabe and Ito's colours: distinct for colour-blind readers, and in grey print.
+AXIS_COLOURS = ("#D55E00", "#009E73", "#0072B2")
 BLACK = "#000000"
 GREY = "#666666"
 SHADE = "#BBBBBB"  # of what does not count
+BAND = 0.2  # opacity
+LETTERS_PER_INCH = 15  # of a note; narrow enough for wide letters
 SETTINGS: Final[dict[str, Any]] = {
     "font.family": ["sans-serif"],
     "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same letters everywhere
@@ -41,16 +54,24 @@ SETTINGS: Final[dict[str, Any]] = {
     "legend.fontsize": 7,
     "legend.title_fontsize": 7,
     "legend.frameon": False,
-    "legend.handlelength": 2.6,  # inches enough to tell the dashes apart
+    "legend.handlelength": 2.6,  # long enough to distinguish the dashes
     "lines.linewidth": 1.1,
     "lines.markersize": 3.2,
-    "pdf.fonttype": 42,  # letters are embedded whole: they can be searched and edited
+    "pdf.fonttype": 42,  # embeds whole fonts: text can be searched and edited
+}
+SYMBOLS = {
+    "velocity": "v",
+    "acceleration": "a",
+    "omega_lab": "ω lab",
+    "omega_body": "ω body",
+    "alpha_lab": "α lab",
+    "alpha_body": "α body",
 }
 
 
 @dataclass(frozen=True, kw_only=True)
-class Look:
-    """How one component is drawn; told apart by colour, and in grey print by line, marker and hatch."""
+class LineStyle:
+    """How one component is drawn; components differ in colour and, for grey print, in line, marker and hatch."""
 
     name: str
     colour: str
@@ -61,20 +82,25 @@ class Look:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """Colour, style and width as `Axes.plot` takes them."""
+        """Colour, style and width as arguments of `Axes.plot`."""
         return {"color": self.colour, "linestyle": self.line, "linewidth": self.width}
 
+    def handle(self, label: str, **more: Any) -> Line2D:
+        """Return a legend entry in this style; `more` are arguments of `Line2D`."""
+        return Line2D([], [], label=label, **(self.drawn | more))
 
-X = Look(name="x", colour=AXIS_COLOURS[0], line="-", marker="o", hatch="")
-Y = Look(name="y", colour=AXIS_COLOURS[1], line=(0, (6, 1.5)), marker="s", hatch="////")
-Z = Look(name="z", colour=AXIS_COLOURS[2], line=(0, (6, 1.5, 1.2, 1.5)), marker="^", hatch="....")
-ALL = Look(name="all", colour=BLACK, line="-", marker="D", width=1.7)
-SECOND = Look(name="second", colour=BLACK, line=(0, (3, 2)), marker="x")  # a law, or what is compared with
+
+X = LineStyle(name="x", colour=AXIS_COLOURS[0], line="-", marker="o")
+Y = LineStyle(name="y", colour=AXIS_COLOURS[1], line=(0, (6, 1.5)), marker="s", hatch="////")
+Z = LineStyle(name="z", colour=AXIS_COLOURS[2], line=(0, (6, 1.5, 1.2, 1.5)), marker="^", hatch="....")
+ALL = LineStyle(name="all", colour=BLACK, line="-", marker="D", width=1.7)
+SECOND = LineStyle(name="second", colour=BLACK, line=(0, (3, 2)), marker="x")  # a law, or a reference
+PLAIN = LineStyle(name="", colour=GREY, line="-", marker="o")  # of legends that hold for all components
 COMPONENTS = (X, Y, Z)
 
 
 def in_style(draw: Callable[P, R]) -> Callable[P, R]:
-    """Run a function in the style of the reports, whatever the user's own matplotlibrc says."""
+    """Run a function in the style of the reports, independent of the user's matplotlibrc."""
 
     @wraps(draw)
     def styled(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -85,34 +111,145 @@ def in_style(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 def new_figure(width_in: float = WIDTH_IN, height_in: float = 3.0) -> Figure:
-    """Return an empty figure whose parts make room for each other.
-
-    Args:
-        width_in: of the figure, inches.
-        height_in: of the figure, inches.
-    """
+    """Return an empty figure with a constrained layout."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
+def panel_grid(count: int, row_in: float, head_in: float, shared: bool = False) -> tuple[Figure, list[Axes]]:
+    """Return a figure of `count` panels, at most two in a row, `row_in` inches high, with room for a head."""
+    columns = min(2, max(count, 1))
+    rows = max(-(-count // columns), 1)
+    figure = new_figure(WIDTH_IN * columns / 2, head_in + row_in * rows)
+    panels = np.ravel(figure.subplots(rows, columns, sharex=shared, sharey=shared, squeeze=False))
+    for axes in panels[count:]:
+        axes.remove()
+    return figure, list(panels[:count])
+
+
 @in_style
-def write_figure(figure: Figure, stem: Path) -> tuple[Path, Path]:
-    """Write a figure as PNG for pages and as PDF for print; the same figure gives the same bytes.
+def write_figure(figure: Figure, path: Path, dpi: float = DPI) -> tuple[Path, ...]:
+    """Write a figure without dates; the same figure gives the same bytes.
 
     Args:
-        figure: of one of the functions of `plots`.
-        stem: the files' path without the suffix; the folder must exist.
+        figure: of matplotlib.
+        path: with the suffix of a format, or without: PNG and PDF are written; the folder must exist.
+        dpi: of pixel formats.
 
     Returns:
-        stem.png and stem.pdf.
+        The files that were written.
 
     Raises:
         OutputError: a file cannot be written.
     """
     undated: dict[str, dict[str, Any]] = {".png": {"Software": None}, ".pdf": {"CreationDate": None}}
-    paths = (stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}.pdf"))
-    for path in paths:
-        with put_aside(path) as aside:
-            figure.savefig(aside, dpi=DPI, metadata=undated[path.suffix])
+    known = path.suffix[1:].lower() in figure.canvas.get_supported_filetypes()
+    paths = (path,) if known else tuple(path.with_name(path.name + suffix) for suffix in undated)
+    for each in paths:
+        with put_aside(each) as aside:
+            figure.savefig(aside, dpi=dpi, metadata=undated.get(each.suffix.lower()))
     return paths
+
+
+def points(axes: Axes, x: Floats, of: Interval, style: LineStyle, label: str = "", joined: bool = False) -> None:
+    """Draw values (K,) as markers and their intervals as bars, without those that are NaN.
+
+    Args:
+        axes: panel.
+        x: (K,).
+        of: (K,) values.
+        style: colour and marker.
+        label: of the legend; empty: no entry.
+        joined: draw a line through the markers.
+    """
+    drawn = style.drawn if joined else style.drawn | {"linestyle": "none"}
+    axes.plot(x, of.value, marker=style.marker, label=label or "_", **drawn)
+    there = np.isfinite(of.low) & np.isfinite(of.high) & np.isfinite(x)
+    # vlines, not errorbar: a corrected interval may exclude its value
+    axes.vlines(x[there], of.low[there], of.high[there], color=style.colour, linewidth=0.8)
+
+
+def band(axes: Axes, x: Floats, low: Floats, high: Floats, style: LineStyle) -> None:
+    """Shade the area between two curves (K,); it is interrupted where one of them is NaN."""
+    there = np.isfinite(low) & np.isfinite(high) & np.isfinite(x)
+    if there.any():
+        axes.fill_between(x, low, high, where=there.tolist(), color=style.colour, alpha=BAND, linewidth=0)
+
+
+def legend_above(axes: Axes, ncols: int = 1, handles: Sequence[Any] | None = None, title: str | None = None) -> None:
+    """Put the legend above the axes, where it covers no data."""
+    handles = axes.get_legend_handles_labels()[0] if handles is None else list(handles)
+    if handles:
+        axes.legend(
+            handles=handles,
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=ncols,
+            title=title,
+            alignment="left",
+            borderaxespad=0.2,
+            columnspacing=1.2,
+            labelspacing=0.25,
+        )
+
+
+def legend_of_figure(figure: Figure, handles: Sequence[Any], ncols: int) -> None:
+    """Put one legend above all panels."""
+    figure.legend(handles=list(handles), loc="outside upper center", ncols=ncols, columnspacing=1.4)
+
+
+def note(figure: Figure, words: str) -> None:
+    """Write a note below all panels, with line breaks."""
+    letters = round(LETTERS_PER_INCH * figure.get_figwidth())
+    figure.supxlabel(textwrap.fill(words, letters), fontsize=7.5)
+
+
+def plain_logarithms(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers: 1, 2, 5, 10, or powers of ten over a wide range."""
+    low, high = axis.get_view_interval()
+    decades = abs(math.log10(high / low)) if low > 0 and high > 0 else 1.0
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 2.5 else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: np.format_float_positional(value, precision=12, trim="-")))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def say_empty(axes: Any, words: str = "nothing measured") -> None:
+    """Write into an empty panel why it is empty."""
+    write = axes.text2D if hasattr(axes, "text2D") else axes.text
+    write(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", color=GREY)
+
+
+def in_frame(quantity: str) -> str:
+    """Return a quantity's symbol with the frame of its components: 'v lab'."""
+    symbol = SYMBOLS.get(quantity, quantity)
+    return symbol if " " in symbol else f"{symbol} lab"
+
+
+def interval_text(of: Interval, unit: str = "", factor: float = 1.0) -> str:
+    """Return a scalar times `factor` with its interval as text: '0.921 ms (0.905 to 0.938)'."""
+    value, low, high = (factor * float(x) for x in (of.value, of.low, of.high))
+    behind = f" {unit}" if unit else ""
+    if not math.isfinite(value):
+        return "unknown"
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return f"{value:.3g}{behind}"
+    places = decimals(high - low)
+    return f"{value:.{places}f}{behind} ({low:.{places}f} to {high:.{places}f})"
+
+
+def decimals(width: float) -> int:
+    """Return how many decimals show an interval of this width with two digits."""
+    return min(max(1 - math.floor(math.log10(width)), 0), 6) if width > 0 else 3
+
+
+def three_digits(value: float) -> str:
+    """Return a number with three digits or more, never as a power of ten."""
+    return f"{value:.{decimals(value / 10)}f}" if math.isfinite(value) else "unknown"
+
+
+def p_value_text(p_value: float) -> str:
+    """Return a p-value as text: 'p = 0.046', 'p < 0.001'."""
+    if not math.isfinite(p_value):
+        return "p unknown"
+    return "p < 0.001" if p_value < 1e-3 else f"p = {p_value:.{2 if p_value >= 0.1 else 3}f}"

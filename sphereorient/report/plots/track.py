@@ -1,25 +1,39 @@
-"""A track in six dimensions against time, with its errors."""
+"""A track in six dimensions against time, and its path through space with the sphere's axes."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from sphereorient import so3
-from sphereorient.report.plots.marks import BAND, band, legend_of_figure, note, say_empty
-from sphereorient.report.plots.part import Part, cut, shown_part
-from sphereorient.report.plots.style import COMPONENTS, GREY, SHADE, WIDTH_IN, in_style, new_figure
+from sphereorient.report.plots.style import (
+    ALL,
+    BAND,
+    COMPONENTS,
+    PLAIN,
+    SHADE,
+    WIDTH_IN,
+    band,
+    in_style,
+    legend_of_figure,
+    new_figure,
+    note,
+    say_empty,
+)
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
+MOST_FRAMES = 2000  # more are not distinguishable on a page
+GAP = 1.5  # typical steps: a longer one is a gap
 SIGMAS = 2.0  # half width of the bands
 NOT_VALID: Final[dict[str, Any]] = {"facecolor": "#E8E8E8", "edgecolor": SHADE, "hatch": "//////", "linewidth": 0.0}
 LATE_S, LONG_S = 10.0, 2.0  # from here on times are given in seconds
@@ -30,63 +44,123 @@ RATES = {
     "acceleration": "acceleration, lab (m/s²)",
     "alpha_lab": "α, lab (rad/s²)",
 }
+TRIPODS = 14
+TRIPOD_SIZE = 0.09  # of the path's largest extent
+THINNEST = 0.35  # of the largest extent: the least length of the box's shortest side
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrackPart:
+    """Frames of a track that are drawn; made by `shown_part`."""
+
+    track: Trajectory  # these frames only
+    words: str  # names the part; empty for the whole track
+    broken: NDArray[np.bool_]  # (n - 1,), interrupt the line between a frame and the next
 
 
 @in_style
 def track_figure(track: Trajectory) -> Figure:
     """Draw position, Tait-Bryan angles, velocities and accelerations against time.
 
-    Lines are the smooth motion with bands of two standard deviations, dots what was measured in single frames. Gaps
-    stay open; frames that are not valid are shaded. Of a long track the best 2,000 frames of its longest segment are
-    drawn, and the figure says so.
+    Lines are the smooth motion with bands of two standard deviations; dots are the measurements of single frames. Gaps
+    stay open; frames that are not valid are shaded. Of a long track, the best 2,000 frames of its longest segment are
+    drawn, and a note says so.
 
-    Args:
-        track: what was measured.
-
-    Returns:
-        The figure, to be written by `write_figure`.
-
-    Source: the paper, figure of a sample track; the angles by ERRATA E1.
+    Source: the paper, figure of a sample track; the angles by docs/errata.md E1.
     """
     part = shown_part(track)
+    track = part.track
+    late = len(track) > 0 and (float(np.ptp(track.time)) > LONG_S or float(track.time.max()) > LATE_S)
+    unit, time = ("s", track.time) if late else ("ms", 1e3 * track.time)
     figure = new_figure(WIDTH_IN, 7.6)
     panels = figure.subplots(3, 2, sharex=True)
-    unit, time = _time(part.track)
-    _position(panels[0, 0], time, part)
+    _dots(panels[0, 0], time, track.position)
+    _curves(panels[0, 0], time, track.position_smooth, _sigma(track.position_smooth_cov), part.broken)
+    panels[0, 0].set_ylabel("position, lab (mm)")
     _angles(panels[0, 1], time, part)
     for axes, (name, label) in zip(panels[1:].ravel(), RATES.items(), strict=True):
-        sigma = getattr(part.track, f"{name}_sigma")
-        _curves(axes, time, getattr(part.track, name), sigma, part.broken)
+        _curves(axes, time, getattr(track, name), getattr(track, f"{name}_sigma"), part.broken)
         axes.set_ylabel(label)
     for axes in panels.ravel():
-        _shade(axes, time, part.track.valid)
+        _shade(axes, time, track.valid)
         axes.margins(x=0.01)
-        if _is_empty(axes):
+        if not any(np.isfinite(np.asarray(line.get_ydata(), np.float64)).any() for line in axes.lines):
             say_empty(axes)
             axes.set_yticks([])
     for axes in panels[-1]:
         axes.set_xlabel(f"time ({unit})")
     figure.align_ylabels()
-    legend_of_figure(figure, _handles(), ncols=6)
+    handles = [
+        *(style.handle(style.name) for style in COMPONENTS),
+        PLAIN.handle("measured", marker=".", linestyle="none"),
+        Patch(color=COMPONENTS[0].colour, alpha=BAND, linewidth=0, label=f"± {SIGMAS:.0f} standard deviations"),
+        Patch(label="frame not valid", **NOT_VALID),
+    ]
+    legend_of_figure(figure, handles, ncols=6)
     if part.words:
         note(figure, part.words)
     return figure
 
 
-def _time(track: Trajectory) -> tuple[str, Floats]:
-    """Return the times in numbers of few digits, and their unit."""
-    late = len(track) > 0 and (float(np.ptp(track.time)) > LONG_S or float(track.time.max()) > LATE_S)
-    return ("s", track.time) if late else ("ms", 1e3 * track.time)
+@in_style
+def path_figure(track: Trajectory) -> Figure:
+    """Draw the path in the lab, to scale, with the axes of the sphere's body; of a long track as `track_figure`.
+
+    Source: the paper, figure of a sample track in space.
+    """
+    part = shown_part(track)
+    figure = new_figure(WIDTH_IN, 5.6)
+    axes: Any = figure.add_subplot(projection="3d")
+    axes.set(xlabel="x, lab (mm)", ylabel="y, lab (mm)", zlabel="z, lab (mm)")
+    position = part.track.position_smooth
+    there = np.flatnonzero(np.isfinite(position).all(1))
+    if len(there):
+        size = TRIPOD_SIZE * max(float(np.ptp(position[there], axis=0).max()), 1.0)
+        axes.plot(*_cut(position, part.broken).T, color=ALL.colour, linewidth=1.0, label="path")
+        axes.plot(*position[there[:1]].T, marker="o", markersize=5, color=ALL.colour, label="start")
+        _tripods(axes, part.track, there, size)
+        _equal_scale(axes, position[there], size)
+    else:
+        say_empty(axes)
+    start = ALL.handle("start", marker="o", linestyle="none", markersize=5)
+    arms = [
+        style.handle(f"body axis {style.name}", linestyle="-", marker=style.marker, linewidth=1.6)
+        for style in COMPONENTS
+    ]
+    legend_of_figure(figure, [ALL.handle("path", linewidth=1.0), start, *arms], ncols=5)
+    words = "the sphere's axes are not to scale"
+    note(figure, f"{part.words}; {words}" if part.words else words)
+    return figure
 
 
-def _position(axes: Axes, time: Floats, part: Part) -> None:
-    track = part.track
-    _dots(axes, time, track.position)
-    _curves(axes, time, track.position_smooth, _sigma(track.position_smooth_cov), part.broken)
-    axes.set_ylabel("position, lab (mm)")
+def shown_part(track: Trajectory, most: int = MOST_FRAMES) -> TrackPart:
+    """Return the whole track, or the `most` consecutive frames of its longest segment with the most valid ones."""
+    rows, words = np.arange(len(track)), ""
+    if len(track) > most:
+        inside = np.flatnonzero(track.segment >= 0)
+        if len(inside):
+            labels, counts = np.unique(track.segment[inside], return_counts=True)
+            rows = np.flatnonzero(track.segment == labels[counts.argmax()])
+        which = "the longest segment" if len(rows) <= most else f"the best {most:,} frames of the longest segment"
+        which = which if len(inside) else "none of them in a segment"
+        if len(rows) > most:
+            total = np.concatenate([[0], np.cumsum(track.valid[rows])])
+            start = int((total[most:] - total[:-most]).argmax())
+            rows = rows[start : start + most]
+        words = f"shown: frames {rows[0]:,} to {rows[-1]:,} of {len(track):,}, {which}"
+    part = track.at(rows)
+    steps = np.diff(track.time)
+    typical = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    broken = np.asarray((np.diff(part.time) > GAP * typical) | (np.diff(part.segment) != 0))
+    return TrackPart(track=part, words=words, broken=broken)
 
 
-def _angles(axes: Axes, time: Floats, part: Part) -> None:
+def _cut(values: Floats, broken: NDArray[np.bool_]) -> Floats:
+    """Insert a row of NaN into values (N, ...) where the line is interrupted, (N - 1,)."""
+    return np.insert(values, np.flatnonzero(broken) + 1, np.nan, axis=0)
+
+
+def _angles(axes: Axes, time: Floats, part: TrackPart) -> None:
     track = part.track
     smooth = tait_bryan_deg(track.orientation_smooth)
     sigma = _sigma_deg(track.orientation_smooth, track.orientation_smooth_cov)
@@ -106,9 +180,9 @@ def tait_bryan_deg(R_lab_body: Floats) -> Floats:
 
 
 def _sigma_deg(R_lab_body: Floats, cov_lab_rad2: Floats) -> Floats:
-    """Return the standard deviations of the angles, (N, 3), degrees, by delta_lab = H dtheta; NaN near the poles.
+    """Return the standard deviations of the angles (N, 3), degrees; NaN near the poles.
 
-    Source: ERRATA E3.
+    Source: delta_lab = H dtheta, docs/errata.md E3.
     """
     theta = np.deg2rad(tait_bryan_deg(R_lab_body))
     there = np.isfinite(theta).all(1) & (np.abs(np.cos(theta[:, 1])) > 0.02)
@@ -135,38 +209,48 @@ def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDA
 
 
 def _curve(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDArray[np.bool_], i: int) -> None:
-    look = COMPONENTS[i]
-    x, y, half = (cut(part, broken) for part in (time, values, SIGMAS * sigma))
-    axes.plot(x, y, label=look.name, **look.drawn)
-    band(axes, x, y - half, y + half, look)
+    style = COMPONENTS[i]
+    x, y, half = (_cut(part, broken) for part in (time, values, SIGMAS * sigma))
+    axes.plot(x, y, label=style.name, **style.drawn)
+    band(axes, x, y - half, y + half, style)
 
 
 def _dots(axes: Axes, time: Floats, values: Floats) -> None:
-    for look, column in zip(COMPONENTS, values.T, strict=True):
-        axes.plot(time, column, ".", color=look.colour, alpha=0.35, markersize=2.5, markeredgewidth=0, label="_")
-
-
-def _is_empty(axes: Axes) -> bool:
-    return not any(np.isfinite(np.asarray(line.get_ydata(), np.float64)).any() for line in axes.lines)
+    for style, column in zip(COMPONENTS, values.T, strict=True):
+        axes.plot(time, column, ".", color=style.colour, alpha=0.35, markersize=2.5, markeredgewidth=0, label="_")
 
 
 def _shade(axes: Axes, time: Floats, valid: NDArray[np.bool_]) -> None:
     """Shade runs of frames that are not valid, half a step to either side."""
     edges = np.flatnonzero(np.diff(np.concatenate([[True], valid, [True]]).astype(np.int8)))
-    if not len(edges):
+    if len(edges):
+        half = float(np.median(np.diff(time))) / 2 if len(time) > 1 else 0.5
+        runs = [(time[a] - half, time[b - 1] - time[a] + 2 * half) for a, b in edges.reshape(-1, 2)]
+        across = axes.get_xaxis_transform()
+        axes.broken_barh(runs, (0, 1), transform=across, zorder=0, label="not valid", **NOT_VALID)
+
+
+def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float) -> None:
+    """Draw the three columns of R_lab_body at some places of the path."""
+    known = there[np.isfinite(track.orientation_smooth[there]).all((1, 2))]
+    if not len(known):
         return
-    half = float(np.median(np.diff(time))) / 2 if len(time) > 1 else 0.5
-    runs = [(time[a] - half, time[b - 1] - time[a] + 2 * half) for a, b in edges.reshape(-1, 2)]
-    across = axes.get_xaxis_transform()
-    axes.broken_barh(runs, (0, 1), transform=across, zorder=0, label="not valid", **NOT_VALID)
+    chosen = known[np.unique(np.linspace(0, len(known) - 1, TRIPODS).round().astype(int))]
+    start = track.position_smooth[chosen]
+    for i, style in enumerate(COMPONENTS):
+        tip = start + size * track.orientation_smooth[chosen, :, i]
+        ends = np.stack([start, tip, np.full_like(tip, np.nan)], axis=1).reshape(-1, 3)
+        axes.plot(*ends.T, color=style.colour, linewidth=1.6, label=f"body axis {style.name}")
+        axes.plot(*tip.T, color=style.colour, marker=style.marker, markersize=3, linestyle="none", label="_")
 
 
-def _handles() -> list[Any]:
-    lines = [Line2D([], [], label=look.name, **look.drawn) for look in COMPONENTS]
-    dot = Line2D([], [], color=GREY, marker=".", linestyle="none", label="measured")
-    return [
-        *lines,
-        dot,
-        Patch(color=COMPONENTS[0].colour, alpha=BAND, linewidth=0, label=f"± {SIGMAS:.0f} standard deviations"),
-        Patch(label="frame not valid", **NOT_VALID),
-    ]
+def _equal_scale(axes: Any, position_mm: Floats, size: float) -> None:
+    """Give a millimetre the same length on all axes; the box is as long as the path, and not too thin."""
+    low, high = position_mm.min(0) - size, position_mm.max(0) + size
+    extent = np.maximum(high - low, THINNEST * (high - low).max())
+    middle = (low + high) / 2
+    axes.set_box_aspect(tuple(extent), zoom=0.95)  # a tuple: it scales an array in place
+    limits = (centre + np.array([-0.5, 0.5]) * length for centre, length in zip(middle, extent, strict=True))
+    axes.set(**dict(zip(("xlim", "ylim", "zlim"), limits, strict=True)))
+    for axis, share in zip((axes.xaxis, axes.yaxis, axes.zaxis), extent / extent.max(), strict=True):
+        axis.set_major_locator(MaxNLocator(max(2, round(6 * share))))

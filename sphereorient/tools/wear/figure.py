@@ -13,8 +13,7 @@ from torch import Tensor
 
 from sphereorient.mapping.compare import RADIUS_DEG
 from sphereorient.report.map_figure import CHANGE_REACH, UNSEEN, equirectangular
-from sphereorient.report.plots.marks import note
-from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure
+from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note
 from sphereorient.tools.wear.series import Place, WearSeries
 
 SHOWN = 6  # maps that are drawn at most, spread over the series

@@ -3,9 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sphereorient.statistics.bootstrap import bootstrap
+from sphereorient.statistics.bootstrap import bootstrap, studentized
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.statistics.studentized import studentized
 
 SETTINGS = BootstrapSettings(resamples=400)
 POSITIVE = np.array([False, True])

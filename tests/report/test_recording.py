@@ -13,9 +13,7 @@ from overlay_examples import changed, command, excerpt, true_track
 
 from sphereorient.cameras import load_cameras
 from sphereorient.errors import OutputError
-from sphereorient.report.recording_scene import pinhole_near
-from sphereorient.report.recording_series import PLOTS, series_of
-from sphereorient.report.recording_view import view_track
+from sphereorient.report.recording import PLOTS, pinhole_near, series_of, view_track
 from sphereorient.trajectory import Trajectory
 
 HEAD = "schema: sphereorient-cameras/1\ncameras:\n"

@@ -9,8 +9,8 @@ from overlay_examples import camera_changed, changed, excerpt, true_track
 from scipy.spatial.transform import Rotation
 
 from sphereorient.errors import OutputError
-from sphereorient.report.worst import worst_frames
-from sphereorient.report.worst_choice import APART_FRAMES, BadFrame, choose_worst
+from sphereorient.report.frame_warnings import APART_FRAMES, BadFrame, choose_worst
+from sphereorient.report.gallery import worst_frames
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
 TURN = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()

@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sphereorient import so3
@@ -19,12 +17,11 @@ from sphereorient.errors import ExperimentError, refusal
 from sphereorient.evaluate import Score
 from sphereorient.experiment import Experiment, open_movies
 from sphereorient.experiment.timeline import timeline
+from sphereorient.report.plots.style import AXIS_COLOURS, new_figure
 from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
 from sphereorient.trajectory import Reason, Trajectory
 
-# Okabe and Ito's colours: told apart by colour-blind readers, and in grey print.
-AXIS_COLOURS = ("#D55E00", "#009E73", "#0072B2")
-BRIGHT_COLOURS = ("#FF8C3B", "#2BE0A8", "#63C3FF")  # the same hues on dark pictures
+BRIGHT_COLOURS = ("#FF8C3B", "#2BE0A8", "#63C3FF")  # the hues of AXIS_COLOURS on dark pictures
 TRUTH_COLOUR = "#444444"
 
 
@@ -37,8 +34,7 @@ def demo_figure(track: Trajectory, experiment: Experiment, path: Path, score: Sc
         path: of the PNG or PDF to write.
         score: errors against the truth, where it is known.
     """
-    figure = Figure(figsize=(12, 9.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(12, 9.5)
     top, bottom = np.ravel(figure.subfigures(2, 1, height_ratios=[0.75, 1.15], squeeze=False))
     _frames_part(top, track, experiment)
     _curves_part(bottom, track, score)

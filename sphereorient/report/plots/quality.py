@@ -1,0 +1,260 @@
+"""Figures of isotropy and of what limits the measurement: attitudes, noise, kernel widths, distance of the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from sphereorient.report.plots.style import (
+    ALL,
+    COMPONENTS,
+    PLAIN,
+    SECOND,
+    SYMBOLS,
+    WIDTH_IN,
+    LineStyle,
+    in_frame,
+    in_style,
+    legend_above,
+    legend_of_figure,
+    new_figure,
+    note,
+    p_value_text,
+    plain_logarithms,
+    points,
+    say_empty,
+)
+from sphereorient.statistics import Interval, Moments
+from sphereorient.statistics.cameras import CameraDistance
+from sphereorient.statistics.isotropy import EulerDensity, Isotropy, Uniformity
+from sphereorient.statistics.moments import WARN_SHARE
+from sphereorient.statistics.noise import WidthCurve
+from sphereorient.statistics.segments import UNITS
+
+Floats = NDArray[np.float64]
+
+BAR, BESIDE = 0.24, 0.2  # width of a bar, distance of components, where quantities are 1 apart
+NOISE_WORDS = {"added": "noise in the variance (%)", "removed": "variance smoothed away (%)"}
+WIDTHS_OF = ("acceleration", "alpha_lab")
+TOO_WIDE = 15.0  # medians: even bins with a longer range show the smaller distances as one bar
+NEAREST = 30.0  # the smaller median over the first of the geometric bins
+GEOMETRIC_BINS = 36
+
+
+@in_style
+def angles_figure(angles: Sequence[EulerDensity], uniformity: Uniformity) -> Figure:
+    """Draw the PDFs of the Euler angles beside those of uniform attitudes, with the result of the test.
+
+    Source: the paper, section II; the angles by docs/errata.md E1.
+    """
+    figure = new_figure(WIDTH_IN, 2.9)
+    panels = figure.subplots(1, len(angles), sharey=True, squeeze=False)[0]
+    for axes, angle, style in zip(panels, angles, COMPONENTS, strict=True):
+        edges_deg = np.rad2deg(angle.edges_rad)
+        points(axes, (edges_deg[1:] + edges_deg[:-1]) / 2, angle.pdf.scaled(np.pi / 180), style, angle.name)
+        law = {"color": SECOND.colour, "linestyle": SECOND.line, "linewidth": 1.1}
+        axes.stairs(angle.uniform * np.pi / 180, edges_deg, baseline=None, **law)
+        axes.set_xlabel(rf"$\theta_{angle.name[-1]}$ (degrees)")
+        step = 45 if edges_deg[-1] < 100 else 90
+        axes.set(xlim=(edges_deg[0], edges_deg[-1]), xticks=np.arange(edges_deg[0], edges_deg[-1] + 1, step))
+    panels[0].set_ylabel("PDF (1/degree)")
+    panels[0].set_ylim(bottom=0.0)
+    bins = PLAIN.handle("bins with intervals", marker="o", linestyle="none")
+    legend_of_figure(figure, [bins, SECOND.handle("all attitudes equally likely")], ncols=2)
+    note(figure, _uniformity_words(uniformity))
+    return figure
+
+
+def _uniformity_words(of: Uniformity) -> str:
+    if not np.isfinite(of.p_value):
+        return "uniformity of the attitudes could not be tested"
+    found = "nothing speaks against uniform attitudes" if of.uniform else "the attitudes are not uniform"
+    return (
+        f"{found}: {p_value_text(of.p_value)}, test on SO(3) of {of.samples:,} frames in {of.segments:,} segments, "
+        f"worth {of.effective:,.0f} independent attitudes"
+    )
+
+
+@in_style
+def isotropy_figure(isotropies: Mapping[str, Isotropy]) -> Figure:
+    """Draw for each quantity the shares of its components in the variance, and the p-value of isotropy.
+
+    Source: the paper, Table I, with docs/errata.md E6.
+    """
+    figure = new_figure(WIDTH_IN, 3.2)
+    axes = figure.subplots()
+    for k, one in enumerate(isotropies.values()):
+        share = one.variance_share.scaled(100.0)
+        for i, style in enumerate(COMPONENTS):
+            points(axes, np.array([k + (i - 1) * BESIDE]), share.part(slice(i, i + 1)), style, style.name)
+    axes.axhline(100 / 3, label="a third", **SECOND.drawn)
+    labels = [f"{in_frame(name)}\n{p_value_text(one.p_value)}" for name, one in isotropies.items()]
+    axes.set_xticks(np.arange(len(labels)), labels)
+    axes.grid(visible=False, axis="x")
+    axes.set_xlabel("vector and its frame, p-value of isotropy (–)")
+    axes.set_ylabel("share in the variance (%)")
+    if isotropies:
+        axes.set_xlim(-0.5, len(labels) - 0.5)
+    else:
+        say_empty(axes)
+    handles = [style.handle(style.name, marker=style.marker, linestyle="none") for style in COMPONENTS]
+    legend_of_figure(figure, [*handles, SECOND.handle("isotropic: a third")], ncols=4)
+    return figure
+
+
+@in_style
+def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"] = "added") -> Figure:
+    """Draw the share of noise in the variance of every component, with intervals and the line of 10 %.
+
+    Args:
+        table: moments by quantity.
+        error: the ensemble's; a track's sigma is noise on top of the motion, or motion that was smoothed away.
+
+    Source: docs/statistics.md, Noise.
+    """
+    figure = new_figure(WIDTH_IN, 3.2)
+    axes = figure.subplots()
+    shares = [one.noise_share.part(slice(0, 3)).scaled(100.0) for one in table.values()]
+    floor = _floor(shares)
+    bars = []
+    for i, style in enumerate(COMPONENTS):
+        at = np.arange(len(shares)) + (i - 1) * BAR
+        value, low, high = (np.array([float(getattr(s, key)[i]) for s in shares]) for key in ("value", "low", "high"))
+        drawn: dict[str, Any] = {"color": style.colour, "edgecolor": "white", "hatch": style.hatch}
+        bars.append(axes.bar(at, value - floor, BAR, bottom=floor, label=style.name, **drawn))
+        there = np.isfinite(low) & np.isfinite(high)
+        axes.vlines(at[there], np.maximum(low[there], floor), high[there], color="black", linewidth=1.0)
+    limit = axes.axhline(100 * WARN_SHARE, label=f"{100 * WARN_SHARE:.0f} %: worth a warning", **SECOND.drawn)
+    axes.set_xticks(np.arange(len(table)), [in_frame(name) for name in table])
+    axes.grid(visible=False, axis="x")
+    axes.set_xlabel("vector and its frame (–)")
+    axes.set_ylabel(NOISE_WORDS[error])
+    top = max([100 * WARN_SHARE, *(float(np.nan_to_num([s.value, s.high]).max()) for s in shares)])
+    if floor:
+        axes.set(yscale="log", ylim=(floor, 1.5 * top))
+        plain_logarithms(axes.yaxis)
+    else:
+        axes.set_ylim(0.0, 1.2 * top)
+    legend_above(axes, ncols=4, handles=[*bars, limit])
+    if not any(np.isfinite(share.value).any() for share in shares):
+        say_empty(axes, "the errors of this track are unknown")
+    return figure
+
+
+def _floor(shares: list[Interval]) -> float:
+    """Return where bars begin on a logarithmic axis: a decade below the least; 0: the axis is linear."""
+    known = np.concatenate([share.value for share in shares]) if shares else np.empty(0)
+    known = known[np.isfinite(known) & (known > 0)]
+    return float(10.0 ** (np.floor(np.log10(known.min())) - (np.log10(known.min()) % 1 < 0.3))) if len(known) else 0.0
+
+
+@in_style
+def widths_figure(widths: Mapping[str, WidthCurve]) -> Figure:
+    """Draw rms, flatness and share of noise of a and alpha against the width of the smoothing kernel.
+
+    Filled markers are corrected for the noise expected from the measurements' errors, open ones are as measured. A
+    plateau of the corrected curves over several widths is the motion's value. Velocity is drawn if neither is given.
+
+    Source: Voth et al. 2002, J. Fluid Mech. 469, 121; the paper, section III.
+    """
+    shown = [name for name in WIDTHS_OF if name in widths] or list(widths)[:1]
+    figure = new_figure(WIDTH_IN * max(len(shown), 1) / 2, 6.6)
+    panels = figure.subplots(3, max(len(shown), 1), sharex="col", squeeze=False)
+    for column, name in zip(panels.T, shown, strict=True):
+        _widths_column(column, widths[name])
+    figure.align_ylabels()
+    x, y, z = (style.handle(style.name, marker=style.marker) for style in COMPONENTS)
+    corrected = PLAIN.handle("corrected for noise", marker="o")
+    measured = PLAIN.handle("as measured", marker="o", markerfacecolor="white", linestyle="none")
+    limit = SECOND.handle(f"{100 * WARN_SHARE:.0f} % of the variance")
+    legend_of_figure(figure, [x, corrected, y, measured, z, limit], ncols=3)
+    return figure
+
+
+def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
+    rms, flatness, share = panels
+    symbol, unit = SYMBOLS[curve.quantity], UNITS[curve.quantity].replace("^2", "²")
+    width_ms = 1e3 * curve.width_s
+    nudge = 0.04 * float(np.min(np.diff(width_ms))) if len(width_ms) > 1 else 0.0
+    open_ = {"markerfacecolor": "white", "linestyle": "none"}
+    for i, style in enumerate(COMPONENTS):
+        x, column = width_ms + (i - 1) * nudge, (slice(None), i)
+        for axes, corrected, measured in (
+            (rms, curve.corrected_rms, curve.rms),
+            (flatness, curve.corrected_flatness, curve.flatness),
+        ):
+            points(axes, x, corrected.part(column), style, f"{style.name}, corrected", joined=True)
+            label = f"{style.name}, measured"
+            axes.plot(x, measured.value[column], marker=style.marker, color=style.colour, label=label, **open_)
+        points(share, x, curve.noise_share.part(column).scaled(100.0), style, style.name, joined=True)
+    share.axhline(100 * WARN_SHARE, label="_10 %", **SECOND.drawn)
+    if (curve.noise_share.value > 0).any():
+        share.set_yscale("log")
+        plain_logarithms(share.yaxis)
+    rms.set_ylim(bottom=0.0)  # a plateau looks level only above zero
+    rms.set_ylabel(f"rms of {symbol} ({unit})")
+    flatness.set_ylabel(f"flatness of {symbol} (–)")
+    share.set_ylabel(f"noise in the variance of {symbol} (%)")
+    share.set_xlabel("kernel width σ (ms)")
+
+
+@in_style
+def camera_distance_figure(distances: Sequence[CameraDistance]) -> Figure:
+    """Draw the PDF of the distance of the cameras' orientations, with its median, a panel for each pair of cameras.
+
+    The PDF without the correction of perspective is dashed. If even bins show the smaller distances as one bar, both
+    axes are logarithmic and the bins geometric; the PDF is still per degree.
+
+    Source: the paper, section III, distance of the two cameras; the sign of the correction by docs/errata.md A1.
+    """
+    figure = new_figure(WIDTH_IN * 0.7, 2.9 * max(len(distances), 1))
+    panels = figure.subplots(max(len(distances), 1), 1, squeeze=False)[:, 0]
+    for axes in panels:
+        axes.set(xlabel="distance of two cameras' orientations (degrees)", ylabel="PDF (1/degree)")
+    if not distances:
+        say_empty(panels[0], "no two cameras to compare")
+    for axes, distance in zip(panels, distances, strict=False):
+        _distance_panel(axes, distance)
+    return figure
+
+
+def _distance_panel(axes: Axes, distance: CameraDistance) -> None:
+    names = " and ".join(distance.cameras)
+    corrected = "distance" if distance.uncorrected_rad is None else "perspective corrected"
+    laws: list[tuple[Floats, Floats, LineStyle, str]] = [(distance.distance_rad, distance.pdf, ALL, corrected)]
+    if distance.uncorrected_rad is not None and distance.uncorrected_pdf is not None:
+        laws.append((distance.uncorrected_rad, distance.uncorrected_pdf, SECOND, "not corrected"))
+    laws = [(np.rad2deg(values), pdf, style, what) for values, pdf, style, what in laws if len(values)]
+    if not laws:
+        say_empty(axes, f"no frame in which {names} both have an orientation")
+        return
+    edges = np.rad2deg(distance.edges_rad)
+    nearest = min(float(np.median(law[0])) for law in laws)
+    even = edges[-1] <= TOO_WIDE * nearest or not nearest
+    if not even:
+        edges = np.geomspace(nearest / NEAREST, edges[-1] * (1 + 1e-9), GEOMETRIC_BINS + 1)
+    for values, pdf, style, what in laws:
+        pdf = pdf * np.pi / 180 if even else _density(values, edges)
+        median = float(np.median(values))
+        label = f"{what}: median {median:.2g}° of {len(values):,} frames"
+        axes.stairs(pdf, edges, color=style.colour, linestyle=style.line, linewidth=1.2, label=label)
+        axes.axvline(median, color=style.colour, linestyle=style.line, linewidth=0.8)
+    if even:
+        axes.set_xlim(0.0, float(edges[-1]))
+        axes.set_ylim(bottom=0.0)
+    else:
+        axes.set(xscale="log", yscale="log", xlim=(edges[0], 1.2 * edges[-1]))
+        plain_logarithms(axes.xaxis)
+        plain_logarithms(axes.yaxis)
+    legend_above(axes, title=names)
+
+
+def _density(values_deg: Floats, edges_deg: Floats) -> Floats:
+    """Return the density in bins of any widths, 1/degree; NaN in empty bins."""
+    counts, _ = np.histogram(values_deg, edges_deg)
+    return np.where(counts > 0, counts / len(values_deg) / np.diff(edges_deg), np.nan)
