@@ -58,13 +58,13 @@ def compare_maps_(
 
 
 def _compare_two(new: Path, old: Path, out: Path | None, *, turned: bool, as_json: bool) -> None:
-    from sphereorient.mapping.compare import CHANGED, compare_maps, paint_change, turned_map, without_changed
+    from sphereorient.mapping.compare import CHANGED, compare_maps, texture_change, turned_map, without_changed
     from sphereorient.report import map_figure
     from sphereorient.so3 import angle
 
     after, before = _known_map(new), _known_map(old)
     comparison = compare_maps(after, before, turned=turned)
-    change = paint_change(turned_map(after, comparison.R_other_reference, len(before)), before)
+    change = texture_change(turned_map(after, comparison.R_other_reference, len(before)), before)
     comparison = without_changed(comparison, change, CHANGED)
     known = change[change.isfinite()]
     changed = float((known.abs() > CHANGED).float().mean()) if len(known) else math.nan

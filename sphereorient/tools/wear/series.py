@@ -19,7 +19,7 @@ from sphereorient.mapping.compare import (
     MapComparison,
     compare_maps,
     fit_levels,
-    paint_change,
+    texture_change,
     turned_map,
     without_changed,
 )
@@ -120,7 +120,7 @@ def _wear(texture: Tensor, first: Tensor, turned: bool) -> Wear:
     """Compare one map with the first."""
     comparison = compare_maps(texture, first, turned)
     there = turned_map(texture, comparison.R_other_reference, len(first))
-    change = paint_change(there, first)
+    change = texture_change(there, first)
     gain, offset = fit_levels(first, there)
     off = (there - (gain * first + offset)).abs()
     known = torch.isfinite(off)
