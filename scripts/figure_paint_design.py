@@ -18,9 +18,9 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from sphereorient.report.map_figure import write_figure
 from sphereorient.report.plots.style import COMPONENTS, WIDTH_IN, in_style, new_figure
 from sphereorient.sphere import SphereRenderer, orthographic_view
-from sphereorient.tools.design.figure import write_design
 from sphereorient.tools.design.judge import DesignSettings, Judgement, judge_paint
 from sphereorient.tools.design.paint import PAINTS, facing, scaled_paint
 
@@ -66,7 +66,7 @@ def main() -> None:
         )[0]
         gain = 1 - own[0].bound_deg[0] / own[-1].bound_deg[0]
         print(f"{kind}: bound ~ border length^{slope:.2f}; {100 * gain:.0f} % less from the coarsest to the finest")
-    write_design(figure(rows), out)
+    write_figure(figure(rows), out)
 
 
 def judged(kind: str, size_deg: float) -> Row:

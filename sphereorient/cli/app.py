@@ -23,7 +23,7 @@ class InOrder(TyperGroup):
 
     ORDER = (
         *("track", "report", "overlay", "export", "view"),
-        *("check", "movie", "convert", "calibrate", "check-cameras", "map", "compare-maps", "synth", "texture"),
+        *("check", "movie", "convert", "calibrate", "check-cameras", "map", "compare-maps", "spin", "synth", "texture"),
         *("bench", "train", "evaluate", "settings", "info"),
     )
 
