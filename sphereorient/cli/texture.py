@@ -154,8 +154,8 @@ def _print(judgement: Judgement, title: str) -> None:
         f"(ball of {settings.diameter_px:g} px, noise {100 * settings.noise_share:g} % of black to white, "
         f"{settings.views} views, position of the ball unknown)",
         f"worst view: {_place(told['worst_view_lon_lat_deg'])}; best: {_place(told['best_view_lon_lat_deg'])}",
-        f"most similar views, {told['most_alike_apart_deg']:.0f} degrees apart: similarity {judgement.alike:.2f}, margin "
-        f"{judgement.margin:.2f}: {' and '.join(_place(each) for each in told['most_alike_lon_lat_deg'])}",
+        f"most similar views, {told['most_alike_apart_deg']:.0f} degrees apart: similarity {judgement.alike:.2f}, "
+        f"margin {judgement.margin:.2f}: {' and '.join(_place(each) for each in told['most_alike_lon_lat_deg'])}",
         f"widest brush that paints it: {judgement.stroke_deg:.0f} degrees; borders {judgement.border:.1f} radii long",
     ]
     for line in lines:

@@ -111,17 +111,15 @@ def filmed(omega, time_s, *, strays=(), mirror=False):
     shown[list(strays)] = so3.random_rotations(len(strays), generator=torch.Generator().manual_seed(5))
     table = DotTable(direction_body=directions, radius_deg=7.0)
     pictures = [photograph(one, directions, seed=k) for k, one in enumerate(shown)]
-    return pictures, R, table.mirrored() if mirror else table
+    return Photographs(pictures=pictures, time_s=time_s), R, table.mirrored() if mirror else table
 
 
 @pytest.mark.slow  # two searches of 12 pictures, 10 s
 def test_photographs_give_back_spin_attitudes_and_aliases_with_strays_between():
     axis = torch.nn.functional.normalize(torch.tensor([0.1, 0.9, -0.3], dtype=torch.float64), dim=0)
     omega, time_s = 0.65 * TURN * axis, STEP * torch.arange(12, dtype=torch.float64)
-    pictures, R, table = filmed(omega, time_s, strays=(3, 8))
-    found = spin_of(
-        Photographs(pictures=pictures, time_s=time_s), table, SpinSettings(omega_max_rad_s=TURN, search=QUICK)
-    )
+    photographs, R, table = filmed(omega, time_s, strays=(3, 8))
+    found = spin_of(photographs, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
     rates = [float(one @ axis) / TURN for one in found.spins.omega_view_rad_s]
     assert rates == pytest.approx([-0.35, 0.65], abs=0.005)  # the slower one leads, the other is told
     assert found.ambiguous == 2
@@ -137,17 +135,17 @@ def test_photographs_give_back_spin_attitudes_and_aliases_with_strays_between():
 def test_a_mirrored_table_is_refused():
     omega = 0.3 * TURN * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     time_s = STEP * torch.arange(12, dtype=torch.float64)
-    pictures, _, table = filmed(omega, time_s, mirror=True)
+    photographs, _, table = filmed(omega, time_s, mirror=True)
     with pytest.raises(PaintError, match="not of its mirror image"):
-        spin_of(Photographs(pictures=pictures, time_s=time_s), table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
+        spin_of(photographs, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
 
 
 @pytest.mark.slow
 def test_pictures_that_show_no_spin_are_refused():
     omega, time_s = torch.zeros(3, dtype=torch.float64), STEP * torch.arange(8, dtype=torch.float64)
-    pictures, _, table = filmed(omega, time_s, strays=tuple(range(8)))
+    photographs, _, table = filmed(omega, time_s, strays=tuple(range(8)))
     with pytest.raises(PaintError, match="more than chance") as caught:
-        spin_of(Photographs(pictures=pictures, time_s=time_s), table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
+        spin_of(photographs, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
     assert "\n" not in str(caught.value)
 
 
