@@ -40,11 +40,7 @@ class PairwiseAttitudes:
 
 
 def find_chain(disks: Disks, settings: MapSettings) -> PairwiseAttitudes:
-    """Find the attitudes of a movie's frames.
-
-    Args:
-        disks: of N instants, each seen by a camera at least.
-        settings: of mapping.
+    """Find the attitudes of a movie's frames from disks of N instants, each seen by a camera at least.
 
     Raises:
         PaintError: the sphere does not turn, the cameras see different rotations, or no patch is seen twice.
@@ -58,11 +54,7 @@ def find_chain(disks: Disks, settings: MapSettings) -> PairwiseAttitudes:
 
 
 def check_turned(R_lab_body: Tensor, settings: MapSettings) -> None:
-    """Refuse attitudes (N, 3, 3) of a sphere that turns by less than the setting.
-
-    Raises:
-        PaintError: it does.
-    """
+    """Raise PaintError if attitudes (N, 3, 3) turn by less than the setting."""
     turned = float(so3.geodesic_distance(R_lab_body[:1], R_lab_body).max())
     if turned < math.radians(settings.turned_min_deg):
         got = f"{math.degrees(turned):.2g} degrees in all frames together"
@@ -185,11 +177,7 @@ def sight_cosines(disks: Disks, R_lab_body: Tensor, rows: Tensor) -> Tensor:
 
 
 def _check_one_ball(disks: Disks, R_lab_body: Tensor) -> None:
-    """Refuse cameras whose own rotations differ.
-
-    Raises:
-        PaintError: the median difference is too large.
-    """
+    """Raise PaintError if the median difference of two cameras' own rotations is too large."""
     cameras = disks.layers.shape[1]
     keys = _keyframes(R_lab_body, 2 * ENOUGH_TURN_RAD)
     keys = keys[disks.seen[keys].all(1)]

@@ -66,11 +66,11 @@ class MapComparison:
 
 
 def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapComparison:
-    """Measure the displacement of a map against a reference.
+    """Measure the displacement of a map against a reference, NaN where unknown; sizes may differ.
 
     Args:
-        other: (H, 2 H), 0 black .. 1 white, NaN where unknown.
-        reference: (h, 2 h), likewise.
+        other: (H, 2 H), 0 black .. 1 white.
+        reference: (h, 2 h).
         turned: find the rotation between the body frames first; False: they are the same.
 
     Raises:
@@ -103,13 +103,7 @@ def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapCo
 
 
 def turned_map(texture: Tensor, R_map_new: Tensor, height: int | None = None) -> Tensor:
-    """Return a map in another body frame: new(d) = texture(R_map_new d), NaN where unknown.
-
-    Args:
-        texture: (H, 2 H), NaN where unknown.
-        R_map_new: (3, 3), from the new body frame to the map's.
-        height: rows of the new map; None: H.
-    """
+    """Return a map (height, 2 height) in another body frame: new(d) = texture(R_map_new d), NaN where unknown."""
     height = len(texture) if height is None else height
     direction = map_directions(height).reshape(-1, 3) @ R_map_new.double().mT
     known = torch.isfinite(texture)
@@ -139,9 +133,7 @@ def fit_levels(texture: Tensor, reference: Tensor) -> tuple[float, float]:
 def texture_change(new: Tensor, old: Tensor) -> Tensor:
     """Return how far the new map's grey lies outside of all grey levels that the old map has near, (H, 2 H).
 
-    Args:
-        new: (H, 2 H), 0 black .. 1 white, NaN where unknown.
-        old: (H, 2 H), of the same frame; its grey levels are fitted to the new ones first.
+    Both are in one frame; the old grey levels are fitted to the new ones first.
 
     Returns:
         -1 .. 1, negative where the texture became darker; 0 where a displacement of up to `RADIUS_DEG` explains all;
@@ -165,13 +157,7 @@ def texture_change(new: Tensor, old: Tensor) -> Tensor:
 
 
 def without_changed(comparison: MapComparison, change: Tensor, most: float) -> MapComparison:
-    """Return a comparison without the patches in which the texture itself changed: their shift means nothing.
-
-    Args:
-        comparison: of two maps.
-        change: (H, 2 H), of `texture_change`, in the reference's frame.
-        most: largest change of a texel that counts as none.
-    """
+    """Return a comparison without the patches in which the texture changed by more than `most`: their shift is void."""
     spots = Patches(direction=comparison.direction_body, R_other_reference=comparison.R_other_reference).points(1.0)
     changed = (change.abs() > most).double()  # an unknown texel has not changed
     spoilt = sample_texture(changed, spots).mean(1) > CHANGED_SHARE
@@ -275,11 +261,7 @@ class Correction:
 
 
 def corrected(learnt: LearntMap, old: Tensor) -> Correction:
-    """Bring a learnt map and its attitudes into the body frame of an old map; keep the old texture where never seen.
-
-    Args:
-        learnt: from the movies alone.
-        old: (h, 2 h), 0 black .. 1 white.
+    """Bring a learnt map and its attitudes into the body frame of an old map (h, 2 h); keep that where never seen.
 
     Raises:
         PaintError: the old map is not one of this ball.

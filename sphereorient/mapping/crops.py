@@ -74,11 +74,7 @@ class Crops:
         return [[self.picture(k, c) for c in range(len(self.views))] for k in frames.tolist()]
 
     def frames_with_ball(self) -> Tensor:
-        """Return the frames (M,) int64 in which a camera sees the ball.
-
-        Raises:
-            PaintError: fewer than two.
-        """
+        """Return the frames (M,) int64 in which a camera sees the ball; raise PaintError if fewer than two."""
         frames = torch.nonzero(self.seen.any(1))[:, 0]
         if len(frames) < 2:
             raise too_few(len(frames))

@@ -53,13 +53,7 @@ class Disks:
     def sampled(
         self, rows: Tensor | slice, camera: int, every: int = 1, slant_power: int = 1
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each n-th pixel of some disks of a camera.
-
-        Args:
-            rows: R of the instants.
-            camera: number of the camera.
-            every: n.
-            slant_power: power of the slant's cosine in the weights.
+        """Return each n-th (`every`) pixel of some disks (R,) of a camera; weights have the slant's cosine to a power.
 
         Returns:
             Directions in the view frame (3, P), grey (R, P) and weight (R, P).
@@ -173,15 +167,11 @@ def reduced(disks: Disks, factor: int) -> Disks:
 
 
 def disk_places(normal_view: Tensor, distance_radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Project directions onto a disk.
-
-    Args:
-        normal_view: (..., 3, P) unit, view frame.
-        distance_radii: (...).
+    """Project directions (..., 3, P), view frame, onto a disk seen from a distance (...), radii.
 
     Returns:
-        Places (..., 2, P) in radii of the disk; their derivative by x and y of the direction (..., 1, P); and the
-        cosine of the slant (..., P), not positive where the camera does not see the direction.
+        Places (..., 2, P) in radii of the disk; their derivative by x and y of the direction (..., 1, P); and the cosine
+        of the slant (..., P), not positive where invisible.
     """
     D = distance_radii[..., None, None]
     x_y, z = normal_view[..., :2, :], normal_view[..., 2:, :]

@@ -47,14 +47,10 @@ def _place(longitude: Tensor, latitude: Tensor, height: int) -> tuple[Tensor, Te
 
 
 def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
-    """Return the texels that a look-up reads: a cubic B-spline whose coefficients are the texels.
-
-    Args:
-        direction_body: (..., 3) unit.
-        height: H of the map (H, 2 H), at least 4.
+    """Return the 16 texels that a cubic B-spline, whose coefficients they are, reads in directions (..., 3).
 
     Returns:
-        Indices (..., 16) int64 in the flattened map, and weights (..., 16), sum 1.
+        Indices (..., 16) int64 in the flattened map (H, 2 H), H at least 4, and weights (..., 16), sum 1.
     """
     width = 2 * height
     column, row = _place(*texture_coordinates(direction_body), height)
@@ -67,12 +63,7 @@ def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
 
 
 class SplineTable(TextureTable):
-    """A texture map looked up by its spline exactly; it records which texels each look-up reads.
-
-    Args:
-        texture: (H, 2 H), blurred as the pictures are.
-        blur_rad: standard deviation of that blur, rad.
-    """
+    """A texture map (H, 2 H), blurred by `blur_rad`, looked up by its spline exactly; records the texels read."""
 
     def __init__(self, texture: Tensor, blur_rad: float) -> None:
         super().__init__(torch.zeros(1, 4), blur_rad)
@@ -156,11 +147,7 @@ def stiffness(height: int) -> csr_matrix:
 
 
 class NormalMatrix:
-    """J^T J of a Jacobian, never multiplied out: that would take longer than solving with it.
-
-    Args:
-        jacobian: (S, T), of each sample by each texel, times the root of its weight.
-    """
+    """J^T J of a weighted Jacobian (S, T), never multiplied out: that would take longer than solving with it."""
 
     def __init__(self, jacobian: csr_matrix) -> None:
         self._jacobian = jacobian
@@ -183,14 +170,7 @@ def texel_sums(jacobian: csr_matrix) -> NDArray[np.float64]:
 def map_sums(
     direction_body: Tensor, value: Tensor, weight: Tensor, height: int
 ) -> tuple[csr_matrix, NDArray[np.float64]]:
-    """Return the normal equations (T, T) and (T,) of a map from samples.
-
-    Args:
-        direction_body: (S, 3) unit.
-        value: (S,), of the map there.
-        weight: (S,), inverse variance.
-        height: H of the map.
-    """
+    """Return the normal equations (T, T) and (T,) of a map from samples: directions (S, 3), values and weights (S,)."""
     place, share = texel_weights(direction_body.double(), height)
     texels = 2 * height * height
     root = weight.double().clamp_min(0).sqrt()
@@ -203,11 +183,11 @@ def map_sums(
 def solve_map(
     normal: csr_matrix | NormalMatrix, right: NDArray[np.float64], height: int, smooth: float, iterations: int = 60
 ) -> Tensor:
-    """Solve for the map, (H, 2 H) float64: weighted least squares with a smoothness penalty.
+    """Solve normal equations (T, T), (T,) for the map, (H, 2 H) float64, with a smoothness penalty.
 
     Args:
-        normal: (T, T).
-        right: (T,).
+        normal: of the pixels.
+        right: of the pixels.
         height: H.
         smooth: weight of the integral of the squared slope, in the unit of the pixels' weights.
         iterations: of conjugate gradients, at most.
@@ -234,13 +214,7 @@ def solve_map(
 
 
 def blur_matrix(direction_body: Tensor, blur_rad: float, height: int) -> csr_matrix:
-    """Return the matrix (M, T) from a map's coefficients to its blurred values in directions (M, 3) float64.
-
-    Args:
-        direction_body: (M, 3) unit, float64.
-        blur_rad: standard deviation of the Gaussian, rad.
-        height: H of the map.
-    """
+    """Return the matrix (M, T) from a map's coefficients to its blurred values in directions (M, 3) float64."""
     right, up = _tangents(direction_body)
     start = np.arange(0, len(direction_body) * READS + 1, READS)
     total = csr_matrix((len(direction_body), 2 * height * height))
@@ -253,15 +227,7 @@ def blur_matrix(direction_body: Tensor, blur_rad: float, height: int) -> csr_mat
 
 
 def sharpened(blurred: Tensor, blur_rad: float, noise: float = NOISE) -> Tensor:
-    """Undo a Gaussian blur as far as noise allows.
-
-    Args:
-        blurred: (H, 2 H), coefficients of the map as the pictures blur it.
-        blur_rad: standard deviation of that blur, rad.
-        noise: the larger, the less is undone.
-
-    Returns:
-        Coefficients of the sharp map, (H, 2 H) float64; `look_up` reads its values.
+    """Undo a Gaussian blur of a map's coefficients (H, 2 H), float64, as far as noise allows.
 
     Source: Tikhonov 1963, the slope's square as the penalty.
     """

@@ -116,15 +116,9 @@ def first_map(disks: Disks, R_lab_body: Tensor, height: int) -> Tensor:
 def first_state(
     crops: Crops, frames: Tensor, R_lab_body: Tensor, texture: Tensor, settings: MapSettings, extra_px: float = 0.0
 ) -> State:
-    """Return what the iterations start with, light unknown.
+    """Return what the iterations start with: attitudes (n, 3, 3) of some frames (n,), a map, light unknown.
 
-    Args:
-        crops: of the movies.
-        frames: (n,) int64.
-        R_lab_body: (n, 3, 3).
-        texture: (H, 2 H).
-        settings: of mapping.
-        extra_px: standard deviation of a Gaussian laid over the pictures first, px.
+    A Gaussian of `extra_px` is laid over the pictures first.
     """
     blur_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
     fitter = Fitter(

@@ -71,11 +71,11 @@ class Linearisation:
 def linearise(
     fitter: Fitter, texture: Tensor, pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, blur_px: float
 ) -> Linearisation:
-    """Compare pictures with a map and linearise, each frame's light at its best.
+    """Compare pictures with a map (H, 2 H), blurred as they are, and linearise, each frame's light at its best.
 
     Args:
         fitter: of views and light; its own map is not used.
-        texture: (H, 2 H), the map, blurred as the pictures are.
+        texture: the map.
         pixels: of B * C disks, the cameras of an instant next to each other.
         position_lab_mm: (B, 3).
         R_lab_body: (B, 3, 3).

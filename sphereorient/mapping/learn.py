@@ -91,13 +91,7 @@ def _finished(start: Start, state: State, iterations: tuple[Iteration, ...], arr
 
 
 def interpolated(chain: Tensor, rows: Tensor, known: Tensor) -> Tensor:
-    """Return attitudes of all instants: some as given, the others corrected like their neighbours.
-
-    Args:
-        chain: (M, 3, 3), all by the chain.
-        rows: (n,) int64, rising, of the given ones.
-        known: (n, 3, 3).
-    """
+    """Return attitudes of all instants (M, 3, 3): of `rows` (n,) as `known`, of the others by the corrected chain."""
     off = so3.log(known @ chain[rows].mT)
     at = torch.arange(len(chain)).clamp(int(rows[0]), int(rows[-1]))
     upper = torch.searchsorted(rows, at).clamp(0, len(rows) - 1)

@@ -102,15 +102,9 @@ def _first_views(disks: Disks, first: Tensor, every: int) -> list[Sampled]:
 def refine_pairs(
     disks: Disks, first: Tensor, second: Tensor, R_ji: Tensor, iterations: int, every: int = 1
 ) -> RelativeRotations:
-    """Refine rough relative rotations, all cameras of both instants against each other.
+    """Refine rough relative rotations R_ji (E, 3, 3) by Gauss-Newton, all cameras of both instants (E,) together.
 
-    Args:
-        disks: of the movie.
-        first: (E,) int64.
-        second: (E,) int64.
-        R_ji: (E, 3, 3), starts.
-        iterations: of Gauss-Newton.
-        every: use each n-th pixel.
+    Only each n-th (`every`) pixel is used.
 
     Source: direct alignment, Lucas and Kanade 1981; robust weights, Geman and McClure 1987.
     """
@@ -169,15 +163,9 @@ def _correlation(w: Tensor, a: Tensor, b: Tensor, aa: Tensor, bb: Tensor, ab: Te
 
 
 def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, grid: Tensor, every: int = 1) -> Tensor:
-    """Return the best of all rotations grid[m] @ about[e], (E, 3, 3), for pairs of instants.
+    """Return the best of all rotations grid[m] @ about[e], (E, 3, 3), for pairs of instants (E,).
 
-    Args:
-        disks: small ones; detail finer than the grid only hides the right place.
-        first: (E,) int64.
-        second: (E,) int64.
-        about: (E, 3, 3), R_ji about which to search.
-        grid: (M, 3, 3).
-        every: use each n-th pixel.
+    The disks should be small ones: detail finer than the grid (M, 3, 3) only hides the right place.
     """
     best = []
     grid = grid.float()
@@ -196,7 +184,7 @@ def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, gri
 
 
 def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tensor, every: int) -> Tensor:
-    """Compare one disk with all first ones of a camera, for all rotations of a grid, (N, M).
+    """Compare one disk with all first ones of a camera, for all rotations of a grid; return correlations (N, M).
 
     A turned disk is looked up once for all disks; the rest are matrix products.
 
@@ -206,9 +194,6 @@ def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tens
         second: instant of the second one.
         grid: (M, 3, 3), from the first disk's view frame to the second one's.
         every: use each n-th pixel.
-
-    Returns:
-        Correlations, shrunk as in `search_pairs`.
     """
     camera, other = cameras
     normal, grey, own = disks.sampled(torch.arange(len(disks)), camera, every)
@@ -228,12 +213,9 @@ def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tens
 
 
 def solve_graph(R_lab_body: Tensor, pairs: RelativeRotations, scale_rad: float) -> tuple[Tensor, Tensor]:
-    """Fit attitudes to relative rotations; the first attitude stays.
+    """Fit attitudes (N, 3, 3) float64 to relative rotations that connect them; the first attitude stays.
 
-    Args:
-        R_lab_body: (N, 3, 3) float64, starts.
-        pairs: that connect every instant to the first one.
-        scale_rad: residual beyond which a pair loses weight.
+    Pairs with residuals beyond `scale_rad` lose weight.
 
     Returns:
         Attitudes (N, 3, 3) and residuals of the pairs (E, 3), rad.

@@ -65,8 +65,7 @@ def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: P
         patches: of the reference.
 
     Returns:
-        Shifts (D, 2) float64, rad east and north, and whether each patch was found (D,): enough contrast, edges both
-        ways, within reach.
+        Shifts (D, 2) float64, rad east and north, and whether each patch was found (D,).
 
     Source: normalised correlation; then direct alignment, Lucas and Kanade 1981, with gain and offset.
     """

@@ -163,9 +163,7 @@ def _starts(small: Disks, grid: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor
 def joined_sets(evidence: Evidence, found: RelativeRotations) -> tuple[Tensor, Tensor]:
     """Join pictures to sets, and sets to larger ones, where all their pictures together agree, best pairs first.
 
-    Args:
-        evidence: of N pictures.
-        found: possible rotations; several of one pair contradict each other.
+    `found` are possible rotations; several of one pair contradict each other.
 
     Returns:
         The number of each picture's set (N,) int64, and attitudes (N, 3, 3), comparable within a set.
@@ -236,11 +234,7 @@ def _settled(evidence: Evidence, rows: Tensor, R_lab_body: Tensor) -> tuple[Tens
 
 
 def _largest(label: Tensor) -> Tensor:
-    """Return the pictures (M,) of the largest set.
-
-    Raises:
-        PaintError: it is too small, or another is nearly as large.
-    """
+    """Return the pictures (M,) of the largest set; raise PaintError if it is too small, or another nearly as large."""
     size, order = label.bincount().sort(descending=True, stable=True)
     if int(size[0]) < FEWEST:
         got = f"{int(size[0]) if int(size[0]) > 1 else 'none'} among {len(label)}"

@@ -39,11 +39,7 @@ class Start:
 
 
 def start_from_movie(crops: Crops, settings: MapSettings, progress: Progress) -> Start:
-    """Find attitudes from neighbouring frames and loops, and a first map.
-
-    Raises:
-        PaintError: one frame only, a sphere that does not turn, or no patch seen twice.
-    """
+    """Find attitudes from neighbouring frames and loops, and a first map; raises as `fit_map`."""
     start = _from_chain(crops, settings, progress)
     if not crops.fixed:
         return start
@@ -72,12 +68,9 @@ def _from_chain(crops: Crops, settings: MapSettings, progress: Progress) -> Star
 
 
 def start_from_photographs(crops: Crops, settings: MapSettings, progress: Progress) -> Start:
-    """Find attitudes of pictures in any order, and a first map.
+    """Find attitudes of pictures in any order, and a first map; raises as `fit_map`.
 
     Of more than `frames_max` pictures, evenly spread ones are used; the others get no attitude.
-
-    Raises:
-        PaintError: too few pictures, none with a common patch, a sphere that does not turn, or two balls.
     """
     progress("photographs", 0, 1)
     frames = evenly_spread(crops.frames_with_ball(), settings.frames_max)

@@ -102,13 +102,7 @@ def _gore_texture(gores: Gores, texture: Tensor, strip: int) -> tuple[Tensor, Te
 
 @in_style
 def gores_figure(texture: Tensor, gores: Gores, *, filled: bool) -> Figure:
-    """Draw the strips at true size: cut along the solid lines, fold along the dashed ones.
-
-    Args:
-        texture: (H, 2 H), the map.
-        gores: of the ball.
-        filled: draw black areas; otherwise only the borders between black and white, to be cut out or traced.
-    """
+    """Draw the strips at true size; not `filled`: only the borders between black and white, to be cut out or traced."""
     (width, height), (equator, meridian) = gores.sheet_mm, gores.size_mm
     figure = Figure(figsize=(width * MM, height * MM))
     axes = figure.add_axes((0, 0, 1, 1))

@@ -123,12 +123,12 @@ def judge_paint(texture: Tensor, settings: DesignSettings | None = None) -> Judg
 
 
 def most_similar_views(texture: Tensor, R_view_body: Tensor, apart_deg: float) -> tuple[float, Tensor]:
-    """Find the two most similar views that are apart.
+    """Find the two most similar views that are at least `apart_deg` apart.
 
     Args:
         texture: (H, 2 H).
         R_view_body: (V, 3, 3), views that are compared with all of SO(3).
-        apart_deg: least angle between the two views.
+        apart_deg: degrees.
 
     Returns:
         Their similarity, 1 at most, and the two, (2, 3, 3) float64.

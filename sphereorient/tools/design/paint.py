@@ -31,10 +31,7 @@ def view_directions(count: int) -> Tensor:
 
 
 def facing(direction_body: Tensor) -> Tensor:
-    """Return attitudes R_view_body (..., 3, 3) that turn body directions (..., 3) to the camera, north up.
-
-    At the poles, +x of the body takes the place of north.
-    """
+    """Return R_view_body (..., 3, 3) that turn directions (..., 3) to the camera, north (at a pole: +x) up."""
     x, y, z = torch.nn.functional.normalize(direction_body, dim=-1).unbind(-1)
     level = torch.hypot(x, y)
     polar = level < 1e-9

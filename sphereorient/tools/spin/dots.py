@@ -113,10 +113,6 @@ class DotSearch:
 
     A dot of the table that is missing in the picture counts against an attitude; dark that is not in the table (a
     maker's name, dirt) hardly does.
-
-    Args:
-        table: of the dots.
-        settings: of the search that proposes; many finalists, because they are ranked anew.
     """
 
     def __init__(self, table: DotTable, settings: GreySearchSettings = DOT_SEARCH) -> None:

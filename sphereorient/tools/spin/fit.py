@@ -96,14 +96,9 @@ def picture_candidates(time_s: Tensor, offset: Tensor, R_view_body: Tensor, weig
 
 
 def fit_spins(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
-    """Find all uniform spins below a limit that pass near the pictures' candidates.
+    """Find the best uniform spin below a limit and all its aliases, best first.
 
-    Args:
-        seen: at least two pictures at different times.
-        omega_max_rad_s: limit of the rate.
-
-    Returns:
-        The best spin and all its aliases, best first; no spin where no two neighbouring pictures have candidates.
+    None is found where no two neighbouring pictures have candidates.
     """
     spins = _guesses(seen, omega_max_rad_s)
     if not len(spins):

@@ -81,10 +81,10 @@ class WearSeries:
 
 
 def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
-    """Find the wear of a ball between movies: compare each map with the first, in its body frame.
+    """Find the wear of a ball between movies: compare each map (H, 2 H) with the first, in its body frame.
 
     Args:
-        maps: two or more, (H, 2 H) each, 0 black .. 1 white, NaN where unknown; in the order of the movies.
+        maps: 0 black .. 1 white, NaN where unknown; in the order of the movies.
         turned: find the rotations between the body frames first; False: they are the same.
 
     Raises:
