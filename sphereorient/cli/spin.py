@@ -43,10 +43,10 @@ def spin(
     from sphereorient.report.map_figure import write_figure
     from sphereorient.tools.spin.dots import DotTable
     from sphereorient.tools.spin.figure import spin_figure
-    from sphereorient.tools.spin.inputs import load_paint, load_photographs
+    from sphereorient.tools.spin.inputs import load_ball, load_photographs
     from sphereorient.tools.spin.spin import SpinSettings, spin_of
 
-    paint = load_paint(texture, dot_radius)
+    paint = load_ball(texture, dot_radius)
     loaded, settings = load_photographs(photographs, times), SpinSettings(omega_max_rad_s=omega_max)
     with progress_bar(quiet, unit="photographs") as advance:
         found = spin_of(loaded, paint, settings, advance)

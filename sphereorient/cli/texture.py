@@ -61,16 +61,16 @@ def design(
     _check(map_, make, gores, diameter_mm, stroke, diameter_px, noise, 0.0 if diameter_mm is None else diameter_mm)
     check_writable(out)
     from sphereorient.tools.design.gores import Gores
-    from sphereorient.tools.design.judge import DesignSettings, judge_paint, make_paint
+    from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture
 
     strips = Gores(count=gores, diameter_mm=diameter_mm) if gores is not None and diameter_mm is not None else None
     settings = DesignSettings(diameter_px=diameter_px, noise_share=noise, views=views)
     if map_ is not None:
         title, painted = map_.name, _loaded(map_)
-        judgement = judge_paint(painted, settings)
+        judgement = judge_texture(painted, settings)
     else:
         with progress_bar(quiet or as_json, unit="maps") as advance:
-            painted, judgement, title = make_paint(
+            painted, judgement, title = design_texture(
                 [name.strip() for name in kinds.split(",") if name.strip()],
                 stroke,
                 settings,

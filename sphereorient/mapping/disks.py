@@ -170,8 +170,8 @@ def disk_places(normal_view: Tensor, distance_radii: Tensor) -> tuple[Tensor, Te
     """Project directions (..., 3, P), view frame, onto a disk seen from a distance (...), radii.
 
     Returns:
-        Places (..., 2, P) in radii of the disk; their derivative by x and y of the direction (..., 1, P); and the cosine
-        of the slant (..., P), not positive where invisible.
+        Places (..., 2, P) in radii of the disk, their derivative by x and y of the direction (..., 1, P), and the
+        cosine of the slant (..., P), not positive where invisible.
     """
     D = distance_radii[..., None, None]
     x_y, z = normal_view[..., :2, :], normal_view[..., 2:, :]

@@ -14,7 +14,7 @@ from torch import Tensor
 from sphereorient.report.plots.style import GREY, SHADE, WIDTH_IN, in_style, new_figure
 from sphereorient.sphere import SphereRenderer, orthographic_view, reduced_texture
 from sphereorient.tools.design.judge import Judgement, lon_lat_deg
-from sphereorient.tools.design.paint import facing
+from sphereorient.tools.design.patterns import facing
 
 SIDE_PX = 96  # of the drawn views
 WORST = "#B42318"

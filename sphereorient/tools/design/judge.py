@@ -18,7 +18,14 @@ from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import SphereRenderer, orthographic_view, reduced_texture
 from sphereorient.sphere.texture import texture_coordinates
-from sphereorient.tools.design.paint import border_length, facing, scaled_paint, stroke_deg, view_directions
+from sphereorient.tools.design.patterns import (
+    SIZES_DEG,
+    border_length,
+    facing,
+    patterned_texture,
+    stroke_deg,
+    view_directions,
+)
 
 SEARCH = GreySearchSettings()  # normalisation and size of the views, as in the search on grey values
 ALIKE_STEP_DEG = 12.0  # of the first comparison: every view is within 14.5 degrees of the grid
@@ -27,7 +34,6 @@ CLOSEST = 24  # most similar views that are compared again
 RENDERED = 512  # views at once
 FEW_VIEWS, FINALISTS = 24, 3  # of the first judgement in a search, and maps that are judged in full
 WHITE_SHARE = (0.15, 0.85)  # of a view, in a search
-SIZES_DEG = (3.0, 60.0)  # of patches, in a search
 
 
 class DesignSettings(BaseModel):
@@ -100,7 +106,7 @@ def _spread(values: Tensor) -> dict[str, float | None]:
     return {name: float(value) if bool(value.isfinite()) else None for name, value in named.items()}
 
 
-def judge_paint(texture: Tensor, settings: DesignSettings | None = None) -> Judgement:
+def judge_texture(texture: Tensor, settings: DesignSettings | None = None) -> Judgement:
     """Judge a map (H, 2 H): balance, information and similarity of its views, and the brush that it needs.
 
     Source: the bound is that of docs/errata.md; similarity is the correlation of normalised pictures, as in the grey
@@ -164,7 +170,7 @@ def most_similar_views(texture: Tensor, R_view_body: Tensor, apart_deg: float) -
     return float(best[k]), torch.stack([R_view_body[k], match[k]])
 
 
-def make_paint(
+def design_texture(
     kinds: Sequence[str],
     stroke: float,
     settings: DesignSettings | None = None,
@@ -179,7 +185,7 @@ def make_paint(
     full; the one with the least bound / margin wins: precise, and hard to confuse.
 
     Args:
-        kinds: of `PAINTS`.
+        kinds: of `PATTERNS`.
         stroke: least width of brush, degrees.
         settings: expected pictures.
         tries: maps of each kind.
@@ -201,7 +207,7 @@ def make_paint(
         kind, k = kinds[number // tries], number % tries
         size = 1.5 * stroke * (5.0 / 1.5) ** (k / max(tries - 1, 1))
         size = min(max(size, SIZES_DEG[0]), SIZES_DEG[1])
-        texture = scaled_paint(kind, size, seed + k, 256)
+        texture = patterned_texture(kind, size, seed + k, 256)
         white = _white(texture, R)
         if stroke_deg(texture) >= stroke and low <= float(white.min()) <= float(white.max()) <= high:
             found.append((float(_bounds(texture, R, small).amax()), kind, size, seed + k))
@@ -209,11 +215,11 @@ def make_paint(
             advance(number + 1, tries * len(kinds))
     if not found:
         expected, do = f"one that a brush of {stroke:g} degrees can paint", "take a finer brush or more tries"
-        raise PaintError(refusal("paint", expected=expected, got=f"none of {tries * len(kinds)}", do=do))
+        raise PaintError(refusal("texture map", expected=expected, got=f"none of {tries * len(kinds)}", do=do))
     judged = []
     for _, kind, size, own_seed in sorted(found)[:FINALISTS]:
-        texture = scaled_paint(kind, size, own_seed)
-        judgement = judge_paint(texture, settings)
+        texture = patterned_texture(kind, size, own_seed)
+        judgement = judge_texture(texture, settings)
         cost = float(judgement.bound_rad.amax()) / max(judgement.margin, 1e-3)
         judged.append((cost, texture, judgement, f"{kind} of {size:.1f} degrees, seed {own_seed}"))
     _, texture, judgement, words = min(judged, key=lambda one: one[0])

@@ -46,7 +46,7 @@ def load_photographs(paths: Sequence[Path], times: str) -> Photographs:
     return Photographs(pictures=pictures, time_s=time_s, names=[str(path) for path in files])
 
 
-def load_paint(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
+def load_ball(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
     """Read a texture map, or a table .csv of dots: x, y, z of a direction a line, without head.
 
     Raises:

@@ -21,8 +21,15 @@ from sphereorient.evaluate import cramer_rao_bound
 from sphereorient.sphere import load_texture, sample_texture
 from sphereorient.synth.textures import map_directions
 from sphereorient.tools.design.gores import Gores, gores_figure, instructions
-from sphereorient.tools.design.judge import DesignSettings, judge_paint, make_paint, most_similar_views
-from sphereorient.tools.design.paint import PAINTS, border_length, facing, scaled_paint, stroke_deg, view_directions
+from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture, most_similar_views
+from sphereorient.tools.design.patterns import (
+    PATTERNS,
+    border_length,
+    facing,
+    patterned_texture,
+    stroke_deg,
+    view_directions,
+)
 
 FEW = DesignSettings(diameter_px=24, views=12)
 
@@ -75,13 +82,13 @@ def test_the_border_of_caps_is_the_sum_of_their_circles():  # oracle
     assert border_length(caps) == pytest.approx(2 * math.pi * (math.sin(0.4) + math.sin(0.9)), rel=0.03)
 
 
-@pytest.mark.parametrize("kind", sorted(PAINTS))
+@pytest.mark.parametrize("kind", sorted(PATTERNS))
 def test_paint_of_twice_the_size_has_half_the_border_and_takes_twice_the_brush(kind):
-    fine, coarse = (scaled_paint(kind, size, 3, 256) for size in (14.0, 28.0))
+    fine, coarse = (patterned_texture(kind, size, 3, 256) for size in (14.0, 28.0))
     assert border_length(fine) / border_length(coarse) == pytest.approx(2.0, rel=0.25)
     assert stroke_deg(coarse) > 1.5 * stroke_deg(fine)
-    assert torch.equal(fine, scaled_paint(kind, 14.0, 3, 256))
-    assert not torch.equal(fine, scaled_paint(kind, 14.0, 4, 256))
+    assert torch.equal(fine, patterned_texture(kind, 14.0, 3, 256))
+    assert not torch.equal(fine, patterned_texture(kind, 14.0, 4, 256))
 
 
 @pytest.mark.parametrize(
@@ -89,11 +96,11 @@ def test_paint_of_twice_the_size_has_half_the_border_and_takes_twice_the_brush(k
 )
 def test_paint_that_nobody_knows_is_refused(kind, size, got):
     with pytest.raises(PaintError, match=got):
-        scaled_paint(kind, size, 0)
+        patterned_texture(kind, size, 0)
 
 
 def test_the_two_faces_of_a_ball_painted_twice_alike_are_found():  # planted
-    texture = scaled_paint("blobs", 25.0, 1, 128)
+    texture = patterned_texture("blobs", 25.0, 1, 128)
     twice = torch.cat([texture[:, :128], texture[:, :128]], dim=1)  # half a turn about z changes nothing
     R = facing(view_directions(12))
     alike, two = most_similar_views(twice, R, 20.0)
@@ -104,7 +111,7 @@ def test_the_two_faces_of_a_ball_painted_twice_alike_are_found():  # planted
 
 
 def test_views_that_are_near_each_other_are_not_counted_as_alike():
-    texture = scaled_paint("patches", 20.0, 2, 128)
+    texture = patterned_texture("patches", 20.0, 2, 128)
     R = facing(view_directions(12))
     for apart in (20.0, 60.0):
         _, two = most_similar_views(texture, R, apart)
@@ -114,9 +121,9 @@ def test_views_that_are_near_each_other_are_not_counted_as_alike():
 def test_the_judgement_is_that_of_the_bound_and_knows_the_view_without_paint():
     # Dots on one half only: the other half's middle is white, and nothing can be said there.
     direction = map_directions(128)
-    texture = scaled_paint("dots", 15.0, 1, 128)
+    texture = patterned_texture("dots", 15.0, 1, 128)
     texture = torch.where(direction[..., 0] > 0, texture, torch.ones_like(texture))
-    judged = judge_paint(texture, FEW)
+    judged = judge_texture(texture, FEW)
     expected = cramer_rao_bound(texture, facing(judged.direction_body).float(), diameter_px=24, supersampling=6)
     assert_close(judged.bound_rad, expected.orientation_rms_rad.double(), atol=1e-9)
     assert float(judged.direction_body[judged.worst, 0]) < -0.5 < 0.2 < float(judged.direction_body[judged.best, 0])
@@ -126,13 +133,13 @@ def test_the_judgement_is_that_of_the_bound_and_knows_the_view_without_paint():
 
 @pytest.mark.slow  # a dozen judgements
 def test_paint_is_made_for_the_brush_and_the_same_seed_gives_the_same():
-    one, judged, words = make_paint(["blobs"], 12.0, FEW, tries=3)
-    two, _, again = make_paint(["blobs"], 12.0, FEW, tries=3)
+    one, judged, words = design_texture(["blobs"], 12.0, FEW, tries=3)
+    two, _, again = design_texture(["blobs"], 12.0, FEW, tries=3)
     assert torch.equal(one, two)
     assert words == again
     assert judged.stroke_deg >= 11
     with pytest.raises(PaintError, match="none of 1"):
-        make_paint(["patches"], 40.0, FEW, tries=1)
+        design_texture(["patches"], 40.0, FEW, tries=1)
 
 
 def place_mm(gores, direction):
@@ -157,7 +164,7 @@ def test_lengths_of_the_strips_are_true():  # oracle
 
 @pytest.mark.parametrize("filled", [True, False])
 def test_the_printed_strips_show_the_paint_of_the_sphere_at_true_size(filled):
-    gores, texture = Gores(count=6, diameter_mm=30.0), scaled_paint("blobs", 25.0, 1, 256)
+    gores, texture = Gores(count=6, diameter_mm=30.0), patterned_texture("blobs", 25.0, 1, 256)
     figure = gores_figure(texture, gores, filled=filled)
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(254)  # 10 pixels a mm

@@ -41,11 +41,11 @@ def facing(direction_body: Tensor) -> Tensor:
     return torch.stack([east, -torch.linalg.cross(outward, east), -outward], dim=-2)
 
 
-def scaled_paint(kind: str, size_deg: float, seed: int, height: int = 512) -> Tensor:
+def patterned_texture(kind: str, size_deg: float, seed: int, height: int = 512) -> Tensor:
     """Draw a map (height, 2 height) float32, 0 black .. 1 white, with patches of a given size.
 
     Args:
-        kind: of `PAINTS`: blobs (wavy patches), patches (polygons) or dots (round and black on white).
+        kind: of `PATTERNS`: blobs (wavy patches), patches (polygons) or dots (round and black on white).
         size_deg: typical width of a patch, degrees on the sphere.
         seed: the same seed gives the same map.
         height: of the map.
@@ -53,13 +53,15 @@ def scaled_paint(kind: str, size_deg: float, seed: int, height: int = 512) -> Te
     Raises:
         PaintError: an unknown kind, or a size out of range.
     """
-    if kind not in PAINTS:
-        raise PaintError(refusal("kind of paint", expected=" or ".join(PAINTS), got=f"'{kind}'", do="name one of them"))
+    if kind not in PATTERNS:
+        raise PaintError(
+            refusal("kind of texture", expected=" or ".join(PATTERNS), got=f"'{kind}'", do="name one of them")
+        )
     low, high = SIZES_DEG
     if not low <= size_deg <= high:
         expected, do = f"{low:g} .. {high:g} degrees", "choose a size in this range"
         raise PaintError(refusal("size of patches", expected=expected, got=f"{size_deg:g}", do=do))
-    return PAINTS[kind](math.radians(size_deg), height, torch.Generator().manual_seed(seed))
+    return PATTERNS[kind](math.radians(size_deg), height, torch.Generator().manual_seed(seed))
 
 
 def stroke_deg(texture: Tensor) -> float:
@@ -162,7 +164,7 @@ def _apart(points: Tensor) -> Tensor:
     return points
 
 
-PAINTS: dict[str, Callable[[float, int, torch.Generator], Tensor]] = {
+PATTERNS: dict[str, Callable[[float, int, torch.Generator], Tensor]] = {
     "blobs": _blobs,
     "patches": _patches,
     "dots": _dots,
