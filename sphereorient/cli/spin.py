@@ -46,19 +46,19 @@ def spin(
     from sphereorient.tools.spin.inputs import load_ball, load_photographs
     from sphereorient.tools.spin.spin import SpinSettings, spin_of
 
-    paint = load_ball(texture, dot_radius)
+    ball = load_ball(texture, dot_radius)
     loaded, settings = load_photographs(photographs, times), SpinSettings(omega_max_rad_s=omega_max)
     with progress_bar(quiet, unit="photographs") as advance:
-        found = spin_of(loaded, paint, settings, advance)
-        if isinstance(paint, DotTable) and dot_radius is None:
-            paint = paint.measured(found.disks, found.R_view_body)
-            found = spin_of(loaded, paint, settings, lambda stage, *rest: advance(f"{stage}, dots measured", *rest))
+        found = spin_of(loaded, ball, settings, advance)
+        if isinstance(ball, DotTable) and dot_radius is None:
+            ball = ball.measured(found.disks, found.R_view_body)
+            found = spin_of(loaded, ball, settings, lambda stage, *rest: advance(f"{stage}, dots measured", *rest))
     result = _numbers(found, loaded)
-    if isinstance(paint, DotTable):
-        result["dot_radius_deg"] = paint.radius_deg
+    if isinstance(ball, DotTable):
+        result["dot_radius_deg"] = ball.radius_deg
     with put_aside(out) as aside:
         aside.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    drawn = paint.texture() if isinstance(paint, DotTable) else paint
+    drawn = ball.texture() if isinstance(ball, DotTable) else ball
     names = [Path(name).stem for name in loaded.names]
     write_figure(spin_figure(found, drawn, loaded.time_s, names), out.with_suffix(".png"))
     if not quiet:

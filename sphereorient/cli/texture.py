@@ -66,11 +66,11 @@ def design(
     strips = Gores(count=gores, diameter_mm=diameter_mm) if gores is not None and diameter_mm is not None else None
     settings = DesignSettings(diameter_px=diameter_px, noise_share=noise, views=views)
     if map_ is not None:
-        title, painted = map_.name, _loaded(map_)
-        judgement = judge_texture(painted, settings)
+        title, drawn = map_.name, _loaded(map_)
+        judgement = judge_texture(drawn, settings)
     else:
         with progress_bar(quiet or as_json, unit="maps") as advance:
-            painted, judgement, title = design_texture(
+            drawn, judgement, title = design_texture(
                 [name.strip() for name in kinds.split(",") if name.strip()],
                 stroke,
                 settings,
@@ -78,11 +78,11 @@ def design(
                 seed=seed,
                 advance=lambda done, total: advance("search", done, total),
             )
-    files = _written(out, painted, judgement, title, make=map_ is None)
+    files = _written(out, drawn, judgement, title, make=map_ is None)
     if strips is not None:
         from sphereorient.tools.design.gores import write_gores
 
-        files += write_gores(painted, strips, out)
+        files += write_gores(drawn, strips, out)
     if as_json:
         typer.echo(json.dumps({"map": title, **judgement.as_dict()}))
     elif not quiet:
@@ -108,9 +108,9 @@ def _loaded(path: Path) -> Tensor:
     """Read a map, averaged down where it is finer than any picture shows."""
     from sphereorient.sphere import load_texture, reduced_texture
 
-    painted = load_texture(path)
-    height = painted.shape[0]
-    return painted if height <= HEIGHT_MAX else reduced_texture(painted, 2 * HEIGHT_MAX / math.pi)
+    drawn = load_texture(path)
+    height = drawn.shape[0]
+    return drawn if height <= HEIGHT_MAX else reduced_texture(drawn, 2 * HEIGHT_MAX / math.pi)
 
 
 def _written(out: Path, painted: Tensor, judgement: Judgement, title: str, *, make: bool) -> list[Path]:
@@ -129,10 +129,10 @@ def _written(out: Path, painted: Tensor, judgement: Judgement, title: str, *, ma
     with put_aside(files[0]) as aside:
         about = {"map": title, "command": " ".join(["sphereorient", *sys.argv[1:]]), **judgement.as_dict()}
         aside.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-    write_figure(design_figure(painted, judgement, title), files[1])
+    write_figure(design_figure(drawn, judgement, title), files[1])
     if make:
         files.append(out / "texture.png")
-        write_texture(painted, files[-1])
+        write_texture(drawn, files[-1])
     return files
 
 

@@ -134,7 +134,7 @@ def normalised_disks(
         flat = usual + (flat - usual) * part
     rough = fine(flat) - wide(flat)
     whole = (rough.square() * share).sum((1, 2), keepdim=True) / share.sum()
-    # Half of the disk's deviation is added: where the paint is uniform the local one would only amplify noise.
+    # Half of the disk's deviation is added: where the texture is uniform the local one would amplify noise.
     local = (wide(rough.square()) + 0.25 * whole).sqrt().clamp_min(1e-12)
     even = (rough / local).clamp(-3.0, 3.0) * seen.reshape(-1, 1, 1)
     return Disks(
