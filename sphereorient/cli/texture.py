@@ -113,7 +113,7 @@ def _loaded(path: Path) -> Tensor:
     return drawn if height <= HEIGHT_MAX else reduced_texture(drawn, 2 * HEIGHT_MAX / math.pi)
 
 
-def _written(out: Path, painted: Tensor, judgement: Judgement, title: str, *, make: bool) -> list[Path]:
+def _written(out: Path, drawn: Tensor, judgement: Judgement, title: str, *, make: bool) -> list[Path]:
     """Write judgement and figure, and the map where it was made; return the files."""
     from sphereorient.files.outputs import put_aside
     from sphereorient.report.map_figure import write_figure
