@@ -102,7 +102,15 @@ def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, sett
         PaintError: no two keyframes show the same patch.
     """
     first, second = _candidates(disks, R_lab_body, settings)
-    found = _compared(disks, R_lab_body, first, second, settings)
+    about = R_lab_body[second] @ R_lab_body[first].mT
+    reach = math.radians(settings.loop_reach_deg)
+    if reach >= math.pi:
+        grid = so3.lattman_grid(math.radians(SEARCH_STEP_DEG + 4))
+    else:
+        grid = so3.local_grid(math.radians(SEARCH_STEP_DEG), reach)
+    if len(first):
+        about = search_pairs(reduced(disks, SMALLER), first, second, about, grid, SEARCH_EVERY)
+    found = refine_pairs(disks, first, second, about, ITERATIONS, EVERY)
     good = found.where((found.score > settings.score_min) & (found.overlap > OVERLAP_MIN))
     if len(first) and not len(good):
         got = f"none among {len(first)} pairs of frames"
@@ -124,20 +132,6 @@ def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, sett
             moved_rad=attitude_change_rad(R_lab_body, R),
         ),
     )
-
-
-def _compared(
-    disks: Disks, R_lab_body: Tensor, first: Tensor, second: Tensor, settings: MapSettings
-) -> RelativeRotations:
-    about = R_lab_body[second] @ R_lab_body[first].mT
-    reach = math.radians(settings.loop_reach_deg)
-    if reach >= math.pi:
-        grid = so3.lattman_grid(math.radians(SEARCH_STEP_DEG + 4))
-    else:
-        grid = so3.local_grid(math.radians(SEARCH_STEP_DEG), reach)
-    if len(first):
-        about = search_pairs(reduced(disks, SMALLER), first, second, about, grid, SEARCH_EVERY)
-    return refine_pairs(disks, first, second, about, ITERATIONS, EVERY)
 
 
 def _keyframes(R_lab_body: Tensor, step_rad: float) -> Tensor:

@@ -48,7 +48,6 @@ LONGEST_RAD = 0.05  # joint step
 BLACK, WHITE = 0.03, 0.97  # shares of the sphere that count as black and white
 BEYOND = 0.2  # by how much the map may leave 0 .. 1 on the way
 NOISE_EVERY = 4  # pixels from which the noise is estimated
-POSE_ITERATIONS = 2  # of each pose by itself with the final map
 HELD = 1e12  # 1/mm^2, precision of a position that must not move
 OUTLIER2 = 25.0  # squared residuals over the noise expected are cut off here
 
@@ -164,41 +163,27 @@ def optics_of(blurred: Tensor, views: Sequence[CameraView], blur_px: float) -> O
     return Optics(map_table(blurred, 2 * blur_px / widest), blur_px, widest)
 
 
-def fitted(state: State, iterations: int) -> tuple[State, Fit]:
-    """Fit each instant's pose to the present map."""
-    fitter = state.map_fitter()
-    fine = fitter.optics.fine
-    parts = [
-        fitter.fit(pixels, state.position_lab_mm[rows], state.R_lab_body[rows], state.use[rows], fine, iterations)
-        for rows, pixels in state.batches()
-    ]
-    fit = _whole_fit(parts)
-    X = fit.position_lab_mm
-    X = X.median(0).values.expand(len(X), 3).clone() if state.fixed else X
-    return replace(state, position_lab_mm=X, R_lab_body=fit.R_lab_body), fit
+def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[State, Fit]:
+    """Fit each instant's pose to the present map.
 
-
-def _whole_fit(parts: Sequence[Fit]) -> Fit:
-    return Fit(**{name: torch.cat([getattr(part, name) for part in parts]) for name in Fit.__dataclass_fields__})
-
-
-def finally_fitted(crops: Crops, state: State) -> tuple[State, Fit]:
-    """Fit each instant's pose to the final map by all pixels: the map needs a part of them, a pose all.
-
-    A position that all instants share is not moved.
+    With crops all their pixels are used: the map needs a part of them, a final pose all. A position that all instants
+    share is not moved then.
     """
     fitter = state.map_fitter()
     fine = fitter.optics.fine
-    held = HELD * torch.eye(3, dtype=torch.float64) if state.fixed else None
+    held = HELD * torch.eye(3, dtype=torch.float64) if state.fixed and crops is not None else None
     parts = []
-    for rows, _ in state.batches():
+    for rows, pixels in state.batches():
         X, R, use = state.position_lab_mm[rows], state.R_lab_body[rows], state.use[rows]
-        pictures = crops.pictures(state.frames[rows])
+        if crops is not None:
+            pixels = fitter.pixels(crops.pictures(state.frames[rows]), X, fine)
         precision = None if held is None else held.expand(len(rows), 3, 3)
-        parts.append(fitter.fit(fitter.pixels(pictures, X, fine), X, R, use, fine, POSE_ITERATIONS, precision))
-    fit = _whole_fit(parts)
-    X = state.position_lab_mm if state.fixed else fit.position_lab_mm
-    return replace(state, position_lab_mm=X, R_lab_body=so3.nearest_rotation(fit.R_lab_body)), fit
+        parts.append(fitter.fit(pixels, X, R, use, fine, iterations, precision))
+    fit = Fit(**{name: torch.cat([getattr(part, name) for part in parts]) for name in Fit.__dataclass_fields__})
+    X = fit.position_lab_mm
+    if state.fixed:
+        X = state.position_lab_mm if crops is not None else X.median(0).values.expand(len(X), 3).clone()
+    return replace(state, position_lab_mm=X, R_lab_body=fit.R_lab_body), fit
 
 
 def _with_light(state: State) -> State:
