@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -32,7 +33,7 @@ MM = 1 / 25.4  # inches
 MARGIN_MM = 12.0  # of the sheet, for the printer and the line below
 RULE_MM = (10.0, 50.0)  # lengths of the line to check the scale by, for small and for large balls
 CUT = "#C000C0"
-FOLD = {"color": "#00A0A0", "linewidth": 0.3, "linestyle": (0, (6, 4))}
+FOLD: dict[str, Any] = {"color": "#00A0A0", "linewidth": 0.3, "linestyle": (0, (6, 4))}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -127,7 +127,9 @@ def _searched(
     disks: Tensor, time_s: Tensor, texture: Tensor | DotTable, settings: SpinSettings, progress: Progress, stage: str
 ) -> tuple[Proposals, PictureCandidates]:
     """Search each disk alone."""
-    search: Proposer = (DotSearch if isinstance(texture, DotTable) else GreySearch)(texture, settings.search)
+    search: Proposer = (
+        DotSearch(texture, settings.search) if isinstance(texture, DotTable) else GreySearch(texture, settings.search)
+    )
     parts = []
     for some in torch.split(torch.arange(len(disks)), AT_ONCE):
         progress(stage, int(some[0]), len(disks))
