@@ -32,7 +32,7 @@ from sphereorient.synth import SynthSettings, make_scene, random_texture, render
 from sphereorient.synth.write import default_cameras
 
 LIGHTS = {"even": 1.0, "lamps": 0.5, "one side dark": 0.05}  # share that comes evenly from everywhere
-PAINTS = {"blobs": 1, "patches": 2, "dots": 3}
+PATTERNS = {"blobs": 1, "patches": 2, "dots": 3}
 NOISE = 0.05
 RIGHT_DEG = 3.0
 CENTRE_PX, RADIUS_SHARE = 0.5, 0.01  # errors planted
@@ -61,7 +61,7 @@ def speed() -> None:
 
 
 def speed_at(size_px: int, rendered: list[Sample]) -> None:
-    texture = random_texture("blobs", PAINTS["blobs"])
+    texture = random_texture("blobs", PATTERNS["blobs"])
     start = time.process_time()
     search = GreySearch(texture, GreySearchSettings(size_px=size_px))
     built = time.process_time() - start
@@ -86,8 +86,8 @@ def accuracy(attitudes: int) -> None:
     settings = GreySearchSettings()
     print(f"\n| paint, light | disks | best proposal within {RIGHT_DEG:g}° | none | p50 / p95 / max (°) | score |")
     print("|---|---|---|---|---|---|")
-    for paint in PAINTS:
-        search = GreySearch(random_texture(paint, PAINTS[paint]), settings)
+    for paint in PATTERNS:
+        search = GreySearch(random_texture(paint, PATTERNS[paint]), settings)
         for light, ambient in LIGHTS.items():
             rendered = frames(paint, ambient, attitudes)
             disks = torch.cat([cropped(settings.size_px, *one) for one in rendered])
@@ -136,7 +136,7 @@ def frames(paint: str, ambient: float, count: int) -> list[Sample]:
 
 
 def _frames(paint: str, settings: SynthSettings, count: int) -> Iterator[Sample]:
-    scene = make_scene(random_texture(paint, PAINTS[paint]), settings)
+    scene = make_scene(random_texture(paint, PATTERNS[paint]), settings)
     camera = default_cameras(settings)["cam1"]
     rng, generator = np.random.default_rng(7), torch.Generator().manual_seed(7)
     position = torch.zeros(1, 3, dtype=torch.float64)

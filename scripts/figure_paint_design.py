@@ -18,11 +18,10 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from sphereorient.report.plots.style import COMPONENTS, WIDTH_IN, in_style, new_figure
+from sphereorient.report.plots.style import COMPONENTS, WIDTH_IN, in_style, new_figure, write_figure
 from sphereorient.sphere import orthographic_view
-from sphereorient.tools.design.figure import write_design
-from sphereorient.tools.design.judge import DesignSettings, Judgement, judge_paint
-from sphereorient.tools.design.paint import PAINTS, facing, scaled_paint
+from sphereorient.tools.design.judge import DesignSettings, Judgement, judge_texture
+from sphereorient.tools.design.patterns import PATTERNS, facing, patterned_texture
 
 REPO = Path(__file__).resolve().parents[1]
 SIZES_DEG = (6.0, 9.0, 14.0, 22.0, 34.0, 50.0)
@@ -52,26 +51,26 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=REPO / "docs" / "paint-design.png")
     out = parser.parse_args().out
     torch.set_num_threads(1)
-    rows = [judged(kind, size) for kind in PAINTS for size in SIZES_DEG]
+    rows = [judged(kind, size) for kind in PATTERNS for size in SIZES_DEG]
     print("| paint | patches, degrees | brush | borders, radii | bound, degrees: rms (worst view) | most alike views |")
     print("|---|---|---|---|---|---|")
     for row in rows:
         rms, worst = row.bound_deg
         line = f"{row.kind} | {row.size_deg:g} | {row.judged.stroke_deg:.0f} | {row.judged.border:.0f}"
         print(f"| {line} | {rms:.3f} ({worst:.3f}) | {row.judged.alike:.2f} |")
-    for kind in PAINTS:
+    for kind in PATTERNS:
         own = [row for row in rows if row.kind == kind]
         slope = np.polyfit(
             [math.log(row.judged.border) for row in own], [math.log(row.bound_deg[0]) for row in own], 1
         )[0]
         gain = 1 - own[0].bound_deg[0] / own[-1].bound_deg[0]
         print(f"{kind}: bound ~ border length^{slope:.2f}; {100 * gain:.0f} % less from the coarsest to the finest")
-    write_design(figure(rows), out)
+    write_figure(figure(rows), out)
 
 
 def judged(kind: str, size_deg: float) -> Row:
-    texture = scaled_paint(kind, size_deg, SEED, HEIGHT)
-    return Row(kind, size_deg, texture, judge_paint(texture, SETTINGS))
+    texture = patterned_texture(kind, size_deg, SEED, HEIGHT)
+    return Row(kind, size_deg, texture, judge_texture(texture, SETTINGS))
 
 
 @in_style
@@ -81,7 +80,7 @@ def figure(rows: list[Row]) -> Figure:
     above, below = drawn.subfigures(2, 1, height_ratios=[0.7, 1.3])
     balls(above, [row for row in rows if row.size_deg in SHOWN_DEG])
     left, right = below.subplots(1, 2)
-    for look, kind in zip(COMPONENTS, PAINTS, strict=True):
+    for look, kind in zip(COMPONENTS, PATTERNS, strict=True):
         own = [row for row in rows if row.kind == kind]
         border = [row.judged.border for row in own]
         style: dict[str, Any] = {**look.drawn, "marker": look.marker, "label": kind}

@@ -21,11 +21,11 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.mapping.compare import turned_map
+from sphereorient.mapping.grid import texel_areas
 from sphereorient.report.map_files import write_texture
 from sphereorient.sphere import sample_texture
 from sphereorient.synth import random_texture
 from sphereorient.synth.textures import map_directions
-from sphereorient.tools.wear.series import texel_areas
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 HEIGHT = 256
@@ -47,7 +47,7 @@ def main() -> None:
             write_texture(learnt(k), path)
         command = [sys.executable, "-m", "sphereorient.cli", "compare-maps", "--series", *map(str, paths)]
         subprocess.run([*command, "--out", str(options.out)], check=True)
-    area = texel_areas(HEIGHT)
+    area = texel_areas(HEIGHT) / (4 * math.pi)
     for k in range(1, len(RADII_DEG)):
         print(f"planted in movie {k + 1}: {100 * float(area[worn(k) & (paint() < 0.5)].sum()):.1f} %")
 

@@ -32,9 +32,9 @@ from sphereorient import so3
 from sphereorient.cameras import save_cameras
 from sphereorient.errors import PaintError
 from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.mapping import take_footage
+from sphereorient.mapping import take_crops
 from sphereorient.mapping.compare import compare_maps
-from sphereorient.mapping.cut import disks_of
+from sphereorient.mapping.disks import disks_of
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.methods.settings import Settings
 from sphereorient.pose.fitter import widest_px
@@ -169,10 +169,10 @@ def paired(experiment: Path) -> Solved:
         R = torch.full(file["orientation"].shape, torch.nan, dtype=torch.float64)
     try:
         with open_recording(experiment, textured=False) as recording:
-            footage = take_footage(recording, paint, settings.locate, silent)
-        frames = torch.nonzero(footage.seen.any(1))[:, 0]
-        finer = finer_settings(paint, widest_px(footage.views))
-        chain = find_photographs(disks_of(footage, frames, paint), disks_of(footage, frames, finer), paint)
+            crops = take_crops(recording, paint, settings.locate, silent)
+        frames = torch.nonzero(crops.seen.any(1))[:, 0]
+        finer = finer_settings(paint, widest_px(crops.views))
+        chain = find_photographs(disks_of(crops, frames, paint), disks_of(crops, frames, finer), paint)
         R[frames[chain.rows]] = chain.R_lab_body
     except PaintError as error:
         print(f"refused: {error}", file=sys.stderr)

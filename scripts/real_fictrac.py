@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.mapping import LearntMap, learn_from, take_footage
+from sphereorient.mapping import LearntMap, fit_map, take_crops
 from sphereorient.mapping.chain import find_chain
-from sphereorient.mapping.cut import disks_of
+from sphereorient.mapping.disks import disks_of
 from sphereorient.methods.results import map_track
 from sphereorient.methods.settings import Settings, load_settings
 from sphereorient.report.map_figure import compare_pictures, map_figure
@@ -177,14 +177,14 @@ def learnt_from(path: Path, settings: Settings) -> tuple[LearntMap, torch.Tensor
     begun = time.perf_counter()
     cpu = time.process_time()
     with open_recording(path, textured=False) as recording:
-        footage = take_footage(recording, settings.paint, settings.locate, silent)
-        learnt = learn_from(footage, settings.paint, silent)
+        crops = take_crops(recording, settings.paint, settings.locate, silent)
+        learnt = fit_map(crops, settings.paint, silent)
         seconds, busy = time.perf_counter() - begun, time.process_time() - cpu
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        print(f"map learnt in {seconds:.0f} s ({busy / len(footage):.2f} CPU s a frame), memory {memory:.2f} GB")
-        frames = torch.nonzero(footage.seen.any(1))[:, 0]
+        print(f"map learnt in {seconds:.0f} s ({busy / len(crops):.2f} CPU s a frame), memory {memory:.2f} GB")
+        frames = torch.nonzero(crops.seen.any(1))[:, 0]
         open_chain = find_chain(
-            disks_of(footage, frames, settings.paint), settings.paint.model_copy(update={"loop_pairs": 1})
+            disks_of(crops, frames, settings.paint), settings.paint.model_copy(update={"loop_pairs": 1})
         )
         track = map_track(recording.experiment, recording.clock, learnt, "", {})
     return learnt, open_chain.R_lab_body, track

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import SphereOrientError
+from sphereorient.tools.spin.disks import Photographs
 from sphereorient.tools.spin.dots import DotTable
 from sphereorient.tools.spin.spin import SpinFound, spin_of
 
@@ -58,9 +59,10 @@ def measure(folder: Path) -> None:
     reference = torch.from_numpy(Rotation.from_quat(quat).as_matrix())
     table = DotTable(direction_body=torch.from_numpy(np.loadtxt(folder / "ref_pattern.csv", delimiter=",")))
     begin = time.process_time()
-    first = spin_of(pictures, time_s, table)
+    photographs = Photographs(pictures=pictures, time_s=time_s)
+    first = spin_of(photographs, table)
     table = table.measured(first.disks, first.R_view_body)
-    found = spin_of(pictures, time_s, table)
+    found = spin_of(photographs, table)
     spent = time.process_time() - begin
     print(f"{len(pictures)} photographs, dots' radius {table.radius_deg:.1f} degrees (blur and motion in it)")
     alone = degrees(found.alone.R_view_body[found.alone.offset[:-1]], reference)

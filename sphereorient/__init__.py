@@ -6,17 +6,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sphereorient.experiment import Experiment, load_experiment
+    from sphereorient.methods.map import learn_map
     from sphereorient.methods.settings import Settings, load_settings
     from sphereorient.run.stages import track_movies
     from sphereorient.trajectory import Trajectory
 
 __version__ = "0.1.0"
-__all__ = ["Experiment", "Settings", "Trajectory", "load_experiment", "load_settings", "track_movies"]
+__all__ = ["Experiment", "Settings", "Trajectory", "learn_map", "load_experiment", "load_settings", "track_movies"]
 
 _HOMES = {
     "Experiment": "experiment",
     "Settings": "methods.settings",
     "Trajectory": "trajectory",
+    "learn_map": "methods.map",
     "load_experiment": "experiment",
     "load_settings": "methods.settings",
     "track_movies": "run.stages",

@@ -5,61 +5,30 @@ from __future__ import annotations
 import math
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import Advance, ExperimentPath, app, camera_names, check_writable, progress_bar
+from sphereorient.cli.app import ExperimentPath, app, camera_names, check_writable, progress_bar
 from sphereorient.cli.compare_maps import print_moved
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from sphereorient.experiment import Experiment
     from sphereorient.mapping import LearntMap
-    from sphereorient.mapping.correct import Correction
-    from sphereorient.methods.settings import Settings
+    from sphereorient.methods.map import MapResult
     from sphereorient.report.map_figure import MapExample
-    from sphereorient.trajectory import Trajectory
 
-OFTEN = 10  # pictures from which on a place counts as well seen
-
-
-@dataclass(frozen=True, kw_only=True)
-class MapPaths:
-    """The files that `map` writes, all beside the map; made by `beside`."""
-
-    texture: Path
-    seen: Path
-    learnt: Path
-    figure: Path
-    moved: Path
-
-    @classmethod
-    def beside(cls, texture: Path) -> MapPaths:
-        """Return the names that go with a map's."""
-        stem = texture.with_suffix("")
-        return cls(
-            texture=texture,
-            seen=texture.with_name(f"{stem.name}_seen.png"),
-            learnt=texture.with_name(f"{stem.name}_map.h5"),
-            figure=texture.with_name(f"{stem.name}_map.png"),
-            moved=texture.with_name(f"{stem.name}_moved.png"),
-        )
-
-    def written(self, moved: bool) -> list[Path]:
-        """Return the files that there are, `moved` where an old map was corrected."""
-        return [self.texture, self.seen, self.learnt, self.figure, *([self.moved] if moved else [])]
+OFTEN = 10  # pictures from which on a texel counts as well seen
 
 
 @app.command("map")
 def map_(
     experiment: ExperimentPath,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write, .png; its other files go beside it.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Texture map to write, .png; its other files go beside it.")],
     init: Annotated[
-        Path | None, typer.Option(help="An old map: gives the body frame, and the paint of what is never seen.")
+        Path | None, typer.Option(help="An old map: gives the body frame, and the texture of what is never seen.")
     ] = None,
     cameras: Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")] = None,
     photographs: Annotated[
@@ -71,94 +40,62 @@ def map_(
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
 ) -> None:
-    """Learn the map of a ball's paint, and all attitudes, from movies in which it turns: no map needed."""
+    """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed."""
     from sphereorient.report.map_files import check_picture_name
 
     check_picture_name(out)
     check_writable(out)
+    from sphereorient.methods.map import learn_map
+    from sphereorient.methods.method import one_thread
     from sphereorient.methods.settings import load_settings
     from sphereorient.sphere import load_texture
 
     overrides = [*(set_ or []), *(["paint.unordered=true"] if photographs else [])]
     chosen, begun = load_settings(settings, overrides), time.perf_counter()
     old = None if init is None else load_texture(init)
-    paths = MapPaths.beside(out)
+    command = " ".join(["sphereorient", *sys.argv[1:]])
     with progress_bar(quiet) as advance:
-        made = _learn(experiment, camera_names(cameras), chosen, old, advance)
+        with one_thread():
+            result = learn_map(
+                experiment, chosen, init=old, cameras=camera_names(cameras), progress=advance, command=command
+            )
         advance("figure", 0, 1)
-        compared = _write(made, old, paths)
+        files, compared = _write(result, old, out)
         advance("figure", 1, 1)
     if quiet:
         return
-    for remark in made.remarks:
+    for remark in result.remarks:
         typer.echo(f"note: {remark}")
-    _print(made.learnt, compared)
-    if made.correction is not None:
-        print_moved(made.correction.comparison, f"against {init}")
-        typer.echo(f"kept of the old map, never seen here: {100 * made.correction.kept_share:.0f} % of the sphere")
+    _print(result.learnt, compared)
+    if result.comparison is not None:
+        print_moved(result.comparison, f"against {init}")
+        typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
     typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
-    typer.echo("Wrote " + ", ".join(str(file) for file in paths.written(init is not None)))
-    if made.experiment.texture_path != paths.texture:
+    typer.echo("Wrote " + ", ".join(str(file) for file in files))
+    if result.experiment.texture_path != out:
         typer.echo(f"next: write texture: {out.name} under sphere: in the experiment, then `sphereorient track`")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Made:
-    """What was learnt; made by `_learn`, written and printed by the command."""
-
-    experiment: Experiment
-    learnt: LearntMap
-    correction: Correction | None  # of an old map, where one was given
-    track: Trajectory
-    remarks: tuple[str, ...]
-
-
-def _learn(path: Path, names: list[str] | None, settings: Settings, old: Tensor | None, advance: Advance) -> Made:
-    """Learn a map, and bring it into an old one's frame where there is one."""
-    from sphereorient.experiment import input_files
-    from sphereorient.experiment.recording import open_recording
-    from sphereorient.files.provenance import provenance
-    from sphereorient.mapping import learn_map
-    from sphereorient.mapping.correct import corrected
-    from sphereorient.methods.results import map_track
-    from sphereorient.methods.settings import settings_yaml
-    from sphereorient.run.stages import one_thread
-
-    with open_recording(path, names, textured=False) as recording, one_thread():
-        learnt = learn_map(recording, settings.paint, settings.locate, advance)
-        correction = None if old is None else corrected(learnt, old)
-        learnt = learnt if correction is None else correction.learnt
-        command = " ".join(["sphereorient", *sys.argv[1:]])
-        origin = provenance(
-            input_files(recording.experiment, list(recording.cameras)), recording.experiment.folder, command
-        )
-        track = map_track(recording.experiment, recording.clock, learnt, settings_yaml(settings), origin)
-        return Made(
-            experiment=recording.experiment,
-            learnt=learnt,
-            correction=correction,
-            track=track,
-            remarks=recording.remarks,
-        )
-
-
-def _write(made: Made, old: Tensor | None, paths: MapPaths) -> list[MapExample]:
-    """Write all files; return how well re-rendered pictures match."""
+def _write(result: MapResult, old: Tensor | None, out: Path) -> tuple[list[Path], list[MapExample]]:
+    """Write all files beside the map; return them, and how well re-rendered pictures match."""
     from sphereorient.report import map_figure, map_files
     from sphereorient.report.plots.style import write_figure
 
-    map_files.write_texture(made.learnt.texture, paths.texture)
-    map_files.write_seen(made.learnt.seen, paths.seen)
-    map_files.write_learnt(made.learnt, made.track, paths.learnt)
-    compared = map_figure.compare_pictures(made.track, made.experiment, paths.texture)
-    write_figure(map_figure.map_figure(made.learnt, compared), paths.figure)
-    if made.correction is not None and old is not None:
-        write_figure(map_figure.moved_figure(old, made.correction.comparison), paths.moved)
-    return compared
+    endings = ("_seen.png", "_map.h5", "_map.png", "_moved.png")
+    seen, learnt, figure, moved = (out.with_name(out.stem + ending) for ending in endings)
+    map_files.write_texture(result.texture, out)
+    map_files.write_seen(result.seen, seen)
+    map_files.write_learnt(result.learnt, result.track, learnt)
+    compared = map_figure.compare_pictures(result.track, result.experiment, out)
+    write_figure(map_figure.map_figure(result.learnt, compared), figure)
+    if result.comparison is None or old is None:
+        return [out, seen, learnt, figure], compared
+    write_figure(map_figure.moved_figure(old, result.comparison), moved)
+    return [out, seen, learnt, figure, moved], compared
 
 
 def _print(learnt: LearntMap, compared: list[MapExample]) -> None:
-    """Say what was learnt from what, and whether to believe it."""
+    """Print from what the map was learnt, and how well it explains the pictures."""
     import numpy as np
 
     from sphereorient.report.map_files import shares_seen
@@ -172,12 +109,12 @@ def _print(learnt: LearntMap, compared: list[MapExample]) -> None:
         f"seen: {100 * seen:.1f} % of the sphere, {100 * often:.1f} % of it in {OFTEN} pictures or more",
         f"frames: {len(learnt.valid)}, with the ball {int(learnt.valid.sum())}, fitted {int(learnt.fitted.sum())}",
         f"loops: {closure.closed} of {closure.loops} closed; {drift}",
-        f"rounds: {len(learnt.rounds)}, the last moved attitudes by {math.degrees(last.moved_rad):.4f}° ({state})",
+        f"iterations: {len(learnt.rounds)}, the last moved attitudes by {math.degrees(last.moved_rad):.4f}° ({state})",
     ]
     alone = ~learnt.valid & learnt.position_lab_mm[:, 0].isfinite()  # of photographs
     if alone.any():
         named = ", ".join(str(k) for k in alone.nonzero()[:, 0].tolist())
-        lines.append(f"without an attitude, sharing too little paint with the others: frames {named}")
+        lines.append(f"without an attitude, because they share too little with the others: frames {named}")
     alike = np.array([example.correlation for example in compared])
     if np.isfinite(alike).any():
         middle, low = np.nanmedian(alike), np.nanpercentile(alike, 5)

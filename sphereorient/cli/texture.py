@@ -1,4 +1,4 @@
-"""`sphereorient texture`: what to paint on a ball."""
+"""`sphereorient texture`: design of a ball's texture."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ if TYPE_CHECKING:
     from sphereorient.tools.design.judge import Judgement
 
 SPREAD = ("min", "median", "max")
-HEIGHT_MAX = 1024  # of a map that is judged: finer than any ball is seen
+HEIGHT_MAX = 1024  # of a map that is judged: finer than any picture shows
 
-texture_app = typer.Typer(
-    help="Judge, make and print the paint of a ball (docs/paint-design.md).", no_args_is_help=True
-)
+texture_app = typer.Typer(help="Judge, make and print a texture map (docs/paint-design.md).", no_args_is_help=True)
 app.add_typer(texture_app, name="texture")
 
 
 @texture_app.callback()
 def texture() -> None:
-    """Judge, make and print the paint of a ball (docs/paint-design.md)."""
+    """Judge, make and print a texture map (docs/paint-design.md)."""
 
 
 @texture_app.command()
@@ -43,19 +41,19 @@ def design(
     make: Annotated[
         bool, typer.Option("--make", help="Search for a map that is easy to paint and hard to confuse.")
     ] = False,
-    kinds: Annotated[str, typer.Option(help="With --make: kinds of paint to try.")] = "blobs,patches,dots",
+    kinds: Annotated[str, typer.Option(help="With --make: kinds of texture to try.")] = "blobs,patches,dots",
     stroke: Annotated[
-        float, typer.Option(min=2, max=40, help="With --make: least width of brush, degrees on the ball.")
+        float, typer.Option(min=2, max=40, help="With --make: least width of the brush, degrees on the ball.")
     ] = 10.0,
-    tries: Annotated[int, typer.Option(min=1, max=1000, help="With --make: paints of each kind.")] = 24,
-    seed: Annotated[int, typer.Option(help="With --make: the same seed, the same map.")] = 0,
-    diameter_px: Annotated[float, typer.Option(min=12, max=400, help="Of the ball in the pictures, px.")] = 80.0,
+    tries: Annotated[int, typer.Option(min=1, max=1000, help="With --make: maps of each kind.")] = 24,
+    seed: Annotated[int, typer.Option(help="With --make: the same seed gives the same map.")] = 0,
+    diameter_px: Annotated[float, typer.Option(min=12, max=400, help="Diameter of the ball's picture, px.")] = 80.0,
     noise: Annotated[
         float, typer.Option(min=0.001, max=1, help="Noise of a pixel over the step from black to white.")
     ] = 0.05,
     views: Annotated[int, typer.Option(min=12, max=2000, help="Views that are judged.")] = 96,
-    gores: Annotated[int | None, typer.Option(help="Print on so many strips, e.g. 12; wants --diameter-mm.")] = None,
-    diameter_mm: Annotated[float | None, typer.Option(help="Of the ball, mm.")] = None,
+    gores: Annotated[int | None, typer.Option(help="Print so many strips, e.g. 12; needs --diameter-mm.")] = None,
+    diameter_mm: Annotated[float | None, typer.Option(help="Diameter of the ball, mm.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the judgement as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")] = False,
 ) -> None:
@@ -63,16 +61,16 @@ def design(
     _check(map_, make, gores, diameter_mm, stroke, diameter_px, noise, 0.0 if diameter_mm is None else diameter_mm)
     check_writable(out)
     from sphereorient.tools.design.gores import Gores
-    from sphereorient.tools.design.judge import DesignSettings, judge_paint, make_paint
+    from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture
 
     strips = Gores(count=gores, diameter_mm=diameter_mm) if gores is not None and diameter_mm is not None else None
     settings = DesignSettings(diameter_px=diameter_px, noise_share=noise, views=views)
     if map_ is not None:
-        title, painted = map_.name, _loaded(map_)
-        judgement = judge_paint(painted, settings)
+        title, drawn = map_.name, _loaded(map_)
+        judgement = judge_texture(drawn, settings)
     else:
-        with progress_bar(quiet or as_json, unit="paints") as advance:
-            painted, judgement, title = make_paint(
+        with progress_bar(quiet or as_json, unit="maps") as advance:
+            drawn, judgement, title = design_texture(
                 [name.strip() for name in kinds.split(",") if name.strip()],
                 stroke,
                 settings,
@@ -80,11 +78,11 @@ def design(
                 seed=seed,
                 advance=lambda done, total: advance("search", done, total),
             )
-    files = _written(out, painted, judgement, title, make=map_ is None)
+    files = _written(out, drawn, judgement, title, make=map_ is None)
     if strips is not None:
-        from sphereorient.tools.design.figure import write_gores
+        from sphereorient.tools.design.gores import write_gores
 
-        files += write_gores(painted, strips, out)
+        files += write_gores(drawn, strips, out)
     if as_json:
         typer.echo(json.dumps({"map": title, **judgement.as_dict()}))
     elif not quiet:
@@ -93,7 +91,7 @@ def design(
 
 
 def _check(map_: Path | None, make: bool, gores: int | None, diameter_mm: float | None, *numbers: float) -> None:
-    """Refuse options that contradict each other, and numbers that are none."""
+    """Refuse options that contradict each other, nan and infinity."""
     if make == (map_ is not None):
         got, do = ("both", "leave one of them away") if make else ("neither", "name a map, or say --make")
         raise TextureError(refusal("texture design", expected="a map to judge or --make", got=got, do=do))
@@ -107,18 +105,20 @@ def _check(map_: Path | None, make: bool, gores: int | None, diameter_mm: float 
 
 
 def _loaded(path: Path) -> Tensor:
-    """The map, averaged down where it is finer than any ball is seen."""
+    """Read a map, averaged down where it is finer than any picture shows."""
     from sphereorient.sphere import load_texture, reduced_texture
 
-    painted = load_texture(path)
-    height = painted.shape[0]
-    return painted if height <= HEIGHT_MAX else reduced_texture(painted, 2 * HEIGHT_MAX / math.pi)
+    drawn = load_texture(path)
+    height = drawn.shape[0]
+    return drawn if height <= HEIGHT_MAX else reduced_texture(drawn, 2 * HEIGHT_MAX / math.pi)
 
 
-def _written(out: Path, painted: Tensor, judgement: Judgement, title: str, *, make: bool) -> list[Path]:
-    """Write judgement and picture, and the map where it was made; the files."""
+def _written(out: Path, drawn: Tensor, judgement: Judgement, title: str, *, make: bool) -> list[Path]:
+    """Write judgement and figure, and the map where it was made; return the files."""
     from sphereorient.files.outputs import put_aside
-    from sphereorient.tools.design.figure import design_figure, write_design
+    from sphereorient.report.map_files import write_texture
+    from sphereorient.report.plots.style import write_figure
+    from sphereorient.tools.design.figure import design_figure
 
     try:
         out.mkdir(exist_ok=True)
@@ -129,15 +129,10 @@ def _written(out: Path, painted: Tensor, judgement: Judgement, title: str, *, ma
     with put_aside(files[0]) as aside:
         about = {"map": title, "command": " ".join(["sphereorient", *sys.argv[1:]]), **judgement.as_dict()}
         aside.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-    write_design(design_figure(painted, judgement, title), files[1])
+    write_figure(design_figure(drawn, judgement, title), files[1])
     if make:
-        import cv2
-
         files.append(out / "texture.png")
-        with put_aside(files[-1]) as aside:
-            grey = (255 * painted).round().clamp(0, 255).byte().numpy()
-            if not cv2.imwrite(str(aside), grey):
-                raise OSError("the picture could not be written")
+        write_texture(drawn, files[-1])
     return files
 
 
@@ -157,10 +152,10 @@ def _print(judgement: Judgement, title: str) -> None:
     settings = judgement.settings
     lines = [
         f"(ball of {settings.diameter_px:g} px, noise {100 * settings.noise_share:g} % of black to white, "
-        f"{settings.views} views, place of the ball unknown)",
+        f"{settings.views} views, position of the ball unknown)",
         f"worst view: {_place(told['worst_view_lon_lat_deg'])}; best: {_place(told['best_view_lon_lat_deg'])}",
-        f"most alike views, {told['most_alike_apart_deg']:.0f} degrees apart: similarity {judgement.alike:.2f}, margin "
-        f"{judgement.margin:.2f}: {' and '.join(_place(each) for each in told['most_alike_lon_lat_deg'])}",
+        f"most similar views, {told['most_alike_apart_deg']:.0f} degrees apart: similarity {judgement.alike:.2f}, "
+        f"margin {judgement.margin:.2f}: {' and '.join(_place(each) for each in told['most_alike_lon_lat_deg'])}",
         f"widest brush that paints it: {judgement.stroke_deg:.0f} degrees; borders {judgement.border:.1f} radii long",
     ]
     for line in lines:
@@ -168,7 +163,7 @@ def _print(judgement: Judgement, title: str) -> None:
 
 
 def _number(value: float | None, times: float, digits: int) -> str:
-    return "open" if value is None else f"{times * value:.{digits}f}"
+    return "undetermined" if value is None else f"{times * value:.{digits}f}"
 
 
 def _place(lon_lat_deg: list[float]) -> str:

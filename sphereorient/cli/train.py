@@ -38,6 +38,7 @@ def train(
     from sphereorient.learn.benchmark import make_examples
     from sphereorient.learn.train import CHECKPOINT, prepare, train_proposer
     from sphereorient.report.learning import examples_figure, learning_curve_figure
+    from sphereorient.report.plots.style import write_figure
 
     prepare(settings, out, resume)
     with put_aside(out / "settings.yaml") as aside:

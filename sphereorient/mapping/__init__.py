@@ -1,14 +1,8 @@
 """The texture map from movies or photographs: relative rotations, loops, then attitudes, light and map together."""
 
-from sphereorient.mapping.footage import take_footage
-from sphereorient.mapping.learn import learn_from, learn_map
+from sphereorient.mapping.crops import take_crops
+from sphereorient.mapping.learn import fit_map
 from sphereorient.mapping.record import LearntMap
-from sphereorient.mapping.settings import PaintSettings
+from sphereorient.mapping.settings import MapSettings
 
-__all__ = [
-    "LearntMap",
-    "PaintSettings",
-    "learn_from",
-    "learn_map",
-    "take_footage",
-]
+__all__ = ["LearntMap", "MapSettings", "fit_map", "take_crops"]

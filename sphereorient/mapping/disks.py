@@ -1,47 +1,74 @@
-"""The ball's disks freed of light, with their slopes: what pictures are compared by as long as there is no map."""
+"""The ball's disks normalised against light, with their slopes: for comparing pictures before there is a map."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from sphereorient.cameras import R_cam_view
+from sphereorient.mapping.crops import Crops
+from sphereorient.mapping.settings import MapSettings
+from sphereorient.search.crop import crop_disk
 from sphereorient.search.normalisation import Blur, rim_share
-from sphereorient.sphere.view import disk_offsets, perspective_view
+from sphereorient.sphere.view import perspective_view
 
+SHOWN_MIN = 0.99  # visible share of a disk's pixel below which it does not count
+FAR_RADII = 50.0  # distance of a camera that does not see the ball: any value does
 DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Disks:
-    """Evened disks of N instants and C cameras; made by `even_disks`, read by the comparison of pairs.
+    """Normalised disks of N instants and C cameras.
 
-    A disk's picture is (S, S), the limb touching its edges; its view frame is x right, y down, z to the ball.
+    A disk's picture is (S, S), the limb touches its edges; its view frame is x right, y down, z to the ball.
     """
 
     layers: Tensor  # (N, C, 3, S, S) float32: normalised grey, its slope to the right and down, per radius
-    share: Tensor  # (S, S), 0 at the limb .. 1
+    share: Tensor  # (S, S), weight of a pixel, 0 at the limb .. 1
     R_lab_view: Tensor  # (N, C, 3, 3) float32
     distance_radii: Tensor  # (N, C), of the camera from the centre
-    seen: Tensor  # (N, C) bool, disks that there are
-    shown: Tensor | None = None  # (N, C, S, S) float32, 0 where something hides the ball .. 1; None: nowhere
+    seen: Tensor  # (N, C) bool
+    shown: Tensor | None = None  # (N, C, S, S) float32, 0 where something hides the ball .. 1; None: nothing does
 
     def __len__(self) -> int:
         """Return the number of instants."""
         return len(self.layers)
 
-    def where(self, rows: Tensor) -> Disks:
-        """Return some of the instants."""
-        shown = None if self.shown is None else self.shown[rows]
+    def where(self, rows: Tensor | slice, cameras: slice = slice(None)) -> Disks:
+        """Return some of the instants and cameras."""
+        shown = None if self.shown is None else self.shown[rows, cameras]
         names = ("layers", "R_lab_view", "distance_radii", "seen")
-        return Disks(share=self.share, shown=shown, **{name: getattr(self, name)[rows] for name in names})
+        return Disks(share=self.share, shown=shown, **{name: getattr(self, name)[rows, cameras] for name in names})
 
-    def told(self, rows: Tensor, camera: int) -> Tensor:
-        """Return how much each place of some disks counts, (R, S * S)."""
+    def weight(self, rows: Tensor | slice, camera: int) -> Tensor:
+        """Return the weights (R, S * S) of the pixels of some disks: 0 where not seen or hidden."""
         counts = self.seen[rows, camera][:, None] * torch.ones(self.size_px**2)
         return counts if self.shown is None else counts * self.shown[rows, camera].flatten(1)
+
+    def sampled(
+        self, rows: Tensor | slice, camera: int, every: int = 1, slant_power: int = 1
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return each n-th (`every`) pixel of some disks (R,) of a camera; weights have the slant's cosine to a power.
+
+        Returns:
+            Directions in the view frame (3, P), grey (R, P) and weight (R, P).
+        """
+        far, size = self.distance_radii[:, camera].median(), self.size_px
+        view = perspective_view(size, float(far))
+        pixel = torch.nonzero(view.inside.reshape(-1))[:, 0]
+        chosen = (pixel // size + pixel % size) % every == 0
+        normal, share = view.normal_view.T.float()[:, chosen].contiguous(), self.share[view.inside][chosen]
+        place, _, depth = disk_places(normal, far)
+        at = ((place + 1) * (size / 2) - 0.5).round().long()
+        cell = at[1] * size + at[0]
+        grey = self.layers[rows, camera, 0].flatten(1)[:, cell]
+        weight = (share * depth.clamp_min(0) ** slant_power)[None] * self.weight(rows, camera)[:, cell]
+        return normal, grey, weight
 
     @property
     def size_px(self) -> int:
@@ -49,50 +76,69 @@ class Disks:
         return self.layers.shape[-1]
 
 
-def even_disks(
+def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:
+    """Cut and normalise the disks of some frames (M,)."""
+    size, count, cameras = settings.disk_px, len(frames), len(crops.views)
+    pictures = torch.zeros(count, cameras, size, size)
+    hidden = any(view.background.shown is not None for view in crops.views)
+    shown = torch.ones(count, cameras, size, size) if hidden else None
+    R = torch.eye(3, dtype=torch.float64).repeat(count, cameras, 1, 1)
+    far = torch.full((count, cameras), FAR_RADII, dtype=torch.float64)
+    X = crops.position_lab_mm[frames]
+    for c, view in enumerate(crops.views):
+        camera = view.camera
+        in_camera = X @ camera.R_cam_lab.mT + camera.T_cam_lab_mm
+        far[:, c] = in_camera.norm(dim=-1) / crops.radius_mm
+        R[:, c] = camera.R_cam_lab.mT @ R_cam_view(in_camera)
+        # The limb lies a little before the great circle that `radius_px` measures.
+        limb = view.radius_px(X, crops.radius_mm) / (1 - far[:, c] ** -2).clamp_min(1e-3).sqrt()
+        middle = camera.project(X)
+        for k, frame in enumerate(frames.tolist()):
+            crop = crops.crops[c][frame]
+            if crop is None or not bool(crops.seen[frame, c]):
+                continue
+            u, v, radius_px = float(middle[k, 0]), float(middle[k, 1]), float(limb[k])
+            pictures[k, c] = torch.from_numpy(crop_disk(crop.grey, u - crop.left, v - crop.top, radius_px, size))
+            if shown is not None and view.background.shown is not None:
+                visible = crop_disk(view.background.shown.astype(np.uint8), u, v, radius_px, size)
+                shown[k, c] = torch.from_numpy(visible) > SHOWN_MIN
+    return normalised_disks(pictures, R, far, crops.seen[frames], settings, shown)
+
+
+def normalised_disks(
     pictures: Tensor,
     R_lab_view: Tensor,
     distance_radii: Tensor,
     seen: Tensor,
-    detail: float,
-    window: float,
+    settings: MapSettings,
     shown: Tensor | None = None,
 ) -> Disks:
-    """Even the disks of a movie.
+    """Remove the light from disks: difference from the local mean over the local deviation.
 
     Args:
-        pictures: (N, C, S, S), grey levels of any scale; what is not seen may hold anything finite.
+        pictures: (N, C, S, S), grey levels of any scale, finite also where not seen.
         R_lab_view: (N, C, 3, 3).
         distance_radii: (N, C), above 1.
         seen: (N, C) bool.
-        detail: standard deviation of the Gaussian laid over the pictures first, radii.
-        window: standard deviation of the neighbourhood over which light is taken to be even, radii.
-        shown: (N, C, S, S), 0 where something hides the ball .. 1; None: nowhere.
-
-    Returns:
-        The disks: each place's difference from its neighbourhood over that neighbourhood's own deviation, so that
-        what is lit dimly counts like what is lit well.
+        settings: of `detail` and `window`.
+        shown: (N, C, S, S), 0 where something hides the ball .. 1; None: nothing does.
     """
     size = pictures.shape[-1]
     share = rim_share(size)
-    fine, wide = Blur(size, detail), Blur(size, window)
+    fine, wide = Blur(size, settings.detail), Blur(size, settings.window)
     flat = pictures.reshape(-1, size, size).float()
-    if shown is not None:  # what hides the ball is taken to be as bright as the ball is on the whole
+    if shown is not None:  # fill what is hidden with the ball's mean grey
         part = shown.reshape(-1, size, size)
         inside = part * share
         usual = (flat * inside).sum((1, 2), keepdim=True) / inside.sum((1, 2), keepdim=True).clamp_min(1e-6)
         flat = usual + (flat - usual) * part
     rough = fine(flat) - wide(flat)
     whole = (rough.square() * share).sum((1, 2), keepdim=True) / share.sum()
-    # A neighbourhood of one paint has no deviation of its own: half of the disk's keeps its noise small.
+    # Half of the disk's deviation is added: where the texture is uniform the local one would amplify noise.
     local = (wide(rough.square()) + 0.25 * whole).sqrt().clamp_min(1e-12)
     even = (rough / local).clamp(-3.0, 3.0) * seen.reshape(-1, 1, 1)
-    padded = F.pad(even[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
-    right = (padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]) * (size / 4)
-    down = (padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]) * (size / 4)
-    layers = torch.stack([even, right, down], dim=1).reshape(*pictures.shape[:2], 3, size, size)
     return Disks(
-        layers=layers,
+        layers=_with_slopes(even.reshape(pictures.shape)),
         share=share,
         R_lab_view=R_lab_view.float(),
         distance_radii=distance_radii.float().clamp(1.01, DEEPEST),
@@ -101,53 +147,35 @@ def even_disks(
     )
 
 
-def reduced(disks: Disks, factor: int) -> Disks:
-    """Return the same with pictures smaller by a whole factor."""
-    size = disks.size_px // factor
-    even = F.avg_pool2d(disks.layers[:, :, 0], factor)
-    padded = F.pad(even, (1, 1, 1, 1), mode="replicate")
+def _with_slopes(grey: Tensor) -> Tensor:
+    """Stack pictures (N, C, S, S) with their slopes to the right and down, per radius, (N, C, 3, S, S)."""
+    size = grey.shape[-1]
+    padded = F.pad(grey, (1, 1, 1, 1), mode="replicate")
     right = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) * (size / 4)
     down = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) * (size / 4)
-    return Disks(
-        layers=torch.stack([even, right, down], dim=2),
-        share=rim_share(size),
-        R_lab_view=disks.R_lab_view,
-        distance_radii=disks.distance_radii,
-        seen=disks.seen,
+    return torch.stack([grey, right, down], dim=2)
+
+
+def reduced(disks: Disks, factor: int) -> Disks:
+    """Return the disks with pictures smaller by a whole factor."""
+    return replace(
+        disks,
+        layers=_with_slopes(F.avg_pool2d(disks.layers[:, :, 0], factor)),
+        share=rim_share(disks.size_px // factor),
         shown=None if disks.shown is None else F.avg_pool2d(disks.shown, factor),
     )
 
 
-def view_normals(size_px: int, distance_radii: float, every: int = 1) -> tuple[Tensor, Tensor]:
-    """Return the normals (3, P) float32, view frame, and shares (P,) of a disk's pixels, every so-many-th of them."""
-    view = perspective_view(size_px, distance_radii)
-    normal, share = view.normal_view.T.float(), rim_share(size_px)[view.inside]
-    place = torch.nonzero(view.inside.reshape(-1))[:, 0]
-    chosen = (place // size_px + place % size_px) % every == 0
-    return normal[:, chosen].contiguous(), share[chosen]
-
-
 def disk_places(normal_view: Tensor, distance_radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Project directions onto a disk.
-
-    Args:
-        normal_view: (..., 3, P) unit, view frame.
-        distance_radii: (...).
+    """Project directions (..., 3, P), view frame, onto a disk seen from a distance (...), radii.
 
     Returns:
-        Places (..., 2, P) in radii of the disk, their derivative by the direction as its factors (..., 1, P) for x and
-        y alike and by z (..., 2, P), all to be used with `depth` > 0; and the cosine `depth` (..., P) under which the
-        camera sees the place, not positive where it does not.
+        Places (..., 2, P) in radii of the disk, their derivative by x and y of the direction (..., 1, P), and the
+        cosine of the slant (..., P), not positive where invisible.
     """
     D = distance_radii[..., None, None]
     x_y, z = normal_view[..., :2, :], normal_view[..., 2:, :]
     scale = (D.square() - 1).sqrt() / (D + z)
-    place = x_y * scale
-    # Seen where the outward normal looks at the camera, which is D away along -z.
+    # Visible where the outward normal points at the camera, which is D away along -z.
     depth = (-z - 1 / D) / (1 - 1 / D)
-    return place, scale, depth[..., 0, :]
-
-
-def offsets(size_px: int) -> Tensor:
-    """Places of the pixels in radii, (S, S, 2) as (right, down)."""
-    return disk_offsets(size_px)
+    return x_y * scale, scale, depth[..., 0, :]

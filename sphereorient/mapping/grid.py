@@ -1,4 +1,4 @@
-"""The unknown map as a linear system: every pixel reads a few texels, every texel is read by many pixels."""
+"""The texture map as unknowns of a linear system: spline look-ups, the smoothness penalty, solving, sharpening."""
 
 from __future__ import annotations
 
@@ -11,32 +11,14 @@ from scipy.sparse import coo_matrix, csr_matrix
 from torch import Tensor
 
 from sphereorient.sphere.texture import texture_coordinates
-from sphereorient.sphere.texture_table import CHUNK, SIDE, TextureTable, octahedral_directions
+from sphereorient.sphere.texture_table import CHUNK, FIVE, SIDE, TextureTable, octahedral_directions
+from sphereorient.synth.textures import map_directions
 
-STEP_RAD = 0.002  # over which a table's slopes are taken
-POLE = 1e-3  # least cosine of a latitude: at the pole itself longitude means nothing
+STEP_RAD = 0.002  # step of a table's finite differences
+POLE = 1e-3  # least cosine of a latitude: at the pole itself longitude is undefined
 READS = 16  # texels that a look-up reads
-
-
-def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
-    """Return which texels a look-up reads: a cubic B-spline whose coefficients are the texels, as `sample_spline`.
-
-    Args:
-        direction_body: (..., 3) unit.
-        height: H of the map (H, 2 H), at least 4.
-
-    Returns:
-        Places (..., 16) int64 in the flattened map, and weights (..., 16), sum 1.
-    """
-    width = 2 * height
-    longitude, latitude = texture_coordinates(direction_body)
-    columns, along = _spline((longitude + math.pi) * (width / (2 * math.pi)) - 0.5)
-    rows, across = _spline((math.pi / 2 - latitude) * (height / math.pi) - 0.5)
-    beyond = (rows < 0) | (rows >= height)  # over a pole the meridian goes on at the other side
-    rows = torch.where(rows < 0, -1 - rows, torch.where(rows >= height, 2 * height - 1 - rows, rows))
-    columns = (columns[..., None, :] + torch.where(beyond, height, 0)[..., None]) % width
-    place = rows[..., None] * width + columns
-    return place.flatten(-2), (across[..., None] * along[..., None, :]).flatten(-2)
+NOISE = 1.0e-3  # variance of the blurred map's errors over that of what sharpening may add
+SHARPENING_ITERATIONS = 200
 
 
 def _spline(place: Tensor) -> tuple[Tensor, Tensor]:
@@ -59,29 +41,44 @@ def _spline_slope(place: Tensor) -> Tensor:
     return torch.stack(slopes, dim=-1) / 2
 
 
-class SplinePaint(TextureTable):
-    """A map looked up by its spline, exactly, and which texels that read: what a least squares of the map asks for.
+def _place(longitude: Tensor, latitude: Tensor, height: int) -> tuple[Tensor, Tensor]:
+    """Return column and row (...) in a map, texels."""
+    return (longitude + math.pi) * (height / math.pi) - 0.5, (math.pi / 2 - latitude) * (height / math.pi) - 0.5
 
-    Args:
-        texture: (H, 2 H), blurred as the pictures are.
-        blur_rad: standard deviation of the blur that is in it, rad.
+
+def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
+    """Return the 16 texels that a cubic B-spline, whose coefficients they are, reads in directions (..., 3).
+
+    Returns:
+        Indices (..., 16) int64 in the flattened map (H, 2 H), H at least 4, and weights (..., 16), sum 1.
     """
+    width = 2 * height
+    column, row = _place(*texture_coordinates(direction_body), height)
+    (columns, along), (rows, across) = _spline(column), _spline(row)
+    beyond = (rows < 0) | (rows >= height)  # over a pole the meridian goes on at the other side
+    rows = torch.where(rows < 0, -1 - rows, torch.where(rows >= height, 2 * height - 1 - rows, rows))
+    columns = (columns[..., None, :] + torch.where(beyond, height, 0)[..., None]) % width
+    place = rows[..., None] * width + columns
+    return place.flatten(-2), (across[..., None] * along[..., None, :]).flatten(-2)
+
+
+class SplineTable(TextureTable):
+    """A texture map (H, 2 H), blurred by `blur_rad`, looked up by its spline exactly; records the texels read."""
 
     def __init__(self, texture: Tensor, blur_rad: float) -> None:
         super().__init__(torch.zeros(1, 4), blur_rad)
         self.texture = texture
-        self.reads: list[tuple[Tensor, Tensor]] = []  # of each look: texels and weights, (L, P, 16)
+        self.reads: list[tuple[Tensor, Tensor]] = []  # of each look-up: texels and weights, (L, P, 16)
 
     def sample(self, direction_body: Tensor) -> tuple[Tensor, Tensor]:
-        """Look up the paint and its slope; see `TextureTable.sample`."""
+        """Look up value and slope; see `TextureTable.sample`."""
         height = len(self.texture)
         direction = direction_body.movedim(1, -1)
         place, weight = texel_weights(direction, height)
         self.reads.append((place, weight))
         found = self.texture.to(direction.dtype).reshape(-1)[place].reshape(*place.shape[:-1], 4, 4)
         longitude, latitude = texture_coordinates(direction)
-        column = (longitude + math.pi) * (height / math.pi) - 0.5
-        row = (math.pi / 2 - latitude) * (height / math.pi) - 0.5
+        column, row = _place(longitude, latitude, height)
         (_, along), (_, across) = _spline(column), _spline(row)
         by_column = ((found * _spline_slope(column)[..., None, :]).sum(-1) * across).sum(-1)
         by_row = ((found * along[..., None, :]).sum(-1) * _spline_slope(row)).sum(-1)
@@ -100,20 +97,21 @@ def look_up(texture: Tensor, direction_body: Tensor) -> Tensor:
     return (texture.reshape(-1)[place] * weight.to(texture.dtype)).sum(-1)
 
 
-def map_table(texture: Tensor, blur_rad: float) -> TextureTable:
-    """Return the table of a map that is blurred already, value and slope those of its spline.
+def _tangents(direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Return two orthogonal unit vectors tangent to the sphere at directions (M, 3)."""
+    helper = torch.where(
+        direction[:, 2:].abs() < 0.9, direction.new_tensor([0.0, 0, 1]), direction.new_tensor([1.0, 0, 0])
+    )
+    right = torch.nn.functional.normalize(torch.linalg.cross(helper, direction), dim=-1)
+    return right, torch.linalg.cross(direction, right)
 
-    Args:
-        texture: (H, 2 H).
-        blur_rad: standard deviation of the blur that is in it, rad.
-    """
-    centre = octahedral_directions(SIDE)
+
+def map_table(texture: Tensor, blur_rad: float) -> TextureTable:
+    """Return the table of a map (H, 2 H) that already has the blur `blur_rad`, rad."""
     parts = []
-    for some in torch.split(centre, CHUNK):
-        helper = torch.where(some[:, 2:].abs() < 0.9, some.new_tensor([0.0, 0, 1]), some.new_tensor([1.0, 0, 0]))
-        right = torch.nn.functional.normalize(torch.linalg.cross(helper, some), dim=-1)
+    for some in torch.split(octahedral_directions(SIDE), CHUNK):
         slope = torch.zeros_like(some)
-        for axis in (right, torch.linalg.cross(some, right)):
+        for axis in _tangents(some):
             there, back = (look_up(texture.double(), some + sign * STEP_RAD * axis) for sign in (1, -1))
             slope += ((there - back) / (2 * STEP_RAD))[:, None] * axis
         value = look_up(texture.double(), some) - (slope * some).sum(-1)
@@ -129,7 +127,7 @@ def texel_areas(height: int) -> Tensor:
 
 
 def stiffness(height: int) -> csr_matrix:
-    """Return L with m^T L m = the integral of the map's squared slope over the sphere: what ties neighbours.
+    """Return L with m^T L m = the integral of the map's squared slope over the sphere.
 
     Source: finite volumes; the edge between two texels counts with its length over their distance.
     """
@@ -148,37 +146,31 @@ def stiffness(height: int) -> csr_matrix:
     return coo_matrix((np.concatenate([w, w, -w, -w]), (rows, columns)), shape=(number.size, number.size)).tocsr()
 
 
-class Gram:
-    """The normal matrix of many look-ups, never written out: to multiply it out takes longer than to solve with it.
+class NormalMatrix:
+    """J^T J of a weighted Jacobian (S, T), never multiplied out: that would take longer than solving with it."""
 
-    Args:
-        reads: (S, T), what each sample reads of the map, times the root of its weight.
-    """
-
-    def __init__(self, reads: csr_matrix) -> None:
-        self._reads = reads
+    def __init__(self, jacobian: csr_matrix) -> None:
+        self._jacobian = jacobian
 
     def __matmul__(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return its product with values (T,)."""
-        seen = self._reads @ values.astype(self._reads.dtype)
-        return np.asarray(self._reads.T @ seen, np.float64)
+        seen = self._jacobian @ values.astype(self._jacobian.dtype)
+        return np.asarray(self._jacobian.T @ seen, np.float64)
 
     def diagonal(self) -> NDArray[np.float64]:
         """Return the weights of the texels, (T,)."""
-        return np.asarray(self._reads.power(2).sum(0), np.float64).ravel()
+        return texel_sums(self._jacobian)
+
+
+def texel_sums(jacobian: csr_matrix) -> NDArray[np.float64]:
+    """Return the diagonal of J^T J, (T,): how well the samples determine each texel."""
+    return np.asarray(jacobian.power(2).sum(0), np.float64).ravel()
 
 
 def map_sums(
     direction_body: Tensor, value: Tensor, weight: Tensor, height: int
 ) -> tuple[csr_matrix, NDArray[np.float64]]:
-    """Sum up what samples of the paint tell of the map: its normal equations, (T, T) and (T,).
-
-    Args:
-        direction_body: (S, 3) unit.
-        value: (S,), paint seen there.
-        weight: (S,), one over its variance.
-        height: H of the map.
-    """
+    """Return the normal equations (T, T) and (T,) of a map from samples: directions (S, 3), values and weights (S,)."""
     place, share = texel_weights(direction_body.double(), height)
     texels = 2 * height * height
     root = weight.double().clamp_min(0).sqrt()
@@ -189,16 +181,16 @@ def map_sums(
 
 
 def solve_map(
-    normal: csr_matrix | Gram, right: NDArray[np.float64], height: int, smooth: float, iterations: int = 60
+    normal: csr_matrix | NormalMatrix, right: NDArray[np.float64], height: int, smooth: float, iterations: int = 60
 ) -> Tensor:
-    """Solve for the map, (H, 2 H) float64: weighted least squares with neighbours tied.
+    """Solve normal equations (T, T), (T,) for the map, (H, 2 H) float64, with a smoothness penalty.
 
     Args:
-        normal: (T, T), of all pixels, or what stands for it.
-        right: (T,).
+        normal: of the pixels.
+        right: of the pixels.
         height: H.
         smooth: weight of the integral of the squared slope, in the unit of the pixels' weights.
-        iterations: of the conjugate gradients, at most.
+        iterations: of conjugate gradients, at most.
     """
     ties = smooth * stiffness(height)
     diagonal = normal.diagonal() + ties.diagonal()
@@ -219,3 +211,31 @@ def solve_map(
         rz, before = float(left @ z), rz
         p = z + rz / before * p
     return torch.from_numpy(x.reshape(height, 2 * height))
+
+
+def blur_matrix(direction_body: Tensor, blur_rad: float, height: int) -> csr_matrix:
+    """Return the matrix (M, T) from a map's coefficients to its blurred values in directions (M, 3) float64."""
+    right, up = _tangents(direction_body)
+    start = np.arange(0, len(direction_body) * READS + 1, READS)
+    total = csr_matrix((len(direction_body), 2 * height * height))
+    for a, share_a in zip(*FIVE, strict=True):
+        for b, share_b in zip(*FIVE, strict=True):
+            place, weight = texel_weights(direction_body + blur_rad * (a * right + b * up), height)
+            entries = (share_a * share_b * weight).reshape(-1).numpy()
+            total = total + csr_matrix((entries, place.reshape(-1).numpy(), start), shape=total.shape)
+    return total
+
+
+def sharpened(blurred: Tensor, blur_rad: float, noise: float = NOISE) -> Tensor:
+    """Undo a Gaussian blur of a map's coefficients (H, 2 H), float64, as far as noise allows.
+
+    Source: Tikhonov 1963, the slope's square as the penalty.
+    """
+    height = len(blurred)
+    direction = map_directions(height).reshape(-1, 3)
+    seen = look_up(blurred.double(), direction).numpy()
+    area = texel_areas(height).reshape(-1).numpy()
+    blur = blur_matrix(direction, blur_rad, height)
+    weighted = blur.multiply(area[:, None]).tocsr()
+    normal, right = (blur.T @ weighted).tocsr(), np.asarray(weighted.T @ seen)
+    return solve_map(normal, right, height, noise * blur_rad**2, SHARPENING_ITERATIONS)

@@ -1,9 +1,9 @@
-"""Gauss-Newton of all poses and the map together: what one camera calls a turn another may call other paint."""
+"""The pictures linearised about map and poses, and one Gauss-Newton step of all poses and the map together."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,79 +11,134 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
-from sphereorient.mapping.grid import stiffness
-from sphereorient.mapping.look import DEPTH_MIN, Look, look_ups
+from sphereorient.mapping.grid import READS, SplineTable, stiffness
+from sphereorient.pose.fit import grey_by_pose, residuals
+from sphereorient.pose.fitter import Fitter
+from sphereorient.pose.model import SphereView
+from sphereorient.pose.pixels import Pixels
 
-POSE = 6
-DAMPING = 1e-5  # of the diagonal: the body frame is free, and the step along it nought
+DEPTH_MIN = 0.2  # cosine of the slant below which a pixel is not used for the map
+POSE = 6  # unknowns of a pose
+DAMPING = 1e-5  # of the diagonal: the body frame is free, the step along it zero
 RIDGE = 1e-7
+LONGEST_SHARE = 0.1  # typical length of a turn, rad, and of a move, radii
+STEPS = 60  # of conjugate gradients
 Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Part:
-    """The linear problem of some disks; made by `part_of`, read by `joint_step`. All is float32, times root weight."""
+class Linearisation:
+    """L disks of P pixels, each linearised about one pose and the map."""
 
-    look_up: csr_matrix  # (L * P, T): what each pixel changes by the map
+    view: SphereView
+    reads: list[tuple[Tensor, Tensor]]  # of the inner and the outer pixels: texels and weights, (L, n * P', 16) each
+    inner: int  # number of first pixels that `reads[0]` is of
+    depth: Tensor  # (L, P), cosine of the slant
+    step: Tensor  # (L, P), grey levels from black to white texture, the frame's own light and coverage included
+    residual: Tensor  # (L, P), grey levels
+    weight: Tensor  # (L, P), robust, 0 .. 1
+    variance: Tensor  # (L, P), grey levels^2
+    by_pose: Tensor  # (L, 6, P), grey levels per rad (delta) and per mm
+    by_light: Tensor  # (L, K, P), by the coefficients of a frame's own light
+
+    @property
+    def precision(self) -> Tensor:
+        """Weight over variance, (L, P), less towards the limb, where errors of the light grow."""
+        slanted = torch.where(self.depth > DEPTH_MIN, self.depth.square(), 1.0)
+        return self.weight / self.variance * slanted
+
+    def by_texel(self, height: int) -> csr_matrix:
+        """Return the derivative by the texels times the root of the precision, (L * P, T) float32."""
+        factor = self.step * self.precision.sqrt() * (self.depth > DEPTH_MIN)
+        places, values, counts = [], [], []
+        for k, (place, share) in enumerate(self.reads):
+            own = factor[:, : self.inner] if k == 0 else factor[:, self.inner :]
+            nodes = place.shape[1] // own.shape[1]
+            several = (len(own), nodes, own.shape[1], READS)
+            scaled = share.reshape(several) * (own / nodes)[:, None, :, None]
+            places.append(place.reshape(several).transpose(1, 2).flatten(2))
+            values.append(scaled.transpose(1, 2).flatten(2))
+            counts.append(torch.full(own.shape, nodes * READS))
+        count = torch.cat(counts, dim=1)
+        start = np.concatenate([[0], count.reshape(-1).cumsum(0).numpy()])
+        # Disk after disk, the inner pixels before the outer ones.
+        columns = torch.cat([part.flatten(1) for part in places], dim=1).reshape(-1).to(torch.int32)
+        entries = torch.cat([part.flatten(1) for part in values], dim=1).reshape(-1).float()
+        shape = (count.numel(), 2 * height * height)
+        return csr_matrix((entries.numpy(), columns.numpy(), start), shape=shape)
+
+
+def linearise(
+    fitter: Fitter, texture: Tensor, pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, blur_px: float
+) -> Linearisation:
+    """Compare pictures with a map (H, 2 H), blurred as they are, and linearise, each frame's light at its best.
+
+    Args:
+        fitter: of views and light; its own map is not used.
+        texture: the map.
+        pixels: of B * C disks, the cameras of an instant next to each other.
+        position_lab_mm: (B, 3).
+        R_lab_body: (B, 3, 3).
+        blur_px: of the pictures.
+    """
+    table = SplineTable(texture, 0.0)
+    model = replace(fitter.model(fitter.optics.fine), paint=table, blur_px=blur_px)
+    at = residuals(pixels, position_lab_mm, R_lab_body, None, model, len(fitter.views))
+    depth = (1 - at.view.across.square().sum(1)).clamp_min(0).sqrt()
+    return Linearisation(
+        view=at.view,
+        reads=table.reads,
+        inner=pixels.inner,
+        depth=depth,
+        step=at.lit,
+        residual=at.residual,
+        weight=at.weight,
+        variance=at.variance,
+        # Near the limb the map is not learnt, so it must not move the pose there either.
+        by_pose=grey_by_pose(at.view, at.lit * (depth > DEPTH_MIN), at.over),
+        by_light=at.design[:, POSE:],
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LinearSystem:
+    """The linear problem of some disks; all float32, times the root of the precision."""
+
+    by_texel: csr_matrix  # (L * P, T)
     by_pose: Tensor  # (L, 6, P)
     by_light: Tensor  # (L, K, P), orthonormal rows
     residual: Tensor  # (L, P)
 
 
-def part_of(at: Look, height: int) -> Part:
-    """Take the linear problem out of a comparison.
-
-    Args:
-        at: of L disks.
-        height: H of the map.
-    """
+def linear_system(at: Linearisation, height: int) -> LinearSystem:
+    """Return the linear problem of a linearisation; `height` is the map's H."""
     root = at.precision.sqrt()
-    told = at.depth > DEPTH_MIN
-    reads = look_ups(at, at.step * root * told, 2 * height * height)
-    # Rows of the light made orthonormal: what is along them, a frame's own light takes.
+    # The rows of the light are made orthonormal: the frame's own light takes what is along them.
     rows = (at.by_light * root[:, None]).double()
     size = rows.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
     rows = rows / size
     gram = rows @ rows.mT + RIDGE * torch.eye(rows.shape[1], dtype=rows.dtype)
     basis = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows, upper=False).float()
-    return Part(look_up=reads, by_pose=at.by_pose * root[:, None], by_light=basis, residual=at.residual * root)
-
-
-def _without_light(part: Part, values: Tensor) -> Tensor:
-    """Take out of values (L, P) what the frames' own light explains."""
-    along = part.by_light @ values[..., None]
-    left: Tensor = values - (part.by_light.mT @ along)[..., 0]
-    return left
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Step:
-    """What a joint step changes; made by `joint_step`."""
-
-    pose: Tensor  # (N, 6) float64: delta (rad) and place (mm)
-    map: Tensor  # (H, 2 H) float64
-    left: float  # of the linear problem, share of its gradient
+    return LinearSystem(
+        by_texel=at.by_texel(height),
+        by_pose=at.by_pose * root[:, None],
+        by_light=basis,
+        residual=at.residual * root,
+    )
 
 
 def joint_step(
-    parts: Sequence[Part],
-    use: Tensor,
-    texture: Tensor,
-    smooth: float,
-    scale: tuple[float, float],
-    iterations: int,
-    fixed: bool = False,
-) -> Step:
-    """Solve for a step of all poses and the map.
+    parts: Sequence[LinearSystem], use: Tensor, texture: Tensor, smooth: float, radius_mm: float, fixed: bool
+) -> Tensor:
+    """Solve for a step of all poses and the map; return that of the poses (N, 6) float64, rad and mm.
 
     Args:
         parts: of N instants with C cameras each, in order.
         use: (N, C) bool.
-        texture: (H, 2 H), the map, whose slopes are held small.
+        texture: (H, 2 H), the map, whose slopes are penalised.
         smooth: weight of the integral of its squared slope.
-        scale: typical lengths of a turn and a move, rad and mm: the longest that are plausible at all.
-        iterations: of the conjugate gradients.
-        fixed: whether all instants share one place.
+        radius_mm: of the sphere.
+        fixed: whether all instants share one position.
 
     Source: Gauss-Newton by preconditioned conjugate gradients, the light of each frame projected out (Golub and
     Pereyra 1973); bundle adjustment in the large, Agarwal et al. 2010.
@@ -91,53 +146,52 @@ def joint_step(
     count, cameras = use.shape
     height = len(texture)
     ties = (smooth * stiffness(height)).astype(np.float32)
-    looks = vstack([part.look_up for part in parts], format="csr")
-    back = looks.T
-    by_pose = torch.cat([part.by_pose for part in parts])
-    by_light = torch.cat([part.by_light for part in parts])
-    whole = Part(look_up=looks, by_pose=by_pose, by_light=by_light, residual=torch.cat([p.residual for p in parts]))
-    shape = whole.residual.shape
+    by_texel = vstack([part.by_texel for part in parts], format="csr")
+    back = by_texel.T
+    by_pose, by_light, residual = (
+        torch.cat([getattr(part, name) for part in parts]) for name in ("by_pose", "by_light", "residual")
+    )
+
+    def without_light(values: Tensor) -> Tensor:
+        along = by_light @ values[..., None]
+        left: Tensor = values - (by_light.mT @ along)[..., 0]
+        return left
 
     def pulled(values: Tensor) -> tuple[Tensor, Array]:
         pose = (by_pose @ values[..., None])[..., 0].reshape(count, cameras, POSE).sum(1)
         return _shared(pose, fixed), back @ values.reshape(-1).numpy()
 
-    def applied(pose: Tensor, paint: Array) -> tuple[Tensor, Array]:
+    def applied(pose: Tensor, texels: Array) -> tuple[Tensor, Array]:
         spread = _spread(pose, count, fixed).repeat_interleave(cameras, 0)
-        values = (spread[:, None] @ by_pose)[:, 0] + torch.from_numpy(looks @ paint).reshape(shape)
-        turned, painted = pulled(_without_light(whole, values))
-        return turned + damp_pose * pose, painted + ties @ paint + damp_map * paint
+        values = (spread[:, None] @ by_pose)[:, 0] + torch.from_numpy(by_texel @ texels).reshape(residual.shape)
+        on_pose, on_map = pulled(without_light(values))
+        return on_pose + damp_pose * pose, on_map + ties @ texels + damp_map * texels
 
     lit = by_pose - (by_pose @ by_light.mT) @ by_light
     blocks = (lit @ lit.mT).reshape(count, cameras, POSE, POSE).sum(1)
-    size = torch.tensor([scale[0]] * 3 + [scale[1]] * 3)
+    size = torch.tensor([LONGEST_SHARE] * 3 + [LONGEST_SHARE * radius_mm] * 3)
     damp = DAMPING * blocks.diagonal(dim1=1, dim2=2) + 1.0 / size.square()
     damp_pose = _shared(damp, fixed)
-    own_map = np.asarray(looks.power(2).sum(0)).ravel()
     damp_map = np.float32(1e-3 * smooth) + np.zeros(1, np.float32)
-    precondition_map = 1.0 / (own_map + ties.diagonal() + damp_map)
+    precondition_map = 1.0 / (np.asarray(by_texel.power(2).sum(0)).ravel() + ties.diagonal() + damp_map)
     solve_pose = _inverse_blocks(blocks, damp, fixed)
-    right = pulled(_without_light(whole, whole.residual))
-    r_pose, r_map = right[0], right[1] - ties @ texture.reshape(-1).float().numpy()
-    pose, paint = torch.zeros_like(r_pose), np.zeros_like(r_map)
+    r_pose, r_map = pulled(without_light(residual))
+    r_map = r_map - ties @ texture.reshape(-1).float().numpy()
+    pose, texels = torch.zeros_like(r_pose), np.zeros_like(r_map)
     z_pose, z_map = solve_pose(r_pose), precondition_map * r_map
     p_pose, p_map = z_pose.clone(), z_map.copy()
     rz = first = _dot(r_pose, z_pose, r_map, z_map)
-    for _ in range(iterations):
+    for _ in range(STEPS):
         if rz <= 1e-8 * first:
             break
         q_pose, q_map = applied(p_pose, p_map)
         alpha = rz / _dot(p_pose, q_pose, p_map, q_map)
-        pose, paint = pose + alpha * p_pose, paint + alpha * p_map
+        pose, texels = pose + alpha * p_pose, texels + alpha * p_map
         r_pose, r_map = r_pose - alpha * q_pose, r_map - alpha * q_map
         z_pose, z_map = solve_pose(r_pose), precondition_map * r_map
         rz, before = _dot(r_pose, z_pose, r_map, z_map), rz
         p_pose, p_map = z_pose + rz / before * p_pose, z_map + rz / before * p_map
-    return Step(
-        pose=_spread(pose, count, fixed).double(),
-        map=torch.from_numpy(paint.astype(np.float64)).reshape(height, -1),
-        left=(rz / max(first, 1e-30)) ** 0.5,
-    )
+    return _spread(pose, count, fixed).double()
 
 
 def _dot(a_pose: Tensor, b_pose: Tensor, a_map: Array, b_map: Array) -> float:
@@ -145,7 +199,7 @@ def _dot(a_pose: Tensor, b_pose: Tensor, a_map: Array, b_map: Array) -> float:
 
 
 def _shared(pose: Tensor, fixed: bool) -> Tensor:
-    """Sum up what all instants share: (N, 6), or (3 N + 3,) with one place for all."""
+    """Sum what all instants share: (N, 6), or (3 N + 3,) with one position for all."""
     return torch.cat([pose[:, :3].reshape(-1), pose[:, 3:].sum(0)]) if fixed else pose
 
 

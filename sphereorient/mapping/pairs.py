@@ -1,27 +1,33 @@
-"""How the ball turned between two instants, from their pictures alone: disks warped over the sphere, no map."""
+"""Relative rotations of pairs of instants from their pictures alone, and attitudes that agree with most of them."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.mapping.disks import Disks, disk_places, view_normals
+from sphereorient.mapping.disks import Disks, disk_places
 
-STEP_RAD = 0.15  # longest step of the climb
+STEP_RAD = 0.15  # longest step of a refinement
 RIDGE = 1e-3
 BATCH = 64  # pairs compared at once
 LOOKS = 1 << 21  # look-ups at once, at most, in a search
-SCALE = 0.7  # residual, in deviations of an normalised picture, that counts half
-OVERLAP_MIN = 0.2  # share of a disk that both pictures of a pair show, below which they tell nothing
+SCALE = 0.7  # residual, in deviations of a normalised picture, that counts half
+OVERLAP_MIN = 0.2  # share of a disk visible in both pictures, below which a correlation is half believed
+GRAPH_ITERATIONS = 20
+ARRIVED_RAD = 1e-6
+Sampled = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Turns:
-    """Relative rotations of E pairs of instants; made by `climb_pairs`, read by the graph."""
+class RelativeRotations:
+    """Relative rotations of E pairs of instants."""
 
     first: Tensor  # (E,) int64, i
     second: Tensor  # (E,) int64, j
@@ -34,27 +40,27 @@ class Turns:
         """Return the number of pairs."""
         return len(self.score)
 
-    def where(self, chosen: Tensor) -> Turns:
+    def where(self, chosen: Tensor) -> RelativeRotations:
         """Return some of the pairs."""
-        return Turns(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
+        return RelativeRotations(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
+
+    def residual(self, R_lab_body: Tensor) -> Tensor:
+        """Return delta (E, 3), rad, between the pairs and attitudes (N, 3, 3): R_ji = exp([delta]x) R(j) R(i)^T."""
+        return so3.log(self.R_ji @ (R_lab_body[self.second] @ R_lab_body[self.first].mT).mT)
 
 
-def joined(parts: list[Turns]) -> Turns:
-    """Return the pairs of all parts."""
-    return Turns(**{name: torch.cat([getattr(part, name) for part in parts]) for name in Turns.__dataclass_fields__})
+def all_rotations(parts: list[RelativeRotations]) -> RelativeRotations:
+    """Return the pairs of all parts in one record."""
+    names = RelativeRotations.__dataclass_fields__
+    return RelativeRotations(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Warp:
-    """One disk laid over another, for E rotations."""
+def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slopes: bool) -> Sampled:
+    """Look up the disks of `second` (E,) in directions (E, 3, P), lab.
 
-    grey: Tensor  # (E, P), of the second disk at the first one's places
-    by_turn: Tensor  # (E, 3, P), its derivative by delta, lab
-    weight: Tensor  # (E, P)
-
-
-def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slopes: bool) -> _Warp:
-    """Look up the disks of `second` (E,) in directions (E, 3, P) that the lab sees at that instant."""
+    Returns:
+        Grey (E, P), its derivative by delta in the lab (E, 3, P) or (E, 0, P) without slopes, and weight (E, P).
+    """
     R = disks.R_lab_view[second, camera]
     normal = R.mT @ normal_lab
     place, scale, depth = disk_places(normal, disks.distance_radii[second, camera])
@@ -72,48 +78,33 @@ def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slope
     upper = corner(0) * (1 - tx)[:, None] + corner(1) * tx[:, None]
     lower = corner(size) * (1 - tx)[:, None] + corner(size + 1) * tx[:, None]
     found = upper * (1 - ty)[:, None] + lower * ty[:, None]
-    near = disks.share.reshape(-1)[cell]
-    weight = depth.clamp_min(0) * near * disks.told(second, camera).gather(1, cell)
+    weight = depth.clamp_min(0) * disks.share.reshape(-1)[cell] * disks.weight(second, camera).gather(1, cell)
     if not slopes:
-        return _Warp(grey=found[:, 0], by_turn=found[:, :0], weight=weight)
+        return found[:, 0], found[:, :0], weight
     # d place = scale (d xy - place / sqrt(D^2 - 1) d z), d n = delta x n, view frame.
     gx, gy = found[:, 1] * scale[:, 0], found[:, 2] * scale[:, 0]
     D = disks.distance_radii[second, camera][:, None]
     gz = -(gx * place[:, 0] + gy * place[:, 1]) / (D.square() - 1).sqrt()
     x, y, z = normal.unbind(1)
     turned = torch.stack([y * gz - z * gy, z * gx - x * gz, x * gy - y * gx], dim=1)
-    return _Warp(grey=found[:, 0], by_turn=R @ turned, weight=weight)
+    return found[:, 0], R @ turned, weight
 
 
-def _first_views(disks: Disks, first: Tensor, every: int) -> list[tuple[Tensor, Tensor, Tensor]]:
+def _first_views(disks: Disks, first: Tensor, every: int) -> list[Sampled]:
     """Return directions in the lab (E, 3, P), grey (E, P) and weight (E, P) of the first disks, camera by camera."""
     views = []
     for camera in range(disks.layers.shape[1]):
-        normal, grey, weight = _sampled(disks, first, camera, every)
+        normal, grey, weight = disks.sampled(first, camera, every)
         views.append((disks.R_lab_view[first, camera] @ normal, grey, weight))
     return views
 
 
-def _sampled(disks: Disks, rows: Tensor, camera: int, every: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return directions in the view frame (3, P), grey (R, P) and weight (R, P) of one camera's disks."""
-    normal, share = view_normals(disks.size_px, float(disks.distance_radii[:, camera].median()), every)
-    place, _, depth = disk_places(normal, disks.distance_radii[:, camera].median())
-    at = ((place + 1) * (disks.size_px / 2) - 0.5).round().long()
-    cell = at[1] * disks.size_px + at[0]
-    grey = disks.layers[rows, camera, 0].flatten(1)[:, cell]
-    return normal, grey, (share * depth.clamp_min(0))[None] * disks.told(rows, camera)[:, cell]
+def refine_pairs(
+    disks: Disks, first: Tensor, second: Tensor, R_ji: Tensor, iterations: int, every: int = 1
+) -> RelativeRotations:
+    """Refine rough relative rotations R_ji (E, 3, 3) by Gauss-Newton, all cameras of both instants (E,) together.
 
-
-def climb_pairs(disks: Disks, first: Tensor, second: Tensor, R_ji: Tensor, steps: int, every: int = 1) -> Turns:
-    """Bring rough relative rotations to the best fit nearby, all cameras of both instants against each other.
-
-    Args:
-        disks: of the movie.
-        first: (E,) int64.
-        second: (E,) int64.
-        R_ji: (E, 3, 3), starts.
-        steps: Gauss-Newton steps.
-        every: which share of the pixels is looked at.
+    Only each n-th (`every`) pixel is used.
 
     Source: direct alignment, Lucas and Kanade 1981; robust weights, Geman and McClure 1987.
     """
@@ -121,58 +112,44 @@ def climb_pairs(disks: Disks, first: Tensor, second: Tensor, R_ji: Tensor, steps
     for rows in torch.split(torch.arange(len(first)), BATCH):
         i, j, R = first[rows], second[rows], R_ji[rows].float()
         views = _first_views(disks, i, every)
-        for _ in range(steps):
+        for _ in range(iterations):
             normal, right, _, _ = _normal_equations(disks, j, R, views, slopes=True)
             ridge = RIDGE * normal.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] * torch.eye(3) + 1e-6 * torch.eye(3)
             turn = torch.linalg.solve((normal + ridge).double(), right.double()[..., None])[..., 0].float()
             turn = turn * (STEP_RAD / turn.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0)
             R = so3.exp(turn) @ R
         normal, _, score, overlap = _normal_equations(disks, j, R, views, slopes=True)
+        R = so3.nearest_rotation(R.double())
         parts.append(
-            Turns(
-                first=i,
-                second=j,
-                R_ji=so3.nearest_rotation(R.double()),
-                information=normal.double(),
-                score=score.double(),
-                overlap=overlap.double(),
+            RelativeRotations(
+                first=i, second=j, R_ji=R, information=normal.double(), score=score.double(), overlap=overlap.double()
             )
         )
-    return joined(parts)
+    return all_rotations(parts)
 
 
 def _normal_equations(
-    disks: Disks, second: Tensor, R: Tensor, views: list[tuple[Tensor, Tensor, Tensor]], slopes: bool
+    disks: Disks, second: Tensor, R: Tensor, views: list[Sampled], slopes: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Sum over all pairs of cameras: normal matrix (E, 3, 3), right side (E, 3), correlation and overlap (E,)."""
     count = len(R)
     normal, right = torch.zeros(count, 3, 3), torch.zeros(count, 3)
     sums = torch.zeros(count, 6)
     disk_weight = 0.0
-    for normal_lab, grey, own in views:
+    for normal_lab, a, own in views:
         turned = R @ normal_lab
         disk_weight += float(own.sum(1).max()) if count else 0.0
         for camera in range(disks.layers.shape[1]):
-            warp = _warped(disks, second, camera, turned, slopes)
-            weight = own * warp.weight
-            left = grey - warp.grey
+            b, by_turn, other = _warped(disks, second, camera, turned, slopes)
+            weight = own * other
+            residual = a - b
             if slopes:
-                trusted = weight / (1 + (left / SCALE).square()).square()
-                scaled = warp.by_turn * trusted[:, None]
-                normal += scaled @ warp.by_turn.mT
-                right += (scaled @ left[..., None])[..., 0]
-            a, b = grey, warp.grey
-            sums += torch.stack(
-                [
-                    weight.sum(1),
-                    (weight * a).sum(1),
-                    (weight * b).sum(1),
-                    (weight * a * a).sum(1),
-                    (weight * b * b).sum(1),
-                    (weight * a * b).sum(1),
-                ],
-                dim=1,
-            )
+                robust = weight / (1 + (residual / SCALE).square()).square()
+                scaled = by_turn * robust[:, None]
+                normal += scaled @ by_turn.mT
+                right += (scaled @ residual[..., None])[..., 0]
+            products = (weight, weight * a, weight * b, weight * a * a, weight * b * b, weight * a * b)
+            sums += torch.stack([product.sum(1) for product in products], dim=1)
     score, w = _correlation(*sums.unbind(1))
     return normal, right, score, w / max(disk_weight / len(views), 1e-9)
 
@@ -186,15 +163,9 @@ def _correlation(w: Tensor, a: Tensor, b: Tensor, aa: Tensor, bb: Tensor, ab: Te
 
 
 def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, grid: Tensor, every: int = 1) -> Tensor:
-    """Return the best of all rotations grid[m] @ about[e], (E, 3, 3), for pairs of instants.
+    """Return the best of all rotations grid[m] @ about[e], (E, 3, 3), for pairs of instants (E,).
 
-    Args:
-        disks: small ones: detail that is finer than the grid only hides the right place.
-        first: (E,) int64.
-        second: (E,) int64.
-        about: (E, 3, 3), R_ji about which is searched.
-        grid: (M, 3, 3).
-        every: which share of the pixels is looked at.
+    The disks should be small ones: detail finer than the grid (M, 3, 3) only hides the right place.
     """
     best = []
     grid = grid.float()
@@ -206,39 +177,90 @@ def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, gri
             tried = some @ R
             views = _first_views(disks, i.expand(len(tried)), every)
             _, _, score, overlap = _normal_equations(disks, j.expand(len(tried)), tried, views, slopes=False)
-            # Little that both show says little: shrunk towards nothing as a correlation of few places is.
+            # Shrunk: a correlation over a small overlap proves little.
             scores.append(score * (overlap / (overlap + OVERLAP_MIN)))
         best.append(grid[int(torch.cat(scores).argmax())] @ R)
     return torch.stack(best).double()
 
 
 def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tensor, every: int) -> Tensor:
-    """Compare one disk with all first ones of a camera, for all rotations of a grid, (N, M).
+    """Compare one disk with all first ones of a camera, for all rotations of a grid; return correlations (N, M).
 
-    A disk that is turned is looked up once for all that it is compared with; the rest are products of matrices.
+    A turned disk is looked up once for all disks; the rest are matrix products.
 
     Args:
         disks: N, small ones, as in `search_pairs`.
         cameras: of the first disks and of the second one.
         second: instant of the second one.
         grid: (M, 3, 3), from the first disk's view frame to the second one's.
-        every: which share of the pixels is looked at.
-
-    Returns:
-        Correlations, shrunk as in `search_pairs`.
+        every: use each n-th pixel.
     """
     camera, other = cameras
-    normal, grey, own = _sampled(disks, torch.arange(len(disks)), camera, every)
+    normal, grey, own = disks.sampled(torch.arange(len(disks)), camera, every)
     left = torch.stack([own, own * grey, own * grey.square()])
     full = float(own.sum(1).max())
     parts = []
     for some in torch.split(grid.float(), max(1, LOOKS // normal.shape[1])):
         rows = torch.full((len(some),), second)
-        warp = _warped(disks, rows, other, disks.R_lab_view[second, other] @ some @ normal, slopes=False)
-        right = torch.stack([warp.weight, warp.weight * warp.grey, warp.weight * warp.grey.square()])
+        b, _, weight = _warped(disks, rows, other, disks.R_lab_view[second, other] @ some @ normal, slopes=False)
+        right = torch.stack([weight, weight * b, weight * b.square()])
         sums = torch.einsum("anp,bmp->abnm", left, right)
         w, a, aa = sums[0, 0], sums[1, 0], sums[2, 0]
         score, w = _correlation(w, a, sums[0, 1], aa, sums[0, 2], sums[1, 1])
         overlap = w / max(full, 1e-9)
         parts.append(score * (overlap / (overlap + OVERLAP_MIN)))
     return torch.cat(parts, dim=1)
+
+
+def solve_graph(R_lab_body: Tensor, pairs: RelativeRotations, scale_rad: float) -> tuple[Tensor, Tensor]:
+    """Fit attitudes (N, 3, 3) float64 to relative rotations that connect them; the first attitude stays.
+
+    Pairs with residuals beyond `scale_rad` lose weight.
+
+    Returns:
+        Attitudes (N, 3, 3) and residuals of the pairs (E, 3), rad.
+
+    Source: pose graph on SO(3) by Gauss-Newton; robust weights, Geman and McClure 1987, narrowed step by step as in
+    graduated non-convexity (Yang et al. 2020).
+    """
+    R = R_lab_body.clone()
+    typical = pairs.information.diagonal(dim1=1, dim2=2).mean().clamp_min(1e-12)
+    shape = pairs.information / typical
+    for k in range(GRAPH_ITERATIONS):
+        wide = scale_rad * max(1.0, 16.0 * 0.6**k)
+        residual = pairs.residual(R)
+        weight = 1 / (1 + (residual.norm(dim=-1) / wide).square()).square()
+        step = _graph_step(R, pairs, residual, shape * weight[:, None, None])
+        R = so3.exp(step) @ R
+        if wide == scale_rad and float(step.norm(dim=-1).max()) < ARRIVED_RAD:
+            break
+    R = so3.nearest_rotation(R @ (R[0].mT @ R_lab_body[0]))
+    return R, pairs.residual(R)
+
+
+def _graph_step(R: Tensor, pairs: RelativeRotations, residual: Tensor, weight: Tensor) -> Tensor:
+    """Solve residual = delta_j - R_ji delta_i for all pairs, (N, 3)."""
+    count, i, j = len(R), pairs.first, pairs.second
+    carry = R[j] @ R[i].mT
+    rows, columns, values = [], [], []
+    axes = torch.arange(3)
+    for a, b, block in (
+        (i, i, carry.mT @ weight @ carry),
+        (i, j, -carry.mT @ weight),
+        (j, i, -weight @ carry),
+        (j, j, weight),
+    ):
+        rows.append((3 * a[:, None, None] + axes[:, None]).expand(-1, 3, 3).reshape(-1))
+        columns.append((3 * b[:, None, None] + axes).expand(-1, 3, 3).reshape(-1))
+        values.append(block.reshape(-1))
+    pulled = (weight @ residual[..., None])[..., 0]
+    right = torch.zeros(count, 3, dtype=R.dtype)
+    right.index_add_(0, j, pulled)
+    right.index_add_(0, i, -(carry.mT @ pulled[..., None])[..., 0])
+    # The first attitude is held; unconnected ones stay.
+    diagonal = torch.full((3 * count,), 1e-9, dtype=R.dtype)
+    diagonal[:3] = 1e9
+    every = torch.arange(3 * count)
+    entries = [torch.cat(part).numpy() for part in ([*values, diagonal], [*rows, every], [*columns, every])]
+    matrix = coo_matrix((entries[0], (entries[1], entries[2])), shape=(3 * count, 3 * count)).tocsc()
+    return torch.from_numpy(np.asarray(spsolve(matrix, right.reshape(-1).numpy())).reshape(count, 3))

@@ -1,4 +1,4 @@
-"""Patches of a map that are looked for in another: where does it have the same paint, to hundredths of a degree."""
+"""Find patches of one texture map in another, to hundredths of a degree."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import Tensor
 from sphereorient.sphere.texture_table import TextureTable
 
 RADIUS_DEG = 7.5  # of a patch
-REACH_DEG = 4.0  # within which it is looked for
+REACH_DEG = 4.0  # of the search
 ROUGH_DEG, FINE_DEG = 1.0, 0.5  # steps of the search, and of the places of a patch
-STEPS = 8  # of the climb
-CONTRAST_MIN = 0.15  # deviation of the paint in a patch, of black to white
-ONE_WAY = 0.15  # share of the weaker direction below which edges run one way only, and say nothing along themselves
-NEIGHBOURS, FEWEST, NEAR_DEG = 6, 3, 20.0  # that are asked, that decide, how far they may be
-APART_DEG = 1.0  # from the neighbours' middle shift, beyond which a patch was found in the wrong place
+STEPS = 8  # of the refinement
+CONTRAST_MIN = 0.15  # deviation of the texture in a patch, of black to white
+ONE_WAY = 0.15  # share of the weaker direction below which all edges run one way: no shift along them is measured
+NEIGHBOURS, FEWEST, NEAR_DEG = 6, 3, 20.0  # compared with, needed for a decision, largest distance
+APART_DEG = 1.0  # from the neighbours' median shift, beyond which a patch was found in the wrong place
 ALIKE_MIN = 0.8  # correlation below which a patch was not found
 
 
@@ -30,7 +30,7 @@ class Patches:
 
     def points(self, step_deg: float) -> Tensor:
         """Return the places of all patches, (D, P, 3), so many degrees apart."""
-        return self.shifted(offsets(step_deg), torch.zeros(len(self.direction), 2, dtype=torch.float64))
+        return self.shifted(_offsets(step_deg), torch.zeros(len(self.direction), 2, dtype=torch.float64))
 
     def shifted(self, offset: Tensor, shift: Tensor) -> Tensor:
         """Return places (D, P, 3) at offsets (P, 2), rad east and north, from patches shifted by (D, 2)."""
@@ -40,15 +40,7 @@ class Patches:
         return torch.nn.functional.normalize(d + at[..., :1] * east + at[..., 1:] * north, dim=-1)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Shifts:
-    """Where patches were found; made by `patch_shifts`."""
-
-    shift_rad: Tensor  # (D, 2) float64, east and north
-    sure: Tensor  # (D,) bool: enough contrast, edges both ways, found within the reach
-
-
-def offsets(step_deg: float) -> Tensor:
+def _offsets(step_deg: float) -> Tensor:
     """Return the places of a patch in its tangent plane, (P, 2) float64, rad."""
     count = math.floor(RADIUS_DEG / step_deg)
     at = torch.arange(-count, count + 1, dtype=torch.float64) * math.radians(step_deg)
@@ -57,70 +49,73 @@ def offsets(step_deg: float) -> Tensor:
 
 
 def compass(direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the unit vectors to the east and to the north of directions (..., 3) that are no poles."""
+    """Return the unit vectors to the east and to the north of directions (..., 3) other than the poles."""
     x, y, z = direction.unbind(-1)
     level = (x * x + y * y).sqrt().clamp_min(1e-12)
     east = torch.stack([-y / level, x / level, torch.zeros_like(x)], dim=-1)
     return east, torch.stack([-z * x / level, -z * y / level, level], dim=-1)
 
 
-def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: Patches) -> Shifts:
+def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: Patches) -> tuple[Tensor, Tensor]:
     """Find patches of the reference in another map.
 
     Args:
-        rough: blurred tables of the other map and of the reference: for the search.
-        fine: likewise, for the climb.
-        patches: which.
+        rough: blurred tables of the other map and of the reference, for the search.
+        fine: likewise, for the refinement.
+        patches: of the reference.
+
+    Returns:
+        Shifts (D, 2) float64, rad east and north, and whether each patch was found (D,).
 
     Source: normalised correlation; then direct alignment, Lucas and Kanade 1981, with gain and offset.
     """
-    start = _searched(rough, patches)
-    shift = start
-    offset = offsets(FINE_DEG)
+    shift = start = _searched(rough, patches)
+    offset = _offsets(FINE_DEG)
     reference, _ = fine[1].sample(patches.points(FINE_DEG).mT.float())
     for _ in range(STEPS):
-        grey, by_shift = _looked(fine[0], patches, offset, shift)
-        normal, right = _normal_equations(grey, by_shift, reference)
-        step = torch.linalg.solve(normal + 1e-9 * torch.eye(4).double(), right[..., None])[:, :2, 0]
+        grey, by_shift = _sampled(fine[0], patches, offset, shift)
+        # Unknowns: shift, gain and offset that take the other map's grey to the reference's.
+        columns = torch.stack([-by_shift[:, 0], -by_shift[:, 1], reference, torch.ones_like(reference)], dim=1).double()
+        normal, right = columns @ columns.mT, columns @ grey.double()[..., None]
+        step = torch.linalg.solve(normal + 1e-9 * torch.eye(4).double(), right)[:, :2, 0]
         longest = math.radians(0.5)
         shift = shift + step * (longest / step.norm(dim=-1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0)
-    grey, by_shift = _looked(fine[0], patches, offset, shift)
+    grey, by_shift = _sampled(fine[0], patches, offset, shift)
     own = (by_shift.double() @ by_shift.double().mT) / len(offset)
     weaker = torch.linalg.eigvalsh(own)[:, 0]
     sure = (weaker > ONE_WAY * own.diagonal(dim1=1, dim2=2).sum(-1)) & (reference.std(1) > CONTRAST_MIN)
-    sure &= (_alike(grey, reference) > ALIKE_MIN) & (shift.norm(dim=-1) < math.radians(REACH_DEG))
-    sure &= (shift - start).norm(dim=-1) < math.radians(ROUGH_DEG)  # a climb that leaves its peak has lost the patch
-    return Shifts(shift_rad=shift, sure=sure & ~_alone(patches.direction, shift, sure))
+    sure &= (_correlation(grey, reference) > ALIKE_MIN) & (shift.norm(dim=-1) < math.radians(REACH_DEG))
+    sure &= (shift - start).norm(dim=-1) < math.radians(ROUGH_DEG)  # else the refinement has left its peak
+    return shift, sure & ~_contradicted(patches.direction, shift, sure)
 
 
-def _alone(direction: Tensor, shift: Tensor, sure: Tensor) -> Tensor:
-    """Return which patches (D,) contradict those around them, which overlap with them: found on another edge."""
+def _contradicted(direction: Tensor, shift: Tensor, sure: Tensor) -> Tensor:
+    """Return which patches (D,) contradict their neighbours, with which they overlap: they found another edge."""
     east, north = compass(direction)
     moved = shift[:, :1] * east + shift[:, 1:] * north
     near = (direction @ direction.mT).fill_diagonal_(-1) * sure - (~sure).double()
     cosine, which = near.topk(min(NEIGHBOURS, len(direction)), dim=1)
-    told = cosine > math.cos(math.radians(NEAR_DEG))
-    others = torch.where(told[..., None], moved[which], torch.nan)
+    close = cosine > math.cos(math.radians(NEAR_DEG))
+    others = torch.where(close[..., None], moved[which], torch.nan)
     apart = (moved - others.nanmedian(1).values).norm(dim=-1)
-    alone: Tensor = (told.sum(1) >= FEWEST) & (apart > math.radians(APART_DEG))
-    return alone
+    contradicted: Tensor = (close.sum(1) >= FEWEST) & (apart > math.radians(APART_DEG))
+    return contradicted
 
 
 def _searched(tables: list[TextureTable], patches: Patches) -> Tensor:
     """Try all shifts within reach, (D, 2)."""
-    offset = offsets(2 * FINE_DEG)
-    reference, _ = tables[1].sample(patches.shifted(offset, torch.zeros(len(patches.direction), 2).double()).mT.float())
-    count = round(REACH_DEG / ROUGH_DEG)
-    at = torch.arange(-count, count + 1, dtype=torch.float64) * math.radians(ROUGH_DEG)
+    count, offset = len(patches.direction), _offsets(2 * FINE_DEG)
+    reference, _ = tables[1].sample(patches.points(2 * FINE_DEG).mT.float())
+    steps = round(REACH_DEG / ROUGH_DEG)
+    at = torch.arange(-steps, steps + 1, dtype=torch.float64) * math.radians(ROUGH_DEG)
     tried = torch.stack(torch.meshgrid(at, at, indexing="ij"), dim=-1).reshape(-1, 2)
-    scores = []
-    for shift in tried:
-        grey, _ = _looked(tables[0], patches, offset, shift.expand(len(patches.direction), 2))
-        scores.append(_alike(grey, reference))
+    scores = [
+        _correlation(_sampled(tables[0], patches, offset, shift.expand(count, 2))[0], reference) for shift in tried
+    ]
     return tried[torch.stack(scores).argmax(0)]
 
 
-def _looked(table: TextureTable, patches: Patches, offset: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+def _sampled(table: TextureTable, patches: Patches, offset: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
     """Return the other map's grey (D, P) at shifted patches, and its derivative by the shift (D, 2, P)."""
     place = patches.shifted(offset, shift)
     value, slope = table.sample((place @ patches.R_other_reference.mT).mT.float())
@@ -133,13 +128,7 @@ def _looked(table: TextureTable, patches: Patches, offset: Tensor, shift: Tensor
     return value, torch.stack(columns, dim=1).float()
 
 
-def _normal_equations(grey: Tensor, by_shift: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (D, 4, 4) and (D, 4) of shift, gain and offset that take the other map's grey to the reference's."""
-    columns = torch.stack([-by_shift[:, 0], -by_shift[:, 1], reference, torch.ones_like(reference)], dim=1).double()
-    return columns @ columns.mT, (columns @ grey.double()[..., None])[..., 0]
-
-
-def _alike(a: Tensor, b: Tensor) -> Tensor:
-    """Correlation of (D, P) with (D, P)."""
+def _correlation(a: Tensor, b: Tensor) -> Tensor:
+    """Return the correlations (D,) of (D, P) with (D, P)."""
     a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
     return (a * b).sum(1) / ((a * a).sum(1) * (b * b).sum(1)).clamp_min(1e-12).sqrt()

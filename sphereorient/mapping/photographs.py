@@ -1,4 +1,4 @@
-"""Attitudes of photographs in any order: all compared with all over all rotations, sets that agree joined."""
+"""Attitudes of photographs in any order: compare all pairs over all rotations, join sets that agree."""
 
 from __future__ import annotations
 
@@ -15,50 +15,47 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
 from sphereorient.mapping.chain import (
-    CLIMB_EVERY,
-    CLIMBS,
+    EVERY,
+    ITERATIONS,
     OVERLAP_MIN,
     SMALLER,
-    Chain,
+    PairwiseAttitudes,
     check_turned,
-    likeness,
-    moved,
-    rms,
+    sight_cosines,
 )
 from sphereorient.mapping.disks import Disks, reduced
-from sphereorient.mapping.graph import solve_graph
-from sphereorient.mapping.pairs import Turns, climb_pairs, joined, search_views
-from sphereorient.mapping.record import Closure
-from sphereorient.mapping.settings import PaintSettings
+from sphereorient.mapping.pairs import RelativeRotations, all_rotations, refine_pairs, search_views, solve_graph
+from sphereorient.mapping.record import Closure, attitude_change_rad, rms
+from sphereorient.mapping.settings import MapSettings
 from sphereorient.search.peaks import distinct
 
 STEP_DEG = 8.0  # of the grid of rotations
-TILT_DEG = 75.0  # between lines of sight in the body, beyond which two disks share too little to be told from chance
-EVERY = 1  # pixels of the small disks
-TOPS, PEAKS = 96, 3  # best rotations of a pair, and distinct ones among them that are climbed from
-FINER = 2.7  # detail, window and pixels of the disks in which pairs are measured at last, where the pictures have it
-DISK_PX_MAX = 128
+TILT_DEG = 75.0  # between lines of sight in the body, beyond which two disks share too little
+SEARCH_EVERY = 1  # pixels of the small disks
+MODES, PEAKS = 96, 3  # best rotations of a pair, and distinct ones among them that are refined
 PEAK_DEG = 18.0  # between distinct ones
-CHANCE_PAIRS = 500  # pairs at random rotations, which tell how well other paint correlates
+FINER = 2.7  # detail, window and pixels of the disks in the last comparison, where the pictures have it
+DISK_PX_MAX = 128
+CHANCE_PAIRS = 500  # pairs at random rotations, which show how well different patches correlate
 CHANCE_SEED = 0
 CHI2_MEDIAN = 0.4549  # of the square of a normal number
-JOIN_STEPS = 4  # of the climb of a pair between two sets
+JOIN_ITERATIONS = 4  # of the refinement of a pair between two sets
 FEWEST = 3  # pictures: each pair of the smallest set is confirmed by the two others
-LIKE_MAX = 0.98  # correlation beyond which paint is not any more the same
-# Log of the odds by which two sets must rather show the same paint than chance to be joined. Among 5 million rotations
-# tried for 30 pictures, the best wrong ones have about 20 (measured); to be wrong here costs more than a picture.
+LIKE_MAX = 0.98  # largest correlation that counts
+# Log-odds above which two sets are joined. Among 5 million rotations tried for 30 pictures, the best wrong ones have
+# about 20 (measured); a wrong join costs more than a picture left out.
 SURE = 25.0
-REACH_RAD = math.radians(10.0)  # by which a pair may differ from where the others say that it is
-SCALE_RAD = math.radians(2.0)  # by which outlines' errors turn pairs that share only slanted places
-SETTLE = 2  # times that pairs are compared in fine detail, each from where all together say
+REACH_RAD = math.radians(10.0)  # by which a pair may differ from the attitudes of the others
+SCALE_RAD = math.radians(2.0)  # scatter of pairs that share only slanted places, by errors of the outlines
+SETTLE = 2  # comparisons in fine detail, each from the attitudes of all together
 OTHER_SHARE, OTHER_LEAST = 0.5, 4  # of the largest set, and pictures: a second set so large is another ball
 
 
-def finer_settings(settings: PaintSettings, diameter_px: float) -> PaintSettings:
-    """Return settings of finer disks: with all that pictures of a ball so wide have, up to a factor.
+def finer_settings(settings: MapSettings, diameter_px: float) -> MapSettings:
+    """Return settings of finer disks, up to the resolution of the pictures.
 
-    Coarse disks have a view of a place that leans with its slant, by degrees at 60 degrees of it; in fine ones,
-    compared with their nearest neighbourhood, that is less: 0.4 degrees instead of 2 (30 pictures of 200 px).
+    Coarse disks give rotations that are wrong where the view is slanted: 2 degrees instead of 0.4 in fine ones
+    (30 pictures of 200 px).
     """
     factor = min(max(diameter_px / settings.disk_px, 1.0), FINER, DISK_PX_MAX / settings.disk_px)
     size = 2 * round(factor * settings.disk_px / 2)
@@ -69,223 +66,183 @@ def finer_settings(settings: PaintSettings, diameter_px: float) -> PaintSettings
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Evidence:
-    """How much likelier a pair shows the same paint than other paint; made by `measured_evidence`."""
+    """How much likelier two disks show the same patch than different patches."""
 
     disks: Disks
-    cells: float  # independent places of a whole disk, by how other paint correlates
+    cells: float  # independent places of a whole disk, from the correlation of different patches
     score_min: float
 
-    def of(self, turns: Turns) -> Tensor:
-        """Return the logarithm of the odds, (E,).
+    def log_odds(self, pairs: RelativeRotations) -> Tensor:
+        """Return the log-odds of pairs, (E,).
 
-        Fisher's z of a correlation over n independent places is normal with variance 1 / n, about 0 for other paint,
-        and about twice that of the setting `score_min` for the same: halfway the odds are even.
+        Fisher's z of a correlation over n independent places is normal with variance 1 / n, about 0 for different
+        patches and about twice that of `score_min` for the same: halfway the odds are even.
 
         Source: Fisher 1921, On the probable error of a coefficient of correlation.
         """
         middle = math.atanh(self.score_min)
-        z = turns.score.clamp(-LIKE_MAX, LIKE_MAX).atanh()
-        return 2 * middle * self.cells * turns.overlap * (z - middle)
+        z = pairs.score.clamp(-LIKE_MAX, LIKE_MAX).atanh()
+        return 2 * middle * self.cells * pairs.overlap * (z - middle)
 
 
-def find_photographs(disks: Disks, finer: Disks, settings: PaintSettings) -> Chain:
-    """Find attitudes of pictures in any order, from them alone.
+def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> PairwiseAttitudes:
+    """Find attitudes of photographs in any order; those outside of the largest connected set get none.
 
     Args:
         disks: of N instants, each seen by a camera at least.
-        finer: the same with more pixels and detail, in which the pairs that were found are measured.
-        settings: of the room.
-
-    Returns:
-        Attitudes of the largest set of pictures that are connected by paint they share. The others have none.
+        finer: the same with more pixels and detail, for the last comparison.
+        settings: of mapping.
 
     Raises:
-        PaintError: fewer than three pictures, none that share paint, a ball that does not turn, or two balls.
+        PaintError: fewer than three pictures, none with a common patch, a ball that does not turn, or two balls.
     """
     if len(disks) < FEWEST:
         do = "take more pictures of the ball, of all its sides"
-        raise PaintError(
-            refusal("photographs", expected=f"{FEWEST} with the ball at least", got=f"{len(disks)}", do=do)
-        )
+        expected = f"{FEWEST} with the ball at least"
+        raise PaintError(refusal("photographs", expected=expected, got=f"{len(disks)}", do=do))
     rough = measured_evidence(disks, settings)
     label, joined_R = joined_sets(rough, all_pairs(disks))
-    rows, R, turns = settled(rough, _largest(label), joined_R)
+    rows, R, pairs = _settled(rough, _largest(label), joined_R)
     fine = measured_evidence(finer, settings)
     for _ in range(SETTLE):
-        rows, R, turns = settled(fine, rows, R)
-    chain = _chain(rows, joined_R, R, turns, len(disks) * (len(disks) - 1) // 2)
-    check_turned(chain.R_lab_body, settings)
-    return chain
+        rows, R, pairs = _settled(fine, rows, R)
+    before, after = (so3.nearest_rotation(attitudes[rows] @ attitudes[rows[0]].mT) for attitudes in (joined_R, R))
+    place = torch.full((len(R),), -1).index_put((rows,), torch.arange(len(rows)))
+    own = replace(pairs, first=place[pairs.first], second=place[pairs.second])
+    check_turned(after, settings)
+    return PairwiseAttitudes(
+        rows=rows,
+        R_lab_body=after,
+        closure=Closure(
+            pairs=len(rows) - 1,
+            loops=len(disks) * (len(disks) - 1) // 2,
+            closed=len(own),
+            drift_before_rad=rms(own.residual(before)),
+            drift_after_rad=rms(own.residual(after)),
+            moved_rad=attitude_change_rad(before, after),
+        ),
+    )
 
 
-def measured_evidence(disks: Disks, settings: PaintSettings) -> Evidence:
-    """Learn from pairs at random rotations how well paint correlates that is not the same."""
+def measured_evidence(disks: Disks, settings: MapSettings) -> Evidence:
+    """Measure at random rotations how well different patches correlate."""
     rng = torch.Generator().manual_seed(CHANCE_SEED)
     first = torch.randint(len(disks), (CHANCE_PAIRS,), generator=rng)
     second = (first + 1 + torch.randint(len(disks) - 1, (CHANCE_PAIRS,), generator=rng)) % len(disks)
-    turns = climb_pairs(disks, first, second, so3.random_rotations(CHANCE_PAIRS, generator=rng), 0, CLIMB_EVERY)
-    told = turns.where(turns.overlap > OVERLAP_MIN)
-    spread = (told.score.square() * told.overlap).median() / CHI2_MEDIAN
-    return Evidence(disks=disks, cells=1 / max(float(spread), 1e-6), score_min=settings.score_min)
+    pairs = refine_pairs(disks, first, second, so3.random_rotations(CHANCE_PAIRS, generator=rng), 0, EVERY)
+    used = pairs.where(pairs.overlap > OVERLAP_MIN)
+    scatter = (used.score.square() * used.overlap).median() / CHI2_MEDIAN
+    return Evidence(disks=disks, cells=1 / max(float(scatter), 1e-6), score_min=settings.score_min)
 
 
-def all_pairs(disks: Disks) -> Turns:
-    """Compare all disks with all over all rotations, and climb from the best few of each pair."""
+def all_pairs(disks: Disks) -> RelativeRotations:
+    """Compare all disks with all over all rotations, and refine the best few rotations of each pair."""
     small = reduced(disks, SMALLER)
     grid = so3.lattman_grid(math.radians(STEP_DEG))
     grid = grid[grid[:, 2, 2] > math.cos(math.radians(TILT_DEG))]
-    parts = list(_starts(small, grid))
-    first, second, R_ji = (torch.cat(part) for part in zip(*parts, strict=True))
-    return climb_pairs(disks, first, second, R_ji, CLIMBS, CLIMB_EVERY)
+    first, second, R_ji = (torch.cat(part) for part in zip(*_starts(small, grid), strict=True))
+    return refine_pairs(disks, first, second, R_ji, ITERATIONS, EVERY)
 
 
 def _starts(small: Disks, grid: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Yield pairs (first, second) and their best rotations R_ji (E, 3, 3), disk after disk."""
-    cameras = small.layers.shape[1]
+    cameras = range(small.layers.shape[1])
+    R_lab_view = small.R_lab_view.double()
     for second in range(len(small)):
-        for a, b in ((a, b) for a in range(cameras) for b in range(cameras)):
-            if not bool(small.seen[second, b]):
-                continue
-            scores = search_views(small, (a, b), second, grid, EVERY)
-            top = scores.topk(min(TOPS, len(grid)), dim=1).indices
+        for a, b in ((a, b) for a in cameras for b in cameras if small.seen[second, b]):
+            scores = search_views(small, (a, b), second, grid, SEARCH_EVERY)
+            top = scores.topk(min(MODES, len(grid)), dim=1).indices
             peak = distinct(grid[top], math.radians(PEAK_DEG))
             peak &= (peak.cumsum(1) <= PEAKS) & small.seen[:, a, None]
             peak[second] = False
             first, which = torch.nonzero(peak).T
-            R_lab_view = small.R_lab_view.double()
             turn = R_lab_view[second, b] @ grid[top[first, which]] @ R_lab_view[first, a].mT
             yield first, torch.full_like(first, second), turn
 
 
-def joined_sets(evidence: Evidence, found: Turns) -> tuple[Tensor, Tensor]:
-    """Join pictures to sets, and sets to larger ones, where all their pictures together say so, surest pairs first.
+def joined_sets(evidence: Evidence, found: RelativeRotations) -> tuple[Tensor, Tensor]:
+    """Join pictures to sets, and sets to larger ones, where all their pictures together agree, best pairs first.
 
-    Args:
-        evidence: of N pictures.
-        found: what pairs may be; several of one pair contradict each other.
+    `found` are possible rotations; several of one pair contradict each other.
 
     Returns:
         The number of each picture's set (N,) int64, and attitudes (N, 3, 3), comparable within a set.
     """
     count = len(evidence.disks)
     label, R = torch.arange(count), torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
-    odds = evidence.of(found)
+    odds = evidence.log_odds(found)
     order = odds.argsort(descending=True, stable=True)
     order = order[odds[order] > 0]
-    turns, before = found.where(order[:0]), label + 1
-    while not torch.equal(label, before):  # what larger sets tell may join what smaller ones could not
+    pairs, before = found.where(order[:0]), label + 1
+    while not torch.equal(label, before):  # larger sets may join what smaller ones could not
         before = label
         for i, j, R_ji in zip(found.first[order], found.second[order], found.R_ji[order], strict=True):
             if label[i] == label[j]:
                 continue
             one, other = label == label[i], label == label[j]
             placed = torch.where(other[:, None, None], R @ (R[j].mT @ R_ji @ R[i]), R)
-            told, gained = _told(evidence, placed, one[:, None] & other, JOIN_STEPS)
+            between, gained = _compared_at(evidence, placed, one[:, None] & other, JOIN_ITERATIONS)
             if float(gained.sum()) > SURE:
-                turns = joined([turns, told.where(gained > 0)])
+                pairs = all_rotations([pairs, between.where(gained > 0)])
                 label = torch.where(other, label[i], label)
-                R = _solved(placed, turns, one | other)
+                R = _solved(placed, pairs, one | other)
     return label, R
 
 
-def _told(evidence: Evidence, R_lab_body: Tensor, wanted: Tensor, steps: int) -> tuple[Turns, Tensor]:
-    """Compare pairs of pictures where attitudes say that they are.
-
-    Args:
-        evidence: of N pictures.
-        R_lab_body: (N, 3, 3).
-        wanted: (N, N) bool, pairs; those that should share too little are left out.
-        steps: of the climb.
+def _compared_at(
+    evidence: Evidence, R_lab_body: Tensor, wanted: Tensor, iterations: int
+) -> tuple[RelativeRotations, Tensor]:
+    """Compare the pairs `wanted` (N, N) bool at given attitudes; leave out pairs that should share too little.
 
     Returns:
-        Turns, and the log of their odds (E,); pairs that are elsewhere than they should be do not show the same.
+        Relative rotations and their log-odds (E,); a pair that ends far from the attitudes counts as different.
     """
-    alike = likeness(evidence.disks, R_lab_body, torch.arange(len(R_lab_body)))
-    first, second = torch.nonzero(wanted & (alike > math.cos(math.radians(TILT_DEG)))).T
+    near = sight_cosines(evidence.disks, R_lab_body, torch.arange(len(R_lab_body)))
+    first, second = torch.nonzero(wanted & (near > math.cos(math.radians(TILT_DEG)))).T
     about = R_lab_body[second] @ R_lab_body[first].mT
-    turns = climb_pairs(evidence.disks, first, second, about, steps, CLIMB_EVERY)
-    near = so3.geodesic_distance(turns.R_ji, about) < REACH_RAD
-    return turns, evidence.of(replace(turns, score=torch.where(near, turns.score, 0.0)))
+    pairs = refine_pairs(evidence.disks, first, second, about, iterations, EVERY)
+    close = so3.geodesic_distance(pairs.R_ji, about) < REACH_RAD
+    return pairs, evidence.log_odds(replace(pairs, score=torch.where(close, pairs.score, 0.0)))
 
 
-def _solved(R_lab_body: Tensor, turns: Turns, chosen: Tensor) -> Tensor:
-    """Return attitudes (N, 3, 3) of which some, chosen (N,) bool, are fitted to the turns among them."""
-    own = turns.where(chosen[turns.first] & chosen[turns.second])
+def _solved(R_lab_body: Tensor, pairs: RelativeRotations, chosen: Tensor) -> Tensor:
+    """Fit the chosen attitudes (N,) bool to the pairs among them; return all, (N, 3, 3)."""
+    own = pairs.where(chosen[pairs.first] & chosen[pairs.second])
     place = chosen.cumsum(0) - 1
     R = R_lab_body.clone()
     R[chosen], _ = solve_graph(R[chosen], replace(own, first=place[own.first], second=place[own.second]), SCALE_RAD)
     return R
 
 
-def settled(evidence: Evidence, rows: Tensor, R_lab_body: Tensor) -> tuple[Tensor, Tensor, Turns]:
-    """Compare all pairs of a set that should share paint, and fit attitudes to those that do.
-
-    Args:
-        evidence: of N pictures.
-        rows: (M,) int64, rising, of the set.
-        R_lab_body: (N, 3, 3), to a few degrees.
+def _settled(evidence: Evidence, rows: Tensor, R_lab_body: Tensor) -> tuple[Tensor, Tensor, RelativeRotations]:
+    """Compare all pairs of a set (M,) that should share a patch, and fit attitudes (N, 3, 3) to those that do.
 
     Returns:
-        Rows of the pictures that belong to it by all their pairs together, their attitudes, and the turns, of N.
+        Rows of the pictures that belong to the set by all their pairs together, attitudes and pairs, of N.
     """
     inside = torch.zeros(len(R_lab_body), dtype=torch.bool)
     inside[rows] = True
-    told, odds = _told(evidence, R_lab_body, (inside[:, None] & inside).triu(1), CLIMBS)
+    pairs, odds = _compared_at(evidence, R_lab_body, (inside[:, None] & inside).triu(1), ITERATIONS)
     total = torch.zeros(len(R_lab_body), dtype=odds.dtype)
-    total = total.index_add(0, told.first, odds).index_add(0, told.second, odds)
-    good = (odds > 0) & (total[told.first] > 0) & (total[told.second] > 0)
-    told = told.where(good)
-    rows = _connected(told, len(R_lab_body))
-    chosen = torch.zeros_like(inside)
-    chosen[rows] = True
-    told = told.where(chosen[told.first])
-    R_lab_body = _solved(R_lab_body, told, chosen)
-    return rows, R_lab_body, told
-
-
-def _connected(turns: Turns, count: int) -> Tensor:
-    """Return the instants (M,) of the largest set that turns connect."""
-    one = np.ones(len(turns))
-    graph = coo_matrix((one, (turns.first.numpy(), turns.second.numpy())), shape=(count, count))
+    total = total.index_add(0, pairs.first, odds).index_add(0, pairs.second, odds)
+    pairs = pairs.where((odds > 0) & (total[pairs.first] > 0) & (total[pairs.second] > 0))
+    graph = coo_matrix((np.ones(len(pairs)), (pairs.first.numpy(), pairs.second.numpy())), shape=(len(inside),) * 2)
     label = torch.from_numpy(connected_components(graph, directed=False)[1].astype(np.int64))
-    return torch.nonzero(label == int(label.bincount().argmax()))[:, 0]
+    chosen = label == int(label.bincount().argmax())
+    pairs = pairs.where(chosen[pairs.first])
+    return torch.nonzero(chosen)[:, 0], _solved(R_lab_body, pairs, chosen), pairs
 
 
 def _largest(label: Tensor) -> Tensor:
-    """Return the pictures (M,) of the largest set.
-
-    Raises:
-        PaintError: there is none, or another that is nearly as large.
-    """
+    """Return the pictures (M,) of the largest set; raise PaintError if it is too small, or another nearly as large."""
     size, order = label.bincount().sort(descending=True, stable=True)
     if int(size[0]) < FEWEST:
         got = f"{int(size[0]) if int(size[0]) > 1 else 'none'} among {len(label)}"
-        do = "take pictures that show the same paint, from 45 degrees apart at most"
-        raise PaintError(refusal("photographs", expected=f"{FEWEST} that share paint", got=got, do=do))
+        do = "take pictures of the same side, from 45 degrees apart at most"
+        raise PaintError(refusal("photographs", expected=f"{FEWEST} that share a patch", got=got, do=do))
     second = int(size[1]) if len(size) > 1 else 0
     if second >= max(OTHER_LEAST, OTHER_SHARE * int(size[0])):
-        got = f"{int(size[0])} pictures and {second} others that show no paint of theirs"
+        got = f"{int(size[0])} pictures and {second} others that share no patch with them"
         do = "check that all are of one ball, or take pictures of the sides between"
         raise PaintError(refusal("photographs", expected="one ball", got=got, do=do))
     return torch.nonzero(label == order[0])[:, 0]
-
-
-def _chain(rows: Tensor, joined_R: Tensor, R_lab_body: Tensor, turns: Turns, compared: int) -> Chain:
-    """Put it into the noun that comes out: the body frame is the lab's at the first picture of the set."""
-    place = torch.full((len(R_lab_body),), -1).index_put((rows,), torch.arange(len(rows)))
-    own = replace(turns, first=place[turns.first], second=place[turns.second])
-    before, after = (so3.nearest_rotation(R[rows] @ R[rows[0]].mT) for R in (joined_R, R_lab_body))
-    drift = [so3.log(own.R_ji @ (R[own.second] @ R[own.first].mT).mT) for R in (before, after)]
-    return Chain(
-        rows=rows,
-        R_lab_body=after,
-        turns=own,
-        closure=Closure(
-            pairs=len(rows) - 1,
-            loops=compared,
-            closed=len(own),
-            drift_before_rad=rms(drift[0]),
-            drift_after_rad=rms(drift[1]),
-            moved_rad=moved(before, after),
-        ),
-    )

@@ -1,12 +1,14 @@
-"""The noun that comes out: a learnt map, and all that was learnt with it."""
+"""The result of mapping: the texture map and all that was estimated with it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.pose.fitter import CameraView
 from sphereorient.pose.light import Light
@@ -14,40 +16,39 @@ from sphereorient.pose.light import Light
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Closure:
-    """What closing the loops did; angles in rad."""
+    """What closing the loops changed; angles in rad."""
 
     pairs: int  # of neighbouring instants
     loops: int  # tried
     closed: int  # accepted and kept by the graph
-    drift_before_rad: float  # rms of what the closed loops were off in the chain
+    drift_before_rad: float  # rms error of the closed loops in the chain
     drift_after_rad: float  # and afterwards
-    moved_rad: float  # rms of how far attitudes were moved, the body frame's own turn taken off
+    moved_rad: float  # rms move of the attitudes, the body frame's own turn removed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Round:
-    """One round of attitudes, light and map."""
+class Iteration:
+    """One iteration of attitudes, light and map."""
 
-    moved_rad: float  # rms of the attitudes' moves
-    misfit: float  # mean square of the residuals over the noise expected, the map not yet solved anew
+    moved_rad: float  # rms move of the attitudes
+    misfit: float  # chi^2 per pixel, before the map is solved anew
     blur_px: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LearntMap:
-    """A map learnt from movies; made by `learn_map`.
+    """A texture map learnt from movies or photographs.
 
-    The body frame of a learnt map is arbitrary; it is the lab's at the first instant that has an attitude:
-    R_lab_body = identity there.
+    The body frame is arbitrary: it is the lab frame at the first instant with an attitude (R_lab_body = identity).
 
-    Pictures through a mirror give the mirrored map and mirrored turns: one camera cannot tell, nor can two whose
-    pictures' horizontal axes are one line in the lab; the others then contradict each other and are refused. Say
-    `flip:` in the experiment.
+    Pictures through a mirror give the mirrored map and mirrored rotations. One camera cannot detect this, nor can two
+    cameras whose horizontal picture axes are parallel; other pairs contradict each other and are refused. Set `flip:`
+    in the experiment.
     """
 
     texture: Tensor  # (H, 2 H) float32, 0 black .. 1 white; NaN where never seen
     seen: Tensor  # (H, 2 H) int64, pictures that show each texel
-    sigma: Tensor  # (H, 2 H) float32, standard deviation of the paint by noise alone; infinite where never seen
+    sigma: Tensor  # (H, 2 H) float32, standard deviation of the texture by noise alone; infinite where never seen
     R_lab_body: Tensor  # (N, 3, 3) float64, NaN where the sphere was not found
     position_lab_mm: Tensor  # (N, 3) float64, NaN likewise
     valid: Tensor  # (N,) bool, frames with an attitude
@@ -55,13 +56,31 @@ class LearntMap:
     score: Tensor  # (N, C), share of each picture's variance that the map explains; NaN where not fitted
     views: Sequence[CameraView]  # with the scenes without the ball
     light: Light
-    blur_px: float  # with which the map was learnt
+    blur_px: float  # estimated with the map
     closure: Closure
-    rounds: tuple[Round, ...]
-    arrived: bool  # whether the last round moved attitudes by less than the setting
+    rounds: tuple[Iteration, ...]
+    arrived: bool  # whether the last iteration moved attitudes by less than the setting `arrived_deg`
 
     @property
     def seen_share(self) -> float:
-        """Share of the sphere that was seen at all."""
+        """Return the share of the sphere that was seen at all."""
         areas = texel_areas(len(self.texture))
         return float((areas * (self.seen > 0)).sum() / areas.sum())
+
+
+def attitude_change_rad(before: Tensor, after: Tensor) -> float:
+    """Return the rms angle, rad, between two sets of attitudes (N, 3, 3), the body frame's own turn removed."""
+    Q = so3.nearest_rotation((before.mT @ after).sum(0))
+    return rms(so3.log(after @ (before @ Q).mT))
+
+
+def rms(vectors: Tensor) -> float:
+    """Return the root mean square length of vectors (E, 3), 0 of none."""
+    return float(vectors.square().sum(-1).mean().sqrt()) if len(vectors) else 0.0
+
+
+def evenly_spread(rows: Tensor, count: int) -> Tensor:
+    """Return at most `count` of some rows, evenly spread, ends included."""
+    if len(rows) <= count:
+        return rows
+    return rows[torch.linspace(0, len(rows) - 1, count).round().long()]

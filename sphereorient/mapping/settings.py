@@ -1,12 +1,12 @@
-"""Settings of the room paint."""
+"""Settings of mapping."""
 
 from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
 
-class PaintSettings(BaseModel):
-    """How the map of the paint is learnt from the movies."""
+class MapSettings(BaseModel):
+    """How the texture map is learnt from the movies."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -14,23 +14,21 @@ class PaintSettings(BaseModel):
         32, ge=1, description="evenly spread frames whose mean is the background, where the ball moves"
     )
     unordered: bool = Field(
-        False, description="photographs in any order, at any attitudes: all are compared with all, not neighbours"
+        False, description="photographs in any order: compare all pairs, not only neighbouring frames"
     )
     disk_px: int = Field(48, ge=24, le=128, description="side of the disks that are compared without a map, px; even")
-    detail: float = Field(0.06, gt=0, lt=0.5, description="finer detail is blurred away in them, radii")
-    window: float = Field(0.3, gt=0.1, lt=2, description="neighbourhood over which light is taken to be even, radii")
+    detail: float = Field(0.06, gt=0, lt=0.5, description="finer detail is blurred in these disks, radii")
+    window: float = Field(0.3, gt=0.1, lt=2, description="neighbourhood over which light is taken as uniform, radii")
     turn_max_deg: float = Field(
-        30.0, gt=0, le=180, description="largest turn between neighbouring frames that is looked for; fast spins: more"
+        30.0, gt=0, le=180, description="largest rotation between neighbouring frames; raise for fast spins"
     )
-    baselines: tuple[int, ...] = Field(
-        (1, 2, 4, 8, 16), description="frames between the members of the pairs that make the chain"
-    )
-    keyframe_deg: float = Field(12.0, gt=0, description="turn from one keyframe of the loops to the next")
+    baselines: tuple[int, ...] = Field((1, 2, 4, 8, 16), description="frames between the members of compared pairs")
+    keyframe_deg: float = Field(12.0, gt=0, description="rotation from one keyframe of the loops to the next")
     loop_reach_deg: float = Field(
-        24.0, gt=0, le=180, description="drift up to which loops are found again; 180 searches all rotations, slowly"
+        24.0, gt=0, le=180, description="largest drift at which loops are found; 180 searches all rotations, slowly"
     )
     loop_pairs: int = Field(1500, ge=0, description="pairs of keyframes that are tried for loops, at most")
-    score_min: float = Field(0.7, gt=0, lt=1, description="correlation from which on two pictures show the same paint")
+    score_min: float = Field(0.7, gt=0, lt=1, description="correlation above which two pictures show the same patch")
     frames_max: int = Field(
         400, ge=2, description="evenly spread frames from which the map is fitted, at most; the others follow them"
     )
@@ -39,13 +37,11 @@ class PaintSettings(BaseModel):
     )
     pixels: int = Field(1600, ge=200, description="pixels of each disk from which the map is fitted, about")
     blur_px: float | None = Field(
-        None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null learns it"
+        None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null estimates it"
     )
-    smooth: float = Field(
-        4.0e-3, gt=0, description="weight that ties neighbouring texels, of the typical texel's own weight"
-    )
-    rounds: int = Field(14, ge=1, description="rounds of attitudes, light and map, at most")
+    smooth: float = Field(4.0e-3, gt=0, description="smoothness penalty, relative to the weight of a typical texel")
+    rounds: int = Field(14, ge=1, description="iterations of attitudes, light and map, at most")
     arrived_deg: float = Field(
-        0.005, gt=0, description="attitudes that move by less from round to round, rms, have arrived"
+        0.005, gt=0, description="stop when an iteration moves the attitudes by less, degrees rms"
     )
-    turned_min_deg: float = Field(8.0, gt=0, description="a sphere that turns by less in the whole movie does not turn")
+    turned_min_deg: float = Field(8.0, gt=0, description="refuse a movie in which the sphere turns by less")

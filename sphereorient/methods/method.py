@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -35,3 +36,14 @@ class Method:
     learn: Callable[[Job, Progress], Follower | None]
     resume: Callable[[Job, Learnt], Follower]  # instead of learn, with what is known
     join: Callable[[Job, Follower | None, Iterable[list[Poses]], Progress], tuple[Trajectory, Learnt | None]]
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep torch to one thread for a while: its tensors here are small, and idle threads that spin starve decoding."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -20,7 +20,7 @@ from sphereorient.files.yaml_file import FAULTS, parse_yaml, read_yaml, short
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.learn.settings import ProposerSettings
 from sphereorient.locate.settings import LocateSettings
-from sphereorient.mapping.settings import PaintSettings
+from sphereorient.mapping.settings import MapSettings
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
 from sphereorient.search.settings import GreySearchSettings, OrientSettings, ProposeSettings
 from sphereorient.statistics.settings import StatisticsSettings
@@ -61,7 +61,7 @@ class Settings(BaseModel):
     orient: OrientSettings = Field(default_factory=OrientSettings, description="where could it point (paper)")
     assemble: AssembleSettings = Field(default_factory=AssembleSettings, description="which candidate is true (paper)")
     motion: MotionSettings = Field(default_factory=MotionSettings, description="velocities, accelerations (paper)")
-    paint: PaintSettings = Field(default_factory=PaintSettings, description="the map from the movies (`map`)")
+    paint: MapSettings = Field(default_factory=MapSettings, description="the map from the movies (`map`)")
     statistics: StatisticsSettings = Field(default_factory=StatisticsSettings, description="numbers of a report")
 
 

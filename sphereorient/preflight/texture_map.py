@@ -12,7 +12,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.experiment.stream import spread_frames
-from sphereorient.mapping.compare import fibonacci
+from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.preflight.finding import Finding, fault, ok, warning
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.search import GreySearch, crop_disk
@@ -162,7 +162,7 @@ def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPai
     def normalised(R: Tensor) -> Tensor:
         return torch.cat([normalisation(pictures(some)) for some in torch.split(R, BATCH)])
 
-    seen = views_towards(fibonacci(VIEWS)).float()
+    seen = views_towards(fibonacci_directions(VIEWS)).float()
     grid = so3.lattman_grid(math.radians(STEP_DEG)).float()
     cosine = (seen.reshape(-1, 9) @ grid.reshape(-1, 9).T - 1) / 2
     likeness = normalised(seen) @ normalised(grid).T

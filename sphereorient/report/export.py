@@ -18,7 +18,6 @@ from sphereorient.report.export_columns import (
     frame_wise,
     metadata,
     package,
-    quaternions_wxyz,
     reasons,
     safe_names,
     with_unit,
@@ -101,7 +100,7 @@ def _write_csv(track: Trajectory, path: Path, progress: Advance) -> None:
     about = metadata(track)
     settings = about.pop("settings")
     lines = [f"{key}: {' '.join(as_text(value).split())}" for key, value in about.items()]
-    lines += ["quaternions_wxyz: of R_lab_body, w first; units stand at the end of the names", "settings:"]
+    lines += ["quaternions: of R_lab_body, w first; units stand at the end of the names", "settings:"]
     lines += [f"  {line}" for line in settings.splitlines()]
     plain = arrow_csv.WriteOptions(include_header=False, quoting_style="none")
     with path.open("wb") as file:
@@ -144,7 +143,7 @@ def _write_mat(track: Trajectory, path: Path, progress: Advance) -> None:
 
 
 def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
-    """Return arrays by name with unit; rotations as matrices and as quaternions_wxyz (quat_wxyz for orientation)."""
+    """Return arrays by name with unit; rotations as matrices and as quaternions (quat_wxyz for orientation)."""
     arrays: dict[str, Any] = {}
     for dataset in frame_wise(record):
         arrays[with_unit(dataset.name, dataset.units)] = dataset.values

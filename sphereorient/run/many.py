@@ -18,9 +18,10 @@ import numpy as np
 from sphereorient.errors import SettingsError, SphereOrientError, refusal
 from sphereorient.experiment.recording import Progress, silent
 from sphereorient.follow.follower import Batch
+from sphereorient.methods.method import one_thread
 from sphereorient.run.executors import Executor
 from sphereorient.run.request import Request
-from sphereorient.run.stages import Task, Work, check_method, check_out, one_thread, opened, stages
+from sphereorient.run.stages import Task, Work, check_method, check_out, opened, stages
 from sphereorient.run.store import FolderStore
 from sphereorient.trajectory import Trajectory
 

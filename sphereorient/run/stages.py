@@ -20,7 +20,7 @@ from sphereorient.files.provenance import provenance, sha256
 from sphereorient.follow.follower import Batch, Follower
 from sphereorient.methods import results
 from sphereorient.methods.learnt import Learnt
-from sphereorient.methods.method import Job, Method
+from sphereorient.methods.method import Job, Method, one_thread
 from sphereorient.methods.paper import PAPER
 from sphereorient.methods.precise import PRECISE
 from sphereorient.methods.proposers import checkpoint_path
@@ -251,17 +251,6 @@ def check_out(request: Request) -> None:
     if request.out is not None and not request.out.parent.is_dir():
         expected, do = f"an existing folder {request.out.parent}", "make it first"
         raise OutputError(refusal(str(request.out), expected=expected, got="none", do=do))
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Keep torch to one thread for a while: its tensors here are small, and idle threads that spin starve decoding."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def torch_device(name: str) -> torch.device:

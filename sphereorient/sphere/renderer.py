@@ -293,4 +293,5 @@ def expected_grey(rays: Rays, position_lab_mm: Tensor, R_lab_body: Tensor, ball:
     strength = ball.lamps_lab.norm(dim=-1)
     light = ball.ambient + lambert(seen.normal, ball.lamps_lab / strength[:, None], strength, SHADE)
     grey = (ball.black + (ball.white - ball.black) * seen.paint) * light
-    return coverage * grey + (1.0 - coverage) * ball.behind
+    picture: Tensor = coverage * grey + (1.0 - coverage) * ball.behind
+    return picture

@@ -1,1 +1,1 @@
-"""Tools beside tracking: paint to print, comparing maps, photographs of a spinning ball."""
+"""Tools beside tracking: design of a texture, wear of a ball, spin from photographs."""

@@ -10,6 +10,9 @@ import torch
 import yaml
 from torch import Tensor
 
+from sphereorient.experiment.recording import Recording, silent
+from sphereorient.locate import LocateSettings
+from sphereorient.mapping import LearntMap, MapSettings, fit_map, take_crops
 from sphereorient.sphere import sample_texture
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 from sphereorient.synth.textures import map_directions
@@ -74,3 +77,8 @@ def save_map(texture: Tensor, path: Path) -> Path:
     """Write a map as 8-bit picture."""
     cv2.imwrite(str(path), (255 * texture).round().clamp(0, 255).byte().numpy())
     return path
+
+
+def mapped(recording: Recording, settings: MapSettings) -> LearntMap:
+    """Learn a map from an opened recording."""
+    return fit_map(take_crops(recording, settings, LocateSettings(), silent), settings, silent)

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.mapping.disks import Disks, even_disks
+from sphereorient.mapping.disks import Disks, normalised_disks
+from sphereorient.mapping.settings import MapSettings
 from sphereorient.sphere import perspective_view, sample_texture
 from sphereorient.synth.textures import random_texture
 
@@ -33,15 +34,14 @@ def pictures(R_lab_body: Tensor, cameras: int = 1, kind: str = "blobs", seed: in
 
 
 def disks_of_pictures(whole: Tensor, detail: float = 0.06, window: float = 0.3) -> Disks:
-    """Even pictures (N, C, S, S) of `pictures`."""
+    """Normalise pictures (N, C, S, S) of `pictures`."""
     count, cameras = whole.shape[:2]
-    return even_disks(
+    return normalised_disks(
         whole,
         R_LAB_VIEWS[:cameras].expand(count, cameras, 3, 3),
         torch.full((count, cameras), DISTANCE),
         torch.ones(count, cameras, dtype=torch.bool),
-        detail,
-        window,
+        MapSettings(detail=detail, window=window),
     )
 
 

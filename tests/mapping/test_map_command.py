@@ -72,7 +72,7 @@ def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, mo
     out = scene / "learnt.png"
     code, said, err = run(monkeypatch, capsys, "map", rendered, "--out", out, *QUICK)
     assert code == 0, err
-    for words in ("seen:", "loops:", "rounds: 4", "correlation", "next: write texture: learnt.png"):
+    for words in ("seen:", "loops:", "iterations: 4", "correlation", "next: write texture: learnt.png"):
         assert words in said
     texture, seen = load_texture(out), read_seen(seen_path(out))
     assert seen is not None

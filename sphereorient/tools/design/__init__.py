@@ -1,1 +1,1 @@
-"""Paint to print: designs, gores, how well a design fixes the orientation."""
+"""Texture maps to paint on a ball: patterns, their quality, strips to print."""

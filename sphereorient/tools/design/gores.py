@@ -1,4 +1,4 @@
-"""A map cut into gores: strips from pole to pole that lie flat on paper and wrap a ball of a diameter.
+"""Gores: a texture map as strips from pole to pole that lie flat on paper and wrap a ball, printed at true size.
 
 On the sheet x grows to the right and y upwards, mm; the strips touch along the equator, which is pi D long, the first
 one at longitude -180 degrees. North is up and east is right, as seen from outside. Parallels and the middle meridian
@@ -9,19 +9,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import matplotlib
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.errors import PaintError, check_tail, refusal
+from sphereorient.errors import OutputError, PaintError, refusal
+from sphereorient.files.outputs import put_aside
+from sphereorient.report.plots.style import in_style
 from sphereorient.sphere import sample_texture
 
 GORES = (4, 48)
 DIAMETERS_MM = (2.0, 500.0)
 STEP_MM = 0.1  # of the lattice on which borders are followed, at most
 STEP_RAD = math.radians(0.5)  # and on the ball
+MM = 1 / 25.4  # inches
+MARGIN_MM = 12.0  # of the sheet, for the printer and the line below
+RULE_MM = (10.0, 50.0)  # lengths of the line to check the scale by, for small and for large balls
+CUT = "#C000C0"
+FOLD: dict[str, Any] = {"color": "#00A0A0", "linewidth": 0.3, "linestyle": (0, (6, 4))}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,98 +41,150 @@ class Gores:
     """Strips for a ball.
 
     Raises:
-        PaintError: a number of strips or a diameter that cannot be cut.
+        PaintError: the number of strips or the diameter is out of range.
     """
 
     count: int
     diameter_mm: float
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be cut."""
+        """Check the ranges."""
         for name, value, (low, high), unit in (
             ("gores", self.count, GORES, ""),
             ("diameter", self.diameter_mm, DIAMETERS_MM, " mm"),
         ):
             if not low <= value <= high:
-                do = "give what paper and scissors allow"
+                do = "choose strips that can be printed and cut"
                 raise PaintError(refusal(name, expected=f"{low:g} .. {high:g}{unit}", got=f"{value:g}{unit}", do=do))
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width (the equator) and height (from pole to pole) of the sheet."""
+        """Width (the equator) and height (from pole to pole) of the strips."""
         return math.pi * self.diameter_mm, math.pi * self.diameter_mm / 2
 
-    def place_mm(self, direction_body: Tensor) -> Tensor:
-        """Return where directions (..., 3) lie on the sheet, (..., 2), mm; (0, 0) is its middle.
+    @property
+    def sheet_mm(self) -> tuple[float, float]:
+        """Width and height of the printed sheet."""
+        width, height = self.size_mm
+        return max(width, RULE_MM[0] + 70.0) + 2 * MARGIN_MM, height + 2 * MARGIN_MM
 
-        On the border of two strips the eastern one has it.
-        """
-        check_tail("direction_body", direction_body, 3)
-        x, y, z = direction_body.unbind(-1)
-        longitude, latitude = torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))
-        middle = self._middle(longitude)
-        across = middle + (longitude - middle) * latitude.cos()
-        return 0.5 * self.diameter_mm * torch.stack([across, latitude], -1)
-
-    def direction_body(self, place_mm: Tensor) -> tuple[Tensor, Tensor]:
-        """Return which directions places (..., 2) of the sheet show, (..., 3), and whether they lie on a strip (...).
-
-        Beside the strips a direction is that of the nearest strip, continued.
-        """
-        check_tail("place_mm", place_mm, 2)
-        across, latitude = (2 / self.diameter_mm * place_mm).unbind(-1)
-        middle = self._middle(across)
-        room = latitude.cos()
-        offset = (across - middle) / room.clamp_min(1e-9)
-        on = (latitude.abs() < math.pi / 2) & (offset.abs() <= math.pi / self.count) & (across.abs() <= math.pi)
-        longitude = middle + offset
-        direction = torch.stack([room * longitude.cos(), room * longitude.sin(), latitude.sin()], -1)
-        return direction, on
+    def middles_rad(self) -> list[float]:
+        """Return the longitudes of the strips' middles, rad, from west to east."""
+        return [-math.pi + 2 * math.pi * (k + 0.5) / self.count for k in range(self.count)]
 
     def outline_mm(self, points: int = 181) -> list[NDArray[np.float64]]:
-        """Return the closed outline of each strip, (2 points, 2), mm, where scissors go."""
+        """Return the closed outline of each strip, (2 points, 2), mm: the line to cut along."""
         latitude = np.linspace(-math.pi / 2, math.pi / 2, points)
         half = math.pi / self.count * np.cos(latitude)
         edges = [np.column_stack([side * half, latitude]) for side in (-1, 1)]
         loop = np.concatenate([edges[1], edges[0][::-1]])
         return [0.5 * self.diameter_mm * (loop + np.array([middle, 0.0])) for middle in self.middles_rad()]
 
-    def middles_rad(self) -> list[float]:
-        """Longitudes of the strips' middles, rad, from west to east."""
-        return [-math.pi + 2 * math.pi * (k + 0.5) / self.count for k in range(self.count)]
 
-    def _middle(self, longitude: Tensor) -> Tensor:
-        """Longitude of the middle of the strip that a longitude lies on."""
-        width = 2 * math.pi / self.count
-        strip = ((longitude + math.pi) / width).floor().clamp(0, self.count - 1)
-        return -math.pi + (strip + 0.5) * width
+def _gore_texture(gores: Gores, texture: Tensor, strip: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return x (columns) and y (rows), mm, on the sheet, and the texture (rows, columns) of one strip.
 
-
-def painted_gore(gores: Gores, texture: Tensor, strip: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the paint of one strip on a lattice.
-
-    Args:
-        gores: of the ball.
-        texture: (H, 2 H), the map.
-        strip: from west to east.
-
-    Returns:
-        x (columns) and y (rows), mm, on the sheet, and the paint (rows, columns), 0 black .. 1 white; beyond the
-        outline it goes on, so that borders run up to it.
+    Beyond the outline the texture goes on, so that borders run up to it.
     """
-    step = min(STEP_MM, 0.5 * gores.diameter_mm * STEP_RAD)
-    width, height = gores.size_mm
-    middle = 0.5 * gores.diameter_mm * gores.middles_rad()[strip]
-    half = 0.5 * width / gores.count
-    x = middle + torch.linspace(-half, half, math.ceil(2 * half / step) + 1, dtype=torch.float64)
+    radius = 0.5 * gores.diameter_mm
+    step = min(STEP_MM, radius * STEP_RAD)
+    height, half = gores.size_mm[1], math.pi * radius / gores.count
+    middle_rad = gores.middles_rad()[strip]
+    x = torch.linspace(-half, half, math.ceil(2 * half / step) + 1, dtype=torch.float64)
     y = torch.linspace(-height / 2, height / 2, math.ceil(height / step) + 1, dtype=torch.float64)
-    latitude = 2 / gores.diameter_mm * y
-    # On the strip's own middle meridian whatever the rounding: the lattice reaches both borders.
-    longitude = gores.middles_rad()[strip] + (2 / gores.diameter_mm) * (x - middle) / latitude.cos()[:, None].clamp_min(
-        1e-3
-    )
-    room = latitude.cos()[:, None]
+    latitude = (y / radius)[:, None]
+    level = latitude.cos()
+    longitude = middle_rad + x / radius / level.clamp_min(1e-3)
     direction = torch.stack(
-        [room * longitude.cos(), room * longitude.sin(), latitude.sin()[:, None].expand_as(longitude)], -1
+        [level * longitude.cos(), level * longitude.sin(), latitude.sin().expand_as(longitude)], dim=-1
     )
-    return x, y, sample_texture(texture.double(), direction)
+    return radius * middle_rad + x, y, sample_texture(texture.double(), direction)
+
+
+@in_style
+def gores_figure(texture: Tensor, gores: Gores, *, filled: bool) -> Figure:
+    """Draw the strips at true size; not `filled`: only the borders between black and white, to be cut out or traced."""
+    (width, height), (equator, meridian) = gores.sheet_mm, gores.size_mm
+    figure = Figure(figsize=(width * MM, height * MM))
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set_axis_off()
+    axes.set(xlim=(-width / 2, width / 2), ylim=(-height / 2, height / 2))
+    for strip, (outline, middle_rad) in enumerate(zip(gores.outline_mm(), gores.middles_rad(), strict=True)):
+        x, y, grey = _gore_texture(gores, texture, strip)
+        if filled:
+            drawn = axes.contourf(x, y, grey, levels=[-1.0, 0.5], colors=["black"])
+        else:
+            drawn = axes.contour(x, y, grey, levels=[0.5], colors=["black"], linewidths=0.5)
+        drawn.set_clip_path(matplotlib.path.Path(outline), axes.transData)
+        axes.plot(*outline.T, color=CUT, linewidth=0.3)
+        middle = 0.5 * gores.diameter_mm * middle_rad
+        axes.plot([middle, middle], [-meridian / 2, meridian / 2], **FOLD)
+    axes.plot([-equator / 2, equator / 2], [0, 0], **FOLD)
+    _draw_rule(axes, gores)
+    return figure
+
+
+def _draw_rule(axes: Axes, gores: Gores) -> None:
+    """Draw a line of known length below the strips, with its text."""
+    width, height = gores.size_mm
+    length = RULE_MM[1] if width >= RULE_MM[1] else RULE_MM[0]
+    start, level = -gores.sheet_mm[0] / 2 + MARGIN_MM, -height / 2 - 0.4 * MARGIN_MM
+    axes.plot([start, start + length], [level, level], color="black", linewidth=0.8, gid="rule")
+    for end in (start, start + length):
+        axes.plot([end, end], [level - 1.2, level + 1.2], color="black", linewidth=0.8)
+    text = f"{length:g} mm: measure it. Ball {gores.diameter_mm:g} mm, {gores.count} strips, print at 100 %"
+    axes.text(start, level - 2.0, text, fontsize=6, va="top", ha="left")
+
+
+def write_gores(texture: Tensor, gores: Gores, folder: Path) -> list[Path]:
+    """Write the strips and their stencil as PDF and SVG of true size, and instructions; return the files.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
+    written = []
+    for name, filled in (("gores", True), ("stencil", False)):
+        for suffix, when in ((".pdf", "CreationDate"), (".svg", "Date")):
+            path = folder / f"{name}{suffix}"
+            figure = gores_figure(texture, gores, filled=filled)
+            with put_aside(path) as aside, matplotlib.rc_context({"svg.hashsalt": "sphereorient"}):
+                figure.savefig(aside, metadata={when: None})
+            written.append(path)
+    path = folder / "gores.txt"
+    try:
+        path.write_text(instructions(gores), encoding="utf-8")
+    except OSError as error:
+        do = "choose a folder that exists and may be written"
+        raise OutputError(refusal(str(path), expected="a file that can be written", got=str(error), do=do)) from error
+    return [*written, path]
+
+
+def instructions(gores: Gores) -> str:
+    """Return the page of text that comes with the strips."""
+    (width, height), sheet = gores.size_mm, gores.sheet_mm
+    slope = math.pi / gores.count * math.sin(math.pi / 4)  # of a strip's edge against its middle, at latitude 45
+    return f"""\
+{gores.count} strips for a ball of {gores.diameter_mm:g} mm
+
+gores.pdf, gores.svg      the texture: paint black what is black
+stencil.pdf, stencil.svg  the borders only, to be traced or cut out
+
+1. Print at 100 % ("actual size"; no "fit to page"). The sheet is {sheet[0]:.0f} x {sheet[1]:.0f} mm; if it is larger
+   than your paper, let the printer spread it over several pages ("poster").
+2. Measure the line at the bottom. If its length is wrong, the scale is wrong, and so are all measured angles.
+   The equator (the dashed line across) must be {width:.1f} mm long and a strip {height:.1f} mm high: around the ball
+   once, and from pole to pole.
+3. Cut along the solid coloured lines. Leave the strips joined at the equator, where they touch: the chain goes around
+   the ball. Its two ends meet at longitude 180 degrees.
+4. Draw an equator on the ball (a ring that the ball just passes through helps) and two poles. Lay the chain's dashed
+   line on the equator, printed side out, and bring the tips to the poles. The dashed lines down the strips are
+   meridians: fold the strips slightly along them, so that they follow the ball.
+5. As a stencil: print stencil.pdf on adhesive foil, cut out the black areas, lay it on the white ball as above, and
+   paint through it. To trace: put carbon paper below and draw along the borders.
+6. Each strip has true lengths along its middle and along all parallels. At its edges, at latitude 45 degrees, lengths
+   are wrong by up to {100 * (math.hypot(1, slope) - 1):.1f} % and directions by up to {
+        math.degrees(math.atan(slope)):.1f} degrees.
+
+The measurement needs the map that is on the ball, not the one that was planned: compare both, or learn the map from a
+movie.
+"""

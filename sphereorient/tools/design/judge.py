@@ -1,4 +1,4 @@
-"""How good a painted map is for measuring attitudes, and the search for a good one that a hand can paint."""
+"""Judge how well a texture map fixes the orientation, and search for a good one that can be painted by hand."""
 
 from __future__ import annotations
 
@@ -17,36 +17,44 @@ from sphereorient.evaluate.bound import cramer_rao_bound
 from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import Sampling, orthographic_view, reduced_texture
-from sphereorient.tools.design.paint import border_length, facing, scaled_paint, stroke_deg, view_directions
+from sphereorient.sphere.texture import texture_coordinates
+from sphereorient.tools.design.patterns import (
+    SIZES_DEG,
+    border_length,
+    facing,
+    patterned_texture,
+    stroke_deg,
+    view_directions,
+)
 
-SEARCH = GreySearchSettings()  # normalisation and size of the views, as the search on grey values sees them
-ALIKE_STEP_DEG = 12.0  # of the first comparison: no view is beyond 14.5 degrees of one that is compared with
-CLOSER_DEG = (5.0, 2.5)  # steps of the comparisons about the most alike
-CLOSEST = 24  # of the most alike that are looked at closer
+SEARCH = GreySearchSettings()  # normalisation and size of the views, as in the search on grey values
+ALIKE_STEP_DEG = 12.0  # of the first comparison: every view is within 14.5 degrees of the grid
+CLOSER_DEG = (5.0, 2.5)  # steps of the comparisons about the most similar views
+CLOSEST = 24  # most similar views that are compared again
 RENDERED = 512  # views at once
-FEW_VIEWS, FINALISTS = 24, 3  # of the first judgement in a search, and those that are judged in full
-WHITE_SHARE = (0.15, 0.85)  # of a view: outside of it one paint is a rarity
+FEW_VIEWS, FINALISTS = 24, 3  # of the first judgement in a search, and maps that are judged in full
+WHITE_SHARE = (0.15, 0.85)  # of a view, in a search
 
 
 class DesignSettings(BaseModel):
-    """What paint is judged for."""
+    """Pictures that a map is judged for."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     diameter_px: float = Field(80.0, ge=12, le=400, description="of the ball in the pictures, px")
     noise_share: float = Field(0.05, gt=0, le=1, description="a pixel's noise over the step from black to white")
-    views: int = Field(96, ge=12, le=2000, description="evenly spread, that are judged")
+    views: int = Field(96, ge=12, le=2000, description="evenly spread views that are judged")
     apart_deg: float = Field(20.0, ge=10, le=90, description="views further apart than this must look different")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judgement:
-    """What can be said of a map; made by `judge_paint`. V views."""
+    """Quality of a map, from V views."""
 
     settings: DesignSettings
     direction_body: Tensor  # (V, 3), middles of the views
     white: Tensor  # (V,), share of the view that is white
-    bound_rad: Tensor  # (V,), rms of the best possible error of the attitude, place unknown; infinite: open
+    bound_rad: Tensor  # (V,), Cramér-Rao bound of the attitude, rms, position unknown; infinite: undetermined
     alike: float  # greatest similarity of two distinct views under any light, 1: the same
     alike_views: Tensor  # (2, 3, 3), these two
     stroke_deg: float  # widest brush that paints the map
@@ -54,13 +62,8 @@ class Judgement:
 
     @property
     def margin(self) -> float:
-        """What is left to tell the most alike views apart: 1 less their similarity."""
+        """1 less the similarity of the most similar views."""
         return 1.0 - self.alike
-
-    @property
-    def alike_apart_rad(self) -> float:
-        """Angle between the two most alike views."""
-        return float(so3.geodesic_distance(*self.alike_views))
 
     @property
     def worst(self) -> int:
@@ -74,39 +77,45 @@ class Judgement:
 
     def as_dict(self) -> dict[str, Any]:
         """Return all figures for JSON, angles in degrees; None: infinite."""
-        bound = torch.rad2deg(self.bound_rad)
-        places = torch.rad2deg(lon_lat(self.direction_body))
-        two = [torch.rad2deg(lon_lat(-R[2])).tolist() for R in self.alike_views]
+        places = lon_lat_deg(self.direction_body)
         return {
             "diameter_px": self.settings.diameter_px,
             "noise_share": self.settings.noise_share,
-            "views": len(bound),
+            "views": len(places),
             "white_share": _spread(self.white),
-            "bound_deg": _spread(bound),
+            "bound_deg": _spread(torch.rad2deg(self.bound_rad)),
             "worst_view_lon_lat_deg": places[self.worst].tolist(),
             "best_view_lon_lat_deg": places[self.best].tolist(),
             "greatest_similarity": self.alike,
             "margin": self.margin,
-            "most_alike_lon_lat_deg": two,
-            "most_alike_apart_deg": math.degrees(self.alike_apart_rad),
+            "most_alike_lon_lat_deg": lon_lat_deg(-self.alike_views[:, 2]).tolist(),
+            "most_alike_apart_deg": math.degrees(float(so3.geodesic_distance(*self.alike_views))),
             "stroke_deg": self.stroke_deg,
             "border_radii": self.border,
         }
 
 
-def judge_paint(texture: Tensor, settings: DesignSettings | None = None) -> Judgement:
-    """Judge a map: balance, information and likeness of its views, and how fine a brush it takes.
+def lon_lat_deg(direction_body: Tensor) -> Tensor:
+    """Return longitude and latitude (..., 2), degrees, of directions (..., 3)."""
+    return torch.rad2deg(torch.stack(texture_coordinates(direction_body), -1))
 
-    Args:
-        texture: (H, 2 H), 0 black .. 1 white.
-        settings: pictures that are expected.
 
-    Source: the bound is ERRATA's; likeness is the correlation of normalised pictures, as in the grey search.
+def _spread(values: Tensor) -> dict[str, float | None]:
+    """Return least, middle and greatest value; None for infinity."""
+    named = {"min": values.min(), "median": values.median(), "max": values.max()}
+    return {name: float(value) if bool(value.isfinite()) else None for name, value in named.items()}
+
+
+def judge_texture(texture: Tensor, settings: DesignSettings | None = None) -> Judgement:
+    """Judge a map (H, 2 H): balance, information and similarity of its views, and the brush that it needs.
+
+    Source: the bound is that of docs/errata.md; similarity is the correlation of normalised pictures, as in the grey
+    search.
     """
     settings = DesignSettings() if settings is None else settings
     direction = view_directions(settings.views)
     R = facing(direction)
-    alike, two = most_alike(texture, R, settings.apart_deg)
+    alike, two = most_similar_views(texture, R, settings.apart_deg)
     return Judgement(
         settings=settings,
         direction_body=direction,
@@ -119,38 +128,49 @@ def judge_paint(texture: Tensor, settings: DesignSettings | None = None) -> Judg
     )
 
 
-def most_alike(texture: Tensor, R_view_body: Tensor, apart_deg: float) -> tuple[float, Tensor]:
-    """Find the two views that are most alike though they are apart.
+def most_similar_views(texture: Tensor, R_view_body: Tensor, apart_deg: float) -> tuple[float, Tensor]:
+    """Find the two most similar views that are at least `apart_deg` apart.
 
     Args:
         texture: (H, 2 H).
-        R_view_body: (V, 3, 3), views that are compared with all of SO(3); turns of the picture need not be among them.
-        apart_deg: angle beyond which views are apart.
+        R_view_body: (V, 3, 3), views that are compared with all of SO(3).
+        apart_deg: degrees.
 
     Returns:
         Their similarity, 1 at most, and the two, (2, 3, 3) float64.
     """
-    look = _Look(texture)
-    own = look(R_view_body)
-    grid = so3.lattman_grid(math.radians(ALIKE_STEP_DEG))
-    best = torch.full((len(own),), -1.0)
-    match = R_view_body.clone()
-    for some in torch.split(grid, RENDERED):
-        best, match = _better(best, match, R_view_body, own, some, look(some), apart_deg)
-    top = best.topk(min(CLOSEST, len(best))).indices
+    size = SEARCH.size_px
+    texture, view = reduced_texture(texture.float(), size), orthographic_view(size)
+    normalise = LocalNormalisation(size, detail=SEARCH.detail, window=SEARCH.window, clip=SEARCH.clip)
+
+    def vectors(R: Tensor) -> Tensor:
+        return torch.cat([normalise(view.render(texture, some.float())) for some in torch.split(R, RENDERED)])
+
+    own = vectors(R_view_body)
+    best, match = torch.full((len(own),), -1.0), R_view_body.clone()
+
+    def compare(rows: slice, others: Tensor) -> None:
+        """Keep the best of more attitudes (K, 3, 3) for some of the views."""
+        similarity = own[rows] @ vectors(others).T
+        trace = R_view_body[rows].flatten(1) @ others.flatten(1).T
+        similarity = similarity.masked_fill(trace > 1 + 2 * math.cos(math.radians(apart_deg)), -1.0)
+        top, place = similarity.max(1)
+        better = top > best[rows]
+        best[rows] = torch.where(better, top, best[rows])
+        match[rows] = torch.where(better[:, None, None], others[place], match[rows])
+
+    for some in torch.split(so3.lattman_grid(math.radians(ALIKE_STEP_DEG)), RENDERED):
+        compare(slice(None), some)
+    top = best.topk(min(CLOSEST, len(best))).indices.tolist()
     for step in CLOSER_DEG:
         around = so3.local_grid(math.radians(step), math.radians(2 * step))
-        for k in top.tolist():
-            near = around @ match[k]
-            one = slice(k, k + 1)
-            best[one], match[one] = _better(
-                best[one], match[one], R_view_body[one], own[one], near, look(near), apart_deg
-            )
+        for k in top:
+            compare(slice(k, k + 1), around @ match[k])
     k = int(best.argmax())
     return float(best[k]), torch.stack([R_view_body[k], match[k]])
 
 
-def make_paint(
+def design_texture(
     kinds: Sequence[str],
     stroke: float,
     settings: DesignSettings | None = None,
@@ -159,104 +179,58 @@ def make_paint(
     seed: int = 0,
     advance: Callable[[int, int], None] | None = None,
 ) -> tuple[Tensor, Judgement, str]:
-    """Search for the paint whose worst view says most, among those that a brush can paint.
+    """Search for the map with the best worst view among those that a brush can paint.
 
-    Seeds and sizes are tried; the best few by a quick look at the worst view's bound are judged in full, and of these
-    wins the one with the least product of this bound and 1 / margin: precise, and hard to confuse.
+    Sizes from 1.5 to 5 times the brush and seeds are tried. The best few by the bound of the worst view are judged in
+    full; the one with the least bound / margin wins: precise, and hard to confuse.
 
     Args:
-        kinds: of `paint.design.PAINTS`.
+        kinds: of `PATTERNS`.
         stroke: least width of brush, degrees.
-        settings: pictures that are expected.
-        tries: paints drawn of each kind.
+        settings: expected pictures.
+        tries: maps of each kind.
         seed: of the search.
-        advance: called with the number of paints looked at, and of all.
+        advance: called with the number of maps tried, and of all.
 
     Returns:
-        The map (512, 1024), its judgement, and what it is in words.
+        The map (512, 1024), its judgement, and its description.
 
     Raises:
         PaintError: none of them can be painted with such a brush.
     """
     settings = DesignSettings() if settings is None else settings
-    R = facing(view_directions(FEW_VIEWS))
+    # The ratio of bounds hardly depends on the diameter: the first judgement is for a small one.
+    small = settings.model_copy(update={"diameter_px": min(40.0, settings.diameter_px)})
+    R, (low, high) = facing(view_directions(FEW_VIEWS)), WHITE_SHARE
     found: list[tuple[float, str, float, int]] = []
-    for number, (kind, size, own_seed) in enumerate(_drafts(kinds, stroke, tries, seed)):
-        texture = scaled_paint(kind, size, own_seed, 256)
+    for number in range(tries * len(kinds)):
+        kind, k = kinds[number // tries], number % tries
+        size = 1.5 * stroke * (5.0 / 1.5) ** (k / max(tries - 1, 1))
+        size = min(max(size, SIZES_DEG[0]), SIZES_DEG[1])
+        texture = patterned_texture(kind, size, seed + k, 256)
         white = _white(texture, R)
-        if (
-            stroke_deg(texture) >= stroke
-            and WHITE_SHARE[0] <= float(white.min()) <= float(white.max()) <= WHITE_SHARE[1]
-        ):
-            # The ratio of bounds hardly depends on the diameter: the quick look is at a small one.
-            small = settings.model_copy(update={"diameter_px": min(40.0, settings.diameter_px)})
-            found.append((float(_bounds(texture, R, small).amax()), kind, size, own_seed))
+        if stroke_deg(texture) >= stroke and low <= float(white.min()) <= float(white.max()) <= high:
+            found.append((float(_bounds(texture, R, small).amax()), kind, size, seed + k))
         if advance is not None:
             advance(number + 1, tries * len(kinds))
     if not found:
         expected, do = f"one that a brush of {stroke:g} degrees can paint", "take a finer brush or more tries"
-        raise PaintError(refusal("paint", expected=expected, got=f"none of {tries * len(kinds)}", do=do))
+        raise PaintError(refusal("texture map", expected=expected, got=f"none of {tries * len(kinds)}", do=do))
     judged = []
     for _, kind, size, own_seed in sorted(found)[:FINALISTS]:
-        texture = scaled_paint(kind, size, own_seed)
-        judgement = judge_paint(texture, settings)
-        worst = float(judgement.bound_rad.amax())
-        judged.append(
-            (worst / max(judgement.margin, 1e-3), texture, judgement, f"{kind} of {size:.1f} degrees, seed {own_seed}")
-        )
+        texture = patterned_texture(kind, size, own_seed)
+        judgement = judge_texture(texture, settings)
+        cost = float(judgement.bound_rad.amax()) / max(judgement.margin, 1e-3)
+        judged.append((cost, texture, judgement, f"{kind} of {size:.1f} degrees, seed {own_seed}"))
     _, texture, judgement, words = min(judged, key=lambda one: one[0])
     return texture, judgement, words
 
 
-def lon_lat(direction_body: Tensor) -> Tensor:
-    """Longitude and latitude (..., 2), rad, of directions (..., 3)."""
-    x, y, z = direction_body.unbind(-1)
-    return torch.stack([torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))], -1)
-
-
-class _Look:
-    """Evened views of a map."""
-
-    def __init__(self, texture: Tensor) -> None:
-        size = SEARCH.size_px
-        self._texture, self._view = reduced_texture(texture.float(), size), orthographic_view(size)
-        self._normalise = LocalNormalisation(size, detail=SEARCH.detail, window=SEARCH.window, clip=SEARCH.clip)
-
-    def __call__(self, R_view_body: Tensor) -> Tensor:
-        """Vectors (K, P) of length 1."""
-        parts = [
-            self._normalise(self._view.render(self._texture, some.float()))
-            for some in torch.split(R_view_body, RENDERED)
-        ]
-        return torch.cat(parts)
-
-
-def _better(
-    best: Tensor, match: Tensor, R: Tensor, own: Tensor, others: Tensor, look: Tensor, apart_deg: float
-) -> tuple[Tensor, Tensor]:
-    """Best similarity (V,) and its attitude (V, 3, 3) after more attitudes (K, 3, 3) were looked at."""
-    likeness = own @ look.T
-    trace = R.flatten(1) @ others.flatten(1).T
-    likeness = likeness.masked_fill(trace > 1 + 2 * math.cos(math.radians(apart_deg)), -1.0)
-    top, place = likeness.max(1)
-    better = top > best
-    return torch.where(better, top, best), torch.where(better[:, None, None], others[place], match)
-
-
-def _drafts(kinds: Sequence[str], stroke: float, tries: int, seed: int) -> list[tuple[str, float, int]]:
-    """Kind, size and seed of the paints to try: sizes from 1.5 to 5 times the brush's width."""
-    drafts = []
-    for kind in kinds:
-        for k in range(tries):
-            size = 1.5 * stroke * (5.0 / 1.5) ** (k / max(tries - 1, 1))
-            drafts.append((kind, min(max(size, 3.0), 60.0), seed + k))
-    return drafts
-
-
 def _white(texture: Tensor, R_view_body: Tensor) -> Tensor:
-    """Share of each view (V,) that is white."""
-    texture = reduced_texture(texture.float(), SEARCH.size_px)
-    return orthographic_view(SEARCH.size_px).paint(texture, R_view_body.float()).mean(-1).double()
+    """Return the share of each view (V,) that is white."""
+    size = SEARCH.size_px
+    texture = reduced_texture(texture.float(), size)
+    return orthographic_view(size).paint(texture, R_view_body.float()).mean(-1).double()
 
 
 def _bounds(texture: Tensor, R_view_body: Tensor, settings: DesignSettings) -> Tensor:
@@ -268,9 +242,3 @@ def _bounds(texture: Tensor, R_view_body: Tensor, settings: DesignSettings) -> T
         sampling=Sampling(supersampling=6 if settings.diameter_px < 40 else 4),
     )
     return bound.orientation_rms_rad.double()
-
-
-def _spread(values: Tensor) -> dict[str, float | None]:
-    """Least, middle and greatest; None where there is none."""
-    named = {"min": values.min(), "median": values.median(), "max": values.max()}
-    return {name: float(value) if bool(value.isfinite()) else None for name, value in named.items()}

@@ -1,4 +1,4 @@
-"""Photographs of a ball cut to disks: found without the empty scene, made grey by the ball's own colour."""
+"""Photographs of a ball cut to disks: found without a picture of the empty scene, grey by the ball's own colour."""
 
 from __future__ import annotations
 
@@ -19,33 +19,35 @@ from sphereorient.search import crop_disk
 Photograph = NDArray[Any]
 
 FINER = 4  # times: the outline is followed on a lattice finer than the pixels
-CORNER = 0.08  # of the shorter side: squares in the corners that show what is behind the ball
-RIM = (0.85, 0.95)  # of the radius: of this the outline is half as bright
-SPECK = 3  # px, median that takes noise off before the outline is followed
-RADIUS_MIN_PX = 6.0  # below this a disk shows next to no paint
-ROUND_SHARE = 0.6  # of the outline's points must lie on the circle, to 6 % of its radius
-ON_CIRCLE = 0.06
+CORNER = 0.08  # of the shorter side: squares in the corners that show the scene
+RIM = (0.85, 0.95)  # of the radius: the outline is half as bright as this
+SPECK = 3  # px, median that removes noise before the outline is followed
+RADIUS_MIN_PX = 6.0  # below this a disk shows next to no texture
+ROUND_SHARE = 0.6  # of the outline's points that must lie on the circle
+ON_CIRCLE = 0.06  # distance from the circle, of its radius, up to which they do
 STEPS = 12  # of the circle's robust fit
+PICTURES_MIN = 3
+NO_CIRCLE = math.nan, math.nan, math.nan, 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class BallOutline:
-    """Where the ball is in one photograph; made by `find_ball`."""
+    """Where the ball is in one photograph."""
 
     u_px: float
     v_px: float
     radius_px: float
 
 
-def find_ball(picture: Photograph, name: str = "photograph") -> BallOutline:
-    """Find the one ball that a photograph shows before a scene unlike it, whole or cut by the picture's border.
+def find_disk(picture: Photograph, name: str = "photograph") -> BallOutline:
+    """Find the ball in a photograph, whole or cut by the picture's border.
 
     Args:
         picture: (H, W) or (H, W, 3), any grey or colour levels; at least one corner shows the scene.
         name: for the message.
 
     Raises:
-        PaintError: nothing round stands out.
+        PaintError: nothing round stands out from the scene.
     """
     levels = _channels(picture, name)
     difference = np.asarray(cv2.medianBlur(_unlike_corners(levels), SPECK), np.float32)
@@ -54,7 +56,7 @@ def find_ball(picture: Photograph, name: str = "photograph") -> BallOutline:
         raise _nothing(name, "nothing that stands out")
     fine = np.asarray(cv2.resize(difference, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR), np.float32)
     rough = _outlined(fine, 0.5 * float(np.median(difference[inside])))
-    # A lit ball is dimmer at its rim than in its middle: the border lies at half of what is just inside it.
+    # A lit ball is dimmer at its rim than in its middle: the border lies at half of what is just inside of it.
     row, column = np.ogrid[: fine.shape[0], : fine.shape[1]]
     away = np.hypot(row - rough[1], column - rough[0]) / max(rough[2], 1.0)
     rim = fine[(away > RIM[0]) & (away < RIM[1])]
@@ -65,13 +67,52 @@ def find_ball(picture: Photograph, name: str = "photograph") -> BallOutline:
     return BallOutline(u_px=(u + 0.5) / FINER - 0.5, v_px=(v + 0.5) / FINER - 0.5, radius_px=radius)
 
 
-def own_grey(picture: Photograph, ball: BallOutline, name: str = "photograph") -> NDArray[np.float32]:
-    """Return a photograph (H, W, 3) as grey levels (H, W): how much of the ball's own mean colour each pixel has.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Photographs:
+    """F photographs of one flight.
 
-    Dark paint is dark in it and white paint bright whatever the ball's colour, and the channel that shows most of the
-    ball counts most, so that noise is low.
+    Raises:
+        PaintError: fewer than three, or times that do not fit them.
     """
-    levels = _channels(picture, name)
+
+    pictures: Sequence[Photograph]  # (H, W) or (H, W, 3) each, sizes may differ
+    time_s: Tensor  # (F,) float64, from any origin, all different
+    names: Sequence[str] = ()  # for messages
+    balls: Sequence[BallOutline] | None = None  # where the ball is; None: it is searched
+
+    def __post_init__(self) -> None:
+        """Check the number of pictures and the times."""
+        count, time_s = len(self.pictures), self.time_s
+        do = "give one time in seconds for each photograph"
+        if count < PICTURES_MIN:
+            expected = f"{PICTURES_MIN} photographs at least"
+            raise PaintError(refusal("spin", expected=expected, got=str(count), do="add pictures of the same flight"))
+        if time_s.shape != (count,) or not bool(time_s.isfinite().all()):
+            got = f"{tuple(time_s.shape)} times" if bool(time_s.isfinite().all()) else "a time that is no number"
+            raise PaintError(refusal("times", expected=f"{count} times", got=got, do=do))
+        if bool((time_s.sort().values.diff() <= 0).any()):
+            raise PaintError(refusal("times", expected="different times", got="one of them twice", do=do))
+
+    def disks(self, size_px: int) -> tuple[Tensor, tuple[BallOutline, ...]]:
+        """Find the ball in each photograph; return its disks (F, S, S) float32, grey, and the outlines.
+
+        Raises:
+            PaintError: a photograph without a ball, or an array of another shape.
+        """
+        names = self.names or [f"photograph {k}" for k in range(len(self.pictures))]
+        found = tuple(self.balls or [find_disk(*each) for each in zip(self.pictures, names, strict=True)])
+        disks = [
+            crop_disk(_own_grey(_channels(picture, name), ball), ball.u_px, ball.v_px, ball.radius_px, size_px)
+            for picture, name, ball in zip(self.pictures, names, found, strict=True)
+        ]
+        return torch.from_numpy(np.stack(disks)), found
+
+
+def _own_grey(levels: NDArray[np.float32], ball: BallOutline) -> NDArray[np.float32]:
+    """Return the part of the ball's mean colour in each pixel, (H, W), of levels (H, W, C).
+
+    Black is dark and white bright in it whatever the ball's colour; the channel with most signal counts most.
+    """
     row, column = np.ogrid[: levels.shape[0], : levels.shape[1]]
     inside = np.hypot(row - ball.v_px, column - ball.u_px) < ball.radius_px
     colour = levels[inside].mean(0) if inside.any() else np.ones(levels.shape[2], np.float32)
@@ -79,33 +120,8 @@ def own_grey(picture: Photograph, ball: BallOutline, name: str = "photograph") -
     return grey
 
 
-def cut_disks(
-    pictures: Sequence[Photograph], size_px: int, balls: Sequence[BallOutline] | None = None
-) -> tuple[Tensor, tuple[BallOutline, ...]]:
-    """Find the ball in each photograph and resample its disk.
-
-    Args:
-        pictures: F of (H, W) or (H, W, 3), sizes may differ.
-        size_px: side S of the disks.
-        balls: F, where they are; None: they are looked for.
-
-    Returns:
-        (F, S, S) float32, and where the balls were.
-
-    Raises:
-        PaintError: a photograph without a ball, or that is no picture.
-    """
-    names = [f"photograph {k}" for k in range(len(pictures))]
-    found = tuple(find_ball(*each) for each in zip(pictures, names, strict=True)) if balls is None else tuple(balls)
-    disks = [
-        crop_disk(own_grey(picture, ball, name), ball.u_px, ball.v_px, ball.radius_px, size_px)
-        for picture, ball, name in zip(pictures, found, names, strict=True)
-    ]
-    return torch.from_numpy(np.stack(disks)) if disks else torch.zeros(0, size_px, size_px), found
-
-
 def _channels(picture: Photograph, name: str) -> NDArray[np.float32]:
-    """Levels (H, W, C) float32."""
+    """Return the levels of a photograph, (H, W, C)."""
     if picture.ndim not in (2, 3) or min(picture.shape[:2]) < 2 * RADIUS_MIN_PX or picture.shape[2:] not in ((), (3,)):
         expected, do = "(H, W) or (H, W, 3), 12 px at least", "pass pictures as arrays, colours in the last axis"
         raise PaintError(refusal(name, expected=expected, got=str(picture.shape), do=do))
@@ -114,17 +130,13 @@ def _channels(picture: Photograph, name: str) -> NDArray[np.float32]:
 
 
 def _unlike_corners(levels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """How unlike each pixel is to what the corners show, (H, W); a ball that fills a corner or two is outvoted."""
+    """Return each pixel's distance from the corners' median colour, (H, W); the ball may fill a corner."""
     side = max(2, round(CORNER * min(levels.shape[:2])))
-    corners = [levels[rows, columns] for rows in _ends(side) for columns in _ends(side)]
-    means = np.stack([corner.reshape(-1, levels.shape[2]).mean(0) for corner in corners])
-    behind = np.median(means, axis=0)
+    ends = (slice(None, side), slice(-side, None))
+    corners = [levels[rows, columns] for rows in ends for columns in ends]
+    behind = np.median([corner.reshape(-1, levels.shape[2]).mean(0) for corner in corners], axis=0)
     away: NDArray[np.float32] = np.linalg.norm(levels - behind, axis=-1).astype(np.float32)
     return away
-
-
-def _ends(side: int) -> tuple[slice, slice]:
-    return slice(None, side), slice(-side, None)
 
 
 def _otsu(values: NDArray[np.float32]) -> float:
@@ -134,10 +146,10 @@ def _otsu(values: NDArray[np.float32]) -> float:
 
 
 def _outlined(fine: NDArray[np.float32], level: float) -> tuple[float, float, float, float]:
-    """Circle about the largest region above a level, by those points of its border that the picture does not cut."""
+    """Fit a circle to the border of the largest region above a level, where the picture does not cut it."""
     outlines, _ = cv2.findContours((fine > level).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not outlines:
-        return math.nan, math.nan, math.nan, 0.0
+        return NO_CIRCLE
     outline = max(outlines, key=cv2.contourArea)[:, 0].astype(np.float64)
     height, width = fine.shape
     free = (outline > FINER).all(1) & (outline < np.array([width, height]) - 1 - FINER).all(1)
@@ -145,26 +157,25 @@ def _outlined(fine: NDArray[np.float32], level: float) -> tuple[float, float, fl
 
 
 def _circle(points: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Fit a circle to points (K, 2), most of which lie on one: centre, radius, share of points on it.
+    """Fit a circle to points (K, 2) robustly: centre, radius, share of points on it.
 
     Source: the algebraic fit of Kasa 1976, repeated with weights of Geman and McClure 1987.
     """
     if len(points) < 8:
-        return math.nan, math.nan, math.nan, 0.0
+        return NO_CIRCLE
     columns = np.column_stack([2 * points, np.ones(len(points))])
     square = (points**2).sum(1)
     weight, u, v, radius = np.ones(len(points)), 0.0, 0.0, math.nan
     for step in range(STEPS):
         root = np.sqrt(weight)
-        solved = np.linalg.lstsq(columns * root[:, None], square * root, rcond=None)[0]
-        u, v = float(solved[0]), float(solved[1])
-        radius = math.sqrt(max(float(solved[2]) + u * u + v * v, 0.0))
+        u, v, c = np.linalg.lstsq(columns * root[:, None], square * root, rcond=None)[0].tolist()
+        radius = math.sqrt(max(c + u * u + v * v, 0.0))
         off = np.hypot(points[:, 0] - u, points[:, 1] - v) - radius
-        scale = ON_CIRCLE * max(radius, 1.0) * max(1.0, 4.0 - step)  # loose at first: the first circle is pulled
+        scale = ON_CIRCLE * max(radius, 1.0) * max(1.0, 4.0 - step)  # loose at first: outliers pull the first circle
         weight = 1 / (1 + (off / (0.5 * scale)) ** 2) ** 2
     return u, v, radius, float((np.abs(off) < ON_CIRCLE * radius).mean())
 
 
 def _nothing(name: str, got: str) -> PaintError:
-    do = "cut the picture about the ball so that a corner shows the scene, or pass balls="
+    do = "crop the picture about the ball so that a corner shows the scene, or give the outline (balls=)"
     return PaintError(refusal(name, expected="one ball before a scene unlike it", got=got, do=do))

@@ -1,4 +1,4 @@
-"""A ball whose paint is dots: from a table of where they are to a map, and how large they are in pictures."""
+"""A ball with dots: from a table of their directions to a map, their size in pictures, and the search for attitudes."""
 
 from __future__ import annotations
 
@@ -9,101 +9,92 @@ import torch
 from torch import Tensor
 
 from sphereorient.errors import PaintError, check_tail, refusal
-from sphereorient.search.normalisation import Blur
+from sphereorient.search import GreySearch, GreySearchSettings
+from sphereorient.search.normalisation import Blur, rim_share
+from sphereorient.search.proposer import Proposals
 from sphereorient.sphere import orthographic_view
 from sphereorient.synth.textures import map_directions
 
 HEIGHT = 256  # of maps: 0.7 degree
-LENGTH_OFF = 0.05  # by which a direction of a table may miss length 1
+LENGTH_TOLERANCE = 0.05  # of the directions of a table
 LIMB = 0.6  # cosine between a dot and the line of sight below which its picture is too narrow to be measured
 BIN_RAD = math.radians(1.0)  # of the profile
-REACH = 3.0  # radii of the first guess to which the profile goes; the paint around begins at 2
-EVEN = 0.6  # radii of the disk, standard deviation of the neighbourhood: light changes over it, dots are smaller
-RADII_DEG = (0.5, 45.0)  # of dots that a map can hold
+REACH = 3.0  # radii of the first guess to which the profile goes; the white around begins at 2
+EVEN = 0.6  # radii of the disk, standard deviation of the neighbourhood that removes the light; dots are smaller
+RADII_DEG = (0.5, 45.0)  # of dots
+DARKEST = 0.97  # share of a disk's pixels that are brighter than a dot's middle
+CORE, SOFT = 0.8, 0.2  # of a dot's measured radius: where darkness is expected, and the width of this border
+UNKNOWN = 0.25  # weight of dark that is not in the table over that of a missing dot
+DOT_SEARCH = GreySearchSettings(score_min=0.05, peaks=24, finalists=16)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DotTable:
-    """Where the dots of a ball are and how large; made by whoever printed the stencil.
+    """Where the dots of a ball are, and their size.
+
+    A table in a left-handed frame is that of the mirror image: no attitude fits the pictures.
 
     Raises:
-        PaintError: no dots, lengths that are not 1 to 5 %, or radii that are none.
+        PaintError: no dots, lengths that differ from 1 by over 5 %, or a radius out of range.
+        ShapeError: directions that do not end in 3.
     """
 
     direction_body: Tensor  # (D, 3), middles of the dots
     radius_deg: float = 6.0  # angle at the ball's centre between a dot's middle and its border
 
     def __post_init__(self) -> None:
-        """Refuse what is no table."""
-        _checked(self.direction_body, self.radius_deg)
+        """Check directions and radius."""
+        check_tail("direction_body", self.direction_body, 3)
+        length = self.direction_body.reshape(-1, 3).double().norm(dim=-1)
+        if not len(length) or not bool(((length - 1).abs() < LENGTH_TOLERANCE).all()):
+            got = f"one of {float(length[(length - 1).abs().argmax()]):.3g}" if len(length) else "no rows"
+            do = "divide each row by its length"
+            raise PaintError(refusal("table of dots", expected="directions of length 1", got=got, do=do))
+        low, high = RADII_DEG
+        if not low <= self.radius_deg <= high:
+            expected, got = f"{low:g} .. {high:g} degrees", f"{self.radius_deg:.3g}"
+            do = "give the angle at the ball's centre between a dot's middle and its border"
+            raise PaintError(refusal("radius of dots", expected=expected, got=got, do=do))
+
+    def unit(self) -> Tensor:
+        """Return the directions (D, 3) float64 with length 1."""
+        return torch.nn.functional.normalize(self.direction_body.reshape(-1, 3).double(), dim=-1)
 
     def texture(self, height: int = HEIGHT) -> Tensor:
-        """Return the map (height, 2 height); see `dots_texture`."""
-        return dots_texture(self.direction_body, self.radius_deg, height)
+        """Return the map (height, 2 height) float32: black dots on white, borders one texel wide."""
+        away = torch.acos((map_directions(height) @ self.unit().mT).clamp(-1, 1)).amin(-1)
+        return (0.5 + (away - math.radians(self.radius_deg)) * height / math.pi).clamp(0, 1).float()
 
     def mirrored(self) -> DotTable:
-        """Return the table of the mirror image, body y reversed: no turn makes one of the other."""
+        """Return the table of the mirror image, body y reversed."""
         return replace(self, direction_body=self.direction_body * self.direction_body.new_tensor([1.0, -1.0, 1.0]))
 
     def measured(self, disks: Tensor, R_view_body: Tensor) -> DotTable:
-        """Return the table with the radius that pictures show; see `measured_dot_radius_deg`."""
-        radius = measured_dot_radius_deg(disks, R_view_body, self.direction_body, self.radius_deg)
-        return replace(self, radius_deg=radius)
+        """Return the table with the dots' radius measured in pictures: where the mean dot is half as dark.
 
+        Blur and motion during the exposure are in that radius.
 
-def dots_texture(direction_body: Tensor, radius_deg: float | Tensor, height: int = HEIGHT) -> Tensor:
-    """Draw the map of a white ball with round black dots.
+        Args:
+            disks: (F, S, S), grey levels, the outline touching the borders; far cameras.
+            R_view_body: (F, 3, 3), attitudes, to half a dot; the present radius is right to a factor of 2.
 
-    Args:
-        direction_body: (D, 3), middles of the dots, body frame, of length 1 to 5 %. A table in a left-handed frame
-            gives the mirror image of the ball, and no attitude fits its pictures.
-        radius_deg: of the dots, degrees on the sphere, one for all or (D,).
-        height: of the map.
-
-    Returns:
-        (height, 2 height) float32, 0 black .. 1 white, borders one texel wide.
-
-    Raises:
-        PaintError: no dots, lengths that are not 1, or radii that are none.
-        ShapeError: directions that do not end in 3.
-    """
-    direction, radius = _checked(direction_body, radius_deg)
-    away = torch.acos((map_directions(height) @ direction.mT).clamp(-1, 1)) - radius
-    return (0.5 + away.amin(-1) * height / math.pi).clamp(0, 1).float()
-
-
-def measured_dot_radius_deg(
-    disks: Tensor, R_view_body: Tensor, direction_body: Tensor, guess_deg: float = 6.0
-) -> float:
-    """Measure how large the dots are: the angle at which the mean dot is half as dark as in its middle.
-
-    Args:
-        disks: (F, S, S), grey levels, the outline touching the borders; far cameras.
-        R_view_body: (F, 3, 3), attitudes, to half a dot.
-        direction_body: (D, 3), middles of the dots.
-        guess_deg: radius, degrees, to a factor of 2.
-
-    Returns:
-        The radius, degrees, that of the dot as blurred: motion during the exposure is in it.
-
-    Raises:
-        PaintError: no dot is darker in its middle than the paint around it.
-    """
-    direction, _ = _checked(direction_body, guess_deg)
-    size = disks.shape[-1]
-    view = orthographic_view(size, torch.float64)
-    R = R_view_body.double()
-    grey = disks.float()
-    even = (grey / Blur(size, EVEN)(grey).clamp_min(1e-6))[:, view.inside].double()
-    away, nearest = torch.acos(((view.normal_view @ R) @ direction.mT).clamp(-1, 1)).min(-1)  # (F, P)
-    facing = -(R @ direction.mT)[:, 2]  # (F, D), cosine to the line of sight
-    used = (facing.gather(1, nearest) > LIMB) & (away < math.radians(REACH * guess_deg))
-    bins = (away[used] / BIN_RAD).long()
-    return _half_width_deg(torch.bincount(bins, even[used]) / torch.bincount(bins).clamp_min(1), guess_deg)
+        Raises:
+            PaintError: no dot is darker in its middle than the white around it.
+        """
+        direction, guess_deg = self.unit(), self.radius_deg
+        view = orthographic_view(disks.shape[-1], torch.float64)
+        R, grey = R_view_body.double(), disks.float()
+        even = (grey / Blur(disks.shape[-1], EVEN)(grey).clamp_min(1e-6))[:, view.inside].double()
+        away, nearest = torch.acos(((view.normal_view @ R) @ direction.mT).clamp(-1, 1)).min(-1)  # (F, P)
+        facing = -(R @ direction.mT)[:, 2]  # (F, D), cosine to the line of sight
+        used = (facing.gather(1, nearest) > LIMB) & (away < math.radians(REACH * guess_deg))
+        bins = (away[used] / BIN_RAD).long()
+        profile = torch.bincount(bins, even[used]) / torch.bincount(bins).clamp_min(1)
+        return replace(self, radius_deg=_half_width_deg(profile, guess_deg))
 
 
 def _half_width_deg(profile: Tensor, guess_deg: float) -> float:
-    """Where a profile by angle, degrees, has climbed half of the way from its middle to the paint around."""
+    """Return the angle, degrees, at which a profile is halfway from its middle to the white around."""
     outer = profile[round(2 * guess_deg) :]
     around = float(outer.median()) if len(outer) else math.nan
     middle = float(profile[0]) if len(profile) else math.nan
@@ -117,19 +108,48 @@ def _half_width_deg(profile: Tensor, guess_deg: float) -> float:
     return math.degrees(BIN_RAD) * (k - 0.5 + (half - low) / (high - low))
 
 
-def _checked(direction_body: Tensor, radius_deg: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Directions (D, 3) of length 1 and radii, rad, float64."""
-    check_tail("direction_body", direction_body, 3)
-    direction = direction_body.reshape(-1, 3).double()
-    length = direction.norm(dim=-1)
-    if not len(length) or not bool(((length - 1).abs() < LENGTH_OFF).all()):
-        got = f"one of {float(length[(length - 1).abs().argmax()]):.3g}" if len(length) else "no rows"
-        do = "divide each row by its length"
-        raise PaintError(refusal("table of dots", expected="directions of length 1", got=got, do=do))
-    radius = torch.as_tensor(radius_deg, dtype=torch.float64)
-    low, high = RADII_DEG
-    if not bool(((radius >= low) & (radius <= high)).all()):
-        expected, got = f"{low:g} .. {high:g} degrees", f"{float(radius.flatten()[0]):.3g}"
-        do = "give the angle at the ball's centre between a dot's middle and its border"
-        raise PaintError(refusal("radius of dots", expected=expected, got=got, do=do))
-    return direction / length[:, None], torch.deg2rad(radius)
+class DotSearch:
+    """Search all of SO(3) for the views of a table of dots: the grey search proposes, the dots decide.
+
+    A dot of the table that is missing in the picture counts against an attitude; dark that is not in the table (a
+    maker's name, dirt) hardly does.
+    """
+
+    def __init__(self, table: DotTable, settings: GreySearchSettings = DOT_SEARCH) -> None:
+        self._search = GreySearch(table.texture(), settings)
+        view = orthographic_view(settings.size_px, torch.float64)
+        self._inside, self._normal = view.inside, view.normal_view
+        self._even = Blur(settings.size_px, EVEN)
+        self._weight = view.normal_view[:, 2].square() * rim_share(settings.size_px)[view.inside]
+        self._direction = table.unit()
+        self._radius = math.radians(table.radius_deg) * CORE
+
+    @property
+    def size_px(self) -> int:
+        """Side of the disks, px."""
+        return self._search.size_px
+
+    def propose(self, disks: Tensor) -> Proposals:
+        """Propose attitudes; see `GreySearch.propose`.
+
+        Returns:
+            Proposals, best first; the score is 1 where all dark is dots and all dots are visible, 1/2 where a ball
+            without dots would explain as much.
+        """
+        found = self._search.propose(disks)
+        score, order = torch.zeros_like(found.score), torch.arange(len(found.score))
+        for f, disk in enumerate(disks):
+            rows = slice(int(found.offset[f]), int(found.offset[f + 1]))
+            score[rows] = self._scores(disk, found.R_view_body[rows])
+            order[rows] = order[rows][score[rows].argsort(descending=True, stable=True)]
+        return replace(found, R_view_body=found.R_view_body[order], score=score[order])
+
+    def _scores(self, disk: Tensor, R_view_body: Tensor) -> Tensor:
+        """Return the scores (Q,) of attitudes (Q, 3, 3) for a disk (S, S)."""
+        even = (disk / self._even(disk[None].float())[0].clamp_min(1e-6))[self._inside].double()
+        dark = ((1 - even) / (1 - even).quantile(DARKEST).clamp_min(1e-6)).clamp(0, 1)
+        away = torch.acos(((self._normal @ R_view_body) @ self._direction.mT).clamp(-1, 1)).amin(-1)
+        expected = torch.sigmoid((self._radius - away) / (SOFT * self._radius))
+        cost = self._weight * torch.where(expected > dark, 1.0, UNKNOWN) * (expected - dark).square()
+        blank = (self._weight * UNKNOWN * dark.square()).sum().clamp_min(1e-12)
+        return blank / (blank + cost.sum(-1))

@@ -1,12 +1,13 @@
-"""A ball that spins evenly: R(t) = exp(omega (t - t0)) R(t0) through the candidates of many pictures.
+"""Uniform spins R(t) = exp(omega (t - t0)) R(t0) through the candidate attitudes of many pictures.
 
-Pictures at times that are multiples of one step cannot tell a spin from the same with whole turns per step added, nor
-any two of the series omega + 2 pi k / step along the axis. All of them below a limit are fitted and told.
+Pictures at multiples of one time step cannot distinguish omega from omega + 2 pi k / step along its axis. All these
+aliases below a limit are fitted and reported.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,30 +17,30 @@ from sphereorient import so3
 
 ANCHORS = 40  # pairs of neighbouring pictures from which spins are guessed, evenly spread
 PER_PICTURE = 6  # candidates of a picture in these guesses
-KEPT = 256  # guesses that go on
-FIRST_SPAN = 2.6  # usual steps to each side of a guess's pair that it is compared with first
+KEPT = 256  # guesses that are refined
+FIRST_SPAN = 2.6  # median steps to each side of a guess's pair that it is compared with first
 GROWTH = 1.6  # of the span: errors of a fit fall faster than that
 LOOSE_RAD, TIGHT_RAD = math.radians(12.0), math.radians(1.0)  # scatter of right candidates: at first, at least
-STEPS = 3  # of each fit while the span grows
-LAST_STEPS = 12
-STRAYS = 0.2  # share of pictures, at first guess, none of whose candidates is right
-SAME_RAD = math.radians(6.0)  # spins whose attitudes at all pictures' times are this near are one
-PRIOR = 1e-6  # information of the unknowns before any picture, so that what is open stays in place
-ALIAS_SCATTER = 3.0  # times that of the best: how far off an alias may begin, times being multiples but for jitter
+ITERATIONS = 3  # of each fit while the span grows
+LAST_ITERATIONS = 12
+STRAYS = 0.2  # share of pictures, at first guess, without a right candidate
+SAME_RAD = math.radians(6.0)  # spins whose attitudes at all pictures' times are this near are the same
+PRIOR = 1e-6  # information of the unknowns before any picture, so that undetermined ones do not move
+ALIAS_SCATTER = 3.0  # initial scatter of an alias over that of the best spin: times are multiples but for jitter
 REPORTED = 32  # spins at most
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sighted:
-    """Candidates of F pictures, C each, padded; made by `sighted`."""
+class PictureCandidates:
+    """Candidate attitudes of F pictures, C each, padded."""
 
     time_s: Tensor  # (F,) float64
     R_view_body: Tensor  # (F, C, 3, 3) float64
-    weight: Tensor  # (F, C), share of belief, 0 where there is none; the sum over C is 1, or 0
+    weight: Tensor  # (F, C), 0 where padded; the sum over C is 1, or 0
 
     @property
     def step_s(self) -> float:
-        """Shortest time between two pictures, averaged over all where theirs are multiples of it."""
+        """Shortest time between two pictures, averaged over all gaps, taken as multiples of it."""
         gap = self.time_s.sort().values.diff()
         gap = gap[gap > 0]
         return float(gap.sum() / (gap / gap.min()).round().sum())
@@ -47,14 +48,14 @@ class Sighted:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Spins:
-    """K even spins; made by `fit_spins`, best first."""
+    """K uniform spins, best first."""
 
     omega_view_rad_s: Tensor  # (K, 3), view frame: x right, y down, z from the camera to the ball
     R0_view_body: Tensor  # (K, 3, 3), at time0_s
     time0_s: Tensor  # (K,)
-    evidence: Tensor  # (K,), log of how much likelier the candidates are than with random attitudes
+    evidence: Tensor  # (K,), log of the candidates' likelihood over that with random attitudes
     scatter_rad: Tensor  # (K,), of right candidates about the spin, each axis
-    covariance: Tensor  # (K, 6, 6), of a small turn of R0 (view, rad) and of omega (rad/s)
+    covariance: Tensor  # (K, 6, 6), of a small rotation of R0 (view, rad) and of omega (rad/s)
 
     def __len__(self) -> int:
         """Return K."""
@@ -65,67 +66,71 @@ class Spins:
         return Spins(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
 
     def R_view_body(self, time_s: Tensor) -> Tensor:
-        """Attitudes (K, F, 3, 3) at times (F,)."""
+        """Return attitudes (K, F, 3, 3) at times (F,)."""
         since = time_s - self.time0_s[:, None]
         return so3.exp(self.omega_view_rad_s[:, None] * since[..., None]) @ self.R0_view_body[:, None]
 
     def rate_sigma(self) -> Tensor:
-        """Standard deviation (K,) of the rate |omega|, rad/s."""
+        """Return the standard deviation (K,) of the rate |omega|, rad/s."""
         axis = torch.nn.functional.normalize(self.omega_view_rad_s, dim=-1)
         return torch.einsum("ki,kij,kj->k", axis, self.covariance[:, 3:, 3:], axis).clamp_min(0).sqrt()
 
 
-def sighted(time_s: Tensor, offset: Tensor, R_view_body: Tensor, belief: Tensor) -> Sighted:
+def picture_candidates(time_s: Tensor, offset: Tensor, R_view_body: Tensor, weight: Tensor) -> PictureCandidates:
     """Pad candidates to one record.
 
     Args:
         time_s: (F,), any order.
         offset: (F + 1,) int64; the candidates of picture f are the rows offset[f] .. offset[f + 1].
         R_view_body: (M, 3, 3).
-        belief: (M,), not negative, in any unit: only shares within a picture count.
+        weight: (M,), not negative, any unit: only ratios within a picture count.
     """
     counts = offset.diff()
     width = max(int(counts.max()) if len(counts) else 0, 1)
     there = torch.arange(width) < counts[:, None]
     R = torch.eye(3, dtype=torch.float64).repeat(len(counts), width, 1, 1)
-    weight = torch.zeros(len(counts), width, dtype=torch.float64)
-    R[there], weight[there] = R_view_body.double(), belief.double().clamp_min(0)
-    return Sighted(time_s=time_s.double(), R_view_body=R, weight=weight / weight.sum(1, keepdim=True).clamp_min(1e-300))
+    padded = torch.zeros(len(counts), width, dtype=torch.float64)
+    R[there], padded[there] = R_view_body.double(), weight.double().clamp_min(0)
+    padded = padded / padded.sum(1, keepdim=True).clamp_min(1e-300)
+    return PictureCandidates(time_s=time_s.double(), R_view_body=R, weight=padded)
 
 
-def fit_spins(seen: Sighted, omega_max_rad_s: float) -> Spins:
-    """Find all even spins below a limit that pass near the pictures' candidates.
+def fit_spins(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
+    """Find the best uniform spin below a limit and all its aliases, best first.
 
-    Args:
-        seen: two pictures at least, at different times.
-        omega_max_rad_s: limit of the rate.
-
-    Returns:
-        The spins, most evident first: the best and every one that differs from it by whole turns per shortest step,
-        however little it explains; none where no two neighbouring pictures have candidates.
+    None is found where no two neighbouring pictures have candidates.
     """
-    guesses = _guesses(seen, omega_max_rad_s)
-    if not len(guesses):
-        return guesses
-    found = _grown(seen, guesses)
-    best = found.of(found.evidence.argmax()[None])
-    aliases = _aliases(_at_a_picture(best, seen.time_s), seen.step_s, omega_max_rad_s)
-    family = fit(seen, aliases, steps=LAST_STEPS)
+    spins = _guesses(seen, omega_max_rad_s)
+    if not len(spins):
+        return spins
+    # To more and more pictures, from a few about each guess to all; only the better guesses go on.
+    usual = float(seen.time_s.sort().values.diff().median())
+    spans = [FIRST_SPAN * max(usual, seen.step_s)]
+    while spans[-1] < float(seen.time_s.max() - seen.time_s.min()):
+        spans.append(GROWTH * spans[-1])
+    parts = torch.split(torch.arange(len(spins)), KEPT)
+    spins = _joined([refine_spins(seen, spins.of(some), iterations=0, span_s=spans[0]) for some in parts])
+    spins = spins.of(spins.evidence.argsort(descending=True, stable=True)[:KEPT])
+    for span in spans:
+        spins = _distinct(refine_spins(seen, spins, iterations=ITERATIONS, span_s=span), seen.time_s)
+    spins = refine_spins(seen, spins, iterations=LAST_ITERATIONS)
+    aliases = _aliases(spins.of(spins.evidence.argmax()[None]), seen, omega_max_rad_s)
+    family = refine_spins(seen, aliases, iterations=LAST_ITERATIONS)
     below = family.omega_view_rad_s.norm(dim=-1) <= omega_max_rad_s
     return _distinct(family.of(below), seen.time_s, by_spin=True)
 
 
-def fit(seen: Sighted, spins: Spins, *, steps: int, span_s: float = math.inf) -> Spins:
+def refine_spins(seen: PictureCandidates, spins: Spins, *, iterations: int, span_s: float = math.inf) -> Spins:
     """Fit spins to the candidates within a span of their own time0, by expectation and maximisation.
 
-    Each picture's candidates share its weight with the case that none is right; what is right scatters about the spin
-    by an angle that is estimated too.
+    Each picture's candidates share its weight with the case that none is right; the scatter of right candidates about
+    the spin is estimated too.
 
     Source: Dempster et al. 1977; the slope of exp is its left Jacobian.
     """
     since = seen.time_s - spins.time0_s[:, None]
     near = (since.abs() <= span_s).double()
-    for _ in range(steps):
+    for _ in range(iterations):
         turn, share, _ = _matched(seen, spins)
         share = share * near[..., None]
         residual = (share[..., None] * turn).sum(2)  # (K, F, 3), weighted by the shares
@@ -148,17 +153,16 @@ def fit(seen: Sighted, spins: Spins, *, steps: int, span_s: float = math.inf) ->
             scatter_rad=scatter,
             covariance=inverse * scatter[:, None, None] ** 2,
         )
-    gain = _matched(seen, spins)[2]
-    return replace(spins, evidence=(gain * near).sum(1))
+    return replace(spins, evidence=(evidence_of(seen, spins) * near).sum(1))
 
 
-def evidence_of(seen: Sighted, spins: Spins) -> Tensor:
-    """Return each picture's share of the evidence, (K, F): below 0 where no candidate is near."""
+def evidence_of(seen: PictureCandidates, spins: Spins) -> Tensor:
+    """Return each picture's part of the evidence, (K, F): below 0 where no candidate is near."""
     return _matched(seen, spins)[2]
 
 
-def _guesses(seen: Sighted, omega_max_rad_s: float) -> Spins:
-    """Spins through two candidates of neighbouring pictures, with every number of whole turns between them."""
+def _guesses(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
+    """Return spins through two candidates of neighbouring pictures, with any number of whole turns between them."""
     order = seen.time_s.argsort(stable=True)
     gap = seen.time_s[order].diff()
     usable = torch.nonzero(gap > 0)[:, 0]
@@ -171,61 +175,47 @@ def _guesses(seen: Sighted, omega_max_rad_s: float) -> Spins:
     angle = turn.norm(dim=-1, keepdim=True)
     axis = turn / angle.clamp_min(1e-9)
     gaps = gap[usable][:, None, None]
+    time0 = (0.5 * (seen.time_s[i] + seen.time_s[j]))[:, None, None].expand_as(both)
     most = math.ceil(omega_max_rad_s * float(gap[usable].max()) / (2 * math.pi)) + 1
     parts = []
     for k in range(-most, most + 1):
         omega = axis * (angle + 2 * math.pi * k) / gaps[..., None]
         use = both & (omega.norm(dim=-1) <= 1.1 * omega_max_rad_s)
         middle = so3.exp(0.5 * omega * gaps[..., None]) @ first
-        time0 = (0.5 * (seen.time_s[i] + seen.time_s[j]))[:, None, None].expand_as(both)
-        parts.append(_plain(omega[use], middle.expand(*both.shape, 3, 3)[use], time0[use]))
+        count = int(use.sum())
+        parts.append(
+            Spins(
+                omega_view_rad_s=omega[use],
+                R0_view_body=middle.expand(*both.shape, 3, 3)[use],
+                time0_s=time0[use],
+                evidence=omega.new_zeros(count),
+                scatter_rad=omega.new_full((count,), LOOSE_RAD),
+                covariance=omega.new_zeros(count, 6, 6),
+            )
+        )
     return _joined(parts)
 
 
-def _grown(seen: Sighted, spins: Spins) -> Spins:
-    """Fit guesses to more and more pictures, the better ones only."""
-    spans = _spans(seen)
-    parts = [fit(seen, some, steps=0, span_s=spans[0]) for some in _split(spins, KEPT)]
-    spins = _best(_joined(parts), KEPT)
-    for span in spans:
-        spins = _distinct(fit(seen, spins, steps=STEPS, span_s=span), seen.time_s)
-    return fit(seen, spins, steps=LAST_STEPS)
-
-
-def _spans(seen: Sighted) -> list[float]:
-    """Spans to each side, s, from a few pictures to all of them."""
-    usual = float(seen.time_s.sort().values.diff().median())
-    spans = [FIRST_SPAN * max(usual, seen.step_s)]
-    while spans[-1] < float(seen.time_s.max() - seen.time_s.min()):
-        spans.append(GROWTH * spans[-1])
-    return spans
-
-
-def _at_a_picture(spins: Spins, time_s: Tensor) -> Spins:
-    """The same spins with R0 at a picture's time: there, and not between pictures, aliases are at the same attitude."""
-    nearest = (time_s - spins.time0_s[:, None]).abs().argmin(1)
-    R0 = spins.R_view_body(time_s)[torch.arange(len(spins)), nearest]
-    return replace(spins, R0_view_body=R0, time0_s=time_s[nearest])
-
-
-def _aliases(best: Spins, step_s: float, omega_max_rad_s: float) -> Spins:
-    """The spin with whole turns per step added, both ways, up to the limit."""
+def _aliases(best: Spins, seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
+    """Return a spin with whole turns per step added, in both directions, up to the limit."""
+    # R0 is moved to the time of a picture: only there do all aliases have the same attitude.
+    nearest = (seen.time_s - best.time0_s).abs().argmin()[None]
+    best = replace(best, R0_view_body=best.R_view_body(seen.time_s)[:, nearest[0]], time0_s=seen.time_s[nearest])
     rate = float(best.omega_view_rad_s.norm())
     axis = torch.nn.functional.normalize(best.omega_view_rad_s, dim=-1)
-    turn = 2 * math.pi / step_s
+    turn = 2 * math.pi / seen.step_s
     rates = [rate + k * turn for k in range(-math.ceil((omega_max_rad_s + rate) / turn), REPORTED)]
-    rates = [each for each in rates if abs(each) <= 1.05 * omega_max_rad_s]
-    rates = sorted(rates, key=abs)[:REPORTED]
+    rates = sorted((each for each in rates if abs(each) <= 1.05 * omega_max_rad_s), key=abs)[:REPORTED]
     wider = (ALIAS_SCATTER * best.scatter_rad).clamp(max=LOOSE_RAD)
     return _joined([replace(best, omega_view_rad_s=axis * each, scatter_rad=wider) for each in rates])
 
 
-def _matched(seen: Sighted, spins: Spins) -> tuple[Tensor, Tensor, Tensor]:
+def _matched(seen: PictureCandidates, spins: Spins) -> tuple[Tensor, Tensor, Tensor]:
     """Compare spins with candidates.
 
     Returns:
-        Turns (K, F, C, 3) from the spin's attitudes to the candidates, view frame; the share (K, F, C) with which each
-        is the right one; the gain (K, F), log of the likelihood over that of random attitudes.
+        Rotations (K, F, C, 3) from the spin's attitudes to the candidates, view frame; the probability (K, F, C) that
+        each is the right one; the log of the likelihood over that of random attitudes (K, F).
     """
     predicted = spins.R_view_body(seen.time_s)  # (K, F, 3, 3)
     turn = so3.log(seen.R_view_body @ predicted[:, :, None].mT)
@@ -235,56 +225,33 @@ def _matched(seen: Sighted, spins: Spins) -> tuple[Tensor, Tensor, Tensor]:
     log = height - 0.5 * turn.square().sum(-1) / scatter**2 + seen.weight.clamp_min(1e-300).log()
     log = log + math.log(1 - STRAYS)
     whole = torch.logaddexp(log.logsumexp(-1), log.new_tensor(math.log(STRAYS)))
-    blind = seen.weight.sum(-1) == 0
     share = torch.where(seen.weight > 0, (log - whole[..., None]).exp(), 0.0)
-    return turn, share, torch.where(blind, 0.0, whole)
+    return turn, share, torch.where(seen.weight.sum(-1) == 0, 0.0, whole)
 
 
 def _slope(omega: Tensor, since: Tensor) -> Tensor:
-    """How attitudes turn (K, F, 3, 6), view frame, with a turn of R0 and with omega."""
+    """Return the derivative of the attitudes (K, F, 3, 6), view frame, by a rotation of R0 and by omega."""
     swept = omega[:, None] * since[..., None]
     angle = swept.norm(dim=-1)[..., None, None]
     axis = torch.nn.functional.normalize(swept, dim=-1)
     safe = angle.clamp_min(1e-6)
     along = axis[..., :, None] * axis[..., None, :]
     sine, rest = torch.sin(safe) / safe, (1 - torch.cos(safe)) / safe
-    view = torch.eye(3, dtype=torch.float64)
-    jacobian = sine * view + (1 - sine) * along + rest * so3.hat(axis)
+    jacobian = sine * torch.eye(3, dtype=torch.float64) + (1 - sine) * along + rest * so3.hat(axis)
     return torch.cat([so3.exp(swept), jacobian * since[..., None, None]], dim=-1)
 
 
-def _plain(omega: Tensor, R0: Tensor, time0: Tensor) -> Spins:
-    count = len(omega)
-    return Spins(
-        omega_view_rad_s=omega,
-        R0_view_body=R0,
-        time0_s=time0,
-        evidence=omega.new_zeros(count),
-        scatter_rad=omega.new_full((count,), LOOSE_RAD),
-        covariance=omega.new_zeros(count, 6, 6),
-    )
-
-
-def _joined(parts: list[Spins]) -> Spins:
+def _joined(parts: Sequence[Spins]) -> Spins:
     return Spins(**{name: torch.cat([getattr(part, name) for part in parts]) for name in Spins.__dataclass_fields__})
 
 
-def _split(spins: Spins, size: int) -> list[Spins]:
-    return [spins.of(some) for some in torch.split(torch.arange(len(spins)), size)] or [spins]
-
-
-def _best(spins: Spins, count: int) -> Spins:
-    return spins.of(spins.evidence.argsort(descending=True, stable=True)[:count])
-
-
 def _distinct(spins: Spins, time_s: Tensor, by_spin: bool = False) -> Spins:
-    """Spins, best first, without those that show the same attitudes as a better one; `by_spin`: and turn as fast."""
-    spins = _best(spins, len(spins))
+    """Return spins, best first, without those with the attitudes (`by_spin`: and the rate) of a better one."""
+    spins = spins.of(spins.evidence.argsort(descending=True, stable=True))
     R = spins.R_view_body(time_s)
     apart = torch.stack([so3.geodesic_distance(R, one).amax(-1) for one in R]) if len(R) else R.new_zeros(0, 0)
     same = apart < SAME_RAD
     if by_spin:
-        rate = spins.omega_view_rad_s
-        near = (rate[:, None] - rate).norm(dim=-1) < 0.02 * rate.norm(dim=-1) + 1e-3
-        same = same & near
+        omega = spins.omega_view_rad_s
+        same &= (omega[:, None] - omega).norm(dim=-1) < 0.02 * omega.norm(dim=-1) + 1e-3
     return spins.of(~torch.tril(same, -1).any(1))

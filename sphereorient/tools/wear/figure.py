@@ -1,4 +1,4 @@
-"""Figure of a series of maps: where the paint changed, map by map, and how the worn share grows."""
+"""The figure of a series of texture maps: what changed, map by map, and how the worn share grows."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from sphereorient.mapping.compare import RADIUS_DEG
 from sphereorient.report.map_figure import CHANGE_REACH, UNSEEN, equirectangular
 from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note
-from sphereorient.tools.wear.series import Place, WearSeries
+from sphereorient.tools.wear.series import WearSeries
 
 SHOWN = 6  # maps that are drawn at most, spread over the series
 NAMED = 6  # places that have their number in the maps, and their own curve
@@ -24,51 +24,41 @@ LEAST_PERCENT = 0.1  # height of the smallest scale of the curve
 
 @in_style
 def wear_figure(first: Tensor, series: WearSeries, names: Sequence[str]) -> Figure:
-    """Draw a series of maps.
-
-    Args:
-        first: (H, 2 H), the reference, NaN where unknown.
-        series: of it and the maps after it.
-        names: of all maps, the first one's first.
-    """
+    """Draw the wear of a series of maps against the first (H, 2 H), NaN where unknown; `names` are of all maps."""
     count = len(series.wear)
     drawn = np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int)).tolist()
     rows = math.ceil((len(drawn) + 1) / 2)
     figure = new_figure(WIDTH_IN, 1.75 * rows + 2.7)
     grid = figure.add_gridspec(rows + 1, 2, height_ratios=[1.0] * rows + [1.15])
     maps = [figure.add_subplot(grid[k // 2, k % 2]) for k in range(len(drawn) + 1)]
-    _draw_first(maps[0], first, names[0])
+    maps[0].imshow(np.ma.masked_invalid(first.numpy()), cmap="gray", vmin=0, vmax=1, extent=EXTENT)
+    _label(maps[0], f"{names[0]}: the first map")
     for axes, k in zip(maps[1:], drawn, strict=True):
         shown = axes.imshow(
             np.ma.masked_invalid(series.wear[k].change.numpy()),
             cmap="RdBu_r", vmin=-CHANGE_REACH, vmax=CHANGE_REACH, extent=EXTENT,
         )  # fmt: skip
-        _dress(axes, f"{names[k + 1]}: {100 * series.growth[k].worn:.1f} % worn")
+        _label(axes, f"{names[k + 1]}: {100 * series.growth[k].worn:.1f} % worn")
         _mark(axes, series, k)
     figure.colorbar(shown, ax=maps, shrink=0.6, extend="both", label="change, red where brighter")
     _draw_growth(figure.add_subplot(grid[rows, :]), series, names)
     note(
         figure,
-        f"Change is what goes beyond all that the first map has within {RADIUS_DEG:g}°; 1 is the step from black to "
-        "white paint. Outlined: worn places beyond the maps' scatter, the largest ones numbered. Sand: unknown.",
+        f"Change is what lies outside of all grey levels that the first map has within {RADIUS_DEG:g}°; 1 is the step "
+        "from black to white. Outlined: worn places, the largest ones numbered. Sand: unknown.",
     )
     return figure
 
 
-def _dress(axes: Axes, title: str) -> None:
+def _label(axes: Axes, title: str) -> None:
     equirectangular(axes)
     axes.set_xlabel("")
     axes.set_facecolor(UNSEEN)
     axes.set_title(title, fontsize=8)
 
 
-def _draw_first(axes: Axes, first: Tensor, name: str) -> None:
-    axes.imshow(np.ma.masked_invalid(first.numpy()), cmap="gray", vmin=0, vmax=1, extent=EXTENT)
-    _dress(axes, f"{name}: the first map")
-
-
 def _mark(axes: Axes, series: WearSeries, k: int) -> None:
-    """Outline what is worn in one map, and number the largest places."""
+    """Outline the worn places of one map, and number the largest ones."""
     worn = series.wear[k].worn.numpy()
     if worn.any():
         axes.contour(worn.astype(float), [0.5], colors=BLACK, linewidths=0.6, extent=EXTENT, origin="upper")
@@ -85,18 +75,15 @@ def _mark(axes: Axes, series: WearSeries, k: int) -> None:
 
 
 def _draw_growth(axes: Axes, series: WearSeries, names: Sequence[str]) -> None:
-    """Draw the worn share of what each map knows, and that of the largest places, over the series."""
+    """Draw the worn share of each map's known area, and that of the largest places, over the series."""
     at = np.arange(1, len(series.wear) + 1)
     whole = 100 * np.array([one.worn for one in series.growth])
-    axes.plot(np.append(0, at), np.append(0, whole), marker=ALL.marker, label="all, of what is known", **ALL.drawn)
+    axes.plot(np.append(0, at), np.append(0, whole), marker=ALL.marker, label="all, of the known area", **ALL.drawn)
     for number, place in enumerate(series.places[:NAMED], start=1):
-        axes.plot(np.append(0, at), np.append(0, _percent(place)), marker=".", linewidth=0.9, label=f"place {number}")
+        shares = 100 * np.array([0, *place.share])
+        axes.plot(np.append(0, at), shares, marker=".", linewidth=0.9, label=f"place {number}")
     axes.set(ylabel="worn (% of the ball)", xticks=np.append(0, at), ylim=(0, None))
     axes.set_ylim(0, max(LEAST_PERCENT, axes.get_ylim()[1]))
     axes.set_xticklabels(list(names))
     axes.yaxis.set_major_locator(MaxNLocator(6))
     axes.legend(loc="upper left")
-
-
-def _percent(place: Place) -> list[float]:
-    return [100 * share for share in place.share]

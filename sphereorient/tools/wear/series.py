@@ -1,4 +1,4 @@
-"""Maps of one ball, one a movie: where its paint wears off, the same places followed from map to map."""
+"""Wear of a ball from a series of its texture maps: the same worn places followed from map to map."""
 
 from __future__ import annotations
 
@@ -19,76 +19,73 @@ from sphereorient.mapping.compare import (
     MapComparison,
     compare_maps,
     fit_levels,
-    paint_change,
+    texture_change,
     turned_map,
     without_changed,
 )
+from sphereorient.mapping.grid import texel_areas
 from sphereorient.synth.textures import map_directions
 
-BEYOND = 5.0  # times the scatter of paint that did not wear: noise of two maps seldom is
-LEAST_DEG = 1.5  # radius of the smallest place that is told
-HALF = 0.5  # share of a place that a map must know to say how much of it is worn
+BEYOND = 5.0  # times the scatter of the unworn texture: noise alone seldom exceeds this
+LEAST_DEG = 1.5  # radius of the smallest place that is reported
+HALF = 0.5  # share of a place that a map must know to give its worn share
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Wear:
-    """One map beside the first of its series, in that one's body frame and size; made by `wear_series`."""
+    """One map compared with the first of its series, in that one's body frame and size."""
 
-    comparison: MapComparison  # displacement included, but of patches whose paint changed
-    change: Tensor  # (H, 2 H), -1 .. 1, negative where paint became darker; NaN where either map is unknown
-    scatter: float  # standard deviation of grey between the two maps where nothing wore, black to white being 1
-    worn: Tensor  # (H, 2 H) bool: places whose change is beyond scatter
+    comparison: MapComparison  # displacements, without patches whose texture changed
+    change: Tensor  # (H, 2 H), -1 .. 1, negative where darker; NaN where either map is unknown
+    scatter: float  # standard deviation of grey between the two maps where unworn, black to white being 1
+    worn: Tensor  # (H, 2 H) bool: places whose change exceeds the scatter
 
     @property
     def known(self) -> Tensor:
-        """Where both maps know the paint, (H, 2 H) bool."""
+        """Where both maps are known, (H, 2 H) bool."""
         return torch.isfinite(self.change)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Growth:
-    """Wear of one map in figures; shares are of area, NaN where there is nothing to take a share of."""
+class WearFigures:
+    """Wear of one map in figures; shares are of area, NaN where undefined."""
 
-    known: float  # of the ball, by this map and the first
-    worn: float  # of what is known
-    grown: float  # worn now less worn in the map before, of what both know; against the first map: `worn`
-    stays: float  # of what was worn in the map before and is known now, what is worn still
+    known: float  # share of the ball that this map and the first know
+    worn: float  # of the known area
+    grown: float  # worn now less worn in the map before, of the area known in both; against the first map: `worn`
+    stays: float  # still worn, of the area worn in the map before and known now
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Place:
+class WornPlace:
     """A connected place that is worn in some map of a series."""
 
     longitude_deg: float  # of its middle, in the first map's body frame
     latitude_deg: float
-    share: tuple[float, ...]  # of the whole ball's area, worn in each map but the first; NaN where hardly seen
+    share: tuple[float, ...]  # of the ball's area, worn in each map but the first; NaN where hardly seen
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WearSeries:
-    """How the paint of one ball wore from map to map; made by `wear_series`."""
+    """How one ball wore from map to map."""
 
     wear: tuple[Wear, ...]  # of all maps but the first
-    number: Tensor  # (H, 2 H) int64, which place a texel is of, from 1 on; 0 where no map is worn
-    places: tuple[Place, ...]  # of these numbers, largest first
+    number: Tensor  # (H, 2 H) int64, place of each texel, from 1 on; 0 where no map is worn
+    places: tuple[WornPlace, ...]  # by number, largest first
 
     @property
-    def growth(self) -> tuple[Growth, ...]:
+    def growth(self) -> tuple[WearFigures, ...]:
         """The figures of all maps but the first."""
         before = (None, *self.wear[:-1])
-        return tuple(_growth(now, last) for now, last in zip(self.wear, before, strict=True))
+        return tuple(_figures(now, last) for now, last in zip(self.wear, before, strict=True))
 
 
 def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
-    """Find what wore off a ball between movies.
-
-    Each map is turned into the first one's body frame and compared with it; so a place keeps its name, and errors do
-    not add up from map to map.
+    """Find the wear of a ball between movies: compare each map (H, 2 H) with the first, in its body frame.
 
     Args:
-        maps: two or more, (H, 2 H) each, 0 black .. 1 white, NaN where unknown; in the order of the movies, the first
-            one the reference.
-        turned: whether the body frames may differ by rotations, which are found first; else they are one.
+        maps: 0 black .. 1 white, NaN where unknown; in the order of the movies.
+        turned: find the rotations between the body frames first; False: they are the same.
 
     Raises:
         PaintError: fewer than two maps, or they do not show one ball.
@@ -99,39 +96,39 @@ def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
         raise PaintError(refusal("maps", expected="two or more", got=str(len(maps)), do=do))
     wear = tuple(_wear(texture, maps[0], turned) for texture in maps[1:])
     number = _places(torch.stack([one.worn for one in wear]).any(0))
-    area = texel_areas(len(number))
-    sizes = torch.zeros(int(number.max()) + 1, dtype=torch.float64).index_add(0, number.reshape(-1), area.reshape(-1))
-    order = sizes[1:].argsort(descending=True, stable=True)
+    sizes = _sizes(number)
     rank = torch.zeros(len(sizes), dtype=torch.int64)
-    rank[order + 1] = torch.arange(1, len(sizes))
+    rank[sizes[1:].argsort(descending=True, stable=True) + 1] = torch.arange(1, len(sizes))
     number = rank[number]
-    return WearSeries(
-        wear=wear, number=number, places=tuple(_place(number == k, wear, area) for k in range(1, len(sizes)))
-    )
+    return WearSeries(wear=wear, number=number, places=tuple(_place(number == k, wear) for k in range(1, len(sizes))))
 
 
-def texel_areas(height: int) -> Tensor:
+def _shares(height: int) -> Tensor:
     """Return the texels' shares of the sphere's area, (height, 2 height) float64."""
-    edge = torch.linspace(0, math.pi, height + 1, dtype=torch.float64).cos()
-    return ((edge[:-1] - edge[1:]) / (4 * height))[:, None].repeat(1, 2 * height)
+    return texel_areas(height) / (4 * math.pi)
+
+
+def _sizes(number: Tensor) -> Tensor:
+    """Return the share of the sphere of each numbered place, 0 first."""
+    area = _shares(len(number)).reshape(-1)
+    return torch.zeros(int(number.max()) + 1, dtype=torch.float64).index_add(0, number.reshape(-1), area)
 
 
 def _wear(texture: Tensor, first: Tensor, turned: bool) -> Wear:
-    """Compare one map with the first."""
     comparison = compare_maps(texture, first, turned)
     there = turned_map(texture, comparison.R_other_reference, len(first))
-    change = paint_change(there, first)
+    change = texture_change(there, first)
     gain, offset = fit_levels(first, there)
     off = (there - (gain * first + offset)).abs()
     known = torch.isfinite(off)
-    # The median does not see what wore, nor the rims of paint that is displaced.
+    # The median ignores worn places and the rims of displaced ones.
     scatter = 1.4826 * float(off[known].median()) if known.any() else math.nan
-    worn = _large_enough(change.abs() > max(CHANGED, BEYOND * scatter))  # what is unknown is not
+    worn = _large_enough(change.abs() > max(CHANGED, BEYOND * scatter))  # an unknown texel is not
     return Wear(comparison=without_changed(comparison, change, CHANGED), change=change, scatter=scatter, worn=worn)
 
 
-def _growth(now: Wear, before: Wear | None) -> Growth:
-    area = texel_areas(len(now.change))
+def _figures(now: Wear, before: Wear | None) -> WearFigures:
+    area = _shares(len(now.change))
 
     def share(part: Tensor, whole: Tensor) -> float:
         total = float(area[whole].sum())
@@ -140,21 +137,22 @@ def _growth(now: Wear, before: Wear | None) -> Growth:
     worn = share(now.worn, now.known)
     known = float(area[now.known].sum())
     if before is None:
-        return Growth(known=known, worn=worn, grown=worn, stays=math.nan)
+        return WearFigures(known=known, worn=worn, grown=worn, stays=math.nan)
     both = now.known & before.known
     grown = share(now.worn, both) - share(before.worn, both)
-    return Growth(known=known, worn=worn, grown=grown, stays=share(now.worn, before.worn & now.known))
+    return WearFigures(known=known, worn=worn, grown=grown, stays=share(now.worn, before.worn & now.known))
 
 
-def _place(inside: Tensor, wear: Sequence[Wear], area: Tensor) -> Place:
-    """Return where a place (H, 2 H) bool is, and how much of it is worn in each map."""
+def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
+    """Return the middle of a place (H, 2 H) bool, and its worn share in each map."""
+    area = _shares(len(inside))
     direction = map_directions(len(inside))[inside].double()
     x, y, z = (direction * area[inside][:, None]).sum(0).tolist()
     shares = []
     for one in wear:
         seen = float(area[inside & one.known].sum()) >= HALF * float(area[inside].sum())
         shares.append(float(area[inside & one.worn].sum()) if seen else math.nan)
-    return Place(
+    return WornPlace(
         longitude_deg=math.degrees(math.atan2(y, x)),
         latitude_deg=math.degrees(math.atan2(z, math.hypot(x, y))),
         share=tuple(shares),
@@ -162,18 +160,16 @@ def _place(inside: Tensor, wear: Sequence[Wear], area: Tensor) -> Place:
 
 
 def _large_enough(worn: Tensor) -> Tensor:
-    """Return those connected places of a mask (H, 2 H) that are no specks."""
+    """Return a mask (H, 2 H) without its smallest connected places."""
     number = _places(worn)
-    area = texel_areas(len(worn))
-    sizes = torch.zeros(int(number.max()) + 1, dtype=torch.float64).index_add(0, number.reshape(-1), area.reshape(-1))
-    told = sizes >= 0.5 * (1 - math.cos(math.radians(LEAST_DEG)))  # area of a cap over that of the sphere
-    told[0] = False
-    kept: Tensor = told[number]
-    return kept
+    kept = _sizes(number) >= 0.5 * (1 - math.cos(math.radians(LEAST_DEG)))  # area of a cap over that of the sphere
+    kept[0] = False
+    found: Tensor = kept[number]
+    return found
 
 
 def _places(worn: Tensor) -> Tensor:
-    """Number the connected places of a mask (H, 2 H) from 1 on; across the map's edge and its poles as well."""
+    """Number the connected places of a mask (H, 2 H) from 1 on, also across the map's edge and its poles."""
     mask = worn.numpy()
     node = np.arange(mask.size).reshape(mask.shape)
     pairs = [(node, np.roll(node, -1, axis=1)), (node[:-1], node[1:])]

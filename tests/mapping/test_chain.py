@@ -11,9 +11,8 @@ from renders import disks_of_pictures, error_deg, pictures, turning
 from sphereorient import so3
 from sphereorient.errors import PaintError
 from sphereorient.mapping.chain import chained, close_loops, find_chain
-from sphereorient.mapping.graph import solve_graph
-from sphereorient.mapping.pairs import Turns, joined
-from sphereorient.mapping.settings import PaintSettings
+from sphereorient.mapping.pairs import RelativeRotations, all_rotations, solve_graph
+from sphereorient.mapping.settings import MapSettings
 
 
 def turns_of(R, first, second, bias=None):
@@ -23,7 +22,7 @@ def turns_of(R, first, second, bias=None):
     count = len(first)
     view = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
     one = torch.ones(count, dtype=torch.float64)
-    return Turns(first=first, second=second, R_ji=R_ji, information=1e4 * view, score=one, overlap=one)
+    return RelativeRotations(first=first, second=second, R_ji=R_ji, information=1e4 * view, score=one, overlap=one)
 
 
 def drifting(R, bias_deg):
@@ -44,7 +43,7 @@ def test_loops_break_a_planted_drift_and_wrong_ones_do_not():
     loops = turns_of(R, first[apart], second[apart])
     wrong = loops.where(torch.arange(0, len(loops), 4))
     wrong = turns_of(R, wrong.first, wrong.second, [0.0, 0.9, 0.4])
-    closed, left = solve_graph(drifted, joined([chain, loops, wrong]), math.radians(1))
+    closed, left = solve_graph(drifted, all_rotations([chain, loops, wrong]), math.radians(1))
     assert error_deg(closed, R).max() < 0.6
     assert torch.rad2deg(left[-len(wrong) :].norm(dim=-1)).min() > 30  # told apart from the right ones
     alone, _ = solve_graph(drifted, chain, math.radians(1))
@@ -63,7 +62,7 @@ def test_pictures_close_the_loop_that_a_planted_drift_left_open():
     chain = drifting(R, 0.5)
     drifted = chained(chain.R_ji)
     open_deg = float(error_deg(drifted, R).max())
-    closed = close_loops(disks, drifted, chain, PaintSettings(keyframe_deg=11.0))
+    closed = close_loops(disks, drifted, chain, MapSettings(keyframe_deg=11.0))
     assert open_deg > 7
     assert error_deg(closed.R_lab_body, R).max() < 0.4 * open_deg
     assert closed.closure.closed > 20
@@ -72,20 +71,20 @@ def test_pictures_close_the_loop_that_a_planted_drift_left_open():
 
 def test_a_movie_of_two_cameras_is_followed_without_a_map():
     R = turning(12, 7.0)
-    chain = find_chain(disks_of_pictures(pictures(R, 2)), PaintSettings())
+    chain = find_chain(disks_of_pictures(pictures(R, 2)), MapSettings())
     assert error_deg(chain.R_lab_body, R).max() < 0.8
     torch.testing.assert_close(chain.R_lab_body[0], torch.eye(3, dtype=torch.float64))
 
 
 def test_the_same_pictures_give_the_same_bytes():
     disks = disks_of_pictures(pictures(turning(6, 8.0)))
-    one, two = (find_chain(disks, PaintSettings()).R_lab_body for _ in range(2))
+    one, two = (find_chain(disks, MapSettings()).R_lab_body for _ in range(2))
     assert torch.equal(one, two)
 
 
 def refused(whole):
     with pytest.raises(PaintError) as told:
-        find_chain(disks_of_pictures(whole), PaintSettings())
+        find_chain(disks_of_pictures(whole), MapSettings())
     assert "\n" not in str(told.value)
     return str(told.value)
 
@@ -113,4 +112,4 @@ def test_paint_that_is_never_seen_twice_is_refused():
     whole = torch.cat([pictures(R[k : k + 1], seed=20 + k) for k in range(8)])  # other paint in every frame
     keys = turns_of(R, torch.arange(7), torch.arange(1, 8))
     with pytest.raises(PaintError, match="seen twice"):
-        close_loops(disks_of_pictures(whole), R, keys, PaintSettings(keyframe_deg=11.0, score_min=0.8))
+        close_loops(disks_of_pictures(whole), R, keys, MapSettings(keyframe_deg=11.0, score_min=0.8))

@@ -10,7 +10,7 @@ from renders import disks_of_pictures, pictures, turning
 
 from sphereorient import so3
 from sphereorient.mapping.disks import reduced
-from sphereorient.mapping.pairs import climb_pairs, search_pairs
+from sphereorient.mapping.pairs import refine_pairs, search_pairs
 
 GRID = so3.local_grid(math.radians(8), math.radians(30))
 
@@ -18,7 +18,7 @@ GRID = so3.local_grid(math.radians(8), math.radians(30))
 def found(disks, first, second):
     still = torch.eye(3, dtype=torch.float64).expand(len(first), 3, 3)
     start = search_pairs(reduced(disks, 2), first, second, still, GRID, 2)
-    return climb_pairs(disks, first, second, start, 6)
+    return refine_pairs(disks, first, second, start, 6)
 
 
 @pytest.mark.parametrize(("cameras", "within_deg"), [(1, 0.6), (2, 0.6)])
@@ -40,7 +40,7 @@ def test_what_one_camera_shows_is_found_again_by_the_other():
     R = torch.stack([start, quarter @ start])
     disks = disks_of_pictures(pictures(R, 2))
     near = so3.exp(torch.tensor([0.05, -0.04, 0.05], dtype=torch.float64)) @ quarter
-    turns = climb_pairs(disks, torch.tensor([0]), torch.tensor([1]), near[None], 8)
+    turns = refine_pairs(disks, torch.tensor([0]), torch.tensor([1]), near[None], 8)
     assert math.degrees(float(so3.geodesic_distance(turns.R_ji[0], quarter))) < 0.5
     assert float(turns.score) > 0.9
 
@@ -65,7 +65,7 @@ def test_a_batch_of_pairs_is_the_stack_of_its_singles():
     disks = disks_of_pictures(pictures(turning(3, 9.0), 2))
     first, second = torch.tensor([0, 1]), torch.tensor([1, 2])
     start = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
-    whole = climb_pairs(disks, first, second, start, 4)
+    whole = refine_pairs(disks, first, second, start, 4)
     for k in range(2):
-        one = climb_pairs(disks, first[k : k + 1], second[k : k + 1], start[:1], 4)
+        one = refine_pairs(disks, first[k : k + 1], second[k : k + 1], start[:1], 4)
         assert so3.geodesic_distance(one.R_ji[0], whole.R_ji[k]) < 1e-4

@@ -11,14 +11,14 @@ from spin_examples import dot_directions, photograph
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, ShapeError
-from sphereorient.tools.spin.disks import cut_disks, find_ball
-from sphereorient.tools.spin.dots import DotTable, dots_texture, measured_dot_radius_deg
+from sphereorient.tools.spin.disks import BallOutline, Photographs, find_disk
+from sphereorient.tools.spin.dots import DotTable
 
 
 def test_a_dot_lies_where_the_maps_of_the_world_have_it():  # convention
     # +y is 90 degrees east: three quarters of the width; 30 degrees north: a third of the way from pole to pole.
     north_east = torch.tensor([[0.0, math.cos(math.pi / 6), math.sin(math.pi / 6)]])
-    texture = dots_texture(north_east, 5.0, 60)
+    texture = DotTable(direction_body=north_east, radius_deg=5.0).texture(60)
     row, column = np.unravel_index(int(texture.argmin()), texture.shape)
     assert (int(row), int(column)) in {(r, c) for r in (19, 20) for c in (89, 90)}
     assert texture[-20 - 1, 89] == 1  # not in the south
@@ -27,12 +27,11 @@ def test_a_dot_lies_where_the_maps_of_the_world_have_it():  # convention
 
 def test_dots_cover_the_share_of_the_sphere_that_caps_have():  # oracle
     directions = dot_directions(6)
-    radius = torch.tensor([4.0, 6.0, 8.0, 10.0, 5.0, 7.0])
-    texture = dots_texture(directions, radius, 400)
+    texture = DotTable(direction_body=directions, radius_deg=7.0).texture(400)
     latitude = (0.5 - (torch.arange(400) + 0.5) / 400) * math.pi
     area = torch.cos(latitude)[:, None].expand(-1, 800)
     dark = float(((1 - texture) * area).sum() / area.sum())
-    assert dark == pytest.approx(float(((1 - torch.cos(torch.deg2rad(radius))) / 2).sum()), rel=0.01)
+    assert dark == pytest.approx(6 * (1 - math.cos(math.radians(7.0))) / 2, rel=0.01)
 
 
 def test_the_mirrored_table_is_the_mirrored_map():
@@ -45,18 +44,18 @@ def test_the_size_of_dots_is_read_off_photographs(radius_deg):
     directions = dot_directions()
     R = so3.random_rotations(8, generator=torch.Generator().manual_seed(1))
     pictures = [photograph(one, directions, radius_deg, seed=k) for k, one in enumerate(R)]
-    disks, _ = cut_disks(pictures, 48)
-    found = [measured_dot_radius_deg(disks, R, directions, guess) for guess in (0.8 * radius_deg, 1.4 * radius_deg)]
+    disks, _ = Photographs(pictures=pictures, time_s=torch.arange(8)).disks(48)
+    tables = [DotTable(direction_body=directions, radius_deg=factor * radius_deg) for factor in (0.8, 1.4)]
+    found = [table.measured(disks, R).radius_deg for table in tables]
     assert found == pytest.approx([radius_deg] * 2, abs=0.7)
 
 
 def test_dots_that_are_not_there_are_refused():
     directions = dot_directions()
     R = so3.random_rotations(4, generator=torch.Generator().manual_seed(1))
-    disks, _ = cut_disks([photograph(one, directions[:0].new_zeros(1, 3)) for one in R], 40)
-    white = torch.full_like(disks, 100.0)
+    white = torch.full((4, 40, 40), 100.0)
     with pytest.raises(PaintError, match="dark dots where the table has them"):
-        measured_dot_radius_deg(white, R, directions)
+        DotTable(direction_body=directions).measured(white, R)
 
 
 @pytest.mark.parametrize(
@@ -77,21 +76,21 @@ def test_what_is_no_table_of_dots_is_refused_in_one_line(table, radius, got):
 
 def test_directions_of_another_shape_are_refused():
     with pytest.raises(ShapeError):
-        dots_texture(torch.eye(4), 6.0)
+        DotTable(direction_body=torch.eye(4))
 
 
 @pytest.mark.parametrize("ball", [(33.0, 32.0, 29.0), (30.3, 35.6, 21.4), (24.0, 30.0, 29.0)])  # the last one is cut
 def test_a_ball_is_found_to_a_fraction_of_a_pixel(ball):
     R = so3.random_rotations(3, generator=torch.Generator().manual_seed(2))
     for k, one in enumerate(R):
-        found = find_ball(photograph(one, dot_directions(), ball=ball, seed=k))
+        found = find_disk(photograph(one, dot_directions(), ball=ball, seed=k))
         assert (found.u_px, found.v_px) == pytest.approx(ball[:2], abs=0.4)
         assert found.radius_px == pytest.approx(ball[2], abs=0.5)
 
 
 def test_a_dark_ball_on_a_bright_scene_is_found_too():
     picture = 255 - photograph(torch.eye(3), dot_directions())[..., 0]
-    found = find_ball(picture)
+    found = find_disk(picture)
     assert (found.u_px, found.v_px, found.radius_px) == pytest.approx((33.0, 32.0, 29.0), abs=0.6)
 
 
@@ -108,5 +107,13 @@ def test_a_photograph_without_a_ball_is_refused_in_one_line(what):
         "shape": noise[..., :2],
     }[what]
     with pytest.raises(PaintError, match="photograph") as caught:
-        find_ball(picture)
+        find_disk(picture)
     assert "\n" not in str(caught.value)
+
+
+def test_outlines_that_are_given_are_not_searched():
+    pictures = [photograph(torch.eye(3), dot_directions())] * 3
+    balls = [BallOutline(u_px=30.0, v_px=31.0, radius_px=20.0)] * 3
+    disks, found = Photographs(pictures=pictures, time_s=torch.arange(3), balls=balls).disks(32)
+    assert disks.shape == (3, 32, 32)
+    assert found == tuple(balls)

@@ -12,22 +12,21 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from map_examples import SMALL, rewrite, unpainted
+from map_examples import SMALL, mapped, rewrite, unpainted
 
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.locate import LocateSettings
-from sphereorient.mapping import PaintSettings, learn_map, take_footage
-from sphereorient.mapping.first import first_stage
-from sphereorient.mapping.learn import followed, recovered
-from sphereorient.mapping.rounds import next_round
+from sphereorient.mapping import MapSettings, take_crops
+from sphereorient.mapping.iterations import first_state, iterate
+from sphereorient.mapping.learn import interpolated, recovered
 from sphereorient.movies import open_movie
 from sphereorient.sphere import load_texture, reduced_texture
 
 # Two turns and a half: over half a turn without a loop nothing tells a ball that is 1 % too large from a shorter turn.
 FRAMES = 120
-QUICK = PaintSettings(rounds=6, pixels=600, height=64)
+QUICK = MapSettings(rounds=6, pixels=600, height=64)
 
 
 def truth_of(path: Path) -> tuple[torch.Tensor, torch.Tensor]:
@@ -42,9 +41,9 @@ def test_instants_between_are_turned_as_their_neighbours_were():
     true = so3.exp(torch.arange(5, dtype=torch.float64)[:, None] * torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64))
     chain = so3.exp(-0.02 * torch.arange(5, dtype=torch.float64)[:, None] * axis) @ true
     rows = torch.tensor([0, 4])
-    found = followed(chain, rows, true[rows])
+    found = interpolated(chain, rows, true[rows])
     assert float(so3.geodesic_distance(found, true).max()) < 1e-9
-    ends = followed(chain, torch.tensor([1, 3]), true[[1, 3]])
+    ends = interpolated(chain, torch.tensor([1, 3]), true[[1, 3]])
     off = so3.geodesic_distance(ends, true)
     assert off[[0, 4]].tolist() == pytest.approx([0.02, 0.02], abs=1e-9), "beyond the known ones as the nearest was"
 
@@ -55,23 +54,23 @@ def test_instants_that_do_not_fit_are_found_again_and_the_others_stay(tmp_path):
     R, _ = truth_of(path)
     texture = reduced_texture(load_texture(path.parent / "texture.png"), 64.0)
     with open_recording(path, textured=False) as recording:
-        footage = take_footage(recording, QUICK, LocateSettings(), silent)
-    stage = first_stage(footage, torch.arange(len(R)), R, texture, QUICK)
+        crops = take_crops(recording, QUICK, LocateSettings(), silent)
+    state = first_state(crops, torch.arange(len(R)), R, texture, QUICK)
     for k in range(2):
-        stage, _ = next_round(stage, QUICK, k)
+        state, _ = iterate(state, QUICK, k)
     lost = torch.tensor([0, 1, 9, 23])
     turn = torch.tensor([[0.5, 0.3, -0.2], [-0.4, 0.3, 0.5], [0.1, -0.7, 0.2], [0.6, 0.0, 0.4]], dtype=torch.float64)
-    spoilt = stage.R_lab_body.clone()
+    spoilt = state.R_lab_body.clone()
     spoilt[lost] = so3.exp(turn) @ spoilt[lost]
     # A chain that leans by 3 degrees at the end, in a body frame of its own.
     lean = torch.linspace(0, math.radians(3), len(R), dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0]).double()
     chain = so3.exp(lean) @ R @ so3.exp(torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64))
-    found = recovered(footage, replace(stage, R_lab_body=spoilt), chain)
+    found = recovered(crops, replace(state, R_lab_body=spoilt), chain)
     assert float(torch.rad2deg(so3.geodesic_distance(found.R_lab_body[lost], R[lost])).max()) < 0.7
     others = torch.ones(len(R), dtype=torch.bool)
     others[lost] = False
     assert torch.equal(found.R_lab_body[others], spoilt[others])
-    assert recovered(footage, stage, chain) is stage, "nothing is lost: nothing changes"
+    assert recovered(crops, state, chain) is state, "nothing is lost: nothing changes"
 
 
 def in_one_place(folder: Path) -> tuple[Path, float]:
@@ -104,7 +103,7 @@ def in_one_place(folder: Path) -> tuple[Path, float]:
 def test_a_half_hidden_ball_of_unknown_size_is_measured_with_its_map(tmp_path):
     path, far = in_one_place(tmp_path / "scene")
     with open_recording(path, textured=False) as recording:
-        learnt = learn_map(recording, QUICK, LocateSettings(), silent)
+        learnt = mapped(recording, QUICK)
     assert learnt.valid.all()
     place = learnt.position_lab_mm
     assert float((place - place[0]).norm(dim=1).max()) == 0.0, "one place"

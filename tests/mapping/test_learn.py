@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import REPO, SHARED
+from map_examples import mapped
 from renders import error_deg
 
 from sphereorient.errors import PaintError
@@ -20,13 +21,13 @@ from sphereorient.experiment.recording import Recording, silent
 from sphereorient.experiment.stream import CameraStream
 from sphereorient.experiment.timeline import timeline
 from sphereorient.locate import LocateSettings
-from sphereorient.mapping import PaintSettings, learn_map, take_footage
-from sphereorient.mapping.compare import fibonacci
-from sphereorient.mapping.learn import SHOWN_MIN, _counts, followed
+from sphereorient.mapping import MapSettings, take_crops
+from sphereorient.mapping.compare import fibonacci_directions
+from sphereorient.mapping.learn import SHOWN_MIN, _counts, interpolated
 from sphereorient.so3 import exp
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
-QUICK = PaintSettings(pixels=700, rounds=6)
+QUICK = MapSettings(pixels=700, rounds=6)
 
 
 @contextmanager
@@ -53,7 +54,7 @@ def truth(path):
 @pytest.mark.slow
 def test_one_camera_of_the_excerpt_teaches_attitudes_and_leaves_the_unseen_empty():
     with opened(EXCERPT, ["cam1"]) as recording:
-        learnt = learn_map(recording, QUICK, LocateSettings(), silent)
+        learnt = mapped(recording, QUICK)
     assert bool(learnt.valid.all())
     error = error_deg(learnt.R_lab_body, truth(EXCERPT.parent / "truth.h5")[: len(learnt.valid)])
     assert error.median() < 0.5
@@ -70,18 +71,18 @@ def test_one_camera_of_the_excerpt_teaches_attitudes_and_leaves_the_unseen_empty
 
 def test_one_frame_is_refused():
     with opened(EXCERPT, frames=(3, 4)) as recording, pytest.raises(PaintError, match="2 frames"):
-        learn_map(recording, QUICK, LocateSettings(), silent)
+        mapped(recording, QUICK)
 
 
 def test_footage_holds_the_ball_of_every_frame():
     with opened(EXCERPT, ["cam2"], (0, 3)) as recording:
-        footage = take_footage(recording, QUICK, LocateSettings(), silent)
+        crops = take_crops(recording, QUICK, LocateSettings(), silent)
         whole = next(iter(recording.streams[0].pictures()))[0]
-    assert bool(footage.seen.all())
-    window = footage.windows[0][0]
+    assert bool(crops.seen.all())
+    window = crops.crops[0][0]
     rows, columns = window.grey.shape
     inside = np.s_[window.top : window.top + rows, window.left : window.left + columns]
-    np.testing.assert_array_equal(footage.picture(0, 0)[inside], whole[inside])
+    np.testing.assert_array_equal(crops.picture(0, 0)[inside], whole[inside])
 
 
 def test_frames_between_the_fitted_ones_turn_as_they_do():
@@ -89,7 +90,7 @@ def test_frames_between_the_fitted_ones_turn_as_they_do():
     chain = exp(torch.arange(9, dtype=torch.float64)[:, None] * torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64))
     rows = torch.tensor([0, 4, 8])
     told = torch.stack([chain[0], exp(off) @ chain[4], exp(2 * off) @ chain[8]])
-    R = followed(chain, rows, told)
+    R = interpolated(chain, rows, told)
     torch.testing.assert_close(R[rows], told)
     torch.testing.assert_close(R[2], exp(0.5 * off) @ chain[2])
     torch.testing.assert_close(R[6], exp(1.5 * off) @ chain[6])
@@ -102,7 +103,7 @@ def test_a_place_counts_in_the_pictures_that_do_not_show_it_too_slanted():
     middles = torch.tensor([[0.0, 0.0, 5.0], [4.0, 1.0, 0.0]], dtype=torch.float64)
     turns = exp(torch.tensor([[0.1, 0.2, 0.3], [1.0, -2.0, 0.4]], dtype=torch.float64))
     cameras = [SimpleNamespace(R_cam_lab=C, T_cam_lab_mm=-C @ m) for C, m in zip(turns, middles, strict=True)]
-    stage = SimpleNamespace(
+    state = SimpleNamespace(
         R_lab_body=R,
         position_lab_mm=X,
         use=torch.tensor([[True, True], [False, True]]),
@@ -111,14 +112,14 @@ def test_a_place_counts_in_the_pictures_that_do_not_show_it_too_slanted():
             views=[SimpleNamespace(camera=camera, background=SimpleNamespace(shown=None)) for camera in cameras],
         ),
     )
-    direction = fibonacci(300)
+    direction = fibonacci_directions(300)
     expected = torch.zeros(300, dtype=torch.int64)
     for k, c in ((0, 0), (0, 1), (1, 1)):
         normal = direction @ R[k].mT
         towards = middles[c] - (X[k] + 1.5 * normal)
         expected += (normal * towards).sum(-1) / towards.norm(dim=-1) > SHOWN_MIN
     assert len(expected.unique()) > 2
-    torch.testing.assert_close(_counts(stage, direction), expected)
+    torch.testing.assert_close(_counts(state, direction), expected)
 
 
 @pytest.mark.slow
@@ -126,7 +127,7 @@ def test_a_place_counts_in_the_pictures_that_do_not_show_it_too_slanted():
 def test_a_ball_fixed_in_its_place_is_learnt_from_one_camera():
     path = SHARED / "fixed_ball" / "experiment.yaml"
     with opened(path) as recording:
-        learnt = learn_map(recording, PaintSettings(), LocateSettings(), silent)
+        learnt = mapped(recording, MapSettings())
     true = truth(path.parent / "truth.h5")
     R, P = learnt.R_lab_body, torch.eye(3, dtype=torch.float64)
     for _ in range(100):  # the best constant turns on both sides
@@ -144,7 +145,7 @@ def test_a_ball_fixed_in_its_place_is_learnt_from_one_camera():
 def test_the_shared_experiment_is_learnt_without_its_texture(tmp_path):
     path = SHARED / "experiment" / "experiment.yaml"
     with opened(path) as recording:
-        learnt = learn_map(recording, PaintSettings(), LocateSettings(), silent)
+        learnt = mapped(recording, MapSettings())
     error = error_deg(learnt.R_lab_body, truth(path.parent / "truth.h5"))
     assert error.median() < 0.13
     assert error.quantile(0.95) < 0.25

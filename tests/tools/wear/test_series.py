@@ -18,9 +18,10 @@ from sphereorient import so3
 from sphereorient.cli import main
 from sphereorient.errors import PaintError
 from sphereorient.mapping.compare import turned_map
+from sphereorient.mapping.grid import texel_areas
 from sphereorient.report.map_files import write_seen
 from sphereorient.synth.textures import map_directions, random_texture
-from sphereorient.tools.wear.series import WearSeries, _places, texel_areas, wear_series
+from sphereorient.tools.wear.series import WearSeries, _places, wear_series
 
 HEIGHT = 128
 NOISE = 0.02
@@ -83,7 +84,7 @@ def test_worn_places_are_found_where_they_were_planted_in_the_first_maps_frame()
 
 
 def test_the_worn_share_grows_as_it_was_planted():
-    area = texel_areas(HEIGHT)
+    area = texel_areas(HEIGHT) / (4 * math.pi)
     true = [float(area[planted(k)].sum()) for k in range(4)]
     growth = found().growth
     for k, one in enumerate(growth, start=1):
@@ -147,7 +148,7 @@ def test_places_are_one_across_the_maps_edge_and_over_its_poles():
 
 
 def test_texel_areas_are_those_of_their_zones():
-    area = texel_areas(3)  # 60 degrees a row
+    area = texel_areas(3) / (4 * math.pi)  # 60 degrees a row
     assert float(area.sum()) == pytest.approx(1.0)
     assert_close(area[:, 0] * 6, torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64))
 

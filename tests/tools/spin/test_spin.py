@@ -16,8 +16,9 @@ from spin_examples import dot_directions, photograph, spinning
 from sphereorient import so3
 from sphereorient.errors import PaintError
 from sphereorient.search import GreySearchSettings
+from sphereorient.tools.spin.disks import Photographs
 from sphereorient.tools.spin.dots import DotTable
-from sphereorient.tools.spin.fit import Spins, fit_spins, sighted
+from sphereorient.tools.spin.fit import Spins, fit_spins, picture_candidates
 from sphereorient.tools.spin.spin import SpinSettings, spin_of
 
 STEP = 0.004
@@ -35,7 +36,7 @@ def candidates(omega, time_s, *, wrong=2, scatter_deg=3.0, missing=(), seed=3):
     right = [k for k in range(count) if k not in missing]
     R[right, torch.arange(count)[right] % (wrong + 1)] = (so3.exp(noise) @ true)[right]
     offset = torch.arange(count + 1) * (wrong + 1)
-    return sighted(time_s, offset, R.flatten(0, 1), torch.ones(count * (wrong + 1))), true
+    return picture_candidates(time_s, offset, R.flatten(0, 1), torch.ones(count * (wrong + 1))), true
 
 
 def turned(spins: Spins, true, time_s):
@@ -87,8 +88,8 @@ def test_the_order_of_the_pictures_and_the_origin_of_time_do_not_matter():
     true = spinning(omega, so3.random_rotations((), generator=rng), time_s)
     order = torch.randperm(10, generator=rng)
     ones = torch.ones(10)
-    a = fit_spins(sighted(time_s, torch.arange(11), true, ones), 0.5 * TURN)
-    b = fit_spins(sighted(time_s[order] + 7.0, torch.arange(11), true[order], ones), 0.5 * TURN)
+    a = fit_spins(picture_candidates(time_s, torch.arange(11), true, ones), 0.5 * TURN)
+    b = fit_spins(picture_candidates(time_s[order] + 7.0, torch.arange(11), true[order], ones), 0.5 * TURN)
     torch.testing.assert_close(a.omega_view_rad_s, b.omega_view_rad_s, rtol=1e-6, atol=1e-3)
 
 
@@ -110,15 +111,15 @@ def filmed(omega, time_s, *, strays=(), mirror=False):
     shown[list(strays)] = so3.random_rotations(len(strays), generator=torch.Generator().manual_seed(5))
     table = DotTable(direction_body=directions, radius_deg=7.0)
     pictures = [photograph(one, directions, seed=k) for k, one in enumerate(shown)]
-    return pictures, R, table.mirrored() if mirror else table
+    return Photographs(pictures=pictures, time_s=time_s), R, table.mirrored() if mirror else table
 
 
 @pytest.mark.slow  # two searches of 12 pictures, 10 s
 def test_photographs_give_back_spin_attitudes_and_aliases_with_strays_between():
     axis = torch.nn.functional.normalize(torch.tensor([0.1, 0.9, -0.3], dtype=torch.float64), dim=0)
     omega, time_s = 0.65 * TURN * axis, STEP * torch.arange(12, dtype=torch.float64)
-    pictures, R, table = filmed(omega, time_s, strays=(3, 8))
-    found = spin_of(pictures, time_s, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
+    photographs, R, table = filmed(omega, time_s, strays=(3, 8))
+    found = spin_of(photographs, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
     rates = [float(one @ axis) / TURN for one in found.spins.omega_view_rad_s]
     assert rates == pytest.approx([-0.35, 0.65], abs=0.005)  # the slower one leads, the other is told
     assert found.ambiguous == 2
@@ -134,17 +135,17 @@ def test_photographs_give_back_spin_attitudes_and_aliases_with_strays_between():
 def test_a_mirrored_table_is_refused():
     omega = 0.3 * TURN * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     time_s = STEP * torch.arange(12, dtype=torch.float64)
-    pictures, _, table = filmed(omega, time_s, mirror=True)
+    photographs, _, table = filmed(omega, time_s, mirror=True)
     with pytest.raises(PaintError, match="not of its mirror image"):
-        spin_of(pictures, time_s, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
+        spin_of(photographs, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
 
 
 @pytest.mark.slow
 def test_pictures_that_show_no_spin_are_refused():
     omega, time_s = torch.zeros(3, dtype=torch.float64), STEP * torch.arange(8, dtype=torch.float64)
-    pictures, _, table = filmed(omega, time_s, strays=tuple(range(8)))
+    photographs, _, table = filmed(omega, time_s, strays=tuple(range(8)))
     with pytest.raises(PaintError, match="more than chance") as caught:
-        spin_of(pictures, time_s, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
+        spin_of(photographs, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
     assert "\n" not in str(caught.value)
 
 
@@ -160,7 +161,7 @@ def test_pictures_that_show_no_spin_are_refused():
 def test_times_that_do_not_fit_the_pictures_are_refused(count, times, got):
     pictures = [np.zeros((60, 60, 3), np.uint8)] * count
     with pytest.raises(PaintError, match=got):
-        spin_of(pictures, times, DotTable(direction_body=torch.eye(3)))
+        Photographs(pictures=pictures, time_s=torch.tensor(times))
 
 
 @pytest.mark.slow
@@ -169,9 +170,9 @@ def test_the_spin_of_a_real_ball_in_22_photographs():
     folder = SHARED / "real" / "spindoe"
     rows = list(csv.DictReader((folder / "reference_orientations.csv").open()))
     pictures = [cv2.imread(str(folder / "test" / row["file"]))[..., ::-1] for row in rows]
-    time_s = [float(row["t_s"]) for row in rows]
+    time_s = torch.tensor([float(row["t_s"]) for row in rows], dtype=torch.float64)
     table = DotTable(direction_body=torch.from_numpy(np.loadtxt(folder / "ref_pattern.csv", delimiter=",")))
-    found = spin_of(pictures, time_s, table)
+    found = spin_of(Photographs(pictures=pictures, time_s=time_s), table)
     reference = torch.tensor([102.2, 819.5, -116.6], dtype=torch.float64)
     rates = found.spins.omega_view_rad_s.norm(dim=-1)
     assert float(rates[0]) == pytest.approx(float(reference.norm()), rel=0.005)
@@ -185,7 +186,7 @@ def test_the_spin_of_a_real_ball_in_22_photographs():
     alone = torch.rad2deg(so3.geodesic_distance(found.alone.R_view_body[found.alone.offset[:-1]], R))
     assert int((alone < 10).sum()) >= 20
     assert float(torch.rad2deg(so3.geodesic_distance(found.R_view_body, R)).max()) < 10
-    assert all(b > a for a, b in pairwise(time_s))
+    assert all(b > a for a, b in pairwise(time_s.tolist()))
 
 
 def from_quaternion(xyzw):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import REPO, SHARED
-from map_examples import rewrite
+from map_examples import mapped, rewrite
 from renders import disks_of_pictures, error_deg, pictures, turning
 
 sys.path.append(str(REPO / "scripts"))
@@ -22,16 +22,15 @@ from sphereorient import so3
 from sphereorient.cli import main
 from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.locate import LocateSettings
-from sphereorient.mapping import PaintSettings, learn_map
+from sphereorient.experiment.recording import open_recording
+from sphereorient.mapping import MapSettings
 from sphereorient.mapping.compare import compare_maps
 from sphereorient.mapping.pairs import search_pairs, search_views
 from sphereorient.mapping.photographs import all_pairs, find_photographs, joined_sets, measured_evidence
 from sphereorient.movies import open_movie
 from sphereorient.sphere import load_texture
 
-SETTINGS = PaintSettings(disk_px=48)
+SETTINGS = MapSettings(disk_px=48)
 
 
 def random_attitudes(count, seed):
@@ -55,10 +54,8 @@ def test_photographs_in_any_order_get_their_attitudes():
     assert chain.rows.tolist() == list(range(12))
     assert error_deg(chain.R_lab_body, R).max() < 5
     torch.testing.assert_close(chain.R_lab_body[0], torch.eye(3, dtype=torch.float64))
-    # Every turn that is kept is right: none is merely the best of a pair that shares no paint.
-    turns = chain.turns
-    off = so3.geodesic_distance(turns.R_ji, R[turns.second] @ R[turns.first].mT)
-    assert torch.rad2deg(off).max() < 10
+    # Every pair that is kept is right: none is merely the best of a pair without a common patch.
+    assert math.degrees(chain.closure.drift_after_rad) < 5
 
 
 @pytest.mark.slow
@@ -120,7 +117,7 @@ def test_other_paint_is_no_evidence_and_the_same_paint_is():
     whole = torch.cat([pictures(R[:3]), pictures(R[3:], seed=21)])
     evidence = measured_evidence(disks_of_pictures(whole), SETTINGS)
     found = all_pairs(evidence.disks)
-    odds = evidence.of(found)
+    odds = evidence.log_odds(found)
     same = (found.first < 3) == (found.second < 3)
     assert odds[same].max() > 50
     assert odds[~same].max() < 25
@@ -151,7 +148,7 @@ def test_too_few_photographs_are_refused():
 
 def test_photographs_that_share_no_paint_are_refused():
     whole = torch.cat([pictures(random_attitudes(1, k), seed=30 + k) for k in range(5)])
-    assert "3 that share paint, got none among 5" in refused(whole)
+    assert "3 that share a patch, got none among 5" in refused(whole)
 
 
 def test_photographs_of_two_balls_are_refused():
@@ -174,7 +171,7 @@ def true_attitudes(path):
 def test_a_map_is_learnt_from_photographs_at_random_attitudes(tmp_path, moves):
     path = write_stills(tmp_path, Stills(count=14, seed=2, paint="dots", moves=moves, diameter_px=90.0))
     with open_recording(path, textured=False) as recording:
-        learnt = learn_map(recording, PaintSettings(unordered=True), LocateSettings(), silent)
+        learnt = mapped(recording, MapSettings(unordered=True))
     assert learnt.valid.all()
     assert error_deg(learnt.R_lab_body, true_attitudes(path)).median() < 0.2
     comparison = compare_maps(learnt.texture, load_texture(path.parent / "texture.png"))
@@ -187,7 +184,7 @@ def test_a_photograph_of_another_ball_keeps_its_place_and_gets_no_attitude(tmp_p
     other = write_stills(tmp_path / "other", Stills(count=6, seed=3, paint="blobs", moves=True, diameter_px=60.0))
     shutil.copy(other.parent / "photographs" / "005.png", path.parent / "photographs" / "005.png")
     with open_recording(path, textured=False) as recording:
-        learnt = learn_map(recording, PaintSettings(unordered=True), LocateSettings(), silent)
+        learnt = mapped(recording, MapSettings(unordered=True))
     assert learnt.valid.tolist() == [k != 5 for k in range(14)]
     assert learnt.R_lab_body[5].isnan().all()
     assert learnt.position_lab_mm[5].isfinite().all()
@@ -206,7 +203,7 @@ def test_frames_of_the_shared_experiment_shuffled_and_thinned_are_photographs(tm
         load_experiment(source), texture_path=None, movie_paths={"cam1": tmp_path / "stills.npy"}, start={}
     )
     with open_recording(experiment, ["cam1"], textured=False) as recording:
-        learnt = learn_map(recording, PaintSettings(unordered=True), LocateSettings(), silent)
+        learnt = mapped(recording, MapSettings(unordered=True))
     assert learnt.valid.all()
     error = error_deg(learnt.R_lab_body, true_attitudes(source)[rows])
     assert error.median() < 0.2

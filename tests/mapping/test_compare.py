@@ -11,8 +11,15 @@ from map_examples import shift_field, warped
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, ShapeError
-from sphereorient.mapping.compare import compare_maps, fibonacci, fit_levels, paint_change, turned_map, without_changed
-from sphereorient.mapping.correct import nearest
+from sphereorient.mapping.compare import (
+    compare_maps,
+    fibonacci_directions,
+    fit_levels,
+    nearest_texels,
+    texture_change,
+    turned_map,
+    without_changed,
+)
 from sphereorient.mapping.patches import compass
 from sphereorient.synth.textures import map_directions, random_texture
 
@@ -116,14 +123,14 @@ def test_levels_are_fitted_past_a_new_spot(paint):
 
 
 def test_worn_paint_is_shown_and_moved_paint_is_not(paint):
-    assert float(paint_change(paint, paint).abs().max()) < 1e-6
+    assert float(texture_change(paint, paint).abs().max()) < 1e-6
     moved = warped(paint, 0.4)
-    assert float(paint_change(moved, paint).abs().mean()) < 0.005
+    assert float(texture_change(moved, paint).abs().mean()) < 0.005
     direction = map_directions(HEIGHT)
     dot = direction[(paint < 0.05) & (direction[..., 2].abs() < 0.5)][0]
     spot = direction @ dot > math.cos(math.radians(12))
     worn = torch.where(spot, 1.0, moved)  # black dots rubbed off, in white paint
-    change = paint_change(worn, paint)
+    change = texture_change(worn, paint)
     lost = spot & (paint < 0.1)
     assert lost.sum() > 10
     assert float(change[lost].median()) > 0.5, "brighter than before: positive"
@@ -135,13 +142,13 @@ def test_worn_paint_is_shown_and_moved_paint_is_not(paint):
     assert not (gone & ~near).any(), "patches away from the worn place keep their shifts"
     assert torch.isnan(kept.moved_rad[found.direction_body @ dot > math.cos(math.radians(5))]).all()
     unknown = torch.where(spot, torch.nan, paint)
-    assert torch.isnan(paint_change(unknown, paint)[spot]).all()
-    assert torch.isnan(paint_change(paint, unknown)[spot]).all()
+    assert torch.isnan(texture_change(unknown, paint)[spot]).all()
+    assert torch.isnan(texture_change(paint, unknown)[spot]).all()
 
 
 def test_counts_follow_the_frame_as_the_paint_does(paint):
     counts = (paint > 0.5).long() * 7
-    turned = nearest(counts, TURN, HEIGHT)
+    turned = nearest_texels(counts, TURN, HEIGHT)
     there = turned_map(paint, TURN)
     clear = (there - 0.5).abs() > 0.45
     assert_close(turned[clear], (there[clear] > 0.5).long() * 7)
@@ -152,6 +159,6 @@ def test_compass_axes_point_east_and_north():
     east, north = compass(torch.tensor([1.0, 0.0, 0.0]))
     assert_close(east, torch.tensor([0.0, 1.0, 0.0]))
     assert_close(north, torch.tensor([0.0, 0.0, 1.0]))
-    d = fibonacci(100)
+    d = fibonacci_directions(100)
     for axis in compass(d):
         assert_close((axis * d).sum(-1), torch.zeros(100, dtype=torch.float64))

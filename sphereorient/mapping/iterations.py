@@ -1,0 +1,284 @@
+"""Attitudes, light and texture map in turns, and then together: what the iterations start with and do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix, vstack
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.mapping.crops import Crops, pixels_of
+from sphereorient.mapping.disks import Disks
+from sphereorient.mapping.grid import (
+    NormalMatrix,
+    map_sums,
+    map_table,
+    solve_map,
+    stiffness,
+    texel_areas,
+    texel_sums,
+)
+from sphereorient.mapping.joint import Linearisation, joint_step, linear_system, linearise
+from sphereorient.mapping.record import Iteration, attitude_change_rad, evenly_spread
+from sphereorient.mapping.settings import MapSettings
+from sphereorient.pose.defocus import FIRST_BLUR_PX
+from sphereorient.pose.fit import POSE_PARTS, FittedPoses
+from sphereorient.pose.fitter import CameraView, Fitter, Optics, unknown_light, widest_px
+from sphereorient.pose.learn_light import light_maps, light_sums, noise_curve
+from sphereorient.pose.light import Light
+from sphereorient.pose.pixels import Pixels
+
+FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
+CONTRAST = 0.3  # deviation of the first map about mid-grey
+TEXEL_PX = 0.75  # of the widest disk's middle
+ROW, FINEST_ROWS = 32, 512  # the fitted map has a multiple of the one as rows, and at most the other
+SEPARATE_ITERATIONS = 2  # each instant by itself: a joint step would trust the map, which is still blurred
+LIGHT_ITERATIONS = 8  # in which light, noise and blur are estimated anew
+SMOOTHEST = 0.2  # as the setting `smooth`, of the first iteration: attitudes must not follow the map's noise
+BLUR_FRAMES = 32
+BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
+BLUR_PX = (0.25, 3.0)  # narrowest and widest
+BATCH = 24  # instants at once
+LONGEST_RAD = 0.05  # joint step
+BLACK, WHITE = 0.03, 0.97  # shares of the sphere that count as black and white
+BEYOND = 0.2  # by how much the map may leave 0 .. 1 on the way
+NOISE_EVERY = 4  # pixels from which the noise is estimated
+HELD = 1e12  # 1/mm^2, precision of a position that must not move
+OUTLIER2 = 25.0  # squared residuals over the noise expected are cut off here
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class State:
+    """What an iteration improves: n instants of C cameras that the map is fitted to."""
+
+    frames: Tensor  # (n,) int64
+    pixels: Pixels  # of n * C disks
+    use: Tensor  # (n, C) bool
+    position_lab_mm: Tensor  # (n, 3)
+    R_lab_body: Tensor  # (n, 3, 3)
+    texture: Tensor  # (H, 2 H) float32, spline coefficients of the map as the pictures blur it
+    blur_px: float
+    fitter: Fitter  # of views and light; its own map is not used
+    fixed: bool  # whether all instants share one position
+
+    def map_fitter(self) -> Fitter:
+        """Return the fitter of poses to the present map."""
+        return replace(self.fitter, optics=optics_of(self.texture, self.fitter.views, self.blur_px))
+
+    def batches(self) -> Iterator[tuple[Tensor, Pixels]]:
+        """Yield rows of instants and their pixels, some at a time."""
+        for rows in torch.split(torch.arange(len(self.use)), BATCH):
+            yield rows, self.disks(rows)
+
+    def disks(self, rows: Tensor) -> Pixels:
+        """Return the pixels of some instants."""
+        cameras = self.use.shape[1]
+        return self.pixels.where((cameras * rows[:, None] + torch.arange(cameras)).reshape(-1))
+
+    def linearised(self) -> Iterator[Linearisation]:
+        """Yield the linearisation of all disks, some at a time; what is not seen has no weight."""
+        for rows, pixels in self.batches():
+            yield self.linearised_at(rows, pixels, self.blur_px)
+
+    def linearised_at(self, rows: Tensor, pixels: Pixels, blur_px: float) -> Linearisation:
+        """Linearise the disks of some instants, the blur taken to be `blur_px`."""
+        at = linearise(self.fitter, self.texture, pixels, self.position_lab_mm[rows], self.R_lab_body[rows], blur_px)
+        return replace(at, weight=at.weight * self.use[rows].reshape(-1, 1))
+
+
+def map_height(views: Sequence[CameraView], settings: MapSettings) -> int:
+    """Return the rows of the fitted map: texels a little finer than pixels in the widest disk's middle."""
+    if settings.height is not None:
+        return settings.height
+    rows = math.pi / 2 / TEXEL_PX * widest_px(views)
+    return min(FINEST_ROWS, max(2, round(rows / ROW)) * ROW)
+
+
+def first_map(disks: Disks, R_lab_body: Tensor, height: int) -> Tensor:
+    """Return a first map, (H, 2 H) float32, from normalised disks: relative grey about mid-grey."""
+    texels = 2 * height * height
+    matrix, right = csr_matrix((texels, texels)), np.zeros(texels)
+    for c in range(disks.layers.shape[1]):
+        normal, grey, weight = disks.sampled(slice(None), c, slant_power=2)
+        body = (R_lab_body.mT.float() @ (disks.R_lab_view[:, c] @ normal)).mT
+        more, sums = map_sums(body.reshape(-1, 3), grey.reshape(-1), weight.reshape(-1), height)
+        matrix, right = matrix + more, right + sums
+    even = solve_map(matrix, right, height, FIRST_SMOOTH * _typical(matrix.diagonal()))
+    return (0.5 + CONTRAST * even / even.std()).clamp(0, 1).float()
+
+
+def first_state(
+    crops: Crops, frames: Tensor, R_lab_body: Tensor, texture: Tensor, settings: MapSettings, extra_px: float = 0.0
+) -> State:
+    """Return what the iterations start with: attitudes (n, 3, 3) of some frames (n,), a map, light unknown.
+
+    A Gaussian of `extra_px` is laid over the pictures first.
+    """
+    blur_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
+    fitter = Fitter(
+        views=crops.views,
+        radius_mm=crops.radius_mm,
+        optics=optics_of(texture, crops.views, blur_px),
+        light=unknown_light(crops.views),
+    )
+    return State(
+        frames=frames,
+        pixels=pixels_of(crops, fitter, frames, settings.pixels, extra_px),
+        use=crops.seen[frames],
+        position_lab_mm=crops.position_lab_mm[frames],
+        R_lab_body=R_lab_body,
+        texture=texture,
+        blur_px=blur_px,
+        fitter=fitter,
+        fixed=crops.fixed,
+    )
+
+
+def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iteration]:
+    """Improve attitudes, light and map once; k counts the iterations from 0."""
+    before = state.R_lab_body
+    smooth = max(settings.smooth, SMOOTHEST * 0.5**k)
+    if k < SEPARATE_ITERATIONS:
+        state, _ = fitted(state, 3 if k == 0 else 2)
+    if k < LIGHT_ITERATIONS:
+        state = _with_light(state)
+    if k >= SEPARATE_ITERATIONS:
+        state = _with_joint_step(state, smooth)
+    state, chi2 = _with_map(state, smooth)
+    if k < LIGHT_ITERATIONS:
+        state = _rescaled(state)
+    if SEPARATE_ITERATIONS <= k < LIGHT_ITERATIONS and settings.blur_px is None:
+        state = replace(state, blur_px=_better_blur(state))
+    return state, Iteration(moved_rad=attitude_change_rad(before, state.R_lab_body), misfit=chi2, blur_px=state.blur_px)
+
+
+def optics_of(blurred: Tensor, views: Sequence[CameraView], blur_px: float) -> Optics:
+    """Return the optics of a map (H, 2 H) that is blurred as the pictures are."""
+    widest = widest_px(views)
+    return Optics(map_table(blurred, 2 * blur_px / widest), blur_px, widest)
+
+
+def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[State, FittedPoses]:
+    """Fit each instant's pose to the present map.
+
+    With crops all their pixels are used: the map needs a part of them, a final pose all. A position that all instants
+    share is not moved then.
+    """
+    fitter = state.map_fitter()
+    fine = fitter.optics.fine
+    held = HELD * torch.eye(3, dtype=torch.float64) if state.fixed and crops is not None else None
+    parts = []
+    for rows, pixels in state.batches():
+        X, R, use = state.position_lab_mm[rows], state.R_lab_body[rows], state.use[rows]
+        if crops is not None:
+            pixels = fitter.pixels(crops.pictures(state.frames[rows]), X, fine)
+        precision = None if held is None else held.expand(len(rows), 3, 3)
+        parts.append(fitter.fit(pixels, X, R, use, fine, iterations, precision))
+    fit = FittedPoses(**{name: torch.cat([getattr(part, name) for part in parts]) for name in POSE_PARTS})
+    X = fit.position_lab_mm
+    if state.fixed:
+        X = state.position_lab_mm if crops is not None else X.median(0).values.expand(len(X), 3).clone()
+    return replace(state, position_lab_mm=X, R_lab_body=fit.R_lab_body), fit
+
+
+def _with_light(state: State) -> State:
+    """Estimate light and noise from all frames."""
+    cameras, basis = state.use.shape[1], state.fitter.light.difference.shape[-1]
+    normal = torch.zeros(cameras, 2 * basis, 2 * basis, dtype=torch.float64)
+    right = torch.zeros(cameras, 2 * basis, dtype=torch.float64)
+    greys: list[tuple[Tensor, Tensor, Tensor]] = []
+    some = slice(None, None, NOISE_EVERY)
+    for (rows, pixels), at in zip(state.batches(), state.linearised(), strict=True):
+        more_normal, more_right = light_sums(at.view, pixels, at.precision)
+        normal += more_normal.reshape(-1, cameras, *normal.shape[1:]).sum(0)
+        right += more_right.reshape(-1, cameras, 2 * basis).sum(0)
+        inside = pixels.inside & state.use[rows].reshape(-1, 1)
+        greys.append(((pixels.grey - at.residual)[:, some], at.residual[:, some], inside[:, some]))
+    difference, black = light_maps(normal, right)
+    model, residual, inside = (torch.cat(part) for part in zip(*greys, strict=True))
+    curves = [noise_curve(model[c::cameras], residual[c::cameras], inside[c::cameras]) for c in range(cameras)]
+    light = Light(difference=difference, black=black, noise=torch.stack(curves), known=True)
+    return replace(state, fitter=replace(state.fitter, light=light))
+
+
+def _rescaled(state: State) -> State:
+    """Scale the map to black 0 and white 1: pictures alone do not separate a dark light from a dark map."""
+    values, order = state.texture.reshape(-1).sort()
+    share = texel_areas(len(state.texture)).reshape(-1)[order].cumsum(0)
+    low, high = (float(values[int((share < part * share[-1]).sum())]) for part in (BLACK, WHITE))
+    step = max(high - low, 1e-3)
+    light = state.fitter.light
+    if light.known:  # the light takes over the factor, so no picture changes
+        light = replace(light, difference=light.difference * step, black=light.black + light.difference * low)
+    return replace(state, texture=(state.texture - low) / step, fitter=replace(state.fitter, light=light))
+
+
+def _better_blur(state: State) -> float:
+    """Return the blur, px, near the present one with which the limb and slanted texture fit best."""
+    rows = evenly_spread(torch.arange(len(state.use)), BLUR_FRAMES)
+    pixels = state.disks(rows)
+    expected = state.linearised_at(rows, pixels, state.blur_px)
+    chi2 = []
+    for k in (-1, 0, 1):
+        at = state.linearised_at(rows, pixels, state.blur_px * BLUR_RATIO**k)
+        chi2.append(float((expected.weight * (at.residual.square() / expected.variance).clamp_max(OUTLIER2)).sum()))
+    bend = chi2[0] - 2 * chi2[1] + chi2[2]
+    shift = 0.5 * (chi2[0] - chi2[2]) / bend if bend > 0 else (1.0 if chi2[2] < chi2[0] else -1.0)
+    best = float(state.blur_px * BLUR_RATIO ** min(max(shift, -1.0), 1.0))
+    return min(max(best, BLUR_PX[0]), BLUR_PX[1])
+
+
+def _with_joint_step(state: State, smooth: float) -> State:
+    """Move all poses by one joint step; `smooth` is relative to the typical weight of a texel.
+
+    The map's own step is dropped: `_with_map` solves for the map exactly at the new poses.
+    """
+    height = len(state.texture)
+    parts, weight = [], np.zeros(2 * height * height)
+    for at in state.linearised():
+        parts.append(linear_system(at, height))
+        weight += texel_sums(parts[-1].by_texel)
+    tie = smooth * _typical(weight)
+    pose = joint_step(parts, state.use, state.texture, tie, state.fitter.radius_mm, state.fixed)
+    pose = pose * (LONGEST_RAD / pose[:, :3].norm(dim=1).max().clamp_min(1e-9)).clamp_max(1.0)
+    return replace(
+        state,
+        position_lab_mm=state.position_lab_mm + pose[:, 3:],
+        R_lab_body=so3.nearest_rotation(so3.exp(pose[:, :3]) @ state.R_lab_body),
+    )
+
+
+def _with_map(state: State, smooth: float) -> tuple[State, float]:
+    """Solve for the map at the present poses; return also chi^2 per pixel before."""
+    height = len(state.texture)
+    parts, right = [], np.zeros(2 * height * height)
+    squares = expected = 0.0
+    for at in state.linearised():
+        parts.append(at.by_texel(height))
+        right += parts[-1].T @ (at.residual * at.precision.sqrt()).reshape(-1).numpy()
+        squares += float((at.precision * at.residual.square()).sum())
+        expected += float((at.precision * at.variance).sum())
+    normal = NormalMatrix(vstack(parts, format="csr"))
+    tie = smooth * _typical(normal.diagonal())
+    # The penalty is on the whole map, not on the correction alone: else noise would grow with the iterations.
+    right -= tie * (stiffness(height) @ state.texture.double().numpy().ravel())
+    texture = state.texture + solve_map(normal, right, height, tie).float()
+    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND)), squares / max(expected, 1e-9)
+
+
+def map_weight(state: State) -> Tensor:
+    """Return the sum of the pixels' weights at each texel, (H, 2 H) float64: its inverse variance by noise."""
+    height = len(state.texture)
+    total = sum((texel_sums(at.by_texel(height)) for at in state.linearised()), np.zeros(2 * height * height))
+    return torch.from_numpy(total.reshape(height, -1))
+
+
+def _typical(weight: NDArray[np.float64]) -> float:
+    """Return the median weight of the texels that are seen at all."""
+    return float(np.median(weight[weight > 0])) if (weight > 0).any() else 1.0

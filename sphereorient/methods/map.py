@@ -1,0 +1,86 @@
+"""The method of `sphereorient map`: learn the texture map from movies in which the ball turns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from sphereorient.experiment import Experiment, input_files
+from sphereorient.experiment.recording import Progress, open_recording, silent
+from sphereorient.files.provenance import provenance
+from sphereorient.mapping import LearntMap, fit_map, take_crops
+from sphereorient.mapping.compare import MapComparison, corrected
+from sphereorient.methods.method import one_thread
+from sphereorient.methods.results import map_track
+from sphereorient.methods.settings import Settings, check_settings, settings_yaml
+from sphereorient.sphere import load_texture
+from sphereorient.trajectory import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapResult:
+    """What `learn_map` learnt."""
+
+    experiment: Experiment
+    learnt: LearntMap
+    track: Trajectory  # the attitudes of all frames
+    comparison: MapComparison | None  # with the old map, where one was given
+    kept_share: float  # of the sphere with the old map's texture, because it was never seen
+    remarks: tuple[str, ...]  # on the inputs
+
+    @property
+    def texture(self) -> Tensor:
+        """The texture map, (H, 2 H) float32, 0 black .. 1 white; NaN where unknown."""
+        return self.learnt.texture
+
+    @property
+    def seen(self) -> Tensor:
+        """Number of pictures that show each texel, (H, 2 H) int64."""
+        return self.learnt.seen
+
+
+def learn_map(
+    experiment: Experiment | str | Path,
+    settings: Settings | None = None,
+    *,
+    init: Tensor | str | Path | None = None,
+    cameras: Sequence[str] | None = None,
+    progress: Progress = silent,
+    command: str = "sphereorient.learn_map",
+) -> MapResult:
+    """Learn the texture map of a ball, and its attitudes, from movies or photographs; no map is needed.
+
+    Args:
+        experiment: as loaded, or the path of its experiment.yaml.
+        settings: the branches `paint` and `locate` are used; None: the defaults.
+        init: an old map (H, 2 H) or its file: gives the body frame, and the texture of what is never seen.
+        cameras: names of those to use; None: all.
+        progress: called with stage, steps done, and all steps.
+        command: recorded in the track's provenance.
+
+    Raises:
+        SphereOrientError: inputs are missing, unreadable or inconsistent, or the map cannot be learnt from them.
+    """
+    settings = settings or Settings()
+    check_settings(settings, "map")
+    old = load_texture(Path(init)) if isinstance(init, str | Path) else init
+    comparison, kept_share = None, 0.0
+    with open_recording(experiment, cameras, textured=False) as recording, one_thread():
+        crops = take_crops(recording, settings.paint, settings.locate, progress)
+        learnt = fit_map(crops, settings.paint, progress)
+        if old is not None:
+            correction = corrected(learnt, old)
+            learnt, comparison, kept_share = correction.learnt, correction.comparison, correction.kept_share
+        opened = recording.experiment
+        origin = provenance(input_files(opened, list(recording.cameras)), opened.folder, command)
+        return MapResult(
+            experiment=opened,
+            learnt=learnt,
+            track=map_track(opened, recording.clock, learnt, settings_yaml(settings), origin),
+            comparison=comparison,
+            kept_share=kept_share,
+            remarks=recording.remarks,
+        )
