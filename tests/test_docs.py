@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from importlib import import_module
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -94,11 +94,18 @@ def test_the_figure_of_the_conventions_is_drawn_by_its_script(tmp_path):
     assert abs(drawn.astype(float) - committed).mean() < 10
 
 
+@cache
+def defined(folder: Path) -> set[str]:
+    """Names of the functions and classes that a folder's modules define."""
+    text = "\n".join(path.read_text() for path in folder.rglob("*.py"))
+    return set(re.findall(r"^(?:def|class) (\w+)", text, re.MULTILINE))
+
+
 def test_every_test_that_the_paper_map_names_exists():
-    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", (REPO / "docs" / "paper-map.md").read_text())
+    named = re.findall(r"`(tests/\w+)::(\w+)`", (REPO / "docs" / "paper-map.md").read_text())
     assert len(named) > 40
-    for path, test in named:
-        assert f"def {test}(" in (REPO / path).read_text(), f"{path}::{test}"
+    for folder, test in named:
+        assert test in defined(REPO / folder), f"{folder}::{test}"
 
 
 def test_every_function_that_the_paper_map_names_exists():
@@ -106,20 +113,35 @@ def test_every_function_that_the_paper_map_names_exists():
     named = [name for row in rows for name in re.findall(r"`(\w+)\.(\w+)`", row)]
     assert len(named) > 30
     for room, name in named:
-        assert hasattr(import_module(f"sphereorient.{room}"), name), f"{room}.{name}"
+        assert name in defined(REPO / "sphereorient" / room), f"{room}.{name}"
 
 
-def test_every_correction_has_a_row():
-    text = (REPO / "docs" / "paper-map.md").read_text()
-    used = {number for path in (REPO / "sphereorient").rglob("*.py") for number in erratas(path)}
+def sources() -> list[Path]:
+    """The modules of the package."""
+    return sorted((REPO / "sphereorient").rglob("*.py"))
+
+
+def test_every_correction_that_the_package_cites_is_in_the_errata():
+    text = (REPO / "docs" / "errata.md").read_text()
+    used = {code for path in sources() for code in re.findall(r"\b([AE](?:10|[1-9]))\b", path.read_text())}
     assert len(used) > 10
-    for number in used:
-        assert f"\n| {number} | " in text, number
+    for code in used:
+        assert f"\n| {code} | " in text, code
+    for path in sources():
+        for cited in re.findall(r"errata\.md,? ([\w ]*)", path.read_text(), re.IGNORECASE):
+            first = cited.split()[0] if cited.split() else ""
+            section = re.match(r"(the )?(bound|settings of the paper)", cited, re.IGNORECASE)
+            assert f"\n| {first} | " in text or section, f"{path.name}: errata.md {cited}"
 
 
-def erratas(path: Path) -> list[str]:
-    """Numbers such as E5 that a file of the package names."""
-    return re.findall(r"\b([AE](?:10|[1-9]))\b", path.read_text())
+def test_the_package_cites_only_pages_that_exist():
+    for path in sources():
+        text = path.read_text()
+        assert not re.search(r"\bDESIGN\b|\bERRATA\b", text), (
+            f"{path.name}: cite docs/conventions.md, docs/errata.md E1, ..."
+        )
+        for page in re.findall(r"docs/([\w-]+\.md)", text):
+            assert (REPO / "docs" / page).is_file(), f"{path.name}: docs/{page}"
 
 
 def test_the_keys_of_an_experiment_are_all_in_the_data_format():
