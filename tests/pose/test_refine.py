@@ -511,7 +511,7 @@ def test_errors_that_neighbours_share_widen_the_covariance():
     X, R = truth()
     paint, ball = shares()
     clean = BEHIND + (BLACK - BEHIND) * ball + (WHITE - BLACK) * paint
-    scaled, wider = [], []
+    scaled, wider, own = [], [], []
     for seed in range(4):
         drawn = noisy(torch.zeros_like(clean), 1.0, seed).numpy()
         clouds = torch.from_numpy(np.stack([[cv2.GaussianBlur(one, (0, 0), 1.3) for one in pair] for pair in drawn]))
@@ -519,7 +519,9 @@ def test_errors_that_neighbours_share_widen_the_covariance():
         fit = fitted(rig(), "patches", pixels, X, R, SIGMA)
         scaled.append(whitened(fit, errors(fit, X, R)))
         wider.append((fit.covariance / from_truth().covariance).diagonal(dim1=1, dim2=2).sqrt())
+        own.append((fit.own_covariance / from_truth().own_covariance).diagonal(dim1=2, dim2=3).sqrt())
     assert torch.cat(wider).mean() > 1.8
+    assert torch.cat(own).mean() > 1.6, "each camera's own too"
     assert rms(torch.cat(scaled)) < 1.8
 
 
