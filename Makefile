@@ -1,4 +1,4 @@
-# make setup | demo | test | test-all | lint | types
+# make setup | demo | test | test-all | mutants | lint | types
 # TORCH_INDEX: on a machine without a GPU, give pip the address of torch's CPU builds here to avoid the CUDA packages.
 PYTHON ?= python3
 TORCH_INDEX ?=
@@ -8,7 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INDEX := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
 
-.PHONY: setup demo test test-all lint types clean
+.PHONY: setup demo test test-all mutants lint types clean
 
 setup: $(VENV)/.ready
 
@@ -27,6 +27,9 @@ test: setup
 
 test-all: setup
 	$(BIN)/python -m pytest -q -n 2
+
+mutants: setup
+	$(BIN)/python scripts/mutants.py
 
 lint: setup
 	$(BIN)/ruff check .
