@@ -293,6 +293,18 @@ def test_what_the_cameras_would_do_alone_adds_up_to_nothing():
     assert 0.7 < rms(torch.linalg.solve_triangular(root, apart, upper=False)) < 1.5
 
 
+def test_what_a_camera_would_do_alone_is_what_it_fits_alone():
+    X, R = truth()
+    fit = from_truth()
+    for camera in range(2):
+        use = torch.zeros(COUNT, 2, dtype=torch.bool)
+        use[:, camera] = True
+        alone = fitted(rig(), "patches", disks(), X, R, SIGMA, iterations=8, use=use)
+        places = alone.position_lab_mm, fit.position_lab_mm + fit.own_move[:, camera]
+        seen, told = (rig().cameras[camera].project(place) for place in places)
+        assert (seen - told).norm(dim=-1).max() < 0.02  # px
+
+
 def second_shows(X: Tensor, R: Tensor, **changes: object) -> Fit:
     """The fit to a ball of which the second camera shows another pose."""
     paint, ball = share_pictures(rig(), "patches", X, R)
