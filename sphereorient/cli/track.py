@@ -34,7 +34,7 @@ def track(
     ] = "precise",
     settings: Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set orient.fine_step_deg=2.")
+        list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set search.step_deg=10.")
     ] = None,
     cameras: Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")] = None,
     device: Annotated[str, typer.Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu",
