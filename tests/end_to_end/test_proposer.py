@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import REPO
+from excerpt_examples import EXCERPT, shortened
 from typer.testing import CliRunner
 
 from sphereorient import track_movies
@@ -28,7 +29,6 @@ from sphereorient.so3 import geodesic_distance, random_rotations
 from sphereorient.synth import random_texture
 from sphereorient.trajectory import Reason, Trajectory
 
-EXCERPT = REPO / "synthetic_data" / "excerpt"
 SHARED = REPO.parent / "shared" / "experiment"  # skipped where it is absent
 
 
@@ -51,9 +51,9 @@ def filmed(texture: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("method", ["precise", "paper"])
-def test_the_excerpt_is_tracked_with_the_network(method: str) -> None:
+def test_the_excerpt_is_tracked_with_the_network(method: str, tmp_path: Path) -> None:
     alone = load_settings(None, ["propose.when=always"])
-    track = track_movies(EXCERPT / "experiment.yaml", method=method, settings=alone, proposer="default")
+    track = track_movies(shortened(tmp_path / "copy", 0, 12), method=method, settings=alone, proposer="default")
     score = score_track(track, EXCERPT / "truth.h5")
     assert score.valid.all()
     assert np.median(score.orientation_deg) < {"precise": 0.08, "paper": 4.0}[method]
@@ -154,9 +154,8 @@ def test_a_checkpoint_that_is_none_is_one_line(tmp_path: Path, content: bytes | 
 def test_the_command_line_takes_a_checkpoint_and_resumes_only_with_the_same(tmp_path: Path) -> None:
     own, out = tmp_path / "own.ckpt", tmp_path / "track.h5"
     shutil.copy(DEFAULT_CHECKPOINT, own)
-    run = CliRunner().invoke(
-        app, ["track", str(EXCERPT / "experiment.yaml"), "--out", str(out), "--proposer", str(own), "--quiet"]
-    )
+    experiment = shortened(tmp_path / "copy", 0, 6)
+    run = CliRunner().invoke(app, ["track", str(experiment), "--out", str(out), "--proposer", str(own), "--quiet"])
     assert run.exit_code == 0, run.output
     track = Trajectory.load(out)
     assert track.valid.all()

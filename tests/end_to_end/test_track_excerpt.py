@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from conftest import REPO
+from excerpt_examples import EXCERPT, shortened
 
 from sphereorient.cli import main
 from sphereorient.evaluate import score_track
@@ -24,8 +24,6 @@ from sphereorient.methods.settings import load_settings
 from sphereorient.movies import open_movie, write_ffv1
 from sphereorient.run.track import track_movies
 from sphereorient.trajectory import Flag, Trajectory
-
-EXCERPT = REPO / "synthetic_data" / "excerpt"
 
 
 def sphereorient(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -104,26 +102,19 @@ def test_the_file_has_every_dataset_with_units_and_its_provenance(tracked):
             assert "units" in file[name].attrs, name
 
 
-def shortened(folder: Path, first: int, last: int) -> Path:
-    """Have a copy of the excerpt tracked in some frames only."""
-    experiment = folder / "experiment.yaml"
-    experiment.write_text(experiment.read_text() + f"frames: [{first}, {last}]\n")
-    return experiment
-
-
-def test_the_python_call_gives_the_same_bytes_as_the_command(copy):
-    experiment = shortened(copy, 0, 5)
-    assert sphereorient("track", experiment, "--method", "paper", "--out", copy / "track.h5").returncode == 0
+def test_the_python_call_gives_the_same_bytes_as_the_command(tmp_path):
+    experiment = shortened(tmp_path / "copy", 0, 5)
+    assert sphereorient("track", experiment, "--method", "paper", "--out", tmp_path / "track.h5").returncode == 0
     again = track_movies(experiment, method="paper")
-    first = Trajectory.load(copy / "track.h5")
+    first = Trajectory.load(tmp_path / "track.h5")
     for name in ("position", "orientation", "omega_lab", "segment", "flags"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
     for name, camera in first.cameras.items():
         np.testing.assert_array_equal(again.cameras[name].candidate_orientation, camera.candidate_orientation)
 
 
-def test_one_camera_alone_tracks_the_orientation_and_says_so(copy):
-    out, experiment = copy / "one.h5", shortened(copy, 0, 12)
+def test_one_camera_alone_tracks_the_orientation_and_says_so(tmp_path):
+    out, experiment = tmp_path / "one.h5", shortened(tmp_path / "copy", 0, 12)
     run = sphereorient("track", experiment, "--method", "paper", "--out", out, "--cameras", "cam2", "--quiet")
     assert run.returncode == 0, run.stderr
     assert run.stdout == ""
@@ -135,20 +126,21 @@ def test_one_camera_alone_tracks_the_orientation_and_says_so(copy):
     assert np.isnan(track.orientation_cov).all()  # nothing to measure it by
 
 
-def test_a_part_of_the_frames_keeps_the_experiments_clock(copy):
-    track = track_movies(shortened(copy, 10, 18), method="paper")
+def test_a_part_of_the_frames_keeps_the_experiments_clock(tmp_path):
+    track = track_movies(shortened(tmp_path / "copy", 10, 18), method="paper")
     assert np.allclose(track.time, np.arange(10, 18) / 600)
     assert score_track(track, EXCERPT / "truth.h5").percentiles_deg()[3] < 5
 
 
-def test_swapped_cameras_do_not_pass_for_a_measurement(copy):
+def test_swapped_cameras_do_not_pass_for_a_measurement(tmp_path):
     """A wrong input must not give a confident wrong output: the rays then miss each other by centimetres."""
+    experiment = shortened(tmp_path / "copy", 0, 6)
     for name in ("{}.mkv", "empty_{}.png"):
-        first, second = copy / name.format("cam1"), copy / name.format("cam2")
-        aside = first.rename(copy / "aside")
+        first, second = (experiment.with_name(name.format(camera)) for camera in ("cam1", "cam2"))
+        aside = first.rename(tmp_path / "aside")
         second.rename(first)
         aside.rename(second)
-    track = track_movies(shortened(copy, 0, 6), method="paper")
+    track = track_movies(experiment, method="paper")
     assert score_track(track, EXCERPT / "truth.h5").percentiles_mm()[0] > 5
 
 

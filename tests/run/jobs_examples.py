@@ -11,7 +11,8 @@ import numpy as np
 from conftest import REPO
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
-SHORT_BLOCKS = ["--set", "refine.block_frames=2"]  # windows of eight frames: five in the excerpt
+SHORT = "refine.block_frames=2", "refine.study_frames=6"  # windows of eight frames: five in the excerpt
+SHORT_BLOCKS = [word for changed in SHORT for word in ("--set", changed)]
 COMMAND = [sys.executable, "-m", "sphereorient.cli", "track"]
 
 

@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 
 import pytest
-from jobs_examples import COMMAND, EXCERPT, SHORT_BLOCKS, datasets, run
+from excerpt_examples import shortened
+from jobs_examples import COMMAND, EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
 
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.methods.settings import load_settings
@@ -21,10 +22,11 @@ from sphereorient.run import Parts, Request, track_kept
 
 @pytest.fixture(scope="module")
 def request_of(tmp_path_factory):
-    settings = load_settings(None, ["refine.block_frames=2"])
+    settings = load_settings(None, SHORT)
+    experiment = shortened(tmp_path_factory.mktemp("excerpt") / "copy", 0, 24)
 
     def make(folder: Path, **changed: object) -> Request:
-        return Request(experiment=EXCERPT, out=folder / "track.h5", settings=settings, **changed)
+        return Request(experiment=experiment, out=folder / "track.h5", settings=settings, **changed)
 
     return make
 
