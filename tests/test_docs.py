@@ -6,13 +6,16 @@ import contextlib
 import doctest
 import io
 import re
+import shlex
 import subprocess
 import sys
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import pytest
+import typer
 import yaml
 from conftest import REPO
 
@@ -23,7 +26,9 @@ from sphereorient.cameras import load_cameras
 from sphereorient.cameras.io.entries import PortEntry
 from sphereorient.cameras.io.registry import MODELS
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT, parameter_names
+from sphereorient.cli import app
 from sphereorient.experiment import ExperimentKeys, load_experiment
+from sphereorient.methods.settings import load_proposer_settings, load_settings, load_synth_settings
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
 DOCS = sorted([*REPO.glob("*.md"), *(REPO / "docs").glob("*.md")])
@@ -199,6 +204,30 @@ def test_the_commands_and_the_python_of_the_walkthrough_print_what_it_says(tmp_p
             assert cells(line) in shown, line
     for name in ("track.csv", "report/index.html", "overlay.mp4"):
         assert (tmp_path / "out" / "try" / name).is_file()
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
+def test_every_command_of_a_page_exists_with_its_options_and_settings(page):
+    fenced = re.findall(r"^```\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    for line in "".join(fenced).replace("\\\n", " ").splitlines():
+        found = re.match(r"(?:\.venv/bin/)?sphereorient (.*)", line)
+        if not found:
+            continue
+        words, command = shlex.split(found[1], comments=True), typer.main.get_command(app)
+        while hasattr(command, "commands"):
+            assert words[0] in command.commands, line
+            command = command.commands[words.pop(0)]
+        options = {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
+        assert {word for word in words if word.startswith("-")} <= options, line
+        changed = [value for option, value in pairwise(words) if option == "--set"]
+        load = {"synth": load_synth_settings, "train": load_proposer_settings}.get(command.name, load_settings)
+        load(None, changed)
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
+def test_every_script_that_a_page_names_exists(page):
+    for script in re.findall(r"scripts/\w+\.(?:py|yaml)", page.read_text()):
+        assert (REPO / script).is_file(), script
 
 
 @pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)

@@ -11,7 +11,8 @@ import numpy as np
 from conftest import REPO
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
-SHORT = "refine.block_frames=2", "refine.study_frames=6"  # windows of eight frames: five in the excerpt
+# Windows of eight frames, five in the excerpt; every fourth frame is searched for.
+SHORT = "refine.block_frames=4", "refine.lanes=2", "refine.study_frames=6"
 SHORT_BLOCKS = [word for changed in SHORT for word in ("--set", changed)]
 COMMAND = [sys.executable, "-m", "sphereorient.cli", "track"]
 

@@ -11,6 +11,7 @@ import subprocess
 import time
 from pathlib import Path
 
+import h5py
 import pytest
 from excerpt_examples import shortened
 from jobs_examples import COMMAND, EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
@@ -23,7 +24,7 @@ from sphereorient.run import Parts, Request, track_kept
 @pytest.fixture(scope="module")
 def request_of(tmp_path_factory):
     settings = load_settings(None, SHORT)
-    experiment = shortened(tmp_path_factory.mktemp("excerpt") / "copy", 0, 24)
+    experiment = shortened(tmp_path_factory.mktemp("excerpt") / "copy", 0, 16)
 
     def make(folder: Path, **changed: object) -> Request:
         return Request(experiment=experiment, out=folder / "track.h5", settings=settings, **changed)
@@ -33,9 +34,9 @@ def request_of(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, request_of) -> Path:
-    """A run that nothing disturbed, and what its parts were like halfway."""
+    """A run that nothing disturbed, what it learnt, and what its parts were like halfway."""
     folder = tmp_path_factory.mktemp("whole")
-    request = request_of(folder)
+    request = request_of(folder, save_learnt=folder / "learnt.h5")
 
     def keep(stage: str, done: int, total: int) -> None:
         if stage == "track" and 0 < done < total and not (folder / "half").exists():
@@ -116,19 +117,19 @@ def test_two_runs_do_not_write_one_track(whole, tmp_path, request_of):
 
 
 def test_what_was_learnt_measures_the_same_again(whole, tmp_path, request_of):
-    first = request_of(tmp_path / "a", save_learnt=tmp_path / "learnt.h5")
-    (tmp_path / "a").mkdir()
-    track_kept(first)
-    again = request_of(tmp_path, learnt=tmp_path / "learnt.h5")
+    again = request_of(tmp_path, learnt=whole / "learnt.h5")
     track_kept(again)
     assert datasets(again.out) == datasets(whole / "track.h5")
 
 
-def test_knowledge_of_other_cameras_is_refused(tmp_path, request_of):
-    one = request_of(tmp_path, cameras=("cam1",), save_learnt=tmp_path / "learnt.h5")
-    track_kept(one)
+def test_knowledge_of_other_cameras_is_refused(whole, tmp_path, request_of):
+    other = tmp_path / "other.h5"
+    shutil.copy(whole / "learnt.h5", other)
+    with h5py.File(other, "r+") as file:
+        file.move("cameras/cam2", "cameras/left")
+        file.attrs["cameras"] = ["cam1", "left"]
     with pytest.raises(TrackError, match="expected what was learnt of cam2"):
-        track_kept(request_of(tmp_path, learnt=tmp_path / "learnt.h5"))
+        track_kept(request_of(tmp_path, learnt=other))
 
 
 @pytest.mark.slow
