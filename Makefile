@@ -22,11 +22,12 @@ $(VENV)/.ready: pyproject.toml
 demo: setup
 	$(BIN)/python scripts/demo.py
 
+# worksteal: neighbouring tests stay in one worker, so that what a file prepares for its tests is made once.
 test: setup
-	$(BIN)/python -m pytest -q -m "not slow" -n 2
+	$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist worksteal
 
 test-all: setup
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal
 
 mutants: setup
 	$(BIN)/python scripts/mutants.py
