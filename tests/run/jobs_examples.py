@@ -11,8 +11,11 @@ import numpy as np
 from conftest import REPO
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
-# Windows of eight frames, five in the excerpt; every fourth frame is searched for.
-SHORT = "refine.block_frames=4", "refine.lanes=2", "refine.study_frames=6"
+# Windows of eight frames, five in the excerpt; every fourth frame is searched for, in a small bank, the blur given.
+SHORT = (
+    *("refine.block_frames=4", "refine.lanes=2", "refine.study_frames=6", "refine.blur_px=0.63"),
+    "search.step_deg=16",
+)
 SHORT_BLOCKS = [word for changed in SHORT for word in ("--set", changed)]
 COMMAND = [sys.executable, "-m", "sphereorient.cli", "track"]
 

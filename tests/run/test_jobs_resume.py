@@ -99,7 +99,9 @@ def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_pa
 def test_parts_of_another_run_are_refused_with_what_differs(whole, tmp_path, request_of):
     request = request_of(tmp_path, cameras=("cam1",))
     parts = halfway(whole, request)
-    with pytest.raises(TrackError, match=r"parts of a run with another cam2\.mkv, cameras, empty_cam2\.png; run without --resume"):
+    with pytest.raises(
+        TrackError, match=r"parts of a run with another cam2\.mkv, cameras, empty_cam2\.png; run without --resume"
+    ):
         track_kept(request, resume=True)
     told = json.loads((parts.folder / "run.json").read_text())
     told["cam1.mkv"] = "12 34"
