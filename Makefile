@@ -24,7 +24,7 @@ demo: setup
 
 # worksteal: neighbouring tests stay in one worker, so that what a file prepares for its tests is made once.
 test: setup
-	$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist worksteal
+	$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist worksteal --durations=10 --durations-min=5
 
 test-all: setup
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal
