@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from test_orient_held import in_its_place
+from test_fixed_centre import in_its_place
 
 from sphereorient.run.request import Request
 from sphereorient.run.run import track_kept

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from jobs_examples import EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
+from run_examples import EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
 
 from sphereorient.errors import SettingsError
 from sphereorient.methods.settings import Settings, load_settings

@@ -14,7 +14,7 @@ from pathlib import Path
 import h5py
 import pytest
 from excerpt_examples import shortened
-from jobs_examples import COMMAND, EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
+from run_examples import COMMAND, EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
 
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.methods.settings import load_settings
