@@ -1,4 +1,4 @@
-# make setup | demo | test | test-all | lint | types
+# make setup | demo | test | test-all | mutants | lint | types
 # TORCH_INDEX: on a machine without a GPU, give pip the address of torch's CPU builds here to avoid the CUDA packages.
 PYTHON ?= python3
 TORCH_INDEX ?=
@@ -8,7 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INDEX := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
 
-.PHONY: setup demo test test-all lint types clean
+.PHONY: setup demo test test-all mutants lint types clean
 
 setup: $(VENV)/.ready
 
@@ -22,11 +22,15 @@ $(VENV)/.ready: pyproject.toml
 demo: setup
 	$(BIN)/python scripts/demo.py
 
+# worksteal: neighbouring tests stay in one worker, so that what a file prepares for its tests is made once.
 test: setup
-	$(BIN)/python -m pytest -q -m "not slow" -n 2
+	$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist worksteal --durations=10 --durations-min=5
 
 test-all: setup
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal
+
+mutants: setup
+	$(BIN)/python scripts/mutants.py
 
 lint: setup
 	$(BIN)/ruff check .

@@ -23,10 +23,10 @@ REPO = Path(__file__).resolve().parents[1]
 HEAD = """\
 # Parameters
 
-All settings; each branch says which method reads it. A default in **bold** is the paper's number; where the paper
-gives none, the description says why this one. A file with any of them goes in by `--settings FILE`
-(`configs/default.yaml` has them all), a single one by `--set room.key=value`. The track's attribute `settings` keeps
-what was used. Made by `scripts/make_parameters.py`.
+All settings; each heading names the methods that read them. A default in **bold** is the paper's value; where the paper
+gives none, the description states the reason. `--settings FILE` reads a file with any of them (`configs/default.yaml`
+lists all), `--set room.key=value` changes one. A track keeps the settings used in its attribute `settings`. Written by
+`scripts/make_parameters.py`.
 """
 
 FROM_PAPER = re.compile(r"the paper(:|'s (b|w|\d))")  # "the paper's 12", "the paper: under 5", "the paper's b"

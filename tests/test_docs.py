@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import doctest
+import io
 import re
-import shutil
+import shlex
 import subprocess
 import sys
-from importlib import import_module
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import pytest
+import typer
 import yaml
 from conftest import REPO
 
@@ -21,7 +25,9 @@ from sphereorient.calibration.targets import KINDS, target_keys
 from sphereorient.cameras import load_cameras
 from sphereorient.cameras.io.cameras_yaml import ENTRIES, MODELS, PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT, parameter_names
+from sphereorient.cli import app
 from sphereorient.experiment import ExperimentKeys, load_experiment
+from sphereorient.methods.settings import load_proposer_settings, load_settings, load_synth_settings
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
 DOCS = sorted([*REPO.glob("*.md"), *(REPO / "docs").glob("*.md")])
@@ -91,11 +97,18 @@ def test_the_figure_of_the_conventions_is_drawn_by_its_script(tmp_path):
     assert abs(drawn.astype(float) - committed).mean() < 10
 
 
+@cache
+def defined(folder: Path) -> set[str]:
+    """Names of the functions and classes that a folder's modules define."""
+    text = "\n".join(path.read_text() for path in folder.rglob("*.py"))
+    return set(re.findall(r"^(?:def|class) (\w+)", text, re.MULTILINE))
+
+
 def test_every_test_that_the_paper_map_names_exists():
-    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", (REPO / "docs" / "paper-map.md").read_text())
+    named = re.findall(r"`(tests/\w+)::(\w+)`", (REPO / "docs" / "paper-map.md").read_text())
     assert len(named) > 40
-    for path, test in named:
-        assert f"def {test}(" in (REPO / path).read_text(), f"{path}::{test}"
+    for folder, test in named:
+        assert test in defined(REPO / folder), f"{folder}::{test}"
 
 
 def test_every_function_that_the_paper_map_names_exists():
@@ -103,20 +116,35 @@ def test_every_function_that_the_paper_map_names_exists():
     named = [name for row in rows for name in re.findall(r"`(\w+)\.(\w+)`", row)]
     assert len(named) > 30
     for room, name in named:
-        assert hasattr(import_module(f"sphereorient.{room}"), name), f"{room}.{name}"
+        assert name in defined(REPO / "sphereorient" / room), f"{room}.{name}"
 
 
-def test_every_correction_has_a_row():
-    text = (REPO / "docs" / "paper-map.md").read_text()
-    used = {number for path in (REPO / "sphereorient").rglob("*.py") for number in erratas(path)}
+def sources() -> list[Path]:
+    """The modules of the package."""
+    return sorted((REPO / "sphereorient").rglob("*.py"))
+
+
+def test_every_correction_that_the_package_cites_is_in_the_errata():
+    text = (REPO / "docs" / "errata.md").read_text()
+    used = {code for path in sources() for code in re.findall(r"\b([AE](?:10|[1-9]))\b", path.read_text())}
     assert len(used) > 10
-    for number in used:
-        assert f"\n| {number} | " in text, number
+    for code in used:
+        assert f"\n| {code} | " in text, code
+    for path in sources():
+        for cited in re.findall(r"errata\.md,? ([\w ]*)", path.read_text(), re.IGNORECASE):
+            first = cited.split()[0] if cited.split() else ""
+            section = re.match(r"(the )?(bound|settings of the paper)", cited, re.IGNORECASE)
+            assert f"\n| {first} | " in text or section, f"{path.name}: errata.md {cited}"
 
 
-def erratas(path: Path) -> list[str]:
-    """Numbers such as E5 that a file of the package names."""
-    return re.findall(r"\b([AE](?:10|[1-9]))\b", path.read_text())
+def test_the_package_cites_only_pages_that_exist():
+    for path in sources():
+        text = path.read_text()
+        assert not re.search(r"\bDESIGN\b|\bERRATA\b", text), (
+            f"{path.name}: cite docs/conventions.md, docs/errata.md E1, ..."
+        )
+        for page in re.findall(r"docs/([\w-]+\.md)", text):
+            assert (REPO / "docs" / page).is_file(), f"{path.name}: docs/{page}"
 
 
 def test_the_keys_of_an_experiment_are_all_in_the_data_format():
@@ -146,23 +174,63 @@ def test_the_files_of_the_walkthrough_load(tmp_path):
     assert list(load_experiment(tmp_path / "experiment.yaml").cameras) == ["cam1", "cam2"]
 
 
-@pytest.mark.slow  # renders and tracks 60 frames: a quarter of a minute
-def test_the_commands_and_the_python_of_the_walkthrough_run(tmp_path, monkeypatch):
+def cells(line: str) -> str:
+    """The words of a printed line, without the borders of tables and however it is spaced."""
+    return " ".join(re.sub("[│┃|]", " ", line).split())
+
+
+@pytest.mark.slow  # renders 60 frames and tracks them twice: a minute
+def test_the_commands_and_the_python_of_the_walkthrough_print_what_it_says(tmp_path, monkeypatch):
     # A copy of the project's folder, so that its own out/ stays as it is.
     (tmp_path / ".venv").symlink_to(sys.prefix)
-    shutil.copytree(REPO / "scripts", tmp_path / "scripts")
     (tmp_path / "out").mkdir()
-    lines = (line for block in blocks("walkthrough.md", "") for line in block.splitlines())
-    commands = [line for line in lines if line.startswith(".venv/bin/")]
-    assert len(commands) == 5
-    for command in commands:
-        subprocess.run(command.split(), cwd=tmp_path, check=True, capture_output=True)
     monkeypatch.chdir(tmp_path)
+    commands = [line for block in blocks("walkthrough.md", "") for line in block.splitlines()]
+    assert len(commands) == 6
+    printed = ""
+    for command in commands:
+        run = subprocess.run(command.split(), check=True, capture_output=True, text=True)
+        printed += run.stdout
     names: dict[str, object] = {}
-    for block in blocks("walkthrough.md", "python"):
-        exec(block, names)
+    with contextlib.redirect_stdout(io.StringIO()) as python:
+        for block in blocks("walkthrough.md", "python"):
+            exec(block, names)
+    shown = {cells(line) for line in (printed + python.getvalue()).splitlines()}
+    for block in blocks("walkthrough.md", "text"):
+        for line in block.splitlines():
+            assert cells(line) in shown, line
     for name in ("track.csv", "report/index.html", "overlay.mp4"):
         assert (tmp_path / "out" / "try" / name).is_file()
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
+def test_every_command_of_a_page_exists_with_its_options_and_settings(page):
+    fenced = re.findall(r"^```\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    for line in "".join(fenced).replace("\\\n", " ").splitlines():
+        found = re.match(r"(?:\.venv/bin/)?sphereorient (.*)", line)
+        if not found:
+            continue
+        words, command = shlex.split(found[1], comments=True), typer.main.get_command(app)
+        while hasattr(command, "commands"):
+            assert words[0] in command.commands, line
+            command = command.commands[words.pop(0)]
+        options = {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
+        assert {word for word in words if word.startswith("-")} <= options, line
+        changed = [value for option, value in pairwise(words) if option == "--set"]
+        load = {"synth": load_synth_settings, "train": load_proposer_settings}.get(command.name, load_settings)
+        load(None, changed)
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
+def test_every_file_of_the_project_that_a_page_names_exists(page):
+    if page.name == "CHANGELOG.md":  # names what was
+        return
+    rooms = "|".join(path.parent.name for path in (REPO / "sphereorient").glob("*/__init__.py"))
+    text = page.read_text()
+    for name in re.findall(r"(?:scripts|tests|configs|sphereorient)/[\w/]+\.(?:py|yaml)", text):
+        assert (REPO / name).is_file(), name
+    for name in re.findall(rf"`((?:{rooms})/[\w/]+\.py)", text):
+        assert (REPO / "sphereorient" / name).is_file(), name
 
 
 @pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)

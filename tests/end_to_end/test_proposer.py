@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import REPO
+from excerpt_examples import EXCERPT, shortened
 from typer.testing import CliRunner
 
 from sphereorient import track_movies
@@ -28,7 +28,6 @@ from sphereorient.so3 import geodesic_distance, random_rotations
 from sphereorient.synth import random_texture
 from sphereorient.trajectory import Reason, Trajectory
 
-EXCERPT = REPO / "synthetic_data" / "excerpt"
 SHARED = REPO.parent / "shared" / "experiment"  # skipped where it is absent
 
 
@@ -50,16 +49,29 @@ def filmed(texture: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return film_with(texture, R.float(), {"read_noise": 6.0}, rng, PictureSettings()), R
 
 
-@pytest.mark.parametrize("method", ["precise", "paper"])
-def test_the_excerpt_is_tracked_with_the_network(method: str) -> None:
-    alone = load_settings(None, ["propose.when=always"])
-    track = track_movies(EXCERPT / "experiment.yaml", method=method, settings=alone, proposer="default")
+def check_excerpt(track: Trajectory, median_deg: float, proposer: Path) -> None:
     score = score_track(track, EXCERPT / "truth.h5")
     assert score.valid.all()
-    assert np.median(score.orientation_deg) < {"precise": 0.08, "paper": 4.0}[method]
+    assert np.median(score.orientation_deg) < median_deg
     assert score.orientation_deg.max() < 10
-    assert track.provenance["proposer_sha256"] == sha256(DEFAULT_CHECKPOINT)
+    assert track.provenance["proposer_sha256"] == sha256(proposer)
+
+
+def test_the_paper_tracks_the_excerpt_with_the_network(tmp_path: Path) -> None:
+    alone = load_settings(None, ["propose.when=always"])
+    experiment = shortened(tmp_path / "copy", 0, 12)
+    track = track_movies(experiment, method="paper", settings=alone, proposer="default")
+    check_excerpt(track, 4.0, DEFAULT_CHECKPOINT)
     assert "checkpoint: default" in track.settings
+
+
+def test_the_command_line_takes_a_checkpoint(tmp_path: Path) -> None:
+    own, out = tmp_path / "own.ckpt", tmp_path / "track.h5"
+    shutil.copy(DEFAULT_CHECKPOINT, own)
+    words = ["--out", str(out), "--proposer", str(own), "--set", "propose.when=always", "--quiet"]
+    run = CliRunner().invoke(app, ["track", str(shortened(tmp_path / "copy", 0, 12)), *words])
+    assert run.exit_code == 0, run.output
+    check_excerpt(Trajectory.load(out), 0.08, own)
 
 
 @pytest.mark.shared
@@ -149,15 +161,3 @@ def test_a_checkpoint_that_is_none_is_one_line(tmp_path: Path, content: bytes | 
         track_movies(EXCERPT / "experiment.yaml", proposer=path)
     assert "\n" not in str(caught.value)
     assert "other.ckpt" in str(caught.value)
-
-
-def test_the_command_line_takes_a_checkpoint_and_resumes_only_with_the_same(tmp_path: Path) -> None:
-    own, out = tmp_path / "own.ckpt", tmp_path / "track.h5"
-    shutil.copy(DEFAULT_CHECKPOINT, own)
-    run = CliRunner().invoke(
-        app, ["track", str(EXCERPT / "experiment.yaml"), "--out", str(out), "--proposer", str(own), "--quiet"]
-    )
-    assert run.exit_code == 0, run.output
-    track = Trajectory.load(out)
-    assert track.valid.all()
-    assert json.loads(json.dumps(track.provenance))["proposer_sha256"] == sha256(own)

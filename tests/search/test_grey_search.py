@@ -234,6 +234,13 @@ def test_of_each_attitude_a_peak_of_the_bank_lies_within_the_covering_angle(kind
     assert peak[:, 0].all()
 
 
+def test_a_normalised_picture_has_length_1_and_no_mean():
+    normalise = grey_search_of("blobs")._normalise
+    even = normalise(camera_disks("blobs", attitudes(4), light_from(-0.8, -0.3, -0.52)))
+    assert_close(even.norm(dim=1), torch.ones(4), 1e-5)
+    assert_close(even @ normalise._unit, torch.zeros(4), 1e-5)
+
+
 def test_whole_numbers_keep_the_correlation_to_a_few_thousandths():
     search = grey_search_of("blobs")
     even = search._normalise(camera_disks("blobs", attitudes(BATCH)))

@@ -294,6 +294,18 @@ def test_what_the_cameras_would_do_alone_adds_up_to_nothing():
     assert 0.7 < rms(torch.linalg.solve_triangular(root, apart, upper=False)) < 1.5
 
 
+def test_what_a_camera_would_do_alone_is_what_it_fits_alone():
+    X, R = truth()
+    fit = from_truth()
+    for camera in range(2):
+        use = torch.zeros(COUNT, 2, dtype=torch.bool)
+        use[:, camera] = True
+        alone = fitted(rig(), "patches", disks(), X, R, SIGMA, iterations=8, use=use)
+        places = alone.position_lab_mm, fit.position_lab_mm + fit.own_move[:, camera]
+        seen, told = (rig().cameras[camera].project(place) for place in places)
+        assert (seen - told).norm(dim=-1).max() < 0.02  # px
+
+
 def second_shows(X: Tensor, R: Tensor, **changes: object) -> FittedPoses:
     """The fit to a ball of which the second camera shows another pose."""
     paint, ball = share_pictures(rig(), "patches", X, R)
@@ -512,7 +524,7 @@ def test_errors_that_neighbours_share_widen_the_covariance():
     X, R = truth()
     paint, ball = shares()
     clean = BEHIND + (BLACK - BEHIND) * ball + (WHITE - BLACK) * paint
-    scaled, wider = [], []
+    scaled, wider, own = [], [], []
     for seed in range(4):
         drawn = noisy(torch.zeros_like(clean), 1.0, seed).numpy()
         clouds = torch.from_numpy(np.stack([[cv2.GaussianBlur(one, (0, 0), 1.3) for one in pair] for pair in drawn]))
@@ -520,7 +532,9 @@ def test_errors_that_neighbours_share_widen_the_covariance():
         fit = fitted(rig(), "patches", pixels, X, R, SIGMA)
         scaled.append(whitened(fit, errors(fit, X, R)))
         wider.append((fit.covariance / from_truth().covariance).diagonal(dim1=1, dim2=2).sqrt())
+        own.append((fit.own_covariance / from_truth().own_covariance).diagonal(dim1=2, dim2=3).sqrt())
     assert torch.cat(wider).mean() > 1.8
+    assert torch.cat(own).mean() > 1.6, "each camera's own too"
     assert rms(torch.cat(scaled)) < 1.8
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from test_orient_held import in_its_place
+from test_fixed_centre import in_its_place
 
 from sphereorient.run import MemoryStore, Request, run
 from sphereorient.run.stages import track_movies

@@ -11,7 +11,12 @@ import numpy as np
 from conftest import REPO
 
 EXCERPT = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
-SHORT_BLOCKS = ["--set", "refine.chunk_frames=2"]  # windows of eight frames: five in the excerpt
+# Windows of eight frames, five in the excerpt; every fourth frame is searched for, in a small bank, the blur given.
+SHORT = (
+    *("refine.chunk_frames=4", "refine.chunks=2", "refine.appearance_frames=6", "refine.blur_px=0.63"),
+    "search.step_deg=16",
+)
+SHORT_BLOCKS = [word for changed in SHORT for word in ("--set", changed)]
 COMMAND = [sys.executable, "-m", "sphereorient.cli", "track"]
 
 

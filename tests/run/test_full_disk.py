@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from jobs_examples import EXCERPT, SHORT_BLOCKS, datasets, run
+from run_examples import EXCERPT, SHORT_BLOCKS, datasets, run
 
 COMMAND = [sys.executable, "-c", "from sphereorient.cli import main; main()", "track"]
 

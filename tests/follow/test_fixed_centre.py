@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import pytest
 import torch
 from conftest import assert_close
-from refine_examples import f64
+from refine_examples import RADIUS_MM, balls, cut, f64, fitted, pictures_of, rig_of, turn_errors
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.follow import ChunkTracker
-from sphereorient.follow.fixed_centre import FixedCentre, find_fixed_centre, mean_place
+from sphereorient.follow.fixed_centre import FixedCentre, _follows, find_fixed_centre, mean_place
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.poses import Poses
 from sphereorient.locate import Frame, screened_frames
@@ -69,6 +70,27 @@ def test_a_single_frame_tells_the_place_as_well_as_it_can():
     place, C = mean_place(X[0], covariance)
     assert_close(place, X[0, 0], 1e-9)
     assert_close(C, covariance[0], 1e-9)
+
+
+def test_attitudes_err_with_the_place_as_follows_says():
+    rig, (X, R) = rig_of(40.0, ("pinhole",)), balls(4, 1, reach_mm=0.0)
+    pixels, use = cut(rig, pictures_of(rig, "patches", X, R), X), torch.ones(4, 1, dtype=torch.bool)
+
+    def held(X: Tensor, R: Tensor, precision: Tensor) -> Fit:
+        return fitted(rig, "patches", pixels, X, R, 2.0, use=use, iterations=3, place_precision=precision)
+
+    class Held:
+        radius_mm, optics = RADIUS_MM, SimpleNamespace(fine=None)
+
+        def fit(self, pixels, X, R, use, level, iterations, precision):
+            return held(X, R, precision)
+
+    follows = _follows(Held(), pixels, X[0], R, use)
+    firm = 1e14 * torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
+    for aside in f64([[0.05, 0.0, 0.0], [0.0, 0.0, 0.05]]):
+        # Held at the true place + aside, the place errs by -aside: true less measured, as delta is of the attitude.
+        error = turn_errors(held(X + aside, R, firm), R) - turn_errors(held(X, R, firm), R)
+        assert_close(error.median(0).values, -follows @ aside, 0.1 * float((follows @ aside).norm()))
 
 
 @cache

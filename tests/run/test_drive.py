@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from jobs_examples import EXCERPT, SHORT_BLOCKS, datasets, run
+from run_examples import EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
 
 from sphereorient.errors import SettingsError
 from sphereorient.methods.settings import Settings, load_settings
@@ -21,7 +21,7 @@ from sphereorient.run.many import tracks_of
 
 @pytest.fixture(scope="module")
 def settings() -> Settings:
-    return load_settings(None, ["refine.chunk_frames=2"])
+    return load_settings(None, SHORT)
 
 
 @pytest.fixture(scope="module")

@@ -59,7 +59,7 @@ def share_found(search: GreySearch, disks: torch.Tensor, R: torch.Tensor) -> flo
 
 
 def test_templates_as_soft_as_the_pictures_find_what_sharp_ones_miss():
-    R = attitudes(40)
+    R = attitudes(24)
     disks = blurred_disks(R)
     soft = GreySearch(texture_of("patches"), GreySearchSettings(), blur=WIDE)
     told = share_found(soft, disks, R)

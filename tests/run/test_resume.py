@@ -11,8 +11,10 @@ import subprocess
 import time
 from pathlib import Path
 
+import h5py
 import pytest
-from jobs_examples import COMMAND, EXCERPT, SHORT_BLOCKS, datasets, run
+from excerpt_examples import shortened
+from run_examples import COMMAND, EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
 
 from sphereorient.errors import OutputError, TrackError
 from sphereorient.methods.settings import load_settings
@@ -22,19 +24,20 @@ from sphereorient.run import run as run_request
 
 @pytest.fixture(scope="module")
 def request_of(tmp_path_factory):
-    settings = load_settings(None, ["refine.chunk_frames=2"])
+    settings = load_settings(None, SHORT)
+    experiment = shortened(tmp_path_factory.mktemp("excerpt") / "copy", 0, 16)
 
     def make(folder: Path, **changed: object) -> Request:
-        return Request(experiment=EXCERPT, out=folder / "track.h5", settings=settings, **changed)
+        return Request(experiment=experiment, out=folder / "track.h5", settings=settings, **changed)
 
     return make
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, request_of) -> Path:
-    """A run that nothing disturbed, and what its parts were like halfway."""
+    """A run that nothing disturbed, what it learnt, and what its parts were like halfway."""
     folder = tmp_path_factory.mktemp("whole")
-    request = request_of(folder)
+    request = request_of(folder, save_learnt=folder / "learnt.h5")
 
     def keep(stage: str, done: int, total: int) -> None:
         if stage == "track" and 0 < done < total and not (folder / "half").exists():
@@ -102,7 +105,9 @@ def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_pa
 def test_parts_of_another_run_are_refused_with_what_differs(whole, tmp_path, request_of):
     request = request_of(tmp_path, cameras=("cam1",))
     parts = halfway(whole, request)
-    with pytest.raises(TrackError, match=r"parts of a run with another cam2\.mkv, cameras; run without --resume"):
+    with pytest.raises(
+        TrackError, match=r"parts of a run with another cam2\.mkv, cameras, empty_cam2\.png; run without --resume"
+    ):
         tracked(request, resume=True)
     told = json.loads((parts.folder / "run.json").read_text())
     told["cam1.mkv"] = "12 34"
@@ -120,19 +125,19 @@ def test_two_runs_do_not_write_one_track(whole, tmp_path, request_of):
 
 
 def test_what_was_learnt_measures_the_same_again(whole, tmp_path, request_of):
-    first = request_of(tmp_path / "a", save_learnt=tmp_path / "learnt.h5")
-    (tmp_path / "a").mkdir()
-    tracked(first)
-    again = request_of(tmp_path, learnt=tmp_path / "learnt.h5")
+    again = request_of(tmp_path, learnt=whole / "learnt.h5")
     tracked(again)
     assert datasets(again.out) == datasets(whole / "track.h5")
 
 
-def test_knowledge_of_other_cameras_is_refused(tmp_path, request_of):
-    one = request_of(tmp_path, cameras=("cam1",), save_learnt=tmp_path / "learnt.h5")
-    tracked(one)
+def test_knowledge_of_other_cameras_is_refused(whole, tmp_path, request_of):
+    other = tmp_path / "other.h5"
+    shutil.copy(whole / "learnt.h5", other)
+    with h5py.File(other, "r+") as file:
+        file.move("cameras/cam2", "cameras/left")
+        file.attrs["cameras"] = ["cam1", "left"]
     with pytest.raises(TrackError, match="expected what was learnt of cam2"):
-        tracked(request_of(tmp_path, learnt=tmp_path / "learnt.h5"))
+        tracked(request_of(tmp_path, learnt=other))
 
 
 @pytest.mark.slow

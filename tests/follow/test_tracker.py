@@ -1,0 +1,91 @@
+"""What the frames before say of the next one, and when two cameras disagree."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from conftest import assert_close
+from refine_examples import f64
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.follow.initialise import Poses
+from sphereorient.follow.tracker import ChunkTracker, _Lane
+from sphereorient.trajectory import Reason
+
+TIMES = [0.0, 1.0, 2.5, 3.2]
+RADIUS_MM = 9.0
+AXIS = f64([0.6, -0.3, 0.74])
+
+
+def angle(time: float, change: float) -> float:
+    return 0.04 * time + 0.5 * change * time**2
+
+
+def place(time: float, change: float) -> Tensor:
+    return f64([1.0, -2.0, 3.0]) + angle(time, change) * f64([2.0, 1.0, -1.0])
+
+
+def seen(time: float, change: float) -> Poses:
+    """The exact pose at a time of a motion whose rates change evenly."""
+    return Poses(
+        position_lab_mm=place(time, change)[None],
+        R_lab_body=so3.exp(angle(time, change) * AXIS)[None],
+        covariance=1e-10 * torch.eye(6, dtype=torch.float64)[None],
+        own_turn=torch.zeros(1, 2, 3, dtype=torch.float64),
+        own_covariance=torch.zeros(1, 2, 3, 3, dtype=torch.float64),
+        own_move=torch.zeros(1, 2, 3, dtype=torch.float64),
+        deviation=torch.ones(1, 2, dtype=torch.float64),
+        score=torch.ones(1, 2, dtype=torch.float64),
+        nll=torch.zeros(1, dtype=torch.float64),
+        use=torch.tensor([True, True]),
+        reason=(Reason.OK, Reason.OK),
+    )
+
+
+def lane(frames: list[int], change: float, times: list[float] = TIMES) -> _Lane:
+    found = _Lane(0, len(times), times)
+    for frame in frames:
+        found.saw(frame, seen(times[frame], change))
+    return found
+
+
+@pytest.mark.parametrize(("frames", "change"), [([1, 2], 0.0), ([0, 1, 2], 0.0), ([0, 1, 2], 0.02)], ids=str)
+def test_the_next_pose_continues_the_motion_whatever_the_times(frames, change):
+    expected = lane(frames, change).expected(3, RADIUS_MM)
+    assert not expected.rough
+    assert_close(expected.position_lab_mm, place(3.2, change), 1e-9)
+    assert_close(expected.R_lab_body, so3.exp(angle(3.2, change) * AXIS), 1e-9)
+
+
+def test_without_a_known_motion_the_ball_is_near_where_it_was():
+    after_a_pause = [0.0, 1.0, 2.0, 9.0]
+    for one in (lane([2], 0.0), lane([0, 2], 0.0), lane([0, 1, 2], 0.0, after_a_pause)):
+        expected = one.expected(3, RADIUS_MM)
+        assert expected.rough
+        assert_close(expected.R_lab_body, one.past[-1][1].R_lab_body[0])
+        assert_close(torch.linalg.inv(expected.place_precision).diagonal().sqrt(), f64([2.7] * 3), 1e-6)
+
+
+def test_after_a_frame_without_the_ball_nothing_is_expected():
+    assert lane([0, 1], 0.0).expected(3, RADIUS_MM) is None
+
+
+def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and_by_more_than_their_errors():
+    x = f64([1.0, 0.0, 0.0])
+
+    def disagree(first: float, second: float, sigma: float = 1e-3, both: bool = True) -> bool:
+        said = SimpleNamespace(
+            own_turn=torch.stack([first * x, second * x])[None],
+            own_covariance=(sigma**2 * torch.eye(3, dtype=torch.float64)).expand(1, 2, 3, 3),
+        )
+        tracker = SimpleNamespace(usual_apart_rad=0.002)
+        return bool(ChunkTracker._contradictory(tracker, said, torch.tensor([[True, both]])))
+
+    assert disagree(0.006, -0.006)
+    assert not disagree(0.006, 0.006), "both would turn the pose alike"
+    assert not disagree(0.003, -0.003), "four times the usual angle are 0.008"
+    assert not disagree(0.006, -0.006, sigma=0.005), "no more than their errors"
+    assert not disagree(0.006, -0.006, both=False), "one camera"
