@@ -26,6 +26,7 @@ from sphereorient.methods.method import Job
 from sphereorient.methods.precise import learn
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import Fitter
+from sphereorient.pose.fit import FittedPoses
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 
@@ -76,7 +77,7 @@ def test_attitudes_err_with_the_place_as_follows_says():
     rig, (X, R) = rig_of(40.0, ("pinhole",)), balls(4, 1, reach_mm=0.0)
     pixels, use = cut(rig, pictures_of(rig, "patches", X, R), X), torch.ones(4, 1, dtype=torch.bool)
 
-    def held(X: Tensor, R: Tensor, precision: Tensor) -> Fit:
+    def held(X: Tensor, R: Tensor, precision: Tensor) -> FittedPoses:
         return fitted(rig, "patches", pixels, X, R, 2.0, use=use, iterations=3, place_precision=precision)
 
     class Held:
