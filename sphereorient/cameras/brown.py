@@ -40,11 +40,11 @@ class PolynomialCamera(CentralCamera):
         lost = torch.isnan(self.undistort(rim_px).detach()).any(-1)
         if bool(lost.any()):
             u, v = rim_px[lost][0].tolist()
-            expected, do = (
+            expected, got = (
                 "a distortion that can be undone in the whole picture",
-                "correct the camera or calibrate again",
+                f"one that folds before ({u:g}, {v:g})",
             )
-            raise CameraError(refusal("k, p", expected=expected, got=f"one that folds before ({u:g}, {v:g})", do=do))
+            raise CameraError(refusal("k, p", expected=expected, got=got, do="correct the camera or calibrate again"))
 
     @property
     def _p_opencv(self) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.cameras.camera import Camera, Rays
-from sphereorient.cameras.checks import as_parameter, check_points
+from sphereorient.cameras.checks import as_parameter, camera_error, check_points
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.model import CentralCamera, Key
 from sphereorient.errors import CameraError, refusal
@@ -52,8 +52,7 @@ class Port:
         for name, (smallest, do) in (least | {"n_fluid": (1.0, index_do)}).items():
             number = float(getattr(self, name).detach())
             if number < smallest:
-                expected = f"{smallest:g} or more"
-                raise CameraError(refusal(f"port, {name}", expected=expected, got=f"{number:.6g}", do=do))
+                raise camera_error(f"port, {name}", f"{smallest:g} or more", f"{number:.6g}", do)
 
     @property
     def normal_lab(self) -> Tensor:
