@@ -175,9 +175,8 @@ def _ports(keys: CalibrationKeys, path: Path) -> dict[str, Port]:
 def _check_ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> None:
     for name in keys.ports:
         if name not in cameras:
-            raise camera_error(
-                f"{path}, ports", "a camera with pictures", f"'{name}'", f"name one of {', '.join(cameras)}"
-            )
+            do = f"name one of {', '.join(cameras)}"
+            raise camera_error(f"{path}, ports", "a camera with pictures", f"'{name}'", do)
     for name in keys.fit_ports:
         if name not in (*PORT_NUMBERS, *PORT_TILT):
             raise CameraError(refuse_unknown(name, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports"))

@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.checks import check_points
+from sphereorient.cameras.checks import camera_error, check_points
 from sphereorient.cameras.model import CentralCamera, Key
-from sphereorient.errors import CameraError, refusal
 
 RADIAL_STEPS = 30  # of Newton held in a bracket; at a fold, where Newton stalls, halving alone leaves 1e-9
 PLANE_STEPS = 8  # of Newton, from the radial solution: what is left is as small as the tangential part
@@ -40,11 +39,8 @@ class PolynomialCamera(CentralCamera):
         lost = torch.isnan(self.undistort(rim_px).detach()).any(-1)
         if bool(lost.any()):
             u, v = rim_px[lost][0].tolist()
-            expected, got = (
-                "a distortion that can be undone in the whole picture",
-                f"one that folds before ({u:g}, {v:g})",
-            )
-            raise CameraError(refusal("k, p", expected=expected, got=got, do="correct the camera or calibrate again"))
+            expected, do = "a distortion that can be undone in the picture", "correct the camera or calibrate again"
+            raise camera_error("k, p", expected, f"one that folds before ({u:g}, {v:g})", do)
 
     @property
     def _p_opencv(self) -> Tensor:
