@@ -120,16 +120,7 @@ def bent(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
 
 
 def straightened(xy_bent: Tensor, k: Tensor, p: Tensor) -> Tensor:
-    """Return the points that `bent` takes to `xy_bent`.
-
-    Args:
-        xy_bent: (..., 2), any unit, from the centre of the distortion.
-        k: as in `bent`.
-        p: as in `bent`.
-
-    Returns:
-        (..., 2), unit of `xy_bent`; NaN, with gradient 0, where no point before the fold is the source.
-    """
+    """Invert `bent`: return the points (..., 2) that it takes to `xy_bent`; NaN, with gradient 0, if there is none."""
     goal, kk, pp = xy_bent, k.to(xy_bent), p.to(xy_bent)
     with torch.no_grad():
         radius = goal.norm(dim=-1, keepdim=True)
