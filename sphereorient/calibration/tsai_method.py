@@ -177,20 +177,15 @@ def _aligned_plane(own: Tensor, sensor_mm: Tensor) -> list[tuple[Tensor, Tensor]
     a = _null_vector(torch.cat([y * flat, y, -x * flat, -x], dim=-1)).reshape(2, 3)
     a = a / torch.linalg.matrix_norm(a[:, :2], ord=2)
     corner, T_xy = _facing(a[:, :2], a[:, 2], flat, sensor_mm)
-    missing = _missing_column(corner)
+    # The missing column makes the rows orthonormal: I - C C^T has rank one.
+    values, vectors = torch.linalg.eigh(torch.eye(2, dtype=corner.dtype) - corner @ corner.mT)
+    missing = vectors[:, 1] * values[1].clamp_min(0).sqrt()
     T = torch.cat([T_xy, T_xy.new_zeros(1)])
     poses = []
     for sign in (1.0, -1.0):
         rows = torch.cat([corner, sign * missing[:, None]], dim=-1)
         poses.append((torch.stack([rows[0], rows[1], torch.linalg.cross(rows[0], rows[1])]), T))
     return poses
-
-
-def _missing_column(corner: Tensor) -> Tensor:
-    """Return (2,) that makes the rows of (2, 3) orthonormal: I - C C^T has rank one."""
-    values, vectors = torch.linalg.eigh(torch.eye(2, dtype=corner.dtype) - corner @ corner.mT)
-    missing: Tensor = vectors[:, 1] * values[1].clamp_min(0).sqrt()
-    return missing
 
 
 def _facing(rows: Tensor, T_xy: Tensor, own: Tensor, sensor_mm: Tensor) -> tuple[Tensor, Tensor]:
