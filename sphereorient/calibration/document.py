@@ -17,9 +17,10 @@ from torch import Tensor
 
 from sphereorient.calibration.targets import CalibrationTarget, plate_from_entry
 from sphereorient.cameras import Port
+from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.io.cameras_yaml import PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
-from sphereorient.errors import CameraError, refusal
+from sphereorient.errors import CameraError
 from sphereorient.files.whole_file import TABLE_BYTES, read_whole
 from sphereorient.files.yaml_file import read_document, refuse_unknown, short, validated
 
@@ -108,11 +109,11 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
     keys = validated(CalibrationKeys, read_document(path, SCHEMA, CameraError), str(path), CameraError)
     if bool(keys.pictures) == bool(keys.points):
         got, do = ("both" if keys.points else "neither"), "name pictures of a plate, or tables of points"
-        raise _refused(f"{path}, pictures, points", "one of them", got, do)
+        raise camera_error(f"{path}, pictures, points", "one of them", got, do)
     numbers = tuple(sorted({one.pose for one in keys.pictures})) or (0,)
     pictures = _pictures(keys, path, numbers)
     if keys.pictures and keys.plate is None:
-        raise _refused(f"{path}, plate", "a plate", "none", "write what the plate is: type, columns, rows, pitch")
+        raise camera_error(f"{path}, plate", "a plate", "none", "write what the plate is: type, columns, rows, pitch")
     document = CalibrationDocument(
         path=path,
         image_size=keys.image_size,
@@ -141,12 +142,12 @@ def read_points(path: Path) -> NDArray[np.float64]:
         text = content.decode("utf-8-sig")
         rows = list(csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True))
     except (UnicodeDecodeError, csv.Error) as fault:
-        raise _refused(str(path), "a table", "a file that is not CSV", "save the table as CSV") from fault
+        raise camera_error(str(path), "a table", "a file that is not CSV", "save the table as CSV") from fault
     known = [name.strip() for name in rows[0] if name is not None] if rows else []
     missing = [name for name in COLUMNS if name not in known]
     if missing:
         expected, do = f"a first line {','.join(COLUMNS)} and one row a point", "write mm in the lab, and px"
-        raise _refused(str(path), expected, f"no {', '.join(missing)}" if rows else "no rows", do)
+        raise camera_error(str(path), expected, f"no {', '.join(missing)}" if rows else "no rows", do)
     return np.array([[_number(path, k, row, name) for name in COLUMNS] for k, row in enumerate(rows)])
 
 
@@ -157,7 +158,7 @@ def _number(path: Path, k: int, row: dict[str, str], name: str) -> float:
         value = float("nan")
     if not np.isfinite(value):
         do = "correct the number, or leave the point out"
-        raise _refused(f"{path}, row {k + 1}, {name}", "a number", short(row.get(name)), do)
+        raise camera_error(f"{path}, row {k + 1}, {name}", "a number", short(row.get(name)), do)
     return value
 
 
@@ -174,15 +175,16 @@ def _ports(keys: CalibrationKeys, path: Path) -> dict[str, Port]:
 def _check_ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> None:
     for name in keys.ports:
         if name not in cameras:
-            raise _refused(f"{path}, ports", "a camera with pictures", f"'{name}'", f"name one of {', '.join(cameras)}")
+            do = f"name one of {', '.join(cameras)}"
+            raise camera_error(f"{path}, ports", "a camera with pictures", f"'{name}'", do)
     for name in keys.fit_ports:
         if name not in (*PORT_NUMBERS, *PORT_TILT):
             raise CameraError(refuse_unknown(name, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports"))
     if keys.fit_ports and not keys.ports:
         do = "write under `ports` where the walls are, as well as you know"
-        raise _refused(f"{path}, fit_ports", "ports to fit", "none", do)
+        raise camera_error(f"{path}, fit_ports", "ports to fit", "none", do)
     if len(set(keys.fit_ports)) < len(keys.fit_ports):
-        raise _refused(f"{path}, fit_ports", "different names", ", ".join(keys.fit_ports), "name each once")
+        raise camera_error(f"{path}, fit_ports", "different names", ", ".join(keys.fit_ports), "name each once")
 
 
 def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> tuple[Picture, ...]:
@@ -191,11 +193,11 @@ def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> tu
         row, files = numbers.index(entry.pose), entry.model_extra or {}
         if not files:
             do = "name a picture, such as cam1: cam1_00.png, or leave the entry out"
-            raise _refused(f"{path}, pictures, {k}", "a picture", "none", do)
+            raise camera_error(f"{path}, pictures, {k}", "a picture", "none", do)
         for name, file in files.items():
             if (row, name) in seen:
                 got, do = f"a second one of pose {entry.pose}", "give every pose its own number"
-                raise _refused(f"{path}, pictures, {k}, {name}", "one picture of a pose", got, do)
+                raise camera_error(f"{path}, pictures, {k}, {name}", "one picture of a pose", got, do)
             seen.add((row, name))
             pictures.append(Picture(camera=name, row=row, path=path.parent / file))
     return tuple(pictures)
@@ -205,19 +207,15 @@ def _surveyed(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> di
     where = f"{path}, surveyed"
     if keys.surveyed is None:
         do = "write the plate's pose in the lab in one picture: pose, R_lab_plate, T_lab_plate"
-        raise _refused(where, "a pose that defines the lab frame", "none", do)
+        raise camera_error(where, "a pose that defines the lab frame", "none", do)
     if keys.surveyed.pose not in numbers:
         got = f"pose {keys.surveyed.pose}, without a picture"
-        raise _refused(where, "a pose with a picture", got, "name a pose that was filmed")
+        raise camera_error(where, "a pose with a picture", got, "name a pose that was filmed")
     R = torch.tensor(keys.surveyed.R_lab_plate, dtype=torch.float64)
     off = float((R @ R.mT - torch.eye(3, dtype=torch.float64)).abs().max())
     if off > ROTATION_TOLERANCE or float(torch.linalg.det(R)) < 0:
         got = "a reflection" if off <= ROTATION_TOLERANCE else f"rows that are {off:.2g} from it"
         do = "write the plate's x, y and z axis in the lab as its columns"
-        raise _refused(f"{where}, R_lab_plate", "a rotation", got, do)
+        raise camera_error(f"{where}, R_lab_plate", "a rotation", got, do)
     U, _, Vh = torch.linalg.svd(R)
     return {numbers.index(keys.surveyed.pose): (U @ Vh, torch.tensor(keys.surveyed.T_lab_plate, dtype=torch.float64))}
-
-
-def _refused(name: str, expected: str, got: str, do: str) -> CameraError:
-    return CameraError(refusal(name, expected=expected, got=got, do=do))

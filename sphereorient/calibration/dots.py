@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sphereorient.calibration.ellipse import Dots, fit_ellipses, half_box
 from sphereorient.calibration.targets import Floats
+from sphereorient.cameras.checks import camera_error
 from sphereorient.errors import CameraError, refusal
 
 _Chain = list[tuple[Floats, Floats, float]]  # centre, shape and area of a blob, one for each grey level
@@ -81,7 +82,7 @@ def as_grey(picture: NDArray[np.generic]) -> NDArray[np.float32]:
         raise CameraError(refusal("plate picture", expected="(H, W) of 16 px or more", got=f"{picture.shape}", do=do))
     grey = picture.astype(np.float32)
     if not np.isfinite(grey).all():
-        raise CameraError(refusal("plate picture", expected="grey values", got="NaN", do="export it again"))
+        raise camera_error("plate picture", "grey values", "NaN", "export it again")
     return grey
 
 

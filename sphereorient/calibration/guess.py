@@ -17,8 +17,8 @@ from sphereorient.calibration.document import CalibrationDocument
 from sphereorient.calibration.plate_view import PlateView
 from sphereorient.calibration.tsai_method import calibrate_tsai
 from sphereorient.cameras import Camera, Port, PortCamera
+from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.io.cameras_yaml import MODELS
-from sphereorient.errors import CameraError, refusal
 
 POINTS_MIN = 6  # of a picture that is used
 VIEWS_MIN = 3  # of a camera: two planes do not determine the focal length
@@ -96,9 +96,8 @@ def _zhang(
     """Return focal length (px along v), centre (px) and the plate's poses in the frame of one camera."""
     rows = [row for row, view in sorted(seen.items()) if len(view) >= POINTS_MIN]
     if len(rows) < VIEWS_MIN:
-        do = "take pictures of the plate in more poses, tilted differently"
-        expected, got = f"{VIEWS_MIN} pictures or more with {POINTS_MIN} points of the plate", f"{len(rows)}"
-        raise CameraError(refusal(name, expected=expected, got=got, do=do))
+        got, do = f"{len(rows)}", "take pictures of the plate in more poses, tilted differently"
+        raise camera_error(name, f"{VIEWS_MIN} pictures or more with {POINTS_MIN} points of the plate", got, do)
     points = [seen[row].points_plate_mm.astype(np.float32) for row in rows]
     pixels = [seen[row].uv_px.astype(np.float32) for row in rows]
     (width, height), (pitch_u, pitch_v) = document.image_size, document.pixel_pitch_mm
@@ -137,8 +136,7 @@ def _chained(
     missing = [name for name in relative if name not in placed]
     if missing:
         do = "take a picture of one pose with both cameras, or let each see a surveyed pose"
-        got = "none that ties it to the surveyed pose"
-        raise CameraError(refusal(missing[0], expected="a picture of a known pose", got=got, do=do))
+        raise camera_error(missing[0], "a picture of a known pose", "none that ties it to the surveyed pose", do)
     return placed, plate
 
 

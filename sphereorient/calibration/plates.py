@@ -19,6 +19,7 @@ from sphereorient.calibration.document import CalibrationDocument, Picture, load
 from sphereorient.calibration.guess import guess_from_points, guess_rig
 from sphereorient.calibration.plate_view import PlateView, placed
 from sphereorient.cameras import Camera, ParameterCovariance
+from sphereorient.cameras.checks import camera_error
 from sphereorient.errors import CameraError, refusal
 from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
@@ -138,12 +139,10 @@ def _read_grey(path: Path, image_size: tuple[int, int]) -> NDArray[Any]:
     # A file that claims more pixels than any camera has is not decoded.
     picture = decoded_grey(content) if pixels is not None and pixels <= LARGEST_PIXELS else None
     if picture is None:
-        got = "a file that is no picture or too large"
-        raise CameraError(refusal(str(path), expected="a picture", got=got, do="save it as PNG"))
+        raise camera_error(str(path), "a picture", "a file that is no picture or too large", "save it as PNG")
     if picture.shape != image_size[::-1]:
         expected, got = (f"{w} x {h} px" for w, h in (image_size, picture.shape[::-1]))
-        do = "correct image_size, or leave the picture out"
-        raise CameraError(refusal(str(path), expected=expected, got=got, do=do))
+        raise camera_error(str(path), expected, got, "correct image_size, or leave the picture out")
     return np.asarray(picture)
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.cameras import Camera, ParameterCovariance
-from sphereorient.cameras.checks import check_points
+from sphereorient.cameras.checks import camera_error, check_points
 from sphereorient.cameras.parameters import with_parameters
 from sphereorient.errors import CameraError, ShapeError, refusal
 
@@ -117,8 +117,7 @@ def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tenso
         part = vectors[:, 0].abs()
         loose = [name for name, share in zip(names, part.tolist(), strict=True) if share > 0.3 * float(part.max())]
         do = "add points at other depths, tilt the plate, or hold some of these parameters"
-        got = f"no information on {', '.join(loose)}"
-        raise CameraError(refusal("points", expected="a determined camera", got=got, do=do))
+        raise camera_error("points", "a determined camera", f"no information on {', '.join(loose)}", do)
     inverse: Tensor = (vectors / values.clamp_min(1e-14)) @ vectors.mT
     whole: Tensor = scale[:, None] * inverse * scale
     return (whole + whole.mT) / 2
@@ -177,8 +176,7 @@ def checked_points(x_lab_mm: Tensor, uv_px: Tensor) -> tuple[Tensor, Tensor]:
             raise ShapeError(refusal(name, expected=f"shape (n, {size})", got=got, do=do))
         bad = (~torch.isfinite(numbers)).any(-1).nonzero()[:, 0].tolist()
         if bad:
-            do = "leave such points out"
-            raise CameraError(refusal(f"{name}, row {bad[0]}", expected="finite numbers", got="others", do=do))
+            raise camera_error(f"{name}, row {bad[0]}", "finite numbers", "others", "leave such points out")
     if len(x_lab_mm) != len(uv_px):
         got, do = f"{len(x_lab_mm)} points and {len(uv_px)} pixels", "pass one pixel per point"
         raise ShapeError(refusal("uv_px", expected="as many rows as x_lab_mm", got=got, do=do))

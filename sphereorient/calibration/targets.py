@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.cameras.checks import camera_error
 from sphereorient.errors import CameraError, refusal
 from sphereorient.files.yaml_file import short
 
@@ -162,8 +163,7 @@ class CharucoBoard(CalibrationTarget):
             raise _refused("plate, dictionary", "a name of OpenCV's, such as DICT_4X4_50", name, do)
         held, least = len(self._markers().bytesList), self.columns * self.rows // 2
         if held < least:
-            got = f"{held} in {name}"
-            raise CameraError(refusal("plate, dictionary", expected=f"{least} markers or more", got=got, do=do))
+            raise camera_error("plate, dictionary", f"{least} markers or more", f"{held} in {name}", do)
 
     def _markers(self) -> cv2.aruco.Dictionary:
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
@@ -192,8 +192,7 @@ class CircleGrid(CalibrationTarget):
         """Refuse circles that touch, and an asymmetric grid with an even number of rows."""
         super().__post_init__()
         if self.asymmetric and self.rows % 2 == 0:  # the same upside down, and OpenCV does not find it
-            do = "count the rows, or cover one of them"
-            raise CameraError(refusal("plate, rows", expected="an odd number", got=f"{self.rows}", do=do))
+            raise camera_error("plate, rows", "an odd number", f"{self.rows}", "count the rows, or cover one of them")
         nearest = self.pitch_mm * (np.sqrt(2) if self.asymmetric else 1)
         if self.dot_diameter_mm >= nearest:
             got, do = f"{self.dot_diameter_mm:g} mm, {nearest:g} mm apart", "measure the plate"

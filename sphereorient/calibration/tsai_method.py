@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.calibration.solve import checked_points, fit_to_points, rms_px
-from sphereorient.cameras.checks import check_image_size, check_positive
+from sphereorient.cameras.checks import camera_error, check_image_size, check_positive
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION
 from sphereorient.cameras.tsai import TsaiCamera
@@ -142,9 +142,7 @@ def _aligned(points: Tensor, sensor_mm: Tensor) -> list[_Start]:
     """Return the poses without T_z that put each point in the direction of its pixel."""
     frame = _Frame.of(points)
     if frame.narrow < LINE:
-        raise CameraError(
-            refusal("x_lab_mm", expected="points in a plane or in space", got="points on a line", do=_ADD)
-        )
+        raise camera_error("x_lab_mm", "points in a plane or in space", "points on a line", _ADD)
     flat = frame.relief < FLAT
     _check_count(points, POINTS_OF_PLANE if flat else POINTS_OF_SPACE, "in one plane" if flat else "in space")
     own = (points - frame.middle_lab_mm) @ frame.R_own_lab.mT  # own axes: well scaled equations
@@ -179,20 +177,15 @@ def _aligned_plane(own: Tensor, sensor_mm: Tensor) -> list[tuple[Tensor, Tensor]
     a = _null_vector(torch.cat([y * flat, y, -x * flat, -x], dim=-1)).reshape(2, 3)
     a = a / torch.linalg.matrix_norm(a[:, :2], ord=2)
     corner, T_xy = _facing(a[:, :2], a[:, 2], flat, sensor_mm)
-    missing = _missing_column(corner)
+    # The missing column makes the rows orthonormal: I - C C^T has rank one.
+    values, vectors = torch.linalg.eigh(torch.eye(2, dtype=corner.dtype) - corner @ corner.mT)
+    missing = vectors[:, 1] * values[1].clamp_min(0).sqrt()
     T = torch.cat([T_xy, T_xy.new_zeros(1)])
     poses = []
     for sign in (1.0, -1.0):
         rows = torch.cat([corner, sign * missing[:, None]], dim=-1)
         poses.append((torch.stack([rows[0], rows[1], torch.linalg.cross(rows[0], rows[1])]), T))
     return poses
-
-
-def _missing_column(corner: Tensor) -> Tensor:
-    """Return (2,) that makes the rows of (2, 3) orthonormal: I - C C^T has rank one."""
-    values, vectors = torch.linalg.eigh(torch.eye(2, dtype=corner.dtype) - corner @ corner.mT)
-    missing: Tensor = vectors[:, 1] * values[1].clamp_min(0).sqrt()
-    return missing
 
 
 def _facing(rows: Tensor, T_xy: Tensor, own: Tensor, sensor_mm: Tensor) -> tuple[Tensor, Tensor]:
@@ -250,7 +243,7 @@ def _camera(start: _Start, image_size: tuple[int, int], pitch: Tensor) -> TsaiCa
 
 def _check_count(points: Tensor, least: int, where: str) -> None:
     if len(points) < least:
-        raise CameraError(refusal("points", expected=f"{least} or more {where}", got=f"{len(points)}", do=_ADD))
+        raise camera_error("points", f"{least} or more {where}", f"{len(points)}", _ADD)
 
 
 def _no_start(points: Tensor) -> str:
@@ -264,9 +257,8 @@ def _no_start(points: Tensor) -> str:
 def _check_fit(camera: TsaiCamera, points: Tensor, pixels: Tensor) -> None:
     miss_px, diagonal_px = rms_px(camera, points, pixels), float(torch.tensor(camera.image_size).double().norm())
     if not miss_px <= MISFIT * diagonal_px:
-        do = "check their order, their signs and the pixel pitch"
-        expected, got = f"pixels of these points, to {MISFIT * diagonal_px:.2g} px", f"rms {miss_px:.3g} px"
-        raise CameraError(refusal("points", expected=expected, got=got, do=do))
+        got, do = f"rms {miss_px:.3g} px", "check their order, their signs and the pixel pitch"
+        raise camera_error("points", f"pixels of these points, to {MISFIT * diagonal_px:.2g} px", got, do)
     covariance = camera.covariance
     sigma_mm = 0.0 if covariance is None else covariance.sigmas["f"]
     if not sigma_mm <= UNCERTAIN_F * float(camera.f_mm):

@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.checks import check_points
+from sphereorient.cameras.checks import camera_error, check_points
 from sphereorient.cameras.model import CentralCamera, Key
-from sphereorient.errors import CameraError, refusal
 
 RADIAL_STEPS = 30  # of Newton held in a bracket; at a fold, where Newton stalls, halving alone leaves 1e-9
 PLANE_STEPS = 8  # of Newton, from the radial solution: what is left is as small as the tangential part
@@ -40,11 +39,8 @@ class PolynomialCamera(CentralCamera):
         lost = torch.isnan(self.undistort(rim_px).detach()).any(-1)
         if bool(lost.any()):
             u, v = rim_px[lost][0].tolist()
-            expected, do = (
-                "a distortion that can be undone in the whole picture",
-                "correct the camera or calibrate again",
-            )
-            raise CameraError(refusal("k, p", expected=expected, got=f"one that folds before ({u:g}, {v:g})", do=do))
+            expected, do = "a distortion that can be undone in the picture", "correct the camera or calibrate again"
+            raise camera_error("k, p", expected, f"one that folds before ({u:g}, {v:g})", do)
 
     @property
     def _p_opencv(self) -> Tensor:
@@ -124,16 +120,7 @@ def bent(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
 
 
 def straightened(xy_bent: Tensor, k: Tensor, p: Tensor) -> Tensor:
-    """Return the points that `bent` takes to `xy_bent`.
-
-    Args:
-        xy_bent: (..., 2), any unit, from the centre of the distortion.
-        k: as in `bent`.
-        p: as in `bent`.
-
-    Returns:
-        (..., 2), unit of `xy_bent`; NaN, with gradient 0, where no point before the fold is the source.
-    """
+    """Invert `bent`: return the points (..., 2) that it takes to `xy_bent`; NaN, with gradient 0, if there is none."""
     goal, kk, pp = xy_bent, k.to(xy_bent), p.to(xy_bent)
     with torch.no_grad():
         radius = goal.norm(dim=-1, keepdim=True)

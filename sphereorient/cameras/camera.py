@@ -22,7 +22,8 @@ class Camera(Protocol):
     """A calibrated camera.
 
     All methods take any leading shape and compute in the dtype of the argument. They are differentiable in the argument
-    and in those camera parameters that require gradients. A point without an image is NaN, with gradient 0.
+    and in those camera parameters that require gradients. A point without an image is NaN, with gradient 0. Pixels are
+    (u, v), also outside the picture. Arguments with another last axis raise ShapeError.
     """
 
     @property

@@ -24,25 +24,25 @@ def as_parameter(name: str, value: Tensor | float | Sequence[float], *shape: int
     # Not as_tensor alone: it would round plain numbers to float32 first.
     tensor = value.to(torch.float64) if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
     if tuple(tensor.shape) != shape:
-        raise _refused(name, f"shape {shape}", f"shape {tuple(tensor.shape)}")
+        raise camera_error(name, f"shape {shape}", f"shape {tuple(tensor.shape)}")
     if not bool((tensor.detach().abs() <= LARGEST).all()):
-        raise _refused(name, "finite numbers", str(tensor.detach().tolist()))
+        raise camera_error(name, "finite numbers", str(tensor.detach().tolist()))
     return tensor
 
 
 def check_positive(name: str, value: Tensor) -> None:
     """Refuse numbers that are zero or negative (CameraError)."""
     if not bool((value.detach() > 0).all()):
-        raise _refused(name, "above zero", str(value.detach().tolist()))
+        raise camera_error(name, "above zero", str(value.detach().tolist()))
 
 
 def check_image_size(name: str, size: Sequence[int]) -> None:
     """Refuse a picture size that is not two positive whole numbers of at most MAX_SIDE_PX (CameraError)."""
     do = "write width and height in pixels"
     if len(size) != 2 or not all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in size):
-        raise _refused(name, "two whole numbers above zero", short(tuple(size)), do)
+        raise camera_error(name, "two whole numbers above zero", short(tuple(size)), do)
     if max(size) > MAX_SIDE_PX:
-        raise _refused(name, f"at most {MAX_SIDE_PX} px a side", short(tuple(size)), do)
+        raise camera_error(name, f"at most {MAX_SIDE_PX} px a side", short(tuple(size)), do)
 
 
 def check_rotation(name: str, R: Tensor) -> None:
@@ -53,7 +53,7 @@ def check_rotation(name: str, R: Tensor) -> None:
     if error > ROTATION_TOLERANCE or det < 0:
         expected = f"a rotation, |R R^T - I| below {ROTATION_TOLERANCE:g} and det 1"
         do = "write R_cam_lab row by row with at least 7 digits, x right, y down, z forward"
-        raise _refused(name, expected, f"|R R^T - I| = {error:.2g}, det = {det:.6g}", do)
+        raise camera_error(name, expected, f"|R R^T - I| = {error:.2g}, det = {det:.6g}", do)
 
 
 def check_points(name: str, points: Tensor, size: int) -> None:
@@ -64,5 +64,6 @@ def check_points(name: str, points: Tensor, size: int) -> None:
         raise ShapeError(refusal(name, expected="a floating-point tensor", got=str(points.dtype), do=do))
 
 
-def _refused(name: str, expected: str, got: str, do: str = "correct the camera") -> CameraError:
+def camera_error(name: str, expected: str, got: str, do: str = "correct the camera") -> CameraError:
+    """Return a CameraError worded by `refusal`."""
     return CameraError(refusal(name, expected=expected, got=got, do=do))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sphereorient.cameras.checks import camera_error
 from sphereorient.errors import CameraError, refusal
 
 ASYMMETRY = 1e-6  # of the correlation matrix: covariances written with seven digits pass
@@ -30,9 +31,8 @@ class ParameterCovariance:
             got, do = ", ".join(self.names) or "none", "name every parameter once"
             raise CameraError(refusal("covariance, parameters", expected="different names", got=got, do=do))
         if tuple(matrix.shape) != (size, size):
-            expected, got = f"{size} rows of {size} numbers", f"shape {tuple(matrix.shape)}"
-            do = "write one row and one column for each parameter"
-            raise CameraError(refusal("covariance, matrix", expected=expected, got=got, do=do))
+            got, do = f"shape {tuple(matrix.shape)}", "write one row and one column for each parameter"
+            raise camera_error("covariance, matrix", f"{size} rows of {size} numbers", got, do)
         _check_covariance(matrix)
 
     @property
@@ -52,8 +52,7 @@ class ParameterCovariance:
 def _check_covariance(matrix: Tensor) -> None:
     do = "calibrate again, or remove the covariance"
     if not bool(torch.isfinite(matrix).all()) or bool((matrix.diagonal() < 0).any()):
-        expected, got = "finite numbers, none below zero on the diagonal", "others"
-        raise CameraError(refusal("covariance, matrix", expected=expected, got=got, do=do))
+        raise camera_error("covariance, matrix", "finite numbers, none below zero on the diagonal", "others", do)
     sigma = matrix.diagonal().sqrt()
     scale = torch.where(sigma > 0, sigma, torch.ones_like(sigma))  # parameters of different units: judge correlations
     correlation = matrix / (scale[:, None] * scale)

@@ -129,16 +129,7 @@ class CentralCamera(CameraModel):
         """(2,), pixels per unit of slope X/Z and Y/Z on the axis."""
 
     def project(self, x_lab_mm: Tensor) -> Tensor:
-        """Project lab points to pixels, also outside the picture.
-
-        Args:
-            x_lab_mm: (..., 3), lab, mm.
-
-        Returns:
-            (..., 2) as (u, v), px; NaN for points that are not in front of the camera.
-
-        Raises:
-            ShapeError: the last axis is not 3.
+        """Project lab points (..., 3), mm, to pixels (..., 2); NaN for points that are not in front of the camera.
 
         Source: docs/conventions.md (X_cam = R X_lab + T, x_u = f X/Z).
         """
@@ -152,11 +143,7 @@ class CentralCamera(CameraModel):
         return torch.where(before, uv_px, torch.full_like(uv_px, torch.nan))
 
     def rays(self, uv_px: Tensor) -> Rays:
-        """Return the rays (..., 3) of pixels (..., 2), which start at the projection centre.
-
-        Raises:
-            ShapeError: the last axis is not 2.
-        """
+        """Return the rays (..., 3) of pixels (..., 2), which start at the projection centre."""
         check_points("uv_px", uv_px, 2)
         slope = (self.undistort(uv_px) - self.centre_px.to(uv_px)) / self.focal_px.to(uv_px)
         direction_cam = torch.cat([slope, torch.ones_like(slope[..., :1])], dim=-1)

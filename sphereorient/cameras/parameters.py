@@ -18,6 +18,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras.camera import Camera
+from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.model import CameraModel
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.errors import CameraError, check_tail, refusal
@@ -63,8 +64,7 @@ def with_parameters(camera: AnyCamera, names: Sequence[str], delta: Tensor) -> A
             raise CameraError(refuse_unknown(name, known, "parameter"))
     change = dict(zip(names, delta.to(torch.float64).unbind(), strict=True))
     if len(change) < len(names):
-        got, do = ", ".join(names), "name every parameter once"
-        raise CameraError(refusal("parameters", expected="different names", got=got, do=do))
+        raise camera_error("parameters", "different names", ", ".join(names), "name every parameter once")
     return cast(AnyCamera, _changed(camera, change))
 
 

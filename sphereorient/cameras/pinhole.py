@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
+from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.model import CentralCamera, Key
 from sphereorient.errors import CameraError, refusal
 
@@ -61,6 +62,5 @@ def focal_of_field(height_px: int, vfov_deg: float) -> float:
         CameraError: the angle is not between 0 and 180 degrees.
     """
     if not 0.0 < vfov_deg < 180.0:
-        got = f"{vfov_deg:g}"
-        raise CameraError(refusal("vfov_deg", expected="an angle between 0 and 180", got=got, do="correct the camera"))
+        raise camera_error("vfov_deg", "an angle between 0 and 180", f"{vfov_deg:g}", "correct the camera")
     return 0.5 * height_px / math.tan(math.radians(vfov_deg) / 2)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.cameras.camera import Camera, Rays
-from sphereorient.cameras.checks import as_parameter, check_points
+from sphereorient.cameras.checks import as_parameter, camera_error, check_points
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.model import CentralCamera, Key
 from sphereorient.errors import CameraError, refusal
@@ -52,8 +52,7 @@ class Port:
         for name, (smallest, do) in (least | {"n_fluid": (1.0, index_do)}).items():
             number = float(getattr(self, name).detach())
             if number < smallest:
-                expected = f"{smallest:g} or more"
-                raise CameraError(refusal(f"port, {name}", expected=expected, got=f"{number:.6g}", do=do))
+                raise camera_error(f"port, {name}", f"{smallest:g} or more", f"{number:.6g}", do)
 
     @property
     def normal_lab(self) -> Tensor:
@@ -67,11 +66,9 @@ class Port:
         return self.offset_mm + self.thickness_mm
 
     def refract(self, air: Rays) -> Rays:
-        """Refract rays in air (lab; each is taken as a whole line) into the liquid.
+        """Refract rays in air (lab; each is taken as a whole line) into the liquid, from the wall's liquid side.
 
-        Returns:
-            Rays with origin (..., 3) on the wall's liquid side, mm, and direction (..., 3); NaN, with gradient 0, for
-            rays that do not go towards the wall.
+        Rays that do not go towards the wall are NaN, with gradient 0.
 
         Source: Snell's law: the direction's part along the wall is divided by the index (docs/conventions.md).
         """
@@ -93,14 +90,9 @@ class Port:
         return Rays(origin_lab_mm=torch.where(passes, origin, nan), direction_lab=torch.where(passes, direction, nan))
 
     def entry_point(self, x_lab_mm: Tensor, centre_lab_mm: Tensor) -> Tensor:
-        """Return where light from points in the liquid leaves the wall on its way to the camera's centre in air.
+        """Return where light from points in the liquid (..., 3) leaves the wall on its way to a centre in air (3,).
 
-        Args:
-            x_lab_mm: (..., 3), lab, mm, in the liquid.
-            centre_lab_mm: (3,), lab, mm, in the air.
-
-        Returns:
-            (..., 3), lab, mm, on the wall's air side; NaN, with gradient 0, for points that are not in the liquid.
+        All in the lab, mm. NaN, with gradient 0, for points that are not in the liquid.
 
         Source: Snell's law in the plane of normal and point (textbook), solved for the share of the way along the wall.
         """
@@ -194,23 +186,11 @@ class PortCamera:
         return self.camera.distort(uv_px)
 
     def rays(self, uv_px: Tensor) -> Rays:
-        """Return the rays in the liquid of pixels (..., 2); they start on the wall's liquid side.
-
-        NaN where the pixel does not look at the wall.
-
-        Raises:
-            ShapeError: the last axis is not 2.
-        """
+        """Return the rays in the liquid of pixels (..., 2), from the wall's liquid side; NaN beside the wall."""
         return self.port.refract(self.camera.rays(uv_px))
 
     def project(self, x_lab_mm: Tensor) -> Tensor:
-        """Project points in the liquid (..., 3), lab, mm, to pixels (..., 2), also outside the picture.
-
-        NaN for points that are not in the liquid.
-
-        Raises:
-            ShapeError: the last axis is not 3.
-        """
+        """Project points in the liquid (..., 3), lab, mm, to pixels (..., 2); NaN for points outside the liquid."""
         check_points("x_lab_mm", x_lab_mm, 3)
         if isinstance(self.camera, CentralCamera):
             return self.camera.project(self.port.entry_point(x_lab_mm, self.camera.centre_lab_mm))

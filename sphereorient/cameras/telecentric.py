@@ -29,21 +29,13 @@ class TelecentricCamera(CameraModel):
     )
 
     def project(self, x_lab_mm: Tensor) -> Tensor:
-        """Project lab points (..., 3), mm, to pixels (..., 2) as (u, v), also outside the picture.
-
-        Raises:
-            ShapeError: the last axis is not 3.
-        """
+        """Project lab points (..., 3), mm, to pixels (..., 2)."""
         check_points("x_lab_mm", x_lab_mm, 3)
         x_cam_mm = x_lab_mm @ self.R_cam_lab[:2].to(x_lab_mm).mT + self.T_cam_lab_mm[:2].to(x_lab_mm)
         return x_cam_mm / self.scale_mm_px.to(x_lab_mm) + self.centre_px.to(x_lab_mm)
 
     def rays(self, uv_px: Tensor) -> Rays:
-        """Return the rays of pixels (..., 2), which start in the camera's plane z = 0 and have one direction.
-
-        Raises:
-            ShapeError: the last axis is not 2.
-        """
+        """Return the rays of pixels (..., 2), which start in the camera's plane z = 0 and have one direction."""
         check_points("uv_px", uv_px, 2)
         x_cam_mm = (uv_px - self.centre_px.to(uv_px)) * self.scale_mm_px.to(uv_px)
         x_cam_mm = torch.cat([x_cam_mm, torch.zeros_like(x_cam_mm[..., :1])], dim=-1)

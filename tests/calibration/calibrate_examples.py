@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,12 +13,9 @@ import cv2
 import numpy as np
 import torch
 import yaml
-from conftest import REPO
 from numpy.typing import NDArray
-from torch import Tensor
-
-sys.path.append(str(REPO / "tests" / "cameras"))
 from plate_drawing import SIZE, Scene
+from torch import Tensor
 
 from sphereorient.cameras import Camera, PinholeCamera
 

@@ -51,7 +51,7 @@ def surveyed(**changes):
 MIRROR = [[1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]]
 TWICE = [{"pose": 0, "cam1": "a.png"}, {"pose": 0, "cam1": "b.png"}]
 FAULTS = [
-    ({"surveyed": None}, r"surveyed: expected a pose that defines the lab frame, got none; say where"),
+    ({"surveyed": None}, r"surveyed: expected a pose that defines the lab frame, got none; write the plate's pose"),
     (surveyed(pose=77), r"surveyed: expected a pose with a picture, got pose 77, without a picture; name"),
     (surveyed(R_lab_plate=MIRROR), r"R_lab_plate: expected a rotation, got a reflection"),
     (surveyed(R_lab_plate=[[1.0, 0, 0], [0, 1.1, 0], [0, 0, 1.0]]), r"R_lab_plate: expected a rotation"),
@@ -60,9 +60,9 @@ FAULTS = [
     ({"plate": {"type": "dotz"}}, r"plate: expected .*type.*got 'dotz'"),
     ({"pictures": None}, r"pictures, points: expected one of them, got neither"),
     ({"points": {"cam1": "p.csv"}}, r"pictures, points: expected one of them, got both"),
-    ({"pictures": [{"cam1": "a.png"}]}, r"pictures, 0, pose: expected a whole number, got None"),
+    ({"pictures": [{"cam1": "a.png"}]}, r"pictures.0.pose: expected a value, got none"),
     ({"pictures": [{"pose": 0}]}, r"pictures, 0: expected a picture, got none"),
-    ({"pictures": [{"pose": 0, "cam1": 7}]}, r"pictures, 0, cam1: expected a file, got 7"),
+    ({"pictures": [{"pose": 0, "cam1": 7}]}, r"pictures.0.cam1: expected a valid string, got 7"),
     ({"pictures": TWICE}, r"pictures, 1, cam1: expected one picture of a pose, got a second one of pose 0"),
     ({"image_size": [0, 400]}, r"image_size.0.*greater than 0, got 0"),
     ({"pixel_pitch": [0.02, float("nan")]}, r"pixel_pitch.1"),

@@ -241,7 +241,7 @@ def test_an_impossible_plate_is_refused_in_one_line(change: dict[str, object], s
 def test_a_missing_key_is_named() -> None:
     with pytest.raises(CameraError, match="no pitch"):
         plate_from_entry({key: value for key, value in ENTRY.items() if key != "pitch"})
-    with pytest.raises(CameraError, match="write what the plate is"):
+    with pytest.raises(CameraError, match="write the type of the plate"):
         plate_from_entry("dots")
 
 

@@ -154,7 +154,7 @@ def test_refine_with_a_track_repairs_bumped_cameras(tmp_path, monkeypatch, capsy
     given = ("calibrate", tmp_path / "cameras.yaml", "--refine-with", tmp_path / "track.h5", "--out", repaired)
     code, out, _ = run(monkeypatch, capsys, *given)
     assert code == 0
-    assert "cam2: turned by 0.2" in out
+    assert "cam2: rotated by 0.2" in out
     assert "not determined by the sphere, kept: cam1: all (the lab frame)" in out
     found = load_cameras(repaired)
     between = [rig["cam2"].R_cam_lab @ rig["cam1"].R_cam_lab.mT for rig in (found, truly)]

@@ -179,7 +179,7 @@ def test_a_dictionary_that_is_no_text_is_refused(tmp_path):
     # Once an AttributeError.
     document = calibration_documents()[3]
     document["plate"] = document["plate"] | {"dictionary": 4}
-    with pytest.raises(CameraError, match="plate, dictionary: expected a name, got 4"):
+    with pytest.raises(CameraError, match=r"plate, dictionary: expected a name of .*, got 4"):
         load_calibration(written(tmp_path / "calibration.yaml", yaml.safe_dump(document)))
 
 

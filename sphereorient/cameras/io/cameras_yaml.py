@@ -13,6 +13,7 @@ from scipy.linalg import block_diag
 
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.cameras.camera import Camera
+from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.model import CameraModel, Key
 from sphereorient.cameras.openptv_camera import OpenPTVCamera
@@ -66,9 +67,8 @@ class CovarianceEntry(Entry):
         """Build the covariance."""
         lengths = {len(row) for row in self.matrix}
         if lengths != {len(self.parameters)}:
-            expected, got = f"rows of {len(self.parameters)} numbers", f"lengths {sorted(lengths)}"
-            do = "write one row and one column for each parameter"
-            raise CameraError(refusal("covariance, matrix", expected=expected, got=got, do=do))
+            got, do = f"lengths {sorted(lengths)}", "write one row and one column for each parameter"
+            raise camera_error("covariance, matrix", f"rows of {len(self.parameters)} numbers", got, do)
         return ParameterCovariance(names=self.parameters, matrix=torch.tensor(self.matrix, dtype=torch.float64))
 
 
@@ -178,9 +178,9 @@ def save_cameras(
 
 def _build(entry: object, where: str) -> Camera:
     if not isinstance(entry, Mapping):
-        raise CameraError(refusal(where, expected="the keys of a camera", got=short(entry), do="indent them below it"))
+        raise camera_error(where, "the keys of a camera", short(entry), "indent them below it")
     if "model" not in entry:
-        raise CameraError(refusal(f"{where}, model", expected=f"one of {', '.join(MODELS)}", got="none", do="add it"))
+        raise camera_error(f"{where}, model", f"one of {', '.join(MODELS)}", "none", "add it")
     if not isinstance(entry["model"], str) or entry["model"] not in MODELS:
         raise CameraError(refuse_unknown(entry["model"], MODELS, f"{where}, model"))
     checked = validated(ENTRIES[entry["model"]], entry, where, CameraError)

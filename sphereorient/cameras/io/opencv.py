@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras.brown import BrownCamera
+from sphereorient.cameras.checks import camera_error
 from sphereorient.errors import CameraError, OutputError, refusal
 from sphereorient.files.whole_file import TEXT_BYTES, read_whole
 from sphereorient.files.yaml_file import short
@@ -52,11 +53,11 @@ def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> 
     finally:
         storage.release()
     if K.shape != (3, 3):
-        raise _refused(f"{path}, camera_matrix", "3 x 3 numbers", str(K.shape), "correct the file")
+        raise camera_error(f"{path}, camera_matrix", "3 x 3 numbers", str(K.shape), "correct the file")
     if K[0, 1] != 0 or K[1, 0] != 0 or not np.allclose(K[2], (0, 0, 1)):
         expected = "fx and fy on the diagonal, cx and cy in the last column, zeros and a one elsewhere"
         got = short(K.round(6).tolist())
-        raise _refused(f"{path}, camera_matrix", expected, got, "calibrate without shear")
+        raise camera_error(f"{path}, camera_matrix", expected, got, "calibrate without shear")
     try:
         return BrownCamera(
             image_size=size,
@@ -107,13 +108,13 @@ def _opened(path: Path) -> cv2.FileStorage:
     content = read_whole(path, TEXT_BYTES, expected, CameraError, "correct the path")
     if len(OPENER.findall(content)) > MOST_OPENERS or re.search(rb"[ \t]{%d}" % MOST_BLANKS, content):
         got, do = "one with thousands of lists, tags or levels", "name the file of one camera"
-        raise _refused(str(path), expected, got, do)
+        raise camera_error(str(path), expected, got, do)
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     except (cv2.error, SystemError):  # SystemError: a fault of the parser inside the constructor
         storage = None
     if storage is None or not storage.isOpened() or not storage.root().isMap():
-        raise _refused(str(path), expected, "another", "write it with cv2.FileStorage")
+        raise camera_error(str(path), expected, "another", "write it with cv2.FileStorage")
     return storage
 
 
@@ -154,9 +155,9 @@ def _required(storage: cv2.FileStorage, path: Path, key: str) -> Array:
         return matrix
     if key == "camera_matrix" and _node(storage, "K1") is not None:
         expected, got = "the matrix of one camera", "a stereo pair (K1, D1, ...)"
-        raise _refused(f"{path}, {key}", expected, got, "split the stereo file into one file per camera")
+        raise camera_error(f"{path}, {key}", expected, got, "split the stereo file into one file per camera")
     do = "calibrate with OpenCV, or name the file it wrote; write five zeros where there is no distortion"
-    raise _refused(f"{path}, {key}", "an OpenCV matrix", "none", do)
+    raise camera_error(f"{path}, {key}", "an OpenCV matrix", "none", do)
 
 
 def _coefficients(storage: cv2.FileStorage, path: Path) -> Array:
@@ -164,10 +165,10 @@ def _coefficients(storage: cv2.FileStorage, path: Path) -> Array:
     flat = _required(storage, path, "distortion_coefficients").reshape(-1)
     if len(flat) not in LENGTHS:
         expected = f"{', '.join(map(str, LENGTHS[:-1]))} or {LENGTHS[-1]} numbers"
-        raise _refused(where, expected, str(len(flat)), "correct the file")
+        raise camera_error(where, expected, str(len(flat)), "correct the file")
     if np.any(flat[5:] != 0):
         do = "calibrate without CALIB_RATIONAL_MODEL, CALIB_THIN_PRISM_MODEL and CALIB_TILTED_MODEL"
-        raise _refused(where, "k1, k2, p1, p2, k3 and nothing else", "further ones that are not 0", do)
+        raise camera_error(where, "k1, k2, p1, p2, k3 and nothing else", "further ones that are not 0", do)
     return np.pad(flat, (0, 1))[:5]
 
 
@@ -180,7 +181,7 @@ def _rotation(storage: cv2.FileStorage, path: Path) -> Array:
             return np.asarray(cv2.Rodrigues(found.reshape(3, 1))[0], np.float64)
         if found.shape != (3, 3):
             expected = "a matrix of 3 x 3 or a vector of 3 numbers"
-            raise _refused(f"{path}, {key}", expected, str(found.shape), "correct the file")
+            raise camera_error(f"{path}, {key}", expected, str(found.shape), "correct the file")
         return found
     return np.eye(3)
 
@@ -189,7 +190,7 @@ def _translation(storage: cv2.FileStorage, path: Path) -> Array:
     for key in ("T", "tvec"):
         found = _node(storage, key)
         if found is not None and found.size != 3:
-            raise _refused(f"{path}, {key}", "3 numbers", str(found.shape), "correct the file")
+            raise camera_error(f"{path}, {key}", "3 numbers", str(found.shape), "correct the file")
         if found is not None:
             return found.reshape(3)
     return np.zeros(3)
@@ -200,16 +201,12 @@ def _size(storage: cv2.FileStorage, path: Path, image_size: tuple[int, int] | No
     width, height = (_whole(storage.getNode(key)) or 0 for key in ("image_width", "image_height"))
     if width > 0 and height > 0:
         if image_size not in (None, (width, height)):
-            raise _refused(where, str(image_size), short((width, height)), "correct one")
+            raise camera_error(where, str(image_size), short((width, height)), "correct one")
         return width, height
     if image_size is None:
-        raise _refused(where, "two whole numbers", "none", "give image_size (--image-size W,H)")
+        raise camera_error(where, "two whole numbers", "none", "give image_size (--image-size W,H)")
     return image_size
 
 
 def _tensor(array: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float64))
-
-
-def _refused(name: str, expected: str, got: str, do: str) -> CameraError:
-    return CameraError(refusal(name, expected=expected, got=got, do=do))

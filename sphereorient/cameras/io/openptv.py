@@ -17,6 +17,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras.camera import Camera
+from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.openptv_camera import OpenPTVCamera
 from sphereorient.cameras.port import Port, PortCamera
@@ -119,8 +120,7 @@ def load_ptv_par(path: Path | str) -> PtvPar:
     words = _words(path, "\n")
     count = words[0].strip() if words else ""
     if not (count.isascii() and count.isdigit() and len(count) < 4):
-        do = "name OpenPTV's ptv.par"
-        raise CameraError(refusal(str(path), expected="the number of cameras first", got=short(count[:20]), do=do))
+        raise camera_error(str(path), "the number of cameras first", short(count[:20]), "name OpenPTV's ptv.par")
     numbers = _numbers(path, words[1 + 2 * int(count) :], PAR_NUMBERS, PAR_PARTS)
     imx, imy, pix_x, pix_y, chfield, n_air, n_glass, n_fluid, thickness_mm = numbers[3:]
     if chfield != 0:
@@ -224,7 +224,7 @@ def _numbers(path: Path, words: Sequence[str] | None, count: int, parts: str) ->
             number = math.nan
         if not math.isfinite(number):
             name, do = f"{path}, number {place + 1} of {count}", f"correct it ({parts})"
-            raise CameraError(refusal(name, expected="a finite number", got=short(word[:20]), do=do))
+            raise camera_error(name, "a finite number", short(word[:20]), do)
         numbers.append(number)
     return numbers
 
