@@ -143,12 +143,19 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
     def relative(path: Path) -> str:
         return Path(os.path.relpath(path, experiment.folder)).as_posix()
 
+    timed, texture = experiment.times is not None, experiment.texture_path
+    table = MOVIES_OWN if experiment.times == MOVIES_OWN else relative(Path(str(experiment.times)))
     sphere: dict[str, Any] = {"diameter": experiment.diameter_mm}
-    if experiment.texture_path is not None:
-        sphere["texture"] = relative(experiment.texture_path)
-    if experiment.fixed:
-        sphere["fixed"] = True
-    optional: dict[str, Any] = {
+    sphere |= {} if texture is None else {"texture": relative(texture)}
+    sphere |= {"fixed": True} if experiment.fixed else {}
+    document: dict[str, Any] = {
+        "name": experiment.name,
+        "frame_rate": None if timed else float(experiment.frame_rate_hz),
+        "times": table if timed else None,
+        "exposure": None if experiment.exposure_s is None else float(experiment.exposure_s),
+        "sphere": sphere,
+        "cameras": relative(experiment.cameras_path),
+        "movies": {name: relative(path) for name, path in experiment.movie_paths.items()},
         "masks": {name: relative(path) for name, path in experiment.mask_paths.items()},
         "backgrounds": {name: relative(path) for name, path in experiment.background_paths.items()},
         "start": {name: number for name, number in experiment.start.items() if number},
@@ -156,19 +163,7 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
         "flip": dict(experiment.flip),
         "flow": dict(experiment.flow),
     }
-    if experiment.times is None:
-        clock: dict[str, Any] = {"frame_rate": float(experiment.frame_rate_hz)}
-    else:
-        clock = {"times": MOVIES_OWN if experiment.times == MOVIES_OWN else relative(Path(experiment.times))}
-    document = {
-        "name": experiment.name,
-        **clock,
-        **({} if experiment.exposure_s is None else {"exposure": float(experiment.exposure_s)}),
-        "sphere": sphere,
-        "cameras": relative(experiment.cameras_path),
-        "movies": {name: relative(path) for name, path in experiment.movie_paths.items()},
-        **{key: value for key, value in optional.items() if value},
-    }
+    document = {key: value for key, value in document.items() if value not in (None, {})}
     write_document(experiment.path, SCHEMA, document, comment)
     return experiment.path
 

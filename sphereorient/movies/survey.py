@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +58,7 @@ def survey(
     """
     kept = {int(number) for number in np.linspace(0, len(movie) - 1, min(count, len(movie))).round()}
     seen: list[SurveyedFrame] = []
-    for number, before, picture in _all_pairs(movie) if every else _spread_pairs(movie, sorted(kept)):
+    for number, before, picture in _pairs(movie, None if every else sorted(kept)):
         seen.append(_examine(number, before, picture, number in kept))
         progress(len(seen), len(movie) if every else len(kept))
     highest = max((one.highest for one in seen), default=0)
@@ -75,17 +76,15 @@ def survey(
     )
 
 
-def _spread_pairs(movie: Movie, numbers: list[int]) -> Iterator[tuple[int, Grey | None, Grey | None]]:
+def _pairs(movie: Movie, numbers: Iterable[int] | None) -> Iterator[tuple[int, Grey | None, Grey | None]]:
+    """Yield number, frame before and frame of these numbers, or of all."""
+    if numbers is None:
+        for number, (before, picture) in enumerate(pairwise(chain([None], movie.readable()))):
+            yield number, before, picture
+        return
     for number in numbers:
-        *before, picture = movie.readable(max(number - 1, 0), number + 1)
-        yield number, before[0] if before else None, picture
-
-
-def _all_pairs(movie: Movie) -> Iterator[tuple[int, Grey | None, Grey | None]]:
-    before: Grey | None = None
-    for number, picture in enumerate(movie.readable()):
-        yield number, before, picture
-        before = picture
+        *earlier, picture = movie.readable(max(number - 1, 0), number + 1)
+        yield number, earlier[0] if earlier else None, picture
 
 
 def _examine(number: int, before: Grey | None, picture: Grey | None, keep: bool) -> SurveyedFrame:

@@ -62,8 +62,9 @@ class VideoMovie(Movie):
             broken = error_words(error)
         # AVI stores no presentation stamps: where frames are reordered, FFmpeg's guesses are wrong after a seek.
         guessed = container.format.name == "avi" and any(packet.pts != packet.dts for packet in packets)
-        known = stream.average_rate and stream.time_base
-        step: Fraction | None = 1 / (stream.average_rate * stream.time_base) if known else None
+        step: Fraction | None = None
+        if stream.average_rate and stream.time_base:
+            step = 1 / (stream.average_rate * stream.time_base)
         return index_packets(packets, guessed, step), broken
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:

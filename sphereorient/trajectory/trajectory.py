@@ -145,8 +145,8 @@ class Trajectory:
             cameras: names of the cameras.
             fields: frame_rate (Hz; NaN for uneven times), method, settings (YAML), experiment, provenance (for JSON).
         """
-        known = {"frame_rate": np.nan, "method": "", "settings": "", "experiment": "", "provenance": {}} | fields
-        datasets = blank_datasets(cls, len(time)) | {"time": np.asarray(time, "float64")}
+        known: dict[str, Any] = {"frame_rate": np.nan, "provenance": {}, **dict.fromkeys(TEXTS, ""), **fields}
+        datasets: dict[str, Any] = blank_datasets(cls, len(time)) | {"time": np.asarray(time, "float64")}
         return cls(cameras={name: CameraTrack.empty(len(time)) for name in cameras}, **datasets, **known)
 
     def save(self, path: str | Path) -> None:
@@ -196,7 +196,7 @@ class Trajectory:
             got = f"'{' '.join(str(error).split())[:200]}'"
             raise TrackError(refusal(str(path), expected="a whole track", got=got, do=AGAIN)) from error
 
-    def __getitem__(self, frames: slice) -> Self:
+    def __getitem__(self, frames: slice | int) -> Self:
         """Return the frames of a slice, as numpy slices, with a positive step.
 
         Raises:
@@ -249,15 +249,14 @@ class Trajectory:
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(8.3, 11.0), layout="constrained")
-        for axes, (label, *names) in zip(figure.subplots(len(PLOTTED), 1, sharex=True), PLOTTED, strict=True):
-            for name, style in zip(names, ({"ls": "", "marker": ".", "ms": 3}, {"lw": 1.2}), strict=True):
-                if not name:
-                    continue
+        rows = figure.subplots(len(PLOTTED), 1, sharex=True)
+        for axes, (label, measured, smoothed) in zip(rows, PLOTTED, strict=True):
+            for name in filter(None, (measured, smoothed)):
                 values = getattr(self, name)
                 values = values if values.ndim == 2 else _continuous(quaternions_wxyz(values))
                 for axis, part in zip("wxyz"[-values.shape[1] :], values.T, strict=True):
-                    known = axis if style.get("lw") else None
-                    axes.plot(self.time, part, color=COLOURS[axis], label=known, **style)
+                    line = {"lw": 1.2, "label": axis} if name == smoothed else {"ls": "", "marker": ".", "ms": 3}
+                    axes.plot(self.time, part, color=COLOURS[axis], **line)
             axes.set_ylabel(label)
             axes.legend(loc="upper right", ncols=4, fontsize="small")
             axes.grid(alpha=0.3)

@@ -51,7 +51,7 @@ def test_hdf5_is_written_whole(tmp_path: Path) -> None:
         assert file["x"][()].tolist() == [1, 2]
 
 
-def test_writes_after_an_error_are_ignored_and_the_error_is_kept(tmp_path: Path, monkeypatch) -> None:
+def test_writes_after_an_error_are_ignored_and_the_error_is_kept(tmp_path: Path) -> None:
     with GuardedFile(tmp_path / "a") as guarded:
         assert guarded.write(b"abc") == 3
         guarded.check()
@@ -67,7 +67,7 @@ def test_writes_after_an_error_are_ignored_and_the_error_is_kept(tmp_path: Path,
 def test_a_document_can_be_read_by_others(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     write_document(path, "sphereorient-test/1", {"small": 1.0e-7}, "two\nlines")
-    assert path.read_text().startswith("# two\n# lines\nschema: sphereorient-test/1\n")
+    assert path.read_text().startswith("# two\n# lines\n{schema: sphereorient-test/1")
     assert read_yaml(path, OutputError)["small"] == 1.0e-7
     umask = os.umask(0)
     os.umask(umask)

@@ -19,21 +19,21 @@ from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 FRAMES = 7
 # docs/data-format.md, written out once more so that the code's own table cannot vouch for itself
-DESIGN_SHAPES: dict[str, tuple[int, ...]] = {"time": (), "valid": (), "segment": (), "flags": (), "confidence": ()}
-DESIGN_SHAPES |= dict.fromkeys(("position", "position_smooth"), (3,))
-DESIGN_SHAPES |= dict.fromkeys(("position_cov", "position_smooth_cov", "orientation", "orientation_cov"), (3, 3))
-DESIGN_SHAPES |= dict.fromkeys(("orientation_smooth", "orientation_smooth_cov"), (3, 3))
+FORMAT_SHAPES: dict[str, tuple[int, ...]] = {"time": (), "valid": (), "segment": (), "flags": (), "confidence": ()}
+FORMAT_SHAPES |= dict.fromkeys(("position", "position_smooth"), (3,))
+FORMAT_SHAPES |= dict.fromkeys(("position_cov", "position_smooth_cov", "orientation", "orientation_cov"), (3, 3))
+FORMAT_SHAPES |= dict.fromkeys(("orientation_smooth", "orientation_smooth_cov"), (3, 3))
 # And what came later: docs/data-format.md.
-DESIGN_SHAPES |= {
+FORMAT_SHAPES |= {
     "position_systematic_cov": (3, 3),
     "orientation_systematic_cov": (3, 3),
     "margin": (),
     "margin_angle": (),
 }
 MOTIONS = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
-DESIGN_SHAPES |= {f"{name}{end}": (3,) for name in MOTIONS for end in ("", "_sigma")}
-DESIGN_CAMERA = {"centre_px", "radius_px", "outline_rms_px", "orientation", "orientation_cov", "score", "xi", "reason"}
-DESIGN_CAMERA |= {"candidates/offset", "candidates/orientation", "candidates/score"}
+FORMAT_SHAPES |= {f"{name}{end}": (3,) for name in MOTIONS for end in ("", "_sigma")}
+FORMAT_CAMERA = {"centre_px", "radius_px", "outline_rms_px", "orientation", "orientation_cov", "score", "xi", "reason"}
+FORMAT_CAMERA |= {"candidates/offset", "candidates/orientation", "candidates/score"}
 
 
 def full_trajectory() -> Trajectory:
@@ -85,8 +85,8 @@ def datasets(path: Path) -> dict[str, h5py.Dataset]:
 def test_an_empty_trajectory_has_every_dataset_of_the_design_in_its_shape(tmp_path: Path) -> None:
     Trajectory.empty(np.arange(FRAMES) / 600.0, cameras=("cam1",)).save(tmp_path / "track.h5")
     found = datasets(tmp_path / "track.h5")
-    assert set(found) == set(DESIGN_SHAPES) | {f"cameras/cam1/{name}" for name in DESIGN_CAMERA}
-    assert {name: found[name].shape for name in DESIGN_SHAPES} == {n: (FRAMES, *s) for n, s in DESIGN_SHAPES.items()}
+    assert set(found) == set(FORMAT_SHAPES) | {f"cameras/cam1/{name}" for name in FORMAT_CAMERA}
+    assert {name: found[name].shape for name in FORMAT_SHAPES} == {n: (FRAMES, *s) for n, s in FORMAT_SHAPES.items()}
     assert found["cameras/cam1/candidates/offset"].shape == (FRAMES + 1,)
     assert found["flags"].dtype == np.uint32
     assert found["valid"].dtype == bool
