@@ -6,13 +6,14 @@ import math
 from dataclasses import dataclass
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from sphereorient.cameras import Camera, Rays
 from sphereorient.cameras.telecentric import TelecentricCamera
 from sphereorient.errors import CameraError, SettingsError, check_tail, refusal
-from sphereorient.sphere.texture import check_texture, reduced_texture, sample_spline, sample_texture
+from sphereorient.sphere.texture import check_texture_shape, reduced_texture, sample_spline, sample_texture
 from sphereorient.sphere.view import smooth_positive, sphere_normals
 
 RIM = 0.02  # rounding of the limb in smooth pictures, radii^2: the least depth of a look-up is 0.1 radii
@@ -119,7 +120,7 @@ class SphereRenderer(nn.Module):
             self.texture = texture
         else:
             self.register_buffer("texture", torch.as_tensor(texture))
-        check_texture(self.texture)
+        check_texture_shape(self.texture)
         self.radius_mm = radius_mm
         self.camera = orthographic_camera(size_px, 2 * radius_mm / size_px) if size_px else cast("Camera", camera)
         self.sampling = sampling or Sampling()
@@ -145,7 +146,7 @@ class SphereRenderer(nn.Module):
         position = torch.as_tensor((0.0,) * 3 if position_mm is None else position_mm).to(R.device, exact)
         check_tail("position_mm", position, 3)
         radius = torch.as_tensor(self.radius_mm if radius_mm is None else radius_mm).to(position)
-        shape = torch.broadcast_shapes(R.shape[:-2], position.shape[:-1], radius.shape)
+        shape = np.broadcast_shapes(R.shape[:-2], position.shape[:-1], radius.shape)
         flat = (R.expand(*shape, 3, 3), position.expand(*shape, 3), radius.expand(shape))
         picture = self._pictures(*(x.reshape(-1, *x.shape[len(shape) :]) for x in flat))
         return picture.reshape(*shape, *picture.shape[1:])
@@ -293,4 +294,5 @@ def expected_grey(rays: Rays, position_lab_mm: Tensor, R_lab_body: Tensor, ball:
     strength = ball.lamps_lab.norm(dim=-1)
     light = ball.ambient + lambert(seen.normal, ball.lamps_lab / strength[:, None], strength, SHADE)
     grey = (ball.black + (ball.white - ball.black) * seen.paint) * light
-    return coverage * grey + (1.0 - coverage) * ball.behind
+    seen_grey: Tensor = coverage * grey + (1.0 - coverage) * ball.behind
+    return seen_grey
