@@ -168,7 +168,7 @@ class SphereRenderer(nn.Module):
         place = torch.stack([right[reached], down[reached]], dim=-1)
         aperture = aperture_matrix(size, samples, sampling.blur_px).to(R)
         texture = reduced_texture(self.texture.to(R.dtype), samples * 2 * reach / RIM_MARGIN)
-        canvas = R.new_full((len(R), height + 2 * size, width + 2 * size), sampling.outside)
+        windows = [R.new_zeros(0, size, size)]
         for k in torch.split(torch.arange(len(R), device=R.device), max(1, SAMPLES // len(place))):
             rays = self.camera.rays(place + corner[k, None])
             # The limb as wide as a fine sample: a step would count samples, and its derivative be noise.
@@ -179,11 +179,12 @@ class SphereRenderer(nn.Module):
             share = ((1.0 - seen.distance_radii) * radius[k, None] / fine_mm + 0.5).clamp(0, 1)
             fine = R.new_zeros(len(k), *reached.shape)
             fine[:, reached] = (share * (seen.paint - sampling.outside)).to(R.dtype)
-            across = torch.arange(size, device=R.device)
-            rows, columns = (corner[k, axis, None] + size + across for axis in (1, 0))
-            canvas = canvas.index_put(
-                (k[:, None, None], rows[:, :, None], columns[:, None, :]), aperture @ fine @ aperture.mT, True
-            )
+            windows.append(aperture @ fine @ aperture.mT)
+        canvas = R.new_full((len(R), height + 2 * size, width + 2 * size), sampling.outside)
+        across = torch.arange(size, device=R.device)
+        rows, columns = (corner[:, axis, None] + size + across for axis in (1, 0))
+        at = (torch.arange(len(R), device=R.device)[:, None, None], rows[:, :, None], columns[:, None, :])
+        canvas = canvas.index_put(at, torch.cat(windows), accumulate=True)
         return canvas[:, size : size + height, size : size + width]
 
 
