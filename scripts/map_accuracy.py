@@ -28,7 +28,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError
-from sphereorient.experiment import load_experiment, write_synthetic_experiment
+from sphereorient.experiment import load_experiment, write_experiment
 from sphereorient.mapping.compare import compare_maps
 from sphereorient.report.map_files import read_seen, seen_path, shares_seen
 from sphereorient.sphere import load_texture
@@ -217,7 +217,7 @@ def fictrac_attitudes(path: Path) -> Tensor:
 
 def withheld(source: Path, texture: Path | None, path: Path) -> Path:
     """Write an experiment again with another map or none, and return where."""
-    return write_synthetic_experiment(replace(load_experiment(source), path=path, texture_path=texture))
+    return write_experiment(replace(load_experiment(source), path=path, texture_path=texture))
 
 
 def run(command: str, experiment: Path, out: Path, cameras: str | None, more: list[str]) -> Usage:

@@ -116,8 +116,8 @@ def jacobian(render: SphereRenderer, R_view_body: Tensor) -> Tensor:
     R = so3.exp(both[:, :3]) @ R_view_body[:, None]
     position = torch.nn.functional.pad(both[:, 3:5], (0, 1))
     pictures = render(R, position, render.radius_mm + both[:, 5]).reshape(len(R), 2, 6, -1)
-    slopes: Tensor = (pictures[:, 0] - pictures[:, 1]) / (2 * step[:, None])
-    return slopes.mT
+    derivative: Tensor = ((pictures[:, 0] - pictures[:, 1]) / (2 * step[:, None])).mT
+    return derivative
 
 
 def _inverse(information: Tensor, count: int = 6) -> Tensor:

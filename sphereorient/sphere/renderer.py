@@ -6,13 +6,14 @@ import math
 from dataclasses import dataclass
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from sphereorient.cameras import Camera, Rays
 from sphereorient.cameras.telecentric import TelecentricCamera
 from sphereorient.errors import CameraError, SettingsError, check_tail, refusal
-from sphereorient.sphere.texture import check_texture, reduced_texture, sample_spline, sample_texture
+from sphereorient.sphere.texture import check_texture_shape, reduced_texture, sample_spline, sample_texture
 from sphereorient.sphere.view import smooth_positive, sphere_normals
 
 RIM = 0.02  # rounding of the limb in smooth pictures, radii^2: the least depth of a look-up is 0.1 radii
@@ -119,7 +120,7 @@ class SphereRenderer(nn.Module):
             self.texture = texture
         else:
             self.register_buffer("texture", torch.as_tensor(texture))
-        check_texture(self.texture)
+        check_texture_shape(self.texture)
         self.radius_mm = radius_mm
         self.camera = orthographic_camera(size_px, 2 * radius_mm / size_px) if size_px else cast("Camera", camera)
         self.sampling = sampling or Sampling()
@@ -145,7 +146,7 @@ class SphereRenderer(nn.Module):
         position = torch.as_tensor((0.0,) * 3 if position_mm is None else position_mm).to(R.device, exact)
         check_tail("position_mm", position, 3)
         radius = torch.as_tensor(self.radius_mm if radius_mm is None else radius_mm).to(position)
-        shape = torch.broadcast_shapes(R.shape[:-2], position.shape[:-1], radius.shape)
+        shape = np.broadcast_shapes(R.shape[:-2], position.shape[:-1], radius.shape)
         flat = (R.expand(*shape, 3, 3), position.expand(*shape, 3), radius.expand(shape))
         picture = self._pictures(*(x.reshape(-1, *x.shape[len(shape) :]) for x in flat))
         return picture.reshape(*shape, *picture.shape[1:])
@@ -167,7 +168,7 @@ class SphereRenderer(nn.Module):
         place = torch.stack([right[reached], down[reached]], dim=-1)
         aperture = aperture_matrix(size, samples, sampling.blur_px).to(R)
         texture = reduced_texture(self.texture.to(R.dtype), samples * 2 * reach / RIM_MARGIN)
-        canvas = R.new_full((len(R), height + 2 * size, width + 2 * size), sampling.outside)
+        windows = [R.new_zeros(0, size, size)]
         for k in torch.split(torch.arange(len(R), device=R.device), max(1, SAMPLES // len(place))):
             rays = self.camera.rays(place + corner[k, None])
             # The limb as wide as a fine sample: a step would count samples, and its derivative be noise.
@@ -178,11 +179,12 @@ class SphereRenderer(nn.Module):
             share = ((1.0 - seen.distance_radii) * radius[k, None] / fine_mm + 0.5).clamp(0, 1)
             fine = R.new_zeros(len(k), *reached.shape)
             fine[:, reached] = (share * (seen.paint - sampling.outside)).to(R.dtype)
-            across = torch.arange(size, device=R.device)
-            rows, columns = (corner[k, axis, None] + size + across for axis in (1, 0))
-            canvas = canvas.index_put(
-                (k[:, None, None], rows[:, :, None], columns[:, None, :]), aperture @ fine @ aperture.mT, True
-            )
+            windows.append(aperture @ fine @ aperture.mT)
+        canvas = R.new_full((len(R), height + 2 * size, width + 2 * size), sampling.outside)
+        across = torch.arange(size, device=R.device)
+        rows, columns = (corner[:, axis, None] + size + across for axis in (1, 0))
+        at = (torch.arange(len(R), device=R.device)[:, None, None], rows[:, :, None], columns[:, None, :])
+        canvas = canvas.index_put(at, torch.cat(windows), accumulate=True)
         return canvas[:, size : size + height, size : size + width]
 
 
@@ -293,5 +295,5 @@ def expected_grey(rays: Rays, position_lab_mm: Tensor, R_lab_body: Tensor, ball:
     strength = ball.lamps_lab.norm(dim=-1)
     light = ball.ambient + lambert(seen.normal, ball.lamps_lab / strength[:, None], strength, SHADE)
     grey = (ball.black + (ball.white - ball.black) * seen.paint) * light
-    picture: Tensor = coverage * grey + (1.0 - coverage) * ball.behind
-    return picture
+    seen_grey: Tensor = coverage * grey + (1.0 - coverage) * ball.behind
+    return seen_grey

@@ -136,7 +136,7 @@ def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
     return ((texels * columns[..., None, :]).sum(-1) * rows).sum(-1)
 
 
-def check_texture(texture: Tensor) -> None:
+def check_texture_shape(texture: Tensor) -> None:
     """Refuse a tensor that is not one map (H, 2 H), H at least 2 (ShapeError)."""
     if texture.ndim != 2 or texture.shape[1] != 2 * texture.shape[0] or len(texture) < SPLINE_TEXELS:
         expected = f"(H, 2 H), H at least {SPLINE_TEXELS}"
@@ -145,7 +145,7 @@ def check_texture(texture: Tensor) -> None:
 
 def _texel_coordinates(texture: Tensor, direction_body: Tensor) -> tuple[Tensor, Tensor]:
     """Return column and row of body directions, (...) each; whole numbers are the texels' middles."""
-    check_texture(texture)
+    check_texture_shape(texture)
     height, width = texture.shape
     longitude, latitude = texture_coordinates(direction_body)
     column = (longitude + math.pi) * (width / (2 * math.pi)) - 0.5

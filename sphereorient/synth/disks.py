@@ -100,7 +100,9 @@ def _lit(
     """Return grey levels (F, side, side) of balls and background."""
     count, radius = len(R), float(disk.radius_px.amax()) if len(R) else 1.0  # all have the same
     right, down = disk.offset(torch.empty(count, side, side))
-    origin = torch.nn.functional.pad(torch.stack(torch.broadcast_tensors(right, down), -1).flatten(1, 2), (0, 1))
+    origin = torch.nn.functional.pad(
+        torch.stack([right.expand(-1, side, -1), down.expand(-1, -1, side)], -1).flatten(1, 2), (0, 1)
+    )
     rays = Rays(origin_lab_mm=origin, direction_lab=origin.new_tensor([0.0, 0.0, 1.0]))
     seen = see_sphere(rays, torch.zeros(3), _instants(R, values, rng), reduced_texture(texture, 2 * radius), radius)
     levels = [low + (high - low) * torch.rand((count, 1), generator=rng) for low, high in LEVELS]

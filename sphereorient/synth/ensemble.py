@@ -334,7 +334,7 @@ def smoothed_track(
         "orientation_smooth_cov": found.orientation_cov_rad2,
     }
     flags = np.where(found.extrapolated.numpy(), np.uint32(Flag.EXTRAPOLATED), np.uint32(0))
-    arrays = {name: tensor.numpy() for name, tensor in parts.items()}
+    arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in parts.items()}
     return replace(track, **arrays, **_rates_of(found), flags=flags), found.process
 
 

@@ -106,5 +106,5 @@ def _window(
     lit = lambert(seen.normal, direction, lamps[:, 3]) / LIT
     light = settings.ambient + (1 - settings.ambient) * lit
     grey = (settings.black + (settings.white - settings.black) * seen.paint) * light
-    fine = torch.stack([torch.where(hit, grey, 0.0), hit.double()]).unflatten(1, uu.shape)
+    fine = torch.stack([torch.where(hit, grey, 0.0), hit.double()]).reshape(2, *uu.shape)
     return torch.nn.functional.avg_pool2d(fine[None], SUPERSAMPLING)[0].numpy().astype(np.float32)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera
-from sphereorient.synth import Scene, SynthSettings, make_scene
+from sphereorient.synth import RenderedScene, SynthSettings, make_scene
 
 NOISELESS = {"read_noise": 0.0, "shot_noise": 0.0, "blur_px": 0.0}
 WHITE_MAP = torch.ones(8, 16)
@@ -38,7 +38,7 @@ def seen_at(lens: PinholeCamera, right_deg: float, down_deg: float, depth_mm: fl
     return lens.R_cam_lab.T @ (depth_mm * slope - lens.T_cam_lab_mm)
 
 
-def scene(texture: Tensor = WHITE_MAP, **changes: object) -> Scene:
+def scene(texture: Tensor = WHITE_MAP, **changes: object) -> RenderedScene:
     """Even light, no blur, no noise, unless changed."""
     settings = {"ambient": 1.0, "background": 0.0, "diameter_mm": 18.0, "diameter_px": 36.0, "distance_mm": 400.0}
     return make_scene(texture, SynthSettings(**(settings | NOISELESS | changes)))
