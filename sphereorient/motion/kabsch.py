@@ -15,24 +15,17 @@ FEWEST = 3  # points that determine a turn
 
 
 def kabsch(points_a: Tensor, points_b: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return the rotation that carries the first set of points onto the second, best in least squares.
+    """Return the rotation (..., 3, 3) from the first set of points onto the second, best in least squares.
 
-    Both sets are centred first, so a shift between them does not matter. The result is a proper rotation also for
-    points in a plane and for mirror images; points on one line leave the turn about it undetermined (not checked).
+    Both sets are centred first. The result is a proper rotation also for points in a plane and for mirror images;
+    points on one line leave the rotation about it undetermined (not checked).
 
     Args:
         points_a: (..., K, 3), any unit.
         points_b: (..., K, 3), same unit and frame, point by point.
         weights: (..., K), not negative; None weighs all alike.
 
-    Returns:
-        R (..., 3, 3) with points_b ~ R points_a. Between two times it is the paper's increment T, in the components
-        of the points' frame.
-
-    Raises:
-        ShapeError: wrong last axes.
-
-    Source: W. Kabsch, Acta Cryst. A32, 922 (1976); the paper's R_kabsch, docs/errata.md E8.
+    Source: W. Kabsch, Acta Cryst. A32, 922 (1976); the paper's R_kabsch, its increment T, docs/errata.md E8.
     """
     check_tail("points_a", points_a, 3)
     check_tail("points_b", points_b, *points_a.shape[-2:])
@@ -51,26 +44,18 @@ def omega_from_markers(
     segment: Tensor | None = None,
     min_separations: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """Return the angular velocity from tracked markers, in lab components.
+    """Return the angular velocity from tracked markers, in lab components, as `omega_from_orientations`.
 
-    The turn between two frames is found from the markers seen in both, so it is in the components of their frame, the
-    lab; without the absolute orientation it is the body components that stay unknown.
+    The rotation between two frames is found from the markers seen in both. The body components stay unknown.
 
     Args:
         points_lab: (..., N, K, 3), markers in the lab, any unit; NaN where a marker is not seen.
-        dt_s: time between frames, s.
+        dt_s: time between frames.
         separations: values of m, frames, from 1 up, each once.
         segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
-        min_separations: how many separations must be measurable in a frame.
+        min_separations: number of separations that a frame needs, else NaN.
 
-    Returns:
-        omega_lab and its standard error from the scatter, both (..., N, 3), rad/s, as `omega_from_orientations`.
-
-    Raises:
-        ShapeError: points_lab does not end in 3.
-        SettingsError: no separation, one below 1, or one given twice.
-
-    Source: the paper, section III, R_kabsch; frame by docs/errata.md E8.
+    Source: the paper, section III, R_kabsch; docs/errata.md E8.
     """
     check_tail("points_lab", points_lab, 3)
     check_separations(separations)
