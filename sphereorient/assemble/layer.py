@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sphereorient import so3
-from sphereorient.assemble.path import edge_costs
+from sphereorient.assemble.path import edges_over_gaps
 from sphereorient.assemble.second_order_cost import PARAMETERS, VARIANCE_MAX, SecondOrderCost
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.assemble.trellis import ShortestPath, SoftPath, shortest_path, soft_path
@@ -116,7 +116,7 @@ class PathLayer(nn.Module):
         node: Tensor | None = None
         triple: Tensor | None = None
         if self.order == 1:
-            edge = _edges_over_gaps(R, score, time, there)
+            edge = edges_over_gaps(R, score, time, there)
         else:
             edge, there, node, triple = self._second_order_costs(R, score, time, variance, there)
         if self.soft is None:
@@ -144,17 +144,6 @@ class PathLayer(nn.Module):
     def _value(self, name: str) -> Tensor:
         raw: Tensor = getattr(self, name)
         return MOST[name] * torch.sigmoid(raw) if name in MOST else raw.exp() + LEAST.get(name, 0.0)
-
-
-def _edges_over_gaps(R: Tensor, score: Tensor, time_s: Tensor, mask: Tensor) -> Tensor:
-    """Return the paper's edges (..., N - 1, C, C), each from the last frame before it that has candidates."""
-    frame = torch.arange(mask.shape[-2], device=mask.device)
-    last = torch.where(mask.any(-1), frame, 0).cummax(-1).values[..., :-1]
-    pairs = [
-        torch.stack([_taken(part, last, tail), part.narrow(-tail - 1, 1, len(frame) - 1)], -tail - 1)
-        for part, tail in ((R, 3), (score, 1), (time_s, 0))
-    ]
-    return edge_costs(*pairs)[..., 0, :, :]
 
 
 def triple_costs(

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
 from sphereorient import so3
 from sphereorient.assemble.settings import AssembleSettings
@@ -31,12 +30,6 @@ class Path:
     xi: Tensor  # (N,), rad/s, cost of the link that enters the frame; NaN where none does
     spike: Tensor  # (N,) bool, that link is a spike
     segment: Tensor  # (N,) int64, -1 outside any
-
-    def __post_init__(self) -> None:
-        """Compare the lengths of the parts."""
-        for entry in fields(self):
-            tail = (3, 3) if entry.name == "R_lab_body" else ()
-            check_tail(f"Path.{entry.name}", getattr(self, entry.name), len(self.choice), *tail)
 
     @property
     def present(self) -> Tensor:
@@ -64,11 +57,7 @@ def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, setting
             do = "give every camera the experiment's frames"
             expected, got = f"{len(time_s)} frames", f"{len(each)}"
             raise ShapeError(refusal(f"candidates of {name!r}", expected=expected, got=got, do=do))
-    graphs = {name: graph_of(each, settings.quality_min) for name, each in candidates.items()}
-    best = _cheapest(graphs, time_s)
-    return {
-        name: _path(graph, choice, time_s, settings) for (name, graph), choice in zip(graphs.items(), best, strict=True)
-    }
+    return {name: _path(graph_of(each, settings.quality_min), time_s, settings) for name, each in candidates.items()}
 
 
 def assemble_path(candidates: Candidates, time_s: Tensor, settings: AssembleSettings) -> Path:
@@ -82,45 +71,30 @@ def graph_of(candidates: Candidates, quality_min: float) -> Graph:
     return R, score, mask & (score >= quality_min)
 
 
-def _cheapest(graphs: Mapping[str, Graph], time_s: Tensor) -> list[Tensor]:
-    """Return the choices of each camera in the frames with candidates; all cameras go in one padded batch."""
-    visited = [torch.nonzero(mask.any(1))[:, 0] for _, _, mask in graphs.values()]
-    steps = max(map(len, visited), default=0)
-    if steps == 0:
-        return visited
-    width = max(mask.shape[1] for _, _, mask in graphs.values())
-    R, score, mask = (
-        pad_sequence(
-            [_widen(graph[part], width)[frames] for graph, frames in zip(graphs.values(), visited, strict=True)],
-            batch_first=True,
-        )
-        for part in range(3)
-    )
-    time = pad_sequence([time_s[frames] for frames in visited], batch_first=True)
-    # Behind a movie's end stand zeros, times too: the mask keeps these edges out.
-    choice = shortest_path(edge_costs(R, score, time), mask).choice
-    return [row[: len(frames)] for row, frames in zip(choice, visited, strict=True)]
-
-
-def _widen(part: Tensor, width: int) -> Tensor:
-    """Add empty places to the candidates' axis, (N, C, ...) to (N, width, ...)."""
-    missing = part.new_zeros(len(part), width - part.shape[1], *part.shape[2:])
-    return torch.cat([part, missing], dim=1)
-
-
-def _path(graph: Graph, choice: Tensor, time_s: Tensor, settings: AssembleSettings) -> Path:
-    """Read the chosen orientations, their links, spikes and segments."""
+def _path(graph: Graph, time_s: Tensor, settings: AssembleSettings) -> Path:
+    """Return the cheapest path, its links, spikes and segments."""
     R_all, score_all, mask = graph
-    frames = torch.nonzero(mask.any(1))[:, 0]
-    R = torch.full_like(R_all[:, 0], torch.nan)
-    score = torch.full_like(score_all[:, 0], torch.nan)
-    chosen = torch.full_like(score, -1, dtype=torch.int64)
-    chosen[frames] = choice
-    R[frames], score[frames] = R_all[frames, choice], score_all[frames, choice]
+    choice = shortest_path(edges_over_gaps(R_all, score_all, time_s, mask), mask).choice
+    there = choice >= 0
+    R = torch.full((len(choice), 3, 3), torch.nan).to(R_all)
+    score = torch.full((len(choice),), torch.nan).to(score_all)
+    R[there], score[there] = R_all[there, choice[there]], score_all[there, choice[there]]
     xi, turn = links(R, score, time_s)
     spike = find_spikes(xi, turn, settings)
-    segment = number_segments(chosen >= 0, spike, settings.gap_frames_max)
-    return Path(choice=chosen, R_lab_body=R, score=score, xi=xi, spike=spike, segment=segment)
+    segment = number_segments(there, spike, settings.gap_frames_max)
+    return Path(choice=choice, R_lab_body=R, score=score, xi=xi, spike=spike, segment=segment)
+
+
+def edges_over_gaps(R_lab_body: Tensor, score: Tensor, time_s: Tensor, mask: Tensor) -> Tensor:
+    """Return `edge_costs` (..., N - 1, C, C), each from the last frame before it with candidates in the mask."""
+    frame = torch.arange(mask.shape[-2], device=mask.device)
+    last = torch.where(mask.any(-1), frame, 0).cummax(-1).values[..., :-1] if len(frame) else mask[..., 0].long()
+    pairs = []
+    for part, tail in ((R_lab_body, 3), (score, 1), (time_s.expand(mask.shape[:-1]), 0)):
+        index = last[(..., *[None] * tail)].expand(*last.shape, *part.shape[part.ndim - tail :])
+        here = part.narrow(-tail - 1, min(1, len(frame)), max(len(frame) - 1, 0))
+        pairs.append(torch.stack([part.gather(-tail - 1, index), here], -tail - 1))
+    return edge_costs(*pairs)[..., 0, :, :]
 
 
 def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:

@@ -196,7 +196,8 @@ def _walk_back(last: Tensor, origins: list[Tensor], order: int) -> Tensor:
 def _cost_along(start: Tensor, edges: Tensor, walk: Tensor, order: int) -> Tensor:
     """Return the cost (...) of a path; its gradient is the minimum's subgradient."""
     power = edges.shape[-1] ** torch.arange(order, -1, -1, device=walk.device)
-    edge = (walk.unfold(-1, order + 1, 1) * power).sum(-1)
+    steps = walk.shape[-1] - order
+    edge = (torch.stack([walk[..., i : i + steps] for i in range(order + 1)], -1) * power).sum(-1)
     first = (walk[..., :order] * power[1:]).sum(-1, keepdim=True)
     along = edges.flatten(-order - 1).gather(-1, edge[..., None])[..., 0]
     return start.flatten(-order).gather(-1, first)[..., 0] + along.sum(-1)

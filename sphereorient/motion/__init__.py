@@ -1,9 +1,8 @@
 """Velocities and accelerations on R^3 and SO(3)."""
 
-from sphereorient.motion.angular_velocity import omega_from_orientations, to_body
+from sphereorient.motion.angular_velocity import kabsch, omega_from_markers, omega_from_orientations, to_body
 from sphereorient.motion.derivative import gaussian_derivative, noise_gain
-from sphereorient.motion.kabsch import kabsch, omega_from_markers
-from sphereorient.motion.learn import ProcessNoise, ProcessPrior
+from sphereorient.motion.estimate import ProcessNoise, ProcessPrior
 from sphereorient.motion.matern import Prior
 from sphereorient.motion.measure import Motion, measure_motion
 from sphereorient.motion.settings import MotionSettings, SmoothSettings

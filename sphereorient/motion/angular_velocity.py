@@ -1,4 +1,4 @@
-"""Angular velocity from orientations: the turn between two frames around a third, over several separations."""
+"""Angular velocity from orientations or markers: rotations between two frames around a third, several separations."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 from sphereorient.motion.stencil import neighbours_there
 
+FEWEST_POINTS = 3  # points that determine a turn
+
 
 def omega_from_orientations(
     R_lab_body: Tensor,
@@ -22,29 +24,27 @@ def omega_from_orientations(
 ) -> tuple[Tensor, Tensor]:
     """Return the angular velocity in lab components, averaged over several symmetric separations.
 
-    Each separation m gives log(R[k + m] R[k - m]^T) / (2 m dt); this product is the turn in lab components. The mean
-    has weights m^2, which is optimal for white attitude noise: the pairs share no frame and their variance falls as
-    m^-2. The orientation of frame k itself is not used, so a single lost frame costs its neighbours one separation
-    each and itself none. The mean over +-m frames damps what changes within them: a component that oscillates with f
-    cycles per frame is damped by sin(2 pi f m) / (2 pi f m) per separation. Turns of pi and above cannot be told from
-    smaller ones the other way round: 2 max(m) |omega| dt must stay well below pi, which is not checked.
+    Each separation m gives log(R[k + m] R[k - m]^T) / (2 m dt). The mean has weights m^2, optimal for white attitude
+    noise: the pairs share no frame and their variance falls as m^-2. A lost frame costs its neighbours one separation
+    each and itself none. A component that oscillates with f cycles per frame is damped by sin(2 pi f m) / (2 pi f m)
+    per separation. 2 max(m) |omega| dt must stay well below pi, which is not checked.
 
     Args:
         R_lab_body: (..., N, 3, 3), orientations; NaN where missing; orthogonality is not checked.
-        dt_s: time between frames, s.
+        dt_s: time between frames.
         separations: values of m, frames, from 1 up, each once.
         segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
-        min_separations: how many separations must be measurable in a frame.
+        min_separations: number of separations that a frame needs, else NaN.
 
     Returns:
-        omega_lab (..., N, 3), rad/s, NaN where fewer separations are measurable; and its standard error (..., N, 3),
-        rad/s, from the scatter of the separations around their mean, NaN where there are fewer than two.
+        omega_lab (..., N, 3), rad/s, and its standard error (..., N, 3) from the scatter of the separations, NaN where
+        there are fewer than two.
 
     Raises:
         ShapeError: R_lab_body does not end in (N, 3, 3).
         SettingsError: no separation, one below 1, or one given twice.
 
-    Source: the paper, section III, angular velocity from the increment T; frames by docs/errata.md E4 and E6.
+    Source: the paper, section III, angular velocity from the increment T; docs/errata.md E4 and E6.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     if R_lab_body.dim() < 3:
@@ -61,21 +61,11 @@ def omega_from_orientations(
 
 
 def to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
-    """Turn vectors from lab to body components, R^T x.
+    """Return the body components R^T x (..., 3) of vectors in lab components, in the unit of x.
 
-    The derivative of R^T omega_lab is R^T alpha_lab, because omega x omega vanishes: it serves omega and alpha alike.
+    It serves omega and alpha alike: the derivative of R^T omega_lab is R^T alpha_lab, because omega x omega vanishes.
 
-    Args:
-        R_lab_body: (..., 3, 3), orientations.
-        x_lab: (..., 3), any unit, lab components.
-
-    Returns:
-        (..., 3), x's unit, body components.
-
-    Raises:
-        ShapeError: wrong last axes.
-
-    Source: docs/errata.md E6; alpha_lab = R alpha_body, as printed.
+    Source: docs/errata.md E6.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     check_tail("x_lab", x_lab, 3)
@@ -83,30 +73,14 @@ def to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
 
 
 def check_separations(separations: Sequence[int]) -> None:
-    """Refuse separations that are not different numbers from 1 up.
-
-    Args:
-        separations: frames.
-
-    Raises:
-        SettingsError: none, one below 1, or one given twice.
-    """
+    """Refuse separations that are not different numbers from 1 up."""
     if not separations or min(separations) < 1 or len(set(separations)) < len(separations):
         expected, do = "different numbers from 1 up", "give each separation once"
         raise SettingsError(refusal("separations", expected=expected, got=str(tuple(separations)), do=do))
 
 
 def usable_separations(there: Tensor, separations: Sequence[int], segment: Tensor | None) -> Tensor:
-    """Return in which frames which separations can be measured.
-
-    Args:
-        there: (..., N) bool, frames that hold an orientation.
-        separations: values of m, frames; S of them.
-        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
-
-    Returns:
-        (..., N, S) bool: both frames k - m and k + m are there and in the segment of frame k.
-    """
+    """Return in which frames which of S separations have both ends in the segment, (..., N, S) bool."""
     half = max(separations)
     near = neighbours_there(there, segment, half)
     m = torch.as_tensor(separations, device=there.device)
@@ -114,17 +88,7 @@ def usable_separations(there: Tensor, separations: Sequence[int], segment: Tenso
 
 
 def omega_stencil(usable: Tensor, separations: Sequence[int], min_separations: int, dtype: torch.dtype) -> Tensor:
-    """Return the weights that small errors of the orientations have in omega, for the propagation of noise.
-
-    Args:
-        usable: (..., N, S) bool, from `usable_separations`.
-        separations: values of m, frames; S of them.
-        min_separations: how many separations must be measurable in a frame.
-        dtype: of the result.
-
-    Returns:
-        (..., N, 2 max(m) + 1), per frame; NaN where omega is.
-    """
+    """Return the weights (..., N, 2 max(m) + 1), per frame, of orientation errors in omega; NaN where omega is."""
     m = torch.as_tensor(separations, device=usable.device)
     half, weight = max(separations), m.to(dtype) ** 2 * usable
     total = weight.sum(-1, keepdim=True)
@@ -137,17 +101,9 @@ def omega_stencil(usable: Tensor, separations: Sequence[int], min_separations: i
 def mean_over_separations(
     turns: Tensor, usable: Tensor, dt_s: float, separations: Sequence[int], min_separations: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the weighted mean of the angular velocities of several separations, and its standard error.
+    """Return the weighted mean of the angular velocities of S separations and its standard error, (..., N, 3), rad/s.
 
-    Args:
-        turns: (..., N, S, 3, 3), turn from frame k - m to k + m in lab components; unit where not usable.
-        usable: (..., N, S) bool.
-        dt_s: time between frames, s.
-        separations: values of m, frames; S of them.
-        min_separations: how many separations must be measurable in a frame.
-
-    Returns:
-        omega_lab and its standard error from the scatter, both (..., N, 3), rad/s.
+    `turns` (..., N, S, 3, 3) lead from frame k - m to k + m in lab components; unit where not `usable` (..., N, S).
     """
     m = torch.as_tensor(separations, dtype=turns.dtype, device=turns.device)
     omega = so3.log(turns) / (2 * dt_s * m[:, None])  # (..., N, S, 3)
@@ -169,3 +125,65 @@ def mean_over_separations(
 def _shifted(R: Tensor, m: int) -> Tensor:
     """Return R[..., k + m, :, :] at frame k; what wraps around an end is never used."""
     return R.roll(-m, dims=-3)
+
+
+def kabsch(points_a: Tensor, points_b: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Return the rotation (..., 3, 3) from the first set of points onto the second, best in least squares.
+
+    Both sets are centred first. The result is a proper rotation also for points in a plane and for mirror images;
+    points on one line leave the rotation about it undetermined (not checked).
+
+    Args:
+        points_a: (..., K, 3), any unit.
+        points_b: (..., K, 3), same unit and frame, point by point.
+        weights: (..., K), not negative; None weighs all alike.
+
+    Source: W. Kabsch, Acta Cryst. A32, 922 (1976); the paper's R_kabsch, its increment T, docs/errata.md E8.
+    """
+    check_tail("points_a", points_a, 3)
+    check_tail("points_b", points_b, *points_a.shape[-2:])
+    w = torch.ones_like(points_a[..., 0]) if weights is None else weights
+    w = (w / w.sum(-1, keepdim=True))[..., None]
+    a = points_a - (w * points_a).sum(-2, keepdim=True)
+    b = points_b - (w * points_b).sum(-2, keepdim=True)
+    return so3.nearest_rotation((w * b).mT @ a)
+
+
+def omega_from_markers(
+    points_lab: Tensor,
+    dt_s: float,
+    separations: Sequence[int],
+    *,
+    segment: Tensor | None = None,
+    min_separations: int = 1,
+) -> tuple[Tensor, Tensor]:
+    """Return the angular velocity from tracked markers, in lab components, as `omega_from_orientations`.
+
+    The rotation between two frames is found from the markers seen in both. The body components stay unknown.
+
+    Args:
+        points_lab: (..., N, K, 3), markers in the lab, any unit; NaN where a marker is not seen.
+        dt_s: time between frames.
+        separations: values of m, frames, from 1 up, each once.
+        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
+        min_separations: number of separations that a frame needs, else NaN.
+
+    Source: the paper, section III, R_kabsch; docs/errata.md E8.
+    """
+    check_tail("points_lab", points_lab, 3)
+    check_separations(separations)
+    seen = points_lab.isfinite().all(-1)  # (..., N, K)
+    points = torch.where(seen[..., None], points_lab, 0.0)
+    usable = usable_separations(seen.sum(-1) >= FEWEST_POINTS, separations, segment)
+    turns, enough = [], []
+    for m in separations:
+        both = seen.roll(-m, -2) & seen.roll(m, -2)
+        common = both.sum(-1) >= FEWEST_POINTS
+        # equal weights keep the mean defined where the turn is not used
+        weights = torch.where(common[..., None], both, True).to(points.dtype)
+        turns.append(kabsch(points.roll(m, -3), points.roll(-m, -3), weights))
+        enough.append(common)
+    usable = usable & torch.stack(enough, dim=-1)
+    unit = torch.eye(3, dtype=points.dtype, device=points.device)
+    stacked = torch.where(usable[..., None, None], torch.stack(turns, dim=-3), unit)
+    return mean_over_separations(stacked, usable, dt_s, separations, min_separations)

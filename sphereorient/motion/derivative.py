@@ -26,13 +26,13 @@ def gaussian_derivative(
 
     Args:
         x: (..., N, D), any unit; NaN where missing.
-        dt_s: time between frames, s.
-        sigma_frames: width of the Gaussian, frames.
+        dt_s: time between frames.
+        sigma_frames: width of the Gaussian.
         order: of the derivative, 0 (only smooth), 1 or 2.
         truncate: half width of the window in units of sigma.
 
     Returns:
-        (..., N, D), x's unit / s^order; NaN where the window reaches a missing value or an end: nothing is padded.
+        (..., N, D), x's unit / s^order; NaN where the window reaches a missing value or an end.
 
     Raises:
         SettingsError: another order, or a width that is not positive.
@@ -45,21 +45,10 @@ def gaussian_derivative(
 
 
 def noise_gain(sigma_frames: float, order: Order, truncate: float = TRUNCATE) -> float:
-    """Return what white noise of standard deviation 1 becomes in `gaussian_derivative` with dt_s = 1.
+    """Return the standard deviation of white noise of standard deviation 1 after `gaussian_derivative` with dt_s = 1.
 
-    For sigma above about 1.5 frames the three orders give 0.531 sigma^-0.5, 0.376 sigma^-1.5 and 0.460 sigma^-2.5.
+    For sigma above about 1.5 frames the orders 0, 1, 2 give 0.531 sigma^-0.5, 0.376 sigma^-1.5 and 0.460 sigma^-2.5.
     Noise that is correlated over frames gives more, up to the square root of its correlation length.
-
-    Args:
-        sigma_frames: width of the Gaussian, frames.
-        order: of the derivative, 0, 1 or 2.
-        truncate: half width of the window in units of sigma.
-
-    Returns:
-        Standard deviation of the output; divide by dt_s^order.
-
-    Raises:
-        SettingsError: another order, or a width that is not positive.
     """
     return float(_full_kernel(sigma_frames, order, truncate, torch.empty(0, dtype=torch.float64)).norm())
 
@@ -74,22 +63,19 @@ def gap_aware_stencil(
     min_share: float = 1.0,
     dtype: torch.dtype = torch.float64,
 ) -> Tensor:
-    """Return the kernel of `gaussian_derivative` for every frame, corrected for frames that are not there.
+    """Return the kernel of `gaussian_derivative` for every frame, (..., N, 2 h + 1), corrected for missing frames.
 
-    A neighbour is used where its mirror image is there too and both are in the frame's own segment; the moments are
-    corrected for what is left, so polynomials still come out exactly. Towards an end the window shrinks evenly.
+    A neighbour is used where its mirror image is there, too, and both are in the frame's segment; the moments are
+    corrected for what remains, so polynomials still come out exactly. Towards an end the window shrinks evenly.
 
     Args:
-        there: (..., N) bool, frames that hold a measurement.
+        there: (..., N) bool, measured frames.
         segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
-        sigma_frames: width of the Gaussian, frames.
+        sigma_frames: width of the Gaussian.
         order: of the derivative, 0, 1 or 2.
         truncate: half width of the window in units of sigma.
-        min_share: share of the Gaussian's weight that must be there; 1 asks for the whole window.
+        min_share: share of the Gaussian's weight that must be there, else NaN; 1 asks for the whole window.
         dtype: of the result.
-
-    Returns:
-        (..., N, 2 h + 1), per frame^order; NaN for frames outside a segment or with too little around them.
 
     Raises:
         SettingsError: another order, or a width that is not positive.

@@ -24,10 +24,9 @@ M_PER_MM = 1e-3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
-    """Velocities and accelerations of N frames; made by motion, read by pipeline.
+    """Velocities and accelerations of N frames, (..., N, 3), NaN where unknown.
 
-    All are (..., N, 3), NaN where unknown. Each sigma is the standard deviation that white measurement noise leaves;
-    the low-pass bias is not in it.
+    Each sigma is the standard deviation from white measurement noise; the low-pass bias is not in it.
     """
 
     velocity_m_s: Tensor
@@ -56,26 +55,23 @@ def measure_motion(
 ) -> Motion:
     """Return velocity, acceleration, omega and alpha of every frame whose neighbours determine them.
 
-    Nothing is measured across the ends of a segment. Single lost frames inside one are stepped over; a long gap and
-    the frames next to an end give NaN. Body components need the frame's own orientation, lab components do not.
+    Nothing is measured across the ends of a segment. Single lost frames are bridged; a long gap and the frames next to
+    an end give NaN. Body components need the frame's own orientation, lab components do not.
 
     Args:
-        position_mm: (..., N, 3), mm, lab; NaN where missing.
+        position_mm: (..., N, 3), lab; NaN where missing.
         R_lab_body: (..., N, 3, 3), orientations; NaN where missing.
         segment: (..., N) int, number of the segment, -1 outside any.
-        frame_rate_hz: frames per second, even.
+        frame_rate_hz: even.
         settings: widths and limits.
-        position_sigma_mm: (..., N) or (..., N, 3), mm, standard deviation of a coordinate; NaN where unknown.
-        orientation_sigma_rad: (..., N) or (..., N, 3), rad, standard deviation of a component of the small turn delta
-            in R_true = exp([delta]x) R; NaN where unknown.
-
-    Returns:
-        The motion; each sigma is NaN where a sigma that goes into it is unknown.
+        position_sigma_mm: (..., N) or (..., N, 3), of a coordinate; NaN where unknown.
+        orientation_sigma_rad: (..., N) or (..., N, 3), of a component of delta in R_true = exp([delta]x) R; NaN where
+            unknown.
 
     Raises:
         ShapeError: wrong last axes, or unequal numbers of frames.
 
-    Source: the paper, section III; frames by docs/errata.md E4 and E6.
+    Source: the paper, section III; docs/errata.md E4 and E6.
     """
     check_tail("position_mm", position_mm, 3)
     check_tail("R_lab_body", R_lab_body, 3, 3)
@@ -175,8 +171,8 @@ def _to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
 def _sigma_in_body(R_lab_body: Tensor, x_lab: Tensor, x_sigma: Tensor, sigma_rad: Tensor | None) -> Tensor:
     """Return the standard deviations of R^T x from those of the lab components x and of the orientation, all by axis.
 
-    An orientation that is off by delta turns the result by delta x x. This is independent of omega, which does not use
-    the frame's own orientation, and small in alpha.
+    An orientation error delta rotates the result by delta x x. It is independent of omega, which does not use the
+    frame's own orientation, and small in alpha.
     """
     from_x = _to_body(R_lab_body.square(), x_sigma.square())
     unit = torch.eye(3, dtype=x_lab.dtype, device=x_lab.device).expand(*x_lab.shape, 3)

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import ShapeError, check_tail, refusal
-from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, estimate
-from sphereorient.motion.learn import ProcessNoise
+from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, ProcessNoise, estimate
 from sphereorient.motion.path import PositionTrack, RotationTrack
 from sphereorient.motion.settings import SmoothSettings
 

@@ -25,15 +25,12 @@ def windows(x: Tensor, half: int, fill: float = torch.nan) -> Tensor:
 
 
 def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
-    """Return which neighbours of a frame were measured and belong to its segment.
+    """Return which neighbours (..., N, 2 half + 1) of a frame were measured and belong to its segment.
 
     Args:
-        there: (..., N) bool, frames that hold a measurement.
+        there: (..., N) bool, measured frames.
         segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
-        half: how many neighbours to either side.
-
-    Returns:
-        (..., N, 2 half + 1) bool; all False for a frame outside any segment.
+        half: number of neighbours on either side.
     """
     near = windows(there.to(torch.int8), half, fill=0).bool()
     if segment is None:
@@ -42,17 +39,9 @@ def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor
 
 
 def paired(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
-    """Return which neighbours of a frame can be used in pairs k - j, k + j.
+    """Return which neighbours of a frame can be used in pairs k - j, k + j; arguments as `neighbours_there`.
 
     The weights of pairs have one parity: no lower power of time enters the result, whichever frames are missing.
-
-    Args:
-        there: (..., N) bool, frames that hold a measurement.
-        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
-        half: how many neighbours to either side.
-
-    Returns:
-        (..., N, 2 half + 1) bool; in the middle: whether the frame itself is there.
     """
     near = neighbours_there(there, segment, half)
     return near & near.flip(-1)

@@ -19,9 +19,6 @@ def angle(R: Tensor) -> Tensor:
         (...), rad, 0 .. pi, with an error of a few roundings of pi everywhere; the gradient at exactly 0 and pi,
         where there is none, is set to 0.
 
-    Raises:
-        ShapeError: the last axes are not (3, 3).
-
     Source: docs/errata.md A3; acos((Tr - 1)/2), the paper's, loses half the digits near 0 and pi.
     """
     check_tail("R", R, 3, 3)
@@ -39,9 +36,6 @@ def geodesic_distance(A: Tensor, B: Tensor) -> Tensor:
 
     Returns:
         (...), rad, 0 .. pi; exactly 0 for equal inputs; gradient as `angle`.
-
-    Raises:
-        ShapeError: the last axes are not (3, 3).
 
     Source: the paper's d(A, B), worked out by docs/errata.md A3; the cosine from Tr((A-B)(A-B)^T) = 4 (1 - cos d).
     """

@@ -18,9 +18,6 @@ def exp(rotvec: Tensor) -> Tensor:
     Returns:
         (..., 3, 3), the rotation; its columns are the turned unit vectors, in the frame of `rotvec`.
 
-    Raises:
-        ShapeError: the last axis is not 3.
-
     Source: Rodrigues' formula, as the paper prints it.
     """
     check_tail("rotvec", rotvec, 3)
@@ -37,9 +34,6 @@ def log(R: Tensor) -> Tensor:
         (..., 3), axis times angle, rad, of length <= pi up to rounding. A turn by exactly pi has two; one of them
         comes, always the same. Its gradient is finite there too.
 
-    Raises:
-        ShapeError: the last axes are not (3, 3).
-
     Source: textbook; through the quaternion's largest component, so it keeps all digits at 0 and at pi.
     """
     check_tail("R", R, 3, 3)
@@ -47,17 +41,7 @@ def log(R: Tensor) -> Tensor:
 
 
 def hat(v: Tensor) -> Tensor:
-    """Return the matrix whose product with a vector x is the cross product v × x.
-
-    Args:
-        v: (..., 3), any unit, any frame.
-
-    Returns:
-        (..., 3, 3), antisymmetric, unit and frame of `v`.
-
-    Raises:
-        ShapeError: the last axis is not 3.
-    """
+    """Return the antisymmetric matrix (..., 3, 3) whose product with a vector x is the cross product v × x."""
     check_tail("v", v, 3)
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
@@ -65,17 +49,7 @@ def hat(v: Tensor) -> Tensor:
 
 
 def vee(M: Tensor) -> Tensor:
-    """Return the vector of a matrix' antisymmetric part, the inverse of `hat`.
-
-    Args:
-        M: (..., 3, 3), any unit, any frame; of a rotation the vector is axis times sine of the angle.
-
-    Returns:
-        (..., 3), unit and frame of `M`.
-
-    Raises:
-        ShapeError: the last axes are not (3, 3).
-    """
+    """Return the vector (..., 3) of a matrix' antisymmetric part; of a rotation it is axis times sine of the angle."""
     check_tail("M", M, 3, 3)
     twice = M - M.mT
     return torch.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], -1) / 2

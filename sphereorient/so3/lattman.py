@@ -15,33 +15,16 @@ ROUNDING = 1e-9
 
 
 def to_lattman(theta: Tensor) -> Tensor:
-    """Return the Lattman angles of a triplet of Tait-Bryan angles.
-
-    Args:
-        theta: (..., 3), theta_x, theta_y, theta_z, rad.
-
-    Returns:
-        (..., 3), theta_plus = theta_x + theta_z, theta = theta_y, theta_minus = theta_x - theta_z, rad.
-
-    Raises:
-        ShapeError: the last axis is not 3.
-    """
+    """Return the Lattman angles (theta_x + theta_z, theta_y, theta_x - theta_z) of Tait-Bryan angles (..., 3), rad."""
     check_tail("theta", theta, 3)
     x, y, z = theta.unbind(-1)
     return torch.stack([x + z, y, x - z], -1)
 
 
 def from_lattman(lattman: Tensor) -> Tensor:
-    """Return the Tait-Bryan angles of Lattman angles.
+    """Return the Tait-Bryan angles (..., 3), rad, of Lattman angles theta_plus, theta, theta_minus.
 
-    Args:
-        lattman: (..., 3), theta_plus, theta, theta_minus, rad; once around SO(3) are 4 pi, -pi/2 .. pi/2, 2 pi.
-
-    Returns:
-        (..., 3), theta_x, theta_y, theta_z, rad.
-
-    Raises:
-        ShapeError: the last axis is not 3.
+    Once around SO(3) is 4 pi, -pi/2 .. pi/2, 2 pi.
     """
     check_tail("lattman", lattman, 3)
     plus, y, minus = lattman.unbind(-1)

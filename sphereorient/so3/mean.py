@@ -27,9 +27,6 @@ def weighted_mean(R: Tensor, weights: Tensor) -> Tensor:
         (..., 3, 3), frames of R; NaN where all weights are 0. Where the rotations are so far apart that several means
         are equally good (two of them by pi) the result is one of them, always the same.
 
-    Raises:
-        ShapeError: the last axes of R are not (K, 3, 3).
-
     Source: Hartley et al. 2013, Rotation averaging, algorithm 1.
     """
     check_tail("R", R, *weights.shape[-1:], 3, 3)

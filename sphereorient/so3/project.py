@@ -19,9 +19,6 @@ def nearest_rotation(M: Tensor) -> Tensor:
         near (rank below 2, or a reflection with its two smallest singular values equal) one of them comes, with
         gradient 0 in the directions that are undecided. First derivatives only.
 
-    Raises:
-        ShapeError: the last axes are not (3, 3).
-
     Source: Kabsch 1976, the paper's R_kabsch; derivative of the polar factor, textbook.
     """
     check_tail("M", M, 3, 3)

@@ -19,9 +19,6 @@ def from_tait_bryan(theta: Tensor) -> Tensor:
     Returns:
         (..., 3, 3), Rx(theta_x) Ry(theta_y) Rz(theta_z): with the paper R_lab_body, that is body -> lab.
 
-    Raises:
-        ShapeError: the last axis is not 3.
-
     Source: the paper's R(theta). In words (docs/errata.md E9): rotations about the fixed z, then y, then x; or about
         the body's x, then its new y, then its new z.
     """
@@ -44,9 +41,6 @@ def to_tait_bryan(R: Tensor) -> Tensor:
     Returns:
         (..., 3), theta_x, theta_y, theta_z, rad. At cos(theta_y) = 0 (below four roundings) only theta_x + theta_z
         or theta_x - theta_z is defined: theta_z is set to 0, and its gradient. NaN for NaN.
-
-    Raises:
-        ShapeError: the last axes are not (3, 3).
 
     Source: docs/errata.md E1, with other elements for theta_y and theta_x, equal for a rotation: asin loses half the
         digits near theta_y = ± pi/2, and -R23, R33 lose all.
@@ -71,9 +65,6 @@ def second_triplet(theta: Tensor) -> Tensor:
     Returns:
         (..., 3), theta_x + pi, ± pi - theta_y with the sign of theta_y, theta_z + pi, rad, not wrapped.
 
-    Raises:
-        ShapeError: the last axis is not 3.
-
     Source: the paper's second triplet with sign(0) = 1, docs/errata.md E2.
     """
     check_tail("theta", theta, 3)
@@ -83,18 +74,9 @@ def second_triplet(theta: Tensor) -> Tensor:
 
 
 def rate_matrix_lab(theta: Tensor) -> Tensor:
-    """Return H with H dtheta/dt = omega_lab.
+    """Return H (..., 3, 3) with H dtheta/dt = omega_lab, of the angles of R_lab_body; its determinant is cos(theta_y).
 
-    Args:
-        theta: (..., 3), theta_x, theta_y, theta_z of R_lab_body, rad.
-
-    Returns:
-        (..., 3, 3), no unit; determinant cos(theta_y).
-
-    Raises:
-        ShapeError: the last axis is not 3.
-
-    Source: the paper's H, which it takes for the body's (docs/errata.md E3).
+    Source: the paper's H, which it assigns to the body (docs/errata.md E3).
     """
     check_tail("theta", theta, 3)
     x, y, _ = theta.unbind(-1)
@@ -104,19 +86,7 @@ def rate_matrix_lab(theta: Tensor) -> Tensor:
 
 
 def rate_matrix_body(theta: Tensor) -> Tensor:
-    """Return the matrix that takes dtheta/dt to omega_body.
-
-    Args:
-        theta: (..., 3), theta_x, theta_y, theta_z of R_lab_body, rad.
-
-    Returns:
-        (..., 3, 3), R^T `rate_matrix_lab`, no unit; determinant cos(theta_y).
-
-    Raises:
-        ShapeError: the last axis is not 3.
-
-    Source: docs/errata.md E3.
-    """
+    """Return R^T `rate_matrix_lab` (..., 3, 3), from dtheta/dt to omega_body (docs/errata.md E3)."""
     check_tail("theta", theta, 3)
     _, y, z = theta.unbind(-1)
     zero, one = torch.zeros_like(y), torch.ones_like(y)
