@@ -95,10 +95,7 @@ def page_html(report: Report) -> str:
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
         "contents": CONTENTS,
         "tiles": _tiles(summary, tracks),
-        "numbers_about": _numbers_about(summary),
         "grids": [grid for grid in (*_moments(summary), _flow(summary)) if grid.rows],
-        "frames_about": _frames_about(len(report.strips), tracks),
-        "tables_about": _tables_about(report.suffixes),
         "settings": _settings(summary),
         "provenance": [_provenance(name, track) for name, track in tracks.items()],
         "footer": f"sphereorient {versions()['sphereorient']}; {report.command}",
@@ -225,13 +222,6 @@ def _moments(summary: Summary) -> list[Grid]:
     return grids
 
 
-def _numbers_about(summary: Summary) -> str:
-    if summary.distributions is None:
-        return "One segment: without intervals, since the scatter between segments is unknown."
-    level = f"{100 * summary.settings.level:g} %"
-    return f"In small print {level} intervals from resampled segments."
-
-
 def _cell(of: Interval, most: int) -> Cell:
     """Return a scalar with its interval, of at most so many decimals."""
     value, low, high = float(of.value), float(of.low), float(of.high)
@@ -254,18 +244,6 @@ def _flow(summary: Summary) -> Grid:
         rows += [["Kolmogorov's time, s", "tau_eta = (nu / epsilon)^(1/2)", f"{flow.tau_eta_s:.4g}"]]
     rows += [[one.name, one.formula, f"{one.value:.4g}"] for one in summary.comparisons]
     return Grid(title="The sphere and its flow", about=about, head=["", "", "value"], rows=rows)
-
-
-def _frames_about(strips: int, tracks: Mapping[str, Trajectory]) -> str:
-    if strips < len(tracks):
-        return f"The {strips} of {len(tracks)} tracks with the most frames in doubt. Click where to look."
-    return "Click where to look; arrow keys go frame by frame."
-
-
-def _tables_about(suffixes: Sequence[str]) -> str:
-    if "parquet" in suffixes:
-        return "All numbers with all digits and their intervals, beside this page."
-    return "All numbers, beside this page; for Parquet, too: pip install 'sphereorient[table]'."
 
 
 def _settings(summary: Summary) -> str:

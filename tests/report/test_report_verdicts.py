@@ -44,15 +44,15 @@ def test_rows_that_belong_to_no_frame_are_told(lab):
     printed = np.einsum("nij,nj->ni", lab.orientation_smooth, lab.omega_lab)  # docs/errata.md E6: R omega_lab
     wrong = said(replace(lab, omega_lab=printed, omega_body=lab.omega_lab))
     assert wrong["Frame of omega_lab"].grade == Grade.DOUBT
-    assert "no frame's components" in wrong["Frame of omega_lab"].words
-    assert "components of the lab" in wrong["Frame of omega_body"].words
+    assert "not in lab or body components" in wrong["Frame of omega_lab"].words
+    assert "written in lab components" in wrong["Frame of omega_body"].words
 
 
 def test_tails_are_named_by_their_kind(lab):
     found = said(lab)
     assert "heavier tails than a Gaussian" in found["Tails of alpha_lab"].words
     assert "stretched exponential fits better" in found["Tails of alpha_lab"].words
-    assert "not told from a Gaussian" in found["Tails of velocity"].words
+    assert "not distinguishable from a Gaussian" in found["Tails of velocity"].words
 
 
 def test_attitudes_that_prefer_a_direction_are_told(lab):
