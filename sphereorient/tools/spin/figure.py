@@ -33,7 +33,7 @@ def spin_figure(found: SpinFound, texture: Tensor, time_s: Tensor, names: Sequen
         row, column = 2 * (place // COLUMNS), place % COLUMNS
         disk = torch.where(inside, found.disks[k], torch.nan)
         axes[row, column].imshow(disk.numpy(), cmap="gray", interpolation="nearest")
-        axes[row + 1, column].imshow(predicted[k].numpy(), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes[row + 1, column].imshow(predicted[k].numpy(), cmap="gray", vmin=0, vmax=1.2, interpolation="nearest")
         off = float(found.residual_rad[k])
         words = f"{math.degrees(off):.1f}° off" if math.isfinite(off) else "no attitude"
         axes[row, column].set_title(f"{names[k]}, {1e3 * float(time_s[k]):.1f} ms\n{words}", fontsize=6)
