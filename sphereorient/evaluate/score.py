@@ -105,10 +105,13 @@ def _read_truth(path: str | Path, *names: str) -> dict[str, Floats]:
     """Read time, orientation and other datasets of truth.h5."""
     try:
         with h5py.File(path) as file:
+            schema = str(file.attrs.get("schema", ""))  # old truths have none
             truth = {key: np.asarray(file[key][()], np.float64) for key in ("time", "orientation", *names)}
     except (OSError, KeyError) as error:
         got, expected = " ".join(str(error).split()), "time, position, orientation and rates"
         raise TrackError(refusal(f"truth {path}", expected=expected, got=got, do=DO)) from None
+    if schema.startswith("sphereorient-track"):
+        raise TrackError(refusal(f"truth {path}", expected="the exact truth", got="a track", do=DO))
     if not len(truth["time"]) or truth["orientation"].shape != (len(truth["time"]), 3, 3):
         got = str(truth["orientation"].shape)
         raise TrackError(refusal(f"truth {path}", expected="one orientation a frame", got=got, do=DO))
