@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.sparse import csr_matrix
-from sphereorient.sphere.spline_texture import sample_spline
 
 from sphereorient.mapping import joint
 from sphereorient.mapping.grid import (
@@ -24,6 +23,7 @@ from sphereorient.mapping.grid import (
     texel_weights,
 )
 from sphereorient.mapping.joint import LinearSystem
+from sphereorient.sphere.texture import sample_spline
 from sphereorient.synth.textures import map_directions, random_directions, random_texture
 
 

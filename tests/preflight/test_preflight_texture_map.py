@@ -13,7 +13,7 @@ from preflight_examples import PAINTED, Example, checked, clean_example, of
 
 from sphereorient import so3
 from sphereorient.errors import TextureError
-from sphereorient.mapping.compare import fibonacci
+from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.preflight import Severity
 from sphereorient.preflight.texture_map import (
     ViewPair,
@@ -117,7 +117,7 @@ def test_a_paint_in_bands_looks_alike_however_it_spins():
 
 
 def test_a_view_towards_a_direction_has_it_in_the_middle_facing_the_viewer():
-    directions = fibonacci(50)
+    directions = fibonacci_directions(50)
     R_view_body = views_towards(directions)
     assert_close((R_view_body @ directions[..., None])[..., 0], torch.tensor([0.0, 0, -1]).double().expand(50, 3))
     assert_close(torch.linalg.det(R_view_body), torch.ones(50).double())
@@ -126,7 +126,7 @@ def test_a_view_towards_a_direction_has_it_in_the_middle_facing_the_viewer():
 
 def test_spread_directions_leave_no_gap():
     """300 even ones are about 12 degrees apart, so that none of the sphere is further than that from one."""
-    directions = fibonacci(300)
+    directions = fibonacci_directions(300)
     anywhere = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     nearest = (anywhere.double() @ directions.T).amax(1)
     assert float(torch.rad2deg(nearest.clamp(-1, 1).acos()).max()) < 12

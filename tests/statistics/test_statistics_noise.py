@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sphereorient.synth.ensemble_tracks import filtered_track
 
 from sphereorient.errors import TrackError
 from sphereorient.motion import gaussian_derivative, noise_gain
 from sphereorient.statistics.noise import multi_lag, width_curve
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, TrueTracks, draw_ensemble
+from sphereorient.synth.ensemble import EnsembleSpec, TrueTracks, draw_ensemble, filtered_track
 
 FEW = BootstrapSettings(resamples=200)
 NOISE_DEG, NOISE_MM = 0.1, 0.05
