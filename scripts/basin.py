@@ -26,7 +26,7 @@ from sphereorient.methods.settings import Settings
 from sphereorient.pose import base_table
 from sphereorient.pose.defocus import FIRST_BLUR_PX
 from sphereorient.pose.fitter import first_fitter, widest_px
-from sphereorient.search import GreySearch
+from sphereorient.search import TemplateBank
 
 REPO = Path(__file__).resolve().parents[1]
 ANGLES_DEG = (1, 2, 4, 6, 8, 10, 14, 20)
@@ -51,7 +51,7 @@ def main() -> None:
         X, R = (
             torch.from_numpy(file[key][()])[numbers.start : numbers.stop : every] for key in ("position", "orientation")
         )
-    proposers = {view.name: GreySearch(texture, settings.search) for view in views}
+    proposers = {view.name: TemplateBank(texture, settings.search) for view in views}
     base = base_table(texture, widest_px(views))
     taken = list(zip(*shots, strict=True))
     first = Initialiser(

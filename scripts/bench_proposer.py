@@ -33,7 +33,14 @@ from sphereorient.cli.app import progress_bar
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
 from sphereorient.learn.proposer import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.report.plots.style import write_figure
-from sphereorient.search import FallbackProposer, GreySearch, GreySearchSettings, Proposals, Proposer, ProposeSettings
+from sphereorient.search import (
+    Candidates,
+    FallbackProposer,
+    GreySearchSettings,
+    Proposer,
+    ProposeSettings,
+    TemplateBank,
+)
 from sphereorient.search.fallback import resized
 from sphereorient.statistics.reliability import Z95, reliability, wilson
 from sphereorient.synth import random_texture
@@ -107,7 +114,7 @@ class Smaller:
     def __init__(self, proposer: Proposer, size_px: int) -> None:
         self._proposer, self.size_px = proposer, size_px
 
-    def propose(self, disks: Tensor) -> Proposals:
+    def propose(self, disks: Tensor) -> Candidates:
         """Propose for (F, S, S) disks."""
         return self._proposer.propose(resized(disks, self._proposer.size_px))
 
@@ -118,9 +125,9 @@ class Remembering:
     def __init__(self, proposer: Proposer) -> None:
         self._proposer, self.size_px = proposer, proposer.size_px
         self._asked: Tensor | None = None
-        self._answer = Proposals.none(())
+        self._answer = Candidates.none(())
 
-    def propose(self, disks: Tensor) -> Proposals:
+    def propose(self, disks: Tensor) -> Candidates:
         """Propose for (F, S, S) disks."""
         if disks is not self._asked:
             self._answer, self._asked = self._proposer.propose(disks), disks
@@ -130,11 +137,11 @@ class Remembering:
 def methods(texture: Tensor, checkpoint: Path) -> Iterator[tuple[str, Proposer]]:
     """Yield what is compared."""
     settings = GreySearchSettings()
-    search = Remembering(GreySearch(texture, settings))
+    search = Remembering(TemplateBank(texture, settings))
     yield "template search", search
     # As fast as the network: smaller pictures, a coarser bank, fewer climbs.
     quick = settings.model_copy(update={"size_px": 24, "step_deg": 15.0, "peaks": 4, "finalists": 2, "rough_steps": 2})
-    yield "template search, quick", Smaller(GreySearch(texture, quick), settings.size_px)
+    yield "template search, quick", Smaller(TemplateBank(texture, quick), settings.size_px)
     learnt = load_checkpoint(checkpoint)
     network = LearnedProposer(correlator_of(learnt), texture, temperature=learnt.temperature)
     yield "network", network
@@ -198,7 +205,7 @@ def asked(proposer: Proposer, pictures: Tensor, R: Tensor) -> Found:
     return judged(proposals, R, seconds)
 
 
-def judged(proposals: Proposals, R: Tensor, seconds: float) -> Found:
+def judged(proposals: Candidates, R: Tensor, seconds: float) -> Found:
     """Say which pictures have the right orientation among their candidates."""
     counts = proposals.offset.diff()
     frame = torch.repeat_interleave(torch.arange(len(R)), counts)

@@ -29,7 +29,7 @@ from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, LinesOfSight, base_table
 from sphereorient.pose.defocus import FIRST_BLUR_PX
 from sphereorient.pose.fitter import first_fitter
-from sphereorient.search import GreySearch
+from sphereorient.search import TemplateBank
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
 
@@ -63,7 +63,7 @@ def errors_deg(
 ) -> list[float]:
     """Find each frame by itself; infinite where nothing is found."""
     settings = Settings()
-    search = {view.name: GreySearch(texture, settings.search)}
+    search = {view.name: TemplateBank(texture, settings.search)}
     spread = locate.spread_frames(range(len(frames)), settings.refine.appearance_frames)
     base = base_table(texture, view.diameter_px)
     shots = [[Frame(picture=frames[k])] for k in spread]

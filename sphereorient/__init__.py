@@ -5,30 +5,74 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sphereorient import cameras, so3, sphere, synth
+    from sphereorient.assemble import PathLayer
+    from sphereorient.calibration import calibrate_cameras as calibrate
     from sphereorient.experiment import Experiment, load_experiment
     from sphereorient.methods.map import learn_map
     from sphereorient.methods.settings import Settings, load_settings
+    from sphereorient.pose.pose_fitter import PoseFitter
+    from sphereorient.preflight import preflight as check
     from sphereorient.run.stages import track_movies
+    from sphereorient.search import TemplateBank
+    from sphereorient.sphere import SphereRenderer, load_texture
     from sphereorient.trajectory import Trajectory
 
 __version__ = "0.1.0"
-__all__ = ["Experiment", "Settings", "Trajectory", "learn_map", "load_experiment", "load_settings", "track_movies"]
-
+# Public name -> module, and its name there; a room itself has none.
 _HOMES = {
-    "Experiment": "experiment",
-    "Settings": "methods.settings",
-    "Trajectory": "trajectory",
-    "learn_map": "methods.map",
-    "load_experiment": "experiment",
-    "load_settings": "methods.settings",
-    "track_movies": "run.stages",
+    "Experiment": ("experiment", "Experiment"),
+    "PathLayer": ("assemble", "PathLayer"),
+    "PoseFitter": ("pose.pose_fitter", "PoseFitter"),
+    "Settings": ("methods.settings", "Settings"),
+    "SphereRenderer": ("sphere", "SphereRenderer"),
+    "TemplateBank": ("search", "TemplateBank"),
+    "Trajectory": ("trajectory", "Trajectory"),
+    "calibrate": ("calibration", "calibrate_cameras"),
+    "cameras": ("cameras", ""),
+    "check": ("preflight", "preflight"),
+    "learn_map": ("methods.map", "learn_map"),
+    "load_experiment": ("experiment", "load_experiment"),
+    "load_settings": ("methods.settings", "load_settings"),
+    "load_texture": ("sphere", "load_texture"),
+    "so3": ("so3", ""),
+    "sphere": ("sphere", ""),
+    "synth": ("synth", ""),
+    "track_movies": ("run.stages", "track_movies"),
 }
+__all__ = [
+    "Experiment",
+    "PathLayer",
+    "PoseFitter",
+    "Settings",
+    "SphereRenderer",
+    "TemplateBank",
+    "Trajectory",
+    "calibrate",
+    "cameras",
+    "check",
+    "learn_map",
+    "load_experiment",
+    "load_settings",
+    "load_texture",
+    "so3",
+    "sphere",
+    "synth",
+    "track_movies",
+]
 
 
 def __getattr__(name: str) -> Any:
-    """Import on first use: torch takes a second, and `sphereorient --help` has no use for it."""
+    """Import on first use: torch takes a second, and `sphereorient --help` does not need it."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    module, inner = _HOMES[name]
+    found = import_module(f"{__name__}.{module}")
+    return getattr(found, inner) if inner else found
+
+
+def __dir__() -> list[str]:
+    """Return the public names, for completion."""
+    return [*__all__, "__version__"]

@@ -21,7 +21,7 @@ from sphereorient.pose.defocus import defocus_radii
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import FINEST_PX, Fitter, Optics, Picture, level_of, widest_px
 from sphereorient.pose.pixels import Pixels
-from sphereorient.search.proposer import Proposer
+from sphereorient.search.candidates import Proposer
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.trajectory import Reason
 

@@ -12,7 +12,7 @@ from sphereorient import so3
 from sphereorient.errors import ShapeError, refusal
 from sphereorient.learn.density import find_modes
 from sphereorient.learn.network import Correlator, map_blurs
-from sphereorient.search.proposer import Proposals
+from sphereorient.search.candidates import Candidates
 from sphereorient.trajectory import Reason
 
 # Disks at once, padded with empty disks: the last bits of a product depend on its number of rows, and the result of a
@@ -57,7 +57,7 @@ class LearnedProposer:
         return self._network.settings.size_px
 
     @torch.inference_mode()
-    def propose(self, disks: Tensor) -> Proposals:
+    def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations in the view frames of disks, with `score_of` their probability.
 
         Args:
@@ -77,7 +77,7 @@ class LearnedProposer:
         shown = (disks != disks[:, :1, :1]).flatten(1).any(1)  # not uniform
         there = (score >= PROBABILITY_MIN) & shown[:, None]
         counts = there.sum(1)
-        return Proposals(
+        return Candidates(
             offset=F.pad(counts.cumsum(0), (1, 0)),
             R_view_body=so3.nearest_rotation(R[there].double()),
             score=score_of(score[there].double()),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from sphereorient.methods.learnt import Learnt
 from sphereorient.methods.method import Job, Method
 from sphereorient.methods.proposers import paper_proposer
 from sphereorient.methods.settings import Settings
-from sphereorient.search import Candidates, Proposals, crop_disk
+from sphereorient.search import Candidates, crop_disk
 from sphereorient.trajectory import Reason, Trajectory
 
 CHUNK = 64  # frames held at once; a result does not depend on it
@@ -94,12 +95,12 @@ def propose_orientations(
     total = len(stream)
     progress(stage, 0, total)
     if not sightings.placed.any():
-        return in_the_lab(Proposals.none(sightings.reason), stream.camera, sightings.centre_px)
+        return in_the_lab(Candidates.none(sightings.reason), stream.camera, sightings.centre_px)
     proposer = paper_proposer(texture, locate.size_of(sightings, settings.orient.size_px), settings)
     # A place that was filled in from the neighbours helps nothing where the picture is none.
     readable = torch.tensor([reason not in BLIND for reason in sightings.reason])
     placed = sightings.placed & readable
-    proposals = [Proposals.none(sightings.reason[:0])]
+    proposals = [Candidates.none(sightings.reason[:0])]
     waiting: list[NDArray[np.float32]] = []
     done = 0
     for k, (picture, _) in enumerate(stream.pictures()):
@@ -107,33 +108,20 @@ def propose_orientations(
             u, v = sightings.centre_px[k].tolist()
             waiting.append(crop_disk(picture, u, v, float(sightings.radius_px[k]), proposer.size_px))
         if (k + 1) % CHUNK == 0 or k + 1 == total:
-            found = proposer.propose(torch.from_numpy(np.stack(waiting))) if waiting else Proposals.none(())
+            found = proposer.propose(torch.from_numpy(np.stack(waiting))) if waiting else Candidates.none(())
             proposals.append(found.spread(placed[done : k + 1], sightings.reason[done : k + 1]))
             waiting, done = [], k + 1
             progress(stage, done, total)
-    return in_the_lab(Proposals.joined(proposals), stream.camera, sightings.centre_px)
+    return in_the_lab(Candidates.joined(proposals), stream.camera, sightings.centre_px)
 
 
 BLIND = (Reason.UNDECODABLE, Reason.MISSING, Reason.REPEATED, Reason.DARK, Reason.SATURATED)
 
 
-def in_the_lab(proposals: Proposals, camera: Camera, centre_px: Tensor) -> Candidates:
-    """Turn orientations from the view frame of each frame into the lab, the perspective removed (docs/errata.md A1).
-
-    Args:
-        proposals: of N frames.
-        camera: that saw them.
-        centre_px: (N, 2), the outline's centre.
-    """
+def in_the_lab(proposals: Candidates, camera: Camera, centre_px: Tensor) -> Candidates:
+    """Add R_lab_view of each frame, from the outline's centre (N, 2): removes the perspective (docs/errata.md A1)."""
     direction_cam = camera.rays(centre_px).direction_lab @ camera.R_cam_lab.mT
-    R_lab_view = camera.R_cam_lab.mT @ R_cam_view(direction_cam)
-    frame = torch.repeat_interleave(torch.arange(len(centre_px)), proposals.offset.diff())
-    return Candidates(
-        offset=proposals.offset,
-        R_lab_body=R_lab_view[frame] @ proposals.R_view_body,
-        score=proposals.score,
-        reason=proposals.reason,
-    )
+    return replace(proposals, R_lab_view=camera.R_cam_lab.mT @ R_cam_view(direction_cam))
 
 
 def resume(job: Job, learnt: Learnt) -> Follower:

@@ -73,7 +73,7 @@ def examples_figure(examples: Sequence[Example]) -> Figure:
     note(
         figure,
         f"Above proposals: probability and angle to the truth; framed green with a tick if it is below "
-        f"{WITHIN_DEG:g}°, else red. Below pictures: their degradations. Proposals of less than "
+        f"{WITHIN_DEG:g}°, else red. Below pictures: their degradations. Candidates of less than "
         f"{100 * UNLIKELY:g} % are left out.",
     )
     return figure

@@ -1,24 +1,22 @@
 """Where could it point, without history: normalisation, template banks, coarse to fine, the Proposer protocol."""
 
-from sphereorient.search.candidates import Candidates
+from sphereorient.search.candidates import Candidates, Proposer
 from sphereorient.search.crop import crop_disk
 from sphereorient.search.extraction import extract_paint
 from sphereorient.search.fallback import FallbackProposer
-from sphereorient.search.grey_search import GreySearch
-from sphereorient.search.proposer import Proposals, Proposer
+from sphereorient.search.paper_search import PaperSearch
 from sphereorient.search.settings import GreySearchSettings, OrientSettings, ProposeSettings
-from sphereorient.search.template_search import TemplateSearch
+from sphereorient.search.template_bank import TemplateBank
 
 __all__ = [
     "Candidates",
     "FallbackProposer",
-    "GreySearch",
     "GreySearchSettings",
     "OrientSettings",
-    "Proposals",
+    "PaperSearch",
     "ProposeSettings",
     "Proposer",
-    "TemplateSearch",
+    "TemplateBank",
     "crop_disk",
     "extract_paint",
 ]

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from sphereorient.search.candidates import Candidates, Proposer
 from sphereorient.search.peaks import distinct
-from sphereorient.search.proposer import Proposals, Proposer
 from sphereorient.trajectory import Reason
 
 SAME_DEG = 12.0  # proposals of the two nearer than this are one
@@ -32,7 +32,7 @@ class FallbackProposer:
         """Side of the disks, px."""
         return self._first.size_px
 
-    def propose(self, disks: Tensor) -> Proposals:
+    def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations for (F, S, S) float32 grey disks."""
         found = self._first.propose(disks)
         best = torch.zeros(len(disks), dtype=torch.float64)
@@ -47,7 +47,7 @@ class FallbackProposer:
         for f in range(len(disks)):
             own = one_of(found, f)
             parts.append(own if f not in place else interleaved(one_of(more, place[f]), own))
-        return Proposals.joined(parts)
+        return Candidates.joined(parts)
 
 
 def resized(disks: Tensor, size_px: int) -> Tensor:
@@ -60,10 +60,10 @@ def resized(disks: Tensor, size_px: int) -> Tensor:
     return grey[:, 0]
 
 
-def one_of(proposals: Proposals, f: int) -> Proposals:
+def one_of(proposals: Candidates, f: int) -> Candidates:
     """Return the proposals of one disk."""
     rows = slice(int(proposals.offset[f]), int(proposals.offset[f + 1]))
-    return Proposals(
+    return Candidates(
         offset=torch.tensor([0, rows.stop - rows.start]),
         R_view_body=proposals.R_view_body[rows],
         score=proposals.score[rows],
@@ -71,7 +71,7 @@ def one_of(proposals: Proposals, f: int) -> Proposals:
     )
 
 
-def interleaved(one: Proposals, other: Proposals) -> Proposals:
+def interleaved(one: Candidates, other: Candidates) -> Candidates:
     """Return the proposals of two for one disk in turn, the first one's first, what comes twice once."""
     counts = (len(one.score), len(other.score))
     rank = torch.cat([2 * torch.arange(counts[0]), 2 * torch.arange(counts[1]) + 1])
@@ -80,4 +80,4 @@ def interleaved(one: Proposals, other: Proposals) -> Proposals:
     score = torch.cat([one.score, other.score])[order]
     new = distinct(R, math.radians(SAME_DEG)) if len(R) else torch.zeros(0, dtype=torch.bool)
     reason = Reason.OK if len(R) else one.reason[0]
-    return Proposals(offset=torch.tensor([0, int(new.sum())]), R_view_body=R[new], score=score[new], reason=(reason,))
+    return Candidates(offset=torch.tensor([0, int(new.sum())]), R_view_body=R[new], score=score[new], reason=(reason,))

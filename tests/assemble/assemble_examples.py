@@ -49,7 +49,8 @@ def candidates_of(frames: Sequence[Frame]) -> Candidates:
     counts = torch.tensor([0, *map(len, ordered)])
     return Candidates(
         offset=counts.cumsum(0),
-        R_lab_body=torch.stack([R for R, _ in rows]) if rows else torch.zeros(0, 3, 3, dtype=torch.float64),
+        R_view_body=torch.stack([R for R, _ in rows]) if rows else torch.zeros(0, 3, 3, dtype=torch.float64),
+        R_lab_view=torch.eye(3, dtype=torch.float64).expand(len(frames), 3, 3),
         score=torch.tensor([score for _, score in rows], dtype=torch.float64),
         reason=tuple(Reason.OK if frame else Reason.NOT_FOUND for frame in ordered),
     )

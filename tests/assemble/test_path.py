@@ -99,7 +99,8 @@ def test_a_movie_of_fifteen_thousand_frames_with_ten_candidates_each_is_found(rn
     score = torch.linspace(0.95, 0.5, width, dtype=torch.float64).repeat(frames)
     candidates = Candidates(
         offset=torch.arange(frames + 1) * width,
-        R_lab_body=every.flatten(0, 1),
+        R_view_body=every.flatten(0, 1),
+        R_lab_view=torch.eye(3, dtype=torch.float64).expand(frames, 3, 3),
         score=score,
         reason=(Reason.OK,) * frames,
     )

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.search import OrientSettings, Proposals, TemplateSearch
+from sphereorient.search import Candidates, OrientSettings, PaperSearch
 from sphereorient.sphere import orthographic_view, reduced_texture
 from sphereorient.synth import random_texture
 
@@ -23,8 +23,8 @@ def texture_of(kind: str) -> Tensor:
 
 
 @cache
-def search_of(kind: str) -> TemplateSearch:
-    return TemplateSearch(texture_of(kind), SIZE, OrientSettings())
+def search_of(kind: str) -> PaperSearch:
+    return PaperSearch(texture_of(kind), SIZE, OrientSettings())
 
 
 def attitudes(count: int, seed: int = 1) -> Tensor:
@@ -37,13 +37,13 @@ def clean_disks(kind: str, R_view_body: Tensor, size_px: int = SIZE) -> Tensor:
     return 20 + 150 * orthographic_view(size_px).render(texture, R_view_body.float())
 
 
-def of_disk(found: Proposals, disk: int) -> tuple[Tensor, Tensor]:
+def of_disk(found: Candidates, disk: int) -> tuple[Tensor, Tensor]:
     """Orientations and scores of one disk."""
     rows = slice(int(found.offset[disk]), int(found.offset[disk + 1]))
     return found.R_view_body[rows], found.score[rows]
 
 
-def best_errors_deg(found: Proposals, R_true: Tensor) -> Tensor:
+def best_errors_deg(found: Candidates, R_true: Tensor) -> Tensor:
     """Angle of each disk's first proposal from the truth; every disk must have one."""
     assert (found.offset.diff() > 0).all(), [why.value for why in found.reason]
     return so3.geodesic_distance(found.R_view_body[found.offset[:-1]], R_true) * (180 / math.pi)

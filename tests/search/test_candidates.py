@@ -1,4 +1,4 @@
-"""The records of the room: Candidates, Proposals, and the settings."""
+"""The record of the room, Candidates, and the settings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from conftest import assert_close
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError
-from sphereorient.search import Candidates, OrientSettings, Proposals
+from sphereorient.search import Candidates, OrientSettings
 from sphereorient.trajectory import Reason
 
 OK, DARK, RUNAWAY, NOT_FOUND = Reason.OK, Reason.DARK, Reason.RUNAWAY, Reason.NOT_FOUND
@@ -19,16 +19,17 @@ def candidates(counts: list[int], rng: torch.Generator) -> Candidates:
     total = sum(counts)
     return Candidates(
         offset=torch.tensor([0, *counts]).cumsum(0),
-        R_lab_body=so3.random_rotations(total, generator=rng),
+        R_view_body=so3.random_rotations(total, generator=rng),
+        R_lab_view=so3.random_rotations(len(counts), generator=rng).double(),
         score=torch.rand(total, generator=rng, dtype=torch.float64),
         reason=tuple(OK if count else DARK for count in counts),
     )
 
 
-def proposals(counts: list[int], first: int, reason: tuple[Reason, ...]) -> Proposals:
+def proposals(counts: list[int], first: int, reason: tuple[Reason, ...]) -> Candidates:
     """Scores count up from `first`, so that a row is known again."""
     total = sum(counts)
-    return Proposals(
+    return Candidates(
         offset=torch.tensor([0, *counts]).cumsum(0),
         R_view_body=so3.random_rotations(total, generator=torch.Generator().manual_seed(first)),
         score=first + torch.arange(total, dtype=torch.float64),
@@ -61,22 +62,28 @@ def test_padded_is_one_wide_where_no_frame_has_a_candidate(rng, counts):
 
 def test_candidates_whose_lengths_disagree_are_refused(rng):
     good = candidates([2, 0, 1], rng)
-    parts = {"offset": good.offset, "R_lab_body": good.R_lab_body, "score": good.score, "reason": good.reason}
+    parts = {"offset": good.offset, "R_view_body": good.R_view_body, "score": good.score, "reason": good.reason}
     for wrong in (
-        {"R_lab_body": good.R_lab_body[:2]},
+        {"R_view_body": good.R_view_body[:2]},
         {"score": good.score[:2]},
         {"offset": torch.tensor([0, 2, 2, 4])},
         {"reason": good.reason[:2]},
     ):
         with pytest.raises(ShapeError, match=r"Candidates: expected .* orientations and scores"):
             Candidates(**(parts | wrong))
-    with pytest.raises(ShapeError, match=r"Candidates.R_lab_body: expected shape \(\.\.\., 3, 3\)"):
-        Candidates(**(parts | {"R_lab_body": torch.zeros(3, 4)}))
+    with pytest.raises(ShapeError, match=r"Candidates.R_view_body: expected shape \(\.\.\., 3, 3\)"):
+        Candidates(**(parts | {"R_view_body": torch.zeros(3, 4)}))
+
+
+def test_candidates_are_turned_into_the_lab_frame_by_frame(rng):
+    some = candidates([2, 0, 1], rng)
+    expected = [some.R_lab_view[0] @ some.R_view_body[0], some.R_lab_view[0] @ some.R_view_body[1]]
+    assert_close(some.R_lab_body, torch.stack([*expected, some.R_lab_view[2] @ some.R_view_body[2]]))
 
 
 def test_joined_proposals_are_the_disks_of_all_parts_in_order():
-    joined = Proposals.joined(
-        [proposals([1, 2], 0, (OK, OK)), Proposals.none([RUNAWAY]), proposals([0, 1], 10, (DARK, OK))]
+    joined = Candidates.joined(
+        [proposals([1, 2], 0, (OK, OK)), Candidates.none([RUNAWAY]), proposals([0, 1], 10, (DARK, OK))]
     )
     assert joined.offset.tolist() == [0, 1, 3, 3, 3, 4]
     assert joined.score.tolist() == [0, 1, 2, 10]
@@ -96,14 +103,14 @@ def test_spread_proposals_have_an_entry_for_every_frame():
 
 
 def test_spread_over_frames_without_any_disk():
-    spread = Proposals.none(()).spread(torch.zeros(3, dtype=torch.bool), (DARK, NOT_FOUND, DARK))
+    spread = Candidates.none(()).spread(torch.zeros(3, dtype=torch.bool), (DARK, NOT_FOUND, DARK))
     assert spread.offset.tolist() == [0, 0, 0, 0]
     assert spread.reason == (DARK, NOT_FOUND, DARK)
 
 
 def test_reasons_for_another_number_of_frames_are_refused():
     with pytest.raises(ValueError, match="zip"):
-        Proposals.none([RUNAWAY]).spread(torch.tensor([True, False]), (OK,))
+        Candidates.none([RUNAWAY]).spread(torch.tensor([True, False]), (OK,))
 
 
 def test_the_defaults_are_the_papers():

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.search import FallbackProposer, Proposals
+from sphereorient.search import Candidates, FallbackProposer
 from sphereorient.search.fallback import interleaved, resized
 from sphereorient.trajectory import Reason
 
@@ -18,11 +18,11 @@ def turned(*degrees: float) -> Tensor:
     return so3.exp(torch.tensor([[0.0, 0.0, math.radians(d)] for d in degrees], dtype=torch.float64).reshape(-1, 3))
 
 
-def proposals(*disks: list[tuple[float, float]]) -> Proposals:
+def proposals(*disks: list[tuple[float, float]]) -> Candidates:
     """Of each disk some pairs of angle (degrees) and score."""
     counts = torch.tensor([len(disk) for disk in disks])
     rows = [row for disk in disks for row in disk]
-    return Proposals(
+    return Candidates(
         offset=torch.nn.functional.pad(counts.cumsum(0), (1, 0)),
         R_view_body=turned(*(angle for angle, _ in rows)),
         score=torch.tensor([score for _, score in rows], dtype=torch.float64),
@@ -36,7 +36,7 @@ class Planted:
     def __init__(self, answers: dict[int, list[tuple[float, float]]], size_px: int = 4) -> None:
         self.answers, self.size_px, self.asked = answers, size_px, []
 
-    def propose(self, disks: Tensor) -> Proposals:
+    def propose(self, disks: Tensor) -> Candidates:
         assert disks.shape[1:] == (self.size_px, self.size_px)
         keys = [round(float(disk[0, 0])) for disk in disks]
         self.asked += keys
@@ -47,7 +47,7 @@ def disks(*keys: int, size_px: int = 4) -> Tensor:
     return torch.tensor(keys, dtype=torch.float32)[:, None, None].expand(-1, size_px, size_px).contiguous()
 
 
-def angles(found: Proposals, f: int) -> list[float]:
+def angles(found: Candidates, f: int) -> list[float]:
     R = found.R_view_body[found.offset[f] : found.offset[f + 1]]
     return [round(math.degrees(float(x)), 3) for x in so3.log(R)[:, 2]]
 
@@ -88,7 +88,7 @@ def test_a_disk_that_neither_knows_has_the_reason_of_the_second() -> None:
 def test_one_disk_at_a_time_gives_the_same_as_all() -> None:
     proposer = FallbackProposer(Planted(FIRST), Planted(SECOND), sure=0.75)
     together = proposer.propose(disks(3, 1, 2))
-    alone = Proposals.joined([proposer.propose(disks(key)) for key in (3, 1, 2)])
+    alone = Candidates.joined([proposer.propose(disks(key)) for key in (3, 1, 2)])
     assert torch.equal(together.offset, alone.offset)
     assert torch.equal(together.R_view_body, alone.R_view_body)
 

@@ -20,7 +20,7 @@ from orient_examples import (
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError
-from sphereorient.search import OrientSettings, TemplateSearch
+from sphereorient.search import OrientSettings, PaperSearch
 from sphereorient.trajectory import Reason
 
 
@@ -60,7 +60,7 @@ def test_a_finer_grid_answers_more_exactly():
     disks = clean_disks("blobs", R_view_body, 64)
     coarse, fine = (
         best_errors_deg(
-            TemplateSearch(texture_of("blobs"), 64, OrientSettings(fine_step_deg=step)).propose(disks), R_view_body
+            PaperSearch(texture_of("blobs"), 64, OrientSettings(fine_step_deg=step)).propose(disks), R_view_body
         )
         for step in (6.0, 2.0)
     )
@@ -71,9 +71,9 @@ def test_a_finer_grid_answers_more_exactly():
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_tells_a_mirrored_picture_and_a_mirrored_map_from_the_right_one(kind):
     disks = clean_disks(kind, attitudes(10))
-    mirrored_search = TemplateSearch(texture_of(kind).flip(1), SIZE, OrientSettings())
+    mirrored_search = PaperSearch(texture_of(kind).flip(1), SIZE, OrientSettings())
 
-    def best_scores(search: TemplateSearch, disks: torch.Tensor) -> torch.Tensor:
+    def best_scores(search: PaperSearch, disks: torch.Tensor) -> torch.Tensor:
         found = search.propose(disks)
         none = torch.zeros(1, dtype=torch.float64)
         return torch.stack([torch.cat([of_disk(found, disk)[1], none])[0] for disk in range(len(disks))])
@@ -148,7 +148,7 @@ def test_no_disks_give_no_proposals():
 def test_disks_of_another_size_are_refused_and_an_odd_size_is_rounded_up():
     with pytest.raises(ShapeError, match=r"disks: expected \(F, 48, 48\)"):
         search_of("blobs").propose(torch.zeros(2, SIZE + 2, SIZE + 2))
-    search = TemplateSearch(texture_of("blobs"), SIZE - 1, OrientSettings())
+    search = PaperSearch(texture_of("blobs"), SIZE - 1, OrientSettings())
     assert search.size_px == SIZE
     R_view_body = attitudes(2)
     assert best_errors_deg(search.propose(clean_disks("blobs", R_view_body)), R_view_body).max() < 4
@@ -181,14 +181,14 @@ def test_noise_does_not_change_its_neighbours():
 def test_no_proposal_scores_below_score_min_and_those_above_stay():
     disks = clean_disks("dots", attitudes(30))
     all_of_them = search_of("dots").propose(disks)
-    few = TemplateSearch(texture_of("dots"), SIZE, OrientSettings(score_min=0.8)).propose(disks)
+    few = PaperSearch(texture_of("dots"), SIZE, OrientSettings(score_min=0.8)).propose(disks)
     assert (all_of_them.score < 0.8).any()
     assert (few.score >= 0.8).all()
     assert torch.equal(few.score, all_of_them.score[all_of_them.score >= 0.8])
 
 
 def test_a_disk_whose_best_is_below_score_min_says_so():
-    search = TemplateSearch(texture_of("blobs"), SIZE, OrientSettings(score_min=1.0))
+    search = PaperSearch(texture_of("blobs"), SIZE, OrientSettings(score_min=1.0))
     found = search.propose(clean_disks("blobs", attitudes(2)))
     assert found.reason == (Reason.LOW_SCORE,) * 2
     assert found.offset.tolist() == [0, 0, 0]
@@ -203,7 +203,7 @@ def test_the_groups_of_a_disk_are_apart_by_the_groups_angle(group_deg):
     settings = OrientSettings(
         group_deg=group_deg, score_margin=0.2, groups_max=500, fine_radius_deg=0.1, fine_step_deg=1.0
     )
-    found = TemplateSearch(texture_of("dots"), SIZE, settings).propose(clean_disks("dots", attitudes(6)))
+    found = PaperSearch(texture_of("dots"), SIZE, settings).propose(clean_disks("dots", attitudes(6)))
     several = 0
     for disk in range(6):
         R, _ = of_disk(found, disk)
@@ -218,7 +218,7 @@ def test_more_groups_than_allowed_are_a_runaway():
     disks = clean_disks("dots", attitudes(12))
     many = search_of("dots").propose(disks)
     assert (many.offset.diff() > 1).any()
-    one = TemplateSearch(texture_of("dots"), SIZE, OrientSettings(groups_max=1)).propose(disks)
+    one = PaperSearch(texture_of("dots"), SIZE, OrientSettings(groups_max=1)).propose(disks)
     for disk in range(12):
         if many.offset.diff()[disk] > 1:
             assert one.reason[disk] == Reason.RUNAWAY
@@ -227,7 +227,7 @@ def test_more_groups_than_allowed_are_a_runaway():
 
 def test_two_groups_that_climb_to_one_place_give_one_proposal():
     settings = OrientSettings(group_deg=10.0, groups_max=500, score_margin=0.15)
-    found = TemplateSearch(texture_of("blobs"), SIZE, settings).propose(clean_disks("blobs", attitudes(2)))
+    found = PaperSearch(texture_of("blobs"), SIZE, settings).propose(clean_disks("blobs", attitudes(2)))
     for disk in range(2):
         R, _ = of_disk(found, disk)
         gap = so3.geodesic_distance(R[:, None], R[None]).rad2deg() + 360 * torch.eye(len(R))

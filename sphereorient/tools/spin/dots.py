@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from sphereorient.errors import PaintError, check_tail, refusal
-from sphereorient.search import GreySearch, GreySearchSettings
+from sphereorient.search import GreySearchSettings, TemplateBank
+from sphereorient.search.candidates import Candidates
 from sphereorient.search.normalisation import Blur, rim_share
-from sphereorient.search.proposer import Proposals
 from sphereorient.sphere import orthographic_view
 from sphereorient.synth.textures import map_directions
 
@@ -116,7 +116,7 @@ class DotSearch:
     """
 
     def __init__(self, table: DotTable, settings: GreySearchSettings = DOT_SEARCH) -> None:
-        self._search = GreySearch(table.texture(), settings)
+        self._search = TemplateBank(table.texture(), settings)
         view = orthographic_view(settings.size_px, torch.float64)
         self._inside, self._normal = view.inside, view.normal_view
         self._even = Blur(settings.size_px, EVEN)
@@ -129,11 +129,11 @@ class DotSearch:
         """Side of the disks, px."""
         return self._search.size_px
 
-    def propose(self, disks: Tensor) -> Proposals:
-        """Propose attitudes; see `GreySearch.propose`.
+    def propose(self, disks: Tensor) -> Candidates:
+        """Propose attitudes; see `TemplateBank.propose`.
 
         Returns:
-            Proposals, best first; the score is 1 where all dark is dots and all dots are visible, 1/2 where a ball
+            Candidates, best first; the score is 1 where all dark is dots and all dots are visible, 1/2 where a ball
             without dots would explain as much.
         """
         found = self._search.propose(disks)

@@ -12,7 +12,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
 from sphereorient.experiment.recording import Progress, silent
-from sphereorient.search import GreySearch, GreySearchSettings, Proposals, Proposer
+from sphereorient.search import Candidates, GreySearchSettings, Proposer, TemplateBank
 from sphereorient.search.refine_rotation import DetailLevel, detail_level, level_reference, refine_rotation
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import texture_table
@@ -57,7 +57,7 @@ class SpinFound:
     ambiguous: int  # number of spins that the pictures do not distinguish; 1: the first is the only one
     evidence: Tensor  # (K, F), of each picture for each spin, log
     mirrored_evidence: float  # of the best spin of the mirrored texture
-    alone: Proposals  # attitudes from each picture alone, best first
+    alone: Candidates  # attitudes from each picture alone, best first
     R_view_body: Tensor  # (F, 3, 3), each picture's own attitude near the first spin's, else that spin's
     residual_rad: Tensor  # (F,), between the two; NaN where the picture has none
     score: Tensor  # (F,), share of the picture's variance that the texture explains there
@@ -125,17 +125,17 @@ def spin_of(
 
 def _searched(
     disks: Tensor, time_s: Tensor, texture: Tensor | DotTable, settings: SpinSettings, progress: Progress, stage: str
-) -> tuple[Proposals, PictureCandidates]:
+) -> tuple[Candidates, PictureCandidates]:
     """Search each disk alone."""
     search: Proposer = (
-        DotSearch(texture, settings.search) if isinstance(texture, DotTable) else GreySearch(texture, settings.search)
+        DotSearch(texture, settings.search) if isinstance(texture, DotTable) else TemplateBank(texture, settings.search)
     )
     parts = []
     for some in torch.split(torch.arange(len(disks)), AT_ONCE):
         progress(stage, int(some[0]), len(disks))
         parts.append(search.propose(disks[some]))
     progress(stage, len(disks), len(disks))
-    alone = Proposals.joined(parts)
+    alone = Candidates.joined(parts)
     return alone, picture_candidates(time_s, alone.offset, alone.R_view_body, alone.score.square())
 
 

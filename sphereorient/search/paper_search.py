@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.search.candidates import Candidates
 from sphereorient.search.extraction import extract_paint
-from sphereorient.search.proposer import Proposals
 from sphereorient.search.settings import OrientSettings
 from sphereorient.sphere import DirectionTable, DiskView, orthographic_view, reduced_texture
 from sphereorient.sphere.view import disk_offsets
@@ -20,7 +20,7 @@ from sphereorient.trajectory import Reason
 BATCH = 32
 
 
-class TemplateSearch:
+class PaperSearch:
     """Searches all of SO(3) for the views of a map that look like a disk (paper sections III B and C).
 
     Args:
@@ -46,24 +46,24 @@ class TemplateSearch:
         """Side of the disks, px."""
         return self._size_px
 
-    def propose(self, disks: Tensor) -> Proposals:
+    def propose(self, disks: Tensor) -> Candidates:
         """Propose the best orientation of each group that a disk allows.
 
         Args:
             disks: (F, S, S) float32, grey levels, cropped so that the outline touches the borders.
 
         Returns:
-            Proposals; a disk that fits nearly everywhere gives none (`RUNAWAY`), as does one whose best T stays below
+            Candidates; a disk that fits nearly everywhere gives none (`RUNAWAY`), as does one whose best T stays below
             `score_min` (`LOW_SCORE`).
         """
-        parts: list[Proposals] = []
+        parts: list[Candidates] = []
         for first in range(0, len(disks), BATCH):
             batch = disks[first : first + BATCH]
             filled = torch.cat([batch, batch.new_zeros(BATCH - len(batch), *batch.shape[1:])])
             paint = extract_paint(filled, self._fine.inside, self._settings)
             groups = self._groups(self._coarse_scores(paint))
             parts += [self._fine_search(paint[f], groups[f]) for f in range(len(batch))]
-        return Proposals.joined(parts) if parts else Proposals.none(())
+        return Candidates.joined(parts) if parts else Candidates.none(())
 
     def _coarse_scores(self, paint: Tensor) -> Tensor:
         """T of every coarse template, (F, K): 1/2 + sum of products / (2 pixels counted) (docs/errata.md A2)."""
@@ -87,23 +87,23 @@ class TemplateSearch:
             possible &= flat[best] @ flat.T < near
         return [torch.stack(pick) if pick else torch.zeros(0, dtype=torch.long) for pick in picks]
 
-    def _fine_search(self, paint: Tensor, group: Tensor) -> Proposals:
+    def _fine_search(self, paint: Tensor, group: Tensor) -> Candidates:
         """Climb from each group's best on the fine grid: the proposals of one disk, best first."""
         if len(group) > self._settings.groups_max:
-            return Proposals.none([Reason.RUNAWAY])
+            return Candidates.none([Reason.RUNAWAY])
         seen = paint[self._fine.inside][self._fine_used]
         found = [self._climb(seen, self._grid[g]) for g in group]
         score = torch.stack([score for _, score in found]).double()
         order = score.argsort(descending=True, stable=True)
         order = order[score[order] >= self._settings.score_min]
         if not len(order):
-            return Proposals.none([Reason.LOW_SCORE])
+            return Candidates.none([Reason.LOW_SCORE])
         # The float32 products back to rotations of float64.
         R = so3.nearest_rotation(torch.stack([R for R, _ in found]).double()[order])
         # Two groups may climb to one place: keep the first of those within two fine steps.
         gap = so3.geodesic_distance(R[:, None], R[None])
         first = ~torch.tril(gap < 2 * math.radians(self._settings.fine_step_deg), -1).any(1)
-        return Proposals(
+        return Candidates(
             offset=torch.tensor([0, int(first.sum())]),
             R_view_body=R[first],
             score=score[order][first],

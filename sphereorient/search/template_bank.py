@@ -12,9 +12,9 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError, refusal
+from sphereorient.search.candidates import Candidates
 from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.peaks import best_of_groups, compact_groups, distinct
-from sphereorient.search.proposer import Proposals
 from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import orthographic_view, perspective_view
@@ -31,7 +31,7 @@ TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest
 DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
 
 
-class GreySearch(nn.Module):
+class TemplateBank(nn.Module):
     """Searches all of SO(3) for the views of a texture map that look like a disk, under any smooth light.
 
     The bank covers SO(3): every rotation is within (1/2 + 1/sqrt 2) step of a template (`so3.lattman_grid`), and
@@ -102,14 +102,14 @@ class GreySearch(nn.Module):
         scale = 127.0 / DEVIATIONS * math.sqrt(self._pixels)
         return (torch._int_mm(steps, self._bank.T) / scale**2).reshape(*grey.shape[:-2], -1)
 
-    def propose(self, disks: Tensor) -> Proposals:
+    def propose(self, disks: Tensor) -> Candidates:
         """Propose the best orientations that a disk allows, at least `distinct_deg` apart.
 
         Args:
             disks: (F, S, S) float32, grey levels of any scale, the outline touching the borders.
 
         Returns:
-            Proposals, best first. The score is the share of the disk's deviation from smooth light that the paint
+            Candidates, best first. The score is the share of the disk's deviation from smooth light that the paint
             explains, 0 .. 1 (the square of their correlation). A disk whose best score stays below `score_min` has
             none (`LOW_SCORE`).
 
@@ -119,11 +119,11 @@ class GreySearch(nn.Module):
         if disks.shape[1:] != (self.size_px, self.size_px):
             size = f"(F, {self.size_px}, {self.size_px})"
             raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
-        parts = [Proposals.none(())]
+        parts = [Candidates.none(())]
         for some in torch.split(disks, PRODUCT):
             for disk, place, peak in zip(some, *self.search(some), strict=True):
                 parts.append(self._refined(disk, self.templates[place[peak][: self._settings.peaks]]))
-        return Proposals.joined(parts)
+        return Candidates.joined(parts)
 
     def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
         """Compare disks with the whole bank.
@@ -153,7 +153,7 @@ class GreySearch(nn.Module):
         chunks = torch.split(self.templates, BATCH)
         return torch.cat([_steps(self._normalise(self._view.picture(paint.sample(R.mT @ normal)[0]))) for R in chunks])
 
-    def _refined(self, disk: Tensor, starts: Tensor) -> Proposals:
+    def _refined(self, disk: Tensor, starts: Tensor) -> Candidates:
         """Refine the peaks of one disk: its proposals, best first."""
         settings = self._settings
         R, score = refine_rotation(self._rough, level_reference(self._rough, disk), starts, settings.rough_steps)
@@ -162,9 +162,9 @@ class GreySearch(nn.Module):
         chosen = self._distinct(R, score)
         chosen = chosen[score[chosen] >= settings.score_min]
         if not len(chosen):
-            return Proposals.none([Reason.LOW_SCORE])
+            return Candidates.none([Reason.LOW_SCORE])
         # The float32 products back to rotations of float64.
-        return Proposals(
+        return Candidates(
             offset=torch.tensor([0, len(chosen)]),
             R_view_body=so3.nearest_rotation(R[chosen].double()),
             score=score[chosen].double(),
