@@ -14,34 +14,11 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parents[1]
 PACKAGE = REPO / "sphereorient"
 # A room imports only from those before it.
-ORDER = [
-    "errors",
-    "files",
-    "so3",
-    "cameras",
-    "movies",
-    "sphere",
-    "trajectory",
-    "calibration",
-    "experiment",
-    "locate",
-    "pose",
-    "search",
-    "follow",
-    "assemble",
-    "motion",
-    "synth",
-    "statistics",
-    "learn",
-    "mapping",
-    "methods",
-    "run",
-    "preflight",
-    "evaluate",
-    "report",
-    "tools",
-    "cli",
-]
+ORDER = (
+    *("errors", "files", "so3", "cameras", "movies", "sphere", "trajectory", "calibration", "experiment", "locate"),
+    *("pose", "search", "follow", "assemble", "motion", "synth", "statistics", "learn", "mapping", "methods", "run"),
+    *("preflight", "evaluate", "report", "tools", "cli"),
+)
 
 
 def modules() -> dict[str, Path]:
@@ -134,6 +111,57 @@ def lines(name: str) -> tuple[int, int]:
     return total, code
 
 
+def sentence(name: str) -> str:
+    """Return the first sentence of a room's docstring."""
+    path = PACKAGE / name / "__init__.py"
+    path = path if path.is_file() else PACKAGE / f"{name}.py"
+    return (ast.get_docstring(ast.parse(path.read_text())) or "").split("\n")[0].rstrip(".")
+
+
+def write_list() -> None:
+    """Write the list of rooms into CONTRIBUTING.md."""
+    path = REPO / "CONTRIBUTING.md"
+    rows = ["| room | what | lines |", "|---|---|---|"]
+    rows += [f"| `{name}` | {sentence(name)} | {lines(name)[0]:,} |" for name in ORDER]
+    head, _, rest = path.read_text().partition("<!-- rooms -->\n")
+    tail = rest.partition("<!-- end of rooms -->\n")[2]
+    text = "\n".join(rows)
+    path.write_text(f"{head}<!-- rooms -->\n{text}\n<!-- end of rooms -->\n{tail}")
+
+
+def draw(path: Path) -> None:
+    """Draw the rooms on a line, upwards, with an arc for each import."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Arc
+
+    figure = Figure((7.0, 8.6), dpi=110, layout="constrained")
+    axes = figure.add_subplot()
+    found = arrows()
+    for high, name in enumerate(ORDER):
+        axes.text(0.0, high, name, ha="right", va="center", fontsize=9, family="monospace")
+        axes.text(-0.24, high, f"{lines(name)[0]:,}", ha="right", va="center", fontsize=7, color="#777777")
+        for other in found[name]:
+            low = ORDER.index(other)
+            colour = "#0072B2" if low < high else "#D55E00"
+            axes.add_patch(
+                Arc(
+                    (0.02, (high + low) / 2),
+                    0.075 * abs(high - low),
+                    abs(high - low),
+                    theta1=-90,
+                    theta2=90,
+                    color=colour,
+                    lw=0.5,
+                )
+            )
+    axes.set(xlim=(-0.36, 1.0), ylim=(-0.8, len(ORDER) - 0.2))
+    axes.set_axis_off()
+    axes.set_title(
+        "Rooms, their lines, and their imports: blue arcs end at an earlier room (below)", fontsize=9, loc="left"
+    )
+    figure.savefig(path, metadata={"Software": None})
+
+
 def main() -> int:
     """Print all; return 1 where the rooms are not a line."""
     found, whole = arrows(), [0, 0]
@@ -144,6 +172,9 @@ def main() -> int:
         print(f"{name:12} {total:6} {code:6}  {' '.join(sorted(found[name], key=ORDER.index))}")
     front = len((PACKAGE / "__init__.py").read_text().splitlines())
     print(f"{'all':12} {whole[0] + front:6} {whole[1]:6}")
+    if "--write" in sys.argv[1:]:
+        write_list()
+        draw(REPO / "docs" / "rooms.png")
     wrong, round_ = downward(), circles()
     for arrow in wrong:
         print(f"downward: {arrow}")

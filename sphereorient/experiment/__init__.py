@@ -1,4 +1,4 @@
-"""The noun that goes in: experiment, timeline, camera streams, an opened recording."""
+"""What goes in: the experiment, its timeline, camera streams, an opened recording."""
 
 from sphereorient.experiment.experiment import (
     MOVIES_OWN,

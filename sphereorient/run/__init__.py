@@ -1,4 +1,4 @@
-"""One way through: run(request, store), stores that outlive a kill, executors of workers, many experiments."""
+"""One way through: run(request, store), stores that outlive a kill, executors, many experiments."""
 
 from sphereorient.run.many import Outcome, run_many
 from sphereorient.run.request import Request

@@ -1,4 +1,4 @@
-"""Where could it point, without history: normalisation, template banks, coarse to fine, the Proposer protocol."""
+"""Orientation without history: normalisation, template banks, coarse to fine, candidates."""
 
 from sphereorient.search.candidates import Candidates, Proposer
 from sphereorient.search.crop import crop_disk
