@@ -194,9 +194,9 @@ def test_pictures_that_are_missing_or_none_are_refused(tmp_path):
     (tmp_path / "cam1_01.png").unlink()
     refused(path, r"cam1_01.png: expected a picture, got no such file")
     (tmp_path / "cam1_01.png").write_text("no picture")
-    refused(path, r"cam1_01.png: expected a picture, got a file that is none")
+    refused(path, r"cam1_01.png: expected a picture, got a file that is no picture or too large")
     (tmp_path / "cam1_01.png").write_bytes(b"")
-    refused(path, r"cam1_01.png: expected a picture, got a file that is none")
+    refused(path, r"cam1_01.png: expected a picture, got a file that is no picture or too large")
 
 
 def test_poses_too_alike_are_refused_and_the_loose_parameter_is_named(tmp_path):
