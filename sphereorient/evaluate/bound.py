@@ -115,8 +115,8 @@ def jacobian(render: SphereRenderer, R_view_body: Tensor) -> Tensor:
     both = torch.cat([torch.diag(step), -torch.diag(step)])  # (12, 6)
     R = so3.exp(both[:, :3]) @ R_view_body[:, None]
     position = torch.nn.functional.pad(both[:, 3:5], (0, 1))
-    pictures = render(R, position, render.radius_mm + both[:, 5]).reshape(len(R), 2, 6, -1)
-    derivative: Tensor = ((pictures[:, 0] - pictures[:, 1]) / (2 * step[:, None])).mT
+    pictures = render(R, position, render.radius_mm + both[:, 5]).flatten(-2)  # (K, 12, S^2)
+    derivative: Tensor = ((pictures[:, :6] - pictures[:, 6:]) / (2 * step[:, None])).mT
     return derivative
 
 

@@ -16,6 +16,7 @@ from sphereorient.errors import CameraError, SettingsError, ShapeError
 from sphereorient.pose.implicit import _moved
 from sphereorient.sphere import Sampling, SphereRenderer, sample_texture, sphere_normals
 from sphereorient.sphere.renderer import (
+    SHADE,
     PaintedBall,
     aperture_matrix,
     expected_grey,
@@ -210,7 +211,8 @@ def test_inside_the_ball_the_picture_is_the_renderers(rng):
     body = normal @ R
     flat = (body[..., 2].abs() < 0.9) & inner  # beyond, the map is continued over the pole
     lamps = a_ball(texture).lamps_lab
-    light = 0.5 + (normal @ lamps.mT).clamp_min(0).sum(-1)
+    strength = lamps.norm(dim=-1)
+    light = 0.5 + lambert(normal, lamps / strength[:, None], strength, SHADE)
     expected = (20.0 + 150.0 * sample_texture(texture, body)) * light
     got = expected_grey(rays, place, R, a_ball(texture))
     assert int(flat.sum()) > 300

@@ -127,7 +127,7 @@ def test_inputs_stay_as_they_are(rng):
 
 
 def test_what_is_no_map_and_what_is_no_direction_is_refused():
-    with pytest.raises(ShapeError, match=r"texture: expected \(H, 2 H\), got \(8, 15\)"):
+    with pytest.raises(ShapeError, match=r"texture: expected \(H, 2 H\), H at least 2, got \(8, 15\)"):
         sample_texture(torch.zeros(8, 15), torch.zeros(1, 3))
     with pytest.raises(ShapeError, match=r"direction_body: expected shape \(\.\.\., 3\)"):
         sample_texture(torch.zeros(8, 16), torch.zeros(3, 2))

@@ -72,7 +72,7 @@ def test_every_degradation_gets_harder_from_nothing_on():
 
 def test_the_issues_list_is_complete_and_pictures_come_in_the_order_of_the_light():
     assert len(DEGRADATIONS) == 21
-    assert [name for name, row in DEGRADATIONS.items() if row.where == "picture"] == list(NAMES)
+    assert [name for name, row in DEGRADATIONS.items() if row.where in ("picture", "frame")] == list(NAMES)
     assert [row.where for row in DEGRADATIONS.values()][:3] == ["scene"] * 3
     assert degradation("ball_size").values[0] == 160
     assert degradation("ball_size").values[-1] == 20

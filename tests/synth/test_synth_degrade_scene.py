@@ -93,7 +93,7 @@ def test_without_degradations_the_files_are_those_of_synth(plain, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", [name for name, row in DEGRADATIONS.items() if row.where in ("picture", "map", "movie")]
+    "name", [name for name, row in DEGRADATIONS.items() if row.where in ("picture", "frame", "map", "movie")]
 )
 def test_what_spoils_pictures_spoils_the_movies_and_nothing_that_is_told(name, plain, tmp_path):
     path = write_degraded(tmp_path, SETTINGS, {name: 5})
@@ -104,7 +104,7 @@ def test_what_spoils_pictures_spoils_the_movies_and_nothing_that_is_told(name, p
         assert np.abs(frames_of(path)[camera] - frames).mean() > 0.5
 
 
-@pytest.mark.parametrize("name", [name for name, row in DEGRADATIONS.items() if row.where == "told"])
+@pytest.mark.parametrize("name", [name for name, row in DEGRADATIONS.items() if row.where == "reported"])
 def test_what_is_told_wrong_changes_neither_truth_nor_movies(name, plain, tmp_path):
     path = write_degraded(tmp_path, SETTINGS, {name: 4})
     assert same_truth(path, plain)
