@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from sphereorient.experiment import Experiment, load_experiment
     from sphereorient.methods.map import learn_map
     from sphereorient.methods.settings import Settings, load_settings
-    from sphereorient.pose.pose_fitter import PoseFitter
+    from sphereorient.pose import PoseFitter
     from sphereorient.preflight import preflight as check
     from sphereorient.run.stages import track_movies
     from sphereorient.search import TemplateBank
@@ -23,7 +23,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Experiment": ("experiment", "Experiment"),
     "PathLayer": ("assemble", "PathLayer"),
-    "PoseFitter": ("pose.pose_fitter", "PoseFitter"),
+    "PoseFitter": ("pose", "PoseFitter"),
     "Settings": ("methods.settings", "Settings"),
     "SphereRenderer": ("sphere", "SphereRenderer"),
     "TemplateBank": ("search", "TemplateBank"),

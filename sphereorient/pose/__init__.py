@@ -2,15 +2,20 @@
 
 from sphereorient.pose.defocus import estimate_blur_px
 from sphereorient.pose.fitter import CameraView, Fitter, Optics, base_table
+from sphereorient.pose.implicit import ImplicitPose, implicit_pose
 from sphereorient.pose.light import Light
 from sphereorient.pose.pixels import LinesOfSight
+from sphereorient.pose.pose_fitter import PoseFitter
 
 __all__ = [
     "CameraView",
     "Fitter",
+    "ImplicitPose",
     "Light",
     "LinesOfSight",
     "Optics",
+    "PoseFitter",
     "base_table",
     "estimate_blur_px",
+    "implicit_pose",
 ]

@@ -2,6 +2,7 @@
 
 from sphereorient.synth.degrade import degrade
 from sphereorient.synth.degrade_scene import write_degraded
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track, smoothed_track
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion
 from sphereorient.synth.scene import RenderedScene, make_scene, render_frame
 from sphereorient.synth.settings import SynthSettings
@@ -11,16 +12,20 @@ from sphereorient.synth.write import write_synthetic_experiment
 
 __all__ = [
     "DEGRADATIONS",
+    "EnsembleSpec",
     "Motion6D",
     "RandomMotion",
     "RenderedScene",
     "SynthSettings",
     "degrade",
+    "draw_ensemble",
+    "filtered_track",
     "make_scene",
     "random_motion",
     "random_texture",
     "render_frame",
     "severity",
+    "smoothed_track",
     "write_degraded",
     "write_synthetic_experiment",
 ]
