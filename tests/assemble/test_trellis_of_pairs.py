@@ -91,7 +91,7 @@ def test_without_costs_of_triples_it_is_the_first_order(seed):
 
 
 def test_a_motion_that_goes_on_evenly_wins_over_one_that_stands_which_the_first_order_takes():
-    # ERRATA A6 in one dimension: place 0 stands at 5, place 1 moves by 1 each step from 0.
+    # docs/errata.md A6 in one dimension: place 0 stands at 5, place 1 moves by 1 each step from 0.
     steps = 8
     at = torch.stack([torch.full((steps,), 5.0), torch.arange(float(steps))], -1)
     mask = torch.ones(steps, 2, dtype=torch.bool)

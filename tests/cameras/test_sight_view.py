@@ -1,4 +1,4 @@
-"""The view frame (ERRATA A1)."""
+"""The view frame (docs/errata.md A1)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Turns between sets of points, against scipy; what markers can and cannot tell (ERRATA E8)."""
+"""Turns between sets of points, against scipy; what markers can and cannot tell (docs/errata.md E8)."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def test_it_tells_a_mirrored_picture_and_a_mirrored_map_from_the_right_one(kind)
     assert (right - best_scores(mirrored_search, disks.flip(-1))).abs().max() < 0.05
 
 
-# --- T, ERRATA A2
+# --- T, docs/errata.md A2
 
 
 def test_T_of_the_perfect_picture_is_1_because_the_pixels_counted_are_divided_by():

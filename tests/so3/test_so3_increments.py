@@ -1,4 +1,4 @@
-"""In whose components an increment's axis is: ERRATA E4."""
+"""In whose components an increment's axis is: docs/errata.md E4."""
 
 from __future__ import annotations
 

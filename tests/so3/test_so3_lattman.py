@@ -1,4 +1,4 @@
-"""Lattman's angles and grid; corrected and printed steps side by side: ERRATA E5."""
+"""Lattman's angles and grid; corrected and printed steps side by side: docs/errata.md E5."""
 
 from __future__ import annotations
 

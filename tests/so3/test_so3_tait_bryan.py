@@ -1,4 +1,4 @@
-"""Corrected and printed forms side by side: ERRATA E1, E2, E3, E9."""
+"""Corrected and printed forms side by side: docs/errata.md E1, E2, E3, E9."""
 
 from __future__ import annotations
 
