@@ -1,4 +1,4 @@
-"""The path with physics: false candidates that stand still, holes, fast spheres, twins; docs/errata.md A6 has no hole here."""
+"""The path with physics: false candidates that stand still, holes, fast spheres, twins; docs/errata.md A6."""
 
 from __future__ import annotations
 
