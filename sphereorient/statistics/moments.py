@@ -89,20 +89,11 @@ def _statistics(totals: Floats, sign: float) -> Floats:
 def without_noise(
     var: Floats, fourth: Floats, s2: Floats, s4: Floats, mixed: Floats, sign: float
 ) -> tuple[Floats, Floats]:
-    """Return variance and fourth moment (...) of the motion from those that were measured.
+    """Return variance and fourth moment (...) of the motion from the measured ones.
 
-    Noise that a kernel let through is independent of the motion and normal, with its own variance in every frame; it
-    is subtracted (sign 1). A smoother's estimate lacks the motion that it could not follow; its variance is added
-    (sign -1). The share LET_THROUGH of a smoother's error is noise; the lost motion is assumed to be as intermittent as
-    the rest, so that the flatness is that of the estimate without this noise.
-
-    Args:
-        var: (...), measured variance.
-        fourth: (...), measured fourth central moment.
-        s2: (...), mean of sigma^2.
-        s4: (...), mean of sigma^4.
-        mixed: (...), mean of (x - mean)^2 sigma^2.
-        sign: 1 subtracts noise, -1 adds what was smoothed away.
+    `s2`, `s4` and `mixed` (...) are the means of sigma^2, sigma^4 and (x - mean)^2 sigma^2. Sign 1 subtracts
+    independent normal noise that a kernel let through; -1 adds the motion that a smoother removed, as intermittent as
+    the rest.
     """
     part = 1.0 if sign > 0 else LET_THROUGH
     clean_var = var - part * s2
