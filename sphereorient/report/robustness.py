@@ -25,10 +25,9 @@ LEAST_DEG, MOST_DEG = 3e-3, 180.0
 
 
 def robustness_figure(results: Results) -> Figure:
-    """Draw error and lost frames of each method against severity, a panel for each degradation, worst first.
+    """Draw orientation error (median, 95th percentile) and bad frames against severity, a panel for each degradation.
 
-    Above: median (with markers) and 95th percentile of the orientation's error. Below: share of the frames with an
-    error of more than 10 degrees or without an orientation, after assembly.
+    Bad frames have an error of more than 10 degrees or no orientation, after assembly.
     """
     lines = summaries(results)
     kinds = worst_first(lines, results.methods)
@@ -43,7 +42,7 @@ def robustness_figure(results: Results) -> Figure:
 
 
 def worst_first(lines: Sequence[ResultSummary], methods: Sequence[str]) -> list[str]:
-    """Return the kinds of scenes except clean ones, sorted by bad frames, then by error, of the first method."""
+    """Return the degradations, sorted by bad frames, then by error, of the first method."""
 
     def hardness(kind: str) -> tuple[float, float]:
         own = [line for line in lines if line.kind == kind and line.method == methods[0]]
