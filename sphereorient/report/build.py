@@ -44,8 +44,7 @@ def write_report(
 ) -> list[Verdict]:
     """Write the report of tracks, named by file, whole or not at all, and return its findings.
 
-    The folder `out` is made, or replaced if it contains only an older report; `progress` gets stage, steps done, all
-    steps.
+    `out` is made, or replaced if it contains only an older report; `progress` gets stage, steps done and all steps.
 
     Raises:
         TrackError: no usable frame, or tracks of kernels and of smoothers together.
@@ -81,7 +80,7 @@ def write_report(
 def match_experiments(
     tracks: Mapping[str, Trajectory], experiments: Sequence[Experiment]
 ) -> dict[str, Experiment | None]:
-    """Return the experiment of each track by its name, None without one; a single one belongs to a single track.
+    """Return the experiment of each track by its name, or None; a single one belongs to a single track.
 
     Raises:
         ExperimentError: an experiment without a track, or two of one name.

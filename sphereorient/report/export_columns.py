@@ -58,8 +58,7 @@ def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
 def columns(track: Trajectory) -> Iterator[Dataset]:
     """Yield every frame-wise dataset of a track as columns, then of each camera, names as in `Trajectory.to_pandas`.
 
-    Vectors: one per component (position_x_mm); covariances: one per pair (position_cov_xy_mm2); rotations: quaternions,
-    w first and w >= 0 (quat_w ..).
+    Columns are components (position_x_mm), pairs (position_cov_xy_mm2), and quaternions with w >= 0 (quat_w ..).
     """
     for dataset in frame_wise(track):
         yield from _split(dataset, "")

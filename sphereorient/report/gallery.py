@@ -29,7 +29,7 @@ from sphereorient.report.strip import GOOD, BadStretch, bad_stretches, status_of
 from sphereorient.trajectory import Trajectory
 
 COUNT = 120
-BAD_SHARE = 2 / 3  # of the pictures, at most, if there are good frames
+BAD_SHARE = 2 / 3  # largest share of bad frames if there are good ones
 QUALITY = 85  # of the JPEG
 TO_COMPARE = "good; to compare with"
 TILE, GAP, HEAD, TITLE, LINE, LINES = 152, 6, 54, 22, 17, 3  # px; lines of text under a frame
@@ -114,8 +114,7 @@ def gallery(
 def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
     """Choose at most `count` frames to show; return the reasons by row of the track, in the order of the choice.
 
-    First the middles of the bad stretches, longest first, then the worst frames of each kind of problem in turn, then
-    others of the stretches. A third is for good frames, spread evenly.
+    Two thirds are bad frames, the middles of the longest stretches first; good frames, spread evenly, serve to compare.
     """
     status = status_of(track)
     good, bad = np.flatnonzero(status == GOOD), np.flatnonzero(status != GOOD)

@@ -29,7 +29,7 @@ from sphereorient.trajectory import Trajectory
 
 EXAMPLES = 6  # frames that are shown
 COMPARED = 200  # frames at most whose pictures are compared with the model
-UNSEEN = "#C9B48A"  # sand: cannot be mistaken for paint
+UNSEEN = "#C9B48A"  # sand colour: differs from any paint
 REACH = 0.5  # of the contrast of white and black paint: the ends of the residual's scale
 SLANT = 0.3  # cosine of the angle of sight below which pixels are not compared: the light is unknown there
 LEAST_ARROW_DEG = 4.0  # length on the page of the largest arrow, in degrees of the map
@@ -79,7 +79,7 @@ def _compared(view: OverlayView, k: int, picture: Grey, shown: NDArray[np.bool_]
 
 @in_style
 def map_figure(learnt: LearntMap, compared: Sequence[MapExample]) -> Figure:
-    """Draw texture map, coverage, the rounds of the attitudes, and examples of picture, model and residual."""
+    """Draw texture map, coverage, the iterations of the orientations, and examples of picture, model and residual."""
     figure = new_figure(WIDTH_IN, 8.2)
     grid = figure.add_gridspec(4, EXAMPLES, height_ratios=[2.6, 1.0, 1.0, 1.0])
     top = grid[0, :].subgridspec(2, 2, width_ratios=[2, 1])

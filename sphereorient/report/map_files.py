@@ -58,7 +58,7 @@ def read_seen(path: Path) -> Tensor | None:
 
 
 def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:
-    """Write the attitudes as a track, and all other results in its group `map`; may raise OutputError."""
+    """Write the orientations as a track, and all other results in its group `map`; may raise OutputError."""
     with put_aside(path, also=(RuntimeError,)) as aside:
         track.save(aside)
         with h5py.File(aside, "a") as file:

@@ -1,4 +1,4 @@
-"""The measured sphere in a camera's picture: outline, axes, trail, and the re-rendered picture in its light."""
+"""The measured sphere in a camera's picture: outline, axes, trail, and the re-rendered picture."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FINE = 2  # samples along each side of a pixel
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Path3D:
-    """Position and orientation of N frames, from the smoother where a frame has no own; made by `path_of`."""
+    """Position and orientation of N frames, from the smoother where the frame's own is missing; made by `path_of`."""
 
     position_mm: Floats  # (N, 3), lab
     R_lab_body: Floats  # (N, 3, 3)
@@ -150,7 +150,7 @@ class LightFit:
         return float(max(self.gain[0] + self.gain[3], 1e-6))
 
     def picture(self, seen: SeenDisk, filmed: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """Return grey levels (side, side), NaN outside the sphere, scaled by 0.5 .. 2 to the brightness of `filmed`."""
+        """Return model grey levels (side, side), NaN outside, scaled by 0.5 .. 2 to the brightness of `filmed`."""
         grey = (seen.basis @ self.gain) * seen.paint + seen.basis @ self.offset
         if filmed is not None:
             good = np.isfinite(grey) & np.isfinite(filmed)

@@ -196,7 +196,7 @@ def crop_side(half_px: float) -> int:
 
 
 def _fill(panels: Sequence[Panel], view: OverlayView, k: int, picture: Grey | None, window: CropWindow) -> str:
-    """Show crop, re-rendered sphere and residual; return why the sphere is not rendered, or an empty text."""
+    """Show crop, re-rendered sphere and residual; return why the sphere is not rendered, or an empty string."""
     grey = None if picture is None else crop(picture, window)
     if grey is not None:
         panels[0].show(view.shown(grey))

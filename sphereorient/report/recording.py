@@ -59,8 +59,7 @@ def view_track(
 ) -> None:
     """Show a track in Rerun's viewer, or write it to `save` (.rrd) without a window.
 
-    The experiment gives cameras, texture and pictures, these in one of `every` frames; without it the track is shown
-    alone.
+    The experiment adds cameras, texture map and pictures, the latter in one of `every` frames.
 
     Raises:
         OutputError: rerun-sdk is not installed, another suffix, or the file cannot be written.
@@ -122,9 +121,9 @@ def _log(recording: Any, track: Trajectory, experiment: Experiment | None, every
 
 
 def pinhole_near(camera: Camera, near_lab_mm: Floats) -> tuple[Floats, float] | None:
-    """Fit a pinhole to a camera near a point (3,), lab, mm; None if the point is not in front of the centre.
+    """Fit a pinhole, without distortion, to a camera near a point (3,), lab, mm.
 
-    Returns the matrix (3, 3), px, without distortion, and the point's distance along the axis, mm.
+    Return the matrix (3, 3), px, and the distance along the axis, mm; None if the point is not in front (telecentric).
     """
     R, T = camera.R_cam_lab, camera.T_cam_lab_mm
     depth = float((R @ torch.from_numpy(near_lab_mm) + T)[2])

@@ -25,10 +25,7 @@ LEAST_DEG, MOST_DEG = 3e-3, 180.0
 
 
 def robustness_figure(results: Results) -> Figure:
-    """Draw orientation error (median, 95th percentile) and bad frames against severity, a panel for each degradation.
-
-    Bad frames have an error of more than 10 degrees or no orientation, after assembly.
-    """
+    """Draw errors and bad frames (above 10 degrees, or lost) against severity, a panel for each degradation."""
     lines = summaries(results)
     kinds = worst_first(lines, results.methods)
     rows = math.ceil(len(kinds) / COLUMNS)

@@ -130,7 +130,7 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> QualityStrip:
 
 
 def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStretch]:
-    """Find the runs of doubtful or not valid frames, longest first; runs fewer than ten frames apart are one."""
+    """Find runs of bad frames, joined over fewer than ten good ones, longest first; `numbers` as for `strip_of`."""
     numbers = frame_numbers(track) if numbers is None else numbers
     group, warnings = _groups(track)
     status = status_of(track)

@@ -97,10 +97,7 @@ class Lift:
 
 
 def lift(ensemble: Ensemble, settings: BootstrapSettings | None = None) -> Lift:
-    """Return the correlation of a with omega x v, the direction of the Magnus force; v is the sphere's in the lab.
-
-    Source: the paper, section IV, lift.
-    """
+    """Return the correlation of a with omega x v of the sphere, lab (Magnus force). Source: the paper, section IV."""
     v, a = (ensemble.values[q] - ensemble.values[q].mean(0) for q in ("velocity", "acceleration"))
     force = np.cross(ensemble.values["omega_lab"], v)
     products = np.stack([a * force, a * a, force * force], axis=-1)

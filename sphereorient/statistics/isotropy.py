@@ -1,4 +1,4 @@
-"""Tests of isotropy: of vectors in lab and body, and of attitudes on SO(3); Euler angles; the frame of a dataset."""
+"""Tests of isotropy: of vectors in lab and body, and of orientations on SO(3); Euler angles; the frame of a vector."""
 
 from __future__ import annotations
 
@@ -101,10 +101,7 @@ class FrameOfRow:
 
 
 def frame_of_omega(ensemble: Ensemble, omega: Floats) -> FrameOfRow:
-    """Find the frame of the components of omega (M, 3), rad/s, from the rotations between the ensemble's frames.
-
-    Source: docs/errata.md E4; E6: a row of the paper's Table I, R omega_lab, fits neither frame.
-    """
+    """Find the frame of the components of omega (M, 3), rad/s, from the rotations. Source: docs/errata.md E4, E6."""
     from scipy.spatial.transform import Rotation
 
     first, second = Pairs(ensemble).at(1)
@@ -124,12 +121,12 @@ def frame_of_omega(ensemble: Ensemble, omega: Floats) -> FrameOfRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Uniformity:
-    """Result of the test of uniform attitudes; made by `uniformity`."""
+    """Result of the test of uniform orientations; made by `uniformity`."""
 
     statistic: float
     p_value: float
     samples: int
-    effective: float  # number of independent attitudes with the same scatter
+    effective: float  # number of independent orientations with the same scatter
     segments: int
 
     @property
@@ -141,9 +138,9 @@ class Uniformity:
 def uniformity(R_lab_body: Floats, segment: NDArray[np.int64] | None = None) -> Uniformity:
     """Test whether rotations (M, 3, 3) are uniform on SO(3), by the first and second moments of the axes' directions.
 
-    The statistic is 3 n |<R>|^2 + 5 n |<D>|^2, with D of `five_dimensional`. The null distribution rotates whole
-    segments, since a track is correlated; `segment` (M,) increases; None: all rotations are independent. Twenty
-    segments are few; with two the test has no power.
+    The statistic is 3 n |<R>|^2 + 5 n |<D>|^2, with D of `five_dimensional`; its null distribution rotates whole
+    segments. `segment` (M,) increases; None: all are independent. Twenty segments are few; with two the test has no
+    power.
     Source: Rayleigh's and Gine's tests on SO(3): Mardia and Jupp 2000, Directional Statistics, 13.2.
     """
     count = len(R_lab_body)
@@ -190,10 +187,7 @@ class EulerDensity:
 def euler_densities(
     ensemble: Ensemble, bins: int = 24, settings: BootstrapSettings | None = None
 ) -> list[EulerDensity]:
-    """Return the PDFs of theta_x, theta_y, theta_z beside those of uniform rotations.
-
-    Source: the paper, section II; the angles by docs/errata.md E1.
-    """
+    """Return PDFs of the Euler angles and of uniform rotations. Source: the paper, section II; docs/errata.md E1."""
     import torch
 
     from sphereorient import so3

@@ -49,10 +49,7 @@ def table_of_moments(ensemble: Ensemble, settings: BootstrapSettings | None = No
 
 
 def moments(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Moments:
-    """Return the moments of one quantity (a name in UNITS), by component and of the norm, with intervals.
-
-    Source: the paper, Table I; its lab rows are in no frame (docs/errata.md E6).
-    """
+    """Return moments of a quantity (a name in UNITS) and its norm. Source: the paper, Table I; docs/errata.md E6."""
     x = ensemble.values[quantity]
     x = np.concatenate([x, np.linalg.norm(x, axis=1, keepdims=True)], axis=1)
     sigma = np.concatenate([ensemble.sigmas[quantity], np.full((len(x), 1), np.nan)], axis=1)

@@ -216,7 +216,7 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
 
 
 def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
-    """Return rows, their places on a regular grid, and each place's segment, -1: empty, so that no kernel spans two."""
+    """Return rows, their places on a regular grid, and the segment of each place, -1: empty, between segments."""
     rows = np.flatnonzero(track.segment >= 0)
     rows = rows[np.lexsort((track.time[rows], track.segment[rows]))]
     _, segment = np.unique(track.segment[rows], return_inverse=True)

@@ -119,8 +119,7 @@ def _reach(densities: Sequence[Density]) -> tuple[float, float]:
 def increments_figure(distributions: Distributions, table: Mapping[str, Moments] | None = None) -> Figure:
     """Draw the PDFs of increments of omega, each a decade above that of the next shorter lag, and flatness against lag.
 
-    `table` gives the lines at the flatness of omega and alpha, the limits at long and short lags.
-    Source: the paper, section IV, with docs/errata.md E7.
+    `table` gives lines at the flatness of omega and alpha. Source: the paper, section IV, with docs/errata.md E7.
     """
     figure = new_figure(WIDTH_IN, 4.6)
     left, right = figure.subplots(1, 2)
@@ -161,7 +160,6 @@ def _shifted_densities(axes: Axes, distributions: Distributions) -> None:
 
 
 def _levels(axes: Axes, table: Mapping[str, Moments]) -> None:
-    """Draw the flatness of the Gaussian, of omega and of alpha: the limits of that of increments."""
     levels = {"Gaussian": 3.0}
     names = {"ω lab": "omega_lab", "α lab": "alpha_lab"}
     levels |= {name: pooled_flatness(table[key]) for name, key in names.items() if key in table}

@@ -1,4 +1,4 @@
-"""Figures of isotropy and of what limits the measurement: attitudes, noise, kernel widths, distance of the cameras."""
+"""Figures of isotropy and of what limits the measurement: orientations, noise, kernel widths, camera distances."""
 
 from __future__ import annotations
 

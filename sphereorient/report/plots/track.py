@@ -174,7 +174,7 @@ def tait_bryan_deg(R_lab_body: Floats) -> Floats:
 
 
 def _sigma_deg(R_lab_body: Floats, cov_lab_rad2: Floats) -> Floats:
-    """Return the sigmas of the angles (N, 3), degrees; NaN near the poles. Source: docs/errata.md E3, H."""
+    """Return the sigmas of the angles (N, 3), degrees; NaN near the poles. Source: docs/errata.md E3."""
     theta = np.deg2rad(tait_bryan_deg(R_lab_body))
     there = np.isfinite(theta).all(1) & (np.abs(np.cos(theta[:, 1])) > 0.02)
     out = np.full_like(theta, np.nan)
