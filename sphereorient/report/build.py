@@ -42,7 +42,7 @@ def write_report(
     progress: Progress = lambda stage, done, total: None,
     command: str = "",
 ) -> list[Verdict]:
-    """Write the report of tracks, named by file, whole or not at all, and return its findings.
+    """Write the report of tracks, by file name, whole or not at all, and return its findings.
 
     `out` is made, or replaced if it contains only an older report; `progress` gets stage, steps done and all steps.
 

@@ -155,8 +155,8 @@ WRITERS: dict[str, Callable[[Trajectory, Path, Advance], None]] = {
 def to_xarray(track: Trajectory) -> xr.Dataset:
     """Return a track as an xarray dataset, with units and descriptions as attributes; candidates are left out.
 
-    Dimensions: time (s), axis (x, y, z), axis_2 (covariances), body_axis (columns of orientations), camera, image_axis
-    (u, v). The cameras' measurements are camera_*; provenance is JSON; NaN stays NaN.
+    Dimensions: time (s), axis (x, y, z of lab or body), axis_2 (covariances), body_axis (columns of orientations),
+    camera, image_axis (u, v). Variables of the cameras are camera_*; provenance is JSON; NaN stays NaN.
 
     Raises:
         OutputError: xarray is not installed.

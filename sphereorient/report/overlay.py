@@ -188,7 +188,7 @@ def _check_video_name(path: Path) -> None:
 
 
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -> int:
-    """Write RGB pictures (H, W, 3), H and W even, as H.264 (yuv420p); return their number.
+    """Write RGB pictures (H, W, 3), H and W even, as H.264 (yuv420p), and return their number.
 
     Raises:
         OutputError: a suffix other than .mp4, .mov, .mkv, no picture, or a failure; an old file is kept.

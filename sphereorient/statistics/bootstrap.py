@@ -128,8 +128,8 @@ def studentized(
     """Return a statistic of the total of `sums` (S, G, K) over segments, with studentized bootstrap intervals.
 
     For statistics skewed by a few large events, such as the flatness. `statistic` maps totals (..., G, K) to values
-    (..., G, Q), the same for twice the totals; values are NaN where it is. `positive` (Q,) marks values that are
-    positive by definition. Fewer than 20 segments: as `bootstrap`.
+    (..., G, Q) and gives the same for twice the totals; values are NaN where it is. `positive` (Q,) marks values that
+    are positive by definition. Fewer than 20 segments: as `bootstrap`.
     Source: Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapters 12 and 14.
     """
     settings = settings or BootstrapSettings()

@@ -73,7 +73,7 @@ def _pooled(pair: tuple[str, str], parts: list[Floats], rough_parts: list[Floats
 def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, Floats]:
     """Return R_lab_cam R_cam_view^T R_cam_lab R_lab_body, (N, 3, 3) by camera; NaN for frames without an orientation.
 
-    This is each camera's orientation as if its line of sight were parallel to its axis; only of the given cameras.
+    These are the orientations as if each line of sight were parallel to its camera's axis, for the given cameras only.
     Source: the paper, section III, R_persp; its sign by docs/errata.md A1.
     """
     import torch

@@ -36,7 +36,7 @@ def stretched_exponential(x: Floats, a: Floats | float) -> Floats:
 
 
 def log_stretched_exponential(x: Floats, a: Floats | float, noise_share: float = 0.0) -> Floats:
-    """Return the logarithm of `stretched_exponential`; `noise_share` < 1 of the variance of x is normal noise."""
+    """Return the logarithm of `stretched_exponential`; `noise_share` (< 1) of the variance of x is normal noise."""
     if noise_share > 0:
         place, weight = np.polynomial.hermite_e.hermegauss(HERMITE)
         clean = np.sqrt(1 - noise_share)
@@ -85,8 +85,8 @@ def fit_stretched(
 ) -> StretchedFit:
     """Fit the stretched exponential to the motion in a component (M,), any unit, by maximum likelihood, with intervals.
 
-    `segment` (M,), 0 .. segments - 1, increases. Noise, its share of the variance from `moments.noise_let_through`,
-    would fill the peak of the density and lower a.
+    The fit leaves out `noise_share` of the variance (`moments.noise_let_through`); such noise would fill the peak of
+    the density and lower a. `segment` (M,), 0 .. segments - 1, increases.
     """
     normal = (x - x.mean()) / x.std()
     edges = np.linspace(np.log(SMALLEST), np.log(LARGEST), FINE_BINS + 1)

@@ -138,9 +138,8 @@ class Uniformity:
 def uniformity(R_lab_body: Floats, segment: NDArray[np.int64] | None = None) -> Uniformity:
     """Test whether rotations (M, 3, 3) are uniform on SO(3), by the first and second moments of the axes' directions.
 
-    The statistic is 3 n |<R>|^2 + 5 n |<D>|^2, with D of `five_dimensional`; its null distribution rotates whole
-    segments. `segment` (M,) increases; None: all are independent. Twenty segments are few; with two the test has no
-    power.
+    Statistic: 3 n |<R>|^2 + 5 n |<D>|^2, D of `five_dimensional`. The null distribution rotates whole segments, (M,),
+    increasing; None: all rotations are independent. Twenty segments are few; with two the test has no power.
     Source: Rayleigh's and Gine's tests on SO(3): Mardia and Jupp 2000, Directional Statistics, 13.2.
     """
     count = len(R_lab_body)

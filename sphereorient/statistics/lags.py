@@ -59,8 +59,8 @@ def correlation(
 ) -> Correlation:
     """Return the autocorrelation of a quantity (a name in UNITS) about its ensemble mean, and its integral times.
 
-    A value is the mean product of the pairs at this lag over the mean square of the same pairs: unbiased by the lengths
-    of segments. `longest_s` None: the longest lag at which a fiftieth of the samples has a partner.
+    A value is the mean product of pairs over their mean square: unbiased by the lengths of segments. Pairs over a gap
+    count at their true lag. `longest_s` None: the longest lag at which a fiftieth of the samples has a partner.
     Source: textbook; the paper's T_L is the integral time of `velocity`, up to the first zero.
     """
     pairs = Pairs(ensemble)
@@ -134,8 +134,8 @@ def increments(
 ) -> Increments:
     """Return rms and flatness of increments of a quantity (a name in UNITS), for lags that ten segments or more reach.
 
-    `lags_s` None: twelve, geometric, from one frame to `integral_time_s` (None: half the median segment). At short lags
-    the flatness is the derivative's; far beyond the integral time it is 3 + (F - 3) / 2.
+    `lags_s`, s, are rounded to frames; None: twelve, geometric, from one frame to `integral_time_s` (None: half the
+    median segment). The flatness goes from the derivative's to 3 + (F - 3) / 2 at long lags.
     Source: the paper, section IV, with docs/errata.md E7.
     """
     pairs = Pairs(ensemble)

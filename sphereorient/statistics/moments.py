@@ -89,8 +89,7 @@ def without_noise(
     """Return variance and fourth moment (...) of the motion from the measured ones.
 
     `s2`, `s4` and `mixed` (...) are the means of sigma^2, sigma^4 and (x - mean)^2 sigma^2. Sign 1 subtracts
-    independent normal noise that a kernel let through; -1 adds the motion that a smoother removed, as intermittent as
-    the rest.
+    independent normal noise; -1 adds the motion that a smoother removed, taken to be as intermittent as the rest.
     """
     part = 1.0 if sign > 0 else LET_THROUGH
     clean_var = var - part * s2

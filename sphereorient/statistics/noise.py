@@ -163,7 +163,7 @@ def width_curve(
     widths_frames: Sequence[float] = WIDTHS,
     settings: BootstrapSettings | None = None,
 ) -> WidthCurve:
-    """Differentiate the measurements of velocity, acceleration or alpha_lab with Gaussian kernels (sigma, frames).
+    """Differentiate the measurements to velocity, acceleration or alpha_lab with Gaussian kernels (sigma, frames).
 
     Narrow kernels let noise through, wide ones lose motion; a plateau between them is the rms. All widths use the
     frames that the widest one reaches; NaN where all segments are shorter. White noise and regular times are assumed.

@@ -28,7 +28,9 @@ class Reliability:
 
 
 def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> Reliability:
-    """Compare probabilities (N,), 0 .. 1 or NaN (left out), with outcomes (N,), bool, in bins of equal count.
+    """Compare probabilities (N,), 0 .. 1 or NaN (left out), with outcomes (N,), bool, in at most `bins` bins.
+
+    Bins have equal counts, but equal probabilities stay in one bin.
 
     Raises:
         ShapeError: unequal numbers of outcomes and probabilities, probabilities outside 0 .. 1, or no bin.
