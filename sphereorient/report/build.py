@@ -42,18 +42,9 @@ def write_report(
     progress: Progress = lambda stage, done, total: None,
     command: str = "",
 ) -> list[Verdict]:
-    """Write the report of tracks, whole or not at all.
+    """Write the report of tracks, by file name, whole or not at all, and return its findings.
 
-    Args:
-        tracks: by the name of their file.
-        out: folder; it is made, or replaced if it contains only an older report.
-        experiments: those of the tracks, for the pictures, the sphere's diameter and the flow.
-        settings: of the statistics.
-        progress: called with stage, steps done and all steps.
-        command: as the user gave it.
-
-    Returns:
-        The findings in words, as on the page.
+    `out` is made, or replaced if it contains only an older report; `progress` gets stage, steps done and all steps.
 
     Raises:
         TrackError: no usable frame, or tracks of kernels and of smoothers together.
@@ -89,7 +80,7 @@ def write_report(
 def match_experiments(
     tracks: Mapping[str, Trajectory], experiments: Sequence[Experiment]
 ) -> dict[str, Experiment | None]:
-    """Return the experiment of each track by its name, None without one; a single one belongs to a single track.
+    """Return the experiment of each track by its name, or None; a single one belongs to a single track.
 
     Raises:
         ExperimentError: an experiment without a track, or two of one name.
@@ -114,11 +105,7 @@ def match_experiments(
 
 
 def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
-    """Return the properties of sphere and flow of the experiments of a report.
-
-    Raises:
-        ExperimentError: they contradict each other.
-    """
+    """Return the properties of sphere and flow; ExperimentError if the experiments contradict each other."""
     known: dict[str, float] = {}
     for experiment in experiments:
         found = {FLOW_KEYS[key]: value for key, value in experiment.flow.items() if key in FLOW_KEYS}
@@ -136,7 +123,6 @@ Plan = tuple[str, str, Callable[[], Figure], bool]  # name, caption, function, t
 
 
 def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> Iterator[Plan]:
-    """Yield the figures in the order of the page; a new figure is a line here and a function in `plots`."""
     name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
     of = "" if len(tracks) == 1 else f" of {name}"
     yield "track", f"Track{of}, with bands of two standard errors.", lambda: plots.track_figure(track), False
@@ -181,7 +167,7 @@ def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[D
 def _strips(
     tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment | None], progress: Progress
 ) -> Iterator[str]:
-    """Yield the quality strips of the tracks; of too many those with the most bad frames."""
+    """Yield the quality strips of the tracks; if there are too many, those with the most bad frames."""
     bad = {name: sum(one.frames for one in bad_stretches(track)) for name, track in tracks.items()}
     worst = sorted(tracks, key=lambda name: -bad[name])[:MOST_STRIPS]
     chosen = [name for name in tracks if name in worst]
@@ -197,7 +183,7 @@ def _strips(
 
 @contextmanager
 def _folder(out: Path) -> Iterator[Path]:
-    """Yield a temporary folder; it becomes the report at the end, or is removed after an error."""
+    """Yield a temporary folder that becomes the report at the end, or is removed after an error."""
     if out.exists() and (not out.is_dir() or {path.name for path in out.iterdir()} - set(PARTS)):
         do = "choose a new folder"
         expected = "a new folder, or one that holds an older report only"

@@ -20,12 +20,7 @@ OUTLIER = "#CC79A7"
 
 @in_style
 def calibration_figure(result: Calibrated, path: Path) -> None:
-    """Draw pictures with points found and expected, all residuals over the picture, and their histogram.
-
-    Args:
-        result: of `calibrate_cameras`; its pictures are read again; tables of points have none.
-        path: of the PNG or PDF to write.
-    """
+    """Draw the pictures, read again, with points found and expected, and all residuals; into a PNG or PDF."""
     names = list(result.cameras)
     figure = new_figure(4.2 * (SHOWN + 2), 4.3 * len(names))
     axes = figure.subplots(len(names), SHOWN + 2, squeeze=False)

@@ -38,11 +38,7 @@ def export_track(
 ) -> None:
     """Write all frame-wise datasets of a track, with units in their names, and its metadata; NaN stays NaN.
 
-    Args:
-        track: what to write.
-        path: written whole or not at all.
-        to: csv, parquet or mat; None: by the suffix.
-        progress: called with frames done and all frames.
+    `to` is csv, parquet or mat; None: by the suffix. The file is written whole or not at all.
 
     Raises:
         OutputError: an unknown format, a package that is not installed, or a file that cannot be written.
@@ -53,11 +49,7 @@ def export_track(
 
 
 def format_of(path: Path, to: str | None) -> str:
-    """Return the format of a file: csv, parquet or mat, by the option `to`, or by the name's suffix if it is None.
-
-    Raises:
-        OutputError: neither gives a format, or they contradict each other.
-    """
+    """Return csv, parquet or mat, from `to`, or from the suffix if None; OutputError if unknown or contradictory."""
     by_name = SUFFIXES.get(path.suffix.lower())
     if to is not None and to not in WRITERS:
         do = "write --to csv, parquet or mat"
@@ -90,7 +82,6 @@ def to_arrow(track: Trajectory) -> pa.Table:
 
 
 def _write_csv(track: Trajectory, path: Path, progress: Advance) -> None:
-    """Write the metadata as comment lines, the names, and a line for each frame."""
     package("pyarrow", "table")
     import pyarrow.csv as arrow_csv
 
@@ -143,7 +134,7 @@ def _write_mat(track: Trajectory, path: Path, progress: Advance) -> None:
 
 
 def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
-    """Return arrays by name with unit; rotations as matrices and as quaternions (quat_wxyz for orientation)."""
+    """Return arrays by name with unit; rotations as matrices and quaternions (quat_wxyz for orientation)."""
     arrays: dict[str, Any] = {}
     for dataset in frame_wise(record):
         arrays[with_unit(dataset.name, dataset.units)] = dataset.values
@@ -162,12 +153,10 @@ WRITERS: dict[str, Callable[[Trajectory, Path, Advance], None]] = {
 
 
 def to_xarray(track: Trajectory) -> xr.Dataset:
-    """Return a track as an xarray dataset: named axes, units and descriptions as attributes; NaN stays NaN.
+    """Return a track as an xarray dataset, with units and descriptions as attributes; candidates are left out.
 
-    Returns:
-        Dimensions time (coordinate, s), axis (x, y, z of lab or body by the description), axis_2 of covariances,
-        body_axis of orientations (its columns), camera, image_axis (u, v); the cameras' own measurements as camera_*.
-        The candidates stay in the file. Attributes as in the track's file, provenance as JSON.
+    Dimensions: time (s), axis (x, y, z of lab or body), axis_2 (covariances), body_axis (columns of orientations),
+    camera, image_axis (u, v). Variables of the cameras are camera_*; provenance is JSON; NaN stays NaN.
 
     Raises:
         OutputError: xarray is not installed.

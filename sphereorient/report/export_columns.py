@@ -23,7 +23,7 @@ PAIRS = tuple(combinations_with_replacement(range(3), 2))  # of a symmetric matr
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dataset:
-    """One dataset of the file with a row for each frame, or one column of it; made by `frame_wise` and `columns`."""
+    """A dataset of the file with a row for each frame, or one column of it; made by `frame_wise` and `columns`."""
 
     name: str
     units: str
@@ -47,7 +47,7 @@ class Dataset:
 
 
 def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
-    """Yield the datasets of a track or of a camera with a row for each frame, in the order of the file."""
+    """Yield the datasets of a track or camera that have a row for each frame, in the order of the file."""
     for entry in fields(record):
         column = entry.metadata.get("column")
         if column is not None and column.rows == "frames":
@@ -56,10 +56,9 @@ def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
 
 
 def columns(track: Trajectory) -> Iterator[Dataset]:
-    """Yield every frame-wise dataset of a track as columns; names as in `Trajectory.to_pandas`.
+    """Yield every frame-wise dataset of a track as columns, then of each camera, names as in `Trajectory.to_pandas`.
 
-    Vectors come by component (position_x_mm), covariances by pair (position_cov_xy_mm2: they are symmetric), rotations
-    as quaternions with w first and w >= 0 (quat_w ..), then the same of every camera with its name before it.
+    Columns are components (position_x_mm), pairs (position_cov_xy_mm2), and quaternions with w >= 0 (quat_w ..).
     """
     for dataset in frame_wise(track):
         yield from _split(dataset, "")
@@ -89,7 +88,7 @@ def reasons(camera: CameraTrack) -> NDArray[Any]:
 
 
 def safe_names(track: Trajectory) -> dict[str, CameraTrack]:
-    """Return the cameras by names that all programs accept: letters, digits and _, made unique by a number."""
+    """Return the cameras by unique names of letters, digits and _, which all programs accept."""
     safe: dict[str, CameraTrack] = {}
     for name, camera in track.cameras.items():
         plain = re.sub(r"\W", "_", name, flags=re.ASCII)
@@ -127,11 +126,7 @@ def with_unit(name: str, units: str) -> str:
 
 
 def package(name: str, extra: str) -> Any:
-    """Import a package of an extra.
-
-    Raises:
-        OutputError: it is not installed; the message gives the command.
-    """
+    """Import a package of an extra; an OutputError names the command that installs it."""
     try:
         return import_module(name)
     except ImportError as error:

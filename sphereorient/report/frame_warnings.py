@@ -70,7 +70,7 @@ def frame_warnings(track: Trajectory, k: int) -> list[str]:
 
 
 def stated_error(cov: Floats) -> Floats:
-    """Return the standard deviation along or about an axis, the mean of three, (N,), of covariances (N, 3, 3)."""
+    """Return sigma along or about an axis, (N,), the mean of three, of covariances (N, 3, 3)."""
     return np.asarray(np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3), np.float64)
 
 
@@ -91,9 +91,7 @@ class BadFrame:
 def choose_worst(track: Trajectory, count: int) -> list[BadFrame]:
     """Choose at most `count` of the worst frames of a track, worst first, the kinds of problem in turn.
 
-    Kinds are gaps (the first lost frame, the first one found again), flags, scores, stated errors, distance of the
-    cameras' orientations, distance from the smoother. Of frames less than three apart one is taken. If fewer frames are
-    bad, those with the lowest scores follow, and their words say so.
+    Of frames less than three apart one is taken. If fewer frames are bad, those with the lowest scores follow.
     """
     kinds = [list(kind(track)) for kind in KINDS]
     taken: list[int] = []
@@ -139,7 +137,6 @@ def _flags(track: Trajectory) -> Ranked:
 
 
 def _cameras_apart(track: Trajectory) -> Ranked:
-    """Yield frames in which the cameras' own orientations differ."""
     seen = [camera.orientation for camera in track.cameras.values()]
     if len(seen) == 2:
         yield from _outliers(distance_deg(*seen), "cameras {:.2g}\u00b0 apart, usually {:.2g}\u00b0")
@@ -172,7 +169,6 @@ KINDS: tuple[Callable[[Trajectory], Ranked], ...] = (
 
 
 def _lowest(track: Trajectory) -> Ranked:
-    """Yield all measured frames, the lowest scores first."""
     score = _score(track)
     for k in np.argsort(np.where(np.isfinite(score) & track.valid, score, np.inf), kind="stable").tolist():
         if np.isfinite(score[k]) and track.valid[k]:
@@ -180,13 +176,13 @@ def _lowest(track: Trajectory) -> Ranked:
 
 
 def _outliers(values: Floats, words: str, sign: int = 1) -> Ranked:
-    """Yield frames far above the usual value, farthest first; `words` are filled with `sign` times value and usual."""
+    """Yield frames far above the usual value, farthest first; `words` get `sign` times value and usual value."""
     there = np.isfinite(values)
     if there.sum() < 2:
         return
     usual = float(np.median(values[there]))
     spread = 1.4826 * float(np.median(np.abs(values[there] - usual)))
-    # If most values are equal the spread is zero; rounding errors are then not outliers.
+    # If most values are equal the spread is zero; rounding errors are no outliers.
     far = np.where(there, (values - usual) / max(spread, 1e-3 * abs(usual), 1e-12), -np.inf)
     for k in np.argsort(-far, kind="stable").tolist():
         if far[k] < FAR:
@@ -195,7 +191,7 @@ def _outliers(values: Floats, words: str, sign: int = 1) -> Ranked:
 
 
 def _score(track: Trajectory) -> Floats:
-    """Return the lowest of the cameras' scores, (N,); NaN if no camera has a score."""
+    """Return the lowest score of the cameras, (N,); NaN without scores."""
     scores = np.stack([np.full(len(track), np.inf), *(camera.score for camera in track.cameras.values())])
     lowest = np.fmin.reduce(scores)
     return np.asarray(np.where(np.isfinite(lowest), lowest, np.nan), np.float64)

@@ -29,7 +29,7 @@ from sphereorient.report.strip import GOOD, BadStretch, bad_stretches, status_of
 from sphereorient.trajectory import Trajectory
 
 COUNT = 120
-BAD_SHARE = 2 / 3  # of the pictures, at most, if there are good frames
+BAD_SHARE = 2 / 3  # largest share of bad frames if there are good ones
 QUALITY = 85  # of the JPEG
 TO_COMPARE = "good; to compare with"
 TILE, GAP, HEAD, TITLE, LINE, LINES = 152, 6, 54, 22, 17, 3  # px; lines of text under a frame
@@ -77,15 +77,7 @@ class Gallery:
 def gallery(
     track: Trajectory, experiment: Experiment, count: int = COUNT, progress: Progress = lambda done, total: None
 ) -> Gallery:
-    """Draw small pictures of the worst frames and of good ones for comparison.
-
-    A picture shows of each camera the crop with the outline and, beside it, the re-rendered sphere with body axes.
-
-    Args:
-        track: what was measured.
-        experiment: of the track; movies and texture are opened.
-        count: frames at most.
-        progress: called with frames done and all frames.
+    """Draw crop and re-rendered sphere of at most `count` frames: the worst ones, and good ones for comparison.
 
     Raises:
         ExperimentError: a camera that track or experiment do not have.
@@ -120,20 +112,15 @@ def gallery(
 
 
 def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
-    """Choose at most `count` frames to show, and why.
+    """Choose at most `count` frames to show; return the reasons by row of the track, in the order of the choice.
 
-    First the middle of every bad stretch, longest first; then the worst frames, the kinds of problem in turn; then
-    frames spread over the stretches. A third of the places is for good frames, spread evenly, so that one to compare
-    with is always near.
-
-    Returns:
-        By row of the track, the reasons; in the order of the choice.
+    Two thirds are bad frames, the middles of the longest stretches first; good frames, spread evenly, serve to compare.
     """
     status = status_of(track)
     good, bad = np.flatnonzero(status == GOOD), np.flatnonzero(status != GOOD)
     room = min(count, len(track))
     bad_room = room - min(len(good), room - round(BAD_SHARE * room))
-    # At most half of the room for the middles, so that what `choose_worst` finds in good frames has a place too.
+    # At most half are middles, so that frames of `choose_worst` are shown too.
     why = dict(list(_middles(track, bad, bad_stretches(track)))[: -(-bad_room // 2)])
 
     def fill(more: dict[int, tuple[str, ...]], upto: int) -> None:
@@ -159,7 +146,6 @@ def _middles(track: Trajectory, bad: Rows, found: list[BadStretch]) -> Iterator[
 
 
 def _spread(rows: Rows, count: int) -> list[int]:
-    """Return at most `count` of the rows, evenly spread."""
     if count <= 0 or not len(rows):
         return []
     at = (np.arange(min(count, len(rows))) + 0.5) * len(rows) / min(count, len(rows))
@@ -175,15 +161,7 @@ def worst_frames(
     cameras: Sequence[str] | None = None,
     progress: Progress = lambda done, total: None,
 ) -> list[BadFrame]:
-    """Draw the worst frames side by side, each with outline, axes, re-rendered sphere and the reasons; worst first.
-
-    Args:
-        track: what was measured.
-        experiment: of the track; movies and texture are opened.
-        path: .png, .pdf or .jpg.
-        count: frames at most.
-        cameras: names; None: those of the track.
-        progress: called with frames done and all frames.
+    """Draw at most `count` of the worst frames side by side, worst first, into a .png, .pdf or .jpg.
 
     Raises:
         ExperimentError: a camera that track or experiment do not have.
@@ -230,7 +208,6 @@ def _sheet(page: Page, count: int) -> Canvas:
 
 
 def _tile(canvas: Canvas, page: Page, bad: BadFrame, place: int, pictures: Mapping[str, Grey | None]) -> None:
-    """Draw one frame at its place of the sheet."""
     width, height = _tile_size(page)
     left = BETWEEN + place % _columns(page) * (width + BETWEEN)
     top = HEAD + place // _columns(page) * (height + BETWEEN)
@@ -252,7 +229,6 @@ def _pairs_size(page: Page) -> tuple[int, int]:
 def _draw_pairs(
     canvas: Canvas, page: Page, k: int, pictures: Mapping[str, Grey | None], corner: tuple[int, int]
 ) -> None:
-    """Draw of each camera, side by side, the crop with outline and the re-rendered sphere with axes."""
     for column, view in enumerate(page.views):
         at = (corner[0] + 2 * column * (TILE + GAP), corner[1])
         centre = view.centre_px(page.track.cameras[view.name], k)
@@ -267,7 +243,7 @@ def _pair(
     picture: Grey | None,
     corner: tuple[int, int],
 ) -> None:
-    """Draw the crop and the re-rendered sphere of one camera; the whole frame if the centre is unknown."""
+    """Draw crop and re-rendered sphere of one camera; the whole frame if the centre is unknown."""
     path, second = view.model.path, (corner[0] + TILE + GAP, corner[1])
     here = bool(np.isfinite(centre).all()) and np.isfinite(view.half_px)
     half = view.half_px if here else max(view.model.camera.image_size) / 2

@@ -21,7 +21,7 @@ UNLIKELY = 0.005  # proposals with a lower probability are not shown
 
 @in_style
 def learning_curve_figure(rows: Sequence[Mapping[str, float]], best_step: int) -> Figure:
-    """Draw loss and recall against the steps, of the rows of metrics.csv; the weights of `best_step` were kept."""
+    """Draw loss and recall against the steps, from the rows of metrics.csv; the weights of `best_step` were kept."""
     figure = new_figure(WIDTH_IN, 2.7)
     left, right = figure.subplots(1, 2)
     _curve(left, rows, "train_nll", "training", {**SECOND.drawn, "marker": "x"})

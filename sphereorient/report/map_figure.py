@@ -1,4 +1,4 @@
-"""Figures of texture maps: what was learnt, how well it explains the pictures, how far the paint moved or changed."""
+"""Figures of texture maps: content, agreement with the pictures, displacement and change of the paint."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sphereorient.trajectory import Trajectory
 
 EXAMPLES = 6  # frames that are shown
 COMPARED = 200  # frames at most whose pictures are compared with the model
-UNSEEN = "#C9B48A"  # sand: not a grey, so not mistaken for paint
+UNSEEN = "#C9B48A"  # sand colour: differs from any paint
 REACH = 0.5  # of the contrast of white and black paint: the ends of the residual's scale
 SLANT = 0.3  # cosine of the angle of sight below which pixels are not compared: the light is unknown there
 LEAST_ARROW_DEG = 4.0  # length on the page of the largest arrow, in degrees of the map
@@ -39,17 +39,17 @@ CHANGE_REACH = 0.3  # of the contrast of white and black paint: ends of the scal
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapExample:
-    """A picture, and the same rendered with the map."""
+    """A picture, and the same rendered with the texture map."""
 
     title: str
     filmed: NDArray[np.float32]  # (S, S), grey levels
     model: NDArray[np.float32]  # (S, S), NaN outside the sphere
-    contrast: float  # white less black paint, grey levels
+    contrast: float  # white minus black paint, grey levels
     correlation: float  # over the sphere
 
 
 def compare_pictures(track: Trajectory, experiment: Experiment, texture: Path) -> list[MapExample]:
-    """Render the pictures of frames spread over the movie with a map (its file), and compare; without hidden places."""
+    """Render frames spread over the movie with a texture map file, and compare them, without hidden places."""
     compared = []
     with ExitStack() as opened:
         page, streams = prepared(track, replace(experiment, texture_path=texture), None, opened)
@@ -79,7 +79,7 @@ def _compared(view: OverlayView, k: int, picture: Grey, shown: NDArray[np.bool_]
 
 @in_style
 def map_figure(learnt: LearntMap, compared: Sequence[MapExample]) -> Figure:
-    """Draw map, coverage, the rounds of the attitudes, and examples of picture, model and residual."""
+    """Draw texture map, coverage, the iterations of the orientations, and examples of picture, model and residual."""
     figure = new_figure(WIDTH_IN, 8.2)
     grid = figure.add_gridspec(4, EXAMPLES, height_ratios=[2.6, 1.0, 1.0, 1.0])
     top = grid[0, :].subgridspec(2, 2, width_ratios=[2, 1])
@@ -127,14 +127,14 @@ def _draw_example(rows: Sequence[Axes], example: MapExample, first: bool) -> Non
 
 
 def equirectangular(axes: Axes) -> None:
-    """Set up the axes of a map, longitude to the right and latitude upwards, degrees."""
+    """Set up the axes of a texture map, longitude to the right and latitude upwards, degrees."""
     axes.set(xlim=(-180, 180), ylim=(-90, 90), xticks=[-180, -90, 0, 90, 180], yticks=[-90, -45, 0, 45, 90])
     axes.set(xlabel="longitude (degrees)", aspect="equal")
     axes.grid(visible=False)
 
 
 def draw_map(axes: Axes, values: Tensor, title: str, **style: Any) -> Any:
-    """Draw a map (H, 2 H), NaN as sand; grey from 0 to 1 unless `style` (of `imshow`) says otherwise."""
+    """Draw a texture map (H, 2 H), NaN as sand; grey from 0 to 1 unless `style` (of `imshow`) differs."""
     equirectangular(axes)
     axes.set_facecolor(UNSEEN)
     axes.set_title(title)
@@ -145,13 +145,7 @@ def draw_map(axes: Axes, values: Tensor, title: str, **style: Any) -> Any:
 
 @in_style
 def moved_figure(texture: Tensor, comparison: MapComparison, change: Tensor | None = None) -> Figure:
-    """Draw the displacement of the paint from a reference, and where the paint itself changed.
-
-    Args:
-        texture: (H, 2 H), the reference.
-        comparison: of another map with it.
-        change: (H, 2 H), of `paint_change`; None: not drawn.
-    """
+    """Draw the displacement from the reference `texture` (H, 2 H), and `change` (H, 2 H) of `paint_change` if given."""
     figure = new_figure(WIDTH_IN, 4.3 if change is None else 7.7)
     panels = figure.subplots(1 if change is None else 2, 1, squeeze=False)[:, 0]
     draw_map(panels[0], 0.55 + 0.45 * texture, "displacement of the paint from the old map")

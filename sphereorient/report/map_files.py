@@ -1,4 +1,4 @@
-"""A learnt map on disk: the picture that tracking reads, the number of pictures of each texel, and all the rest."""
+"""Files of a texture map: the picture that tracking reads, the pictures per texel, and all other results."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ MOST = 255  # counts beyond are written as this
 
 
 def seen_path(texture: Path) -> Path:
-    """Return the path of a map's counts: texture_seen.png beside texture.png."""
+    """Return the path of the counts of a texture map: texture_seen.png beside texture.png."""
     return texture.with_name(f"{texture.stem}_seen.png")
 
 
 def write_texture(texture: Tensor, path: Path) -> None:
-    """Write a map (H, 2 H), 0 .. 1 or NaN, as 8-bit picture, mid-grey for NaN; may raise OutputError."""
+    """Write a texture map (H, 2 H), 0 .. 1 or NaN (mid-grey), as 8-bit picture; may raise OutputError."""
     grey = torch.where(torch.isfinite(texture), 255 * texture, float(UNSEEN))
     _write_picture(grey.round().clamp(0, 255).byte().numpy(), path)
 
 
 def write_seen(seen: Tensor, path: Path) -> None:
-    """Write counts (H, 2 H) as 8-bit picture, 255 for 255 or more; may raise OutputError."""
+    """Write counts (H, 2 H) as 8-bit picture, limited to 255; may raise OutputError."""
     _write_picture(seen.clamp(0, MOST).byte().numpy(), path)
 
 
@@ -46,11 +46,7 @@ def _write_picture(grey: NDArray[np.uint8], path: Path) -> None:
 
 
 def read_seen(path: Path) -> Tensor | None:
-    """Read the counts beside a map, (H, 2 H); None without a file.
-
-    Raises:
-        TextureError: the file is not an 8-bit picture twice as wide as high.
-    """
+    """Read the counts beside a texture map, (H, 2 H); None without a file. A file of another form: TextureError."""
     if not path.is_file():
         return None
     counts = decoded_grey(path.read_bytes())
@@ -62,7 +58,7 @@ def read_seen(path: Path) -> Tensor | None:
 
 
 def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:
-    """Write the attitudes as a track, and in its group `map` everything else that was learnt; may raise OutputError."""
+    """Write the orientations as a track, and all other results in its group `map`; may raise OutputError."""
     with put_aside(path, also=(RuntimeError,)) as aside:
         track.save(aside)
         with h5py.File(aside, "a") as file:
@@ -89,7 +85,7 @@ def _put(group: h5py.Group, name: str, values: NDArray[np.generic], units: str, 
 
 
 def check_picture_name(path: Path) -> None:
-    """Refuse a suffix other than .png, .tif or .tiff with an OutputError: other formats lose grey values."""
+    """Raise OutputError for a suffix other than .png, .tif or .tiff: other formats lose grey values."""
     if path.suffix.lower() not in (".png", ".tif", ".tiff"):
         do = "choose a name such as texture.png"
         raise OutputError(refusal(f"--out {path}", expected=".png or .tif", got=path.suffix or "no ending", do=do))

@@ -1,4 +1,4 @@
-"""The movie with what was measured drawn on it, and the measured sphere re-rendered beside it."""
+"""The movie with the measurement drawn on it, and the re-rendered sphere beside it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Trajectory
 
 SAMPLE = 16  # frames from which light and brightness are taken
-NEAR_FRAMES = 0.5  # of the time between frames: largest distance of a picture's time from that of the track's frame
+NEAR_FRAMES = 0.5  # frames: largest distance in time of a picture from the track's frame
 DARK, BRIGHT = 0.5, 99.8  # percentiles of the sampled pictures that are shown black and white
 FORMATS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 H264 = {"crf": "19", "preset": "veryfast"}
@@ -46,11 +46,7 @@ class FrameSelection:
     every: int = 1  # one of so many frames is shown
 
     def rows(self, numbers: Rows) -> Rows:
-        """Return the rows of the track's frames, whose numbers are given.
-
-        Raises:
-            TrackError: no frame of the track is in the range.
-        """
+        """Return the rows to show, from the experiment's numbers of all frames (N,); TrackError if there are none."""
         wanted = np.ones(len(numbers), bool)
         if self.first is not None:
             wanted &= numbers >= self.first
@@ -72,20 +68,7 @@ def overlay_movie(
     fps: float = 25.0,
     progress: Progress = lambda done, total: None,
 ) -> int:
-    """Write a movie with outline, body axes and trail, and beside it crop, re-rendered sphere and residual.
-
-    Frames are read, drawn and written one by one: the memory does not depend on the length.
-
-    Args:
-        track: what was measured.
-        experiment: of the track; movies and texture are opened.
-        path: .mp4, .mov or .mkv; an old one is replaced at the end.
-        selection: of cameras and frames; None: all.
-        fps: frames a second of the player.
-        progress: called with frames done and all frames.
-
-    Returns:
-        The number of pictures written.
+    """Write a movie (.mp4, .mov, .mkv) of frame, crop, re-rendered sphere and residual; return the number of pictures.
 
     Raises:
         ExperimentError: a camera that track or experiment do not have.
@@ -109,17 +92,7 @@ def overlay_movie(
 def prepared(
     track: Trajectory, experiment: Experiment, cameras: Sequence[str] | None, opened: ExitStack
 ) -> tuple[Page, dict[str, CameraStream]]:
-    """Open the movies and estimate what all pictures share: light, brightness, sizes.
-
-    Args:
-        track: what was measured.
-        experiment: of the track.
-        cameras: names; None: those of the track.
-        opened: closes the movies.
-
-    Returns:
-        The page, and of each camera the stream with the picture of every frame of the track.
-    """
+    """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them."""
     names = _names(track, experiment, cameras)
     texture = None if experiment.texture_path is None else load_texture(experiment.texture_path)
     movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
@@ -141,14 +114,7 @@ def prepared(
 
 
 def frames_of(track: Trajectory, experiment: Experiment, movies: Mapping[str, Movie]) -> tuple[Rows, dict[str, Rows]]:
-    """Find the frames of a track, which may be of a part of the experiment, by their times.
-
-    Returns:
-        The experiment's numbers (N,), and the pictures of each camera (N,), NONE for missing ones.
-
-    Raises:
-        TrackError: no frame of the track is in the experiment.
-    """
+    """Find a track's frames by time: numbers (N,), and pictures (N,) or NONE by camera; TrackError if none is found."""
     known = timeline(experiment, movies)
     after = np.searchsorted(known.time_s, track.time).clip(1, max(len(known) - 1, 1))
     low, high = after - 1, np.minimum(after, len(known) - 1)
@@ -186,7 +152,6 @@ def pictures_by_row(streams: Mapping[str, CameraStream], rows: Rows) -> Iterator
 
 
 def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
-    """Estimate light and brightness from frames spread over the track."""
     seen = track.cameras[stream.name]
     position = torch.from_numpy(model.path.position_mm)
     radius = seen.radius_px[np.isfinite(seen.radius_px)]
@@ -223,15 +188,10 @@ def _check_video_name(path: Path) -> None:
 
 
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -> int:
-    """Write pictures as H.264 (yuv420p), whole or not at all, and return their number.
-
-    Args:
-        path: .mp4, .mov or .mkv; an old one is replaced.
-        pictures: (H, W, 3) each, red green blue, of equal size, H and W even; taken one by one.
-        fps: pictures a second of the player.
+    """Write RGB pictures (H, W, 3), H and W even, as H.264 (yuv420p), and return their number.
 
     Raises:
-        OutputError: another suffix, no picture, or the file cannot be written; an old one is still there.
+        OutputError: a suffix other than .mp4, .mov, .mkv, no picture, or a failure; an old file is kept.
     """
     _check_video_name(path)
     kind = FORMATS[path.suffix.lower()]

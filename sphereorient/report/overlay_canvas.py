@@ -27,7 +27,7 @@ DOT, SPACE = 3.0, 3.5  # px, of dotted lines
 
 
 class Canvas:
-    """An (H, W, 3) picture, red green blue; panels clip what is drawn in them."""
+    """An (H, W, 3) RGB picture; panels clip what is drawn in them."""
 
     def __init__(self, width: int, height: int) -> None:
         self.pixels = np.full((height, width, 3), BACKGROUND, np.uint8)
@@ -36,7 +36,7 @@ class Canvas:
     def text(
         self, at: tuple[float, float], words: str, size: int = 15, colour: Colour = INK, anchor: str = "ls"
     ) -> None:
-        """Write words; `anchor` is Pillow's: ls is left and baseline, mm the middle."""
+        """Write text at (column, row), px; `anchor` is Pillow's: ls is left and baseline, mm the middle."""
         self._texts.append((at, words, size, colour, anchor))
 
     def finished(self) -> NDArray[np.uint8]:
@@ -52,15 +52,7 @@ class Canvas:
 
 
 class Panel:
-    """A rectangle of a canvas with a part of a picture; lines are in that picture's pixels.
-
-    Args:
-        canvas: to draw on.
-        corner: column and row of the top left corner, px.
-        size: width and height, px.
-        first_px: (u, v) of the picture at the panel's top left edge.
-        scale: pixels of the canvas for one of the picture.
-    """
+    """A rectangle of a canvas that shows a picture from pixel `first_px` (u, v) on; drawn in the picture's pixels."""
 
     def __init__(
         self, canvas: Canvas, corner: tuple[int, int], size: tuple[int, int], first_px: ArrayLike, scale: float
@@ -71,13 +63,13 @@ class Panel:
         self.first_px, self.scale = np.asarray(first_px, np.float64), scale
 
     def show(self, picture: NDArray[np.uint8]) -> None:
-        """Fill the panel with a picture, (h, w) grey or (h, w, 3) colours, resized."""
+        """Fill the panel with a picture, (h, w) grey or (h, w, 3) RGB, resized."""
         shrinks = picture.shape[0] > self.size[1]
         fitted = cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
         self.pixels[:] = fitted if fitted.ndim == 3 else fitted[..., None]
 
     def place(self, uv_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the positions in the panel of pixels (..., 2) of the picture; integers are pixel centres."""
+        """Return canvas positions of pixels (..., 2) of the picture; integers are pixel centres."""
         return np.asarray((uv_px - self.first_px) * self.scale - 0.5, np.float64)
 
     def line(self, uv_px: NDArray[np.float64], colour: Colour, width: int = 1, dotted: bool = False) -> None:
@@ -88,13 +80,13 @@ class Panel:
                 cv2.polylines(self.pixels, [points], False, colour, width, cv2.LINE_AA, SHIFT)
 
     def text(self, uv_px: NDArray[np.float64], words: str, size: int, colour: Colour) -> None:
-        """Write words around a point of the picture, if it is inside the panel."""
+        """Write text around a point of the picture if it is inside the panel."""
         x, y = self.place(uv_px).tolist()
         if 0 <= x < self.size[0] and 0 <= y < self.size[1]:
             self.canvas.text((self.corner[0] + x, self.corner[1] + y), words, size, colour, "mm")
 
     def border(self, colour: Colour, width: int) -> None:
-        """Draw a frame along the edges."""
+        """Draw a border along the edges."""
         for edge in (np.s_[:width], np.s_[-width:], np.s_[:, :width], np.s_[:, -width:]):
             self.pixels[edge] = colour
 
@@ -118,7 +110,6 @@ def _dots(points: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
 
 @cache
 def _font(size: int) -> Any:
-    """Return the font of matplotlib, which is the same on every machine."""
     import matplotlib
     from PIL import ImageFont
 

@@ -1,4 +1,4 @@
-"""The sphere as a track says that a camera saw it: outline, axes, trail, and the picture re-rendered in its light."""
+"""The measured sphere in a camera's picture: outline, axes, trail, and the re-rendered picture."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from sphereorient.sphere import see_sphere
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
-MARGIN = 1.3  # half the side of a crop, in radii of the ball
-SLANT = 0.3  # cosine of the angle of sight below which the paint is too foreshortened to teach the light
+MARGIN = 1.3  # half the side of a crop, in radii of the sphere
+SLANT = 0.3  # cosine of the angle of sight below which the paint is too foreshortened for the light's fit
 FINE = 2  # samples along each side of a pixel
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Path3D:
-    """Position and orientation of N frames, the smoother's where a frame has none of its own; made by `path_of`."""
+    """Position and orientation of N frames, from the smoother where the frame's own is missing; made by `path_of`."""
 
     position_mm: Floats  # (N, 3), lab
     R_lab_body: Floats  # (N, 3, 3)
@@ -46,7 +46,7 @@ def finite_rows(values: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def path_of(track: Trajectory, radius_mm: float) -> Path3D:
-    """Return what a track says of every frame; `radius_mm` is of the sphere, 1 where lengths are in radii."""
+    """Return the poses of all frames of a track; the radius is in mm, or 1 where lengths are in radii."""
     no_position, no_orientation = ~finite_rows(track.position), ~finite_rows(track.orientation)
     position = np.where(no_position[:, None], track.position_smooth, track.position)
     orientation = np.where(no_orientation[:, None, None], track.orientation_smooth, track.orientation)
@@ -55,18 +55,18 @@ def path_of(track: Trajectory, radius_mm: float) -> Path3D:
 
 
 def radius_of(experiment: Experiment) -> float:
-    """Return the radius of the sphere, mm; 1 where its diameter is not known and lengths are in radii."""
+    """Return the radius of the sphere, mm; 1 if its diameter is unknown and lengths are in radii."""
     return 1.0 if experiment.diameter_mm is None else experiment.diameter_mm / 2
 
 
 def outline_px(camera: Camera, path: Path3D, k: int) -> Floats:
-    """Return the outline that a camera shows of the sphere in frame k, closed, (n, 2) px; NaN without a position."""
+    """Return the closed outline of the sphere in frame k, (n, 2) px; NaN without a position."""
     around = expected_outline_px(camera, torch.from_numpy(path.position_mm[k]), path.radius_mm).numpy()
     return np.concatenate([around, around[:1]])
 
 
 def axes_px(camera: Camera, path: Path3D, k: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the tips of the body axes on the sphere in frame k, (3, 2) px, and whether each is on the near side."""
+    """Return the tips of the body axes on the sphere in frame k, (3, 2) px, and whether each faces the camera."""
     centre, R = torch.from_numpy(path.position_mm[k]), torch.from_numpy(path.R_lab_body[k])
     sight = camera.rays(camera.project(centre)).direction_lab
     tips = camera.project(centre + path.radius_mm * R.mT)  # rows: the columns of R are the axes
@@ -82,7 +82,7 @@ class CropWindow:
     side: int  # samples along each side
 
     def grid_px(self, fine: int = 1) -> Floats:
-        """Return where the picture is sampled, (fine side, fine side, 2) as (u, v)."""
+        """Return the sampling positions (u, v), (fine side, fine side, 2), px."""
         count = fine * self.side
         at = ((np.arange(count) + 0.5) * (2 / count) - 1) * self.half_px
         u, v = np.meshgrid(self.centre_px[0] + at, self.centre_px[1] + at)
@@ -90,7 +90,7 @@ class CropWindow:
 
 
 def crop(picture: Grey, window: CropWindow) -> NDArray[np.float32]:
-    """Return a picture within a window, (side, side) grey levels; NaN outside of the picture."""
+    """Return a picture within a window, (side, side) grey levels; NaN outside the picture."""
     at = window.grid_px().astype(np.float32)
     u, v, nan = at[..., 0], at[..., 1], float("nan")
     grey = picture.astype(np.float32)
@@ -100,22 +100,22 @@ def crop(picture: Grey, window: CropWindow) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SeenDisk:
-    """The paint in a window and the basis of the light there, (side, side, ...); made by `Model.look`."""
+    """Texture and basis of the light in a window, (side, side, ...); made by `Model.look`."""
 
-    paint: NDArray[np.float32]  # 0 black .. 1 white; NaN outside of the ball
+    paint: NDArray[np.float32]  # 0 black .. 1 white; NaN outside the sphere
     basis: NDArray[np.float32]  # (side, side, 4): 1, normal's right and down, cosine of the angle of sight
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A camera, the map, and where the ball was; renders what the camera must have seen."""
+    """A camera, the texture map and the poses; renders the expected picture."""
 
     camera: Camera
     texture: Tensor | None  # (H, 2 H), as fine as the window shows it; None: nothing can be rendered
     path: Path3D
 
     def look(self, k: int, window: CropWindow) -> SeenDisk:
-        """Return paint and light's basis in a window of frame k, the mean of finer samples; through ports too."""
+        """Return texture and basis of the light in a window of frame k, the mean of finer samples, ports included."""
         if self.texture is None:
             do = "draw the track of an experiment with a texture"
             raise TextureError(refusal("model", expected="a map of the paint", got="none", do=do))
@@ -132,7 +132,7 @@ class Model:
         return SeenDisk(paint=mean[..., 0], basis=mean[..., 1:])
 
     def window(self, k: int, half_px: float, side: int) -> CropWindow:
-        """Return the window around the ball in frame k."""
+        """Return the window around the sphere in frame k."""
         centre = self.camera.project(torch.from_numpy(self.path.position_mm[k])).numpy()
         return CropWindow(centre_px=centre, half_px=half_px, side=side)
 
@@ -141,41 +141,27 @@ class Model:
 class LightFit:
     """Grey levels of white and black paint over the disk, one for a whole movie; made by `fit_light`."""
 
-    gain: Floats  # (4,), coefficients of the basis: white less black
+    gain: Floats  # (4,), coefficients of the basis: white minus black
     offset: Floats  # (4,), black
 
     @property
     def contrast(self) -> float:
-        """White less black paint in the middle of the disk, grey levels."""
+        """White minus black paint in the middle of the disk, grey levels."""
         return float(max(self.gain[0] + self.gain[3], 1e-6))
 
     def picture(self, seen: SeenDisk, filmed: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """Return the grey levels expected, (side, side); NaN outside of the ball.
-
-        Args:
-            seen: paint and basis.
-            filmed: (side, side) grey levels; the whole is made as bright as this, within a factor of two.
-        """
+        """Return model grey levels (side, side), NaN outside, scaled by 0.5 .. 2 to the brightness of `filmed`."""
         grey = (seen.basis @ self.gain) * seen.paint + seen.basis @ self.offset
         if filmed is not None:
             good = np.isfinite(grey) & np.isfinite(filmed)
-            # Of the sums, not by least squares: that would darken a sphere whose paint is in the wrong place.
+            # Ratio of sums: least squares would darken a sphere with a wrong orientation.
             grey = grey * np.clip(filmed[good].sum() / max(float(grey[good].sum()), 1e-9), 0.5, 2.0)
         return np.asarray(grey, np.float32)
 
 
 def fit_light(pairs: Sequence[tuple[SeenDisk, NDArray[np.float32]]]) -> LightFit | None:
-    """Match the light roughly: gain and offset, each a plane plus the fall to the rim, by least squares.
-
-    One light for all frames, but for a factor (`LightFit.picture`): fitted frame by frame, it would explain a part of
-    what a wrong orientation leaves.
-
-    Args:
-        pairs: of some frames, what the model sees and the crop, grey levels.
-
-    Returns:
-        None where no pixel can be compared.
-    """
+    """Fit one light to all given frames (model, crop in grey levels); None if no pixel can be compared."""
+    # One light for all frames: a fit of each frame would hide a part of a wrong orientation.
     rows, greys = [np.zeros((0, 8))], [np.zeros(0)]
     for seen, grey in pairs:
         with np.errstate(invalid="ignore"):
@@ -186,7 +172,7 @@ def fit_light(pairs: Sequence[tuple[SeenDisk, NDArray[np.float32]]]) -> LightFit
     design, target = np.concatenate(rows), np.concatenate(greys)
     if len(target) < 8:
         return None
-    # A weak pull to zero keeps coefficients finite where the paint seen is of one grey.
+    # A small ridge keeps coefficients finite where the visible paint has one grey level.
     ridge = 1e-3 * np.sqrt(len(target)) * np.eye(8)
     solved = np.linalg.lstsq(np.concatenate([design, ridge]), np.concatenate([target, np.zeros(8)]), rcond=None)[0]
     return LightFit(gain=solved[:4], offset=solved[4:])

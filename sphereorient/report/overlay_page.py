@@ -1,4 +1,4 @@
-"""The pictures of the overlay: of each camera the frame, the crop, the re-rendered sphere and the residual."""
+"""The pictures of the overlay: each camera's frame, crop, re-rendered sphere and residual."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class OverlayView:
 
     @property
     def why_unlit(self) -> str:
-        """Why nothing can be rendered, if there is no light."""
+        """Why nothing can be rendered without a light."""
         return "no map of the paint" if self.model.texture is None else "no valid frame"
 
     def shown(self, grey: NDArray[np.generic]) -> NDArray[np.uint8]:
@@ -50,7 +50,7 @@ class OverlayView:
         return np.asarray(np.clip(np.nan_to_num(share), 0, 1) * 255, np.uint8)
 
     def centre_px(self, seen: CameraTrack, k: int) -> NDArray[np.float64]:
-        """Return the track's centre in frame k, or what the camera alone sees without one; NaN if neither is known."""
+        """Return the centre in frame k from the track, else from the camera alone, px; NaN if neither is known."""
         return np.asarray(self.trail_px[k] if self.placed(k) else seen.centre_px[k])
 
     def placed(self, k: int) -> bool:
@@ -67,7 +67,7 @@ class Page:
     views: Sequence[OverlayView]
 
     def draw(self, k: int, pictures: Mapping[str, Grey | None]) -> NDArray[np.uint8]:
-        """Return frame k (a row of the track) with the pictures (h, w) of each camera, (H, W, 3) with H and W even."""
+        """Return row k of the track, from the pictures (h, w) by camera, as (H, W, 3) with H and W even."""
         height = FRAME_HEIGHT
         sizes = [view.model.camera.image_size for view in self.views]
         widths = [round(min(width / rows, WIDEST) * height) for width, rows in sizes]
@@ -90,7 +90,7 @@ class Page:
         canvas.text((GAP, 50), textwrap.shorten(state, (width - 2 * GAP) // LETTER, placeholder=" ..."), 15, colour)
 
     def state(self, k: int) -> tuple[str, ink.Colour]:
-        """Return the state of a frame as text, with a mark for readers without colours, and its colour."""
+        """Return the state of a frame as text, with a mark for colour-blind readers, and its colour."""
         flags = ", ".join(flag_words(self.track, k))
         if not self.track.valid[k]:
             return f"\u2716 not valid{': ' + flags if flags else ''}", ink.LOST
@@ -143,7 +143,6 @@ class Page:
         self._words(canvas, view, k, (left, corner[1] + TITLE + SIDE + 24), size[1] - SIDE - TITLE)
 
     def _words(self, canvas: Canvas, view: OverlayView, k: int, at: tuple[int, int], room: int) -> None:
-        """Write this camera's warnings and numbers, and the scale of the residual."""
         seen = self.track.cameras[view.name]
         lost = lost_cameras(self.track, k).get(view.name)
         lines = [(f"{view.name}: {lost}", ink.DOUBT) if lost else (f"{view.name}: measured", ink.GOOD)]
@@ -181,7 +180,7 @@ class Page:
         canvas.text((width - GAP, top + 16), f"{words}{len(self.track)} valid)", 13, ink.FAINT, "rs")
 
     def _strip(self, width: int) -> NDArray[np.uint8]:
-        """Return the states of all frames side by side, (width, 3); of the frames of one pixel the worst."""
+        """Return the states of all frames side by side, (width, 3); a pixel shows the worst of its frames."""
         flags = self.track.flags if len(self.track.cameras) > 1 else self.track.flags & ~np.uint32(Flag.ONE_CAMERA)
         state = np.where(self.track.valid, np.where(flags != 0, 1, 0), 2)
         edges = np.linspace(0, len(state), width + 1)
@@ -192,12 +191,12 @@ class Page:
 
 
 def crop_side(half_px: float) -> int:
-    """Return the samples along each side of a crop: the picture's own pixels, as far as the panel shows them."""
+    """Return the samples along each side of a crop: the picture's own pixels, up to the panel's."""
     return max(48, min(SIDE, round(2 * half_px))) if np.isfinite(half_px) else SIDE
 
 
 def _fill(panels: Sequence[Panel], view: OverlayView, k: int, picture: Grey | None, window: CropWindow) -> str:
-    """Show crop, re-rendered sphere and residual; return why the sphere is not rendered, or ''."""
+    """Show crop, re-rendered sphere and residual; return why the sphere is not rendered, or an empty string."""
     grey = None if picture is None else crop(picture, window)
     if grey is not None:
         panels[0].show(view.shown(grey))

@@ -49,7 +49,7 @@ class DrawnFigure:
 
     @property
     def base64(self) -> str:
-        """The picture as text."""
+        """The PNG in base64."""
         return base64.b64encode(self.png).decode()
 
 
@@ -122,18 +122,9 @@ def strip_assets() -> tuple[str, str]:
 
 
 def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
-    """Return the section of the page with the quality of every frame of a track.
+    """Return the HTML section (text escaped) with the quality of every frame of a track; needs `strip_assets`.
 
-    Without JavaScript it is a table of the bad stretches, and the pictures; with it, strips that react to the mouse.
-    Style and script are those of `strip_assets`.
-
-    Args:
-        name: of the track on the page.
-        track: what was measured.
-        gallery: pictures of some of its frames; None: none.
-
-    Returns:
-        HTML, all text escaped.
+    Without JavaScript it shows a table of the bad stretches and the pictures; with it, interactive strips.
     """
     numbers = None if gallery is None else gallery.numbers
     strip, found = strip_of(track, numbers), bad_stretches(track, numbers)
@@ -153,19 +144,16 @@ def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
 
 
 def _reasons(stretch: BadStretch) -> str:
-    """Return the warnings of a stretch with their numbers of frames."""
     return "; ".join(f"{words} ({count})" for words, count in stretch.reasons) or "no reason given"
 
 
 def _caption(frame: GalleryFrame) -> str:
-    """Return status and reasons of a picture."""
     status = STATUS_WORDS[frame.status]
     words = [words for words in frame.words if words != status]
     return "; ".join(words if words and words[0].startswith(status) else [status, *words])
 
 
 def _some(names: Sequence[str], most: int = 4) -> str:
-    """Return names in a row, many of them shortened."""
     shown = ", ".join(names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
@@ -194,7 +182,6 @@ def _unit(units: str) -> str:
 
 
 def _moments(summary: Summary) -> list[Grid]:
-    """Return a grid for each statistic of Table I, a row for each quantity."""
     lost, done = {
         "added": ("noise that the filter let through", "subtracted"),
         "removed": ("motion that the smoother could not follow", "added"),
@@ -223,7 +210,6 @@ def _moments(summary: Summary) -> list[Grid]:
 
 
 def _cell(of: Interval, most: int) -> Cell:
-    """Return a scalar with its interval, of at most so many decimals."""
     value, low, high = float(of.value), float(of.low), float(of.high)
     if not math.isfinite(value):
         return Cell(value="\u2013")

@@ -31,7 +31,7 @@ CHARACTERS = 145  # in a line of the list
 
 
 def preflight_figure(result: Preflight, path: Path) -> None:
-    """Write a PNG or PDF: a frame of each camera with outlines, the gap by offset, the map, and the findings."""
+    """Write a PNG or PDF: a frame of each camera with outlines, the gap by offset, texture map, and findings."""
     lines = _lines(result)
     agreement = result.scan is not None or result.texture is not None
     heights = [PICTURE, PICTURE if agreement else 0.01, LINE * (len(lines) + 2)]
@@ -50,7 +50,6 @@ def preflight_figure(result: Preflight, path: Path) -> None:
 
 
 def _cameras_part(part: Any, result: Preflight) -> None:
-    """Draw for each camera the frame with the best outlines, whole and enlarged."""
     coverage = torch.stack([torch.nan_to_num(one.sightings.coverage, nan=-1.0) for one in result.samples]).amin(0)
     k = int(coverage.argmax())
     axes = part.subplots(1, 4)
@@ -65,7 +64,7 @@ def _cameras_part(part: Any, result: Preflight) -> None:
 
 
 def _expected_px(result: Preflight, sample: MovieSample, k: int) -> NDArray[np.float64] | None:
-    """Return the outline by both cameras and the diameter, (n, 2) px; None if unknown."""
+    """Return the outline expected from both cameras and the diameter, (n, 2) px; None if unknown."""
     if result.scan is None or result.experiment.diameter_mm is None:
         return None
     position = sample_gaps(result.samples).position_lab_mm[k]
@@ -153,7 +152,7 @@ def _no_data(ax: Any, text: str) -> None:
 
 
 def _lines(result: Preflight) -> list[tuple[Severity | None, str, str, bool]]:
-    """Return the list of findings line by line, faults first: mark, title, text, whether it is advice."""
+    """Return the findings line by line, faults first: mark, title, text, whether it is advice."""
     lines: list[tuple[Severity | None, str, str, bool]] = []
     order = list(Severity)
     for finding in sorted(result.findings, key=lambda one: -order.index(one.severity)):

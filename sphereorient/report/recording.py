@@ -57,15 +57,9 @@ def view_track(
     pictures: bool = True,
     progress: Advance = lambda done, total: None,
 ) -> None:
-    """Show a track in Rerun's viewer, or write it as a recording.
+    """Show a track in Rerun's viewer, or write it to `save` (.rrd) without a window.
 
-    Args:
-        track: what was measured.
-        experiment: of the track, for cameras, texture and pictures; None: the track alone.
-        save: .rrd to write, without a window; None: the viewer is opened.
-        every: of so many frames one has its pictures.
-        pictures: include pictures.
-        progress: called with pictures done and all pictures.
+    The experiment adds cameras, texture map and pictures, the latter in one of `every` frames.
 
     Raises:
         OutputError: rerun-sdk is not installed, another suffix, or the file cannot be written.
@@ -95,7 +89,6 @@ def view_track(
 
 
 def _layout(track: Trajectory, experiment: Experiment | None) -> Any:
-    """Return the windows: space, one for each camera, the series as tabs, the warnings."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -128,13 +121,9 @@ def _log(recording: Any, track: Trajectory, experiment: Experiment | None, every
 
 
 def pinhole_near(camera: Camera, near_lab_mm: Floats) -> tuple[Floats, float] | None:
-    """Fit a pinhole to what a camera shows of the surroundings of a place (3,); a viewer draws pinholes only.
+    """Fit a pinhole, without distortion, to a camera near a point (3,), lab, mm.
 
-    Distortion is left out; the refraction of a wall becomes a part of the focal length.
-
-    Returns:
-        The matrix (3, 3) of the picture, px, and the place's distance along the axis, mm; None if the place is not in
-        front of the centre, as for a telecentric camera, whose centre is arbitrary.
+    Return the matrix (3, 3), px, and the distance along the axis, mm; None if the point is not in front (telecentric).
     """
     R, T = camera.R_cam_lab, camera.T_cam_lab_mm
     depth = float((R @ torch.from_numpy(near_lab_mm) + T)[2])
@@ -154,7 +143,6 @@ def pinhole_near(camera: Camera, near_lab_mm: Floats) -> tuple[Floats, float] | 
 
 
 def _log_cameras(recording: Any, cameras: Mapping[str, Camera], near_lab_mm: Floats) -> None:
-    """Log each camera's pose and frustum, once."""
     import rerun as rr
 
     for name, camera in cameras.items():
@@ -175,7 +163,6 @@ def _log_cameras(recording: Any, cameras: Mapping[str, Camera], near_lab_mm: Flo
 def _log_sphere(
     recording: Any, track: Trajectory, path: Path3D, experiment: Experiment | None, when: Callable[[Any], Any]
 ) -> None:
-    """Log the sphere with its texture and axes, its pose in every frame, and the path of its centre."""
     import rerun as rr
 
     radius = path.radius_mm
@@ -200,7 +187,6 @@ def _log_sphere(
 
 
 def _textured(radius: float, map_: NDArray[np.float32]) -> Any:
-    """Return the sphere as a mesh with its map (docs/conventions.md: texture map)."""
     import rerun as rr
 
     across, down = np.linspace(0, 1, MESH + 1), np.linspace(0, 1, MESH // 2 + 1)
@@ -229,7 +215,7 @@ def series_of(track: Trajectory) -> dict[str, tuple[Floats, Floats]]:
 
 
 def _log_series(recording: Any, track: Trajectory, when: Callable[[Any], Any]) -> None:
-    """Log every series as nine lines (value, one standard deviation above and below), states and warnings."""
+    """Log every series as nine lines (value, one sigma above and below), states and warnings."""
     import rerun as rr
 
     rows = np.arange(len(track))
@@ -258,7 +244,6 @@ def _log_series(recording: Any, track: Trajectory, when: Callable[[Any], Any]) -
 def _log_pictures(
     recording: Any, track: Trajectory, experiment: Experiment, chosen: NDArray[np.int64], progress: Advance
 ) -> None:
-    """Log the movies' pictures as JPEG, frame by frame; rows `chosen` of the track."""
     import rerun as rr
 
     names = [name for name in track.cameras if name in experiment.cameras]
@@ -275,7 +260,7 @@ def _log_pictures(
             recording.set_time(FRAME, sequence=k)
             for name, picture in pictures.items():
                 if picture is not None:
-                    # One scale for the whole movie: that of the first picture.
+                    # One scale for the whole movie, from the first picture.
                     top = white.setdefault(name, max(1.0, float(np.percentile(picture, 99.9))))
                     encoded = rr.EncodedImage(contents=_jpeg(picture, top), media_type="image/jpeg")
                     recording.log(f"lab/{name}/picture", encoded)

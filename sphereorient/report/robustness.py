@@ -25,11 +25,7 @@ LEAST_DEG, MOST_DEG = 3e-3, 180.0
 
 
 def robustness_figure(results: Results) -> Figure:
-    """Draw error and lost frames of each method against severity, a panel for each degradation, worst first.
-
-    Above: median (with markers) and 95th percentile of the orientation's error. Below: share of the frames with an
-    error of more than 10 degrees or without an orientation, after assembly.
-    """
+    """Draw errors and bad frames (above 10 degrees, or lost) against severity, a panel for each degradation."""
     lines = summaries(results)
     kinds = worst_first(lines, results.methods)
     rows = math.ceil(len(kinds) / COLUMNS)
@@ -43,7 +39,7 @@ def robustness_figure(results: Results) -> Figure:
 
 
 def worst_first(lines: Sequence[ResultSummary], methods: Sequence[str]) -> list[str]:
-    """Return the kinds of scenes except clean ones, sorted by bad frames, then by error, of the first method."""
+    """Return the degradations, sorted by bad frames, then by error, of the first method."""
 
     def hardness(kind: str) -> tuple[float, float]:
         own = [line for line in lines if line.kind == kind and line.method == methods[0]]

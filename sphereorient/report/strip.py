@@ -40,10 +40,7 @@ class CameraStrip:
 
 @dataclass(frozen=True, kw_only=True)
 class QualityStrip:
-    """Quality of all frames, or of n bins of `per_bin` frames each, represented by the worst frame.
-
-    Made by `strip_of`, read by the page. Unknown numbers are None: JSON has no NaN.
-    """
+    """Quality of n bins of `per_bin` frames, represented by the worst one; None (not NaN, for JSON) where unknown."""
 
     name: str  # of the experiment
     frames: int
@@ -88,14 +85,7 @@ class BadStretch:
 
 
 def strip_of(track: Trajectory, numbers: Ints | None = None) -> QualityStrip:
-    """Collect the quality of every frame for the page.
-
-    Tracks of more than 20,000 frames are binned. A bin shows the worst of its frames, so that no bad frame is lost.
-
-    Args:
-        track: what was measured.
-        numbers: (N,), the experiment's numbers of the frames; None: by their times.
-    """
+    """Collect the quality of frames, or bins of a long track; `numbers` (N,): the experiment's; None: by the times."""
     size = max(1, -(-len(track) // MOST_BINS))
     rows, starts = np.arange(len(track)), np.arange(0, len(track), size)
     numbers = frame_numbers(track) if numbers is None else numbers
@@ -104,7 +94,7 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> QualityStrip:
     seen = [camera.orientation for camera in track.cameras.values()]
 
     def first(wanted: NDArray[np.bool_]) -> Ints:
-        """Return the first such frame of every bin; the bin's first frame if there is none."""
+        """Return the first such frame of every bin; else the first of the bin."""
         found = np.minimum.reduceat(np.where(wanted, rows, len(track)), starts)
         return np.where(found < len(track), found, starts)
 
@@ -140,15 +130,7 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> QualityStrip:
 
 
 def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStretch]:
-    """Find the runs of frames that are doubtful or not valid; runs fewer than ten frames apart are one.
-
-    Args:
-        track: what was measured.
-        numbers: (N,), the experiment's numbers of the frames; None: by their times.
-
-    Returns:
-        Longest first; of equal length first those with more frames that are not valid.
-    """
+    """Find runs of bad frames, joined over fewer than ten good ones, longest first; `numbers` as for `strip_of`."""
     numbers = frame_numbers(track) if numbers is None else numbers
     group, warnings = _groups(track)
     status = status_of(track)
@@ -203,7 +185,7 @@ def _groups(track: Trajectory) -> tuple[Ints, list[list[str]]]:
 
 
 def _reason_codes(track: Trajectory) -> tuple[dict[str, Ints], tuple[str, ...]]:
-    """Return each camera's reasons as small numbers, (N,), 0 if measured, and the meaning of the numbers."""
+    """Return each camera's reasons as numbers, (N,), 0 if measured, and the meaning of the numbers."""
     known: dict[str, int] = {Reason.OK: 0}
     words = {0: "measured"}
     codes = {}

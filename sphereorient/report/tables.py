@@ -34,18 +34,12 @@ class Table:
 
     @property
     def columns(self) -> list[str]:
-        """Names of the columns, units at their ends."""
+        """Names of the columns, with their units at the end."""
         return list(self.rows[0]) if self.rows else []
 
 
 def tables_of(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> list[Table]:
-    """Return all numbers of a report, without empty tables; a new table is a line here and a function.
-
-    Args:
-        summary: the statistics.
-        tracks: by the name of their file.
-        distances: between the cameras of all tracks.
-    """
+    """Return all non-empty tables of a report, from the statistics, the tracks by file name, and camera distances."""
     level = f"{100 * summary.settings.level:g} % intervals"
     found: list[tuple[str, str, Iterable[Row]]] = [
         ("tracks", "the tracks, and the frames that each camera lost", _tracks(tracks)),

@@ -33,7 +33,7 @@ class Interval:
     error: Floats  # standard deviation of the resampled values
 
     def part(self, key: Any) -> Interval:
-        """Return some of the values, by an index of an array."""
+        """Return some of the values, selected by an array index."""
         value, low, high, error = (np.asarray(x)[key] for x in (self.value, self.low, self.high, self.error))
         return Interval(value=value, low=low, high=high, error=error)
 
@@ -57,19 +57,10 @@ def segment_sums(values: Floats, segment: Rows, segments: int) -> Floats:
 
 
 def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | None = None) -> Interval:
-    """Return a statistic of sums over segments, with BCa intervals from resampled segments.
+    """Return a statistic of the total of `sums` (S, ...) over segments, with BCa intervals from resampled segments.
 
-    A segment weighs as much as it has samples, since the statistic is of sums. The acceleration of BCa comes from
-    leaving out each segment in turn.
-
-    Args:
-        sums: (S, ...), contribution of each independent segment.
-        statistic: maps total sums (..., *sums.shape[1:]) to values with the same leading shape.
-        settings: resamples, level, seed.
-
-    Returns:
-        Values and intervals of the statistic's shape; NaN where the statistic is. One segment has no intervals.
-
+    `statistic` maps totals (..., *sums.shape[1:]) to values with the same leading shape; values are NaN where it is.
+    The intervals of a single segment are NaN.
     Source: Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 14.
     """
     settings = settings or BootstrapSettings()
@@ -97,17 +88,16 @@ def _by_blocks(part: Callable[[Rows], Floats], count: int, width: int) -> Floats
 
 
 def _weights(segments: int, rows: Rows, settings: BootstrapSettings) -> Floats:
-    """Return how often each segment is in the resamples of these numbers (B,), (B, segments)."""
+    """Return how often each segment is in the resamples with the numbers `rows` (B,), (B, segments)."""
     weights = np.empty((len(rows), segments))
     for place, row in enumerate(rows.tolist()):
-        # A seed for each resample, so that the size of the blocks does not change the numbers.
+        # One seed per resample: the block size does not change the numbers.
         draw = np.random.default_rng([settings.seed, row]).integers(0, segments, segments)
         weights[place] = np.bincount(draw, minlength=segments)
     return weights
 
 
 def _bca(value: Floats, drawn: Floats, without: Floats, level: float) -> tuple[Floats, Floats]:
-    """Return the corrected quantiles of the drawn values."""
     below = ((drawn < value).mean(0) + (drawn <= value).mean(0)) / 2
     rest = 0.5 / len(drawn)
     bias = ndtri(np.clip(below, rest, 1 - rest))
@@ -135,22 +125,11 @@ def _quantiles(drawn: Floats, share: Floats) -> Floats:
 def studentized(
     sums: Floats, statistic: Statistic, positive: NDArray[np.bool_], settings: BootstrapSettings | None = None
 ) -> Interval:
-    """Return a statistic of sums over segments, with studentized bootstrap intervals.
+    """Return a statistic of the total of `sums` (S, G, K) over segments, with studentized bootstrap intervals.
 
-    The resampled quantity is t = (resampled value - value) / (resampled error), of logarithms for positive values. For
-    a statistic whose sampling is skewed by a few large events, such as the flatness, percentiles of the values end too
-    low. Errors come from the derivative by each segment's weight. With fewer than 20 segments the intervals are those
-    of `bootstrap`.
-
-    Args:
-        sums: (S, G, K), contributions of each independent segment to G groups.
-        statistic: maps totals (..., G, K) to values (..., G, Q), group by group, and is the same for twice the totals.
-        positive: (Q,), which values are positive by definition.
-        settings: resamples, level, seed.
-
-    Returns:
-        Values and intervals, (G, Q); NaN where the statistic is.
-
+    For statistics skewed by a few large events, such as the flatness. `statistic` maps totals (..., G, K) to values
+    (..., G, Q) and gives the same for twice the totals; values are NaN where it is. `positive` (Q,) marks values that
+    are positive by definition. Fewer than 20 segments: as `bootstrap`.
     Source: Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapters 12 and 14.
     """
     settings = settings or BootstrapSettings()
@@ -182,7 +161,7 @@ def studentized(
 
 
 def _drawn(at: Statistic, sums: Floats, settings: BootstrapSettings) -> tuple[Floats, Floats]:
-    """Return the values of the resampled ensembles and their errors, (B, G, Q) each."""
+    """Return values and errors of the resampled ensembles, (B, G, Q) each."""
     segments, groups, size = sums.shape
     flat = sums.reshape(segments, -1)
     products = (sums[..., :, None] * sums[..., None, :]).reshape(segments, -1)
@@ -198,17 +177,9 @@ def _drawn(at: Statistic, sums: Floats, settings: BootstrapSettings) -> tuple[Fl
 
 
 def _error(at: Statistic, totals: Floats, squares: Floats) -> Floats:
-    """Return the standard deviation of a statistic (..., G, Q) from the scatter of the segments' contributions.
-
-    A segment's weight changes the statistic by its gradient times the segment's sums. Twice the totals give the same
-    value, so the gradient is orthogonal to the totals and these contributions have mean zero.
-
-    Args:
-        at: the statistic.
-        totals: (..., G, K).
-        squares: (..., G, K, K), products of the segments' sums, summed over the segments.
-    """
+    """Return the error (..., G, Q) of a statistic, by its gradient; `squares` (..., G, K, K): products of the sums."""
     squares = np.nan_to_num(squares)  # unknown sums of a group enter only statistics that are NaN
+    # Twice the totals give the same value: the gradient is orthogonal to them, contributions of segments have mean 0.
     slopes = []
     for k in range(totals.shape[-1]):
         step = STEP * np.sqrt(squares[..., k, k])

@@ -28,7 +28,7 @@ class CameraDistance:
 
     @property
     def median_rad(self) -> float:
-        """The median distance; NaN without frames."""
+        """Median distance, rad; NaN without frames."""
         return float(np.median(self.distance_rad)) if len(self.distance_rad) else float("nan")
 
 
@@ -39,11 +39,7 @@ def camera_distances(
 ) -> list[CameraDistance]:
     """Return the distances for every pair of cameras, frames of all tracks together; empty for one camera.
 
-    Args:
-        tracks: with each camera's own R_lab_body, corrected for perspective.
-        uncorrected: of each track (N, 3, 3) by camera, of `without_perspective`; None or missing: unknown.
-        bins: of the PDF, from 0 to the largest distance or 180 degrees.
-
+    `uncorrected` holds for each track the result of `without_perspective`; None or missing: unknown.
     Source: the paper, section III, distance of the two cameras; the angle by docs/errata.md A3.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
@@ -75,15 +71,9 @@ def _pooled(pair: tuple[str, str], parts: list[Floats], rough_parts: list[Floats
 
 
 def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, Floats]:
-    """Return each camera's orientations as if its line of sight were parallel to its axis.
+    """Return R_lab_cam R_cam_view^T R_cam_lab R_lab_body, (N, 3, 3) by camera; NaN for frames without an orientation.
 
-    Args:
-        track: with each camera's own R_lab_body (N, 3, 3) and the projected centre.
-        cameras: by name; others of the track are left out.
-
-    Returns:
-        R_lab_cam R_cam_view^T R_cam_lab R_lab_body, (N, 3, 3) by camera; NaN for frames without an orientation.
-
+    These are the orientations as if each line of sight were parallel to its camera's axis, for the given cameras only.
     Source: the paper, section III, R_persp; its sign by docs/errata.md A1.
     """
     import torch

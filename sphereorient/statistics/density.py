@@ -27,28 +27,16 @@ REACH = 10.0  # of the PDF to either side, standard deviations
 
 
 def stretched_exponential(x: Floats, a: Floats | float) -> Floats:
-    """Return the density of unit variance that the paper fits to accelerations.
+    """Return the density of unit variance that the paper fits to accelerations, at x (...), in standard deviations.
 
-    It is the density of the product of a uniform and a log-normal number: p(x) = exp(3 a^2 / 2) / (4 sqrt 3)
-    erfc((ln|x / sqrt 3| + 2 a^2) / (sqrt 2 a)). It is computed with erfc in logarithms: 1 - erf is 0 from |x| = 30 on.
-
-    Args:
-        x: (...), in standard deviations.
-        a: width of the logarithm; flatness is 9/5 exp(4 a^2). Broadcasts against x.
-
+    p(x) = exp(3 a^2 / 2) / (4 sqrt 3) erfc((ln|x / sqrt 3| + 2 a^2) / (sqrt 2 a)); a broadcasts against x.
     Source: Mordant, Crawford and Bodenschatz 2004, Physica D 193, 245; the paper, section IV.
     """
     return np.asarray(np.exp(log_stretched_exponential(x, a)))
 
 
 def log_stretched_exponential(x: Floats, a: Floats | float, noise_share: float = 0.0) -> Floats:
-    """Return the logarithm of `stretched_exponential`, finite for all floats.
-
-    Args:
-        x: (...), in standard deviations, of the sum where there is noise.
-        a: width of the logarithm; broadcasts against x.
-        noise_share: share of normal noise in the variance, 0 .. below 1; by Gauss-Hermite quadrature.
-    """
+    """Return the logarithm of `stretched_exponential`; `noise_share` (< 1) of the variance of x is normal noise."""
     if noise_share > 0:
         place, weight = np.polynomial.hermite_e.hermegauss(HERMITE)
         clean = np.sqrt(1 - noise_share)
@@ -95,18 +83,10 @@ def fit_stretched(
     settings: BootstrapSettings | None = None,
     noise_share: float = 0.0,
 ) -> StretchedFit:
-    """Fit the stretched exponential by maximum likelihood, with intervals from resampled segments.
+    """Fit the stretched exponential to the motion in a component (M,), any unit, by maximum likelihood, with intervals.
 
-    Mean and standard deviation are the sample's own. The fit depends on where most of the data are; the flatness
-    depends on the few largest values.
-
-    Args:
-        x: (M,), one component, any unit.
-        segment: (M,), 0 .. segments - 1, increasing.
-        segments: their number.
-        settings: of the bootstrap.
-        noise_share: of the variance, of `moments.noise_let_through`: the fit is of the motion without this noise, which
-            would fill the peak of the density and lower a.
+    The fit leaves out `noise_share` of the variance (`moments.noise_let_through`); such noise would fill the peak of
+    the density and lower a. `segment` (M,), 0 .. segments - 1, increases.
     """
     normal = (x - x.mean()) / x.std()
     edges = np.linspace(np.log(SMALLEST), np.log(LARGEST), FINE_BINS + 1)
@@ -128,10 +108,9 @@ def fit_stretched(
 
 
 class _Likelihood:
-    """The likelihood of binned data as a smooth function of a and of the scale."""
+    """The likelihood of binned data, ln|x| (K,), as a smooth function of a and of the scale."""
 
     def __init__(self, log_x: Floats, noise_share: float) -> None:
-        """Tabulate it for the bins' ln|x|, (K,)."""
         self.nodes = np.linspace(NARROWEST_S, WIDEST_S, NODES)
         self.table = log_stretched_exponential(np.exp(log_x)[:, None], self.nodes, noise_share)
         # d/d ln|x|: a resampled ensemble has its own standard deviation, by which its values are divided
@@ -171,12 +150,12 @@ class Density:
 
     @property
     def centres(self) -> Floats:
-        """(B,), middle of each bin."""
+        """Middle of each bin, (B,)."""
         return np.asarray((self.edges[1:] + self.edges[:-1]) / 2)
 
 
 def density(ensemble: Ensemble, quantity: str, component: int, *, settings: BootstrapSettings | None = None) -> Density:
-    """Return the PDF of a component as measured, with intervals, and the fit to the motion without noise."""
+    """Return the PDF of a measured component, with intervals, and the fit to the motion without noise."""
     x = ensemble.values[quantity][:, component]
     share = noise_let_through(ensemble, quantity, component)
     return density_of(x, ensemble.segment, ensemble.segments, settings=settings, noise_share=share)
@@ -191,7 +170,7 @@ def density_of(
     settings: BootstrapSettings | None = None,
     noise_share: float = 0.0,
 ) -> Density:
-    """Return the PDF of numbers (M,) sorted by segment, over 10 standard deviations to either side; as `density`."""
+    """Return the PDF of values (M,) sorted by segment, over 10 standard deviations to either side; as `density`."""
     normal = (x - x.mean()) / x.std()
     edges = np.linspace(-REACH, REACH, bins + 1)
     place = np.searchsorted(edges, normal, side="right") - 1

@@ -18,22 +18,19 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class FlowScales:
-    """Kolmogorov's scales of a liquid in use, for example of water-glycerol.
-
-    Source: Kolmogorov 1941; docs/errata.md A5 for the paper's values, which are water's.
-    """
+    """Scales of the liquid in use, such as water-glycerol. Source: Kolmogorov 1941; docs/errata.md A5 (water)."""
 
     viscosity_m2_s: float  # kinematic
     dissipation_w_kg: float  # energy dissipated per mass
 
     @property
     def eta_m(self) -> float:
-        """Length, (nu^3 / epsilon)^(1/4)."""
+        """Kolmogorov's length, (nu^3 / epsilon)^(1/4), m."""
         return float((self.viscosity_m2_s**3 / self.dissipation_w_kg) ** 0.25)
 
     @property
     def tau_eta_s(self) -> float:
-        """Time, (nu / epsilon)^(1/2)."""
+        """Kolmogorov's time, (nu / epsilon)^(1/2), s."""
         return float((self.viscosity_m2_s / self.dissipation_w_kg) ** 0.5)
 
 
@@ -54,17 +51,9 @@ def comparisons(
     u_rms_m_s: float | None = None,
     integral_length_m: float | None = None,
 ) -> list[Comparison]:
-    """Return the dimensionless numbers that the given inputs allow.
+    """Return the dimensionless numbers that the given inputs allow, from the moments by quantity.
 
-    The sphere's rms values are corrected for noise, root mean square over the three components.
-
-    Args:
-        table: moments by quantity.
-        diameter_mm: of the sphere.
-        flow: the flow's scales, if viscosity and dissipation are known.
-        u_rms_m_s: rms of a component of the flow's velocity.
-        integral_length_m: of the flow.
-
+    Rms values are of one component; the sphere's are corrected for noise.
     Source: the paper, section IV: omega_rms against u_rms / D; docs/errata.md A5.
     """
     diameter_m = diameter_mm * M_PER_MM
@@ -93,7 +82,7 @@ def comparisons(
 
 
 def _component_rms(moments: Moments) -> float:
-    """Return the rms of one component, the mean square over the three; as measured if the noise is unknown."""
+    """Return the rms over the three components; as measured if the noise is unknown."""
     corrected = moments.corrected_rms.value[:3]
     rms = corrected if np.isfinite(corrected).all() else moments.rms.value[:3]
     return float(np.sqrt((rms**2).mean()))
@@ -101,19 +90,14 @@ def _component_rms(moments: Moments) -> float:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lift:
-    """Correlation of omega x v with a, lab; made by `lift`. Columns: x, y, z, and the vectors' (their sum)."""
+    """Correlation of omega x v with a, lab; made by `lift`. Columns: x, y, z, and the whole vectors (their sum)."""
 
     correlation: Interval  # (4,), cosine: <a . l> / sqrt(<a^2> <l^2>) with l = omega x v
     coefficient: Interval  # (4,), least squares of a = C omega x v
 
 
 def lift(ensemble: Ensemble, settings: BootstrapSettings | None = None) -> Lift:
-    """Return the correlation of the acceleration with omega x v, the direction of the Magnus force.
-
-    The velocity is the sphere's in the lab, as in the paper: the liquid's velocity is unknown.
-
-    Source: the paper, section IV, lift.
-    """
+    """Return the correlation of a with omega x v of the sphere, lab (Magnus force). Source: the paper, section IV."""
     v, a = (ensemble.values[q] - ensemble.values[q].mean(0) for q in ("velocity", "acceleration"))
     force = np.cross(ensemble.values["omega_lab"], v)
     products = np.stack([a * force, a * a, force * force], axis=-1)

@@ -1,4 +1,4 @@
-"""Tests of isotropy: of vectors in lab and body, and of attitudes on SO(3); Euler angles; the frame of a dataset."""
+"""Tests of isotropy: of vectors in lab and body, and of orientations on SO(3); Euler angles; the frame of a vector."""
 
 from __future__ import annotations
 
@@ -49,10 +49,7 @@ class Isotropy:
 def isotropy(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Isotropy:
     """Test whether the covariance of a quantity (a name in UNITS) is the same in all directions of its frame.
 
-    Isotropy means that the five numbers of the covariance's traceless part are zero. Each segment contributes their
-    sums; Hotelling's test compares their mean with their scatter over segments, so that the correlation along a track
-    does not matter. With six segments or fewer the p-value is NaN.
-
+    Samples are whole segments, since a track is correlated. With six segments or fewer the p-value is NaN.
     Source: Hotelling 1931; the paper, Table I, with docs/errata.md E6.
     """
     x = ensemble.values[quantity] - ensemble.values[quantity].mean(0)
@@ -88,11 +85,7 @@ def zero_mean_p_value(rows: Floats) -> float:
 
 
 def anisotropic_frame(lab: Isotropy, body: Isotropy, level: float = 0.05) -> Literal["lab", "body", "both", "neither"]:
-    """Return the frame in which a vector is anisotropic, by the tests on lab and body components at a level.
-
-    A flow with axes is anisotropic in the lab; in a body that tumbles it averages out. A body with unequal axes is
-    anisotropic in the body.
-    """
+    """Return the frame in which a vector is anisotropic, by the tests of its lab and body components at a level."""
     if lab.p_value >= level:
         return "neither" if body.p_value >= level else "body"
     return "lab" if body.p_value >= level else "both"
@@ -108,12 +101,7 @@ class FrameOfRow:
 
 
 def frame_of_omega(ensemble: Ensemble, omega: Floats) -> FrameOfRow:
-    """Find the frame of the components of an angular velocity (M, 3), rad/s, by the ensemble's orientations.
-
-    From frame to frame the sphere rotates by R_{k+1} R_k^T in lab components and by R_k^T R_{k+1} in body components
-    (docs/errata.md E4); the mean of the row's two values is compared with both. A row of the paper's Table I,
-    R omega_lab, fits neither (E6).
-    """
+    """Find the frame of the components of omega (M, 3), rad/s, from the rotations. Source: docs/errata.md E4, E6."""
     from scipy.spatial.transform import Rotation
 
     first, second = Pairs(ensemble).at(1)
@@ -133,12 +121,12 @@ def frame_of_omega(ensemble: Ensemble, omega: Floats) -> FrameOfRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Uniformity:
-    """Result of the test of uniform attitudes; made by `uniformity`."""
+    """Result of the test of uniform orientations; made by `uniformity`."""
 
     statistic: float
     p_value: float
     samples: int
-    effective: float  # number of independent attitudes with the same scatter
+    effective: float  # number of independent orientations with the same scatter
     segments: int
 
     @property
@@ -148,21 +136,10 @@ class Uniformity:
 
 
 def uniformity(R_lab_body: Floats, segment: NDArray[np.int64] | None = None) -> Uniformity:
-    """Test whether rotations are uniform on SO(3).
+    """Test whether rotations (M, 3, 3) are uniform on SO(3), by the first and second moments of the axes' directions.
 
-    The statistic is the squared norm of the mean of the first two representations: 3 n |<R>|^2 + 5 n |<D>|^2,
-    chi-squared with 9 + 25 degrees of freedom for independent attitudes. It sees deviations in the first and second
-    moments of the axes' directions. Attitudes along a track are correlated, so the units of the null distribution are
-    segments: a segment is as likely after any rotation in the body. The sum over segments then has the covariance of
-    the segments' own sums; many segments make it normal, and the statistic a weighted sum of chi-squares.
-
-    Args:
-        R_lab_body: (M, 3, 3).
-        segment: (M,), increasing, equal within a segment; None: all rotations are independent.
-
-    Returns:
-        Statistic and p-value. Twenty segments are few; with two the test has no power.
-
+    Statistic: 3 n |<R>|^2 + 5 n |<D>|^2, D of `five_dimensional`. The null distribution rotates whole segments, (M,),
+    increasing; None: all rotations are independent. Twenty segments are few; with two the test has no power.
     Source: Rayleigh's and Gine's tests on SO(3): Mardia and Jupp 2000, Directional Statistics, 13.2.
     """
     count = len(R_lab_body)
@@ -209,12 +186,7 @@ class EulerDensity:
 def euler_densities(
     ensemble: Ensemble, bins: int = 24, settings: BootstrapSettings | None = None
 ) -> list[EulerDensity]:
-    """Return the PDFs of theta_x, theta_y, theta_z beside those of uniform rotations.
-
-    Uniform rotations have theta_x and theta_z uniform over 2 pi and theta_y with density cos(theta_y) / 2.
-
-    Source: the paper, section II; the angles by docs/errata.md E1.
-    """
+    """Return PDFs of the Euler angles and of uniform rotations. Source: the paper, section II; docs/errata.md E1."""
     import torch
 
     from sphereorient import so3

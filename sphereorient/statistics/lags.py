@@ -22,10 +22,9 @@ FEWEST_SEGMENTS = 10  # of a lag; with fewer its error bar means little
 
 
 class Pairs:
-    """Pairs of samples of one segment at a given lag; gaps are respected. Made once for an ensemble."""
+    """Pairs of samples of one segment at a given lag, on a regular grid with empty places for lost frames."""
 
     def __init__(self, ensemble: Ensemble) -> None:
-        """Make a regular grid of the frames of each segment, with empty places for lost frames."""
         frames = np.maximum.reduceat(ensemble.frame, ensemble.starts[:-1]) + 1
         self.longest = int(frames.max()) - 1  # lag, frames
         begin = np.concatenate([[0], np.cumsum(frames)[:-1]])
@@ -58,21 +57,11 @@ class Correlation:
 def correlation(
     ensemble: Ensemble, quantity: str, longest_s: float | None = None, settings: BootstrapSettings | None = None
 ) -> Correlation:
-    """Return the autocorrelation of a quantity about its mean over the ensemble.
+    """Return the autocorrelation of a quantity (a name in UNITS) about its ensemble mean, and its integral times.
 
-    A value is the mean product of the pairs at this lag over the mean square of the same pairs: unbiased by the lengths
-    of the segments, and 1 for a constant. Pairs over a gap count at their true lag.
-
-    Args:
-        ensemble: the samples.
-        quantity: a name in UNITS.
-        longest_s: longest lag, s; None: the longest at which a fiftieth of the samples has a partner.
-        settings: of the bootstrap.
-
-    Returns:
-        The curve and the integral times, to the first zero (trapezoids, the last one cut at the zero).
-
-    Source: textbook; the paper's T_L is the integral time of `velocity`.
+    A value is the mean product of pairs over their mean square: unbiased by the lengths of segments. Pairs over a gap
+    count at their true lag. `longest_s` None: the longest lag at which a fiftieth of the samples has a partner.
+    Source: textbook; the paper's T_L is the integral time of `velocity`, up to the first zero.
     """
     pairs = Pairs(ensemble)
     x = ensemble.values[quantity] - ensemble.values[quantity].mean(0)
@@ -97,7 +86,6 @@ def correlation(
 
 
 def _correlation_lags(pairs: Pairs, ensemble: Ensemble, longest_s: float | None) -> Rows:
-    """Return lags in frames: each one at first, then ever sparser."""
     most = pairs.longest if longest_s is None else min(pairs.longest, int(longest_s / ensemble.step_s))
     if longest_s is None:
         length = np.sort(np.bincount(ensemble.segment))
@@ -116,7 +104,7 @@ def _curve_and_times(totals: Floats, lag_s: Floats) -> Floats:
 
 
 def integral_time(curve: Floats, lag_s: Floats) -> Floats:
-    """Return the integral up to the first zero, (..., C), of curves (..., L, C) at lags (L,); it ends before a NaN."""
+    """Return the integrals (..., C) of curves (..., L, C) over lags (L,), up to the first zero or NaN."""
     a, b = curve[..., :-1, :], curve[..., 1:, :]
     step = np.diff(lag_s)[:, None]
     before = np.logical_and.accumulate((a > 0) & np.isfinite(b), axis=-2)
@@ -144,21 +132,10 @@ def increments(
     integral_time_s: float | None = None,
     settings: BootstrapSettings | None = None,
 ) -> Increments:
-    """Return rms and flatness of increments over lags.
+    """Return rms and flatness of increments of a quantity (a name in UNITS), for lags that ten segments or more reach.
 
-    At short lags an increment is the derivative times the lag, with its flatness; far beyond the integral time it is
-    the difference of two independent values, with flatness 3 + (F - 3) / 2.
-
-    Args:
-        ensemble: the samples.
-        quantity: a name in UNITS.
-        lags_s: lags, s, rounded to frames; None: twelve, from a frame to the integral time, geometric.
-        integral_time_s: the longest of these twelve; None: half the median segment.
-        settings: of the bootstrap.
-
-    Returns:
-        Statistics by lag, without lags that fewer than ten segments reach.
-
+    `lags_s`, s, are rounded to frames; None: twelve, geometric, from one frame to `integral_time_s` (None: half the
+    median segment). The flatness goes from the derivative's to 3 + (F - 3) / 2 at long lags.
     Source: the paper, section IV, with docs/errata.md E7.
     """
     pairs = Pairs(ensemble)

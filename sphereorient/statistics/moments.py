@@ -49,10 +49,7 @@ def table_of_moments(ensemble: Ensemble, settings: BootstrapSettings | None = No
 
 
 def moments(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Moments:
-    """Return the moments of one quantity (a name in UNITS), by component and of the norm, with intervals.
-
-    Source: the paper, Table I; its lab rows are in no frame (docs/errata.md E6).
-    """
+    """Return moments of a quantity (a name in UNITS) and its norm. Source: the paper, Table I; docs/errata.md E6."""
     x = ensemble.values[quantity]
     x = np.concatenate([x, np.linalg.norm(x, axis=1, keepdims=True)], axis=1)
     sigma = np.concatenate([ensemble.sigmas[quantity], np.full((len(x), 1), np.nan)], axis=1)
@@ -89,20 +86,10 @@ def _statistics(totals: Floats, sign: float) -> Floats:
 def without_noise(
     var: Floats, fourth: Floats, s2: Floats, s4: Floats, mixed: Floats, sign: float
 ) -> tuple[Floats, Floats]:
-    """Return variance and fourth moment (...) of the motion from those that were measured.
+    """Return variance and fourth moment (...) of the motion from the measured ones.
 
-    Noise that a kernel let through is independent of the motion and normal, with its own variance in every frame; it
-    is subtracted (sign 1). A smoother's estimate lacks the motion that it could not follow; its variance is added
-    (sign -1). The share LET_THROUGH of a smoother's error is noise; the lost motion is assumed to be as intermittent as
-    the rest, so that the flatness is that of the estimate without this noise.
-
-    Args:
-        var: (...), measured variance.
-        fourth: (...), measured fourth central moment.
-        s2: (...), mean of sigma^2.
-        s4: (...), mean of sigma^4.
-        mixed: (...), mean of (x - mean)^2 sigma^2.
-        sign: 1 subtracts noise, -1 adds what was smoothed away.
+    `s2`, `s4` and `mixed` (...) are the means of sigma^2, sigma^4 and (x - mean)^2 sigma^2. Sign 1 subtracts
+    independent normal noise; -1 adds the motion that a smoother removed, taken to be as intermittent as the rest.
     """
     part = 1.0 if sign > 0 else LET_THROUGH
     clean_var = var - part * s2

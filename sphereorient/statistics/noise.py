@@ -59,7 +59,7 @@ class MultiLag:
 
     @property
     def rms(self) -> Floats:
-        """(3,), of the motion itself."""
+        """Rms of the motion itself, (3,)."""
         return np.sqrt(np.maximum(self.variance.value, 0.0))
 
 
@@ -69,23 +69,15 @@ def multi_lag(
     lags: tuple[int, ...] = LAGS,
     settings: BootstrapSettings | None = None,
 ) -> MultiLag:
-    """Estimate the variance of acceleration or alpha from the raw measurements, without their white noise.
+    """Estimate the variance of "acceleration" or "alpha_lab" from the raw measurements, without their white noise.
 
-    The second difference over n frames has the variance of the motion, (n dt)^4 <a^2> (1 - c n^2), plus 6 times the
-    noise variance, which does not depend on n. A linear fit separates the two and the loss c; it uses neither a filter
-    nor the track's sigmas. For alpha the difference is that of the rotations R_{k+n} R_k^T and R_k R_{k-n}^T.
-
-    Args:
-        tracks: with `position` and `orientation` as measured.
-        quantity: "acceleration" or "alpha_lab".
-        lags: n, frames; at least four.
-        settings: of the bootstrap over segments.
+    The second difference over n frames has variance (n dt)^4 <a^2> (1 - c n^2) + 6 times the noise variance; a linear
+    fit over four lags n or more separates them. For alpha it is the difference of R_{k+n} R_k^T and R_k R_{k-n}^T.
 
     Raises:
         TrackError: too few segments or lags for the fit.
 
-    Source: second-order statistics of increments over several time steps: Machicoane, Lopez-Caballero, Bourgoin,
-    Aliseda and Volk 2017, Meas. Sci. Technol. 28, 107002.
+    Source: Machicoane, Lopez-Caballero, Bourgoin, Aliseda and Volk 2017, Meas. Sci. Technol. 28, 107002.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
     step_s = float(np.median(np.concatenate([np.diff(t.time) for t in many])))
@@ -129,7 +121,7 @@ def _second_differences(track: Trajectory, quantity: str, n: int, step_s: float)
 
 
 def _rotation(R: Floats, first: Rows, second: Rows) -> Floats:
-    """Return the rotation vectors from some rows to others in lab components, (K, 3); NaN where either is."""
+    """Return the rotation vectors from rows `first` to `second`, lab, (K, 3); NaN where either is NaN."""
     from scipy.spatial.transform import Rotation
 
     there = np.isfinite(R[first] + R[second]).all((1, 2))
@@ -141,10 +133,7 @@ def _rotation(R: Floats, first: Rows, second: Rows) -> Floats:
 
 
 def _extrapolated(square: Floats, lag_s: Floats) -> Floats:
-    """Return variance of the motion and of the noise, (..., 2, 3), of mean squares (..., L, 3).
-
-    Least squares for square = 6 noise + variance lag^4 - loss lag^6 + more lag^8, relative to each lag's own size.
-    """
+    """Fit square (..., L, 3) = 6 noise + variance lag^4 - loss lag^6 + more lag^8; return variance and noise."""
     scale = lag_s / lag_s[-1]
     powers = np.stack([np.full_like(scale, 6.0), scale**4, scale**6, scale**8], axis=1)[:, : min(4, len(lag_s) - 1)]
     weight = 1 / square.mean(-1, keepdims=True)
@@ -174,21 +163,10 @@ def width_curve(
     widths_frames: Sequence[float] = WIDTHS,
     settings: BootstrapSettings | None = None,
 ) -> WidthCurve:
-    """Differentiate the measured positions or orientations with kernels of many widths.
+    """Differentiate the measurements to velocity, acceleration or alpha_lab with Gaussian kernels (sigma, frames).
 
-    Narrow kernels let noise through, wide ones lose the motion; without a plateau between them the rms is not well
-    known. All widths use the frames that the widest one reaches. White noise and regular times within a segment are
-    assumed. Alpha is the derivative of omega from the rotations over two frames.
-
-    Args:
-        tracks: with positions, orientations and their covariances.
-        quantity: velocity, acceleration or alpha_lab.
-        widths_frames: sigma of the Gaussian, frames.
-        settings: of the bootstrap over segments.
-
-    Returns:
-        The curve; NaN where all segments are shorter than the widest kernel.
-
+    Narrow kernels let noise through, wide ones lose motion; a plateau between them is the rms. All widths use the
+    frames that the widest one reaches; NaN where all segments are shorter. White noise and regular times are assumed.
     Source: Voth, La Porta, Crawford, Alexander and Bodenschatz 2002, J. Fluid Mech. 469, 121; the paper, section III.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
@@ -206,7 +184,6 @@ def width_curve(
 
 
 def _step(track: Trajectory) -> float:
-    """Return the time between frames, s."""
     return float(np.median(np.diff(track.time)))
 
 
@@ -239,10 +216,7 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
 
 
 def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
-    """Return the rows of segments, their places on a regular grid, and every place's segment, -1 for empty places.
-
-    At least one place between segments is empty, so that no kernel spans two segments.
-    """
+    """Return rows, their places on a regular grid, and the segment of each place, -1: empty, between segments."""
     rows = np.flatnonzero(track.segment >= 0)
     rows = rows[np.lexsort((track.time[rows], track.segment[rows]))]
     _, segment = np.unique(track.segment[rows], return_inverse=True)
@@ -256,7 +230,6 @@ def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
 
 
 def _kernel(width: float, order: int) -> Floats:
-    """Return the weights of the project's Gaussian derivative, per frame^order, for np.convolve."""
     import torch
 
     from sphereorient.motion import gaussian_derivative

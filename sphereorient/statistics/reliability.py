@@ -23,17 +23,14 @@ class Reliability:
     low: Floats  # (B,), of the 95 % interval of the share
     high: Floats  # (B,)
     count: NDArray[np.int64]  # (B,), outcomes in the bin
-    error: float  # expected calibration error: mean distance of share and probability over outcomes; NaN of none
-    chance: float  # the error expected of perfect probabilities by the scatter of as many outcomes
+    error: float  # expected calibration error: mean |share - probability| over outcomes; NaN without outcomes
+    chance: float  # the error expected by scatter alone if the probabilities are perfect
 
 
 def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> Reliability:
-    """Compare probabilities with outcomes, in bins of equal count.
+    """Compare probabilities (N,), 0 .. 1 or NaN (left out), with outcomes (N,), bool, in at most `bins` bins.
 
-    Args:
-        probability: (N,), 0 .. 1; NaN is left out.
-        outcome: (N,) bool.
-        bins: at most; equal probabilities stay in one bin.
+    Bins have equal counts, but equal probabilities stay in one bin.
 
     Raises:
         ShapeError: unequal numbers of outcomes and probabilities, probabilities outside 0 .. 1, or no bin.
@@ -74,14 +71,12 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
 
 
 def _edges(said: Floats, bins: int) -> NDArray[np.int64]:
-    """Return the first outcome of each bin, and the end, (B + 1,), moved to where the sorted probabilities change."""
     wanted = said[np.rint(np.linspace(0, len(said), bins + 1)[1:-1]).astype(np.int64)] if len(said) >= bins else said
     inner = np.searchsorted(said, wanted, side="left")
     return np.unique(np.concatenate([[0], inner, [len(said)]])).astype(np.int64)
 
 
 def _means(values: Floats, edges: NDArray[np.int64]) -> Floats:
-    """Return the mean of each bin."""
     sums = np.add.reduceat(values, edges[:-1]) if len(edges) > 1 else np.zeros(0)
     return np.asarray(sums / np.diff(edges), np.float64)
 

@@ -41,28 +41,23 @@ class Ensemble:
     R_lab_body: Floats  # (M, 3, 3), smooth
     values: Mapping[str, Floats]  # (M, 3) by name, UNITS
     sigmas: Mapping[str, Floats]  # (M, 3), standard deviations of the same; NaN where unknown
-    error: Literal["added", "removed"]  # a sigma is noise on top of the motion, or motion that was smoothed away
+    error: Literal["added", "removed"]  # sigma is noise that a kernel let through, or motion that a smoother removed
 
     def __len__(self) -> int:
-        """Return the number of samples."""
         return len(self.time_s)
 
     @property
     def segments(self) -> int:
-        """The number of segments."""
+        """Number of segments, S."""
         return len(self.span_s)
 
     @property
     def starts(self) -> Rows:
-        """(S + 1,), segment n has the rows starts[n] .. starts[n + 1]."""
+        """First row of each segment and the end, (S + 1,): segment n has the rows starts[n] .. starts[n + 1]."""
         return np.searchsorted(self.segment, np.arange(self.segments + 1)).astype(np.int64)
 
     def at(self, kept: NDArray[np.bool_]) -> Self:
-        """Return the ensemble of some segments, (S,) bool.
-
-        Raises:
-            TrackError: fewer than two segments are left.
-        """
+        """Return the ensemble of the segments marked in `kept` (S,); TrackError if fewer than two are left."""
         _refuse_few(int(kept.sum()), "the segments kept")
         rows = kept[self.segment]
         by_row = ("time_s", "frame", "position_mm", "R_lab_body")
@@ -78,24 +73,13 @@ def ensemble_of(
     name: str = "tracks",
     fewest: int = FEWEST,
 ) -> Ensemble:
-    """Collect the usable segments of tracks.
+    """Collect the usable segments of one or many tracks; `name` is for messages.
 
-    A frame is usable if all six quantities and the smoother's position and orientation are finite, and it was not
-    extrapolated. A segment counts if it has enough usable frames. Frames at the ends of a segment with larger errors,
-    which the smoother knows from one side only, are then left out.
-
-    Args:
-        tracks: one or many.
-        settings: which frames and segments count; None: the paper's.
-        name: of the tracks in a message.
-        fewest: least number of segments.
-
-    Returns:
-        The ensemble. Its `error` is "removed" for a smoother's tracks, whose sigma is the motion it could not follow,
-        and "added" for a kernel's, whose sigma is the noise it let through.
+    A frame is usable if all six quantities and the smooth pose are finite, and it was not extrapolated. A segment
+    counts if it has enough usable frames; frames with larger errors at its ends are then left out.
 
     Raises:
-        TrackError: no usable frame, too few segments, or tracks of kernels and of smoothers together.
+        TrackError: no usable frame, fewer than `fewest` segments, or tracks of kernels and of smoothers together.
 
     Source: the paper, section IV: segments above 0.25 T_L; docs/errata.md, settings of the paper: 50 frames.
     """
@@ -117,7 +101,6 @@ def ensemble_of(
 
 
 def _pieces(track: Trajectory, number: int, settings: SegmentSettings) -> dict[str, NDArray[Any]]:
-    """Return the usable rows of one track, sorted by segment and time."""
     usable = (track.segment >= 0) & np.isfinite(track.position_smooth).all(1)
     usable &= np.isfinite(track.orientation_smooth).all((1, 2)) & np.isfinite(track.time)
     for quantity in UNITS:
@@ -152,7 +135,6 @@ def _numbered(
     name: str,
     fewest: int,
 ) -> Ensemble:
-    """Number the segments, cut the long ones, leave out the short ones."""
     time_s = whole["time_s"]
     first = np.ones(len(time_s), dtype=bool)
     first[1:] = (np.diff(whole["label"]) != 0) | (np.diff(whole["track"]) != 0)
@@ -185,7 +167,7 @@ def _numbered(
 
 
 def _piece(time_s: Floats, first: NDArray[np.bool_], longest_s: float) -> Rows:
-    """Return the number of the piece of its segment of each row, (M,): equal pieces, none above longest_s."""
+    """Return the number of each row's piece of its segment, (M,): equal pieces of at most longest_s."""
     number, begin = np.cumsum(first) - 1, np.flatnonzero(first)
     end = np.append(begin[1:], len(time_s)) - 1
     span_s = time_s[end] - time_s[begin]
@@ -217,26 +199,17 @@ class Durations:
 
     @property
     def expected(self) -> Floats:
-        """(B,), counts of the fitted law."""
+        """Counts of the fitted law, (B,)."""
         return self.law(float(self.decay_time_s.value))
 
 
 def durations(span_s: Floats, truncated_s: float, *, bins: int = 20, level: float = 0.95) -> Durations:
-    """Return the histogram of durations and their exponential decay time by maximum likelihood.
-
-    Beyond the truncation the mean excess is the decay time. Twice the sum of the excesses over the decay time follows
-    chi-squared with two degrees of freedom a segment, so the interval is exact.
-
-    Args:
-        span_s: (S,), durations, s.
-        truncated_s: shorter ones do not count.
-        bins: of the histogram.
-        level: of the interval.
+    """Return the histogram of durations (S,), s, and their exponential decay time with its exact interval.
 
     Raises:
-        TrackError: fewer than two segments are long enough.
+        TrackError: fewer than two durations are `truncated_s` or longer.
 
-    Source: textbook (Epstein and Sobel 1953); the paper, section IV.
+    Source: textbook (Epstein and Sobel 1953), maximum likelihood; the paper, section IV.
     """
     from scipy.stats import chi2
 

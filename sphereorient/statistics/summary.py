@@ -1,8 +1,4 @@
-"""All statistics of the paper's section IV, of one or many tracks, in one record.
-
-A new statistic is a module with a record and a function, and two lines here: its field of `Distributions`, and its call
-in `_distributions`.
-"""
+"""All statistics of the paper's section IV; a new one needs a field of `Distributions`, a call in `_distributions`."""
 
 from __future__ import annotations
 
@@ -59,7 +55,7 @@ class Surroundings:
 
     @property
     def flow(self) -> FlowScales | None:
-        """The flow's scales; None if viscosity or dissipation is unknown."""
+        """Scales of the flow; None if viscosity or dissipation is unknown."""
         if self.viscosity_m2_s is None or self.dissipation_w_kg is None:
             return None
         return FlowScales(viscosity_m2_s=self.viscosity_m2_s, dissipation_w_kg=self.dissipation_w_kg)
@@ -108,17 +104,9 @@ def summarise(
     progress: Progress = lambda done, total: None,
     name: str = "tracks",
 ) -> Summary:
-    """Compute all statistics of tracks.
+    """Compute all statistics of tracks, with an integral time that is measured if not given; `name` is for messages.
 
-    If the integral time of the velocity is not given, it is measured on all segments with enough frames; the short ones
-    are then left out. A single segment gives the table only, without intervals, since its scatter is unknown.
-
-    Args:
-        tracks: one or many, of one kind of method.
-        settings: which segments count, and the bootstrap.
-        surroundings: the sphere's diameter and the flow, for the comparisons.
-        progress: called with steps done and all steps.
-        name: of the tracks in a message.
+    A single segment gives only the table, without intervals.
 
     Raises:
         TrackError: no usable frame, or tracks of kernels and of smoothers together.
@@ -154,7 +142,7 @@ def summarise(
 
 
 def _long_enough(ensemble: Ensemble, settings: StatisticsSettings) -> tuple[Ensemble, StatisticsSettings]:
-    """Leave out segments that are short against the integral time of all of them."""
+    """Leave out segments that are short compared with the integral time of all of them."""
     measured = float(correlation(ensemble, "velocity", settings=settings).integral_time_s.value[3])
     if not measured > 0:
         return ensemble, settings

@@ -50,10 +50,7 @@ BARS: Final[dict[str, Any]] = {"facecolor": "#E0E0E0", "edgecolor": "#444444", "
 
 @in_style
 def densities_figure(summary: Summary, quantities: Sequence[str] = tuple(UNITS)) -> Figure:
-    """Draw the PDFs of the components of some quantities, each in its own standard deviations.
-
-    Points are bins with counts and their intervals, curves the fitted stretched exponentials; the legend gives their
-    width a and flatness F. The Gaussian is dashed.
+    """Draw the PDFs of the components of some quantities, in standard deviations, with the fit and the Gaussian.
 
     Raises:
         TrackError: a single segment has no densities.
@@ -102,37 +99,27 @@ def _densities_panel(axes: Axes, quantity: str, densities: Sequence[Density]) ->
 
 
 def _gaussian(axes: Axes, density: Density, factor: float = 1.0) -> None:
-    """Draw the Gaussian of unit variance over the range of a PDF, times a factor."""
     x = np.linspace(density.edges[0], density.edges[-1], CURVE_POINTS)
     y = factor * np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
     axes.plot(x, y, label="_gaussian", **(SECOND.drawn | {"linewidth": 1.0}))
 
 
 def _lowest(densities: Sequence[Density]) -> float:
-    """Return the smallest density of a bin with counts; without counts that of three standard deviations."""
     values = np.concatenate([d.pdf.value[d.counts > 0] for d in densities]) if densities else np.empty(0)
     values = values[np.isfinite(values) & (values > 0)]
     return float(values.min()) if len(values) else 4e-3
 
 
 def _reach(densities: Sequence[Density]) -> tuple[float, float]:
-    """Return the limits of the horizontal axis that show all counts."""
     reach = max((float(np.abs(d.centres[d.counts > 0]).max(initial=4.0)) for d in densities), default=4.0)
     return -reach - 0.5, reach + 0.5
 
 
 @in_style
 def increments_figure(distributions: Distributions, table: Mapping[str, Moments] | None = None) -> Figure:
-    """Draw PDFs of the increments of omega at the shown lags, and their flatness against the lag.
+    """Draw the PDFs of increments of omega, each a decade above that of the next shorter lag, and flatness against lag.
 
-    The PDFs are of the x component in standard deviations, each a decade above the one of the next shorter lag. The
-    flatness goes from that of alpha at short lags towards that of omega and the Gaussian's 3.
-
-    Args:
-        distributions: increments of omega_lab, columns x, y, z and all three.
-        table: moments by quantity, for the lines at the flatness of omega and alpha; None: no lines.
-
-    Source: the paper, section IV, with docs/errata.md E7.
+    `table` gives lines at the flatness of omega and alpha. Source: the paper, section IV, with docs/errata.md E7.
     """
     figure = new_figure(WIDTH_IN, 4.6)
     left, right = figure.subplots(1, 2)
@@ -173,7 +160,6 @@ def _shifted_densities(axes: Axes, distributions: Distributions) -> None:
 
 
 def _levels(axes: Axes, table: Mapping[str, Moments]) -> None:
-    """Draw the flatness of the Gaussian, of omega and of alpha, the limits of that of increments."""
     levels = {"Gaussian": 3.0}
     names = {"ω lab": "omega_lab", "α lab": "alpha_lab"}
     levels |= {name: pooled_flatness(table[key]) for name, key in names.items() if key in table}
@@ -191,13 +177,7 @@ def pooled_flatness(of: Moments) -> float:
 
 @in_style
 def correlations_figure(correlations: Mapping[str, Correlation]) -> Figure:
-    """Draw autocorrelations against the lag, with bands and integral times; columns x, y, z and the vector.
-
-    A marker below zero is an integral time with its interval. Where a curve does not reach zero, the legend says that
-    its integral time is a lower bound.
-
-    Source: textbook; the paper's T_L is the integral time of `velocity`.
-    """
+    """Draw autocorrelations against the lag, with bands; markers below zero are integral times. Source: textbook."""
     figure, panels = panel_grid(len(correlations), 3.0, 0.4)
     for axes, (quantity, correlation) in zip(panels, correlations.items(), strict=True):
         _correlation_panel(axes, correlation)
@@ -229,7 +209,6 @@ def _correlation_panel(axes: Axes, correlation: Correlation) -> None:
 
 
 def _longest_ms(correlation: Correlation) -> float:
-    """Return the longest lag that is shown."""
     lag_ms = 1e3 * correlation.lag_s
     below = np.flatnonzero((correlation.value.value <= 0).any(1))
     zero = float(lag_ms[below[0]]) if len(below) else float(lag_ms[-1])
@@ -239,7 +218,7 @@ def _longest_ms(correlation: Correlation) -> float:
 
 @in_style
 def durations_figure(durations: Durations) -> Figure:
-    """Draw the histogram of the segments' durations, counts in logarithms, with the exponential law."""
+    """Draw the histogram of the segments' durations, counts on a logarithmic axis, with the exponential law."""
     figure = new_figure(WIDTH_IN * 0.7, 3.0)
     axes = figure.subplots()
     unit, factor = ("ms", 1e3) if durations.edges_s[-1] < 2 else ("s", 1.0)

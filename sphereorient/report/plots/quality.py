@@ -1,4 +1,4 @@
-"""Figures of isotropy and of what limits the measurement: attitudes, noise, kernel widths, distance of the cameras."""
+"""Figures of isotropy and of what limits the measurement: orientations, noise, kernel widths, camera distances."""
 
 from __future__ import annotations
 
@@ -48,10 +48,7 @@ GEOMETRIC_BINS = 36
 
 @in_style
 def angles_figure(angles: Sequence[EulerDensity], uniformity: Uniformity) -> Figure:
-    """Draw the PDFs of the Euler angles beside those of uniform attitudes, with the result of the test.
-
-    Source: the paper, section II; the angles by docs/errata.md E1.
-    """
+    """Draw PDFs of the Euler angles and of uniform rotations. Source: the paper, section II; docs/errata.md E1."""
     figure = new_figure(WIDTH_IN, 2.9)
     panels = figure.subplots(1, len(angles), sharey=True, squeeze=False)[0]
     for axes, angle, style in zip(panels, angles, COMPONENTS, strict=True):
@@ -82,10 +79,7 @@ def _uniformity_words(of: Uniformity) -> str:
 
 @in_style
 def isotropy_figure(isotropies: Mapping[str, Isotropy]) -> Figure:
-    """Draw for each quantity the shares of its components in the variance, and the p-value of isotropy.
-
-    Source: the paper, Table I, with docs/errata.md E6.
-    """
+    """Draw each component's share in the variance, and p-values. Source: the paper, Table I, with docs/errata.md E6."""
     figure = new_figure(WIDTH_IN, 3.2)
     axes = figure.subplots()
     for k, one in enumerate(isotropies.values()):
@@ -109,14 +103,7 @@ def isotropy_figure(isotropies: Mapping[str, Isotropy]) -> Figure:
 
 @in_style
 def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"] = "added") -> Figure:
-    """Draw the share of noise in the variance of every component, with intervals and the line of 10 %.
-
-    Args:
-        table: moments by quantity.
-        error: the ensemble's; a track's sigma is noise on top of the motion, or motion that was smoothed away.
-
-    Source: docs/statistics.md, Noise.
-    """
+    """Draw the share of noise in each variance; `error`: `Ensemble.error`. Source: docs/statistics.md, Noise."""
     figure = new_figure(WIDTH_IN, 3.2)
     axes = figure.subplots()
     shares = [one.noise_share.part(slice(0, 3)).scaled(100.0) for one in table.values()]
@@ -147,7 +134,7 @@ def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"
 
 
 def _floor(shares: list[Interval]) -> float:
-    """Return where bars begin on a logarithmic axis: a decade below the least; 0: the axis is linear."""
+    """Return where bars begin on a logarithmic axis, a decade below the least; 0: the axis is linear."""
     known = np.concatenate([share.value for share in shares]) if shares else np.empty(0)
     known = known[np.isfinite(known) & (known > 0)]
     return float(10.0 ** (np.floor(np.log10(known.min())) - (np.log10(known.min()) % 1 < 0.3))) if len(known) else 0.0
@@ -155,11 +142,9 @@ def _floor(shares: list[Interval]) -> float:
 
 @in_style
 def widths_figure(widths: Mapping[str, WidthCurve]) -> Figure:
-    """Draw rms, flatness and share of noise of a and alpha against the width of the smoothing kernel.
+    """Draw rms, flatness and share of noise of a and alpha, else of velocity, against the kernel's width.
 
-    Filled markers are corrected for the noise expected from the measurements' errors, open ones are as measured. A
-    plateau of the corrected curves over several widths is the motion's value. Velocity is drawn if neither is given.
-
+    Filled markers are corrected for the expected noise; their plateau over several widths is the motion's value.
     Source: Voth et al. 2002, J. Fluid Mech. 469, 121; the paper, section III.
     """
     shown = [name for name in WIDTHS_OF if name in widths] or list(widths)[:1]
@@ -205,11 +190,9 @@ def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
 
 @in_style
 def camera_distance_figure(distances: Sequence[CameraDistance]) -> Figure:
-    """Draw the PDF of the distance of the cameras' orientations, with its median, a panel for each pair of cameras.
+    """Draw the PDF of the distance of the cameras' orientations and its median, a panel for each pair of cameras.
 
-    The PDF without the correction of perspective is dashed. If even bins show the smaller distances as one bar, both
-    axes are logarithmic and the bins geometric; the PDF is still per degree.
-
+    Both axes are logarithmic if even bins would show the smaller distances as one bar; the PDF is per degree.
     Source: the paper, section III, distance of the two cameras; the sign of the correction by docs/errata.md A1.
     """
     figure = new_figure(WIDTH_IN * 0.7, 2.9 * max(len(distances), 1))

@@ -111,7 +111,7 @@ def in_style(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 def new_figure(width_in: float = WIDTH_IN, height_in: float = 3.0) -> Figure:
-    """Return an empty figure with a constrained layout."""
+    """Return an empty figure with a constrained layout, inches."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -130,15 +130,9 @@ def panel_grid(count: int, row_in: float, head_in: float, shared: bool = False) 
 
 @in_style
 def write_figure(figure: Figure, path: Path, dpi: float = DPI) -> tuple[Path, ...]:
-    """Write a figure without dates; the same figure gives the same bytes.
+    """Write a figure, the same bytes for the same figure, and return the files.
 
-    Args:
-        figure: of matplotlib.
-        path: with the suffix of a format, or without: PNG and PDF are written; the folder must exist.
-        dpi: of pixel formats.
-
-    Returns:
-        The files that were written.
+    Without a suffix `path` gets PNG and PDF; its folder must exist.
 
     Raises:
         OutputError: a file cannot be written.
@@ -153,16 +147,7 @@ def write_figure(figure: Figure, path: Path, dpi: float = DPI) -> tuple[Path, ..
 
 
 def points(axes: Axes, x: Floats, of: Interval, style: LineStyle, label: str = "", joined: bool = False) -> None:
-    """Draw values (K,) as markers and their intervals as bars, without those that are NaN.
-
-    Args:
-        axes: panel.
-        x: (K,).
-        of: (K,) values.
-        style: colour and marker.
-        label: of the legend; empty: no entry.
-        joined: draw a line through the markers.
-    """
+    """Draw values (K,) at x (K,) as markers with intervals, without NaN; an empty label gives no legend entry."""
     drawn = style.drawn if joined else style.drawn | {"linestyle": "none"}
     axes.plot(x, of.value, marker=style.marker, label=label or "_", **drawn)
     there = np.isfinite(of.low) & np.isfinite(of.high) & np.isfinite(x)
@@ -171,7 +156,7 @@ def points(axes: Axes, x: Floats, of: Interval, style: LineStyle, label: str = "
 
 
 def band(axes: Axes, x: Floats, low: Floats, high: Floats, style: LineStyle) -> None:
-    """Shade the area between two curves (K,); it is interrupted where one of them is NaN."""
+    """Shade the area between two curves (K,), interrupted at NaN."""
     there = np.isfinite(low) & np.isfinite(high) & np.isfinite(x)
     if there.any():
         axes.fill_between(x, low, high, where=there.tolist(), color=style.colour, alpha=BAND, linewidth=0)

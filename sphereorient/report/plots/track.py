@@ -60,12 +60,9 @@ class TrackPart:
 
 @in_style
 def track_figure(track: Trajectory) -> Figure:
-    """Draw position, Tait-Bryan angles, velocities and accelerations against time.
+    """Draw position, Tait-Bryan angles, velocities and accelerations against time: smooth with 2 sigma, and measured.
 
-    Lines are the smooth motion with bands of two standard deviations; dots are the measurements of single frames. Gaps
-    stay open; frames that are not valid are shaded. Of a long track, the best 2,000 frames of its longest segment are
-    drawn, and a note says so.
-
+    Frames that are not valid are shaded. Of a long track, the part of `shown_part` is drawn, with a note.
     Source: the paper, figure of a sample track; the angles by docs/errata.md E1.
     """
     part = shown_part(track)
@@ -104,10 +101,7 @@ def track_figure(track: Trajectory) -> Figure:
 
 @in_style
 def path_figure(track: Trajectory) -> Figure:
-    """Draw the path in the lab, to scale, with the axes of the sphere's body; of a long track as `track_figure`.
-
-    Source: the paper, figure of a sample track in space.
-    """
+    """Draw the path in the lab, to scale, with body axes; of a long track `shown_part`. Source: the paper, figure."""
     part = shown_part(track)
     figure = new_figure(WIDTH_IN, 5.6)
     axes: Any = figure.add_subplot(projection="3d")
@@ -134,7 +128,7 @@ def path_figure(track: Trajectory) -> Figure:
 
 
 def shown_part(track: Trajectory, most: int = MOST_FRAMES) -> TrackPart:
-    """Return the whole track, or the `most` consecutive frames of its longest segment with the most valid ones."""
+    """Return the whole track, or the `most` consecutive frames of its longest segment that have the most valid ones."""
     rows, words = np.arange(len(track)), ""
     if len(track) > most:
         inside = np.flatnonzero(track.segment >= 0)
@@ -156,7 +150,7 @@ def shown_part(track: Trajectory, most: int = MOST_FRAMES) -> TrackPart:
 
 
 def _cut(values: Floats, broken: NDArray[np.bool_]) -> Floats:
-    """Insert a row of NaN into values (N, ...) where the line is interrupted, (N - 1,)."""
+    """Insert a row of NaN into values (N, ...) where the line is broken, (N - 1,)."""
     return np.insert(values, np.flatnonzero(broken) + 1, np.nan, axis=0)
 
 
@@ -180,10 +174,7 @@ def tait_bryan_deg(R_lab_body: Floats) -> Floats:
 
 
 def _sigma_deg(R_lab_body: Floats, cov_lab_rad2: Floats) -> Floats:
-    """Return the standard deviations of the angles (N, 3), degrees; NaN near the poles.
-
-    Source: delta_lab = H dtheta, docs/errata.md E3.
-    """
+    """Return the sigmas of the angles (N, 3), degrees; NaN near the poles. Source: docs/errata.md E3."""
     theta = np.deg2rad(tait_bryan_deg(R_lab_body))
     there = np.isfinite(theta).all(1) & (np.abs(np.cos(theta[:, 1])) > 0.02)
     out = np.full_like(theta, np.nan)
@@ -197,7 +188,7 @@ def _sigma(cov: Floats) -> Floats:
 
 
 def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDArray[np.bool_]) -> None:
-    """Draw three components (N, 3) and limit the axis to them: at the ends of segments the bands are far wider."""
+    """Draw three components (N, 3) and limit the axis to them: bands are far wider at the ends of segments."""
     for i in range(3):
         _curve(axes, time, values[:, i], sigma[:, i], broken, i)
     known = values[np.isfinite(values)]
@@ -221,7 +212,6 @@ def _dots(axes: Axes, time: Floats, values: Floats) -> None:
 
 
 def _shade(axes: Axes, time: Floats, valid: NDArray[np.bool_]) -> None:
-    """Shade runs of frames that are not valid, half a step to either side."""
     edges = np.flatnonzero(np.diff(np.concatenate([[True], valid, [True]]).astype(np.int8)))
     if len(edges):
         half = float(np.median(np.diff(time))) / 2 if len(time) > 1 else 0.5
@@ -231,7 +221,6 @@ def _shade(axes: Axes, time: Floats, valid: NDArray[np.bool_]) -> None:
 
 
 def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float) -> None:
-    """Draw the three columns of R_lab_body at some places of the path."""
     known = there[np.isfinite(track.orientation_smooth[there]).all((1, 2))]
     if not len(known):
         return
@@ -245,7 +234,7 @@ def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float
 
 
 def _equal_scale(axes: Any, position_mm: Floats, size: float) -> None:
-    """Give a millimetre the same length on all axes; the box is as long as the path, and not too thin."""
+    """Give all axes the same scale; the box is as long as the path, and not too thin."""
     low, high = position_mm.min(0) - size, position_mm.max(0) + size
     extent = np.maximum(high - low, THINNEST * (high - low).max())
     middle = (low + high) / 2
