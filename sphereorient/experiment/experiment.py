@@ -1,5 +1,3 @@
-"""The input: an experiment with cameras and movies, from experiment.yaml."""
-
 from __future__ import annotations
 
 import os
@@ -27,7 +25,7 @@ class Experiment:
     """Content of experiment.yaml; made by `load_experiment` or synth."""
 
     name: str
-    path: Path  # of experiment.yaml
+    path: Path
     frame_rate_hz: float  # NaN if times are given instead
     cameras_path: Path
     cameras: dict[str, Camera]  # of the movies, in their order
@@ -171,7 +169,7 @@ def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> d
 
     Raises:
         ExperimentError: unknown camera name.
-        MovieError: movie missing, unreadable, or of another size than its camera.
+        MovieError: missing, unreadable, or of another size than the camera.
     """
     movies: dict[str, Movie] = {}
     for name in experiment.movie_paths if names is None else names:

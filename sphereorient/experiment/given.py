@@ -58,7 +58,6 @@ def load_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def _picture(path: Path, name: str, frame_shape: tuple[int, int], do: str) -> NDArray[Any]:
-    """Read a grey picture of a movie's size, (H, W), in its own depth."""
     height, width = frame_shape
     content = read_whole(path, BYTES_A_PIXEL * height * width + HEADER_BYTES, "a picture", ExperimentError, do)
     claimed, expected = claimed_pixels(content), f"{width} x {height} px as the movie"

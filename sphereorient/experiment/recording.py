@@ -1,5 +1,3 @@
-"""An open experiment: timeline, camera streams, texture map."""
-
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
@@ -32,8 +30,8 @@ class Recording:
     experiment: Experiment
     streams: Sequence[CameraStream]
     timeline: Timeline
-    texture: Tensor  # (H, W) with W = 2 H; (0, 0) if it is to be estimated
-    remarks: tuple[str, ...]  # warnings about the inputs
+    texture: Tensor  # (H, 2 H); (0, 0) if it is to be estimated
+    remarks: tuple[str, ...]
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -110,7 +108,6 @@ def open_recording(
 
 
 def _chosen(experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:
-    """Return the cameras to use, in the experiment's order."""
     known = list(experiment.movie_paths)
     wanted = known if cameras is None else list(cameras)
     unknown = [name for name in wanted if name not in known]

@@ -1,5 +1,3 @@
-"""Pictures of one camera of an experiment."""
-
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
@@ -39,11 +37,7 @@ class CameraStream:
             yield picture, why if picture is None else Reason.OK
 
     def spread(self, count: int) -> Grey:
-        """Return at most `count` readable pictures evenly spread over the frames, (n, H, W).
-
-        Raises:
-            MovieError: no picture is readable.
-        """
+        """Return at most `count` evenly spread readable pictures, (n, H, W); raise MovieError if there are none."""
         numbers = self.rows[self.rows != NONE].tolist()
         wanted = [numbers[k] for k in spread_frames(range(len(numbers)), count)]
         try:

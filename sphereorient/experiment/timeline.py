@@ -33,7 +33,7 @@ class Timeline:
     number: Rows  # (N,), frame numbers, increasing
     time_s: Floats  # (N,), mid-exposure times, s, increasing
     rows: Mapping[str, Rows]  # (N,) per camera: number in its movie, or NONE
-    remarks: tuple[str, ...] = ()  # warnings for the user
+    remarks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.number)
@@ -93,7 +93,6 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
 
 def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
-    """Pair pictures by number."""
     there = {name: len(movie) - experiment.start.get(name, 0) for name, movie in movies.items()}
     subject = f"{experiment.path}, movies"
     if min(there.values()) <= 0:
@@ -143,7 +142,7 @@ def load_times(path: Path) -> Floats:
         try:
             values.append(float(text))
         except ValueError:
-            if not values and number == 1:  # a heading
+            if not values and number == 1:
                 continue
             name = f"{path}, line {number}"
             raise ExperimentError(refusal(name, expected="a number", got=repr(text[:40]), do=do)) from None
@@ -163,7 +162,6 @@ def _increasing(name: str, time_s: Floats, do: str) -> Floats:
 
 
 def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
-    """Pair pictures by time stamp."""
     clocks: dict[str, Floats] = {}
     for name, movie in movies.items():
         start = experiment.start.get(name, 0)

@@ -1,5 +1,3 @@
-"""Background of a movie and its noise, from evenly spread frames."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass, replace

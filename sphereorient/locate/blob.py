@@ -1,5 +1,3 @@
-"""Candidates for the sphere: round blobs of the expected size."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass

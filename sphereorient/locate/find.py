@@ -1,5 +1,3 @@
-"""Finding the sphere in single frames: background, blobs, outline."""
-
 from __future__ import annotations
 
 from collections.abc import Iterable
@@ -22,8 +20,6 @@ def find_ball(
     frame: NDArray[np.generic], background: Background, diameter_px: float, settings: LocateSettings
 ) -> Found:
     """Return the sphere's outline in a frame (H, W) and `Reason.OK`, or None and the reason.
-
-    Reasons: `NOT_FOUND` (no blob), `OUTLINE` (too few directions support a circle), `DARK`, `SATURATED`.
 
     Source: paper section III A.
     """
@@ -70,7 +66,6 @@ def _why_unreadable(
     outline: Outline,
     settings: LocateSettings,
 ) -> Reason:
-    """Return DARK or SATURATED for an unreadable sphere, else OK."""
     half = int(0.7 * outline.radius_px)  # square inside the disk
     height, width = frame.shape
     u, v = min(max(round(outline.u_px), 0), width - 1), min(max(round(outline.v_px), 0), height - 1)

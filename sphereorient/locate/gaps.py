@@ -17,9 +17,7 @@ DEGREE = 3
 
 
 def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
-    """Return sightings with outliers replaced by a least-squares spline and short gaps filled, flagged, without rms.
-
-    Longer gaps stay NaN.
+    """Replace outliers by a least-squares spline and fill short gaps, with flags and without rms; longer gaps stay NaN.
 
     Source: paper section III A.
     """
@@ -62,8 +60,7 @@ def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArr
 def robust_spline(
     frame: NDArray[np.int64], value: NDArray[np.float64], settings: LocateSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return a robust least-squares cubic spline (n, D) of values (n, D), px, at frames (n,), and outliers (n,) bool.
-    """
+    """Return a robust cubic spline (n, D) of values (n, D), px, at frames (n,), and the outliers (n,) bool."""
     outlier = np.zeros(len(frame), bool)
     fitted = value.copy()
     for _ in range(5):
@@ -81,7 +78,6 @@ def robust_spline(
 
 
 def _spline(x: NDArray[np.int64], y: NDArray[np.float64], spacing: int):  # type: ignore[no-untyped-def]
-    """Return a cubic least-squares spline with inner knots `spacing` frames apart."""
     inner = np.arange(x[0] + spacing, x[-1] - spacing / 2, spacing, dtype=float)
     counts = np.histogram(x, np.concatenate([[x[0]], inner, [x[-1] + 1]]))[0]
     # Schoenberg and Whitney: each knot needs data nearby.

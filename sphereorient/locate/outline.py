@@ -1,5 +1,3 @@
-"""Outline of the sphere with sub-pixel accuracy: edges, best supported circle, robust fit."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -47,7 +45,6 @@ class _Edges:
 
 
 def _edge_points(window: NDArray[np.float32], steepness: float) -> _Edges:
-    """Return the Canny edges of a blurred window, window px."""
     du = cv2.Scharr(window, cv2.CV_32F, 1, 0) / 32
     dv = cv2.Scharr(window, cv2.CV_32F, 0, 1) / 32
     scale = 8192 / max(float(np.abs(du).max()), float(np.abs(dv).max()), 1e-6)
@@ -90,10 +87,7 @@ def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _support(circles: NDArray[np.float64], edges: _Edges, tolerance: float) -> NDArray[np.float64]:
-    """Return the number of directions with an edge on the circle minus half of those with one just outside.
-
-    Edges must fall outwards. The rim's edges are outermost: circles through texture edges have edges outside.
-    """
+    """Count directions with an edge on the circle, less half of those with one just outside: the rim is outermost."""
     away = edges.point[None] - circles[:, None, :2]
     distance = np.linalg.norm(away, axis=2)
     radial = -(away * edges.inward[None]).sum(2) / np.maximum(distance, 1e-9) > 0.8
@@ -173,10 +167,7 @@ def _radial_edges(
     steepness: float,
     clear: NDArray[np.bool_] | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return unit direction (n, 2), distance from the circle (n,), px, and steepness (n,) of the rim points.
-
-    On each profile the outermost fall counts: texture edges inside are often steeper than the rim.
-    """
+    """Return direction (n, 2), offset (n,), px, and steepness (n,) of outermost falls; inner edges may be steeper."""
     step = 0.5
     # A fall needs two samples on each side.
     offset = np.arange(-max(reach[0], 2 * step), max(reach[1], 2 * step) + step / 2, step)
@@ -209,10 +200,7 @@ def _radial_edges(
 def _consensus(
     outward: NDArray[np.float64], offset: NDArray[np.float64], trust: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.float64]:
-    """Return the shift (du, dv, dr) of a circle with the largest consensus of rim points (RANSAC).
-
-    Texture edges where black paint hides the rim are one-sided outliers: a mean or median would shrink the circle.
-    """
+    """Return the shift (du, dv, dr) with most support: outliers lie inside, so that means and medians are biased."""
     design = np.column_stack([outward, np.ones(len(outward))])
     choice = np.random.default_rng(0).integers(0, len(offset), (300, 3))
     triple = design[choice]
@@ -234,7 +222,6 @@ def _fit_circle(
     steepness: float,
     clear: NDArray[np.bool_] | None,
 ) -> Outline | None:
-    """Fit a circle to rim points: consensus, then least squares with Tukey weights."""
     for reach in ((0.35 * circle[2], 0.25 * circle[2]), (0.1 * circle[2], 0.1 * circle[2])):
         outward, offset, fall = _radial_edges(window, circle, reach, steepness, clear)
         if len(offset) < 12:
@@ -281,15 +268,8 @@ def fit_outline(
 ) -> Outline | None:
     """Return the outline near a blob, picture px; None if no circle of an allowed size is supported.
 
-    Robust to texture edges, bubbles and black paint on a dark background.
-
-    Args:
-        difference: (H, W), |frame - background|, grey levels.
-        noise: typical background noise, grey levels.
-        blob: approximate position.
-        diameter_px: expected diameter.
-        settings: of this room.
-        shown: (H, W), False where something hides the sphere; None: nowhere.
+    `difference` (H, W) is |frame - background| and `noise` its sigma, grey levels; `shown` (H, W) is False where
+    something hides the sphere. Robust to texture edges, bubbles and black paint on a dark background.
 
     Source: paper section III A (Canny edges, circle fit); the robust part is ours.
     """

@@ -23,13 +23,10 @@ class Positions:
     position_lab_mm: Tensor  # (N, 3), NaN without a centre
     covariance_mm2: Tensor  # (N, 3, 3), NaN if not measured
     gap_mm: Tensor  # (N,), distance of the two rays, NaN with one
-    flags: Tensor  # (N,) int64
+    flags: Tensor
 
     def for_motion(self) -> Tensor:
-        """Return positions for derivatives, (N, 3), mm: only those from two rays, or all if there are none.
-
-        Mixing both kinds would look like a velocity: a distance from the radius is 100 times less accurate.
-        """
+        """Return positions from two rays, or all if there are none, (N, 3), mm; a mixture would look like motion."""
         two_rays = torch.isfinite(self.gap_mm)
         return torch.where(two_rays[:, None] | ~two_rays.any(), self.position_lab_mm, torch.nan)
 
@@ -79,8 +76,6 @@ def find_positions(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
-    """Position of the sphere by one camera."""
-
     rays: Rays  # (N), to the centre of the outline
     from_size_mm: Tensor  # (N, 3), on the ray, at the distance from the radius
     across: Tensor  # (N, 3, 3), information across the ray, 1/mm^2
@@ -112,7 +107,6 @@ def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
 
 
 def _inverse(information: Tensor) -> Tensor:
-    """Return the inverse of (N, 3, 3), NaN if it does not exist."""
     finite = torch.isfinite(information).all(-1).all(-1) & (torch.linalg.det(torch.nan_to_num(information)) > 0)
     view = torch.eye(3, dtype=information.dtype)
     inverse = torch.linalg.inv(torch.where(finite[:, None, None], information, view))

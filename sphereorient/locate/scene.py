@@ -1,5 +1,3 @@
-"""Background of one camera and the expected size of the sphere."""
-
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -41,11 +39,7 @@ class CameraScene:
 
 
 def known_diameter_px(recording: Recording, name: str, settings: LocateSettings) -> float | None:
-    """Return the expected diameter, px; None if only the movie can show it.
-
-    Raises:
-        SettingsError: see `expected_diameter_px`.
-    """
+    """Return the expected diameter, px; None if only the movie can show it; raise as `expected_diameter_px` does."""
     if settings.diameter_px is None and recording.experiment.fixed and recording.experiment.diameter_mm is None:
         return None
     return settings.diameter_px or expected_diameter_px(name, recording.cameras, recording.experiment.diameter_mm)
@@ -122,11 +116,7 @@ def learn_background(
 def _quieter(
     background: Background, pictures: NDArray[Any], diameter_px: float, settings: LocateSettings
 ) -> Background:
-    """Limit the noise to the frame-to-frame change if the sphere is not found otherwise.
-
-    Pixels that the sphere never leaves scatter by its contrast, which would hide a blurred sphere; glitter stays
-    hidden.
-    """
+    """Limit the noise to the frame-to-frame change if a sphere that never leaves its pixels is not found otherwise."""
     loud = background.noise > LOUD * background.typical_noise
     if loud.sum() < LOUD_SHARE * np.pi / 4 * diameter_px**2:
         return background
@@ -202,7 +192,6 @@ def fixed_ball(
 
 
 def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
-    """Return a region's diameter from its area, or from its enclosing circle if partly hidden."""
     if hidden:
         return 2 * float(cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1])
     return 2 * float(np.sqrt(inside.sum() / np.pi))

@@ -55,10 +55,7 @@ def screened(picture: Picture, before: Picture | None, background: Background) -
 def screened_frames(
     stream: CameraStream, background: Background, first: int = 0, last: int | None = None
 ) -> Iterator[Frame]:
-    """Yield frames first .. last - 1 of a camera, counted from its first frame in use, with their reasons.
-
-    A reason depends only on the frame and the previous one: chunks agree with the whole.
-    """
+    """Yield frames first .. last - 1 from the first in use; reasons depend on this and the previous frame only."""
     lead = min(first, 1)
     blank = np.zeros(stream.movie.frame_shape, stream.movie.dtype)
     before: Picture | None = None

@@ -1,5 +1,3 @@
-"""Outlines of the sphere in one camera, frame by frame."""
-
 from __future__ import annotations
 
 from collections.abc import Mapping

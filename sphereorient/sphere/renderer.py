@@ -1,5 +1,3 @@
-"""Renderer of the painted sphere: rays to paint, coverage, light and pixels."""
-
 from __future__ import annotations
 
 import math
@@ -40,33 +38,23 @@ class SphereSight:
 def see_sphere(
     rays: Rays, centre: Tensor, R: Tensor, texture: Tensor, radius: float | Tensor = 1.0, *, smooth: bool = False
 ) -> SphereSight:
-    """Look up the paint that rays see; all rendering uses this function.
+    """Return the paint that rays of P pixels, (..., P, 3), see; all rendering uses this function.
 
-    Args:
-        rays: rays of P pixels, (..., P, 3), any frame and unit.
-        centre: (..., 3), sphere centre, same frame and unit.
-        R: (..., 3, 3), body to that frame.
-        texture: (H, 2 H), sampled in its own dtype.
-        radius: () or (..., 1), same unit.
-        smooth: twice differentiable (spline, rounded limb); False: bilinear and exact.
+    `centre` (..., 3), `R` (..., 3, 3, from body) and `radius` (() or (..., 1)) have the rays' frame and unit; `texture`
+    is (H, 2 H). `smooth` is twice differentiable (spline, rounded limb); otherwise bilinear and exact.
     """
     check_tail("position_lab_mm", centre, 3)
     check_tail("R_lab_body", R, 3, 3)
     corner = RIM if smooth else 0.0
     normal, depth2 = sphere_normals(rays.origin_lab_mm, rays.direction_lab, centre[..., None, :], radius, corner)
-    # Rows: n @ R is R^T n, the normal in body components.
     paint = (sample_spline if smooth else sample_texture)(texture, (normal @ R).to(texture.dtype))
     return SphereSight(paint=paint.to(normal.dtype), normal=normal, depth2=depth2)
 
 
 def lambert(normal: Tensor, towards: Tensor, strength: Tensor | float, corner: float = 0.0) -> Tensor:
-    """Return the Lambertian light (...) of K lamps.
+    """Return the Lambertian light (...) on unit normals (..., 3) of K lamps in unit directions `towards` (..., K, 3).
 
-    Args:
-        normal: (..., 3), unit normals.
-        towards: (..., K, 3), unit directions to the lamps, same frame.
-        strength: of each lamp, (K,) or one number.
-        corner: rounding width of the shadow's edge, cosine; 0 is exact.
+    `strength` is (K,) or one number; `corner` rounds the shadow's edge (width in cosine; 0 is exact).
     """
     cosine = normal @ towards.mT
     cosine = smooth_positive(cosine, corner) if corner > 0 else cosine.clamp_min(0)
@@ -126,12 +114,10 @@ class SphereRenderer(nn.Module):
         self.sampling = sampling or Sampling()
 
     def forward(self, R_lab_body: Any, position_mm: Any = None, radius_mm: Tensor | None = None) -> Tensor:
-        """Return pictures (..., H, W), 0 black paint .. 1 white paint, in the dtype of R_lab_body.
+        """Return pictures (..., H, W), 0 black paint .. 1 white paint, in the dtype of R_lab_body (..., 3, 3).
 
-        Args:
-            R_lab_body: (..., 3, 3), body to lab, or to the view without a camera.
-            position_mm: (..., 3), sphere centre, lab; None for the origin.
-            radius_mm: (...), overrides the renderer's radius.
+        Without a camera R_lab_body leads to the view. `position_mm` is (..., 3), None for the origin; `radius_mm` is
+        (...).
 
         Raises:
             CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
@@ -227,7 +213,7 @@ def rim_directions(camera: Camera, position_lab_mm: Tensor, count: int) -> tuple
 
 
 def reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> float:
-    """Return the largest distance from projected centres to rims, px, plus 4 %; `position_lab_mm` is (N, 3).
+    """Return the largest distance from projected centres to rims, px, plus 4 %, for centres (N, 3), mm, lab.
 
     Raises:
         CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
@@ -260,15 +246,10 @@ class PaintedBall:
 
 
 def expected_grey(rays: Rays, position_lab_mm: Tensor, R_lab_body: Tensor, ball: PaintedBall) -> Tensor:
-    """Return grey levels (..., P), twice differentiable in cameras, pose, paint and light, limb included.
+    """Return grey levels (..., P) of rays (..., P, 3), twice differentiable in cameras, pose, paint and light.
 
-    One ray per pixel, blur in the coverage only: slower and optically simpler than `SphereRenderer`.
-
-    Args:
-        rays: rays of P pixels, (..., P, 3); they carry the gradients of the camera.
-        position_lab_mm: (..., 3), sphere centre.
-        R_lab_body: (..., 3, 3).
-        ball: paint and light.
+    One ray per pixel and blur in the coverage only: optically simpler than `SphereRenderer`. `position_lab_mm` is (...,
+    3), `R_lab_body` (..., 3, 3).
     """
     seen = see_sphere(rays, position_lab_mm, R_lab_body, ball.texture, ball.radius_mm, smooth=True)
     # 0.5 depth2 is the distance from the limb, radii, near the limb; it has no kink at the centre.

@@ -1,5 +1,3 @@
-"""Texture map: loading, reduction, sampling by direction."""
-
 from __future__ import annotations
 
 import math
@@ -117,7 +115,7 @@ def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
     first_row = first_row.clamp(-SPLINE_TEXELS, height + SPLINE_TEXELS - 4) + SPLINE_TEXELS
     steps = torch.arange(4, device=texture.device)
     at = (first_row[..., None, None] + steps[:, None]) * closed.shape[1] + first_column[..., None, None] + steps
-    texels = closed.reshape(-1)[at]  # (..., 4, 4)
+    texels = closed.reshape(-1)[at]
     return ((texels * columns[..., None, :]).sum(-1) * rows).sum(-1)
 
 

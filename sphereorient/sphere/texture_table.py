@@ -131,7 +131,6 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE) -> Texture
         for share, offset, at in _disk_nodes(centre, finest, FIVE):
             v = sample_texture(reduced, at)
             value = value + share * v
-            # Slope: mean of grey times offset, over the variance.
             slope = slope + share * v[:, None] * offset / finest**2
         parts.append(_rows(value, slope, centre.float()))
     return TextureTable(torch.cat(parts), finest).blurred(blur_rad)

@@ -1,5 +1,3 @@
-"""View geometry: where rays meet a sphere, and the disk that a sphere fills."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -80,7 +78,7 @@ def sphere_normals(
     direction = direction / direction.norm(dim=-1, keepdim=True)
     to_centre = centre - origin
     along = (to_centre * direction).sum(-1, keepdim=True)
-    nearest = along * direction - to_centre  # from the sphere's centre to the ray's nearest point
+    nearest = along * direction - to_centre
     depth2 = radius**2 - nearest.square().sum(-1, keepdim=True)
     if corner > 0:
         depth = radius * smooth_positive(depth2 / radius**2, corner).sqrt()

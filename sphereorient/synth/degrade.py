@@ -18,7 +18,7 @@ from torch import Tensor
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 from sphereorient.synth.severities import DEGRADATIONS, degradation
 
-WHITE_LEVEL = 255  # saturated 8-bit pixel
+WHITE_LEVEL = 255
 VEIL = 95.0  # grey level of turbid liquid
 OCCLUDER, SPECK, GLINT = 30.0, 12.0, 120.0  # grey levels of an occluder, of dirt, of a bubble's glint
 LOBES, LOBE_RADII = 2, 0.12  # highlights: number, and sigma in sphere radii
@@ -62,13 +62,9 @@ Operation = Callable[[Tensor, float, Disk, torch.Generator], Tensor]
 
 
 def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torch.Generator) -> Tensor:
-    """Apply picture degradations in a fixed order; return grey levels (..., H, W), neither rounded nor clipped.
+    """Return pictures (..., H, W) with degradations in a fixed order, neither rounded nor clipped.
 
-    Args:
-        pictures: (..., H, W), unrounded grey levels, floats.
-        disk: place of the sphere.
-        values: operation name -> physical value, see `severity`.
-        rng: generator of all random numbers.
+    `pictures` (..., H, W) are unrounded grey levels, floats; `values` maps names to physical values, see `severity`.
 
     Raises:
         SettingsError: unknown name, no picture degradation, or impossible value.
@@ -94,9 +90,6 @@ def to_bytes(pictures: Tensor) -> Tensor:
     return pictures.round().clamp(0, WHITE_LEVEL).to(torch.uint8)
 
 
-# The light on the ball.
-
-
 def uneven_light(pictures: Tensor, ratio: float, disk: Disk, rng: torch.Generator) -> Tensor:
     """Dim the sphere across the disk, to 1 / ratio at one limb."""
     angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]
@@ -119,9 +112,6 @@ def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) 
         square = (right - away * angle.cos()).square() + (down - away * angle.sin()).square()
         light = light + torch.exp(-0.5 * square / (LOBE_RADII * radius).square())
     return pictures + peak * disk.covered(pictures) * light
-
-
-# What is behind and before the ball.
 
 
 def background_clutter(pictures: Tensor, rms: float, disk: Disk, rng: torch.Generator) -> Tensor:
@@ -182,9 +172,6 @@ def dirt(pictures: Tensor, radius_px: float, disk: Disk, rng: torch.Generator) -
     return pictures + hidden.reshape(pictures.shape) * (SPECK - pictures)
 
 
-# The way to the sensor.
-
-
 def contrast_loss(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
     """Move all grey levels towards VEIL by this share."""
     return pictures + share * (VEIL - pictures)
@@ -196,10 +183,7 @@ def defocus(pictures: Tensor, sigma_px: float, disk: Disk, rng: torch.Generator)
 
 
 def saturation(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Brighten each picture until this share of its white paint exceeds 255; `to_bytes` clips.
-
-    White paint is above the mean of the disk's extreme grey levels. `degrade_scene` finds one gain for a whole movie.
-    """
+    """Brighten each picture until this share of its white paint (above the mean of the extremes) exceeds 255."""
     if share == 0:
         return pictures
     inside = (disk.covered(pictures) > 0.99).expand(pictures.shape).flatten(-2)
@@ -247,9 +231,6 @@ OPERATIONS: Mapping[str, Operation] = MappingProxyType(
 )
 
 
-# Movies, and errors of the disk.
-
-
 def lost_frames(like: Tensor, share: float, rng: torch.Generator) -> Tensor:
     """Draw the lost frames, (..., N) bool, for a tensor (..., N): round(share N) per row."""
     count = like.shape[-1]
@@ -271,9 +252,6 @@ def radius_error(disk: Disk, error_px: float) -> Disk:
     """Return the disk with its radius increased by `error_px`."""
     degradation("radius_error").check(error_px)
     return Disk(centre_px=disk.centre_px, radius_px=disk.radius_px + error_px)
-
-
-# Parts of the operations.
 
 
 def blurred(pictures: Tensor, sigma_px: float) -> Tensor:
@@ -305,7 +283,6 @@ def _distance_of_overlap(share: float) -> float:
 
 
 def _uniform(pictures: Tensor, rng: torch.Generator, *tail: int) -> Tensor:
-    """Draw numbers in 0 .. 1, (..., *tail), picture by picture."""
     shape = (*pictures.shape[:-2], *tail)
     return torch.rand(shape, generator=rng, dtype=pictures.dtype, device=rng.device).to(pictures.device)
 
@@ -316,5 +293,4 @@ def _normal(pictures: Tensor, rng: torch.Generator) -> Tensor:
 
 
 def _spread(field: Tensor) -> Tensor:
-    """Return each picture's standard deviation, (..., 1, 1)."""
     return (field - field.mean((-2, -1), keepdim=True)).square().mean((-2, -1), keepdim=True).sqrt()

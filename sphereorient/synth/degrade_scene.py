@@ -37,15 +37,10 @@ def write_degraded(
     applied: Mapping[str, int],
     progress: Callable[[int], None] = lambda done: None,
 ) -> Path:
-    """Render a degraded experiment and return the path of experiment.yaml.
+    """Render a degraded experiment in `folder`, replacing old files, and return the path of experiment.yaml.
 
+    `applied` maps degradations to levels 1 .. 5; `progress` receives the number of frames rendered since the last call.
     Reported cameras, texture map and diameter may be wrong; truth.h5 describes the filmed cameras and sphere.
-
-    Args:
-        folder: created if missing; old files are replaced.
-        base: scene and random seed.
-        applied: degradation name -> level 1 .. 5.
-        progress: receives the number of frames rendered since the last call.
 
     Raises:
         SettingsError: unknown name or level, or impossible scene.
@@ -66,9 +61,6 @@ def write_with_values(
         degradation(name).check(value)
     settings = degraded_settings(base, values)
     return write_synthetic_experiment(folder, settings, progress, DegradedFilming(settings, values))
-
-
-# The scene.
 
 
 def degraded_settings(base: SynthSettings, values: Mapping[str, float]) -> SynthSettings:
@@ -97,7 +89,7 @@ def with_spin(base: SynthSettings, degrees_per_frame: float) -> SynthSettings:
 def with_motion_blur(base: SynthSettings, degrees_per_exposure: float) -> SynthSettings:
     """Return settings with this rotation per exposure, rms of |omega|: longer exposure first, then faster rotation."""
     turn = math.radians(degrees_per_exposure)
-    spin = base.omega_rms * math.sqrt(3)  # rad/s
+    spin = base.omega_rms * math.sqrt(3)
     exposure = min(turn / spin, 1 / base.frame_rate) if spin > 0 else 1 / base.frame_rate
     omega_rms = max(base.omega_rms, turn / exposure / math.sqrt(3)) if exposure > 0 else base.omega_rms
     turned_px = turn * base.diameter_px / 2
@@ -117,9 +109,6 @@ SCENE: Mapping[str, Callable[[SynthSettings, float], SynthSettings]] = {
 
 def _changed(base: SynthSettings, **update: object) -> SynthSettings:
     return SynthSettings.model_validate(base.model_dump() | update)
-
-
-# The paint.
 
 
 def worn(texture: Tensor, share: float, rng: torch.Generator) -> Tensor:
@@ -157,9 +146,6 @@ def random_patches(texture: Tensor, share: float, rng: torch.Generator) -> Tenso
     below = area[rising.indices].cumsum(-1) / area.sum()
     last = (below < share).sum(-1, keepdim=True).clamp_max(below.shape[-1] - 1)
     return (fields <= rising.values.gather(-1, last)[..., None]).to(texture.device)
-
-
-# The pictures.
 
 
 class DegradedFilming(Filming):
@@ -201,7 +187,6 @@ class DegradedFilming(Filming):
         return frozenset(lost.nonzero()[:, 0].tolist())
 
     def _through(self, light: Tensor, view: FilmedView, names: tuple[str, ...]) -> Tensor:
-        """Apply the named picture degradations."""
         centre_px, radius_px = picture_of_ball(view.camera, view.position_lab_mm, self.settings.diameter_mm / 2)
         disk = Disk(centre_px=centre_px, radius_px=radius_px, cover=torch.from_numpy(view.cover))
         for name in names:

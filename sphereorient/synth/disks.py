@@ -55,12 +55,8 @@ def film_disks(
 ) -> Tensor:
     """Film a sphere with random light per picture; return crops (F, S, S) float32, grey levels.
 
-    Args:
-        texture: (H, 2 H), worn texture map.
-        R_view_body: (F, 3, 3), orientations.
-        values: name of `DISK_DEGRADATIONS` -> physical value; values of maps are ignored.
-        rng: generator of all random numbers.
-        settings: picture settings.
+    `texture` is the worn map (H, 2 H), `R_view_body` (F, 3, 3); `values` maps `DISK_DEGRADATIONS` to physical values,
+    values of maps are ignored.
 
     Raises:
         SettingsError: unknown name or impossible value.
@@ -94,7 +90,6 @@ def _check(values: Mapping[str, float]) -> None:
 def _lit(
     texture: Tensor, R: Tensor, values: Mapping[str, float], disk: Disk, side: int, rng: torch.Generator
 ) -> Tensor:
-    """Return grey levels (F, side, side) of spheres and background."""
     count, radius = len(R), float(disk.radius_px.amax()) if len(R) else 1.0
     right, down = disk.offset(torch.empty(count, side, side))
     origin = torch.nn.functional.pad(
@@ -131,7 +126,6 @@ def _light(normal: Tensor, rng: torch.Generator) -> Tensor:
 def _outline(
     disk: Disk, values: Mapping[str, float], scale: float, rng: torch.Generator, settings: DiskSettings
 ) -> Disk:
-    """Return disks with the errors of a measured outline."""
     count = len(disk.radius_px)
     if "centre_error" in values:
         disk = centre_error(disk, values["centre_error"] * scale, rng)

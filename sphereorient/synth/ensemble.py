@@ -63,13 +63,9 @@ class Law:
 
     @classmethod
     def of(cls, rms: float, derivative_rms: float, flatness: float = 3.0, derivative_flatness: float = 3.0) -> Self:
-        """Return the process with these rms values and flatnesses.
+        """Return the process with these statistics of the rate (any unit) and its derivative (that unit / s).
 
-        Args:
-            rms: rms of the rate, any unit.
-            derivative_rms: rms of its derivative, that unit / s.
-            flatness: flatness of the rate, at least 3.
-            derivative_flatness: flatness of the derivative: 3 if `flatness` is 3, else up to about 9.
+        A flatness is at least 3; the derivative's is 3 if the rate's is 3, else up to about 9.
         """
         modulation, growth, flat = _burst()
         share = math.sqrt(max(flatness - GAUSSIAN, 0.0) / (modulation - GAUSSIAN))
@@ -90,7 +86,7 @@ class Draw:
     """Realisations of a `Law` in S segments."""
 
     law: Law
-    coefficients: Floats  # (S, 2 processes, cosine and sine, WAVES)
+    coefficients: Floats
     phase: Floats  # (S, 2), burst phases at time 0
 
     def at(self, time_s: Floats, segment: NDArray[np.int64]) -> tuple[Floats, Floats]:
@@ -200,14 +196,14 @@ def nominal(spec: EnsembleSpec) -> dict[str, Nominal]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueTracks:
-    """Exact motion at M frames of S segments; made by `draw_ensemble`."""
+    """Exact motion at M frames of S segments, (M, ...); made by `draw_ensemble`."""
 
     spec: EnsembleSpec
-    time_s: Floats  # (M,)
-    segment: Rows  # (M,)
-    position_mm: Floats  # (M, 3)
-    R_lab_body: Floats  # (M, 3, 3)
-    velocity: Floats  # (M, 3), m/s
+    time_s: Floats  # (M,); the other fields are (M, ...)
+    segment: Rows
+    position_mm: Floats
+    R_lab_body: Floats
+    velocity: Floats  # m/s
     acceleration: Floats  # m/s^2
     omega_lab: Floats  # rad/s
     omega_body: Floats
@@ -250,7 +246,6 @@ def draw_ensemble(spec: EnsembleSpec, seed: int) -> TrueTracks:
 
 
 def _rates(draws: list[Draw], since_s: Floats, segment: Rows) -> tuple[Floats, Floats]:
-    """Return the rates and their derivatives, (M, 3) each."""
     rate, slope = zip(*(draw.at(since_s, segment) for draw in draws), strict=True)
     return np.stack(rate, axis=1), np.stack(slope, axis=1)
 
@@ -297,13 +292,8 @@ def smoothed_track(
 ) -> tuple[Trajectory, ProcessNoise]:
     """Add white noise to an ensemble and smooth it; return the precise method's trajectory and the process noise.
 
-    Args:
-        true: exact motion.
-        noise_deg: standard deviation of each orientation component, degrees.
-        noise_mm: standard deviation of each coordinate, mm.
-        seed: seed of the noise.
-        known: process noise of an earlier ensemble; None estimates it.
-        silent: smooth exact data as if they were noisy, which shows the bias of smoothing alone.
+    Noise is a standard deviation per component. `known` is the process noise of an earlier ensemble, None estimates it.
+    `silent` smooths exact data as if they were noisy, which shows the bias of smoothing alone.
     """
     track = _noisy(true, noise_deg, noise_mm, seed, "precise")
     if silent:
@@ -351,13 +341,11 @@ def filtered_track(
 
 
 def _rates_of(found: Smoothed | Motion) -> dict[str, Any]:
-    """Return the rates and sigmas under the field names of a trajectory."""
     values = {name: getattr(found, f"{name}_{unit}").numpy() for name, unit in _UNITS.items()}
     return values | {f"{name}_sigma": getattr(found, f"{name}_sigma_{unit}").numpy() for name, unit in _UNITS.items()}
 
 
 def _noisy(true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, method: str) -> Trajectory:
-    """Return positions and orientations with white noise."""
     rng = np.random.default_rng([seed, 1])
     noise_rad = math.radians(noise_deg)
     delta = torch.from_numpy(noise_rad * rng.standard_normal(true.position_mm.shape))
@@ -369,7 +357,6 @@ def _noisy(true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, metho
 def _measured(
     true: TrueTracks, position_mm: Floats, R: Floats, noise_mm: float, noise_rad: float, method: str
 ) -> Trajectory:
-    """Return a trajectory with positions and orientations only."""
     count, unit = len(true.time_s), np.eye(3)
     blank = Trajectory.empty(true.time_s, frame_rate=true.spec.frame_rate_hz, method=method, experiment="synthetic")
     return replace(

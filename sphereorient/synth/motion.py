@@ -1,5 +1,3 @@
-"""Smooth random 6D motion with exact derivatives."""
-
 from __future__ import annotations
 
 import math
@@ -13,21 +11,19 @@ from sphereorient import so3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion6D:
-    """Exact motion at N instants; SI units except mm."""
+    """Exact motion at N instants, (N, ...); made by `RandomMotion.at`."""
 
-    time_s: Tensor  # (N,)
-    position_lab_mm: Tensor  # (N, 3)
-    velocity_m_s: Tensor  # (N, 3)
-    acceleration_m_s2: Tensor  # (N, 3)
-    R_lab_body: Tensor  # (N, 3, 3)
-    omega_lab_rad_s: Tensor  # (N, 3)
-    alpha_lab_rad_s2: Tensor  # (N, 3)
+    time_s: Tensor
+    position_lab_mm: Tensor
+    velocity_m_s: Tensor
+    acceleration_m_s2: Tensor
+    R_lab_body: Tensor
+    omega_lab_rad_s: Tensor
+    alpha_lab_rad_s2: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Waves:
-    """Sum of sines with random directions and phases."""
-
     amplitude: Tensor  # (M, 3)
     rate: Tensor  # (M,) rad/s
     phase: Tensor  # (M, 3)
@@ -58,10 +54,7 @@ class RandomMotion:
     R_start: Tensor  # (3, 3), R_lab_body at time 0
 
     def at(self, time_s: Tensor) -> Motion6D:
-        """Return the motion at increasing times (N,), s, float64; orientations are exact to 1e-9 rad per frame.
-
-        Times must be close: R comes from a fourth-order Magnus integration; the first may be negative.
-        """
+        """Return the motion at close, increasing times (N,), s, float64; R is exact to 1e-9 rad per frame."""
         return Motion6D(
             time_s=time_s,
             position_lab_mm=self.path(time_s, -1),
@@ -76,15 +69,9 @@ class RandomMotion:
 def random_motion(
     velocity_rms: float, velocity_time: float, omega_rms: float, omega_time: float, volume_mm: float, seed: int
 ) -> RandomMotion:
-    """Draw a smooth motion; equal seeds give equal motions.
+    """Draw a smooth motion from rms values per component, m/s and rad/s (lab), and correlation times, s.
 
-    Args:
-        velocity_rms: m/s per component, reduced if the path would leave the volume.
-        velocity_time: correlation time, s.
-        omega_rms: rad/s per lab component.
-        omega_time: correlation time, s.
-        volume_mm: twice the largest rms distance from the origin.
-        seed: random seed.
+    The velocity is reduced where the rms distance from the origin would exceed half of `volume_mm`.
     """
     rng = torch.Generator().manual_seed(seed)
     path = _random_waves(velocity_rms * 1000, velocity_time, rng)

@@ -1,5 +1,3 @@
-"""Pictures of the sphere in perspective through a camera: shaded, blurred, noisy, 8 bit."""
-
 from __future__ import annotations
 
 import math

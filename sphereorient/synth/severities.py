@@ -24,10 +24,10 @@ class Degradation:
     """A degradation with five severities; a row of `DEGRADATIONS`."""
 
     name: str
-    unit: str  # of the values
+    unit: str
     does: str
     values: Values  # level 1 (mild) .. level 5 (hard)
-    reason: str  # for the values
+    reason: str
     nothing: float | None  # value without effect; None: the base scene's value
     where: Place
 
@@ -165,11 +165,7 @@ def degradation(name: str) -> Degradation:
 
 
 def severity(name: str, level: int) -> float:
-    """Return the physical value of a level, 1 (mild) to 5 (hard).
-
-    Raises:
-        SettingsError: unknown name or level.
-    """
+    """Return the physical value of a level, 1 (mild) to 5 (hard); raise SettingsError for an unknown name or level."""
     row = degradation(name)
     if isinstance(level, bool) or level not in LEVELS:
         do = "choose one of them"

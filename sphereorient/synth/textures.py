@@ -46,7 +46,6 @@ def dots(height: int, rng: torch.Generator) -> Tensor:
 
 
 def _edge(value: Tensor, width: float) -> Tensor:
-    """Return 1 for positive, 0 for negative values, linear over `width`."""
     return (0.5 + value / width).clamp(0, 1).float()
 
 

@@ -30,7 +30,7 @@ PIXEL_PITCH_MM = 0.02
 class FilmedView:
     """The sphere in one picture, for `Filming.picture`."""
 
-    name: str  # of the camera
+    name: str
     camera: Camera
     frame: int | None  # frame number; None: background picture
     cover: NDArray[np.float32]  # (H, W), coverage of each pixel
@@ -98,15 +98,11 @@ def write_synthetic_experiment(
     progress: Callable[[int], None] = lambda done: None,
     filming: Filming | None = None,
 ) -> Path:
-    """Render a two-camera experiment with exact truth and return the path of experiment.yaml.
+    """Render a two-camera experiment with exact truth in `folder` and return the path of experiment.yaml.
 
-    The folder also receives movies, backgrounds, texture.png, cameras.yaml and truth.h5.
-
-    Args:
-        folder: created if missing; old files are replaced.
-        settings: scene settings.
-        progress: receives the number of frames rendered since the last call.
-        filming: changes of pictures and reported files; None: no changes.
+    Old files are replaced. The folder also receives movies, backgrounds, texture.png, cameras.yaml and truth.h5;
+    `progress` receives the number of frames rendered since the last call; `filming` changes pictures and reported
+    files.
 
     Raises:
         OutputError: folder not writable.
@@ -154,7 +150,6 @@ def motion_of(settings: SynthSettings) -> RandomMotion:
 
 
 def _as_file(texture: Tensor) -> NDArray[np.uint8]:
-    """Return a texture map, 0 .. 1, as 8-bit grey levels."""
     grey: NDArray[np.uint8] = np.rint(texture.numpy() * 255).astype(np.uint8)
     return grey
 
@@ -171,7 +166,6 @@ def _frames(
     rng: np.random.Generator,
     progress: Callable[[int], None],
 ) -> Iterator[NDArray[np.uint8]]:
-    """Yield one camera's frames."""
     settings, (name, camera) = scene.settings, named
     count = settings.exposure_samples
     within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
@@ -188,7 +182,6 @@ def _frames(
 
 
 def _without_the_ball(settings: SynthSettings, name: str, camera: Camera, filming: Filming) -> NDArray[np.uint8]:
-    """Return the noise-free background picture."""
     size = camera.image_size[::-1]
     cover, origin = np.zeros(size, np.float32), torch.zeros(3, dtype=torch.float64)
     view = FilmedView(name=name, camera=camera, frame=None, cover=cover, position_lab_mm=origin)

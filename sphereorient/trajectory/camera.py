@@ -1,5 +1,3 @@
-"""Results of one camera in a trajectory, and its group in the file."""
-
 # ruff: noqa: RUF009 -- stored returns a dataclass field without a default
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-"""Flags of a frame, and reasons why a camera has no orientation."""
-
 from __future__ import annotations
 
 from enum import IntFlag, StrEnum
@@ -33,4 +31,4 @@ class Reason(StrEnum):
     AMBIGUOUS = "ambiguous"
     CONTRADICTS = "contradicts"  # its line of sight misses the other camera's sphere
     UNDECODABLE = "undecodable"
-    MISSING = "missing"  # no picture of the frame
+    MISSING = "missing"

@@ -1,5 +1,3 @@
-"""Result of a measurement: position, orientation and motion of one sphere, and each camera's results."""
-
 # ruff: noqa: RUF009 -- stored returns a dataclass field without a default
 
 from __future__ import annotations
@@ -49,10 +47,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """All results on one sphere in N frames; mm, s, rad, m/s and m/s^2; NaN if not measured.
-
-    Make one with `Trajectory.empty` and `dataclasses.replace`; `track[10:50]` is a part of it.
-    """
+    """All results on one sphere in N frames; mm, s, rad, m/s and m/s^2; NaN if not measured; slices are parts."""
 
     time: Floats = stored("s", "frame number of the experiment / frame rate; middle of the exposure")
     valid: NDArray[np.bool_] = stored("1", "orientation and position measured in this frame", dtype="bool", fill=0)
@@ -97,8 +92,8 @@ class Trajectory:
     frame_rate: float  # Hz
     method: str  # paper, precise
     settings: str  # YAML text
-    experiment: str  # the experiment's name
-    provenance: Mapping[str, Any]  # name of the experiment
+    experiment: str
+    provenance: Mapping[str, Any]  # versions, command, sha256 of inputs; JSON types
 
     def __post_init__(self) -> None:
         frames = np.size(self.time)
@@ -276,7 +271,6 @@ def _continuous(quat_wxyz: Floats) -> Floats:
 
 
 def _read(file: h5py.File) -> dict[str, Any]:
-    """Return all fields of a trajectory."""
     schema = file.attrs.get("schema")
     if schema != SCHEMA:
         got, do = repr(str(schema))[1:60].strip("'"), "pass a track, or update sphereorient where the track is newer"
