@@ -130,7 +130,7 @@ def load_experiment(path: Path | str) -> Experiment:
 
 
 def write_experiment(experiment: Experiment, comment: str = "") -> Path:
-    """Write an experiment to its `path`, with `comment` at the top, and return the path; cameras are not written.
+    """Write an experiment, without its cameras, to its `path`, and return the path; `comment` stands at the top.
 
     Raises:
         OutputError: file not writable.

@@ -1,5 +1,3 @@
-"""Given pictures of a camera's scene: background and mask."""
-
 from __future__ import annotations
 
 from pathlib import Path
@@ -34,17 +32,13 @@ def given_mask(experiment: Experiment, name: str, frame_shape: tuple[int, int]) 
 
 
 def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Read a picture of the scene without the sphere, (H, W), grey levels.
-
-    Raises:
-        ExperimentError: missing, not a picture, or not of the movie's size.
-    """
+    """Read a background, (H, W), grey levels; raise ExperimentError unless it is a picture of the movie's size."""
     do = "save a frame without the ball as PNG, in the movie's own grey levels"
     return np.asarray(_picture(path, f"background {path}", frame_shape, do), np.float32)
 
 
 def load_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Read a mask, (H, W): True (white) where the sphere is visible, False (black) where something hides it.
+    """Read a mask, (H, W), True (white) where the sphere is visible, False (black) where something hides it.
 
     Raises:
         ExperimentError: missing, not a picture, not of the movie's size, or all black.

@@ -71,9 +71,7 @@ class Recording:
 def open_recording(
     source: Experiment | str | Path, cameras: Sequence[str] | None = None, *, textured: bool = True
 ) -> Iterator[Recording]:
-    """Open an experiment, or the one at a path, with the named cameras (None: all).
-
-    `textured` requires and reads the texture map; False: the map is to be estimated.
+    """Open an experiment, or its path, with the named cameras (None: all); `textured` requires the texture map.
 
     Raises:
         SphereOrientError: inputs missing, unreadable or inconsistent.

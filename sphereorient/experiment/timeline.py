@@ -44,7 +44,7 @@ class Timeline:
         return float(np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")
 
     def gridded(self) -> tuple[Timeline, Rows]:
-        """Resample onto a regular time grid, inserting missing frames; return it and the frames' indices in it.
+        """Resample onto a regular grid, inserting missing frames; return it and the frames' indices in it.
 
         Raises:
             ExperimentError: the times lie on no regular grid.
@@ -74,8 +74,8 @@ class Timeline:
 def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     """Return the times of the selected frames and the pictures of the cameras at each frame.
 
-    Times are number / frame rate, a table, or time stamps of the movies; equal stamps of two cameras make one frame.
-    MKV stamps are not used: they are rounded to 1 ms. A movie that ends early causes a remark.
+    Times come from the frame rate, a table, or stamps of the movies; equal stamps of two cameras make one frame. MKV
+    stamps are not used: they are rounded to 1 ms.
 
     Raises:
         ExperimentError: unreadable table of times, or one of another length.

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Noise: a quantile of the deviations over that quantile of a unit normal. Measured mean: the sphere passes a pixel in
-# fewer frames than glitter. Given scene: a tenth of the frames shows it even where the sphere stays long.
+# A pixel's noise is a quantile of its deviations over that of a unit normal. Measured mean: glitter is in more frames
+# than 1 - share, the sphere in fewer. Given scene: a tenth of the frames shows it where the sphere stays long.
 MEASURED_SHARE, MEASURED_SIGMAS = 0.8, 1.2816
 GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
 FEW = 10  # frames; with fewer, all pixels get the same noise

@@ -33,9 +33,8 @@ def find_blobs(
 ) -> list[Blob]:
     """Return at most `settings.blob_candidates` round blobs of about `diameter_px`, best first.
 
-    `difference` (H, W) is |frame - background|, `noise` (H, W) the background's sigma, both in grey levels. A
-    difference of two box filters responds to blobs; merit: variance inside the disk times the share of nearby
-    foreground inside.
+    `difference` is |frame - background|, `noise` the background's sigma, (H, W), grey levels. The blob filter is a
+    difference of two box filters.
 
     Source: paper section III A.
     """

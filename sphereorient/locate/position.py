@@ -39,10 +39,9 @@ class Positions:
 def find_positions(
     sightings: Mapping[str, Sightings], cameras: Mapping[str, Camera], diameter_mm: float | None
 ) -> Positions:
-    """Return the sphere's positions in N frames from the outlines of one or two cameras.
+    """Return the sphere's positions in N frames from the outlines of one or two cameras; in radii without a diameter.
 
     A centre's sigma is its outline's rms. With one outline the distance comes from its radius: flag `ONE_CAMERA`.
-    Lengths are in radii if the diameter is None.
 
     Raises:
         ExperimentError: two cameras and an unknown diameter.

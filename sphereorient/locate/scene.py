@@ -94,10 +94,10 @@ def learn_background(
     empty: NDArray[np.float32] | None = None,
     shown: NDArray[np.bool_] | None = None,
 ) -> Background:
-    """Estimate the background: average the frames, find the sphere, measure the covered pixels from the other frames.
+    """Estimate the background of frames (n, H, W): average, find the sphere, measure its pixels from other frames.
 
-    `pictures` are evenly spread frames (n, H, W). With `empty` (H, W), the scene without the sphere, only the noise is
-    measured. `shown` (H, W) is False where something static hides the sphere; None: nowhere.
+    With `empty` (H, W), the scene without the sphere, only the noise is measured. `shown` is False where the sphere is
+    hidden.
     """
     background = replace(measure_background(pictures, empty), shown=shown)
     if empty is not None:
@@ -161,10 +161,9 @@ def fixed_ball(
     empty: NDArray[np.float32] | None = None,
     shown: NDArray[np.bool_] | None = None,
 ) -> FixedBall:
-    """Find a rotating sphere with a fixed centre: only its pixels change from frame to frame.
+    """Find a rotating sphere with a fixed centre in frames (n, H, W): only its pixels change.
 
-    `pictures` are evenly spread frames (n, H, W); `empty` (H, W) is the scene without the sphere; `shown` (H, W) is
-    False where something hides the sphere.
+    `empty` (H, W) is the scene without the sphere; `shown` (H, W) is False where something hides the sphere.
 
     Raises:
         ExperimentError: nothing round changes.

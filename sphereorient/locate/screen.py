@@ -15,9 +15,9 @@ from sphereorient.trajectory import Reason
 
 Picture = NDArray[Any]
 
-LIT_NOISES = 10.0  # noise sigmas above black of a lit background pixel
+LIT_NOISES = 10.0  # a lit background pixel is this many noise sigmas above black
 LIT_SHARE = 0.1  # least share of lit pixels; in a darker scene a failed lamp is invisible
-DARK_LEVEL = 0.3  # share of the background's grey level below which a pixel is unlit
+DARK_LEVEL = 0.3  # darker than this share of the background is unlit
 DARK_SHARE = 0.95  # share of the lit pixels
 WHITE_SHARE = 0.5  # share of all pixels
 

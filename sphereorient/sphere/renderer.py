@@ -38,10 +38,10 @@ class SphereSight:
 def see_sphere(
     rays: Rays, centre: Tensor, R: Tensor, texture: Tensor, radius: float | Tensor = 1.0, *, smooth: bool = False
 ) -> SphereSight:
-    """Return the paint that rays of P pixels, (..., P, 3), see; all rendering uses this function.
+    """Return the paint that rays (..., P, 3) see on a map (H, 2 H); all rendering uses this function.
 
-    `centre` (..., 3), `R` (..., 3, 3, from body) and `radius` (() or (..., 1)) have the rays' frame and unit; `texture`
-    is (H, 2 H). `smooth` is twice differentiable (spline, rounded limb); otherwise bilinear and exact.
+    `centre` (..., 3), `R` (..., 3, 3, from body) and `radius` (() or (..., 1)) have the rays' frame and unit. `smooth`
+    is twice differentiable (spline, rounded limb); otherwise bilinear and exact.
     """
     check_tail("position_lab_mm", centre, 3)
     check_tail("R_lab_body", R, 3, 3)
@@ -52,7 +52,7 @@ def see_sphere(
 
 
 def lambert(normal: Tensor, towards: Tensor, strength: Tensor | float, corner: float = 0.0) -> Tensor:
-    """Return the Lambertian light (...) on unit normals (..., 3) of K lamps in unit directions `towards` (..., K, 3).
+    """Return the light (...) on unit normals (..., 3) of Lambertian lamps in unit directions `towards` (..., K, 3).
 
     `strength` is (K,) or one number; `corner` rounds the shadow's edge (width in cosine; 0 is exact).
     """
@@ -82,7 +82,7 @@ class SphereRenderer(nn.Module):
         sampling: blur, background grey, rays per pixel.
 
     Raises:
-        SettingsError: both or neither of camera and size_px, or a radius that is not positive.
+        SettingsError: not exactly one of camera and size_px, or a radius that is not positive.
         ShapeError: texture is not (H, 2 H).
     """
 
@@ -188,9 +188,9 @@ def fine_pixels(size_px: int, supersampling: int) -> Tensor:
 
 
 def aperture_matrix(size_px: int, supersampling: int, sigma_px: float) -> Tensor:
-    """Return weights A of fine samples, (S, S supersampling) float64: picture = A fine A^T; sigma 0 leaves the box.
+    """Return weights A (S, S supersampling) float64, picture = A fine A^T, for a pixel box and a Gaussian `sigma_px`.
 
-    Source: a pixel box convolved with a Gaussian is a difference of two normal distribution functions.
+    Source: the convolution is a difference of two normal distribution functions.
     """
     offset = fine_pixels(size_px, supersampling) - torch.arange(size_px, dtype=torch.float64)[:, None]
     if sigma_px > 0:

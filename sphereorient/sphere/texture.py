@@ -101,9 +101,7 @@ def sample_texture(texture: Tensor, direction_body: Tensor) -> Tensor:
 def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
     """Return the cubic B-spline grey (...) at body directions (..., 3); twice differentiable, except at the poles.
 
-    The texels are the coefficients: the blur is sqrt(1/3) texels along rows and columns (bilinear: 0.41).
-
-    Source: Unser 1999, Splines, a perfect fit, eq. 3.
+    Source: Unser 1999, Splines, a perfect fit, eq. 3; the texels are the coefficients: a blur of 0.58 texels.
     """
     column, row = _texel_coordinates(texture, direction_body)
     height, width = texture.shape

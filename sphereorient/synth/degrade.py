@@ -1,8 +1,4 @@
-"""Degradations of picture batches, for benchmarks and training.
-
-Operations take unrounded grey levels, a physical value, the disk and a generator, and keep the dtype. Kornia's
-augmentations are not used: they draw from torch's global generator.
-"""
+"""Degradations of picture batches, without kornia augmentations: these draw from torch's global generator."""
 
 from __future__ import annotations
 
@@ -62,9 +58,9 @@ Operation = Callable[[Tensor, float, Disk, torch.Generator], Tensor]
 
 
 def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torch.Generator) -> Tensor:
-    """Return pictures (..., H, W) with degradations in a fixed order, neither rounded nor clipped.
+    """Return pictures (..., H, W), unrounded and unclipped floats, with degradations in a fixed order.
 
-    `pictures` (..., H, W) are unrounded grey levels, floats; `values` maps names to physical values, see `severity`.
+    `values` maps names to physical values, see `severity`.
 
     Raises:
         SettingsError: unknown name, no picture degradation, or impossible value.
@@ -106,7 +102,6 @@ def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) 
     right, down = disk.offset(pictures)
     light = torch.zeros_like(pictures)
     for lobe in range(LOBES):
-        # Spread about the centre: a lamp beside the camera is reflected near it, one at right angles at 0.7 radii.
         angle = 2 * math.pi * (draw[..., 0, :, :] + lobe / LOBES)
         away = (0.2 + 0.5 * draw[..., 1 + lobe, :, :]) * radius
         square = (right - away * angle.cos()).square() + (down - away * angle.sin()).square()

@@ -128,7 +128,6 @@ def random_patches(texture: Tensor, share: float, rng: torch.Generator) -> Tenso
     if share == 0:
         return torch.zeros_like(texture, dtype=torch.bool)
     height, lead = texture.shape[-2], texture.shape[:-2]
-    # Smooth random functions of direction: a sum of waves.
     draw = torch.rand((*lead, WAVES, 4), generator=rng, dtype=torch.float64, device=rng.device).cpu()
     up = 2 * draw[..., 0] - 1
     around, phase = 2 * math.pi * draw[..., 1], 2 * math.pi * draw[..., 2]
@@ -196,7 +195,6 @@ class DegradedFilming(Filming):
                 continue
             # Static degradations use the same random numbers in every frame.
             rng = self._generator(name, view.name, *([] if row.where != "frame" else [view.frame or 0]))
-            # The gain is constant over the movie.
             light = light * self.gains[view.name] if name == "saturation" else OPERATIONS[name](light, value, disk, rng)
         return light
 

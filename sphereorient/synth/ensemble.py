@@ -1,8 +1,7 @@
 """Synthetic ensembles of 6D trajectories without pictures, with the true statistics of the paper's Table I.
 
-A component is a smooth stationary rate, rms (sqrt(1 - b) g1 + sqrt(b / <A^2>) A g2): g1 and g2 are Gaussian processes,
-ln A is a sum of DEPTH cos(phase) over uniformly advancing phases. A is bounded: unbounded log-normal bursts would let
-the largest event set the flatness of 300 segments.
+A rate is rms (sqrt(1 - b) g1 + sqrt(b / <A^2>) A g2): g1 and g2 are Gaussian processes, ln A is a sum of DEPTH
+cos(phase). A is bounded: with log-normal bursts the largest event would set the flatness of 300 segments.
 """
 
 from __future__ import annotations
@@ -292,8 +291,7 @@ def smoothed_track(
 ) -> tuple[Trajectory, ProcessNoise]:
     """Add white noise to an ensemble and smooth it; return the precise method's trajectory and the process noise.
 
-    Noise is a standard deviation per component. `known` is the process noise of an earlier ensemble, None estimates it.
-    `silent` smooths exact data as if they were noisy, which shows the bias of smoothing alone.
+    `known` is an earlier process noise, None estimates it. `silent` smooths exact data: the bias of smoothing alone.
     """
     track = _noisy(true, noise_deg, noise_mm, seed, "precise")
     if silent:

@@ -44,7 +44,7 @@ def render_frame(
 def expose(
     scene: RenderedScene, camera: Camera, position_lab_mm: Tensor, R_lab_body: Tensor
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return one exposure's grey levels without noise and the coverage, (H, W) float32 each, blurred by the optics.
+    """Return one exposure without noise, and the coverage, (H, W) float32 each, blurred by the optics.
 
     `position_lab_mm` (E, 3) and `R_lab_body` (E, 3, 3) are the poses at E instants of the exposure.
 

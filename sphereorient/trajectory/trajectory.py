@@ -47,7 +47,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """All results on one sphere in N frames; mm, s, rad, m/s and m/s^2; NaN if not measured; slices are parts."""
+    """All results on one sphere in N frames; mm, s, rad, m/s, m/s^2; NaN if not measured; `track[10:50]` is a part."""
 
     time: Floats = stored("s", "frame number of the experiment / frame rate; middle of the exposure")
     valid: NDArray[np.bool_] = stored("1", "orientation and position measured in this frame", dtype="bool", fill=0)
@@ -197,10 +197,9 @@ class Trajectory:
         return replace(self, **parts, cameras={name: camera.at(rows) for name, camera in self.cameras.items()})
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return a table, one row per frame, units in the column names, without covariances and cameras.
+        """Return a table, one row per frame, units in the column names (time_s, position_x_mm, velocity_x_m_s, ...).
 
-        Columns: time_s, position_x_mm, velocity_x_m_s, ..., quat_w .. quat_z (R_lab_body, w >= 0), quat_smooth_w ..
-        (smoother).
+        It has quaternions quat_* and quat_smooth_* (R_lab_body, w >= 0), but neither covariances nor cameras.
 
         Raises:
             OutputError: pandas is not installed.
