@@ -1,4 +1,4 @@
-"""The noun that goes in: experiment, timeline, camera streams, an opened recording."""
+"""The input of a measurement: experiment, timeline, camera streams, open recording."""
 
 from sphereorient.experiment.experiment import (
     MOVIES_OWN,

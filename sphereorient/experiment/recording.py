@@ -71,10 +71,10 @@ class Recording:
 def open_recording(
     source: Experiment | str | Path, cameras: Sequence[str] | None = None, *, textured: bool = True
 ) -> Iterator[Recording]:
-    """Open an experiment, or its path, with the named cameras (None: all); `textured` requires the texture map.
+    """Open an experiment, or its path, with the named cameras (None: all); without `textured`, no texture map is read.
 
     Raises:
-        SphereOrientError: inputs missing, unreadable or inconsistent.
+        SphereOrientError: inputs missing, unreadable or inconsistent; with `textured`, no texture map.
     """
     experiment = source if isinstance(source, Experiment) else load_experiment(Path(source))
     if textured and experiment.texture_path is None:

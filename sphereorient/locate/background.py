@@ -68,7 +68,7 @@ def _full_scale(pictures: NDArray[Any]) -> float:
 
 
 def without_ball(background: Background, pictures: NDArray[Any], covered: NDArray[np.bool_]) -> Background:
-    """Measure a background again without the pixels `covered` (n, H, W); pixels free in under four frames stay."""
+    """Measure the pixels `covered` (n, H, W) again from the other frames; with under four they keep their values."""
     free = len(pictures) - covered.sum(axis=0)
     again = (free < len(pictures)) & (free >= 4)
     values = pictures[:, again].astype(np.float32)

@@ -19,7 +19,7 @@ Found = tuple[Outline | None, Reason]
 def find_ball(
     frame: NDArray[np.generic], background: Background, diameter_px: float, settings: LocateSettings
 ) -> Found:
-    """Return the sphere's outline in a frame (H, W) and `Reason.OK`, or None and the reason.
+    """Return the outline in a frame (H, W) and `OK`, or None and `NOT_FOUND`, `OUTLINE`, `DARK` or `SATURATED`.
 
     Source: paper section III A.
     """

@@ -96,8 +96,7 @@ def learn_background(
 ) -> Background:
     """Estimate the background of frames (n, H, W): average, find the sphere, measure its pixels from other frames.
 
-    With `empty` (H, W), the scene without the sphere, only the noise is measured. `shown` is False where the sphere is
-    hidden.
+    With `empty` (H, W), a given background, only the noise is measured. `shown` is False where the sphere is hidden.
     """
     background = replace(measure_background(pictures, empty), shown=shown)
     if empty is not None:

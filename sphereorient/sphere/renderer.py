@@ -40,8 +40,8 @@ def see_sphere(
 ) -> SphereSight:
     """Return the paint that rays (..., P, 3) see on a map (H, 2 H); all rendering uses this function.
 
-    `centre` (..., 3), `R` (..., 3, 3, from body) and `radius` (() or (..., 1)) have the rays' frame and unit. `smooth`
-    is twice differentiable (spline, rounded limb); otherwise bilinear and exact.
+    `R` (..., 3, 3) takes body components to the rays' frame; `centre` (..., 3) and `radius`, () or (..., 1), have its
+    unit. `smooth` is twice differentiable (spline, rounded limb); otherwise bilinear and exact.
     """
     check_tail("position_lab_mm", centre, 3)
     check_tail("R_lab_body", R, 3, 3)
@@ -114,10 +114,10 @@ class SphereRenderer(nn.Module):
         self.sampling = sampling or Sampling()
 
     def forward(self, R_lab_body: Any, position_mm: Any = None, radius_mm: Tensor | None = None) -> Tensor:
-        """Return pictures (..., H, W), 0 black paint .. 1 white paint, in the dtype of R_lab_body (..., 3, 3).
+        """Return pictures (..., H, W), 0 black paint .. 1 white paint, of spheres at orientations R_lab_body (..., 3, 3).
 
-        Without a camera R_lab_body leads to the view. `position_mm` is (..., 3), None for the origin; `radius_mm` is
-        (...).
+        `R_lab_body` sets the dtype and, without a camera, leads to the view; `position_mm` (..., 3) is the origin by
+        default.
 
         Raises:
             CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
@@ -248,8 +248,7 @@ class PaintedBall:
 def expected_grey(rays: Rays, position_lab_mm: Tensor, R_lab_body: Tensor, ball: PaintedBall) -> Tensor:
     """Return grey levels (..., P) of rays (..., P, 3), twice differentiable in cameras, pose, paint and light.
 
-    One ray per pixel and blur in the coverage only: optically simpler than `SphereRenderer`. `position_lab_mm` is (...,
-    3), `R_lab_body` (..., 3, 3).
+    `position_lab_mm` is (..., 3), `R_lab_body` (..., 3, 3). Optically simpler than `SphereRenderer`: one ray per pixel.
     """
     seen = see_sphere(rays, position_lab_mm, R_lab_body, ball.texture, ball.radius_mm, smooth=True)
     # 0.5 depth2 is the distance from the limb, radii, near the limb; it has no kink at the centre.

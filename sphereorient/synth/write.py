@@ -100,7 +100,7 @@ def write_synthetic_experiment(
 ) -> Path:
     """Render a two-camera experiment with exact truth in `folder` and return the path of experiment.yaml.
 
-    Old files are replaced. The folder also receives movies, backgrounds, texture.png, cameras.yaml and truth.h5;
+    The folder also receives movies, backgrounds, texture.png, cameras.yaml and truth.h5; old files are replaced.
     `progress` receives the number of frames rendered since the last call; `filming` changes pictures and reported
     files.
 
