@@ -114,10 +114,10 @@ class SphereRenderer(nn.Module):
         self.sampling = sampling or Sampling()
 
     def forward(self, R_lab_body: Any, position_mm: Any = None, radius_mm: Tensor | None = None) -> Tensor:
-        """Return pictures (..., H, W), 0 black paint .. 1 white paint, of spheres at orientations R_lab_body (..., 3, 3).
+        """Return pictures (..., H, W), 0 black paint .. 1 white paint, of spheres with orientation (..., 3, 3).
 
-        `R_lab_body` sets the dtype and, without a camera, leads to the view; `position_mm` (..., 3) is the origin by
-        default.
+        `R_lab_body` sets the dtype; without a camera it leads to the view. `position_mm` (..., 3) is the origin if
+        None.
 
         Raises:
             CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
