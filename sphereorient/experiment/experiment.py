@@ -1,5 +1,3 @@
-"""The input of a measurement: an experiment, its cameras and its movies, read from experiment.yaml."""
-
 from __future__ import annotations
 
 import os
@@ -24,31 +22,31 @@ FrameNumber = Annotated[int, Field(ge=0)]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Experiment:
-    """The content of experiment.yaml; made by `load_experiment` or synth, read by everyone who opens movies."""
+    """Content of experiment.yaml; made by `load_experiment` or synth."""
 
     name: str
-    path: Path  # of experiment.yaml
-    frame_rate_hz: float  # NaN where times are given instead
+    path: Path
+    frame_rate_hz: float  # NaN if times are given instead
     cameras_path: Path
     cameras: dict[str, Camera]  # of the movies, in their order
     movie_paths: dict[str, Path]
     exposure_s: float | None = None
-    diameter_mm: float | None = None  # None: not known, lengths are in radii
-    texture_path: Path | None = None  # None: to be learnt
-    fixed: bool = False  # whether the ball does not move
-    mask_paths: dict[str, Path] = field(default_factory=dict)  # black where something that does not move hides the ball
-    background_paths: dict[str, Path] = field(default_factory=dict)  # the scene without the ball
-    times: str | None = None  # path of a table of times, or "movies": their own stamps; None: evenly spaced frames
+    diameter_mm: float | None = None  # None: unknown, lengths are in radii
+    texture_path: Path | None = None  # None: to be estimated
+    fixed: bool = False  # whether the centre is fixed
+    mask_paths: dict[str, Path] = field(default_factory=dict)  # black where something static hides the sphere
+    background_paths: dict[str, Path] = field(default_factory=dict)  # scene without the sphere
+    times: str | None = None  # path of a table, or "movies": their time stamps; None: constant frame rate
     start: dict[str, int] = field(default_factory=dict)  # frame of each movie that is the experiment's frame 0
-    start_given: bool = False  # whether the file says so; with stamps each camera's clock then begins there
-    flip: dict[str, str] = field(default_factory=dict)  # movies seen through a mirror: see movies.flipped
-    frames: tuple[int, int] | None = None  # first, last + 1 of the experiment; None: all
+    start_given: bool = False  # whether the file has `start`; time stamps then begin there
+    flip: dict[str, str] = field(default_factory=dict)  # mirrored movies, see movies.flipped
+    frames: tuple[int, int] | None = None  # first, last + 1; None: all
     flow: dict[str, float] = field(default_factory=dict)  # SI
-    camera_covariance: ParameterCovariance | None = None  # of the cameras' parameters, named camera.parameter
+    camera_covariance: ParameterCovariance | None = None  # parameters are named camera.parameter
 
     @property
     def folder(self) -> Path:
-        """The folder that paths in the file are relative to."""
+        """Folder of experiment.yaml; its paths are relative to it."""
         return self.path.parent
 
 
@@ -91,11 +89,11 @@ class ExperimentKeys(BaseModel):
 
 
 def load_experiment(path: Path | str) -> Experiment:
-    """Read experiment.yaml, with paths relative to its folder, and its cameras; movies and pictures are not opened.
+    """Read experiment.yaml and its cameras; movies and pictures are not opened.
 
     Raises:
-        ExperimentError: missing, malformed or inconsistent.
-        CameraError: the cameras' file is missing or malformed.
+        ExperimentError: missing, malformed or inconsistent file.
+        CameraError: missing or malformed cameras file.
     """
     path = Path(path)
     document = read_document(path, SCHEMA, ExperimentError)
@@ -132,12 +130,10 @@ def load_experiment(path: Path | str) -> Experiment:
 
 
 def write_experiment(experiment: Experiment, comment: str = "") -> Path:
-    """Write an experiment to its `path`, with `comment` at the top, and return the path.
-
-    The cameras' file is not written: see `save_cameras`.
+    """Write an experiment, without its cameras, to its `path`, and return the path; `comment` stands at the top.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: file not writable.
     """
 
     def relative(path: Path) -> str:
@@ -169,11 +165,11 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
 
 
 def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> dict[str, Movie]:
-    """Open the movies of an experiment, all or those of the named cameras, and check that they fit the cameras.
+    """Open the movies of the named cameras (None: all) and check their picture sizes.
 
     Raises:
-        ExperimentError: a name that the experiment does not have.
-        MovieError: a movie is missing or unreadable, or of another size than its camera's picture.
+        ExperimentError: unknown camera name.
+        MovieError: missing, unreadable, or of another size than the camera.
     """
     movies: dict[str, Movie] = {}
     for name in experiment.movie_paths if names is None else names:
@@ -191,7 +187,7 @@ def open_movies(experiment: Experiment, names: Sequence[str] | None = None) -> d
 
 
 def input_files(experiment: Experiment, names: Sequence[str] | None = None) -> dict[Path, list[Path]]:
-    """Return the inputs of an experiment for the named cameras or all, each with its files: itself, or its pictures."""
+    """Return the input paths for the named cameras (None: all), each with its files."""
     used = list(experiment.movie_paths) if names is None else list(names)
     single = [experiment.path, experiment.cameras_path]
     for paths in (experiment.background_paths, experiment.mask_paths):
@@ -205,7 +201,7 @@ def input_files(experiment: Experiment, names: Sequence[str] | None = None) -> d
 
 
 def outside_paths(experiment: Experiment) -> list[Path]:
-    """Return the inputs of an experiment that lie outside of its own folder."""
+    """Return the inputs outside the experiment's folder."""
     folder = Path(os.path.realpath(experiment.folder))
     return [path for path in input_files(experiment) if not Path(os.path.realpath(path)).is_relative_to(folder)]
 

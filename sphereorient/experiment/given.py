@@ -1,5 +1,3 @@
-"""Pictures that an experiment gives of a camera's scene: without the ball, and what hides the ball."""
-
 from __future__ import annotations
 
 from pathlib import Path
@@ -14,11 +12,11 @@ from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 from sphereorient.movies import flipped_picture
 
-BYTES_A_PIXEL, HEADER_BYTES = 8, 1_000_000  # of a picture without any compression, and what may stand before it
+BYTES_A_PIXEL, HEADER_BYTES = 8, 1_000_000  # uncompressed, and its header
 
 
 def given_scene(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.float32] | None:
-    """Return the given picture of a camera's scene without the ball, flipped as its movie is; None without one."""
+    """Return a camera's background, (H, W) grey levels, flipped as its movie; None if not given."""
     path = experiment.background_paths.get(name)
     if path is None:
         return None
@@ -26,7 +24,7 @@ def given_scene(experiment: Experiment, name: str, frame_shape: tuple[int, int])
 
 
 def given_mask(experiment: Experiment, name: str, frame_shape: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """Return where a camera sees the ball, (H, W), flipped as its movie is; None where nothing hides it."""
+    """Return a camera's mask, (H, W), False where the sphere is hidden, flipped as its movie; None if not given."""
     path = experiment.mask_paths.get(name)
     if path is None:
         return None
@@ -34,20 +32,16 @@ def given_mask(experiment: Experiment, name: str, frame_shape: tuple[int, int]) 
 
 
 def load_background(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Read a picture of the scene without the ball, (H, W), grey levels.
-
-    Raises:
-        ExperimentError: missing, not a picture, or not of the size of the movie's frames.
-    """
+    """Read a background, (H, W), grey levels; raise ExperimentError unless it is a picture of the movie's size."""
     do = "save a frame without the ball as PNG, in the movie's own grey levels"
     return np.asarray(_picture(path, f"background {path}", frame_shape, do), np.float32)
 
 
 def load_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Read a mask, (H, W), True (white) where the ball can be seen, False (black) where something hides it.
+    """Read a mask, (H, W), True (white) where the sphere is visible, False (black) where something hides it.
 
     Raises:
-        ExperimentError: missing, not a picture, not of the size of the movie's frames, or all black.
+        ExperimentError: missing, not a picture, not of the movie's size, or all black.
     """
     name, do = f"mask {path}", "paint what hides the ball black, all else white, on a frame of the movie"
     picture = _picture(path, name, frame_shape, do)
@@ -58,11 +52,10 @@ def load_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def _picture(path: Path, name: str, frame_shape: tuple[int, int], do: str) -> NDArray[Any]:
-    """Read a grey picture of the size of a movie's frames, (H, W), in its own depth."""
     height, width = frame_shape
     content = read_whole(path, BYTES_A_PIXEL * height * width + HEADER_BYTES, "a picture", ExperimentError, do)
     claimed, expected = claimed_pixels(content), f"{width} x {height} px as the movie"
-    if claimed is not None and claimed > height * width:  # before memory is allocated for it
+    if claimed is not None and claimed > height * width:  # before allocating memory
         raise ExperimentError(refusal(name, expected=expected, got=f"{claimed} px", do=do))
     picture = None if claimed is None else decoded_grey(content)
     if picture is None:

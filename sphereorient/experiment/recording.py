@@ -1,5 +1,3 @@
-"""An experiment opened: its frames, its camera streams, its texture map. What the stages of a method work on."""
-
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +16,7 @@ from sphereorient.experiment.stream import CameraStream
 from sphereorient.experiment.timeline import Rows, Timeline, timeline
 from sphereorient.sphere import load_texture
 
-Progress = Callable[[str, int, int], None]  # (stage, frames done, frames in all); the command line draws a bar
+Progress = Callable[[str, int, int], None]  # (stage, frames done, all frames); the command line draws a bar
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -27,43 +25,43 @@ def silent(stage: str, done: int, total: int) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """An experiment whose movies are open; made by `open_recording`, read by the methods."""
+    """Experiment with open movies; made by `open_recording`."""
 
     experiment: Experiment
     streams: Sequence[CameraStream]
     timeline: Timeline
-    texture: Tensor  # (H, 2 H); (0, 0) where it is to be learnt
-    remarks: tuple[str, ...]  # warnings about the inputs, for the user
+    texture: Tensor  # (H, 2 H); (0, 0) if it is to be estimated
+    remarks: tuple[str, ...]
 
     @property
     def cameras(self) -> dict[str, Camera]:
-        """The cameras in use."""
+        """Cameras in use."""
         return {stream.name: stream.camera for stream in self.streams}
 
     @property
     def frames(self) -> range:
-        """Numbers of the experiment's frames."""
+        """Frame numbers of the experiment."""
         number = self.timeline.number
         return range(int(number[0]), int(number[-1]) + 1)
 
     @property
     def clock(self) -> Tensor:
-        """Times of the frames, (N,), s."""
+        """Frame times, (N,), s."""
         return torch.from_numpy(self.timeline.time_s)
 
     @property
     def radius_mm(self) -> float:
-        """Radius of the sphere; 1 where lengths are in radii."""
+        """Radius of the sphere; 1 if lengths are in radii."""
         return 1.0 if self.experiment.diameter_mm is None else self.experiment.diameter_mm / 2
 
     @property
     def covariance(self) -> ParameterCovariance | None:
-        """Covariance of the parameters of the cameras in use."""
+        """Parameter covariance of the cameras in use."""
         whole = self.experiment.camera_covariance
         return None if whole is None else whole.of(list(self.cameras))
 
     def gridded(self) -> tuple[Recording, Rows]:
-        """Return the recording on a regular time grid, and the indices of its frames in it; see `Timeline`."""
+        """Return the recording on a regular time grid, and its frames' indices in it; see `Timeline`."""
         grid, place = self.timeline.gridded()
         streams = [replace(stream, rows=grid.rows[stream.name]) for stream in self.streams]
         return replace(self, timeline=grid, streams=streams), place
@@ -73,15 +71,10 @@ class Recording:
 def open_recording(
     source: Experiment | str | Path, cameras: Sequence[str] | None = None, *, textured: bool = True
 ) -> Iterator[Recording]:
-    """Open an experiment for tracking or for learning its texture map.
-
-    Args:
-        source: the experiment as loaded, or the path of its experiment.yaml.
-        cameras: names of those to use; None: all.
-        textured: read its texture map, which must be given; False: the map is to be learnt.
+    """Open an experiment, or its path, with the named cameras (None: all); without `textured`, no texture map is read.
 
     Raises:
-        SphereOrientError: inputs that are missing, unreadable or do not fit together.
+        SphereOrientError: inputs missing, unreadable or inconsistent; with `textured`, no texture map.
     """
     experiment = source if isinstance(source, Experiment) else load_experiment(Path(source))
     if textured and experiment.texture_path is None:
@@ -113,7 +106,6 @@ def open_recording(
 
 
 def _chosen(experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:
-    """Return the names of the cameras to use, in the experiment's order."""
     known = list(experiment.movie_paths)
     wanted = known if cameras is None else list(cameras)
     unknown = [name for name in wanted if name not in known]

@@ -1,5 +1,3 @@
-"""One camera's part of an experiment: the pictures of its frames."""
-
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
@@ -14,37 +12,32 @@ from sphereorient.experiment.timeline import NONE
 from sphereorient.movies import Grey, Movie
 from sphereorient.trajectory import Reason
 
-EVERY = 4  # pixels: a fault of a whole picture shows in every fourth row and column
-GLARE_SHARE = 0.5  # of the pixels at full scale: such a picture is useless for the background
+EVERY = 4  # pixels: faults of whole pictures show in every fourth row and column
+GLARE_SHARE = 0.5  # share of saturated pixels that excludes a picture from the background
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraStream:
-    """A camera, its movie, and which of its pictures show the frames; made by `open_recording`, read by the stages."""
+    """A camera, its movie, and the picture of each frame; made by `open_recording`."""
 
     name: str
     camera: Camera
     movie: Movie
-    rows: NDArray[np.int64]  # (N,), the movie's own numbers of the frames; NONE where it has no picture
-    shown: NDArray[np.bool_] | None = None  # (H, W), False where something hides the ball; None: nowhere
+    rows: NDArray[np.int64]  # (N,), number in the movie, or NONE
+    shown: NDArray[np.bool_] | None = None  # (H, W), False where something hides the sphere; None: nowhere
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.rows)
 
     def pictures(self, first: int = 0, last: int | None = None) -> Iterator[tuple[Grey | None, Reason]]:
-        """Yield the pictures of frames first .. last - 1, counted from the first frame in use; None with the reason."""
+        """Yield the pictures of frames first .. last - 1, from the first frame in use, or None, with the reason."""
         rows = self.rows[first:last]
         for row, picture in zip(rows.tolist(), pictures_of(self.movie, rows), strict=True):
             why = Reason.MISSING if row == NONE else Reason.UNDECODABLE
             yield picture, why if picture is None else Reason.OK
 
     def spread(self, count: int) -> Grey:
-        """Return at most `count` readable pictures spread evenly over the frames, (n, H, W).
-
-        Raises:
-            MovieError: none of them is readable.
-        """
+        """Return at most `count` evenly spread readable pictures, (n, H, W); raise MovieError if there are none."""
         numbers = self.rows[self.rows != NONE].tolist()
         wanted = [numbers[k] for k in spread_frames(range(len(numbers)), count)]
         try:
@@ -59,27 +52,27 @@ class CameraStream:
 
 
 def spread_frames(frames: range, count: int) -> list[int]:
-    """Return at most `count` frame numbers, evenly spread over a range, ends included."""
+    """Return at most `count` evenly spread frame numbers of a range, ends included."""
     if len(frames) <= count:
         return list(frames)
     return [frames[int(i)] for i in np.linspace(0, len(frames) - 1, count).round()]
 
 
 def uniform(picture: Grey) -> bool:
-    """Return whether a picture has only one grey value: camera noise rules this out for any scene."""
+    """Return whether a picture has only one grey level."""
     some = picture[::EVERY, ::EVERY]
     return bool(some.min() == some.max())
 
 
 def pictures_of(movie: Movie, rows: NDArray[np.int64]) -> Iterator[Grey | None]:
-    """Yield pictures of a movie by their numbers (N,), None for NONE and for those that cannot be decoded."""
+    """Yield a movie's pictures by number (N,); None for NONE and undecodable pictures."""
     found = _read(movie, rows[rows != NONE].tolist())
     for row in rows.tolist():
         yield None if row == NONE else next(found)
 
 
 def _read(movie: Movie, numbers: Sequence[int]) -> Iterator[Grey | None]:
-    """Yield pictures by their numbers, consecutive ones in one pass."""
+    """Yield pictures by number, consecutive ones in one pass."""
     begin = 0
     for end in range(1, len(numbers) + 1):
         if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:

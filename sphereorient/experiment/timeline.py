@@ -1,4 +1,4 @@
-"""The time of each frame of an experiment, and which picture of each movie shows it."""
+"""Times of an experiment's frames, and the picture of each movie at each frame."""
 
 from __future__ import annotations
 
@@ -17,35 +17,34 @@ from sphereorient.movies import Movie
 Rows = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
-NONE = -1  # in `Timeline.rows`: the camera has no picture of the frame
-PAIR_STEPS = 0.5  # of the frame period: stamps of two cameras nearer than this are one instant
-LATE_STEPS = 0.05  # of the frame period: a larger median difference of the stamps is worth a remark
-EVEN_STEPS = 1e-3  # of the frame period: largest deviation of evenly spaced times
-ON_GRID = 0.02  # of the frame period: largest deviation of frames on a regular grid
-LONGEST_PAUSE = 50  # frame periods; the motion does not continue over longer ones
-TIMES_BYTES = 1 << 24  # largest table of times
+NONE = -1  # in `Timeline.rows`: no picture
+PAIR_STEPS = 0.5  # frame periods: nearer stamps of two cameras are one instant
+LATE_STEPS = 0.05  # frame periods: a larger median difference of stamps causes a remark
+EVEN_STEPS = 1e-3  # frame periods: tolerance of evenly spaced times
+ON_GRID = 0.02  # frame periods: tolerance of a regular grid
+LONGEST_PAUSE = 50  # frame periods; no motion continues over a longer pause
+TIMES_BYTES = 1 << 24
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Timeline:
     """N frames of an experiment; made by `timeline`."""
 
-    number: Rows  # (N,), of the frames, increasing; blocks begin at round ones
-    time_s: Floats  # (N,), s, increasing: the middle of the exposures
-    rows: Mapping[str, Rows]  # (N,) of each camera: the picture in its movie's own counting, NONE where it has none
-    remarks: tuple[str, ...] = ()  # warnings for the user
+    number: Rows  # (N,), frame numbers, increasing
+    time_s: Floats  # (N,), mid-exposure times, s, increasing
+    rows: Mapping[str, Rows]  # (N,) per camera: number in its movie, or NONE
+    remarks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.number)
 
     @property
     def frame_s(self) -> float:
-        """Median time between frames, s; NaN for a single one."""
+        """Median time between frames, s; NaN for a single frame."""
         return float(np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")
 
     def gridded(self) -> tuple[Timeline, Rows]:
-        """Resample onto a regular time grid, inserting missing frames; return it and the indices of the frames in it.
+        """Resample onto a regular grid, inserting missing frames; return it and the frames' indices in it.
 
         Raises:
             ExperimentError: the times lie on no regular grid.
@@ -73,15 +72,14 @@ class Timeline:
 
 
 def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
-    """Return the times of the frames of `frames:` or of all, and pair the pictures of the cameras.
+    """Return the times of the selected frames and the pictures of the cameras at each frame.
 
-    The time of a frame is its number / frame rate; with `times: FILE` the value in the file; with `times: movies` the
-    time stamp in the movie, and pictures of two cameras with the same stamp are one frame. Stamps of MKV are not used:
-    they are rounded to 1 ms. A movie that ends early has no pictures of the last frames, and a remark says so.
+    Times come from the frame rate, a table, or stamps of the movies; equal stamps of two cameras make one frame. MKV
+    stamps are not used: they are rounded to 1 ms.
 
     Raises:
-        ExperimentError: an unreadable table of times, or one of another length.
-        MovieError: no movie has the frames asked for, or a movie has no stamps with `times: movies`.
+        ExperimentError: unreadable table of times, or one of another length.
+        MovieError: a movie lacks frames, or time stamps with `times: movies`.
     """
     whole = _stamped(experiment, movies) if experiment.times == MOVIES_OWN else _counted(experiment, movies)
     if experiment.frames is None:
@@ -95,7 +93,6 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
 
 def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
-    """Pair pictures by their number."""
     there = {name: len(movie) - experiment.start.get(name, 0) for name, movie in movies.items()}
     subject = f"{experiment.path}, movies"
     if min(there.values()) <= 0:
@@ -125,10 +122,10 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
 
 def load_times(path: Path) -> Floats:
-    """Read a table of times, (N,), s: one a line; a heading and comments after # are skipped.
+    """Read a table of times, (N,), s, one per line; a heading and # comments are skipped.
 
     Raises:
-        ExperimentError: missing, too large, a line without a number, or times that do not increase.
+        ExperimentError: missing, too large, a line without a number, or times not increasing.
     """
     do = "write one time a line, in seconds, increasing"
     content = read_whole(path, TIMES_BYTES, "a table of times", ExperimentError, "correct times:")
@@ -145,7 +142,7 @@ def load_times(path: Path) -> Floats:
         try:
             values.append(float(text))
         except ValueError:
-            if not values and number == 1:  # a heading
+            if not values and number == 1:
                 continue
             name = f"{path}, line {number}"
             raise ExperimentError(refusal(name, expected="a number", got=repr(text[:40]), do=do)) from None
@@ -165,7 +162,6 @@ def _increasing(name: str, time_s: Floats, do: str) -> Floats:
 
 
 def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
-    """Pair pictures by their time stamps."""
     clocks: dict[str, Floats] = {}
     for name, movie in movies.items():
         start = experiment.start.get(name, 0)
@@ -176,7 +172,7 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
             got, do = f"{len(movie)}", "correct start:"
             raise MovieError(refusal(str(movie.path), expected=f"more than {start} frames", got=got, do=do))
         stamps = _increasing(f"{movie.path}, time stamps", movie.times_s, "write frame_rate:, or times: with a file")
-        # With start: each clock begins at that picture; without, all stamps count from the trigger.
+        # `start`: each clock begins at that picture; otherwise all stamps count from the trigger.
         clocks[name] = stamps[start:] - stamps[start] if experiment.start_given else stamps[start:]
     usual_s = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]) if clocks else [np.nan]))
     names = list(clocks)
@@ -206,13 +202,13 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
 
 def _paired(one: Floats, other: Floats, within_s: float) -> Rows:
-    """Pair increasing times nearer than `within_s`; (N, 2) indices in order of time, NONE without a partner."""
+    """Pair increasing times nearer than `within_s`; return (N, 2) indices in order of time, NONE without a partner."""
     after = np.searchsorted(other, one).clip(1, max(len(other) - 1, 1))
     low = np.clip(after - 1, 0, len(other) - 1)
     high = np.clip(after, 0, len(other) - 1)
     nearest = np.where(np.abs(other[high] - one) < np.abs(other[low] - one), high, low)
     near = np.abs(other[nearest] - one) <= within_s
-    # Two of `one` may have the same nearest neighbour in `other`: it is paired with the nearer one.
+    # Two times of `one` may share a nearest neighbour: the nearer one gets it.
     best = np.full(len(other), NONE)
     for k in np.flatnonzero(near):
         j = nearest[k]

@@ -1,4 +1,4 @@
-"""Where the ball is in a picture: background, blob, outline, gaps, and its position in the lab."""
+"""Locating the sphere: background, blob, outline, gaps, position in the lab."""
 
 from sphereorient.locate.background import Background
 from sphereorient.locate.find import Found, find_ball, sightings_of

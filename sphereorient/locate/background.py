@@ -1,5 +1,3 @@
-"""The background of a movie: the mean of evenly spread frames without the ball, and its noise."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -9,33 +7,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# The noise of a pixel is this quantile of its deviations, divided by the quantile of Gaussian noise in standard
-# deviations. About the mean of the movie: glittering things move a pixel in more frames than that, the passing ball in
-# fewer. About a given picture of the scene: a tenth of the frames shows the scene even where the ball stays long.
+# A pixel's noise is a quantile of its deviations over that of a unit normal. Measured mean: glitter is in more frames
+# than 1 - share, the sphere in fewer. Given scene: a tenth of the frames shows it where the sphere stays long.
 MEASURED_SHARE, MEASURED_SIGMAS = 0.8, 1.2816
 GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
-FEW = 10  # frames; with fewer, the quantile is meaningless and all pixels get the same noise
+FEW = 10  # frames; with fewer, all pixels get the same noise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Background:
-    """Mean picture and noise of one movie; made by `learn_background`, read by blob and outline."""
+    """Mean picture and noise of one movie; made by `learn_background`."""
 
     mean: NDArray[np.float32]  # (H, W), grey levels
-    noise: NDArray[np.float32]  # (H, W), robust standard deviation of each pixel about the mean, grey levels
-    full_scale: float  # grey level of a saturated pixel, 255 for 8 bit, 1023 for 10
-    shown: NDArray[np.bool_] | None = None  # (H, W), False where something that does not move hides the ball
+    noise: NDArray[np.float32]  # (H, W), robust sigma about the mean, grey levels
+    full_scale: float  # saturated grey level: 255 for 8 bit, 1023 for 10 bit
+    shown: NDArray[np.bool_] | None = None  # (H, W), False where something static hides the sphere
 
     @cached_property
     def typical_noise(self) -> float:
-        """Median of the pixels' noise, grey levels."""
+        """Median noise of the pixels, grey levels."""
         return float(np.median(self.noise))
 
     def difference(self, frame: NDArray[np.generic]) -> NDArray[np.float32]:
-        """Return |frame - background|, (H, W) float32, grey levels; 0 where the ball is hidden.
-
-        White paint is brighter and black paint often darker than the background: both belong to the ball.
-        """
+        """Return |frame - background|, (H, W) float32, grey levels; 0 where the sphere is hidden."""
         out: NDArray[np.float32] = np.abs(frame.astype(np.float32) - self.mean)
         if self.shown is not None:
             out[~self.shown] = 0
@@ -43,28 +37,24 @@ class Background:
 
 
 def measure_background(pictures: NDArray[Any], empty: NDArray[np.float32] | None = None) -> Background:
-    """Return the clipped mean and the noise of each pixel over the frames of a movie.
+    """Return the clipped mean and noise per pixel of evenly spread frames (n, H, W), uint8 or uint16.
 
-    The paper's plain mean (section III A) keeps 1/n of the ball's brightness wherever it passed, as much as black paint
-    differs from a dark wall; here, values more than four robust sigmas from the median are left out.
-
-    Args:
-        pictures: (n, H, W), evenly spread frames, uint8 or uint16.
-        empty: (H, W), a picture of the scene without the ball, if there is one; then only the noise is measured.
+    Values beyond four robust sigmas are left out: the plain mean (paper, section III A) keeps 1/n of the sphere. With
+    `empty` (H, W), the scene without the sphere, only the noise is measured.
     """
     full_scale = _full_scale(pictures)
     shape = pictures.shape[1:]
     mean, noise = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    for row in range(0, shape[0], 16):  # by strips: a float copy of all frames would be four times the frames
+    for row in range(0, shape[0], 16):  # strips: a float copy of all frames is four times their size
         these = np.s_[row : row + 16]
         given = None if empty is None else empty[these]
         mean[these], noise[these] = _statistics(pictures[:, these].astype(np.float32), given, full_scale)
     if empty is not None:
-        # A low quantile of integer grey levels is often 0: the noise is at least the typical one.
+        # A low quantile of integers is often 0: the typical noise is the lower limit.
         quiet = np.abs(pictures[:, ::8, ::8].astype(np.float32) - empty[::8, ::8])
         if len(pictures) >= FEW:
             noise = np.maximum(noise, np.median(_nan_quantile(quiet, MEASURED_SHARE)) / MEASURED_SIGMAS)
-        else:  # the ball itself would count as noise
+        else:  # here the sphere itself would count as noise
             noise = np.full(shape, max(1.4826 * np.median(quiet), _rounding(full_scale)), np.float32)
     return Background(mean=mean, noise=noise, full_scale=full_scale)
 
@@ -78,10 +68,7 @@ def _full_scale(pictures: NDArray[Any]) -> float:
 
 
 def without_ball(background: Background, pictures: NDArray[Any], covered: NDArray[np.bool_]) -> Background:
-    """Measure a background again without the pixels of the ball, `covered` (n, H, W), in the same `pictures`.
-
-    A pixel that is free in fewer than four frames keeps its values.
-    """
+    """Measure the pixels `covered` (n, H, W) again from the other frames; with under four they keep their values."""
     free = len(pictures) - covered.sum(axis=0)
     again = (free < len(pictures)) & (free >= 4)
     values = pictures[:, again].astype(np.float32)
@@ -92,14 +79,13 @@ def without_ball(background: Background, pictures: NDArray[Any], covered: NDArra
 
 
 def _rounding(full_scale: float) -> float:
-    """Return the rounding noise of a pixel, grey levels."""
     return float(full_scale / 255 / 12**0.5)
 
 
 def _statistics(
     values: NDArray[np.float32], given: NDArray[np.float32] | None, full_scale: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the clipped mean, or the given one, and the robust sigma over the first axis, ignoring NaN."""
+    """Return the clipped mean, or the given one, and the robust sigma over axis 0, ignoring NaN."""
     rounding = _rounding(full_scale)
     share, sigmas = (MEASURED_SHARE, MEASURED_SIGMAS) if given is None else (GIVEN_SHARE, GIVEN_SIGMAS)
     middle = _nan_quantile(values, 0.5) if given is None else given
@@ -112,8 +98,8 @@ def _statistics(
 
 
 def _nan_quantile(values: NDArray[np.float32], share: float) -> NDArray[np.float32]:
-    """Return the quantile over the first axis without NaN, nearest rank; np.nanquantile loops over the pixels."""
-    ordered = np.sort(values, axis=0)  # NaN last
+    """Return the quantile over axis 0 without NaN, nearest rank; np.nanquantile loops over pixels."""
+    ordered = np.sort(values, axis=0)
     count = np.isfinite(values).sum(axis=0)
     rank = np.clip(np.rint(share * (count - 1)), 0, None).astype(np.int64)
     return np.asarray(np.take_along_axis(ordered, rank[None], axis=0)[0])

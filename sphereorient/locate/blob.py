@@ -1,5 +1,3 @@
-"""Candidates for the ball: round blobs of about the expected size, ranked by variance and roundness."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,7 +11,7 @@ from sphereorient.locate.settings import LocateSettings
 
 @dataclass(frozen=True, kw_only=True)
 class Blob:
-    """Approximate position of the ball; made by `find_blobs`, read by outline."""
+    """Approximate position of the sphere; made by `find_blobs`."""
 
     u_px: float
     v_px: float
@@ -33,26 +31,16 @@ def _reduce(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
 def find_blobs(
     difference: NDArray[np.float32], noise: NDArray[np.float32], diameter_px: float, settings: LocateSettings
 ) -> list[Blob]:
-    """Find round blobs of about the expected diameter.
+    """Return at most `settings.blob_candidates` round blobs of about `diameter_px`, best first.
 
-    A difference of two box filters (fast approximations of Gaussians) on the reduced, clipped difference responds to
-    blobs of the ball's size; the merit of a maximum is the variance inside the disk times the share of the foreground
-    around it that lies inside.
-
-    Args:
-        difference: (H, W), |frame - background|, grey levels.
-        noise: (H, W), standard deviation of each background pixel, grey levels; large values hide glittering things.
-        diameter_px: expected diameter.
-        settings: of this room.
-
-    Returns:
-        At most `settings.blob_candidates` blobs, best first; none in a picture without foreground.
+    `difference` is |frame - background|, `noise` the background's sigma, (H, W), grey levels. The blob filter is a
+    difference of two box filters.
 
     Source: paper section III A.
     """
     factor = settings.reduction
     small = np.maximum(_reduce(difference - settings.noise_factor * noise, factor), 0)
-    # Clip near the ball's own brightness, so that a bright reflection does not dominate.
+    # Clip near the sphere's brightness: a bright reflection must not dominate.
     lit = small[small > 0]
     if lit.size == 0:
         return []
@@ -77,7 +65,7 @@ def find_blobs(
 
 
 def _judge(small: NDArray[np.float32], u: float, v: float, radius: float) -> tuple[float, float, float]:
-    """Centre a blob on the mean of its foreground and return (u, v, merit)."""
+    """Centre a blob on its foreground; return (u, v, merit)."""
     merit = 0.0
     for _ in range(2):
         reach = int(np.ceil(1.5 * radius))

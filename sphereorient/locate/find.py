@@ -1,5 +1,3 @@
-"""Finding the ball in single frames: background, blobs, outline, in this order."""
-
 from __future__ import annotations
 
 from collections.abc import Iterable
@@ -21,11 +19,7 @@ Found = tuple[Outline | None, Reason]
 def find_ball(
     frame: NDArray[np.generic], background: Background, diameter_px: float, settings: LocateSettings
 ) -> Found:
-    """Find the outline of the ball in one frame (H, W), or the reason why it has none.
-
-    Returns:
-        The outline and `Reason.OK`, or None and `NOT_FOUND` (no blob of that size), `OUTLINE` (no circle that enough
-        directions support), `DARK` or `SATURATED`.
+    """Return the outline in a frame (H, W) and `OK`, or None and `NOT_FOUND`, `OUTLINE`, `DARK` or `SATURATED`.
 
     Source: paper section III A.
     """
@@ -36,7 +30,7 @@ def find_ball(
         outline = fit_outline(difference, background.typical_noise, blob, diameter_px, settings, background.shown)
         if outline is not None and (best is None or _likelier(outline, best, settings)):
             best = outline
-        # The best blob usually is the ball; the others are tried only if its rim is incomplete.
+        # Usually the first blob; others are tried only if its rim is incomplete.
         if best is not None and best.painted and best.coverage >= max(settings.coverage_min, 0.5):
             break
     if best is None or best.coverage < settings.coverage_min:
@@ -46,7 +40,7 @@ def find_ball(
 
 
 def _likelier(one: Outline, other: Outline, settings: LocateSettings) -> bool:
-    """Compare two outlines: a painted and supported one is likelier the ball, then the better supported one."""
+    """Compare outlines: painted and supported ones first, then by coverage."""
     rank = [(each.painted and each.coverage >= settings.coverage_min, each.coverage) for each in (one, other)]
     return rank[0] > rank[1]
 
@@ -72,8 +66,7 @@ def _why_unreadable(
     outline: Outline,
     settings: LocateSettings,
 ) -> Reason:
-    """Return DARK or SATURATED for a ball that cannot be read, OK otherwise."""
-    half = int(0.7 * outline.radius_px)  # the square inside the disk
+    half = int(0.7 * outline.radius_px)  # square inside the disk
     height, width = frame.shape
     u, v = min(max(round(outline.u_px), 0), width - 1), min(max(round(outline.v_px), 0), height - 1)
     inside = np.s_[max(0, v - half) : v + half + 1, max(0, u - half) : u + half + 1]
@@ -85,7 +78,7 @@ def _why_unreadable(
 
 
 def sightings_of(found: Iterable[Found]) -> Sightings:
-    """Collect what `find_ball` found in consecutive frames."""
+    """Collect the results of `find_ball` in consecutive frames."""
     rows = list(found)
     table = torch.full((len(rows), 5), torch.nan, dtype=torch.float64)
     for k, (outline, _) in enumerate(rows):

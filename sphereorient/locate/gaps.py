@@ -1,4 +1,4 @@
-"""Outliers of the track in the picture replaced by a spline, and short gaps interpolated; both are flagged."""
+"""Outliers of outlines replaced by a spline, short gaps interpolated; both are flagged."""
 
 from __future__ import annotations
 
@@ -17,10 +17,7 @@ DEGREE = 3
 
 
 def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
-    """Replace outliers of one camera by a least-squares spline and fill short gaps.
-
-    Replaced and interpolated frames have a flag and no `outline_rms_px`. Longer gaps stay NaN: a sphere that left the
-    view is not an error.
+    """Replace outliers by a least-squares spline and fill short gaps, with flags and without rms; longer gaps stay NaN.
 
     Source: paper section III A.
     """
@@ -52,7 +49,7 @@ def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
 
 
 def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArray[np.int64]]:
-    """Return runs of frame numbers with gaps of at most `gap_frames_max`, each from a known to a known frame."""
+    """Return runs of frame numbers with gaps of at most `gap_frames_max`; the ends are known frames."""
     at = np.flatnonzero(known)
     if not len(at):
         return []
@@ -63,16 +60,12 @@ def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArr
 def robust_spline(
     frame: NDArray[np.int64], value: NDArray[np.float64], settings: LocateSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Fit a least-squares cubic spline to values (n, D), px, at increasing frame numbers (n,), without outliers.
-
-    Returns:
-        The spline at the frames (n, D), and the outliers (n,) bool: values with an outlier in any component.
-    """
+    """Return a robust cubic spline (n, D) of values (n, D), px, at frames (n,), and the outliers (n,) bool."""
     outlier = np.zeros(len(frame), bool)
     fitted = value.copy()
     for _ in range(5):
         good = ~outlier
-        if good.sum() < 4 * (DEGREE + 1):  # too few to distinguish an outlier from motion
+        if good.sum() < 4 * (DEGREE + 1):  # too few to separate outliers from motion
             return value.copy(), np.zeros(len(frame), bool)
         fitted = _spline(frame[good], value[good], settings.spline_knot_frames)(frame)
         deviation = np.abs(fitted - value)
@@ -85,10 +78,9 @@ def robust_spline(
 
 
 def _spline(x: NDArray[np.int64], y: NDArray[np.float64], spacing: int):  # type: ignore[no-untyped-def]
-    """Return a cubic least-squares spline with inner knots `spacing` frames apart."""
     inner = np.arange(x[0] + spacing, x[-1] - spacing / 2, spacing, dtype=float)
     counts = np.histogram(x, np.concatenate([[x[0]], inner, [x[-1] + 1]]))[0]
-    # Schoenberg and Whitney: a knot needs data between its neighbours.
+    # Schoenberg and Whitney: each knot needs data nearby.
     inner = inner[(counts[:-1] >= DEGREE + 1) & (counts[1:] >= DEGREE + 1)]
     knots = np.concatenate([[x[0]] * (DEGREE + 1), inner, [x[-1]] * (DEGREE + 1)]).astype(float)
     return make_lsq_spline(x.astype(float), y, knots, k=DEGREE)

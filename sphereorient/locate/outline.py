@@ -1,5 +1,3 @@
-"""The ball's outline with sub-pixel accuracy: edges, the circle with the most support, a robust fit."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -11,43 +9,42 @@ from numpy.typing import NDArray
 from sphereorient.locate.blob import Blob
 from sphereorient.locate.settings import LocateSettings
 
-DIRECTIONS = 72  # bins of 5 degrees in which the support of a circle is counted
-BEYOND = 1.0  # weight of a rim point beyond a circle against one on it
-NOISE_FLOOR = 2.0  # below so many sigmas the root is linear, so that noise is not amplified
-NOISE_STEEPNESS = 0.28  # times the root of the noise: steepness of stabilised noise at one pixel of ten thousand
-LEAST_RIM = 0.25  # of all directions: least denominator of the coverage, however much of the rim is hidden
-NEAR_HIDDEN_PX = 3  # from the border of the mask: edges there do not belong to the rim
-PAINTED = 0.15  # least variance of the ball, as a share of the largest variance in the window
+DIRECTIONS = 72  # bins of 5 degrees for a circle's support
+BEYOND = 1.0  # weight of a rim point outside a circle relative to one on it
+NOISE_FLOOR = 2.0  # the root is linear below this many sigmas: noise is not amplified
+NOISE_STEEPNESS = 0.28  # times root noise: steepness of stabilised noise at one pixel in 10^4
+LEAST_RIM = 0.25  # least denominator of the coverage, share of all directions
+NEAR_HIDDEN_PX = 3  # edges this near to the mask do not belong to the rim
+PAINTED = 0.15  # least variance of the sphere, share of the window's largest
 BESIDE, NEAR_RIM = (
     0.1,
     1.1,
-)  # share of the disk: more foreground beside it is another object; radii: halo
+)  # most foreground beside the sphere, share of the disk; radii: halo
 SET_ASIDE = 2  # other round objects whose rims are removed
-PROFILES = 180  # radial profiles of the sub-pixel fit; more sample the same pixels again
+PROFILES = 180  # radial profiles; more sample the same pixels again
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outline:
-    """The circle fitted to the rim of a ball; made by `fit_outline`."""
+    """Circle fitted to the limb; made by `fit_outline`."""
 
     u_px: float
     v_px: float
     radius_px: float
-    rms_px: float  # distance of the supporting edges from the circle
-    coverage: float  # share of the visible directions that have a supporting edge
-    painted: bool = True  # whether it holds more than one grey
+    rms_px: float  # distance of supporting edges from the circle
+    coverage: float  # share of the visible directions with a supporting edge
+    painted: bool = True  # more than one grey inside
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Edges:
-    """Edge pixels with the unit vector from dark to bright."""
+    """Edge pixels (E, 2), px, and unit vectors from dark to bright (E, 2)."""
 
-    point: NDArray[np.float64]  # (E, 2), px
-    inward: NDArray[np.float64]  # (E, 2)
+    point: NDArray[np.float64]
+    inward: NDArray[np.float64]
 
 
 def _edge_points(window: NDArray[np.float32], steepness: float) -> _Edges:
-    """Return the Canny edges of a blurred window, in window pixels."""
     du = cv2.Scharr(window, cv2.CV_32F, 1, 0) / 32
     dv = cv2.Scharr(window, cv2.CV_32F, 0, 1) / 32
     scale = 8192 / max(float(np.abs(du).max()), float(np.abs(dv).max()), 1e-6)
@@ -62,7 +59,7 @@ def _edge_points(window: NDArray[np.float32], steepness: float) -> _Edges:
 
 
 def _in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """Return which points (n, 2), window px, are not near the mask, (n,)."""
+    """Return which points (n, 2), window px, are away from the mask, (n,)."""
     if clear is None:
         return np.ones(len(place), bool)
     limit = np.array(clear.shape[::-1]) - 1
@@ -71,7 +68,7 @@ def _in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_] | None) -
 
 
 def _rim_in_the_clear(circle: NDArray[np.float64], clear: NDArray[np.bool_] | None) -> float:
-    """Return the number of directions in which the rim of a circle is not near the mask."""
+    """Return the number of directions in which the rim is away from the mask."""
     if clear is None:
         return DIRECTIONS
     angle = (np.arange(DIRECTIONS) + 0.5) * (2 * np.pi / DIRECTIONS)
@@ -80,7 +77,7 @@ def _rim_in_the_clear(circle: NDArray[np.float64], clear: NDArray[np.bool_] | No
 
 
 def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return circles (n, 3: u, v, r) through triples of points (n, 3, 2); NaN for collinear ones."""
+    """Return circles (n, 3: u, v, r) through point triples (n, 3, 2); NaN if collinear."""
     a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     cross = 2 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -90,11 +87,7 @@ def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _support(circles: NDArray[np.float64], edges: _Edges, tolerance: float) -> NDArray[np.float64]:
-    """Return the support of circles: directions with an edge on the circle, less half of those with one just outside.
-
-    An edge supports a circle if it lies on it and falls outwards along the radius. The edges of the rim are the
-    outermost: a circle through texture edges has more edges of the ball outside.
-    """
+    """Count directions with an edge on the circle, less half of those with one just outside: the rim is outermost."""
     away = edges.point[None] - circles[:, None, :2]
     distance = np.linalg.norm(away, axis=2)
     radial = -(away * edges.inward[None]).sum(2) / np.maximum(distance, 1e-9) > 0.8
@@ -111,11 +104,8 @@ def _support(circles: NDArray[np.float64], edges: _Edges, tolerance: float) -> N
 
 
 def _painted(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
-    """Return whether the variance inside a circle is not much less than in squares of its size elsewhere.
-
-    An object before or beside the ball may be as round and as large, with a more complete rim; but it has one colour.
-    """
-    side = max(3, round(2**0.5 * circle[2]) | 1)  # of the square within the circle
+    """Return whether the variance inside a circle is near the window's largest: objects of one colour have less."""
+    side = max(3, round(2**0.5 * circle[2]) | 1)
     mean, square = (
         cv2.boxFilter(part, -1, (side, side), borderType=cv2.BORDER_REPLICATE) for part in (window, window**2)
     )
@@ -126,7 +116,7 @@ def _painted(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
 
 
 def _alone(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
-    """Return whether there is no foreground outside a circle: then it may be a ball of one colour."""
+    """Return whether there is no foreground outside a circle, which then may be a sphere of one colour."""
     row, column = np.ogrid[: window.shape[0], : window.shape[1]]
     away = np.hypot(row - circle[1], column - circle[0]) / circle[2]
     inside = away < 1
@@ -137,17 +127,16 @@ def _alone(window: NDArray[np.float32], circle: NDArray[np.float64]) -> bool:
 def _best_circle(
     edges: _Edges, radius_range: tuple[float, float], tolerance: float, tries: int = 400
 ) -> NDArray[np.float64] | None:
-    """Return the circle of an allowed size with the most support, from seeded random triples (RANSAC)."""
+    """Return the best supported circle of an allowed size (RANSAC, fixed seed)."""
     if len(edges.point) < 8:
         return None
-    # A fixed seed: the same picture gives the same circle.
     choice = np.random.default_rng(0).integers(0, len(edges.point), (4 * tries, 3))
     circles = _circles_through(edges.point[choice])
     good = np.isfinite(circles).all(1) & (circles[:, 2] > radius_range[0]) & (circles[:, 2] < radius_range[1])
     circles = circles[good]
     if not len(circles):
         return None
-    # All three edges must fall outwards: most triples of texture edges fail this cheap test.
+    # Cheap test first: all three edges must fall outwards.
     away = edges.point[choice[good]] - circles[:, None, :2]
     outwards = -(away * edges.inward[choice[good]]).sum(2) / circles[:, 2:3] > 0.8
     circles = circles[outwards.all(1)][:tries]
@@ -160,7 +149,7 @@ def _best_circle(
 def _ball_circle(
     edges: _Edges, window: NDArray[np.float32], radius_range: tuple[float, float], tolerance: float
 ) -> tuple[NDArray[np.float64] | None, bool]:
-    """Return the best circle that may be the ball, and whether it is painted; rims of other objects are removed."""
+    """Return the best circle that may be the sphere, and whether it is painted; remove rims of other objects."""
     for _ in range(SET_ASIDE + 1):
         circle = _best_circle(edges, radius_range, tolerance)
         painted = circle is not None and _painted(window, circle)
@@ -178,15 +167,9 @@ def _radial_edges(
     steepness: float,
     clear: NDArray[np.bool_] | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Find the outermost steep fall along radial profiles about a circle, with sub-pixel accuracy.
-
-    The outermost, not the steepest: texture edges inside are often steeper than the rim.
-
-    Returns:
-        Of profiles with such a fall: unit direction (n, 2), signed distance from the circle (n,), px, steepness (n,).
-    """
+    """Return direction (n, 2), offset (n,), px, and steepness (n,) of outermost falls; inner edges may be steeper."""
     step = 0.5
-    # Two samples to each side of a fall are needed, however small the circle.
+    # A fall needs two samples on each side.
     offset = np.arange(-max(reach[0], 2 * step), max(reach[1], 2 * step) + step / 2, step)
     angle = np.arange(PROFILES) * (2 * np.pi / PROFILES)
     outward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -199,7 +182,7 @@ def _radial_edges(
         borderMode=cv2.BORDER_REPLICATE,
     )
     fall = np.asarray(cv2.blur(profile[:, :-2] - profile[:, 2:], (3, 1)) / (2 * step), np.float32)
-    # A maximum within 1 px to both sides: interpolation makes the tail of the blurred rim ripple.
+    # Maximum within 1 px: interpolation ripples the tail of the blurred rim.
     peak = (fall >= cv2.dilate(fall, np.ones((1, 5), np.uint8))) & (fall > steepness)
     peak[:, [0, -1]] = False
     last = peak.shape[1] - 1 - peak[:, ::-1].argmax(1)
@@ -217,20 +200,16 @@ def _radial_edges(
 def _consensus(
     outward: NDArray[np.float64], offset: NDArray[np.float64], trust: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.float64]:
-    """Return the shift (du, dv, dr) of a circle on which most rim points agree, from seeded random triples.
-
-    Where black paint hides the rim, the outermost fall is a texture edge further inside. Such outliers are one-sided: a
-    mean or a median would shrink the circle; the largest consensus set does not.
-    """
+    """Return the shift (du, dv, dr) with most support: outliers lie inside, so that means and medians are biased."""
     design = np.column_stack([outward, np.ones(len(outward))])
     choice = np.random.default_rng(0).integers(0, len(offset), (300, 3))
     triple = design[choice]
-    solvable = np.abs(np.linalg.det(triple)) > 0.2  # triples within about 60 degrees are ill-conditioned
+    solvable = np.abs(np.linalg.det(triple)) > 0.2  # triples within 60 degrees are ill-conditioned
     if not solvable.any():
         return np.zeros(3)
     moves = np.linalg.solve(triple[solvable], offset[choice[solvable]][..., None])[..., 0]
     residual = offset - moves @ design.T
-    # Nothing of the ball lies beyond its rim: points beyond a circle weigh more than points on it.
+    # The sphere ends at its rim: points outside weigh more than points on it.
     merit = (np.abs(residual) < tolerance) @ trust - BEYOND * ((residual > 2 * tolerance) @ trust)
     best: NDArray[np.float64] = moves[int(merit.argmax())]
     return best
@@ -243,7 +222,6 @@ def _fit_circle(
     steepness: float,
     clear: NDArray[np.bool_] | None,
 ) -> Outline | None:
-    """Fit a circle to the sub-pixel rim points: consensus, then least squares with Tukey weights."""
     for reach in ((0.35 * circle[2], 0.25 * circle[2]), (0.1 * circle[2], 0.1 * circle[2])):
         outward, offset, fall = _radial_edges(window, circle, reach, steepness, clear)
         if len(offset) < 12:
@@ -288,23 +266,12 @@ def fit_outline(
     settings: LocateSettings,
     shown: NDArray[np.bool_] | None = None,
 ) -> Outline | None:
-    """Fit the circle of a ball near a blob.
+    """Return the outline near a blob, picture px; None if no circle of an allowed size is supported.
 
-    Robust against texture edges (not on one circle), bubbles (few directions), and black paint before a dark background
-    (missing directions).
+    `difference` (H, W) is |frame - background| and `noise` its sigma, grey levels; `shown` (H, W) is False where
+    something hides the sphere. Robust to texture edges, bubbles and black paint on a dark background.
 
-    Args:
-        difference: (H, W), |frame - background|, grey levels.
-        noise: typical standard deviation of a background pixel, grey levels.
-        blob: approximate position.
-        diameter_px: expected diameter.
-        settings: of this room.
-        shown: (H, W), False where something hides the ball; None: nowhere.
-
-    Returns:
-        The outline in picture pixels, or None if no circle of an allowed size is supported.
-
-    Source: paper section III A (Canny edges and a circle fit); the robust part is ours.
+    Source: paper section III A (Canny edges, circle fit); the robust part is ours.
     """
     reach = int(np.ceil(0.5 * diameter_px * (1 + settings.diameter_tolerance) + 8))
     left, top = max(0, int(blob.u_px) - reach), max(0, int(blob.v_px) - reach)
@@ -317,8 +284,7 @@ def fit_outline(
         return None
     window = _stabilised(window, NOISE_FLOOR * noise, settings.edge_blur_px)
     contrast = float(np.percentile(window, 90))
-    # A step blurred by sigma is contrast / (sigma sqrt(2 pi)) steep.
-    # The floor keeps circles from being fitted to noise alone.
+    # A step blurred by sigma has steepness contrast / (sigma sqrt(2 pi)); the floor excludes noise.
     floor = NOISE_STEEPNESS * noise**0.5
     steepness = max(settings.edge_fraction * contrast / (settings.edge_blur_px * 2.5), floor)
     edges = _edge_points(window, steepness)

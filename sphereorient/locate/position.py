@@ -1,4 +1,4 @@
-"""Position of the sphere in the lab: by two rays if two cameras see it, by ray and size if one does."""
+"""Position of the sphere in the lab: from two rays, or from one ray and the radius."""
 
 from __future__ import annotations
 
@@ -18,39 +18,33 @@ NOT_MEASURED = int(Flag.POSITION_INTERPOLATED | Flag.POSITION_OUTLIER_REPLACED)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Positions:
-    """Centre of the sphere in the lab in N frames; made by `find_positions`."""
+    """Sphere centres in N frames; made by `find_positions`."""
 
-    position_lab_mm: Tensor  # (N, 3), NaN where no camera has a centre
-    covariance_mm2: Tensor  # (N, 3, 3), NaN where the position is not measured
+    position_lab_mm: Tensor  # (N, 3), NaN without a centre
+    covariance_mm2: Tensor  # (N, 3, 3), NaN if not measured
     gap_mm: Tensor  # (N,), distance of the two rays, NaN with one
-    flags: Tensor  # (N,) int64
+    flags: Tensor
 
     def for_motion(self) -> Tensor:
-        """Return positions for derivatives, (N, 3), mm: those from two rays if there are any, else all.
-
-        A distance from the size is a hundred times less accurate than one from two rays: switching between them would
-        look like a velocity.
-        """
+        """Return positions from two rays, or all if there are none, (N, 3), mm; a mixture would look like motion."""
         two_rays = torch.isfinite(self.gap_mm)
         return torch.where(two_rays[:, None] | ~two_rays.any(), self.position_lab_mm, torch.nan)
 
     @property
     def measured(self) -> Tensor:
-        """Frames whose position comes from outlines measured in them, (N,) bool."""
+        """Frames whose position comes from their own outlines, (N,) bool."""
         return torch.isfinite(self.position_lab_mm).all(-1) & ((self.flags & NOT_MEASURED) == 0)
 
 
 def find_positions(
     sightings: Mapping[str, Sightings], cameras: Mapping[str, Camera], diameter_mm: float | None
 ) -> Positions:
-    """Triangulate the sphere from the outlines of one or two cameras in the same N frames.
+    """Return the sphere's positions in N frames from the outlines of one or two cameras; in radii without a diameter.
 
-    If only one camera has the outline, the distance comes from its radius, is far less accurate, and the frame is
-    flagged `ONE_CAMERA`. If the diameter is None, lengths are in radii of the sphere. The standard deviation of a
-    centre per axis is the rms of its outline.
+    A centre's sigma is its outline's rms. With one outline the distance comes from its radius: flag `ONE_CAMERA`.
 
     Raises:
-        ExperimentError: two cameras and an unknown diameter: radii and mm would be mixed.
+        ExperimentError: two cameras and an unknown diameter.
 
     Source: paper section III A (triangulation).
     """
@@ -69,7 +63,6 @@ def find_positions(
         position = torch.where(placed.all(0)[:, None], crossing, alone)
     one = placed.sum(0) == 1
     across = sum(torch.where(ok[:, None, None], view.across, 0.0) for view, ok in zip(views, placed, strict=True))
-    # Distance from size: only where no second ray says better.
     along = sum(torch.where((ok & one)[:, None, None], view.along, 0.0) for view, ok in zip(views, placed, strict=True))
     flags = torch.zeros(len(position), dtype=torch.int64)
     for seen, ok in zip(sightings.values(), placed, strict=True):
@@ -82,26 +75,24 @@ def find_positions(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
-    """Position of the sphere by one camera."""
-
     rays: Rays  # (N), to the centre of the outline
-    from_size_mm: Tensor  # (N, 3), on the ray, at the distance by the radius
-    across: Tensor  # (N, 3, 3), information (1/mm^2) across the ray
-    along: Tensor  # (N, 3, 3), information along the ray, from the size
+    from_size_mm: Tensor  # (N, 3), on the ray, at the distance from the radius
+    across: Tensor  # (N, 3, 3), information across the ray, 1/mm^2
+    along: Tensor  # (N, 3, 3), information along the ray, from the radius
 
 
 def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
     rays = camera.rays(seen.centre_px)
     rim = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=seen.centre_px.dtype)
     limb = camera.rays(seen.centre_px[:, None] + rim * seen.radius_px[:, None, None])
-    # sin of the angle between the rays of centre and limb: the cross product is exact for small angles.
+    # Sine of the angle between the rays of centre and limb: exact for small angles.
     away = torch.linalg.cross(rays.direction_lab[:, None].expand_as(limb.direction_lab), limb.direction_lab)
     sine = away.norm(dim=-1).mean(1)
-    distance = radius_mm / sine  # from the point where the rays would meet
-    # Behind a window the rays begin apart: this part of the distance, over the angle, is subtracted.
+    distance = radius_mm / sine
+    # Behind a port the rays start apart: subtract this part of the distance.
     begun = torch.linalg.cross(rays.origin_lab_mm[:, None] - limb.origin_lab_mm, limb.direction_lab)
     before = (begun * away).sum(-1).mean(1) / sine.square()
-    per_px = distance * sine / seen.radius_px  # mm in space per px, at the sphere
+    per_px = distance * sine / seen.radius_px  # mm per px at the sphere
     sigma = seen.outline_rms_px * per_px
     outer = rays.direction_lab[:, :, None] * rays.direction_lab[:, None, :]
     view = torch.eye(3, dtype=outer.dtype)
@@ -115,7 +106,6 @@ def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
 
 
 def _inverse(information: Tensor) -> Tensor:
-    """Inverse of (N, 3, 3) where it exists, NaN elsewhere."""
     finite = torch.isfinite(information).all(-1).all(-1) & (torch.linalg.det(torch.nan_to_num(information)) > 0)
     view = torch.eye(3, dtype=information.dtype)
     inverse = torch.linalg.inv(torch.where(finite[:, None, None], information, view))

@@ -1,5 +1,3 @@
-"""One camera's scene: what it shows without the ball, and the expected size of the ball in it."""
-
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -22,41 +20,37 @@ from sphereorient.locate.find import find_ball
 from sphereorient.locate.outline import Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
 
-ROUNDS = 4  # iterations at most; each finds the ball in more frames, most movies need two
-RIM = 1.15  # of the radius: the ball's halo and shadow belong to it
+ROUNDS = 4  # most iterations; most movies need two
+RIM = 1.15  # of the radius: includes halo and shadow
 LOUD, LOUD_SHARE = 5.0, 0.1  # times the typical noise; share of such pixels in the disk that triggers `_quieter`
-CHANGE_SIGMAS = 0.6745 * 2**0.5  # median of the difference of two normal numbers, in their standard deviation
-CHANGES = 2.5  # times the typical scatter of a pixel: texture passes there
+CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in sigmas
+CHANGES = 2.5  # times a pixel's typical scatter: texture passes
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
-RING = 1.5  # of the radius: the median grey of the scene in this ring is taken as background behind the ball
-WINDOW = 5  # px of the median filter that removes single pixels
+RING = 1.5  # of the radius: its median grey replaces the background behind the sphere
+WINDOW = 5  # median filter against single pixels, px
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraScene:
-    """The scene of one camera; made by `find_scene`."""
+    """Background and expected diameter, px, of one camera; made by `find_scene`."""
 
     background: Background
-    diameter_px: float  # expected, of the ball
+    diameter_px: float
 
 
 def known_diameter_px(recording: Recording, name: str, settings: LocateSettings) -> float | None:
-    """Return the expected diameter of the ball in a camera; None where only the movie can show it.
-
-    Raises:
-        SettingsError: see `expected_diameter_px`.
-    """
+    """Return the expected diameter, px; None if only the movie can show it; raise as `expected_diameter_px` does."""
     if settings.diameter_px is None and recording.experiment.fixed and recording.experiment.diameter_mm is None:
         return None
     return settings.diameter_px or expected_diameter_px(name, recording.cameras, recording.experiment.diameter_mm)
 
 
 def find_scene(recording: Recording, stream: CameraStream, count: int, settings: LocateSettings) -> CameraScene:
-    """Estimate the background of one camera, from `count` frames or from the experiment's own picture.
+    """Return one camera's scene from `count` frames or from the given background.
 
     Raises:
-        ExperimentError: a ball that is said to be fixed does not turn in one place.
-        SettingsError: the ball's diameter is unknown.
+        ExperimentError: a sphere declared fixed does not rotate in one place.
+        SettingsError: unknown diameter.
     """
     empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     diameter_px = known_diameter_px(recording, stream.name, settings)
@@ -65,18 +59,16 @@ def find_scene(recording: Recording, stream: CameraStream, count: int, settings:
         diameter_px = diameter_px or 2 * fixed.outline.radius_px
         if empty is None:
             return CameraScene(background=fixed.scene, diameter_px=diameter_px)
-    assert diameter_px is not None  # a moving ball has one, or is refused
+    assert diameter_px is not None
     background = learn_background(stream.spread(count), diameter_px, settings, empty, stream.shown)
     return CameraScene(background=background, diameter_px=diameter_px)
 
 
 def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: float | None) -> float:
-    """Return the diameter of the sphere in the picture of camera `name`, if it is in the middle of the volume.
-
-    The middle is where the optical axes of two cameras pass nearest, or the lab origin for one camera.
+    """Return the sphere's diameter, px, at the middle of the volume: nearest point of two axes, or lab origin.
 
     Raises:
-        SettingsError: the diameter is unknown, or the single camera is at the lab origin (not calibrated).
+        SettingsError: diameter unknown, or a single uncalibrated camera.
     """
     camera = cameras[name]
     do = "set locate.diameter_px to the diameter of the ball in the picture"
@@ -86,7 +78,6 @@ def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: 
     if len(cameras) == 2:
         axes = [each.rays((torch.tensor(each.image_size, dtype=torch.float64) - 1) / 2) for each in cameras.values()]
         middle, _ = triangulate(axes[0], axes[1])
-    # Two points half a diameter to the sides, at right angles to the camera's axis.
     right_lab = camera.R_cam_lab[0] * diameter_mm / 2
     rim = camera.project(torch.stack([middle - right_lab, middle + right_lab]))
     diameter_px = float((rim[1] - rim[0]).norm())
@@ -103,17 +94,9 @@ def learn_background(
     empty: NDArray[np.float32] | None = None,
     shown: NDArray[np.bool_] | None = None,
 ) -> Background:
-    """Estimate the background of a movie.
+    """Estimate the background of frames (n, H, W): average, find the sphere, measure its pixels from other frames.
 
-    Average the frames, find the ball in them, and measure the pixels that it covers again from the other frames:
-    otherwise a ball that stays long in one region becomes part of the background there.
-
-    Args:
-        pictures: (n, H, W), evenly spread frames of one movie.
-        diameter_px: expected diameter of the ball.
-        settings: of this room.
-        empty: (H, W), a picture of the scene without the ball, if there is one; then only the noise is measured.
-        shown: (H, W), False where something that does not move hides the ball; None: nowhere.
+    With `empty` (H, W), a given background, only the noise is measured. `shown` is False where the sphere is hidden.
     """
     background = replace(measure_background(pictures, empty), shown=shown)
     if empty is not None:
@@ -123,7 +106,7 @@ def learn_background(
         covered = _covered(pictures, background, diameter_px, settings)
         background = without_ball(first, pictures, covered)
         found = int(covered.any(axis=(1, 2)).sum())
-        if found <= before or found == len(pictures):  # nothing new to learn
+        if found <= before or found == len(pictures):
             break
         before = found
     return background
@@ -132,11 +115,7 @@ def learn_background(
 def _quieter(
     background: Background, pictures: NDArray[Any], diameter_px: float, settings: LocateSettings
 ) -> Background:
-    """Limit the noise of a pixel to its change from frame to frame, if the ball is not found otherwise.
-
-    With a given scene, a pixel that the ball never leaves scatters by the contrast of the ball, which hides a blurred
-    ball. Glittering things change from frame to frame and stay hidden.
-    """
+    """Limit the noise to the frame-to-frame change if a sphere that never leaves its pixels is not found otherwise."""
     loud = background.noise > LOUD * background.typical_noise
     if loud.sum() < LOUD_SHARE * np.pi / 4 * diameter_px**2:
         return background
@@ -153,7 +132,7 @@ def _quieter(
 def _covered(
     pictures: NDArray[Any], background: Background, diameter_px: float, settings: LocateSettings
 ) -> NDArray[np.bool_]:
-    """Return the pixels of the ball in each of (n, H, W) frames; all False where it was not found."""
+    """Return the sphere's pixels in frames (n, H, W); all False where it was not found."""
     covered = np.zeros(pictures.shape, bool)
     for picture, mask in zip(pictures, covered, strict=True):
         outline, _ = find_ball(picture, background, diameter_px, settings)
@@ -169,7 +148,7 @@ def _covered(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FixedBall:
-    """Outline of a fixed ball in all frames, and the scene, with a guess behind the ball; made by `fixed_ball`."""
+    """Outline of a fixed sphere, and the background with a guess behind it; made by `fixed_ball`."""
 
     outline: Outline
     scene: Background
@@ -181,13 +160,9 @@ def fixed_ball(
     empty: NDArray[np.float32] | None = None,
     shown: NDArray[np.bool_] | None = None,
 ) -> FixedBall:
-    """Find a ball that rotates about a fixed centre: its pixels change from frame to frame, the scene does not.
+    """Find a rotating sphere with a fixed centre in frames (n, H, W): only its pixels change.
 
-    Args:
-        pictures: (n, H, W), evenly spread frames of one movie.
-        locating: how outlines are found.
-        empty: (H, W), a picture of the scene without the ball, if there is one.
-        shown: (H, W), False where something hides the ball; None: nowhere.
+    `empty` (H, W) is the scene without the sphere; `shown` (H, W) is False where something hides the sphere.
 
     Raises:
         ExperimentError: nothing round changes.
@@ -205,7 +180,7 @@ def fixed_ball(
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     inside = (labels == largest).astype(np.uint8)
     guess = locating.diameter_px or _diameter(inside, shown is not None)
-    change = np.minimum(scatter, np.percentile(scatter[inside > 0], 30))  # the rim without the texture
+    change = np.minimum(scatter, np.percentile(scatter[inside > 0], 30))  # limb without texture
     blob = Blob(u_px=float(centres[largest][0]), v_px=float(centres[largest][1]), merit=1.0)
     outline = fit_outline(change, 0.2 * usual, blob, guess, locating, shown)
     if outline is None or outline.coverage < locating.coverage_min:
@@ -215,7 +190,6 @@ def fixed_ball(
 
 
 def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
-    """Return the diameter of a region by its area, or by its enclosing circle if a part may be hidden."""
     if hidden:
         return 2 * float(cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1])
     return 2 * float(np.sqrt(inside.sum() / np.pi))

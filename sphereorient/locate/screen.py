@@ -1,4 +1,4 @@
-"""Frames that cannot show the ball: unreadable, dark, saturated or repeated pictures."""
+"""Screening of frames: unreadable, dark, saturated or repeated pictures."""
 
 from __future__ import annotations
 
@@ -15,33 +15,28 @@ from sphereorient.trajectory import Reason
 
 Picture = NDArray[Any]
 
-LIT_NOISES = 10.0  # a lit pixel of the background is this many noise sigmas above black
-LIT_SHARE = 0.1  # of the pixels; in a darker scene a failed lamp cannot be noticed
-DARK_LEVEL = 0.3  # of the background's grey level: darker is unlit
-DARK_SHARE = 0.95  # of the lit pixels
-WHITE_SHARE = 0.5  # of all pixels
+LIT_NOISES = 10.0  # a lit background pixel is this many noise sigmas above black
+LIT_SHARE = 0.1  # least share of lit pixels; in a darker scene a failed lamp is invisible
+DARK_LEVEL = 0.3  # darker than this share of the background is unlit
+DARK_SHARE = 0.95  # share of the lit pixels
+WHITE_SHARE = 0.5  # share of all pixels
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
-    """The picture of one camera at one instant; made by `screened_frames`, read by the trackers."""
+    """Picture of one camera at one instant; made by `screened_frames`."""
 
     picture: Picture  # (H, W); zeros if missing
     reason: Reason = Reason.OK  # OK, or why it cannot be used
 
     @property
     def usable(self) -> bool:
-        """Whether the picture may show the ball."""
+        """Whether the picture may show the sphere."""
         return self.reason is Reason.OK
 
 
 def screened(picture: Picture, before: Picture | None, background: Background) -> Frame:
-    """Check whether a picture (H, W) may show the ball.
-
-    Returns:
-        The picture with `DARK` (black, or a lit scene without light), `SATURATED` (white), `REPEATED` (equal to the
-        picture before: noise never repeats), or `OK`.
-    """
+    """Return the picture (H, W) with `OK`, `DARK` (no light), `SATURATED` (white) or `REPEATED` (equal to `before`)."""
     some = picture[::EVERY, ::EVERY]
     empty = background.mean[::EVERY, ::EVERY]
     if uniform(picture):
@@ -60,10 +55,7 @@ def screened(picture: Picture, before: Picture | None, background: Background) -
 def screened_frames(
     stream: CameraStream, background: Background, first: int = 0, last: int | None = None
 ) -> Iterator[Frame]:
-    """Yield frames first .. last - 1 of a camera, counted from the first frame in use, with their reason.
-
-    The reason depends on the frame and the one before only, so that chunks agree with the whole.
-    """
+    """Yield frames first .. last - 1 from the first in use; reasons depend on this and the previous frame only."""
     lead = min(first, 1)
     blank = np.zeros(stream.movie.frame_shape, stream.movie.dtype)
     before: Picture | None = None

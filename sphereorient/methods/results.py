@@ -19,7 +19,7 @@ from sphereorient.follow import Appearance
 from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping.record import LearntMap
-from sphereorient.motion import Motion, Smoothed
+from sphereorient.motion import Motion, Smoothed, rates_of
 from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
@@ -68,18 +68,7 @@ def paper_track(
         position_cov=positions.covariance_mm2.numpy(),
         orientation=fused.R_lab_body.numpy(),
         orientation_cov=variance.numpy(),
-        velocity=moved.velocity_m_s.numpy(),
-        velocity_sigma=moved.velocity_sigma_m_s.numpy(),
-        acceleration=moved.acceleration_m_s2.numpy(),
-        acceleration_sigma=moved.acceleration_sigma_m_s2.numpy(),
-        omega_lab=moved.omega_lab_rad_s.numpy(),
-        omega_lab_sigma=moved.omega_lab_sigma_rad_s.numpy(),
-        omega_body=moved.omega_body_rad_s.numpy(),
-        omega_body_sigma=moved.omega_body_sigma_rad_s.numpy(),
-        alpha_lab=moved.alpha_lab_rad_s2.numpy(),
-        alpha_lab_sigma=moved.alpha_lab_sigma_rad_s2.numpy(),
-        alpha_body=moved.alpha_body_rad_s2.numpy(),
-        alpha_body_sigma=moved.alpha_body_sigma_rad_s2.numpy(),
+        **rates_of(moved),
         segment=fused.segment.numpy(),
         flags=(fused.flags | positions.flags).numpy().astype(np.uint32),
         cameras=dict(tracks),
@@ -146,18 +135,7 @@ def precise_track(
         position_smooth_cov=smoothed.position_cov_mm2.numpy(),
         orientation_smooth=smoothed.R_lab_body.numpy(),
         orientation_smooth_cov=smoothed.orientation_cov_rad2.numpy(),
-        velocity=smoothed.velocity_m_s.numpy(),
-        velocity_sigma=smoothed.velocity_sigma_m_s.numpy(),
-        acceleration=smoothed.acceleration_m_s2.numpy(),
-        acceleration_sigma=smoothed.acceleration_sigma_m_s2.numpy(),
-        omega_lab=smoothed.omega_lab_rad_s.numpy(),
-        omega_lab_sigma=smoothed.omega_lab_sigma_rad_s.numpy(),
-        omega_body=smoothed.omega_body_rad_s.numpy(),
-        omega_body_sigma=smoothed.omega_body_sigma_rad_s.numpy(),
-        alpha_lab=smoothed.alpha_lab_rad_s2.numpy(),
-        alpha_lab_sigma=smoothed.alpha_lab_sigma_rad_s2.numpy(),
-        alpha_body=smoothed.alpha_body_rad_s2.numpy(),
-        alpha_body_sigma=smoothed.alpha_body_sigma_rad_s2.numpy(),
+        **rates_of(smoothed),
         segment=chosen.segment.numpy(),
         flags=flags.numpy().astype(np.uint32),
         confidence=chosen.probability.numpy(),

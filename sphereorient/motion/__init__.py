@@ -6,9 +6,10 @@ from sphereorient.motion.estimate import ProcessNoise, ProcessPrior
 from sphereorient.motion.matern import Prior
 from sphereorient.motion.measure import Motion, measure_motion
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
-from sphereorient.motion.smooth import MeasuredPoses, Smoothed, smooth_motion
+from sphereorient.motion.smooth import RATE_UNITS, MeasuredPoses, Smoothed, rates_of, smooth_motion
 
 __all__ = [
+    "RATE_UNITS",
     "MeasuredPoses",
     "Motion",
     "MotionSettings",
@@ -23,6 +24,7 @@ __all__ = [
     "noise_gain",
     "omega_from_markers",
     "omega_from_orientations",
+    "rates_of",
     "smooth_motion",
     "to_body",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, ProcessNoise, estimate
+from sphereorient.motion.measure import Motion
 from sphereorient.motion.path import PositionTrack, RotationTrack
 from sphereorient.motion.settings import SmoothSettings
 
@@ -228,3 +229,21 @@ def _put_turns(out: dict[str, Floats], rows: NDArray[np.int64], at: Estimate, fr
         out[f"{name}_lab_sigma_{unit}"][rows] = _sigma(C[:, part, part]) * scale
         out[f"{name}_body_{unit}"][rows] = (R.mT @ values[..., None])[..., 0] * scale
         out[f"{name}_body_sigma_{unit}"][rows] = _sigma(R.mT @ whole @ R) * scale
+
+
+RATE_UNITS = {
+    "velocity": "m_s",
+    "acceleration": "m_s2",
+    "omega_lab": "rad_s",
+    "omega_body": "rad_s",
+    "alpha_lab": "rad_s2",
+    "alpha_body": "rad_s2",
+}
+
+
+def rates_of(found: Motion | Smoothed) -> dict[str, Any]:
+    """Return velocity to alpha_body and their sigmas, (N, 3) each, under the names of a track."""
+    values = {name: getattr(found, f"{name}_{unit}").numpy() for name, unit in RATE_UNITS.items()}
+    return values | {
+        f"{name}_sigma": getattr(found, f"{name}_sigma_{unit}").numpy() for name, unit in RATE_UNITS.items()
+    }

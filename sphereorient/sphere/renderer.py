@@ -1,5 +1,3 @@
-"""The renderer of the painted sphere: lines of sight to paint and coverage, pixels, light."""
-
 from __future__ import annotations
 
 import math
@@ -16,57 +14,47 @@ from sphereorient.errors import CameraError, SettingsError, check_tail, refusal
 from sphereorient.sphere.texture import check_texture_shape, reduced_texture, sample_spline, sample_texture
 from sphereorient.sphere.view import smooth_positive, sphere_normals
 
-RIM = 0.02  # rounding of the limb in smooth pictures, radii^2: the least depth of a look-up is 0.1 radii
-SHADE = 0.02  # rounding of a lamp's cosine in smooth pictures: the light does not end at a kink
-RIM_POINTS = 16  # that show how far a sphere's picture reaches; between two of them it reaches 2 % further
-RIM_MARGIN = 1.04  # for that, and for the cap that a near camera sees larger (2 % at five radii)
-SAMPLES = 1 << 18  # lines of sight computed at once: more leave the cache
+RIM = 0.02  # rounding of the limb, radii^2: the least depth is 0.1 radii
+SHADE = 0.02  # rounding of a lamp's cosine: no kink in the light
+RIM_POINTS = 16  # rim points per sphere; between two of them the picture reaches 2 % further
+RIM_MARGIN = 1.04  # for these 2 %, and for the larger visible cap of a near camera (2 % at five radii)
+SAMPLES = 1 << 18  # rays computed at once: more leave the cache
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SphereSight:
-    """What lines of sight see of a sphere; made by `see_sphere`."""
+    """Paint and normals that rays see; made by `see_sphere`."""
 
-    paint: Tensor  # (..., P), grey of the map; beyond the limb, that of the nearest approach
-    normal: Tensor  # (..., P, 3), outward unit normals, frame of the lines
-    depth2: Tensor  # (..., P), 1 - (distance of the line from the centre, radii)^2: above 0 where it hits
+    paint: Tensor  # (..., P), grey of the map; beyond the limb, of the nearest approach
+    normal: Tensor  # (..., P, 3), outward unit normals, frame of the rays
+    depth2: Tensor  # (..., P), 1 - (distance of the ray from the centre, radii)^2: positive on a hit
 
     @property
     def distance_radii(self) -> Tensor:
-        """(..., P), distance of the lines from the centre."""
+        """Distance of the rays from the centre, (..., P), radii."""
         return (1.0 - self.depth2).clamp_min(1e-12).sqrt()
 
 
 def see_sphere(
     rays: Rays, centre: Tensor, R: Tensor, texture: Tensor, radius: float | Tensor = 1.0, *, smooth: bool = False
 ) -> SphereSight:
-    """Look up the paint that lines of sight see; every picture of a sphere is made from this.
+    """Return the paint that rays (..., P, 3) see on a map (H, 2 H); all rendering uses this function.
 
-    Args:
-        rays: lines of sight of P pixels, (..., P, 3), in any frame and unit.
-        centre: (..., 3), of the sphere, same frame and unit.
-        R: (..., 3, 3), body to that frame.
-        texture: (H, 2 H), looked up in its own dtype.
-        radius: () or (..., 1), same unit.
-        smooth: twice differentiable: a spline for the map, the limb rounded. Else bilinear and exact.
+    `R` (..., 3, 3) takes body components to the rays' frame; `centre` (..., 3) and `radius`, () or (..., 1), have its
+    unit. `smooth` is twice differentiable (spline, rounded limb); otherwise bilinear and exact.
     """
     check_tail("position_lab_mm", centre, 3)
     check_tail("R_lab_body", R, 3, 3)
     corner = RIM if smooth else 0.0
     normal, depth2 = sphere_normals(rays.origin_lab_mm, rays.direction_lab, centre[..., None, :], radius, corner)
-    # Rows: n @ R is R^T n, the normal in body components.
     paint = (sample_spline if smooth else sample_texture)(texture, (normal @ R).to(texture.dtype))
     return SphereSight(paint=paint.to(normal.dtype), normal=normal, depth2=depth2)
 
 
 def lambert(normal: Tensor, towards: Tensor, strength: Tensor | float, corner: float = 0.0) -> Tensor:
-    """Return the light (...) of lamps on matt surfaces.
+    """Return the light (...) on unit normals (..., 3) of Lambertian lamps in unit directions `towards` (..., K, 3).
 
-    Args:
-        normal: (..., 3), unit normals.
-        towards: (..., K, 3), unit directions to the lamps, same frame.
-        strength: of each lamp, (K,) or one number.
-        corner: width over which the shadow's edge is rounded, cosine.
+    `strength` is (K,) or one number; `corner` rounds the shadow's edge (width in cosine; 0 is exact).
     """
     cosine = normal @ towards.mT
     cosine = smooth_positive(cosine, corner) if corner > 0 else cosine.clamp_min(0)
@@ -76,26 +64,26 @@ def lambert(normal: Tensor, towards: Tensor, strength: Tensor | float, corner: f
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """How pixels integrate what lines of sight see."""
+    """How pixels integrate the sphere's picture."""
 
-    blur_px: float = 0.55  # standard deviation of the optics' Gaussian; the pixel's square comes on top
-    outside: float = 0.0  # grey beside the sphere: 0 as black paint, 1 as white paint
-    supersampling: int = 4  # lines of sight per pixel and axis
+    blur_px: float = 0.55  # sigma of the optics; the pixel's box is added
+    outside: float = 0.0  # background: 0 as black paint, 1 as white paint
+    supersampling: int = 4  # rays per pixel and axis
 
 
 class SphereRenderer(nn.Module):
-    """Pictures of a painted sphere, differentiable in orientation, position, radius and texture.
+    """Render a painted sphere, differentiable in orientation, position, radius and texture.
 
     Args:
-        texture: (H, 2 H), 0 black .. 1 white; an `nn.Parameter` stays one, anything else becomes a buffer.
-        radius_mm: of the sphere.
-        camera: whose full picture is rendered; None for the orthographic view along z (x right, y down).
-        size_px: side of the orthographic picture, which a sphere at the origin fills; see `orthographic_camera`.
-        sampling: blur, background, lines of sight per pixel.
+        texture: (H, 2 H), 0 black .. 1 white; an `nn.Parameter` is trained, anything else becomes a buffer.
+        radius_mm: sphere radius.
+        camera: camera of the picture; None for the orthographic view along z (x right, y down).
+        size_px: side of the orthographic picture, which a sphere at the origin fills.
+        sampling: blur, background grey, rays per pixel.
 
     Raises:
-        SettingsError: both a camera and a size, or neither; a radius that is not positive.
-        ShapeError: a texture that is not (H, 2 H).
+        SettingsError: not exactly one of camera and size_px, or a radius that is not positive.
+        ShapeError: texture is not (H, 2 H).
     """
 
     texture: Tensor
@@ -126,22 +114,17 @@ class SphereRenderer(nn.Module):
         self.sampling = sampling or Sampling()
 
     def forward(self, R_lab_body: Any, position_mm: Any = None, radius_mm: Tensor | None = None) -> Tensor:
-        """Render.
+        """Return pictures (..., H, W), 0 black paint .. 1 white paint, of spheres with orientation (..., 3, 3).
 
-        Args:
-            R_lab_body: (..., 3, 3), body to lab, or to the view without a camera.
-            position_mm: (..., 3), centre of the sphere; None for the origin.
-            radius_mm: (...), instead of the renderer's own.
-
-        Returns:
-            (..., H, W) in the dtype of R_lab_body, 0 black paint .. 1 white paint.
+        `R_lab_body` sets the dtype; without a camera it leads to the view. `position_mm` (..., 3) is the origin if
+        None.
 
         Raises:
-            CameraError: a sphere that is not wholly before the camera, or not wholly in the liquid.
+            CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
         """
         R = torch.as_tensor(R_lab_body, device=self.texture.device)
         check_tail("R_lab_body", R, 3, 3)
-        # A few mm less half a metre: single precision would move the picture.
+        # mm differences at half a metre: single precision would move the picture.
         exact = R.dtype if isinstance(self.camera, TelecentricCamera) else torch.float64
         position = torch.as_tensor((0.0,) * 3 if position_mm is None else position_mm).to(R.device, exact)
         check_tail("position_mm", position, 3)
@@ -152,14 +135,14 @@ class SphereRenderer(nn.Module):
         return picture.reshape(*shape, *picture.shape[1:])
 
     def _pictures(self, R: Tensor, position: Tensor, radius: Tensor) -> Tensor:
-        """Render K spheres, each in a window that its picture just fills, (K, H, W)."""
+        """Render K spheres in windows that fit them, (K, H, W)."""
         (width, height), sampling = self.camera.image_size, self.sampling
         samples = sampling.supersampling
-        middle_px = self.camera.project(position)  # (K, 2)
+        middle_px = self.camera.project(position)
         reach = reach_px(self.camera, position.detach(), float(radius.amax()) if len(radius) else 1.0)
         half = math.ceil(reach + 4 * sampling.blur_px) + 1
         size = 2 * half + 1
-        # Spheres may leave the picture: beyond its edges there is room for a window.
+        # Spheres may leave the picture: the canvas has room for a window beyond its edges.
         limit = torch.tensor([width, height], device=position.device)
         corner = (middle_px.detach().round().long() - half).clamp_min(-size).minimum(limit)
         fine_px = fine_pixels(size, samples).to(position)
@@ -171,7 +154,7 @@ class SphereRenderer(nn.Module):
         windows = [R.new_zeros(0, size, size)]
         for k in torch.split(torch.arange(len(R), device=R.device), max(1, SAMPLES // len(place))):
             rays = self.camera.rays(place + corner[k, None])
-            # The limb as wide as a fine sample: a step would count samples, and its derivative be noise.
+            # The limb is one sample wide: a step would have a noisy derivative.
             beside = self.camera.rays(middle_px[k, None].detach() + position.new_tensor([1.0 / samples, 0.0]))
             to_centre = position[k, None] - beside.origin_lab_mm
             fine_mm = torch.linalg.cross(beside.direction_lab, to_centre).norm(dim=-1).detach()
@@ -189,7 +172,7 @@ class SphereRenderer(nn.Module):
 
 
 def orthographic_camera(size_px: int, mm_px: float) -> TelecentricCamera:
-    """Return the orthographic view along lab z: x right, y down, the lab's origin in the middle of a square."""
+    """Return the orthographic camera along lab z: x right, y down, lab origin at the centre of a square picture."""
     return TelecentricCamera(
         image_size=(size_px, size_px),
         R_cam_lab=torch.eye(3, dtype=torch.float64),
@@ -200,22 +183,14 @@ def orthographic_camera(size_px: int, mm_px: float) -> TelecentricCamera:
 
 
 def fine_pixels(size_px: int, supersampling: int) -> Tensor:
-    """Return the middles of the fine samples along one axis, (size supersampling,) float64, px.
-
-    Whole numbers are pixel centres: the first pixel spans -0.5 .. 0.5.
-    """
+    """Return sample positions along one axis, (size supersampling,) float64, px; integers are pixel centres."""
     return (torch.arange(size_px * supersampling, dtype=torch.float64) + 0.5) / supersampling - 0.5
 
 
 def aperture_matrix(size_px: int, supersampling: int, sigma_px: float) -> Tensor:
-    """Return the exact weights of fine samples in pixels, (S, S supersampling) float64; picture = A fine A^T.
+    """Return weights A (S, S supersampling) float64, picture = A fine A^T, for a pixel box and a Gaussian `sigma_px`.
 
-    Args:
-        size_px: S, side of the picture.
-        supersampling: fine samples per pixel and axis.
-        sigma_px: standard deviation of the optics' Gaussian; 0 leaves the pixel's own square.
-
-    Source: a box of one pixel convolved with a Gaussian is the difference of two normal distribution functions.
+    Source: the convolution is a difference of two normal distribution functions.
     """
     offset = fine_pixels(size_px, supersampling) - torch.arange(size_px, dtype=torch.float64)[:, None]
     if sigma_px > 0:
@@ -228,7 +203,7 @@ def aperture_matrix(size_px: int, supersampling: int, sigma_px: float) -> Tensor
 
 
 def rim_directions(camera: Camera, position_lab_mm: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return unit directions from centres (..., 3) to their rims, (..., count, 3), and the lines of sight (..., 3)."""
+    """Return unit directions from centres (..., 3) to the rim, (..., count, 3), and the rays' directions (..., 3)."""
     sight = camera.rays(camera.project(position_lab_mm)).direction_lab
     across = torch.linalg.cross(sight, camera.R_cam_lab[0].to(sight).expand_as(sight))
     across = across / across.norm(dim=-1, keepdim=True)
@@ -238,20 +213,15 @@ def rim_directions(camera: Camera, position_lab_mm: Tensor, count: int) -> tuple
 
 
 def reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> float:
-    """Return the greatest distance of spheres' rims from the pictures of their centres, px, 4 % for safety.
-
-    Args:
-        camera: any model, also behind a port.
-        position_lab_mm: (N, 3), centres.
-        radius_mm: of the spheres.
+    """Return the largest distance from projected centres to rims, px, plus 4 %, for centres (N, 3), mm, lab.
 
     Raises:
-        CameraError: a sphere that is not wholly before the camera, or not wholly in the liquid.
+        CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
     """
     if len(position_lab_mm) == 0:
         return 1.0
     rim, sight = rim_directions(camera, position_lab_mm, RIM_POINTS)
-    # The point nearest to the camera is not on the rim, but it too must be in the liquid.
+    # The point nearest to the camera is not on the rim but must be in the liquid too.
     offset_mm = radius_mm * torch.cat([RIM_MARGIN * rim, -sight[:, None]], dim=1)
     rim_px = camera.project(position_lab_mm[:, None] + offset_mm)
     reach = float((rim_px - camera.project(position_lab_mm)[:, None]).norm(dim=-1).max())
@@ -263,34 +233,25 @@ def reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> float
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PaintedBall:
-    """A ball, its paint and its light for `expected_grey`. One dtype; every tensor may require gradients."""
+    """Sphere with paint and light for `expected_grey`; one dtype, gradients allowed."""
 
     texture: Tensor  # (H, 2 H), 0 black paint .. 1 white paint
     radius_mm: float
-    edge_mm: float  # standard deviation of the optics' and the pixel's blur at the ball
-    ambient: Tensor  # (), light from everywhere
-    lamps_lab: Tensor  # (K, 3), towards each lamp, as long as it is bright (Lambert)
+    edge_mm: float  # sigma of the optics' and the pixel's blur, at the sphere
+    ambient: Tensor  # (), ambient light
+    lamps_lab: Tensor  # (K, 3), towards each lamp; the length is its brightness (Lambert)
     black: Tensor  # (), grey level of black paint in light 1
     white: Tensor  # (), grey level of white paint in light 1
-    behind: Tensor  # () or of the pixels' shape, grey level without the ball
+    behind: Tensor  # () or the pixels' shape, background grey level
 
 
 def expected_grey(rays: Rays, position_lab_mm: Tensor, R_lab_body: Tensor, ball: PaintedBall) -> Tensor:
-    """Return the grey levels of pixels, twice differentiable in cameras, pose, paint and light, limb included.
+    """Return grey levels (..., P) of rays (..., P, 3), twice differentiable in cameras, pose, paint and light.
 
-    Slower and simpler in its optics than `SphereRenderer`: one line of sight a pixel, the blur in the coverage alone.
-
-    Args:
-        rays: lines of sight of P pixels, (..., P, 3), of any camera; its parameters receive gradients through them.
-        position_lab_mm: (..., 3), centre of the ball.
-        R_lab_body: (..., 3, 3).
-        ball: paint and light.
-
-    Returns:
-        (..., P): shaded paint times the share of the pixel that the ball fills, and the background for the rest.
+    `position_lab_mm` is (..., 3), `R_lab_body` (..., 3, 3). Optically simpler than `SphereRenderer`: one ray per pixel.
     """
     seen = see_sphere(rays, position_lab_mm, R_lab_body, ball.texture, ball.radius_mm, smooth=True)
-    # Half of depth2 is the distance from the limb, in radii, near the limb; and it has no kink in the middle.
+    # 0.5 depth2 is the distance from the limb, radii, near the limb; it has no kink at the centre.
     coverage = torch.special.ndtr(0.5 * seen.depth2 * (ball.radius_mm / ball.edge_mm))
     strength = ball.lamps_lab.norm(dim=-1)
     light = ball.ambient + lambert(seen.normal, ball.lamps_lab / strength[:, None], strength, SHADE)

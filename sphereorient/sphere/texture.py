@@ -1,5 +1,3 @@
-"""The texture map: loading, reducing, and looking up by direction."""
-
 from __future__ import annotations
 
 import math
@@ -16,16 +14,16 @@ from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 
 PICTURE_BYTES = 100_000_000
-MOST_PIXELS = 2**25  # 8192 x 4096: finer than a ball of 2600 px shows it
-SPLINE_TEXELS = 2  # beyond the map's edges that a cubic spline reaches
-WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}  # grey level of white paint by type of picture
+MOST_PIXELS = 2**25  # 8192 x 4096: enough for a disk of 2600 px
+SPLINE_TEXELS = 2  # reach of a cubic spline beyond the map's edges
+WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}  # grey level of white paint
 
 
 def load_texture(path: Path) -> Tensor:
-    """Read an equirectangular grey map (docs/conventions.md) of 8 or 16 bit, (H, 2 H) float32, 0 black .. 1 white.
+    """Read an 8 or 16 bit equirectangular map (docs/conventions.md), (H, 2 H) float32, 0 black .. 1 white.
 
     Raises:
-        TextureError: the file is missing, no picture, not 2:1, smaller than 16 x 8, or of one grey only.
+        TextureError: missing, not a picture, not 2:1, smaller than 16 x 8, or of one grey.
     """
     name, do = f"texture {path}", "correct sphere.texture in the experiment"
     content = read_whole(path, PICTURE_BYTES, "a picture file", TextureError, do)
@@ -64,10 +62,7 @@ def load_texture(path: Path) -> Tensor:
 
 
 def reduced_texture(texture: Tensor, diameter_px: float) -> Tensor:
-    """Average a map (H, 2 H) by a whole factor, against aliasing in a disk of some diameter, px.
-
-    The result (h, 2 h) is at least as fine as one pixel at the disk's centre.
-    """
+    """Average a map (H, 2 H) by an integer factor to the resolution of a disk `diameter_px` wide, without aliasing."""
     circumference_px = math.pi * diameter_px
     factor = max(1, int(texture.shape[-1] / circumference_px))
     while texture.shape[-2] % factor:
@@ -76,14 +71,10 @@ def reduced_texture(texture: Tensor, diameter_px: float) -> Tensor:
 
 
 def texture_coordinates(direction_body: Tensor) -> tuple[Tensor, Tensor]:
-    """Return longitude -pi .. pi and latitude -pi/2 .. pi/2 of body directions (..., 3), rad, (...) each.
-
-    Gradients are finite at the poles. Directions may have any length but zero.
-    """
+    """Return longitude -pi .. pi and latitude -pi/2 .. pi/2, rad, of directions (..., 3); finite gradients at poles."""
     check_tail("direction_body", direction_body, 3)
     x, y, z = direction_body.unbind(-1)
-    # At the poles longitude is undefined and its gradient infinite; a direction nudged off the axis has a longitude,
-    # and without the gradients of x and y it has none of 1 / nudge, which would drown those of all other directions.
+    # At the poles the gradient of the longitude is infinite: replace x by a constant nudge and detach y.
     nudge = torch.finfo(direction_body.dtype).eps
     polar = (x.abs() < nudge) & (y.abs() < nudge)
     x, y = torch.where(polar, x.detach() + nudge, x), torch.where(polar, y.detach(), y)
@@ -91,14 +82,11 @@ def texture_coordinates(direction_body: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def sample_texture(texture: Tensor, direction_body: Tensor) -> Tensor:
-    """Look up the map at body directions, bilinear, continuous over the date line and the poles.
+    """Return the bilinear grey (...) of a map (H, 2 H) at body directions (..., 3) of any length but zero.
 
-    Args:
-        texture: (H, 2 H), dtype and device of the directions; differentiable.
-        direction_body: (..., 3), any length but zero; differentiable.
+    Differentiable, continuous over the date line and the poles; map and directions share dtype and device.
 
-    Source: docs/conventions.md (texture map); kornia's remap with align_corners=True, its default being wrong for
-    pixel coordinates.
+    Source: docs/conventions.md (texture map); kornia's remap needs align_corners=True for pixel coordinates.
     """
     column, row = _texel_coordinates(texture, direction_body)
     grey = kornia_transform.remap(
@@ -111,40 +99,33 @@ def sample_texture(texture: Tensor, direction_body: Tensor) -> Tensor:
 
 
 def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
-    """Look up the map by a cubic B-spline whose coefficients are the texels: twice continuously differentiable.
+    """Return the cubic B-spline grey (...) at body directions (..., 3); twice differentiable, except at the poles.
 
-    `sample_texture` has kinks at the texels' middles, and torch has no forward derivative of its look-up. The spline
-    blurs by 0.58 texels (sqrt(1/3), standard deviation along rows and columns), the bilinear look-up by 0.41.
-
-    Args:
-        texture: (H, 2 H), H at least 2, dtype and device of the directions; differentiable.
-        direction_body: (..., 3), any length but zero; differentiable but at the very poles.
-
-    Source: Unser 1999, Splines, a perfect fit, eq. 3.
+    Source: Unser 1999, Splines, a perfect fit, eq. 3; the texels are the coefficients: a blur of 0.58 texels.
     """
     column, row = _texel_coordinates(texture, direction_body)
     height, width = texture.shape
     closed = _continued(texture, SPLINE_TEXELS)
     first_column, columns = _spline_weights(column)
     first_row, rows = _spline_weights(row)
-    # The rounding of a longitude of pi may step one column over the edge.
+    # A longitude of pi may round to one column beyond the edge.
     first_column = first_column.clamp(-SPLINE_TEXELS, width + SPLINE_TEXELS - 4) + SPLINE_TEXELS
     first_row = first_row.clamp(-SPLINE_TEXELS, height + SPLINE_TEXELS - 4) + SPLINE_TEXELS
     steps = torch.arange(4, device=texture.device)
     at = (first_row[..., None, None] + steps[:, None]) * closed.shape[1] + first_column[..., None, None] + steps
-    texels = closed.reshape(-1)[at]  # (..., 4, 4)
+    texels = closed.reshape(-1)[at]
     return ((texels * columns[..., None, :]).sum(-1) * rows).sum(-1)
 
 
 def check_texture_shape(texture: Tensor) -> None:
-    """Refuse a tensor that is not one map (H, 2 H), H at least 2 (ShapeError)."""
+    """Raise ShapeError unless the tensor is one map (H, 2 H), H at least 2."""
     if texture.ndim != 2 or texture.shape[1] != 2 * texture.shape[0] or len(texture) < SPLINE_TEXELS:
         expected = f"(H, 2 H), H at least {SPLINE_TEXELS}"
         raise ShapeError(refusal("texture", expected=expected, got=str(tuple(texture.shape)), do="pass one map"))
 
 
 def _texel_coordinates(texture: Tensor, direction_body: Tensor) -> tuple[Tensor, Tensor]:
-    """Return column and row of body directions, (...) each; whole numbers are the texels' middles."""
+    """Return column and row (...) of body directions; integers are texel centres."""
     check_texture_shape(texture)
     height, width = texture.shape
     longitude, latitude = texture_coordinates(direction_body)
@@ -153,14 +134,14 @@ def _texel_coordinates(texture: Tensor, direction_body: Tensor) -> tuple[Tensor,
 
 
 def _continued(texture: Tensor, texels: int) -> Tensor:
-    """Continue the map by some texels: over a pole along the opposite meridian, and over the date line."""
+    """Pad the map across the poles (opposite meridian) and the date line."""
     beyond = texture.roll(texture.shape[1] // 2, 1)
     tall = torch.cat([beyond[:texels].flip(0), texture, beyond[-texels:].flip(0)])
     return torch.cat([tall[:, -texels:], tall, tall[:, :texels]], dim=1)
 
 
 def _spline_weights(place: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the first of the four texels about places (...) in texels, int64, and their weights (..., 4), sum 1."""
+    """Return the first of four texels (...) int64 and the weights (..., 4), sum 1."""
     below = place.detach().floor()
     t = place - below
     s = 1.0 - t

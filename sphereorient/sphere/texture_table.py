@@ -1,4 +1,4 @@
-"""Tables of the texture map over direction space: black and white for banks, value and slope for fits."""
+"""Tables of the texture map over directions: black and white for banks, value and slope for fits."""
 
 from __future__ import annotations
 
@@ -10,23 +10,22 @@ from torch import Tensor
 
 from sphereorient.sphere.texture import reduced_texture, sample_texture
 
-# Nodes of the 5-point and 3-point Gauss-Hermite rules for a unit normal, and their weights.
+# Nodes and weights of the 5-point and 3-point Gauss-Hermite rules for a unit normal.
 FIVE = (
     (-2.8569700138728, -1.3556261799742659, 0.0, 1.3556261799742659, 2.8569700138728),
     (0.011257411327721, 0.22207592200561264, 0.5333333333333333, 0.22207592200561264, 0.011257411327721),
 )
 THREE = ((-math.sqrt(3.0), 0.0, math.sqrt(3.0)), (1 / 6, 2 / 3, 1 / 6))
-BASE_RAD = 0.008  # blur of the finest table: below half a pixel of any disk that is resolved to 160 px
-CHUNK = 1 << 16  # directions looked up at once while a table is made
-SIDE = 512  # cells along each axis of the finest table: 0.4 degrees, 4 MB
-CELLS_A_BLUR = 3.0  # cells that a blur's standard deviation is wide at least, in tables coarser than the finest
+BASE_RAD = 0.008  # blur of the finest table: below half a pixel for disks up to 160 px
+CHUNK = 1 << 16  # directions per batch while a table is built
+SIDE = 512  # cells per axis of the finest table: 0.4 degrees, 4 MB
+CELLS_A_BLUR = 3.0  # least cells per blur sigma in coarser tables
 
 
 def octahedral_directions(side: int) -> Tensor:
-    """Return the unit direction at the middle of each cell of an octahedral map, (side^2, 3) float64, row by row.
+    """Return unit directions at the cell centres of an octahedral map, (side^2, 3) float64, row by row.
 
-    Source: the octahedron |x| + |y| + |z| = 1 unfolded into a square (Praun and Hoppe 2003): no poles, no
-    trigonometry, cells of nearly equal size.
+    Source: Praun and Hoppe 2003 (octahedron unfolded into a square: no poles, cells of nearly equal size).
     """
     at = (torch.arange(side, dtype=torch.float64) + 0.5) * (2.0 / side) - 1.0
     y, x = torch.meshgrid(at, at, indexing="ij")
@@ -37,8 +36,7 @@ def octahedral_directions(side: int) -> Tensor:
 
 
 def octahedral_cells(x: Tensor, y: Tensor, z: Tensor, side: int) -> Tensor:
-    """Return the cell (...) int64 that holds each direction; the components may have any common length."""
-    # The square's coordinates in cells, the middle at zero.
+    """Return the cell (...) int64 of each direction; directions may have any common length."""
     half = 0.5 * side
     scale = half / (x.abs() + y.abs() + z.abs())
     u, v = x * scale, y * scale
@@ -54,13 +52,9 @@ def octahedral_cells(x: Tensor, y: Tensor, z: Tensor, side: int) -> Tensor:
 
 
 class DirectionTable:
-    """Black and white paint in n^3 cells of the unit cube, for template banks: ten times faster than `DiskView.render`.
+    """Black and white paint of a map (H, 2 H), in `cells`^3 cells of the unit cube (128: 1 degree, 2 MB).
 
-    It differs only in pixels at the borders of patches, which serves to propose candidates and not to refine them.
-
-    Args:
-        texture: (H, 2 H); only sign(texture - 0.5) is kept.
-        cells: n; 128 is 1 degree, 2 MB.
+    Ten times faster than `DiskView.render`; pixels at patch borders differ: for candidates, not for refinement.
     """
 
     def __init__(self, texture: Tensor, cells: int = 128) -> None:
@@ -71,10 +65,9 @@ class DirectionTable:
         self.paint = torch.where(grey >= 0.5, 1.0, -1.0).to(torch.int8)
 
     def render(self, R_view_body: Tensor, normal_view: Tensor) -> Tensor:
-        """Look up orientations (K, 3, 3) at a view's normals (P, 3), float32: (K, P) int8, -1 black and +1 white."""
+        """Return paint (K, P) int8, -1 black, +1 white, of orientations (K, 3, 3) at view normals (P, 3), float32."""
         n = self.cells
-        # One product for all: rows of (R^T n) for x, y and z lie contiguous, (K, 3, P). The chunk keeps the
-        # temporaries in the cache, where the whole at once spends its time on page faults.
+        # One product; rows for x, y and z are contiguous, (K, 3, P). Chunks keep temporaries in the cache.
         columns = normal_view.T.contiguous() * (0.5 * n * (1.0 - 1e-6))
         out = torch.empty((len(R_view_body), len(normal_view)), dtype=torch.int8)
         for first in range(0, len(R_view_body), 32):
@@ -86,14 +79,9 @@ class DirectionTable:
 
 
 class TextureTable:
-    """The map convolved with a Gaussian on the sphere, as value and slope in cells of direction space.
+    """Texture map blurred by a Gaussian on the sphere (sigma `blur_rad`), as tangent planes in cells of directions.
 
-    Within a cell the map is its tangent plane: value and slope agree exactly, and the value's error is of second order
-    in the cell's size over the blur.
-
-    Args:
-        rows: (side^2, 4) float32, from `texture_table`.
-        blur_rad: the Gaussian's standard deviation, rad.
+    `rows` (side^2, 4) float32 come from `texture_table`; the value's error is of second order in cell size over blur.
     """
 
     def __init__(self, rows: Tensor, blur_rad: float) -> None:
@@ -102,14 +90,7 @@ class TextureTable:
         self.blur_rad = blur_rad
 
     def sample(self, direction_body: Tensor) -> tuple[Tensor, Tensor]:
-        """Look up value and slope.
-
-        Args:
-            direction_body: (L, 3, P) unit vectors, body frame; component by component, as products make them.
-
-        Returns:
-            Value (L, P), 0 black .. 1 white, and its gradient (L, 3, P) per rad, tangent to the sphere.
-        """
+        """Return values (L, P), 0 .. 1, and tangent gradients (L, 3, P), 1/rad, at unit body directions (L, 3, P)."""
         x, y, z = direction_body.unbind(1)
         cell = octahedral_cells(x, y, z, self.side)
         found = self.rows.index_select(0, cell.reshape(-1)).reshape(*cell.shape, 4)
@@ -118,17 +99,17 @@ class TextureTable:
         return value, slope
 
     def to(self, device: torch.device) -> TextureTable:
-        """Return the table on another device for `sample`; `blurred` works on the CPU."""
+        """Return the table on another device for `sample`; `blurred` needs the CPU."""
         return TextureTable(self.rows.to(device), self.blur_rad)
 
     def blurred(self, blur_rad: float) -> TextureTable:
-        """Return the table of a wider blur (standard deviation of the whole Gaussian); itself if it is not wider."""
+        """Return a table whose total blur is `blur_rad`, or itself if that is not wider."""
         if blur_rad <= self.blur_rad:
             return self
-        # Nine points are exact for what is smooth over the added width: go there in steps of 1.6 at most.
+        # The 9-point rule is exact if the map is smooth over the added width: widen by 1.6 at most.
         target = min(blur_rad, 1.6 * self.blur_rad)
         added = math.sqrt(target**2 - self.blur_rad**2)
-        # A cell is 2.2 / side wide; what is blurred more needs fewer of them.
+        # A cell is 2.2 / side wide: a wider blur needs fewer cells.
         side = min(self.side, 1 << math.ceil(math.log2(2.2 * CELLS_A_BLUR / target)))
         parts = [torch.zeros(0, 4)]
         for centre in torch.split(octahedral_directions(side), CHUNK):
@@ -141,16 +122,15 @@ class TextureTable:
 
 
 def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE) -> TextureTable:
-    """Make the table of a map (H, 2 H) for a Gaussian blur on the sphere; `side` counts cells along each axis."""
+    """Return the table of a map (H, 2 H) for a Gaussian blur, rad; `side` counts cells per axis."""
     finest = min(blur_rad, BASE_RAD)
-    reduced = reduced_texture(texture.float(), 2.0 / finest)  # pixels as wide as the blur: the rule sees no steps
+    reduced = reduced_texture(texture.float(), 2.0 / finest)  # pixels as wide as the blur: no steps
     parts = [torch.zeros(0, 4)]
     for centre in torch.split(octahedral_directions(side), CHUNK):
         value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
         for share, offset, at in _disk_nodes(centre, finest, FIVE):
             v = sample_texture(reduced, at)
             value = value + share * v
-            # The Gaussian's derivative: the slope is the mean of grey times offset, over the variance.
             slope = slope + share * v[:, None] * offset / finest**2
         parts.append(_rows(value, slope, centre.float()))
     return TextureTable(torch.cat(parts), finest).blurred(blur_rad)
@@ -159,7 +139,7 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE) -> Texture
 def _disk_nodes(
     centre: Tensor, width: float, rule: tuple[tuple[float, ...], tuple[float, ...]]
 ) -> Iterator[tuple[float, Tensor, Tensor]]:
-    """Yield share, tangent offset (M, 3) and direction (M, 3) of the nodes of a Gaussian about directions (M, 3)."""
+    """Yield weight, tangent offset (M, 3) and direction (M, 3) of the nodes of a Gaussian about directions (M, 3)."""
     helper = torch.where(centre[:, 2:].abs() < 0.9, centre.new_tensor([0.0, 0, 1]), centre.new_tensor([1.0, 0, 0]))
     right = torch.nn.functional.normalize(torch.linalg.cross(helper, centre), dim=-1)
     up = torch.linalg.cross(centre, right)
@@ -171,6 +151,6 @@ def _disk_nodes(
 
 
 def _rows(value: Tensor, slope: Tensor, centre: Tensor) -> Tensor:
-    """Rows of a table: the tangent plane's value at the origin and its slope."""
+    """Return table rows: the tangent plane's value at the origin, and its slope."""
     slope = slope - (slope * centre).sum(-1, keepdim=True) * centre
     return torch.cat([value[:, None] - (slope * centre).sum(-1, keepdim=True), slope], dim=-1)

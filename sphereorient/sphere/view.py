@@ -1,5 +1,3 @@
-"""Geometry of the view: where lines of sight meet a sphere, and the canonical disk that a sphere fills."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,43 +11,39 @@ from sphereorient.sphere.texture import sample_texture
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DiskView:
-    """Pixels of a square picture that the disk of a sphere just fills.
-
-    View frame: x right, y down, z from the camera to the sphere's centre.
-    """
+    """Pixels of a square picture filled by a sphere's disk; view frame x right, y down, z to the centre."""
 
     size_px: int
     inside: Tensor  # (S, S) bool, the pixels of the disk
     normal_view: Tensor  # (P, 3), outward normals at the P pixels inside, view frame, row by row
 
     def picture(self, values: Tensor, outside: float = 0.0) -> Tensor:
-        """Put the values of the disk's pixels, (..., P), into pictures (..., S, S)."""
+        """Return pictures (..., S, S) from the values (..., P) of the disk's pixels."""
         picture = values.new_full((*values.shape[:-1], self.size_px, self.size_px), outside)
         picture[..., self.inside] = values
         return picture
 
     def paint(self, texture: Tensor, R_view_body: Tensor) -> Tensor:
-        """Look up a map (H, 2 H) at the disk's pixels, (..., P), for orientations (..., 3, 3); differentiable."""
+        """Return the paint (..., P) of a map (H, 2 H) at orientations (..., 3, 3); differentiable."""
         check_tail("R_view_body", R_view_body, 3, 3)
-        # Rows: n_view @ R_view_body is R_view_body^T n_view, the normal in body components.
         return sample_texture(texture.to(R_view_body.dtype), self.normal_view.to(R_view_body.dtype) @ R_view_body)
 
     def render(self, texture: Tensor, R_view_body: Tensor, outside: float = 0.0) -> Tensor:
-        """Render one sample a pixel, (..., S, S); `SphereRenderer` integrates over the pixels."""
+        """Return pictures (..., S, S), one sample per pixel; `SphereRenderer` integrates over pixels."""
         return self.picture(self.paint(texture, R_view_body), outside)
 
 
 def disk_offsets(size_px: int, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return the pixel centres of a square in units of the disk's radius, (S, S, 2) as (right, down)."""
+    """Return pixel centres of a square, (S, S, 2) as (right, down), in disk radii."""
     at = (torch.arange(size_px, dtype=dtype) + 0.5) * (2.0 / size_px) - 1.0
     down, right = torch.meshgrid(at, at, indexing="ij")
     return torch.stack([right, down], dim=-1)
 
 
 def orthographic_view(size_px: int, dtype: torch.dtype = torch.float32) -> DiskView:
-    """Return the view from infinity: the pixel at (x, y) radii shows the normal (x, y, -sqrt(1 - x^2 - y^2)).
+    """Return the view from infinity: the pixel at (x, y) radii has the normal (x, y, -sqrt(1 - x^2 - y^2)).
 
-    Source: paper section III (templates); docs/errata.md A4 says what it neglects.
+    Source: paper section III (templates); docs/errata.md A4 lists the neglected effects.
     """
     origin = torch.nn.functional.pad(disk_offsets(size_px), (0, 1))
     normal, depth2 = sphere_normals(origin, origin.new_tensor([0.0, 0.0, 1.0]), origin.new_zeros(3), 1.0)
@@ -58,14 +52,9 @@ def orthographic_view(size_px: int, dtype: torch.dtype = torch.float32) -> DiskV
 
 
 def perspective_view(size_px: int, distance_radii: float, dtype: torch.dtype = torch.float32) -> DiskView:
-    """Return the view from a finite distance along the line to the centre; the visible cap fills the disk.
+    """Return the view from `distance_radii` (above 1) to the sphere's centre; the visible cap fills the disk.
 
-    Args:
-        size_px: side of the picture; the limb touches its edges.
-        distance_radii: from the projection centre to the sphere's centre, in radii, above 1.
-        dtype: of the normals.
-
-    Source: docs/errata.md A4 (the rim lies asin(1 / distance) before the great circle).
+    Source: docs/errata.md A4 (the rim lies asin(1 / distance) in front of the great circle).
     """
     offset = disk_offsets(size_px)
     inside = offset.square().sum(-1) < 1
@@ -78,32 +67,24 @@ def perspective_view(size_px: int, distance_radii: float, dtype: torch.dtype = t
 def sphere_normals(
     origin: Tensor, direction: Tensor, centre: Tensor, radius: float | Tensor, corner: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Intersect rays with a sphere at the near side.
+    """Return unit normals (..., 3) where rays first meet a sphere, and 1 - (ray distance / radius)^2, (...).
 
-    Args:
-        origin: (..., 3), start of the rays, any one frame and unit.
-        direction: (..., 3), same frame, any length.
-        centre: (..., 3), of the sphere, same frame and unit.
-        radius: () or (...), same unit.
-        corner: width, in radii squared, over which the depth fades to 0 at the limb; above 0 the normals are twice
-            differentiable, and those within about sqrt(corner) of the limb lie a little inside their true place.
-
-    Returns:
-        Outward unit normals (..., 3), at the nearest approach where a ray misses; and 1 - (distance of the ray from the
-        centre, in radii)^2, (...): above 0 where it hits.
+    A ray that misses gets the normal at its nearest approach. `origin`, `direction` and `centre` are (..., 3), `radius`
+    () or (...), in one frame and unit. `corner` (radii^2) above 0 rounds the limb: twice differentiable, normals within
+    about sqrt(corner) of the limb are shifted inwards.
     """
     check_tail("direction", direction, 3)
     radius = torch.as_tensor(radius, dtype=direction.dtype, device=direction.device)[..., None]
     direction = direction / direction.norm(dim=-1, keepdim=True)
     to_centre = centre - origin
     along = (to_centre * direction).sum(-1, keepdim=True)
-    nearest = along * direction - to_centre  # from the sphere's centre to the ray's nearest point
+    nearest = along * direction - to_centre
     depth2 = radius**2 - nearest.square().sum(-1, keepdim=True)
     if corner > 0:
         depth = radius * smooth_positive(depth2 / radius**2, corner).sqrt()
     else:
         hit = depth2 > 0
-        # The square root's gradient is infinite at the limb: a floor keeps it finite, and misses have no depth.
+        # The root's gradient is infinite at the limb: a floor keeps it finite.
         depth = torch.where(hit, depth2, 1.0).maximum(1e-12 * radius**2).sqrt()
         depth = torch.where(hit, depth, 0.0)
     normal = nearest - depth * direction
@@ -112,7 +93,7 @@ def sphere_normals(
 
 
 def smooth_positive(x: Tensor, width: float) -> Tensor:
-    """Return max(x, 0) with its corner rounded over about `width`; always above 0."""
+    """Return max(x, 0), rounded over about `width`; always positive."""
     root = (x * x + width * width).sqrt()
-    # The second form is the same without the difference of two nearly equal numbers.
+    # The second form avoids the difference of nearly equal numbers.
     return torch.where(x > 0, 0.5 * (x + root), 0.5 * width * width / (root + x.abs()))

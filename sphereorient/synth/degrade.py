@@ -1,9 +1,4 @@
-"""Degradations of pictures: torch operations on batches, for benchmarks and for training alike.
-
-An operation takes grey levels before noise and rounding, a physical value (`severities`), the ball's disk and a
-generator, and returns pictures in the same dtype. All random numbers come from the generator, picture by picture: a
-batch is the stack of its singles. Kornia's augmentations draw from torch's global generator and are not used.
-"""
+"""Degradations of picture batches, without kornia augmentations: these draw from torch's global generator."""
 
 from __future__ import annotations
 
@@ -19,30 +14,29 @@ from torch import Tensor
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 from sphereorient.synth.severities import DEGRADATIONS, degradation
 
-WHITE_LEVEL = 255  # of 8 bits
+WHITE_LEVEL = 255
 VEIL = 95.0  # grey level of turbid liquid
 OCCLUDER, SPECK, GLINT = 30.0, 12.0, 120.0  # grey levels of an occluder, of dirt, of a bubble's glint
-LOBES, LOBE_RADII = 2, 0.12  # highlights: how many, and their sigma in radii of the ball
-BUBBLE_RADII = 0.12  # radius of a bubble in radii of the ball
-SPECKS_PER_PX2 = 6e-4  # three before the paper's ball
-CLUTTER_PX = 6.0  # Gaussian that makes the structure behind the ball: about as coarse as the paint
-DARKEST = 1.0  # grey level below which shot noise grows no smaller: its root has no finite slope at 0
+LOBES, LOBE_RADII = 2, 0.12  # highlights: number, and sigma in sphere radii
+BUBBLE_RADII = 0.12  # bubble radius in sphere radii
+SPECKS_PER_PX2 = 6e-4  # three on the paper's disk
+CLUTTER_PX = 6.0  # sigma of the background structure: about as coarse as the paint
+DARKEST = 1.0  # grey level of the least shot noise: the root has no finite slope at 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Disk:
-    """Where the ball is in pictures (..., H, W)."""
+    """Place of the sphere in pictures (..., H, W)."""
 
     centre_px: Tensor  # (..., 2) as (u, v)
     radius_px: Tensor  # (...)
-    cover: Tensor | None = None  # (..., H, W), the share of each pixel that the ball fills; None: a round disk's
+    cover: Tensor | None = None  # (..., H, W), coverage of each pixel; None: of a round disk
 
     def __post_init__(self) -> None:
-        """Refuse centres of another shape."""
         check_tail("centre_px", self.centre_px, 2)
 
     def offset(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """Return how far right and down of the centre each pixel is, (..., H, W) each, px."""
+        """Return each pixel's offset from the centre to the right and down, (..., H, W) each, px."""
         height, width = pictures.shape[-2:]
         centre = self.centre_px.to(pictures)[..., None, None, :]
         right = torch.arange(width, dtype=pictures.dtype, device=pictures.device)
@@ -50,11 +44,11 @@ class Disk:
         return right - centre[..., 0], down - centre[..., 1]
 
     def radius(self, pictures: Tensor) -> Tensor:
-        """Return the radius with axes for rows and columns, (..., 1, 1), px."""
+        """Return the radius with pixel axes, (..., 1, 1), px."""
         return self.radius_px.to(pictures)[..., None, None]
 
     def covered(self, pictures: Tensor) -> Tensor:
-        """Return the share of each pixel that the ball fills, (..., H, W)."""
+        """Return the coverage of each pixel, (..., H, W), 0 to 1."""
         if self.cover is not None:
             return self.cover.to(pictures)
         return _round(*self.offset(pictures), self.radius(pictures))
@@ -64,19 +58,12 @@ Operation = Callable[[Tensor, float, Disk, torch.Generator], Tensor]
 
 
 def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torch.Generator) -> Tensor:
-    """Apply degradations of pictures, in the order of `DEGRADATIONS` whatever the order of `values`.
+    """Return pictures (..., H, W), unrounded and unclipped floats, with degradations in a fixed order.
 
-    Args:
-        pictures: (..., H, W), grey levels, not rounded; float32 or float64.
-        disk: where the ball is.
-        values: name of an operation -> physical value; see `severity`.
-        rng: of all that is random.
-
-    Returns:
-        (..., H, W) grey levels, neither rounded nor clipped: `to_bytes` comes last.
+    `values` maps names to physical values, see `severity`.
 
     Raises:
-        SettingsError: an unknown name, one that does not act on pictures, or an impossible value.
+        SettingsError: unknown name, no picture degradation, or impossible value.
         ShapeError: not pictures.
     """
     if pictures.ndim < 2 or not pictures.is_floating_point():
@@ -95,15 +82,12 @@ def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torc
 
 
 def to_bytes(pictures: Tensor) -> Tensor:
-    """Round grey levels to 8 bits and clip them, as a sensor does."""
+    """Round and clip grey levels to 8 bits."""
     return pictures.round().clamp(0, WHITE_LEVEL).to(torch.uint8)
 
 
-# The light on the ball.
-
-
 def uneven_light(pictures: Tensor, ratio: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Dim the ball from one limb, which keeps its light, to the opposite one, which has 1 / ratio of it."""
+    """Dim the sphere across the disk, to 1 / ratio at one limb."""
     angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]
     right, down = disk.offset(pictures)
     across = ((right * angle.cos() + down * angle.sin()) / disk.radius(pictures)).clamp(-1, 1)
@@ -112,14 +96,12 @@ def uneven_light(pictures: Tensor, ratio: float, disk: Disk, rng: torch.Generato
 
 
 def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Add lamps mirrored in the paint: Gaussian lobes whose peaks are `peak` grey levels above the paint."""
+    """Add Gaussian lamp reflections of `peak` grey levels."""
     draw = _uniform(pictures, rng, 1 + LOBES)[..., None, None]
     radius = disk.radius(pictures)
     right, down = disk.offset(pictures)
     light = torch.zeros_like(pictures)
     for lobe in range(LOBES):
-        # Spread around the middle, apart from each other; a lamp beside the camera is mirrored near the middle, one at
-        # right angles to it at 0.7 radii.
         angle = 2 * math.pi * (draw[..., 0, :, :] + lobe / LOBES)
         away = (0.2 + 0.5 * draw[..., 1 + lobe, :, :]) * radius
         square = (right - away * angle.cos()).square() + (down - away * angle.sin()).square()
@@ -127,11 +109,8 @@ def highlights(pictures: Tensor, peak: float, disk: Disk, rng: torch.Generator) 
     return pictures + peak * disk.covered(pictures) * light
 
 
-# What is behind and before the ball.
-
-
 def background_clutter(pictures: Tensor, rms: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Add structure behind the ball, at least 0, evenly distributed, with this standard deviation in grey levels."""
+    """Add structure behind the sphere, uniformly distributed, at least 0, standard deviation `rms` grey levels."""
     field = blurred(_normal(pictures, rng), CLUTTER_PX)
     field = (field - field.mean((-2, -1), keepdim=True)) / _spread(field)
     even = torch.special.ndtr(field)
@@ -141,7 +120,7 @@ def background_clutter(pictures: Tensor, rms: float, disk: Disk, rng: torch.Gene
 
 
 def occlusion(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Hide this share of the disk behind a dark disk of the same size, on any side."""
+    """Hide this share of the disk behind an equal dark disk, on a random side."""
     if share == 0:
         return pictures
     angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]
@@ -153,13 +132,13 @@ def occlusion(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) 
 
 
 def bubbles(pictures: Tensor, number: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Scatter bubbles before the disk: clear in the middle, dark towards the rim, with a glint at the upper left."""
+    """Draw bubbles in front of the disk: clear centre, dark rim, glint at the upper left."""
     count = round(number)
     draw = _uniform(pictures, rng, count, 2)
     radius = disk.radius(pictures)
     size = BUBBLE_RADII * radius
     right, down = disk.offset(pictures)
-    for k in range(count):  # one after the other: all at once would hold `count` pictures per picture
+    for k in range(count):  # a loop: all at once would hold `count` copies of each picture
         angle = 2 * math.pi * draw[..., k, 0, None, None]
         away = draw[..., k, 1, None, None].sqrt() * radius
         x, y = right - away * angle.cos(), down - away * angle.sin()
@@ -171,12 +150,12 @@ def bubbles(pictures: Tensor, number: float, disk: Disk, rng: torch.Generator) -
 
 
 def dirt(pictures: Tensor, radius_px: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Put dark round specks of this radius anywhere in the picture, `SPECKS_PER_PX2` of them per pixel."""
+    """Draw dark round specks of this radius, px, anywhere in the picture."""
     if radius_px == 0:
         return pictures
     height, width = pictures.shape[-2:]
     half = math.ceil(radius_px)
-    # Middles beyond the border too, so that specks reach in from there.
+    # Centres lie beyond the border too: specks reach in from there.
     wider = pictures.new_empty((*pictures.shape[:-2], height + 2 * half, width + 2 * half))
     middles = (torch.rand(wider.shape, generator=rng, dtype=wider.dtype, device=rng.device) < SPECKS_PER_PX2).to(wider)
     at = torch.arange(-half, half + 1, dtype=pictures.dtype, device=pictures.device)
@@ -188,11 +167,8 @@ def dirt(pictures: Tensor, radius_px: float, disk: Disk, rng: torch.Generator) -
     return pictures + hidden.reshape(pictures.shape) * (SPECK - pictures)
 
 
-# The way to the sensor.
-
-
 def contrast_loss(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Move all grey levels towards the veil by this share of the way."""
+    """Move all grey levels towards VEIL by this share."""
     return pictures + share * (VEIL - pictures)
 
 
@@ -202,11 +178,7 @@ def defocus(pictures: Tensor, sigma_px: float, disk: Disk, rng: torch.Generator)
 
 
 def saturation(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Brighten every picture until this share of its white paint exceeds 255; `to_bytes` clips.
-
-    White paint is brighter than the middle between the disk's darkest and brightest pixels. For a movie, which has one
-    exposure, `degrade_scene` finds the gain from a white ball.
-    """
+    """Brighten each picture until this share of its white paint (above the mean of the extremes) exceeds 255."""
     if share == 0:
         return pictures
     inside = (disk.covered(pictures) > 0.99).expand(pictures.shape).flatten(-2)
@@ -217,18 +189,18 @@ def saturation(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator)
 
 
 def gain_to_clip(grey: Tensor, white: Tensor, share: float) -> Tensor:
-    """Return the factor (...), 1 at least, that takes a share of the white pixels above 255; both (..., P)."""
+    """Return the gain (...), at least 1, that lifts a share of the white pixels above 255; both tensors (..., P)."""
     count = white.sum(-1, keepdim=True)
     falling = grey.masked_fill(~white, -math.inf).sort(-1, descending=True).values
     limit = (share * count).round().long().minimum((count - 1).clamp_min(0))
     level = falling.gather(-1, limit)[..., 0]
-    level = torch.where(level > 0, level, torch.full_like(level, WHITE_LEVEL))  # no white paint in sight
+    level = torch.where(level > 0, level, torch.full_like(level, WHITE_LEVEL))  # no white paint visible
     gain: Tensor = (WHITE_LEVEL / level).clamp_min(1)
     return gain
 
 
 def shot_noise(pictures: Tensor, per_root: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Add white noise of `per_root` grey levels times the root of each pixel's grey level."""
+    """Add white noise of `per_root` times the root of the grey level."""
     return pictures + per_root * pictures.clamp_min(DARKEST).sqrt() * _normal(pictures, rng)
 
 
@@ -254,18 +226,15 @@ OPERATIONS: Mapping[str, Operation] = MappingProxyType(
 )
 
 
-# Movies, and errors of the disk.
-
-
 def lost_frames(like: Tensor, share: float, rng: torch.Generator) -> Tensor:
-    """Draw which frames are lost, (..., N) bool, for a tensor (..., N): round(share N) of each row."""
+    """Draw the lost frames, (..., N) bool, for a tensor (..., N): round(share N) per row."""
     count = like.shape[-1]
     draw = torch.rand(like.shape, generator=rng, dtype=torch.float64, device=rng.device).to(like.device)
     return draw.argsort(-1).argsort(-1) < round(share * count)
 
 
 def centre_error(disk: Disk, error_px: float, rng: torch.Generator) -> Disk:
-    """Return the disk with its centre off by this many px, in a random direction."""
+    """Return the disk with its centre moved by `error_px` in a random direction."""
     degradation("centre_error").check(error_px)
     centre = disk.centre_px
     draw = torch.rand((*centre.shape[:-1], 1), generator=rng, dtype=centre.dtype, device=rng.device).to(centre)
@@ -275,16 +244,13 @@ def centre_error(disk: Disk, error_px: float, rng: torch.Generator) -> Disk:
 
 
 def radius_error(disk: Disk, error_px: float) -> Disk:
-    """Return the disk with its radius too large by this many px."""
+    """Return the disk with its radius increased by `error_px`."""
     degradation("radius_error").check(error_px)
     return Disk(centre_px=disk.centre_px, radius_px=disk.radius_px + error_px)
 
 
-# Parts of the operations.
-
-
 def blurred(pictures: Tensor, sigma_px: float) -> Tensor:
-    """Blur pictures (..., H, W) with a Gaussian, px; the border is continued."""
+    """Blur pictures (..., H, W) with a Gaussian, px; the border is replicated."""
     if sigma_px == 0 or pictures.numel() == 0:
         return pictures
     size = 2 * math.ceil(4 * sigma_px) + 1
@@ -294,15 +260,15 @@ def blurred(pictures: Tensor, sigma_px: float) -> Tensor:
 
 
 def _round(right: Tensor, down: Tensor, radius_px: Tensor) -> Tensor:
-    """Return the share of each pixel inside a circle, the border one pixel wide."""
+    """Return the share of each pixel inside a circle whose edge is one pixel wide."""
     square = right.square() + down.square()
-    # The root has no slope at the middle of the circle, where the share does not change either.
+    # The root has no slope at the centre, where the share is constant anyway.
     distance = square.clamp_min(1e-6).sqrt()
     return (radius_px - distance + 0.5).clamp(0, 1)
 
 
 def _distance_of_overlap(share: float) -> float:
-    """Return the distance, in radii, at which a circle hides this share of an equal one (bisection)."""
+    """Return the centre distance, in radii, at which a circle hides this share of an equal one."""
     near, far = 0.0, 2.0
     for _ in range(50):
         middle = 0.5 * (near + far)
@@ -312,7 +278,6 @@ def _distance_of_overlap(share: float) -> float:
 
 
 def _uniform(pictures: Tensor, rng: torch.Generator, *tail: int) -> Tensor:
-    """Draw numbers in 0 .. 1, (..., *tail), those of one picture together."""
     shape = (*pictures.shape[:-2], *tail)
     return torch.rand(shape, generator=rng, dtype=pictures.dtype, device=rng.device).to(pictures.device)
 
@@ -323,5 +288,4 @@ def _normal(pictures: Tensor, rng: torch.Generator) -> Tensor:
 
 
 def _spread(field: Tensor) -> Tensor:
-    """Standard deviation over each picture, (..., 1, 1)."""
     return (field - field.mean((-2, -1), keepdim=True)).square().mean((-2, -1), keepdim=True).sqrt()

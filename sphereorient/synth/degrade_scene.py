@@ -1,4 +1,4 @@
-"""Degraded experiments on disk: scene, paint, pictures, and wrong reports of map and cameras; truth.h5 stays exact."""
+"""Degraded synthetic experiments on disk; truth.h5 stays exact."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from sphereorient.synth.severities import DEGRADATIONS, degradation, severity
 from sphereorient.synth.textures import map_directions
 from sphereorient.synth.write import FilmedView, Filming, default_cameras, write_synthetic_experiment
 
-BARE = 0.5  # grey of the map where the paint is gone
-WAVES, WAVE_RATES = 24, (6.0, 12.0)  # patches: a sum of waves over the body's directions, periods of 30 to 60 degrees
-MASK_ROWS = 128  # patches are drawn on a map of this height: finer than their borders curve
-SMEAR_PX = 1.0  # instants of an exposure are at most about this far apart
+BARE = 0.5  # grey of bare patches
+WAVES, WAVE_RATES = 24, (6.0, 12.0)  # patches: waves, and rates for periods of 30 to 60 degrees
+MASK_ROWS = 128  # height of the patch map: finer than the patches' borders
+SMEAR_PX = 1.0  # largest motion between exposure samples
 
 
 def write_degraded(
@@ -37,21 +37,14 @@ def write_degraded(
     applied: Mapping[str, int],
     progress: Callable[[int], None] = lambda done: None,
 ) -> Path:
-    """Render an experiment as `write_synthetic_experiment` does, with any number of degradations.
+    """Render a degraded experiment in `folder`, replacing old files, and return the path of experiment.yaml.
 
-    Args:
-        folder: created if missing; files of an older run are replaced.
-        base: the scene, and the seed of all that is random.
-        applied: name -> level 1 .. 5, in any order.
-        progress: called with the number of frames rendered since the last call.
-
-    Returns:
-        Path of experiment.yaml. cameras.yaml, texture.png and sphere.diameter may be wrong; truth.h5 and its centre_px
-        are of the cameras and the ball that were filmed.
+    `applied` maps degradations to levels 1 .. 5; `progress` receives the number of frames rendered since the last call.
+    Reported cameras, texture map and diameter may be wrong; truth.h5 describes the filmed cameras and sphere.
 
     Raises:
-        SettingsError: an unknown name or level, or a scene that cannot be.
-        OutputError: the folder cannot be written.
+        SettingsError: unknown name or level, or impossible scene.
+        OutputError: folder not writable.
     """
     values = {name: severity(name, applied[name]) for name in applied}
     return write_with_values(folder, base, values, progress)
@@ -70,11 +63,8 @@ def write_with_values(
     return write_synthetic_experiment(folder, settings, progress, DegradedFilming(settings, values))
 
 
-# The scene.
-
-
 def degraded_settings(base: SynthSettings, values: Mapping[str, float]) -> SynthSettings:
-    """Apply the degradations of the scene: ball_size, spin, motion_blur, in this order."""
+    """Return the settings with ball_size, spin and motion_blur applied, in this order."""
     settings = base
     for name, change in SCENE.items():
         if name in values:
@@ -83,31 +73,28 @@ def degraded_settings(base: SynthSettings, values: Mapping[str, float]) -> Synth
 
 
 def with_ball_size(base: SynthSettings, diameter_px: float) -> SynthSettings:
-    """Change the size of the pixels: the whole picture grows or shrinks with the ball."""
+    """Return settings with another pixel size: picture and sphere scale together."""
     scale = diameter_px / base.diameter_px
     width, height = (max(8, round(side * scale)) for side in base.image_size)
     return _changed(base, diameter_px=diameter_px, image_size=(width, height))
 
 
 def with_spin(base: SynthSettings, degrees_per_frame: float) -> SynthSettings:
-    """Change the rotation in a frame, rms of |omega| over time.
-
-    The exposure shrinks as the spin grows, so that the smear stays: that is motion_blur's.
-    """
+    """Return settings with this rotation per frame, rms of |omega|; a shorter exposure keeps the motion blur."""
     omega_rms = math.radians(degrees_per_frame) * base.frame_rate / math.sqrt(3)
     shorter = min(1.0, base.omega_rms / omega_rms) if omega_rms > 0 else 1.0
     return _changed(base, omega_rms=omega_rms, exposure=base.exposure * shorter)
 
 
 def with_motion_blur(base: SynthSettings, degrees_per_exposure: float) -> SynthSettings:
-    """Change the rotation in an exposure, rms of |omega| over time: a longer exposure first, then more spin."""
+    """Return settings with this rotation per exposure, rms of |omega|: longer exposure first, then faster rotation."""
     turn = math.radians(degrees_per_exposure)
-    spin = base.omega_rms * math.sqrt(3)  # rad/s
+    spin = base.omega_rms * math.sqrt(3)
     exposure = min(turn / spin, 1 / base.frame_rate) if spin > 0 else 1 / base.frame_rate
     omega_rms = max(base.omega_rms, turn / exposure / math.sqrt(3)) if exposure > 0 else base.omega_rms
     turned_px = turn * base.diameter_px / 2
     moved_px = math.sqrt(3) * base.velocity_rms * 1000 * exposure * base.diameter_px / base.diameter_mm
-    # Half more than the rms of both: most of the movie is then sampled finely enough.
+    # Half above the rms of both: most of the movie is sampled finely enough.
     samples = math.ceil(1.5 * math.hypot(turned_px, moved_px) / SMEAR_PX)
     samples = max(base.exposure_samples, samples)
     return _changed(base, exposure=exposure, omega_rms=omega_rms, exposure_samples=samples)
@@ -124,27 +111,23 @@ def _changed(base: SynthSettings, **update: object) -> SynthSettings:
     return SynthSettings.model_validate(base.model_dump() | update)
 
 
-# The paint.
-
-
 def worn(texture: Tensor, share: float, rng: torch.Generator) -> Tensor:
-    """Return maps (..., H, 2 H) whose paint is gone (`BARE`) in patches that cover a share of the sphere's area."""
+    """Return maps (..., H, 2 H) with grey `BARE` patches on this share of the sphere's area."""
     degradation("paint_wear").check(share)
     return torch.where(random_patches(texture, share, rng), torch.full_like(texture, BARE), texture)
 
 
 def misdrawn(texture: Tensor, share: float, rng: torch.Generator) -> Tensor:
-    """Return maps (..., H, 2 H) with black and white exchanged in patches that cover a share of the sphere's area."""
+    """Return maps (..., H, 2 H) with black and white exchanged on this share of the sphere's area."""
     degradation("texture_error").check(share)
     return torch.where(random_patches(texture, share, rng), 1 - texture, texture)
 
 
 def random_patches(texture: Tensor, share: float, rng: torch.Generator) -> Tensor:
-    """Draw seamless patches that cover a share of the sphere's area, bool in the shape of the maps (..., H, 2 H)."""
+    """Draw seamless patches on this share of the sphere's area, bool, shape of the maps (..., H, 2 H)."""
     if share == 0:
         return torch.zeros_like(texture, dtype=torch.bool)
     height, lead = texture.shape[-2], texture.shape[:-2]
-    # Random smooth functions of the body's direction, on a map of MASK_ROWS: a sum of waves.
     draw = torch.rand((*lead, WAVES, 4), generator=rng, dtype=torch.float64, device=rng.device).cpu()
     up = 2 * draw[..., 0] - 1
     around, phase = 2 * math.pi * draw[..., 1], 2 * math.pi * draw[..., 2]
@@ -157,23 +140,15 @@ def random_patches(texture: Tensor, share: float, rng: torch.Generator) -> Tenso
         body = map_directions(height)
         finer = [sample_texture(field, body) for field in fields.reshape(-1, *fields.shape[-2:])]
         fields = torch.stack(finer).reshape(texture.shape) if finer else fields.new_zeros(texture.shape)
-    area = map_directions(height)[..., :2].norm(dim=-1).flatten()  # of a texel: the cosine of its latitude
+    area = map_directions(height)[..., :2].norm(dim=-1).flatten()  # texel area: cosine of the latitude
     rising = fields.flatten(-2).sort(-1)
     below = area[rising.indices].cumsum(-1) / area.sum()
     last = (below < share).sum(-1, keepdim=True).clamp_max(below.shape[-1] - 1)
     return (fields <= rising.values.gather(-1, last)[..., None]).to(texture.device)
 
 
-# The pictures.
-
-
 class DegradedFilming(Filming):
-    """Applies degradations of map, pictures and movie, each with its own random numbers.
-
-    Args:
-        settings: of the scene, already degraded.
-        values: name -> physical value; degradations of the scene are ignored.
-    """
+    """Apply degradations of map, pictures and movie, name -> physical value, each with its own random numbers."""
 
     def __init__(self, settings: SynthSettings, values: Mapping[str, float]) -> None:
         self.settings = settings
@@ -184,23 +159,23 @@ class DegradedFilming(Filming):
             self.gains = {name: self._gain(name, camera) for name, camera in self.cameras.items()}
 
     def paint(self, texture: Tensor) -> Tensor:
-        """Return the map with its paint worn."""
+        """Return the worn texture map."""
         return worn(texture, self.values.get("paint_wear", 0.0), self._generator("paint_wear"))
 
     def reported_texture(self, texture: Tensor) -> Tensor:
-        """Return the map with patches exchanged."""
+        """Return the texture map with exchanged patches."""
         return misdrawn(texture, self.values.get("texture_error", 0.0), self._generator("texture_error"))
 
     def reported_cameras(self, cameras: Mapping[str, Camera]) -> Mapping[str, Camera]:
-        """Return the cameras, wrong by centre_error, camera_rotation and camera_shift."""
+        """Return cameras with centre_error, camera_rotation and camera_shift."""
         return wrong_cameras(cameras, self.values)
 
     def reported_diameter_mm(self, diameter_mm: float) -> float:
-        """Return the diameter, wrong by radius_error."""
+        """Return the diameter with radius_error, mm."""
         return diameter_mm * (1 + self.values.get("radius_error", 0.0) / (self.settings.diameter_px / 2))
 
     def picture(self, picture: NDArray[np.float32], view: FilmedView) -> NDArray[np.float32]:
-        """Degrade the picture; the one without the ball only by what stays throughout a movie."""
+        """Degrade a picture; frame None gets only degradations that are constant over the movie."""
         light = self._through(torch.from_numpy(picture), view, tuple(OPERATIONS))
         return cast("NDArray[np.float32]", light.numpy())
 
@@ -211,7 +186,6 @@ class DegradedFilming(Filming):
         return frozenset(lost.nonzero()[:, 0].tolist())
 
     def _through(self, light: Tensor, view: FilmedView, names: tuple[str, ...]) -> Tensor:
-        """Apply some of the degradations of pictures."""
         centre_px, radius_px = picture_of_ball(view.camera, view.position_lab_mm, self.settings.diameter_mm / 2)
         disk = Disk(centre_px=centre_px, radius_px=radius_px, cover=torch.from_numpy(view.cover))
         for name in names:
@@ -219,14 +193,13 @@ class DegradedFilming(Filming):
             value = self.values.get(name, row.nothing)
             if value is None or value == row.nothing or (row.where == "frame" and view.frame is None):
                 continue
-            # What is still has the same random numbers in every frame.
+            # Static degradations use the same random numbers in every frame.
             rng = self._generator(name, view.name, *([] if row.where != "frame" else [view.frame or 0]))
-            # One exposure throughout a movie: its gain was found before.
             light = light * self.gains[view.name] if name == "saturation" else OPERATIONS[name](light, value, disk, rng)
         return light
 
     def _gain(self, name: str, camera: Camera) -> float:
-        """Return the exposure at which a white ball saturates, under all degradations that dim or light it."""
+        """Return the exposure gain that saturates a white sphere, after the operations before saturation."""
         origin = torch.zeros(1, 3, dtype=torch.float64)
         scene = make_scene(torch.ones(8, 16), self.settings)
         picture, cover = expose(scene, camera, origin, torch.eye(3, dtype=torch.float64)[None])
@@ -237,14 +210,14 @@ class DegradedFilming(Filming):
         return float(gain_to_clip(light.flatten(), white.flatten(), self.values["saturation"]))
 
     def _generator(self, *what: str | int) -> torch.Generator:
-        # By name: one more degradation leaves the random numbers of the others.
+        # By name: another degradation does not change the random numbers of the rest.
         words = [zlib.crc32(word.encode()) if isinstance(word, str) else word for word in what]
         state = np.random.SeedSequence([self.settings.seed, *words]).generate_state(1, np.uint64)
         return torch.Generator().manual_seed(int(state[0]) >> 1)
 
 
 def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
-    """Return the pictures of the centres of balls (..., 3), (..., 2), and the mean radii of their rims (...), px."""
+    """Return the projected centres (..., 2) and mean rim radii (...), px, of spheres at (..., 3), mm, lab."""
     centre_px = camera.project(position_lab_mm)
     rim, _ = rim_directions(camera, position_lab_mm, 4)
     rim_px = camera.project(position_lab_mm[..., None, :] + radius_mm * rim)
@@ -252,7 +225,7 @@ def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -
 
 
 def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float]) -> Mapping[str, Camera]:
-    """Apply centre_error, opposite in the two cameras, and camera_rotation and camera_shift of the second."""
+    """Return cameras with opposite centre errors, the second also rotated and shifted."""
     if not any(values.get(name) for name in ("centre_error", "camera_rotation", "camera_shift")):
         return cameras
     wrong = {name: _shifted_centre(camera, k, values) for k, (name, camera) in enumerate(cameras.items())}
@@ -262,7 +235,7 @@ def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float]) ->
 
 
 def _shifted_centre(camera: Camera, index: int, values: Mapping[str, float]) -> Camera:
-    """Shift the principal point along the picture's diagonal, the second camera's the other way."""
+    """Shift the principal point along the diagonal, in opposite directions for the two cameras."""
     error_px = values.get("centre_error", 0.0)
     if error_px == 0:
         return camera
@@ -272,7 +245,7 @@ def _shifted_centre(camera: Camera, index: int, values: Mapping[str, float]) -> 
 
 
 def _displaced(camera: Camera, values: Mapping[str, float]) -> Camera:
-    """Rotate a camera about the lab's origin, which keeps its pixel, and shift it along its own x."""
+    """Rotate a camera about the lab origin, whose pixel stays, and shift it along its own x."""
     angle, shift_mm = math.radians(values.get("camera_rotation", 0.0)), values.get("camera_shift", 0.0)
     if angle == 0 and shift_mm == 0:
         return camera

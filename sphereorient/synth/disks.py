@@ -1,4 +1,4 @@
-"""Cropped pictures of single balls by the thousand: for the training of a proposer and for its benchmark."""
+"""Random crops of single spheres, for training and benchmarks of proposers."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from sphereorient.synth.scene import LIT
 from sphereorient.synth.severities import DEGRADATIONS
 from sphereorient.synth.textures import random_directions
 
-MARGIN = 0.2  # filmed beside the ball, radii
-BLUR_INSTANTS = 8  # of an exposure during which the ball turns
-LEVELS = (120.0, 200.0), (8.0, 30.0), (8.0, 40.0)  # ranges of grey levels: white paint, black paint, background
-AMBIENT = (0.3, 1.0)  # range of the share of even light
+MARGIN = 0.2  # picture beyond the limb, radii
+BLUR_INSTANTS = 8  # sampled orientations per exposure
+LEVELS = (120.0, 200.0), (8.0, 30.0), (8.0, 40.0)  # grey level ranges of white paint, black paint, background
+AMBIENT = (0.3, 1.0)  # range of the ambient share
 LAMPS = 2
-READ_NOISE, SHOT_NOISE, BLUR_PX = 1.5, 0.3, 0.55  # as `SynthSettings`, always there
-IN_PX = ("dirt", "defocus", "centre_error", "radius_error")  # values that shrink with the picture
-# Without those of movies and of two cameras.
+READ_NOISE, SHOT_NOISE, BLUR_PX = 1.5, 0.3, 0.55  # always present, as in `SynthSettings`
+IN_PX = ("dirt", "defocus", "centre_error", "radius_error")  # values that scale with the picture
+# without those of movies and of two cameras
 DISK_DEGRADATIONS = tuple(
     name
     for name in DEGRADATIONS
@@ -53,26 +53,19 @@ class DiskSettings(BaseModel):
 def film_disks(
     texture: Tensor, R_view_body: Tensor, values: Mapping[str, float], rng: torch.Generator, settings: DiskSettings
 ) -> Tensor:
-    """Film a ball under light drawn anew for each picture, and crop the disks as `crop_disk` does.
+    """Film a sphere with random light per picture; return crops (F, S, S) float32, grey levels.
 
-    Args:
-        texture: (H, 2 H), the map on the ball, already worn.
-        R_view_body: (F, 3, 3), the attitudes.
-        values: name of `DISK_DEGRADATIONS` -> physical value; those of maps are ignored.
-        rng: of all that is random.
-        settings: of the pictures.
-
-    Returns:
-        (F, S, S) float32, grey levels, rounded before resampling.
+    `texture` is the worn map (H, 2 H), `R_view_body` (F, 3, 3); `values` maps `DISK_DEGRADATIONS` to physical values,
+    values of maps are ignored.
 
     Raises:
-        SettingsError: an unknown name, or an impossible value.
+        SettingsError: unknown name or impossible value.
     """
     _check(values)
     scale = settings.scale
     diameter = values.get("ball_size", settings.diameter_px)
     if diameter < settings.diameter_px:
-        scale = max(scale, min(1.0, settings.size_px / diameter))  # coarse pictures stay
+        scale = max(scale, min(1.0, settings.size_px / diameter))  # coarse pictures keep their size
     radius = diameter * scale / 2
     count = len(R_view_body)
     side = 2 * math.ceil(radius * (1 + MARGIN)) + 2
@@ -97,8 +90,7 @@ def _check(values: Mapping[str, float]) -> None:
 def _lit(
     texture: Tensor, R: Tensor, values: Mapping[str, float], disk: Disk, side: int, rng: torch.Generator
 ) -> Tensor:
-    """Return grey levels (F, side, side) of balls and background."""
-    count, radius = len(R), float(disk.radius_px.amax()) if len(R) else 1.0  # all have the same
+    count, radius = len(R), float(disk.radius_px.amax()) if len(R) else 1.0
     right, down = disk.offset(torch.empty(count, side, side))
     origin = torch.nn.functional.pad(
         torch.stack([right.expand(-1, side, -1), down.expand(-1, -1, side)], -1).flatten(1, 2), (0, 1)
@@ -113,7 +105,7 @@ def _lit(
 
 
 def _instants(R: Tensor, values: Mapping[str, float], rng: torch.Generator) -> Tensor:
-    """Return the orientations (E, F, 3, 3) during an exposure; rotation vectors are normally distributed."""
+    """Return orientations (E, F, 3, 3) during the exposure, with normal rotation vectors."""
     degrees = values.get("motion_blur", 0.0)
     if degrees == 0:
         return R[None]
@@ -123,7 +115,7 @@ def _instants(R: Tensor, values: Mapping[str, float], rng: torch.Generator) -> T
 
 
 def _light(normal: Tensor, rng: torch.Generator) -> Tensor:
-    """Return the light on normals (F, P, 3): an even part, and lamps anywhere on the camera's side."""
+    """Return ambient light and random lamps on the camera's side for normals (F, P, 3)."""
     count = len(normal)
     ambient = AMBIENT[0] + (AMBIENT[1] - AMBIENT[0]) * torch.rand((count, 1), generator=rng)
     lamps = random_directions(count * LAMPS, rng).float().reshape(count, LAMPS, 3)
@@ -134,7 +126,6 @@ def _light(normal: Tensor, rng: torch.Generator) -> Tensor:
 def _outline(
     disk: Disk, values: Mapping[str, float], scale: float, rng: torch.Generator, settings: DiskSettings
 ) -> Disk:
-    """Return the disks that a measured outline would give."""
     count = len(disk.radius_px)
     if "centre_error" in values:
         disk = centre_error(disk, values["centre_error"] * scale, rng)

@@ -1,10 +1,7 @@
-"""Ensembles of six-dimensional tracks without pictures, whose true statistics are those of the paper's Table I.
+"""Synthetic ensembles of 6D trajectories without pictures, with the true statistics of the paper's Table I.
 
-A component is a smooth stationary random rate with known rms and flatness, its derivative's too:
-rate = rms (sqrt(1 - b) g1 + sqrt(b / <A^2>) A g2): two independent Gaussian processes, the second amplified in bursts
-by A, whose logarithm is a sum of DEPTH cos(phase) over phases that turn evenly from random starts. Given the phases
-everything is Gaussian: all moments are means over them. A is nearly the log-normal factor of turbulence, but bounded:
-otherwise the flatness of 300 segments would depend on the largest event in them.
+A rate is rms (sqrt(1 - b) g1 + sqrt(b / <A^2>) A g2): g1 and g2 are Gaussian processes, ln A is a sum of DEPTH
+cos(phase). A is bounded: with log-normal bursts the largest event would set the flatness of 300 segments.
 """
 
 from __future__ import annotations
@@ -21,13 +18,13 @@ from scipy.special import i0e, ndtri
 
 from sphereorient import so3
 from sphereorient.motion import (
+    RATE_UNITS,
     MeasuredPoses,
-    Motion,
     MotionSettings,
     ProcessNoise,
-    Smoothed,
     SmoothSettings,
     measure_motion,
+    rates_of,
     smooth_motion,
 )
 from sphereorient.synth.motion import magnus_rotation
@@ -37,21 +34,13 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Three = tuple[float, float, float]
 
-TURNS = (0.25, 0.4)  # rates of the phases over that of g2: a burst holds a few oscillations
-DEPTH = 0.66  # of each phase's part in ln A; 0.63 would not reach a flatness of 7.6 in the derivative
-WAVES = 24  # sines of each Gaussian process
-GAUSSIAN = 3.0  # its flatness
-NODES = 64  # of each phase: means over so many are exact to rounding for these smooth periodic functions
-REST = 10  # steps between the end of a segment and the start of the next
-BOX_MM = 40.0  # segments start within this distance of the origin, by component
-_UNITS = {  # of motion's names
-    "velocity": "m_s",
-    "acceleration": "m_s2",
-    "omega_lab": "rad_s",
-    "omega_body": "rad_s",
-    "alpha_lab": "rad_s2",
-    "alpha_body": "rad_s2",
-}
+TURNS = (0.25, 0.4)  # rates of the phases relative to that of g2: a burst holds a few oscillations
+DEPTH = 0.66  # amplitude of each phase in ln A; 0.63 would not reach a derivative flatness of 7.6
+WAVES = 24  # sines per Gaussian process
+GAUSSIAN = 3.0  # flatness of a Gaussian
+NODES = 64  # per phase: averages of these smooth periodic functions are then exact to rounding
+REST = 10  # frames between two segments
+BOX_MM = 40.0  # largest start coordinate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,19 +48,15 @@ class Law:
     """Statistics of one component; made by `Law.of`."""
 
     rms: float
-    share: float  # b, of the bursts in the variance
+    share: float  # b, variance share of the bursts
     slow: float  # rms rate of g1, rad/s
     fast: float  # rms rate of g2, rad/s
 
     @classmethod
     def of(cls, rms: float, derivative_rms: float, flatness: float = 3.0, derivative_flatness: float = 3.0) -> Self:
-        """Find the process with these statistics.
+        """Return the process with these statistics of the rate (any unit) and its derivative (that unit / s).
 
-        Args:
-            rms: of the rate, any unit.
-            derivative_rms: the same unit / s.
-            flatness: of the rate, 3 or more.
-            derivative_flatness: of its derivative; 3 where the flatness is 3, else up to about 9.
+        A flatness is at least 3; the derivative's is 3 if the rate's is 3, else up to about 9.
         """
         modulation, growth, flat = _burst()
         share = math.sqrt(max(flatness - GAUSSIAN, 0.0) / (modulation - GAUSSIAN))
@@ -82,7 +67,7 @@ class Law:
         return cls(rms=rms, share=share, slow=slow, fast=fast)
 
     def draw(self, segments: int, rng: np.random.Generator) -> Draw:
-        """Draw independent realisations, one a segment."""
+        """Draw one independent realisation per segment."""
         coefficients = rng.standard_normal((segments, 2, 2, WAVES)) / math.sqrt(WAVES)
         return Draw(law=self, coefficients=coefficients, phase=rng.uniform(0.0, 2 * np.pi, (segments, len(TURNS))))
 
@@ -92,11 +77,11 @@ class Draw:
     """Realisations of a `Law` in S segments."""
 
     law: Law
-    coefficients: Floats  # (S, 2 processes, cosine and sine, WAVES)
-    phase: Floats  # (S, 2), of the bursts at time 0
+    coefficients: Floats
+    phase: Floats  # (S, 2), burst phases at time 0
 
     def at(self, time_s: Floats, segment: NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return the rate and its derivative, (M,) each, at times (M,) since the start of their segments."""
+        """Return the rate and its derivative, (M,) each, at times (M,), s, from the start of each segment."""
         law = self.law
         g1, g1_slope = self._gaussian(0, law.slow, time_s, segment)
         g2, g2_slope = self._gaussian(1, law.fast, time_s, segment)
@@ -109,7 +94,7 @@ class Draw:
         return calm * g1 + strong * burst * g2, calm * g1_slope + strong * (rise * g2 + burst * g2_slope)
 
     def integral(self, time_s: Floats, segment: NDArray[np.int64]) -> Floats:
-        """Return the integral of the calm part from each segment's start, (M,); for laws without bursts."""
+        """Return the integral of the rate from each segment's start, (M,); only for laws without bursts."""
         rate = self.law.slow * _spectrum()
         cosine, sine = self.coefficients[segment, 0, 0], self.coefficients[segment, 0, 1]
         angle = rate * time_s[:, None]
@@ -117,7 +102,6 @@ class Draw:
         return np.asarray(self.law.rms * math.sqrt(1 - self.law.share) * whole.sum(1))
 
     def _gaussian(self, which: int, rate: float, time_s: Floats, segment: NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return a Gaussian process of unit variance and its derivative."""
         rates = rate * _spectrum()
         angle = rates * time_s[:, None]
         cosine, sine = self.coefficients[segment, which, 0], self.coefficients[segment, which, 1]
@@ -126,14 +110,14 @@ class Draw:
 
 
 def _spectrum() -> Floats:
-    """Return the rates of the sines, mean square 1, by the quantiles of a half normal law: C(t) near exp(-t^2/2)."""
+    """Return the rates of the sines, mean square 1; the correlation is close to exp(-t^2 / 2)."""
     rates = ndtri(0.5 + (np.arange(WAVES) + 0.5) / (2 * WAVES))
     return np.asarray(rates / np.sqrt((rates**2).mean()))
 
 
 @cache
 def _burst() -> tuple[float, float, float]:
-    """Return the flatness of A g2, the mean square of its derivative over that of A g2' alone, and its flatness."""
+    """Return the flatness of A g2, the growth of its derivative's mean square by A, and that derivative's flatness."""
     angle = np.linspace(0.0, 2 * np.pi, NODES, endpoint=False)
     phases = np.meshgrid(*(angle for _ in TURNS), indexing="ij")
     var = np.exp(2 * DEPTH * sum(np.cos(phase) for phase in phases))
@@ -145,11 +129,11 @@ def _burst() -> tuple[float, float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class EnsembleSpec:
-    """Parameters of an ensemble; the defaults are Table I's. Components in `frame` are independent."""
+    """Parameters of an ensemble; the defaults are those of Table I."""
 
     segments: int = 300
     shortest_frames: int = 50
-    mean_frames: float = 150.0  # shortest_frames plus an exponentially distributed number
+    mean_frames: float = 150.0  # shortest_frames plus an exponential number
     frame_rate_hz: float = 600.0
     velocity_rms: Three = (0.28, 0.40, 0.37)  # m/s, lab
     acceleration_rms: Three = (5.5, 5.6, 6.0)  # m/s^2, lab
@@ -157,14 +141,14 @@ class EnsembleSpec:
     alpha_rms: Three = (560.0, 560.0, 560.0)  # rad/s^2
     omega_flatness: float = 4.0
     alpha_flatness: float = 7.6
-    frame: Literal["lab", "body"] = "lab"  # where omega's components are independent; in the other they are isotropic
+    frame: Literal["lab", "body"] = "lab"  # frame of independent components; in the other frame they are isotropic
 
     def velocity_laws(self) -> list[Law]:
-        """Return the Gaussian laws of the velocity's components."""
+        """Return the Gaussian laws of the velocity components, m/s, lab."""
         return [Law.of(rms, slope) for rms, slope in zip(self.velocity_rms, self.acceleration_rms, strict=True)]
 
     def omega_laws(self) -> list[Law]:
-        """Return the laws of omega's components in `frame`."""
+        """Return the laws of the omega components, rad/s, in `frame`."""
         pairs = zip(self.omega_rms, self.alpha_rms, strict=True)
         return [Law.of(rms, slope, self.omega_flatness, self.alpha_flatness) for rms, slope in pairs]
 
@@ -180,8 +164,7 @@ class Nominal:
 def nominal(spec: EnsembleSpec) -> dict[str, Nominal]:
     """Return the true moments of every quantity in closed form.
 
-    In the frame where the components depend on each other, the vector's direction is uniform: with R uniform and
-    independent of it, <(n x)^2> = |x|^2 / 3 and <(n x)^4> = |x|^4 / 5.
+    In the other frame directions are uniform: <(n x)^2> = |x|^2 / 3 and <(n x)^4> = |x|^4 / 5.
     """
     other = {"lab": "body", "body": "lab"}[spec.frame]
     out = {}
@@ -204,14 +187,14 @@ def nominal(spec: EnsembleSpec) -> dict[str, Nominal]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueTracks:
-    """Exact motion at M frames of S segments; made by `draw_ensemble`."""
+    """Exact motion at M frames of S segments, (M, ...); made by `draw_ensemble`."""
 
     spec: EnsembleSpec
-    time_s: Floats  # (M,)
-    segment: Rows  # (M,)
-    position_mm: Floats  # (M, 3)
-    R_lab_body: Floats  # (M, 3, 3)
-    velocity: Floats  # (M, 3), m/s
+    time_s: Floats  # (M,); the other fields are (M, ...)
+    segment: Rows
+    position_mm: Floats
+    R_lab_body: Floats
+    velocity: Floats  # m/s
     acceleration: Floats  # m/s^2
     omega_lab: Floats  # rad/s
     omega_body: Floats
@@ -220,10 +203,7 @@ class TrueTracks:
 
 
 def draw_ensemble(spec: EnsembleSpec, seed: int) -> TrueTracks:
-    """Draw independent segments with exponentially distributed durations, without noise; same seed, same ensemble.
-
-    Orientations are exact to 1e-6 rad per segment.
-    """
+    """Draw segments of exponential random length without noise; orientations are exact to 1e-6 rad per segment."""
     rng = np.random.default_rng(seed)
     extra = rng.exponential(spec.mean_frames - spec.shortest_frames, spec.segments)
     frames = spec.shortest_frames + np.floor(extra).astype(np.int64)
@@ -257,7 +237,6 @@ def draw_ensemble(spec: EnsembleSpec, seed: int) -> TrueTracks:
 
 
 def _rates(draws: list[Draw], since_s: Floats, segment: Rows) -> tuple[Floats, Floats]:
-    """Return the rates and their derivatives, (M, 3) each."""
     rate, slope = zip(*(draw.at(since_s, segment) for draw in draws), strict=True)
     return np.stack(rate, axis=1), np.stack(slope, axis=1)
 
@@ -265,10 +244,10 @@ def _rates(draws: list[Draw], since_s: Floats, segment: Rows) -> tuple[Floats, F
 def _orientations(
     turns: list[Draw], frames: Rows, since_s: Floats, segment: Rows, R_start: Floats, spec: EnsembleSpec
 ) -> Floats:
-    """Integrate omega from random starts, all segments side by side."""
+    """Integrate omega from random starts, all segments in parallel; return (M, 3, 3)."""
     h = 1 / spec.frame_rate_hz
     early, late = (_rates(turns, since_s + h * (0.5 + sign * math.sqrt(3) / 6), segment)[0] for sign in (-1, 1))
-    # In the body dR^T/dt = -[omega_body]x R^T: the same equation for the transpose.
+    # In the body frame, dR^T/dt = -[omega_body]x R^T: the same equation for the transpose.
     sign = 1.0 if spec.frame == "lab" else -1.0
     step = magnus_rotation(
         torch.from_numpy(sign * early), torch.from_numpy(sign * late), torch.tensor(h, dtype=torch.float64)
@@ -276,7 +255,7 @@ def _orientations(
     R = np.empty((len(segment), 3, 3))
     start = np.concatenate([[0], np.cumsum(frames)[:-1]])
     now = R_start if spec.frame == "lab" else R_start.swapaxes(1, 2)
-    for k in range(int(frames.max())):  # a product in order: nothing to batch but the segments
+    for k in range(int(frames.max())):
         alive = frames > k
         rows = start[alive] + k
         R[rows] = now[alive]
@@ -286,10 +265,10 @@ def _orientations(
 
 
 def exact_track(true: TrueTracks) -> Trajectory:
-    """Return the track of a perfect measurement; its sigmas are zero."""
+    """Return the trajectory of a perfect measurement; all sigmas are zero."""
     blank = _measured(true, true.position_mm, true.R_lab_body, 0.0, 0.0, "precise")
     parts: dict[str, Any] = {"position_smooth": true.position_mm, "orientation_smooth": true.R_lab_body}
-    for name in _UNITS:
+    for name in RATE_UNITS:
         parts |= {name: getattr(true, name), f"{name}_sigma": np.zeros((len(true.time_s), 3))}
     return replace(blank, **parts)
 
@@ -302,18 +281,9 @@ def smoothed_track(
     known: ProcessNoise | None = None,
     silent: bool = False,
 ) -> tuple[Trajectory, ProcessNoise]:
-    """Measure an ensemble with white noise and smooth it with `motion.smooth_motion`.
+    """Add white noise to an ensemble and smooth it; return the precise method's trajectory and the process noise.
 
-    Args:
-        true: the motion.
-        noise_deg: standard deviation of each component of the orientation's error, degrees.
-        noise_mm: of each coordinate of the position.
-        seed: of the noise.
-        known: process noise learnt from an earlier ensemble; None learns from this one.
-        silent: measure without noise but smooth as if there were: shows the bias of smoothing alone.
-
-    Returns:
-        The track as the precise method writes it, and the process noise.
+    `known` is an earlier process noise, None estimates it. `silent` smooths exact data: the bias of smoothing alone.
     """
     track = _noisy(true, noise_deg, noise_mm, seed, "precise")
     if silent:
@@ -335,16 +305,16 @@ def smoothed_track(
     }
     flags = np.where(found.extrapolated.numpy(), np.uint32(Flag.EXTRAPOLATED), np.uint32(0))
     arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in parts.items()}
-    return replace(track, **arrays, **_rates_of(found), flags=flags), found.process
+    return replace(track, **arrays, **rates_of(found), flags=flags), found.process
 
 
 def filtered_track(
     true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, settings: MotionSettings | None = None
 ) -> Trajectory:
-    """Measure an ensemble with white noise and differentiate it with Gaussian kernels, `motion.measure_motion`.
+    """Add white noise to an ensemble and differentiate with Gaussian kernels; return the paper method's trajectory.
 
-    The track is as the paper's method writes it; the kernels' low-pass bias stays in. Arguments as `smoothed_track`'s;
-    `settings` are the widths, None for the paper's.
+    The kernels' low-pass bias stays in. `noise_deg` and `noise_mm` are standard deviations per component; `settings`
+    holds the kernel widths, None for the paper's.
     """
     track = _noisy(true, noise_deg, noise_mm, seed, "paper")
     sigma_mm, sigma_rad = (torch.full((len(track),), x) for x in (noise_mm, math.radians(noise_deg)))
@@ -357,17 +327,10 @@ def filtered_track(
         position_sigma_mm=sigma_mm.double(),
         orientation_sigma_rad=sigma_rad.double(),
     )
-    return replace(track, position_smooth=track.position, orientation_smooth=track.orientation, **_rates_of(found))
-
-
-def _rates_of(found: Smoothed | Motion) -> dict[str, Any]:
-    """Return the rates of `motion` and their sigmas under the names of a track."""
-    values = {name: getattr(found, f"{name}_{unit}").numpy() for name, unit in _UNITS.items()}
-    return values | {f"{name}_sigma": getattr(found, f"{name}_sigma_{unit}").numpy() for name, unit in _UNITS.items()}
+    return replace(track, position_smooth=track.position, orientation_smooth=track.orientation, **rates_of(found))
 
 
 def _noisy(true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, method: str) -> Trajectory:
-    """Return positions and orientations with white noise."""
     rng = np.random.default_rng([seed, 1])
     noise_rad = math.radians(noise_deg)
     delta = torch.from_numpy(noise_rad * rng.standard_normal(true.position_mm.shape))
@@ -379,7 +342,6 @@ def _noisy(true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, metho
 def _measured(
     true: TrueTracks, position_mm: Floats, R: Floats, noise_mm: float, noise_rad: float, method: str
 ) -> Trajectory:
-    """Return a track of positions and orientations alone."""
     count, unit = len(true.time_s), np.eye(3)
     blank = Trajectory.empty(true.time_s, frame_rate=true.spec.frame_rate_hz, method=method, experiment="synthetic")
     return replace(

@@ -1,5 +1,3 @@
-"""Smooth random motion in six dimensions with exact derivatives."""
-
 from __future__ import annotations
 
 import math
@@ -13,33 +11,31 @@ from sphereorient import so3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion6D:
-    """Exact motion at N instants; made by `RandomMotion.at`. SI but for mm."""
+    """Exact motion at N instants, (N, ...); made by `RandomMotion.at`."""
 
-    time_s: Tensor  # (N,)
-    position_lab_mm: Tensor  # (N, 3)
-    velocity_m_s: Tensor  # (N, 3)
-    acceleration_m_s2: Tensor  # (N, 3)
-    R_lab_body: Tensor  # (N, 3, 3)
-    omega_lab_rad_s: Tensor  # (N, 3)
-    alpha_lab_rad_s2: Tensor  # (N, 3)
+    time_s: Tensor
+    position_lab_mm: Tensor
+    velocity_m_s: Tensor
+    acceleration_m_s2: Tensor
+    R_lab_body: Tensor
+    omega_lab_rad_s: Tensor
+    alpha_lab_rad_s2: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Waves:
-    """A sum of sines with random directions and phases: smooth, stationary, exact to differentiate."""
-
     amplitude: Tensor  # (M, 3)
     rate: Tensor  # (M,) rad/s
     phase: Tensor  # (M, 3)
 
     def __call__(self, time_s: Tensor, derivative: int = 0) -> Tensor:
-        """Return the value or a derivative at instants (...), (..., 3); derivative -1 is the integral."""
+        """Return the value or a derivative, (..., 3), at times (...), s; derivative -1 is the integral."""
         angle = self.rate[:, None] * time_s[..., None, None] + self.phase + derivative * math.pi / 2
         return (self.amplitude * self.rate[:, None] ** derivative * torch.sin(angle)).sum(-2)
 
 
 def _random_waves(rms: float, correlation_time: float, rng: torch.Generator, count: int = 24) -> _Waves:
-    """Draw waves of this rms per component, their rates spread up to a few inverse correlation times."""
+    """Draw waves of this rms per component; rates reach a few inverse correlation times."""
     share = (torch.arange(count, dtype=torch.float64) + 0.5) / count
     rate = (0.2 + 2.0 * share) / correlation_time
     weight = torch.exp(-0.5 * (rate * correlation_time) ** 2).sqrt()
@@ -51,17 +47,14 @@ def _random_waves(rms: float, correlation_time: float, rng: torch.Generator, cou
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RandomMotion:
-    """A smooth motion, known at any instant; made by `random_motion`."""
+    """Smooth motion, known at any instant; made by `random_motion`."""
 
-    path: _Waves  # velocity, mm/s; its integral is the path
+    path: _Waves  # velocity, mm/s; its integral is the position
     omega: _Waves  # omega_lab, rad/s
     R_start: Tensor  # (3, 3), R_lab_body at time 0
 
     def at(self, time_s: Tensor) -> Motion6D:
-        """Evaluate at (N,) instants, s, float64, each near the one before; the first may lie before time 0.
-
-        R by a fourth-order Magnus integration of omega_lab, exact to better than 1e-9 rad per frame.
-        """
+        """Return the motion at close, increasing times (N,), s, float64; R is exact to 1e-9 rad per frame."""
         return Motion6D(
             time_s=time_s,
             position_lab_mm=self.path(time_s, -1),
@@ -76,27 +69,21 @@ class RandomMotion:
 def random_motion(
     velocity_rms: float, velocity_time: float, omega_rms: float, omega_time: float, volume_mm: float, seed: int
 ) -> RandomMotion:
-    """Draw a smooth motion.
+    """Draw a smooth motion from rms values per component, m/s and rad/s (lab), and correlation times, s.
 
-    Args:
-        velocity_rms: m/s per component; less where the path would leave the volume.
-        velocity_time: correlation time of the velocity, s.
-        omega_rms: rad/s per component of omega_lab.
-        omega_time: correlation time of omega_lab, s.
-        volume_mm: the path stays about this near to the origin: a rms radius above half of it is scaled down.
-        seed: same seed, same motion.
+    The velocity is reduced where the rms distance from the origin would exceed half of `volume_mm`.
     """
     rng = torch.Generator().manual_seed(seed)
     path = _random_waves(velocity_rms * 1000, velocity_time, rng)
     omega = _random_waves(omega_rms, omega_time, rng)
-    reach = float((path.amplitude / path.rate[:, None]).square().sum().div(2).sqrt())  # rms distance from the middle
+    reach = float((path.amplitude / path.rate[:, None]).square().sum().div(2).sqrt())
     squeeze = min(1.0, 0.5 * volume_mm / max(reach, 1e-9))
     R_start = so3.random_rotations(1, generator=rng, dtype=torch.float64)[0]
     return RandomMotion(path=replace(path, amplitude=path.amplitude * squeeze), omega=omega, R_start=R_start)
 
 
 def _integrate(omega: _Waves, time_s: Tensor, R_start: Tensor, substeps: int = 8) -> Tensor:
-    """Return orientations with dR/dt = [omega_lab]x R, R(time 0) = R_start, at every instant."""
+    """Integrate dR/dt = [omega_lab]x R from R_start at time 0; return R at every instant."""
     start = torch.cat([time_s.new_zeros(1), time_s[:-1]])
     step = ((time_s - start) / substeps)[:, None]
     begin = start[:, None] + step * torch.arange(substeps, dtype=time_s.dtype)
@@ -104,7 +91,7 @@ def _integrate(omega: _Waves, time_s: Tensor, R_start: Tensor, substeps: int = 8
     turn = magnus_rotation(omega(early), omega(late), step[..., None])
     R = R_start
     out = []
-    for per_frame in turn:  # a product in order: nothing to batch
+    for per_frame in turn:
         for dR in per_frame:
             R = dR @ R
         R = so3.nearest_rotation(R)
@@ -113,9 +100,9 @@ def _integrate(omega: _Waves, time_s: Tensor, R_start: Tensor, substeps: int = 8
 
 
 def magnus_rotation(early: Tensor, late: Tensor, step_s: Tensor) -> Tensor:
-    """Return the rotations (..., 3, 3) of steps from omega (..., 3), rad/s, at the steps' two Gauss nodes.
+    """Return step rotations (..., 3, 3) from omega (..., 3), rad/s, at each step's two Gauss nodes.
 
-    Source: Magnus expansion of fourth order (Iserles and Norsett 1999).
+    Source: fourth-order Magnus expansion (Iserles and Norsett 1999).
     """
     h = step_s
     return so3.exp(h * (early + late) / 2 - math.sqrt(3) / 12 * h**2 * torch.linalg.cross(early, late))

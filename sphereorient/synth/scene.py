@@ -1,5 +1,3 @@
-"""Pictures of the scene: the sphere in perspective through a real camera, shaded, blurred, noisy, in 8 bits."""
-
 from __future__ import annotations
 
 import math
@@ -16,50 +14,42 @@ from sphereorient.sphere import reduced_texture, see_sphere
 from sphereorient.sphere.renderer import fine_pixels, lambert, reach_px
 from sphereorient.synth.settings import SynthSettings
 
-SUPERSAMPLING = 3  # rays per pixel and axis: edges of paint and the limb are then right to a few per cent
+SUPERSAMPLING = 3  # rays per pixel and axis: edges are accurate to a few per cent
 
-# Three lamps, directions from the sphere (lab), and their shares: two bright and one weak, so that no side is quite
-# dark and the underside is dim.
+# Lamp directions from the sphere (lab) and shares: two bright, one weak, so that no side is black.
 LAMPS = ((-0.6, -0.5, 0.6, 0.55), (0.7, -0.3, 0.65, 0.35), (0.0, 0.9, -0.4, 0.1))
-LIT = 0.75  # of the sum of the shares: what the brightest side gets
+LIT = 0.75  # share of the lamps that the brightest side receives
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RenderedScene:
-    """What does not move: map, sphere, light, grey levels; made by `make_scene`."""
+    """Static part of the scene: texture map, light, grey levels; made by `make_scene`."""
 
     texture: Tensor  # (H, 2 H) float32, reduced to the picture's resolution
     settings: SynthSettings
 
 
 def make_scene(texture: Tensor, settings: SynthSettings) -> RenderedScene:
-    """Prepare a scene from a full-size map."""
+    """Prepare a scene from a texture map (H, 2 H)."""
     return RenderedScene(texture=reduced_texture(texture, SUPERSAMPLING * settings.diameter_px), settings=settings)
 
 
 def render_frame(
     scene: RenderedScene, camera: Camera, position_lab_mm: Tensor, R_lab_body: Tensor, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Render one exposure with noise, (H, W); arguments as those of `expose`."""
+    """Render one noisy exposure, (H, W); arguments as in `expose`."""
     return digitise(expose(scene, camera, position_lab_mm, R_lab_body)[0], scene.settings, rng)
 
 
 def expose(
     scene: RenderedScene, camera: Camera, position_lab_mm: Tensor, R_lab_body: Tensor
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the grey levels of one exposure without noise, and the share of each pixel that the ball fills.
+    """Return one exposure without noise, and the coverage, (H, W) float32 each, blurred by the optics.
 
-    Args:
-        scene: map, light, levels.
-        camera: any model; its rays make the perspective and the distortion.
-        position_lab_mm: (E, 3), centre at the E instants of the exposure.
-        R_lab_body: (E, 3, 3), orientation at these instants.
-
-    Returns:
-        (H, W) float32 both, blurred by the optics.
+    `position_lab_mm` (E, 3) and `R_lab_body` (E, 3, 3) are the poses at E instants of the exposure.
 
     Raises:
-        CameraError: a ball that is not wholly before the camera, or not wholly in the liquid.
+        CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
     """
     settings = scene.settings
     width, height = camera.image_size
@@ -82,7 +72,7 @@ def expose(
 
 
 def digitise(picture: NDArray[np.float32], settings: SynthSettings, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Add the camera's noise to grey levels (H, W) and round them to 8 bits."""
+    """Add camera noise to grey levels (H, W) and round to 8 bits."""
     sigma = np.sqrt(settings.read_noise**2 + settings.shot_noise**2 * np.maximum(picture, 0))
     noisy = picture + sigma * rng.standard_normal(picture.shape, dtype=np.float32)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
@@ -91,7 +81,7 @@ def digitise(picture: NDArray[np.float32], settings: SynthSettings, rng: np.rand
 def _window(
     scene: RenderedScene, camera: Camera, box: tuple[int, int, int, int], position: Tensor, R_lab_body: Tensor
 ) -> NDArray[np.float32]:
-    """Return shaded paint times coverage, and coverage, (2, h, w), within left, right, top and bottom."""
+    """Return shaded paint times coverage, and coverage, (2, h, w), in the box left, right, top, bottom."""
     settings = scene.settings
     left, right, top, bottom = box
     within = fine_pixels(1, SUPERSAMPLING)

@@ -1,5 +1,3 @@
-"""Settings of a synthetic experiment."""
-
 from __future__ import annotations
 
 from typing import Literal, Self

@@ -1,4 +1,4 @@
-"""What can be wrong with pictures and with what is known of them: names, units, and five severities."""
+"""Degradations of pictures and reported inputs: names, units, five severities."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from sphereorient.files.yaml_file import refuse_unknown
 
 LEVELS = (1, 2, 3, 4, 5)
 Values = tuple[float, float, float, float, float]
-# scene and map: before filming; picture: the same throughout a movie, and in the picture without the ball; frame: drawn
-# anew for each; reported: what the method is given, not what is filmed.
+# scene, map: before filming; picture: constant over the movie, in the background too; frame: drawn per frame;
+# reported: in the inputs of the method only.
 Place = Literal["scene", "map", "picture", "frame", "movie", "reported"]
-SHARE = "share of "  # how units of the values begin that lie in 0 .. 1
+SHARE = "share of "  # prefix of units with values in 0 .. 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Degradation:
-    """One thing that can be wrong, in five severities; a row of `DEGRADATIONS`."""
+    """A degradation with five severities; a row of `DEGRADATIONS`."""
 
     name: str
-    unit: str  # of the values
-    does: str  # one sentence
-    values: Values  # from mild to hard: level 1 .. level 5
-    reason: str  # for the values
-    nothing: float | None  # the value at which nothing happens; None: the base scene's own value
+    unit: str
+    does: str
+    values: Values  # level 1 (mild) .. level 5 (hard)
+    reason: str
+    nothing: float | None  # value without effect; None: the base scene's value
     where: Place
 
     def check(self, value: float) -> None:
-        """Refuse a value that is not a number, below nothing, or a share of 1 or more (SettingsError)."""
+        """Raise SettingsError unless the value is finite, at least `nothing`, and below 1 for a share."""
         least = 0.0 if self.nothing is None else self.nothing
         most = 1.0 if self.unit.startswith(SHARE) else math.inf
         if not (math.isfinite(value) and least <= value < most):
@@ -41,8 +41,7 @@ class Degradation:
             raise SettingsError(refusal(f"degradation {self.name}", expected=expected, got=f"{value:g}", do=do))
 
 
-# Name, where it acts, value at which nothing happens, unit and values; what it does; the reason for the values. In the
-# order in which the light meets them; what the method is given comes last.
+# Name, place, value without effect, unit, values; effect; reason. In the order of the light path, inputs last.
 _ROWS: tuple[tuple[tuple[str, Place, float | None, str, Values], str, str], ...] = (
     (
         ("ball_size", "scene", None, "px of diameter", (160.0, 80.0, 50.0, 32.0, 20.0)),
@@ -159,22 +158,14 @@ DEGRADATIONS: Mapping[str, Degradation] = MappingProxyType(
 
 
 def degradation(name: str) -> Degradation:
-    """Return a row of `DEGRADATIONS`.
-
-    Raises:
-        SettingsError: an unknown name; the message names the nearest known one.
-    """
+    """Return a row of `DEGRADATIONS`; raise SettingsError for an unknown name."""
     if name not in DEGRADATIONS:
         raise SettingsError(refuse_unknown(name, DEGRADATIONS, "degradation"))
     return DEGRADATIONS[name]
 
 
 def severity(name: str, level: int) -> float:
-    """Return the physical value of a level, 1 (mild) to 5 (hard).
-
-    Raises:
-        SettingsError: an unknown name, or another level.
-    """
+    """Return the physical value of a level, 1 (mild) to 5 (hard); raise SettingsError for an unknown name or level."""
     row = degradation(name)
     if isinstance(level, bool) or level not in LEVELS:
         do = "choose one of them"

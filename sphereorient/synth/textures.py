@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def map_directions(height: int) -> Tensor:
-    """Return the body direction of every texel of a map, (H, 2 H, 3) float64 (docs/conventions.md)."""
+    """Return the body direction of every texel, (H, 2 H, 3) float64 (docs/conventions.md)."""
     latitude = math.pi / 2 - math.pi * (torch.arange(height, dtype=torch.float64) + 0.5) / height
     longitude = math.pi * (torch.arange(2 * height, dtype=torch.float64) + 0.5) / height - math.pi
     lat, lon = torch.meshgrid(latitude, longitude, indexing="ij")
@@ -17,13 +17,13 @@ def map_directions(height: int) -> Tensor:
 
 
 def random_directions(count: int, rng: torch.Generator) -> Tensor:
-    """Draw directions uniformly over the sphere, (count, 3) float64."""
+    """Draw uniform unit directions, (count, 3) float64."""
     draw = torch.randn(count, 3, generator=rng, dtype=torch.float64)
     return torch.nn.functional.normalize(draw, dim=-1)
 
 
 def blobs(height: int, rng: torch.Generator) -> Tensor:
-    """Draw smooth blobs: the sign of a random function of body direction, half the sphere white."""
+    """Draw smooth blobs, half of the sphere white."""
     wave = random_directions(60, rng) * (5 + 5 * torch.rand(60, 1, generator=rng, dtype=torch.float64))
     phase = 2 * math.pi * torch.rand(60, generator=rng, dtype=torch.float64)
     value = torch.cos(map_directions(height) @ wave.T + phase).sum(-1)
@@ -31,14 +31,14 @@ def blobs(height: int, rng: torch.Generator) -> Tensor:
 
 
 def polygons(height: int, rng: torch.Generator) -> Tensor:
-    """Draw polygons: the regions nearest to random points, black or white in turn."""
+    """Draw black and white regions nearest to random points."""
     points = random_directions(60, rng)
     owner = (map_directions(height) @ points.T).argmax(-1)
     return (owner % 2).float()
 
 
 def dots(height: int, rng: torch.Generator) -> Tensor:
-    """Draw scattered black dots of 8 to 14 degrees radius on white."""
+    """Draw black dots of 8 to 14 degrees radius on white."""
     points = random_directions(34, rng)
     radius = torch.deg2rad(8 + 6 * torch.rand(34, generator=rng, dtype=torch.float64))
     outside = (torch.acos((map_directions(height) @ points.T).clamp(-1, 1)) - radius).amin(-1)
@@ -46,7 +46,6 @@ def dots(height: int, rng: torch.Generator) -> Tensor:
 
 
 def _edge(value: Tensor, width: float) -> Tensor:
-    """Return white where positive, black where negative, soft over `width`."""
     return (0.5 + value / width).clamp(0, 1).float()
 
 
@@ -54,5 +53,5 @@ KINDS = {"blobs": blobs, "patches": polygons, "dots": dots}
 
 
 def random_texture(kind: str, seed: int, height: int = 512) -> Tensor:
-    """Draw a map of a kind of `KINDS`, (H, 2 H) float32, 0 black .. 1 white; same seed, same map."""
+    """Draw a texture map of a kind in `KINDS`, (H, 2 H) float32, 0 black .. 1 white; equal seeds give equal maps."""
     return KINDS[kind](height, torch.Generator().manual_seed(seed))

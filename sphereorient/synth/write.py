@@ -1,4 +1,4 @@
-"""A synthetic experiment on disk, in the format that `sphereorient track` reads."""
+"""Write synthetic experiments in the format that `sphereorient track` reads."""
 
 from __future__ import annotations
 
@@ -28,45 +28,45 @@ PIXEL_PITCH_MM = 0.02
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FilmedView:
-    """The ball in one picture, for `Filming.picture`."""
+    """The sphere in one picture, for `Filming.picture`."""
 
-    name: str  # of the camera
+    name: str
     camera: Camera
-    frame: int | None  # its number; None for the picture without the ball
-    cover: NDArray[np.float32]  # (H, W), share of each pixel that the ball fills
-    position_lab_mm: Tensor  # (3,) float64, its centre in the middle of the exposure
+    frame: int | None  # frame number; None: background picture
+    cover: NDArray[np.float32]  # (H, W), coverage of each pixel
+    position_lab_mm: Tensor  # (3,) float64, centre at mid-exposure
 
 
 class Filming:
-    """What changes between the scene and its files, and what the files report of it: here nothing, and the truth."""
+    """Hooks that change pictures and reported files; the base class changes nothing."""
 
     def paint(self, texture: Tensor) -> Tensor:
-        """Return the map on the filmed ball, (H, 2 H), from a new one."""
+        """Return the texture map of the filmed sphere, (H, 2 H)."""
         return texture
 
     def picture(self, picture: NDArray[np.float32], view: FilmedView) -> NDArray[np.float32]:
-        """Return grey levels (H, W) before noise, from those of camera and optics."""
+        """Return grey levels (H, W) before noise."""
         return picture
 
     def lost(self, name: str, frames: int) -> frozenset[int]:
-        """Return which of the frames 0 .. frames - 1 of a camera come out black."""
+        """Return the numbers of a camera's black frames."""
         return frozenset()
 
     def reported_texture(self, texture: Tensor) -> Tensor:
-        """Return the map, (H, 2 H), that the experiment's files hold."""
+        """Return the texture map (H, 2 H) to write."""
         return texture
 
     def reported_cameras(self, cameras: Mapping[str, Camera]) -> Mapping[str, Camera]:
-        """Return the cameras that the experiment's files hold."""
+        """Return the cameras to write."""
         return cameras
 
     def reported_diameter_mm(self, diameter_mm: float) -> float:
-        """Return the sphere's diameter that the experiment's files hold."""
+        """Return the diameter to write, mm."""
         return diameter_mm
 
 
 def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
-    """Return two Tsai cameras at right angles: cam1 looks along lab +y, cam2 along lab -z; slight distortion."""
+    """Return two Tsai cameras with slight distortion: cam1 looks along lab +y, cam2 along lab -z."""
     focal_mm = settings.diameter_px * PIXEL_PITCH_MM * settings.distance_mm / settings.diameter_mm
     width, height = settings.image_size
 
@@ -98,20 +98,14 @@ def write_synthetic_experiment(
     progress: Callable[[int], None] = lambda done: None,
     filming: Filming | None = None,
 ) -> Path:
-    """Render a two-camera experiment with exact truth.
+    """Render a two-camera experiment with exact truth in `folder` and return the path of experiment.yaml.
 
-    Args:
-        folder: created if missing; files of an older run are replaced.
-        settings: the scene.
-        progress: called with the number of frames rendered since the last call.
-        filming: changes of the pictures and of what the files report; None for neither.
-
-    Returns:
-        Path of experiment.yaml; beside it cam1.mkv, cam2.mkv, pictures of the scene without the sphere, texture.png,
-        cameras.yaml and truth.h5.
+    The folder also receives movies, backgrounds, texture.png, cameras.yaml and truth.h5; old files are replaced.
+    `progress` receives the number of frames rendered since the last call; `filming` changes pictures and reported
+    files.
 
     Raises:
-        OutputError: the folder cannot be written.
+        OutputError: folder not writable.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -120,7 +114,7 @@ def write_synthetic_experiment(
             refusal(f"folder {folder}", expected="a folder that can be made", got=str(error), do="choose another --out")
         ) from None
     filming = filming or Filming()
-    # In whole grey levels, as the file holds it.
+    # Rounded to grey levels, as in the file.
     texture = _as_file(random_texture(settings.texture, settings.seed)) / np.float32(255)
     cameras = default_cameras(settings)
     scene = make_scene(filming.paint(torch.from_numpy(texture)), settings)
@@ -139,7 +133,7 @@ def write_synthetic_experiment(
 
 
 def frame_times_s(settings: SynthSettings) -> Tensor:
-    """Return the middles of the exposures, (N,) float64."""
+    """Return mid-exposure times, (N,) float64, s."""
     return torch.arange(settings.frames, dtype=torch.float64) / settings.frame_rate
 
 
@@ -156,7 +150,6 @@ def motion_of(settings: SynthSettings) -> RandomMotion:
 
 
 def _as_file(texture: Tensor) -> NDArray[np.uint8]:
-    """Return a map, 0 black .. 1 white, in the grey levels of its file."""
     grey: NDArray[np.uint8] = np.rint(texture.numpy() * 255).astype(np.uint8)
     return grey
 
@@ -173,7 +166,6 @@ def _frames(
     rng: np.random.Generator,
     progress: Callable[[int], None],
 ) -> Iterator[NDArray[np.uint8]]:
-    """Render the movie of one camera, frame by frame."""
     settings, (name, camera) = scene.settings, named
     count = settings.exposure_samples
     within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
@@ -183,14 +175,13 @@ def _frames(
         position, R_lab_body = (x[k * count : (k + 1) * count] for x in (now.position_lab_mm, now.R_lab_body))
         picture, cover = expose(scene, camera, position, R_lab_body)
         view = FilmedView(name=name, camera=camera, frame=k, cover=cover, position_lab_mm=position.mean(0))
-        # Noise is drawn for lost frames too: a loss does not change the other frames.
+        # Lost frames draw noise too: the other frames do not depend on losses.
         frame = digitise(filming.picture(picture, view), settings, rng)
         yield np.zeros_like(frame) if k in lost else frame
         progress(1)
 
 
 def _without_the_ball(settings: SynthSettings, name: str, camera: Camera, filming: Filming) -> NDArray[np.uint8]:
-    """Return the picture of the scene without the ball, averaged over many frames: without noise."""
     size = camera.image_size[::-1]
     cover, origin = np.zeros(size, np.float32), torch.zeros(3, dtype=torch.float64)
     view = FilmedView(name=name, camera=camera, frame=None, cover=cover, position_lab_mm=origin)
@@ -200,7 +191,7 @@ def _without_the_ball(settings: SynthSettings, name: str, camera: Camera, filmin
 
 
 def _write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> None:
-    """Write truth.h5 (docs/data-format.md), aside and then under its name."""
+    """Write truth.h5 (docs/data-format.md) under a temporary name, then rename it."""
     body = truth.R_lab_body.mT
     data = {
         "time": truth.time_s,
@@ -222,7 +213,7 @@ def _write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> 
 
 
 def _experiment(settings: SynthSettings, cameras: Mapping[str, Camera], filming: Filming) -> dict[str, Any]:
-    # A momentary exposure is left out: the experiment's key is a duration above 0.
+    # exposure 0 is left out: the key must be above 0.
     exposure = {"exposure": settings.exposure} if settings.exposure > 0 else {}
     return {
         "schema": "sphereorient-experiment/1",

@@ -1,5 +1,3 @@
-"""The record of one camera in a trajectory, and its group in the file."""
-
 # ruff: noqa: RUF009 -- stored returns a dataclass field without a default
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraTrack:
-    """Results of one camera, N frames; the candidates of frame k are the rows offset[k] .. offset[k + 1]."""
+    """Results of one camera in N frames; candidates of frame k are rows offset[k] .. offset[k + 1]."""
 
     centre_px: Floats = stored("px", "projection of the sphere's centre, (u, v)", 2)
     radius_px: Floats = stored("px", "radius of the outline")
@@ -43,7 +41,7 @@ class CameraTrack:
     orientation_cov: Floats = stored("rad^2", "covariance of delta, R_true = exp([delta]x) R, lab components", 3, 3)
     score: Floats = stored("1", "agreement of the picture with the map at this orientation, 0 to 1")
     xi: Floats = stored("rad", "the paper's measure of this camera's noise; its moving variance weighs the cameras")
-    reason: tuple[str, ...]  # N values of Reason; a newer file may name reasons that Reason does not know yet
+    reason: tuple[str, ...]  # N values of Reason; newer files may have unknown reasons
     candidate_offset: NDArray[np.int64] = stored(
         "1", "candidates of frame k are the rows offset[k] .. offset[k + 1]", dtype="int64", fill=0, rows="offsets"
     )
@@ -51,7 +49,6 @@ class CameraTrack:
     candidate_score: Floats = stored("1", "score of every candidate", rows="candidates")
 
     def __post_init__(self) -> None:
-        """Compare the lengths of the parts."""
         offset = np.asarray(self.candidate_offset)
         if offset.size and (np.diff(offset, prepend=0) < 0).any():
             got, do = f"{offset[:5].tolist()}", "count the candidates frame by frame"
@@ -72,14 +69,14 @@ class CameraTrack:
 
     @classmethod
     def empty(cls, frames: int) -> Self:
-        """Return the record of a camera that found nothing in `frames` frames."""
+        """Return an empty record of `frames` frames."""
         return cls(reason=(Reason.NOT_FOUND,) * frames, **blank_datasets(cls, frames))
 
 
 def write_camera(camera: CameraTrack, group: h5py.Group) -> None:
     """Write the datasets of one camera."""
     write_datasets(camera, group)
-    # of fixed length: HDF5 stores strings of varying length apart from their dataset
+    # fixed length: HDF5 stores variable strings outside the dataset
     width = max([16, *map(len, camera.reason)])
     write_dataset(group, "reason", np.array([str(r) for r in camera.reason], f"S{width}"), REASON)
 

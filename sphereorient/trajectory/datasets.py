@@ -1,4 +1,4 @@
-"""The table of datasets of a track file: each field of a record declares its axes, unit, description and type."""
+"""Datasets of a track file: axes, unit, description and type of each record field."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sphereorient.errors import ShapeError, TrackError, refusal
 
 KEY = "column"
-LARGEST_RATIO = 1200  # largest compression ratio: a dataset that claims more is not in the file
+LARGEST_RATIO = 1200  # compression ratio; a dataset that claims more is not in the file
 
 
 @dataclass(frozen=True)
@@ -25,18 +25,18 @@ class DatasetSpec:
     description: str
     tail: tuple[int, ...] = ()  # axes after the first
     dtype: str = "float64"
-    fill: float = np.nan  # value of what was not measured
-    since: str = ""  # the version that added it: files of older ones are read without it
-    rows: str = "frames"  # or offsets (frames + 1), or candidates
+    fill: float = np.nan  # value if not measured
+    since: str = ""  # first version with this dataset; older files are read without it
+    rows: str = "frames"  # frames, offsets (frames + 1) or candidates
 
 
 def stored(units: str, description: str, *tail: int, **more: Any) -> Any:
-    """Declare a field of a record that is a dataset of the file."""
+    """Declare a record field that is a dataset of the file."""
     return field(metadata={KEY: DatasetSpec(units, description, tail, **more)})
 
 
 def stored_fields(record: type[Any]) -> Iterator[tuple[str, DatasetSpec]]:
-    """Yield field name and specification of every dataset of a record, in order."""
+    """Yield name and specification of every dataset of a record, in order."""
     return ((entry.name, entry.metadata[KEY]) for entry in fields(record) if KEY in entry.metadata)
 
 
@@ -47,7 +47,7 @@ def blank_datasets(record: type[Any], frames: int) -> dict[str, NDArray[Any]]:
 
 
 def check_shapes(record: object, rows: Mapping[str, int]) -> None:
-    """Refuse a record in which a dataset has another shape than declared."""
+    """Raise ShapeError if a dataset of a record has another shape than declared."""
     for name, c in stored_fields(type(record)):
         expected, got = (rows[c.rows], *c.tail), np.shape(getattr(record, name))
         if got != expected:
@@ -63,13 +63,13 @@ def write_datasets(record: Any, group: h5py.Group) -> None:
 
 
 def write_dataset(group: h5py.Group, place: str, values: NDArray[Any], spec: DatasetSpec) -> None:
-    """Write one dataset with unit and description; without times, so that equal arrays give equal bytes."""
+    """Write one dataset with unit and description; without timestamps: equal arrays give equal bytes."""
     dataset = group.create_dataset(place, data=values, track_times=False)
     dataset.attrs["units"], dataset.attrs["description"] = spec.units, spec.description
 
 
 def read_datasets(group: h5py.Group, record: type[Any]) -> dict[str, NDArray[Any]]:
-    """Return all datasets of a record by field name; those that an older version did not write are blank."""
+    """Return all datasets of a record by field name; those newer than the file are blank."""
     known = {
         name: read_dataset(group, _place(name), c.dtype).astype(c.dtype)
         for name, c in stored_fields(record)
@@ -81,7 +81,7 @@ def read_datasets(group: h5py.Group, record: type[Any]) -> dict[str, NDArray[Any
 
 
 def read_dataset(group: h5py.Group, place: str, dtype: str) -> NDArray[Any]:
-    """Return the values of a dataset; refuse, before reading, one in other files or of an impossible size."""
+    """Return a dataset's values; raise TrackError, before reading, if it is external or impossibly large."""
     dataset = inside(group, place)
     got = ""
     if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
@@ -99,7 +99,7 @@ def read_dataset(group: h5py.Group, place: str, dtype: str) -> NDArray[Any]:
 
 
 def inside(group: h5py.Group, place: str) -> Any:
-    """Return the object at a place in a group; None if there is none, or a link, which may lead to other files."""
+    """Return the object at a place in a group; None if missing or a link, which may lead to other files."""
     here: Any = group
     for part in place.split("/"):
         if not isinstance(here, h5py.Group) or not isinstance(here.get(part, getlink=True), h5py.HardLink):

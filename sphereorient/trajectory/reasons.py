@@ -1,12 +1,10 @@
-"""Flags of a frame, and reasons why a camera has no orientation."""
-
 from __future__ import annotations
 
 from enum import IntFlag, StrEnum
 
 
 class Flag(IntFlag):
-    """Bits of the dataset `flags`; several may hold for one frame."""
+    """Bits of the dataset `flags`."""
 
     POSITION_INTERPOLATED = 1
     POSITION_OUTLIER_REPLACED = 2
@@ -20,7 +18,7 @@ class Flag(IntFlag):
 
 
 class Reason(StrEnum):
-    """Reason why one camera has no orientation in a frame; `OK` if it has one."""
+    """Why a camera has no orientation in a frame; `OK` if it has one."""
 
     OK = "ok"
     NOT_FOUND = "not_found"
@@ -31,6 +29,6 @@ class Reason(StrEnum):
     RUNAWAY = "runaway"
     LOW_SCORE = "low_score"
     AMBIGUOUS = "ambiguous"
-    CONTRADICTS = "contradicts"  # its line of sight misses the other camera's ball: the cameras disagree
+    CONTRADICTS = "contradicts"  # its line of sight misses the other camera's sphere
     UNDECODABLE = "undecodable"
-    MISSING = "missing"  # the camera has no picture of the frame
+    MISSING = "missing"

@@ -1,5 +1,3 @@
-"""The result of a measurement: position, orientation and motion of one sphere, and what each camera saw."""
-
 # ruff: noqa: RUF009 -- stored returns a dataclass field without a default
 
 from __future__ import annotations
@@ -35,8 +33,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = "sphereorient-track/1"
-TEXTS = ("method", "settings", "experiment")  # root attributes
-# Rows of `plot`: the label, the measured field, the smoothed one.
+TEXTS = ("method", "settings", "experiment")
+# Rows of `plot`: label, measured field, smoothed field.
 PLOTTED = (
     ("position (mm)", "position", "position_smooth"),
     ("orientation (quaternion, 1)", "orientation", "orientation_smooth"),
@@ -49,11 +47,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """All results on one sphere, N frames; made by the methods, read by report, evaluate and the user.
-
-    Lengths are mm, times s, angles rad; velocities m/s and accelerations m/s^2. What could not be measured is NaN.
-    Make one with `Trajectory.empty` and `dataclasses.replace`; `track[10:50]` is a part of it.
-    """
+    """All results on one sphere in N frames; mm, s, rad, m/s, m/s^2; NaN if not measured; `track[10:50]` is a part."""
 
     time: Floats = stored("s", "frame number of the experiment / frame rate; middle of the exposure")
     valid: NDArray[np.bool_] = stored("1", "orientation and position measured in this frame", dtype="bool", fill=0)
@@ -98,11 +92,10 @@ class Trajectory:
     frame_rate: float  # Hz
     method: str  # paper, precise
     settings: str  # YAML text
-    experiment: str  # the experiment's name
-    provenance: Mapping[str, Any]  # versions, command, sha256 of inputs; must go into JSON
+    experiment: str
+    provenance: Mapping[str, Any]  # versions, command, sha256 of inputs; JSON types
 
     def __post_init__(self) -> None:
-        """Compare the lengths of the parts."""
         frames = np.size(self.time)
         check_shapes(self, {"frames": frames})
         for name, camera in self.cameras.items():
@@ -111,15 +104,12 @@ class Trajectory:
                 raise ShapeError(refusal(f"Trajectory.cameras[{name!r}]", expected=f"{frames}", got=got, do=do))
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.time)
 
     def __repr__(self) -> str:
-        """Return a summary of a few lines."""
         return "\n".join(["Trajectory", *(f"  {title:8} {text}" for title, text in self._facts())])
 
     def _repr_html_(self) -> str:
-        """Return the same summary as a table, for notebooks."""
         rows = (f"<tr><th>{title}</th><td>{escape(text)}</td></tr>" for title, text in self._facts())
         return f"<table><caption>Trajectory</caption>{''.join(rows)}</table>"
 
@@ -138,24 +128,19 @@ class Trajectory:
 
     @classmethod
     def empty(cls, time: Floats, *, cameras: Sequence[str] = (), **fields: Any) -> Self:
-        """Return a trajectory with every dataset present and nothing measured.
+        """Return a trajectory at times (N,), s, for the named cameras, with nothing measured.
 
-        Args:
-            time: (N,), s.
-            cameras: names of the cameras.
-            fields: frame_rate (Hz; NaN for uneven times), method, settings (YAML), experiment, provenance (for JSON).
+        `fields`: frame_rate (Hz; NaN for uneven times), method, settings (YAML), experiment, provenance (JSON types).
         """
         known: dict[str, Any] = {"frame_rate": np.nan, "provenance": {}, **dict.fromkeys(TEXTS, ""), **fields}
         datasets: dict[str, Any] = blank_datasets(cls, len(time)) | {"time": np.asarray(time, "float64")}
         return cls(cameras={name: CameraTrack.empty(len(time)) for name in cameras}, **datasets, **known)
 
     def save(self, path: str | Path) -> None:
-        """Write the trajectory as HDF5 of schema sphereorient-track/1; an old file is replaced when it is complete.
-
-        The same arrays give the same bytes in every dataset.
+        """Write HDF5 of schema sphereorient-track/1, replacing an old file at the end; equal arrays give equal bytes.
 
         Raises:
-            OutputError: the folder is missing or cannot be written to.
+            OutputError: folder missing or not writable.
         """
         path = Path(path)
         if not path.parent.is_dir():
@@ -174,10 +159,10 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a trajectory that `save` wrote; datasets and attributes that this version does not know are left out.
+        """Read a trajectory written by `save`; unknown datasets and attributes are ignored.
 
         Raises:
-            TrackError: no such file, no HDF5 file, another schema, or a dataset is missing or has a wrong shape.
+            TrackError: no HDF5 file, another schema, or a dataset missing or of wrong shape.
         """
         path = Path(path)
         got, do = "no file", "pass the track.h5 that `sphereorient track` wrote"
@@ -192,17 +177,12 @@ class Trajectory:
         try:
             with file:
                 return cls(**_read(file))
-        except DAMAGE as error:  # ShapeError and broken JSON among them
+        except DAMAGE as error:  # includes ShapeError and broken JSON
             got = f"'{' '.join(str(error).split())[:200]}'"
             raise TrackError(refusal(str(path), expected="a whole track", got=got, do=AGAIN)) from error
 
     def __getitem__(self, frames: slice | int) -> Self:
-        """Return the frames of a slice, as numpy slices, with a positive step.
-
-        Raises:
-            TypeError: an index that is not a slice.
-            ShapeError: a negative step.
-        """
+        """Return the frames of a slice with positive step; raise TypeError or ShapeError for anything else."""
         if not isinstance(frames, slice):
             got, do = f"{frames!r:.60}", "write track[10:11] for one frame"
             raise TypeError(refusal("Trajectory[...]", expected="a slice of frames", got=got, do=do))
@@ -217,11 +197,9 @@ class Trajectory:
         return replace(self, **parts, cameras={name: camera.at(rows) for name, camera in self.cameras.items()})
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return the trajectory as a table, one row a frame.
+        """Return a table, one row per frame, units in the column names (time_s, position_x_mm, velocity_x_m_s, ...).
 
-        Returns:
-            Columns with their units in the name: time_s, position_x_mm, velocity_x_m_s, ..., quat_w, quat_x, quat_y,
-            quat_z (of R_lab_body, w >= 0), and the smoother's as quat_smooth_*; without covariances and cameras.
+        It has quaternions quat_* and quat_smooth_* (R_lab_body, w >= 0), but neither covariances nor cameras.
 
         Raises:
             OutputError: pandas is not installed.
@@ -242,10 +220,7 @@ class Trajectory:
         return pd.DataFrame(table)
 
     def plot(self) -> Figure:
-        """Draw position, orientation, velocity and angular velocity over time: dots measured, lines smoothed.
-
-        Quaternions keep their sign from frame to frame.
-        """
+        """Draw position, quaternion (continuous sign), velocity and omega over time: measured dots, smoothed lines."""
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(8.3, 11.0), layout="constrained")
@@ -265,7 +240,7 @@ class Trajectory:
         return figure
 
     def summary(self) -> dict[str, Any]:
-        """Return `frames`, `valid`, and `lost`: each camera's lost frames by reason, most frequent first."""
+        """Return `frames`, `valid`, and `lost`: lost frames of each camera by reason, most frequent first."""
         lost = {}
         for name, camera in self.cameras.items():
             counts = Counter(str(reason) for reason in camera.reason if reason != Reason.OK)
@@ -274,7 +249,7 @@ class Trajectory:
 
 
 def quaternions_wxyz(R: NDArray[Any]) -> Floats:
-    """Return (N, 4), w first, w >= 0, of rotations (N, 3, 3); NaN where one is missing."""
+    """Return quaternions (N, 4), w first, w >= 0, of rotations (N, 3, 3); NaN stays NaN."""
     from scipy.spatial.transform import Rotation
 
     quat_wxyz = np.full((len(R), 4), np.nan)
@@ -285,7 +260,7 @@ def quaternions_wxyz(R: NDArray[Any]) -> Floats:
 
 
 def _continuous(quat_wxyz: Floats) -> Floats:
-    """Choose the signs of quaternions (N, 4) so that each is nearest to the one before."""
+    """Choose the signs of quaternions (N, 4) nearest to the previous one."""
     there = np.isfinite(quat_wxyz).all(1)
     known = quat_wxyz[there]
     flips = np.cumprod(np.where((known[1:] * known[:-1]).sum(1) < 0, -1.0, 1.0))
@@ -295,7 +270,6 @@ def _continuous(quat_wxyz: Floats) -> Floats:
 
 
 def _read(file: h5py.File) -> dict[str, Any]:
-    """Return all fields of a trajectory."""
     schema = file.attrs.get("schema")
     if schema != SCHEMA:
         got, do = repr(str(schema))[1:60].strip("'"), "pass a track, or update sphereorient where the track is newer"

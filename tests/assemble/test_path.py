@@ -80,7 +80,9 @@ def test_of_equal_candidates_the_first_is_taken_each_time():
 
 def test_single_precision_chooses_the_same_and_keeps_its_links_late_in_a_movie(rng):
     full = among_false_ones(turning(40), rng, better_in=(7,))
-    single_precision = replace(full, R_view_body=full.R_view_body.float(), R_lab_view=full.R_lab_view.float(), score=full.score.float())
+    single_precision = replace(
+        full, R_view_body=full.R_view_body.float(), R_lab_view=full.R_lab_view.float(), score=full.score.float()
+    )
     late = times(40) + 20_000.0  # s; steps of 1/600 s are lost in single precision there
     expected, path = (assemble_path(each, late, SETTINGS) for each in (full, single_precision))
     assert torch.equal(path.choice, expected.choice)

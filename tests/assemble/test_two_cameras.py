@@ -393,13 +393,13 @@ def test_single_precision_gives_the_same_in_single_precision(rng):
     R = turning(100)
     cameras = {"cam1": single(noisy(R, 0.01, rng)), "cam2": single(noisy(R, 0.03, rng), without=[40])}
     expected = fused(cameras)
-    single = {
+    halved = {
         name: replace(
             one, R_view_body=one.R_view_body.float(), R_lab_view=one.R_lab_view.float(), score=one.score.float()
         )
         for name, one in cameras.items()
     }
-    track = fused(single)
+    track = fused(halved)
     for name, value in tensors(track).items():
         if value.is_floating_point():
             assert value.dtype == torch.float32
