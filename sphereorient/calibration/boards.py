@@ -36,13 +36,10 @@ def see_plate(
     name: str = "plate picture",
     settings: DotSettings | None = None,
 ) -> PlateView:
-    """Find a target in one picture; a picture that shows nothing usable gives a `refused` view with the reason.
-
-    Args:
-        picture: (H, W), grey, any number type.
-        plate: the target, from `plate_from_entry`.
-        name: of the picture, for the reason.
-        settings: of the detection of dots.
+    """Find a target in a grey picture (H, W) of any number type; an unusable picture gives a `refused` view with the
+    reason.
+    `plate` comes from `plate_from_entry`; `name` of the picture appears in the reason; `settings` are those of the
+    dots.
 
     Raises:
         CameraError: not a grey picture.
@@ -58,7 +55,7 @@ def see_plate(
 
 
 def _chessboard(picture: NDArray[np.generic], board: Chessboard, name: str) -> PlateView:
-    """Find the inner corners of a whole chessboard; floating where the board is the same after a rotation."""
+    """Find all inner corners of a chessboard; floating where the board has a rotational symmetry."""
     grey = _eight_bits(picture)
     found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=SHARP)
     if not found:
@@ -93,10 +90,7 @@ def _charuco(picture: NDArray[np.generic], board: CharucoBoard, name: str) -> Pl
 
 
 def _circles(picture: NDArray[np.generic], grid: CircleGrid, name: str) -> PlateView:
-    """Find the circles of a whole grid; floating where the grid is the same after a rotation.
-
-    `find_dots` finds and measures the circles; OpenCV only orders them.
-    """
+    """Find and measure all circles by `find_dots`; OpenCV only orders them."""
     dots = find_dots(picture, dark=grid.dark)
     order = _circles_in_order(dots, grid)
     if order is None:
@@ -119,7 +113,6 @@ def _view(plate: CalibrationTarget, index: Ints, uv_px: Floats, sigma_px: Floats
 
 
 def _settled(view: PlateView, plate: CalibrationTarget, placements: list[Ints], name: str) -> PlateView:
-    """Return the view tied if one placement is left, else floating."""
     if len(placements) == 1:
         return placed(view, plate, placements[0])
     expected, got = "a plate that looks the same from one side only", f"{len(placements)} possible rotations"
@@ -158,9 +151,9 @@ def _homography(index: Floats | Ints, uv_px: Floats) -> Floats:
 
 
 def _seen_from_front(index: Ints, uv_px: Floats) -> Ints:
-    """Return the indices, with rows reversed where OpenCV counts as if seen from behind."""
+    """Reverse the rows where OpenCV counts as if the target were seen from behind."""
     h = _homography(index - index.mean(axis=0), uv_px)
-    # Jacobian at the middle of the board; v runs down, so from the front its determinant is negative.
+    # Determinant of the Jacobian: v runs down, so from the front it is negative.
     slope = h[:2, :2] / h[2, 2] - np.outer(h[:2, 2], h[2, :2]) / h[2, 2] ** 2
     if np.linalg.det(slope) < 0:
         return index
@@ -188,7 +181,6 @@ def _lower_left_is_dark(grey: NDArray[np.uint8], index: Ints, uv_px: Floats) -> 
 
 
 def _circles_in_order(dots: Dots, grid: CircleGrid) -> Ints | None:
-    """Return the dots in OpenCV's order, row by row, or None."""
     if len(dots) < grid.columns * grid.rows:
         return None
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if grid.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID

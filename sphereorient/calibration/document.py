@@ -79,7 +79,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CalibrationDocument:
-    """A checked calibration.yaml; made by `load_calibration`."""
+    """A checked calibration.yaml."""
 
     path: Path
     image_size: tuple[int, int]  # W, H px
@@ -132,10 +132,10 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
 
 
 def read_points(path: Path) -> NDArray[np.float64]:
-    """Read a CSV table with the columns x, y, z (lab, mm), u, v (px), in any order, as (n, 5).
+    """Read a CSV table with columns x, y, z (lab, mm), u, v (px), in any order, as (n, 5).
 
     Raises:
-        CameraError: unreadable, a missing column, or something that is not a number.
+        CameraError: unreadable, a missing column, or a value that is not a number.
     """
     content = read_whole(path, TABLE_BYTES, "a table", CameraError, "correct the path")
     try:

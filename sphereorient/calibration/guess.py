@@ -27,7 +27,7 @@ Pose = tuple[Tensor, Tensor]  # R (3, 3) and T (3,), mm
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Start:
-    """A camera without distortion, as it would be without a wall."""
+    """A camera without distortion and without port."""
 
     f_px: float  # along v
     centre_px: tuple[float, float]
@@ -36,19 +36,12 @@ class _Start:
 
 
 def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, PlateView]]) -> Rig:
-    """Return cameras without distortion and plate poses, to start the fit.
-
-    Args:
-        document: the calibration.
-        views: tied views of each camera, by row of the pose.
-
-    Returns:
-        The rig; T of a pose that no picture with enough points shows is NaN.
+    """Return cameras without distortion and plate poses from the tied views of each camera, keyed by row of the pose.
+    T is NaN for a pose without a picture with enough points.
+    Source: Zhang 2000 (OpenCV's calibrateCamera).
 
     Raises:
         CameraError: too few pictures of a camera, or a camera that shares no pose with the others.
-
-    Source: Zhang 2000 (OpenCV's calibrateCamera).
     """
     lenses = {name: _zhang(name, seen, document) for name, seen in views.items()}
     placed, plate = _chained({name: relative for name, (_, _, relative) in lenses.items()}, document.surveyed)
@@ -64,11 +57,7 @@ def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, Pl
 
 
 def guess_from_points(document: CalibrationDocument, name: str, x_lab_mm: Tensor, uv_px: Tensor) -> Camera:
-    """Return a camera without distortion from lab points (n, 3) and their pixels (n, 2), to start the fit.
-
-    Raises:
-        CameraError: points that do not determine a camera.
-
+    """Return a camera without distortion from lab points (n, 3), mm, and pixels (n, 2); CameraError if undetermined.
     Source: Tsai 1987.
     """
     found = calibrate_tsai(x_lab_mm, uv_px, document.image_size, document.pixel_pitch_mm)
@@ -93,7 +82,7 @@ def _camera(document: CalibrationDocument, name: str, start: _Start) -> Camera:
 def _zhang(
     name: str, seen: Mapping[int, PlateView], document: CalibrationDocument
 ) -> tuple[float, tuple[float, float], dict[int, Pose]]:
-    """Return focal length (px along v), centre (px) and the plate's poses in the frame of one camera."""
+    """Return focal length (px along v), centre (px) and the plate's poses in one camera's frame."""
     rows = [row for row, view in sorted(seen.items()) if len(view) >= POINTS_MIN]
     if len(rows) < VIEWS_MIN:
         got, do = f"{len(rows)}", "take pictures of the plate in more poses, tilted differently"
@@ -141,10 +130,8 @@ def _chained(
 
 
 def _in_air(start: _Start, port: Port) -> _Start:
-    """Return the camera in air whose picture through a wall is about that of a camera in the liquid without it.
-
-    For rays near the normal, Snell's law is a stretch: angles in air are n times those in the liquid, and the camera's
-    distance to the wall is 1/n of the apparent one.
+    """Return the camera in air whose picture through a wall resembles that of a camera in the liquid.
+    Small-angle Snell's law: angles in air are n times larger, the distance to the wall is n times smaller.
     """
     R, T, normal, n = start.R_cam_lab, start.T_cam_lab_mm, port.normal_lab, float(port.n_fluid)
     centre = -(R.mT @ T)

@@ -1,4 +1,4 @@
-"""Dots of a plate: a square lattice among them, and its place on the plate from the fiducials."""
+"""Dots of a plate: find their square lattice, and identify it on the plate by the fiducials."""
 
 from __future__ import annotations
 
@@ -38,10 +38,8 @@ class Lattice:
 
 def find_lattice(dots: Dots) -> Lattice | None:
     """Find the largest square lattice among dots; None for fewer than 9 dots, or a single row.
-
-    The shape of a dot shows the local foreshortening of the plate: measured in radii of the dots around it, the four
-    neighbours of a dot are equally far and at right angles under any tilt. Steps from dot to dot use that. Then a
-    smooth map from grid to picture (homography, with cubic terms for many dots) has to agree with every dot.
+    The shape of a dot gives the local foreshortening: in units of the local radii the four neighbours are equally far
+    and at right angles under any tilt. A smooth map from grid to picture then has to fit every dot.
     """
     if len(dots) < 9:
         return None
@@ -74,7 +72,7 @@ class _Field:
         tree: cKDTree[None] = cKDTree(dots.uv_px)
         k = min(NEIGHBOURS, len(dots) - 1)
         near = np.asarray(tree.query(dots.uv_px, k=k + 1)[1], dtype=np.int64)
-        # The median over neighbours removes the size of a fiducial or a stray blob.
+        # The median over neighbours removes the effect of fiducials and stray blobs.
         shape = np.median(dots.shape[near[:, : min(k, 8) + 1]], axis=1)
         away = dots.uv_px[near[:, 1:]] - dots.uv_px[:, None]
         radii = np.sqrt(np.einsum("nka,nab,nkb->nk", away, shape, away))
@@ -133,7 +131,7 @@ class _Field:
     def _local_basis(
         self, k: int, at: tuple[int, int], dot_at: dict[tuple[int, int], int], guess: tuple[Floats, Floats]
     ) -> tuple[Floats, Floats]:
-        # Steps to neighbours already placed follow the perspective; without one the parent's step is used.
+        # Steps to neighbours already placed follow the perspective; otherwise the parent's step is used.
         found: list[Floats] = []
         for axis in (0, 1):
             seen = []
@@ -147,7 +145,7 @@ class _Field:
 
 @dataclass(frozen=True, eq=False)
 class _Map:
-    """A smooth map from grid indices to pixels: a homography, then cubic terms in the index."""
+    """A homography from grid indices to pixels, then cubic terms in the index."""
 
     homography: Floats  # (3, 3)
     middle: Floats  # (2,), of the grid indices
@@ -181,7 +179,7 @@ class _Map:
         return uv_px
 
     def nearest(self, uv_px: Floats) -> Ints:
-        """Return the nearest grid indices (n, 2) of pixels, by the homography: cubic terms do not extrapolate."""
+        """Return the nearest grid indices (n, 2), by the homography: cubic terms do not extrapolate."""
         h = np.column_stack([uv_px, np.ones(len(uv_px))]) @ np.linalg.inv(self.homography).T
         nearest: Ints = np.rint(h[:, :2] / h[:, 2:] * self.size + self.middle).astype(np.int64)
         return nearest
@@ -208,7 +206,7 @@ def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
     taken = {tuple(at) for at in index.tolist()}
     low, high = index.min(axis=0), index.max(axis=0)
     free = np.array([tuple(at) not in taken for at in there.tolist()], dtype=bool) if len(rest) else np.zeros(0, bool)
-    # Only gaps are filled: outside the reached area a stray blob is more likely than a dot.
+    # Fill gaps only: outside the reached area a stray blob is more likely than a dot.
     free &= ((there >= low) & (there <= high)).all(axis=1)
     fits = np.flatnonzero(free)
     fits = fits[lattice_map.misses(there[fits], dots.uv_px[rest[fits]]) < MODEL_MISS]
@@ -222,7 +220,7 @@ def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
 
 
 def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints, _Map | None]:
-    """Drop the worst dots, a few at a time, until all are within MODEL_MISS of the map of the remaining ones."""
+    """Drop the worst dots, a few at a time, until all are within MODEL_MISS of the map of the others."""
     while True:
         enough = len(which) >= 9 and (np.ptp(index, axis=0) >= 1).all()
         lattice_map = _Map.fitted(index, dots.uv_px[which]) if enough else None
@@ -236,16 +234,9 @@ def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints, _Map | 
 
 
 def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> PlateView:
-    """Identify the dots of a picture on the plate.
-
-    All placements of the lattice (`find_lattice`) on the plate are tried, by quarter turns and shifts: dots must lie on
-    the plate, and the larger ones must be exactly the visible fiducials. One placement is left: `tied`. Several:
-    `floating`. None: `refused`.
-
-    Args:
-        dots: from `find_dots`.
-        plate: the target.
-        name: of the picture, for the reason.
+    """Identify the dots of a picture on the plate; `name` of the picture appears in the reason.
+    Placements by quarter turns and shifts must keep all dots on the plate, with the larger ones exactly at the visible
+    fiducials. One placement: `tied`; several: `floating`; none: `refused`.
     """
     lattice = find_lattice(dots)
     if lattice is None or len(lattice.index) < LEAST_DOTS:
@@ -297,7 +288,6 @@ def _placements(index: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
 
 def _shifts(at: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
     if large.any():
-        # The first larger dot must be one of the three fiducials.
         onto: Ints = np.array(plate.fiducials, dtype=np.int64) - at[large][0]
         return onto
     low, high = np.array(plate.first) - at.min(axis=0), np.array(plate.last) - at.max(axis=0)
@@ -306,7 +296,7 @@ def _shifts(at: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
 
 
 def _sizes(lattice: Lattice, plate: DotPlate) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which dots are as large as fiducials, and which are as large as neither."""
+    """Return which dots have the size of fiducials, and which have neither size."""
     dot, fiducial = plate.dot_diameter_mm / plate.pitch_mm, plate.fiducial_diameter_mm / plate.pitch_mm
     large = lattice.width > np.sqrt(dot * fiducial)
     stated = np.where(large, fiducial, dot)

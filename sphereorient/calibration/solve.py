@@ -1,4 +1,4 @@
-"""Least squares of the calibration: derivatives, damped steps, covariances, and the fit of one camera to points."""
+"""Least squares of the calibration: derivatives, damped steps, covariances, fit of one camera to points."""
 
 from __future__ import annotations
 
@@ -24,13 +24,8 @@ UNDETERMINED = 1e-9  # smallest eigenvalue of the scaled information: float64 ca
 
 
 def slopes_along(function: Callable[[Tensor], Tensor], at: Tensor, directions: Sequence[Tensor] | Tensor) -> Tensor:
-    """Return the derivatives of a function at a point along K directions, (..., K) where the function returns (...).
-
-    The backward pass is linear in the weights of the outputs; its derivative by them is the slope. The function is
-    called once for all directions; forward differentiation calls it for each and takes ten times as long.
-
-    The directions have the shape of `at`.
-
+    """Return derivatives along K directions (shape of `at`) of a function, (..., K) where the function returns (...).
+    The double-vjp trick calls the function once; forward differentiation calls it K times and takes ten times as long.
     Source: the double-vjp trick (Townsend 2017).
     """
     with torch.enable_grad():
@@ -56,9 +51,8 @@ def least_squares(
     steps: int = 100,
 ) -> Tensor:
     """Return the unknowns (K,) that minimise the sum of squared residuals, or of their soft L1 losses.
-
-    Normal equations: scipy's least_squares decomposes the whole Jacobian at each step, and its trust region starts at
-    one sigma; it takes three times as many slopes of a whole calibration.
+    Normal equations need a third of the slopes that scipy's least_squares takes for a whole calibration.
+    Source: Marquardt 1963; weights of the soft L1 loss, Triggs et al. 2000 (appendix).
 
     Args:
         residuals: of unknowns (K,), (n,); NaN counts as FAR. A step whose residuals raise CameraError is rejected.
@@ -67,8 +61,6 @@ def least_squares(
         soft: residual beyond which the loss grows linearly.
         gain: relative decrease of the cost at which the iteration ends.
         steps: maximum number.
-
-    Source: Marquardt 1963; weights of the soft L1 loss, Triggs et al. 2000 (appendix).
     """
 
     def tried(at: Tensor) -> tuple[Tensor, float]:
@@ -105,11 +97,7 @@ def least_squares(
 
 def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tensor:
     """Invert an information matrix of parameters in different units.
-
-    A direction without information gets a huge variance; with `names` it is refused instead.
-
-    Raises:
-        CameraError: an undetermined direction; its parameters are named.
+    A direction without information gets a huge variance; with `names`, CameraError names its parameters.
     """
     scale = _scale(information)
     values, vectors = torch.linalg.eigh(scale[:, None] * information * scale)
@@ -124,16 +112,9 @@ def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tenso
 
 
 def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_px: Tensor) -> AnyCamera:
-    """Fit some parameters of a camera to points and their pixels.
-
-    Args:
-        camera: near enough, of any model, also behind a port.
-        names: of the fitted parameters, as in `parameter_names`.
-        x_lab_mm: (n, 3), lab, mm.
-        uv_px: (n, 2), px, all equally certain.
-
-    Returns:
-        The camera with the covariance of the fitted parameters, from the residuals or at least from 0.05 px.
+    """Fit the parameters `names` of a camera (any model, also behind a port) to lab points (n, 3), mm, and pixels (n,
+    2).
+    The camera must be near enough. The covariance assumes equal errors, from the residuals or at least 0.05 px.
 
     Raises:
         CameraError: too few points, numbers that are not finite, or undetermined parameters, named.
@@ -163,11 +144,8 @@ def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_
 
 
 def checked_points(x_lab_mm: Tensor, uv_px: Tensor) -> tuple[Tensor, Tensor]:
-    """Return points (n, 3) and their pixels (n, 2) as float64 on the CPU.
-
-    Raises:
-        CameraError: a row that is not finite, named.
-        ShapeError: another shape, or unequal numbers of rows.
+    """Return points (n, 3) and pixels (n, 2) as float64 on the CPU; CameraError for a row not finite, ShapeError for
+    shapes.
     """
     for name, numbers, size in (("x_lab_mm", x_lab_mm, 3), ("uv_px", uv_px, 2)):
         check_points(name, numbers, size)

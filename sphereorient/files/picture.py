@@ -1,4 +1,4 @@
-"""Picture files from anybody: the size that the header claims, before anything is decoded, and the grey values."""
+"""Picture files of unknown origin: the size that the header claims, and the grey values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading and writing YAML files: plain values only, bounded in size; every fault is one line with file and key."""
+"""Reading and writing bounded YAML files of plain values; every fault is one line with file and key."""
 
 from __future__ import annotations
 
@@ -30,11 +30,7 @@ FAULTS = (yaml.YAMLError, ValueError, OverflowError)  # a date that does not exi
 
 
 def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> dict[str, Any]:
-    """Read a YAML file whose key `schema` must be `schema`; return the mapping without this key.
-
-    Raises:
-        error: missing, unreadable, not YAML, not a mapping, or of another schema.
-    """
+    """Read a YAML mapping whose key `schema` must be `schema`, without this key; raise `error` for anything else."""
     document = read_yaml(path, error)
     if not isinstance(document, dict):
         got = "an empty file" if document is None else short(document)
@@ -47,10 +43,8 @@ def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> di
 
 
 def read_yaml(path: Path, error: type[SphereOrientError]) -> Any:
-    """Read a YAML file of plain values, UTF-8, at most TEXT_BYTES; None for an empty one.
-
-    Raises:
-        error: missing, unreadable, not text, or not YAML as `parse_yaml` accepts it.
+    """Read a YAML file of plain values, UTF-8, at most TEXT_BYTES; None for an empty one; raise `error` for anything
+    else.
     """
     content = read_whole(path, TEXT_BYTES, "a YAML file", error, "correct the path")
     try:
@@ -63,16 +57,9 @@ def read_yaml(path: Path, error: type[SphereOrientError]) -> Any:
 
 
 def validated(model: type[Model], data: Any, where: str, error: type[SphereOrientError]) -> Model:
-    """Validate data from a YAML file against a model, and word its first fault in one line.
-
-    Args:
-        model: its keys and their types; it must forbid extra keys.
-        data: content of the file.
-        where: file and place in it, for the message.
-        error: the error to raise.
-
-    Raises:
-        error: an unknown key (with the nearest known one), a missing key, or an impossible value.
+    """Validate data from a YAML file against a model that forbids extra keys; raise `error` with the first fault in one
+    line.
+    `where` is file and place in it. An unknown key comes with the nearest known one.
     """
     try:
         return model.model_validate(data)
@@ -90,12 +77,9 @@ def refuse_unknown(key: object, known: Iterable[str], where: str) -> str:
 
 
 def write_document(path: Path, schema: str, document: Mapping[str, Any], comment: str = "") -> None:
-    """Write a YAML file with its schema as first key and `comment` above; it replaces an old file at once.
-
+    """Write a YAML file with its schema as first key and `comment` above, replacing an old file at once (else
+    OutputError).
     Small numbers are written as 1.0e-05: YAML 1.1 reads 1e-05 as text.
-
-    Raises:
-        OutputError: the file cannot be written.
     """
     lines = "".join(f"# {line}\n" for line in comment.splitlines())
     content = {"schema": schema, **document}
@@ -111,7 +95,7 @@ def short(value: object) -> str:
 
 
 def yaml_words(fault: Exception) -> str:
-    """Word what is wrong with a YAML text in one short line."""
+    """Word the fault of a YAML text in one short line."""
     mark = getattr(fault, "problem_mark", None)
     problem = " ".join((getattr(fault, "problem", None) or str(fault).partition("\n")[0]).split())
     problem = problem if len(problem) <= 120 else problem[:117] + "..."
@@ -135,10 +119,7 @@ def is_one_line(text: str) -> bool:
 
 
 class _BoundedLoader(yaml.SafeLoader):
-    """PyYAML's safe loader, with bounds that are checked while nodes are composed, before any value is built.
-
-    An alias counts with its size: what walks through the values later meets it as often as it is used.
-    """
+    """PyYAML's safe loader with bounds, checked before any value is built; an alias counts with its size."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)

@@ -62,13 +62,12 @@ class Hdf5Movie(Movie):
 
 
 def split_path(path: Path) -> tuple[Path, str]:
-    """Return the file and the name of the data set in it, empty where `path` names none."""
+    """Return the file and the name of the data set in it, empty if `path` has none."""
     file, _, name = str(path).partition(SEPARATOR)
     return Path(file), name
 
 
 def _shown(name: object) -> str:
-    """Return a name from the file as one line of at most 60 characters."""
     text = str(name)
     return (text if text.isprintable() else repr(text))[:60]
 
@@ -126,7 +125,6 @@ def _follow(path: Path, file: Any, name: str) -> Any:
 
 
 def _candidates(file: Any) -> list[str]:
-    """Return the names of the data sets that can be movies."""
     found: list[str] = []
     seen = 0
 
@@ -148,8 +146,7 @@ def _is_movie(data: Any) -> bool:
 
 def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int] | None]:
     """Return the number of frames up to the last written one, and the written chunks along the first axis.
-
-    None instead of chunks: the values are contiguous. Nothing is read, and no claim of the shape is trusted.
+    Contiguous values give None for the chunks. Nothing is read; the stated shape is not trusted.
     """
     stated, height, width = (int(size) for size in data.shape)
     frame_bytes = height * width * data.dtype.itemsize
@@ -173,7 +170,7 @@ def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int
 
 
 def _times(data: Any, stated: int, count: int) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """Return the times beside a data set, (count,), s, or a remark why they are not used."""
+    """Return the times (count,), s, beside a data set, or a remark why they are not used."""
     for name in TIMES:
         if not isinstance(data.parent.get(name, getlink=True), h5py.HardLink):
             continue

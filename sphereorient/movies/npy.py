@@ -1,5 +1,3 @@
-"""Movies in one numpy array, memory-mapped."""
-
 from __future__ import annotations
 
 import math

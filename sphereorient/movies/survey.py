@@ -1,5 +1,3 @@
-"""What some frames of a movie show, and what is wrong with them."""
-
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
@@ -36,7 +34,7 @@ class SurveyedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What some frames of a movie show; made by `survey`, read by the contact sheet."""
+    """What some frames of a movie show, and their faults."""
 
     frames: tuple[SurveyedFrame, ...]  # evenly spread over the movie, to be shown
     looked: int  # number of frames examined
@@ -48,13 +46,8 @@ class Survey:
 def survey(
     movie: Movie, count: int = 24, every: bool = False, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Survey:
-    """Examine frames spread over a movie, each with the one before it, or every frame.
-
-    Args:
-        movie: any movie.
-        count: frames to examine and to keep.
-        every: examine all frames; `count` are kept.
-        progress: called with the number of frames done and in all.
+    """Examine `count` frames spread over a movie, each with the one before it; or `every` frame, keeping `count`.
+    `progress` is called with the number of frames done and in all.
     """
     kept = {int(number) for number in np.linspace(0, len(movie) - 1, min(count, len(movie))).round()}
     seen: list[SurveyedFrame] = []
