@@ -1,5 +1,3 @@
-"""Targets in a picture: dot plates, and through OpenCV chessboards, ChArUco boards and circle grids."""
-
 from __future__ import annotations
 
 from dataclasses import replace
@@ -36,14 +34,7 @@ def see_plate(
     name: str = "plate picture",
     settings: DotSettings | None = None,
 ) -> PlateView:
-    """Find a target in a grey picture (H, W) of any number type; an unusable picture gives a `refused` view with the
-    reason.
-    `plate` comes from `plate_from_entry`; `name` of the picture appears in the reason; `settings` are those of the
-    dots.
-
-    Raises:
-        CameraError: not a grey picture.
-    """
+    """Find `plate` in a grey picture (H, W), any number type (or CameraError); `refused` with a reason if unusable."""
     if isinstance(plate, Chessboard):
         return _chessboard(picture, plate, name)
     if isinstance(plate, CharucoBoard):
@@ -71,7 +62,7 @@ def _chessboard(picture: NDArray[np.generic], board: Chessboard, name: str) -> P
 
 
 def _charuco(picture: NDArray[np.generic], board: CharucoBoard, name: str) -> PlateView:
-    """Find the corners of a ChArUco board or a part of it; its markers identify every corner."""
+    """Find the corners of a ChArUco board or a part of it."""
     detector = cv2.aruco.CharucoDetector(board.opencv())
     corners, ids, _, markers = detector.detectBoard(_eight_bits(picture))
     count = 0 if ids is None else len(ids)
@@ -131,7 +122,6 @@ def _eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
 
 
 def _refined(grey: NDArray[np.uint8], uv_px: Floats) -> Floats:
-    """Refine corners by OpenCV's sub-pixel step, in windows that hold one corner each."""
     away = np.linalg.norm(uv_px[:, None] - uv_px[None], axis=-1) + np.diag(np.full(len(uv_px), np.inf))
     half = int(np.clip(WINDOW * away.min(), 2, 15))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3)

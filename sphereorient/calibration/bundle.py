@@ -142,7 +142,6 @@ class Problem:
         return torch.cat(parts)
 
     def _split(self, change: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-        """Split a vector of changes into those of each camera and of all poses (P, 6)."""
         lengths = [len(names) for names in self.names.values()]
         *shares, poses = torch.split(change, [*lengths, POSE_PARTS * len(self.free)])
         whole = change.new_zeros(len(self.rig.R_lab_plate), POSE_PARTS)
@@ -176,8 +175,8 @@ class Fitted:
 
 
 def adjust(problem: Problem) -> Fitted:
-    """Fit cameras and poses; covariance: inverse information times the variance of the residuals.
-    The start must place each dot nearer to its own image than to its neighbours' images.
+    """Fit cameras and poses from a start that places each dot nearest to its own image.
+    The covariance is the inverse information times the variance of the residuals.
     Source: Triggs et al. 2000 (bundle adjustment); soft L1 loss, Huber 1981.
     """
     change = torch.zeros(problem.size, dtype=torch.float64)
@@ -229,16 +228,15 @@ def _solved(problem: Problem, start: Tensor, shifts: Mapping[str, Tensor], rows:
 def disk_centre_shift(
     camera: Camera, R_lab_plate: Tensor, T_lab_plate: Tensor, points_plate: Tensor, dot_diameter: Tensor
 ) -> Tensor:
-    """Return centroid minus image of the centre (..., n, 2), px, for disks of a plate; subtract it from a measured
-    centroid.
-    NaN where part of a disk is not imaged. Differentiable in everything; blur does not move the centroid.
+    """Return centroid minus image of the centre (..., n, 2), px, for disks of a plate; differentiable in everything.
+    NaN where part of a disk is not imaged; blur does not move the centroid.
     Source: Green's theorem, area = 1/2 loop(u dv - v du), area times centroid_u = 1/2 loop(u^2 dv), likewise v.
 
     Args:
         camera: any camera, also behind a port.
         R_lab_plate: (..., 3, 3), takes plate components to lab components.
         T_lab_plate: (..., 3), lab, mm: X_lab = R_lab_plate X_plate + T_lab_plate.
-        points_plate: (..., n, 3), centres, plate frame, mm; the disks lie in planes z = const (else ShapeError).
+        points_plate: (..., n, 3), centres, plate frame, mm; the disks lie in planes z = const.
         dot_diameter: (..., n), mm; 0 for a corner, whose shift is 0.
     """
     check_points("points_plate", points_plate, 3)
@@ -260,9 +258,7 @@ def disk_centre_shift(
 
 
 def _slope_matrix(like: Tensor) -> Tensor:
-    """Return d/d angle (RIM_POINTS, RIM_POINTS) of the trigonometric interpolant.
-    Source: Trefethen, Spectral Methods in MATLAB, eq. (3.10), even number of points.
-    """
+    """Return d/d angle (RIM_POINTS, RIM_POINTS) of the trigonometric interpolant (Trefethen 2000, eq. 3.10, even)."""
     k = torch.arange(RIM_POINTS, device=like.device)
     apart = (k[:, None] - k[None, :]).to(torch.float64) * (math.pi / RIM_POINTS)
     sign = 1.0 - 2.0 * ((k[:, None] - k[None, :]) % 2)

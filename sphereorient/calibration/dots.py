@@ -1,5 +1,3 @@
-"""Dots of a calibration plate: detected at many grey levels, measured by fitting blurred ellipses."""
-
 from __future__ import annotations
 
 from typing import Any
@@ -39,12 +37,8 @@ class DotSettings(BaseModel):
 
 
 def find_dots(picture: NDArray[np.generic], *, dark: bool = True, settings: DotSettings | None = None) -> Dots:
-    """Find all dots wholly inside a grey picture (H, W) of any number type and measure their centres, from top to
-    bottom.
-    Dots are dark on a bright background, or the reverse with `dark` False; uneven light needs no setting.
-
-    Raises:
-        CameraError: not a grey picture, or NaN in it.
+    """Find dots wholly inside a grey picture (H, W) of any number type and measure their centres, from top to bottom.
+    `dark` dots lie on a bright background; uneven light needs no setting. CameraError for other pictures or NaN.
     """
     settings = settings or DotSettings()
     grey = as_grey(picture)
@@ -86,9 +80,7 @@ def _first_of_equals(uv_px: Floats, shape: Floats, good: NDArray[np.bool_]) -> N
 
 
 def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Floats]:
-    """Return centres (n, 2), px, and shapes (n, 2, 2) of dark blobs that are ellipses over three grey levels or more.
-    A dot is an ellipse at every threshold between its grey and the background's; noise only at one or two.
-    """
+    """Return centres (n, 2), px, and shapes (n, 2, 2) of dark blobs that are ellipses at three grey levels or more."""
     smooth = cv2.GaussianBlur(grey, (0, 0), settings.smooth_px) if settings.smooth_px > 0 else grey
     low, high = np.percentile(smooth, [0.1, 99.9])
     done: list[_Chain] = []
@@ -114,7 +106,7 @@ def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Fl
 def _ellipses_at(
     mask: NDArray[np.bool_], settings: DotSettings
 ) -> tuple[NDArray[np.int32], dict[int, int], Floats, Floats, Floats]:
-    """Return the labels of the mask's components; number, area, centre and shape of the ellipses among them."""
+    """Return labels of the mask's components; number, area, centre and shape of the ellipses among them."""
     height, width = mask.shape
     pieces: Any = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     labels, stats = pieces[1], pieces[2]

@@ -1,5 +1,3 @@
-"""Blurred ellipses fitted to the grey values around dots."""
-
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -45,11 +43,9 @@ class Dots:
 
 
 def fit_ellipses(grey: NDArray[np.float32], centre_px: Floats, shape: Floats, *, dark: bool) -> Dots:
-    """Fit rim, blur, light and contrast of n dots to the grey values (H, W) around them, from centres (n, 2), px.
-    `shape` (n, 2, 2), 1/px^2, is the first guess of the rim x^T shape x = 1; `dark` dots are darker than the
-    background.
-    The model is light(u, v) (1 - contrast cover(u, v)): light a plane, cover an error function of the distance to the
-    rim. Cover is symmetric, so blur, a wrong rim profile and the picture's edge do not move the centre.
+    """Fit rim, blur, light and contrast of n dots to the grey values (H, W) around centres (n, 2), px.
+    `shape` (n, 2, 2), 1/px^2: first guess of the rim x^T shape x = 1. The model is light times 1 - contrast cover.
+    Light is a plane and cover symmetric: blur, a wrong rim profile and the picture's edge do not move the centre.
     """
     n = len(centre_px)
     values = np.full((n, PARAMETERS), np.nan)
@@ -74,7 +70,6 @@ def fit_ellipses(grey: NDArray[np.float32], centre_px: Floats, shape: Floats, *,
 
 
 def _window(shape: Floats) -> Ints:
-    """Return half the sides (n,) of the windows, px."""
     return np.asarray(np.ceil(RING * half_box(shape) + LEAST_RING_PX).astype(int).max(axis=1, initial=0))
 
 
@@ -113,7 +108,6 @@ class _Windows:
     def cut(
         cls, grey: NDArray[np.float32], owner: NDArray[np.int32], which: Ints, centre_px: Floats, shape: Floats
     ) -> _Windows:
-        """Cut the windows of the dots `which`; pixels of other dots get weight 0."""
         height, width = grey.shape
         half = int(_window(shape).max())
         steps = np.arange(-half, half + 1)
@@ -239,7 +233,7 @@ class _Rim:
     metric: tuple[Floats, Floats, Floats]  # a, b, c of A = [[a, b], [b, c]], (n, 1)
 
     def slopes(self, pull: Floats, out: Floats) -> None:
-        """Write pull times the derivatives of the distance by centre u, centre v, a, b, c into out (n, 5, K)."""
+        """Write pull times d distance / d (centre u, centre v, a, b, c) into out (n, 5, K)."""
         a, b, c = self.metric
         by_q2, by_h = pull * (1 - 0.5 / self.q) / self.h, -pull * self.distance / self.h**2
         by_u, by_v = by_h * self.along_u, by_h * self.along_v

@@ -1,5 +1,3 @@
-"""Start of the fit: each camera by Zhang's method, plate poses chained from camera to camera."""
-
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -27,8 +25,6 @@ Pose = tuple[Tensor, Tensor]  # R (3, 3) and T (3,), mm
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Start:
-    """A camera without distortion and without port."""
-
     f_px: float  # along v
     centre_px: tuple[float, float]
     R_cam_lab: Tensor  # (3, 3)
@@ -37,11 +33,8 @@ class _Start:
 
 def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, PlateView]]) -> Rig:
     """Return cameras without distortion and plate poses from the tied views of each camera, keyed by row of the pose.
-    T is NaN for a pose without a picture with enough points.
+    T is NaN for a pose without enough points; CameraError for too few pictures or a camera that shares no pose.
     Source: Zhang 2000 (OpenCV's calibrateCamera).
-
-    Raises:
-        CameraError: too few pictures of a camera, or a camera that shares no pose with the others.
     """
     lenses = {name: _zhang(name, seen, document) for name, seen in views.items()}
     placed, plate = _chained({name: relative for name, (_, _, relative) in lenses.items()}, document.surveyed)
@@ -57,9 +50,7 @@ def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, Pl
 
 
 def guess_from_points(document: CalibrationDocument, name: str, x_lab_mm: Tensor, uv_px: Tensor) -> Camera:
-    """Return a camera without distortion from lab points (n, 3), mm, and pixels (n, 2); CameraError if undetermined.
-    Source: Tsai 1987.
-    """
+    """Return a camera without distortion from lab points (n, 3), mm, and pixels (n, 2), by Tsai 1987 (CameraError)."""
     found = calibrate_tsai(x_lab_mm, uv_px, document.image_size, document.pixel_pitch_mm)
     start = _Start(
         f_px=float(found.f_mm) / document.pixel_pitch_mm[1],
@@ -130,9 +121,7 @@ def _chained(
 
 
 def _in_air(start: _Start, port: Port) -> _Start:
-    """Return the camera in air whose picture through a wall resembles that of a camera in the liquid.
-    Small-angle Snell's law: angles in air are n times larger, the distance to the wall is n times smaller.
-    """
+    """Return the camera in air for one in the liquid: small-angle Snell, angles times n, distance to the wall / n."""
     R, T, normal, n = start.R_cam_lab, start.T_cam_lab_mm, port.normal_lab, float(port.n_fluid)
     centre = -(R.mT @ T)
     height = float(centre @ normal) - float(port.offset_mm)

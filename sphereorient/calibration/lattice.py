@@ -1,5 +1,3 @@
-"""Dots of a plate: find their square lattice, and identify it on the plate by the fiducials."""
-
 from __future__ import annotations
 
 from collections import deque
@@ -37,9 +35,8 @@ class Lattice:
 
 
 def find_lattice(dots: Dots) -> Lattice | None:
-    """Find the largest square lattice among dots; None for fewer than 9 dots, or a single row.
-    The shape of a dot gives the local foreshortening: in units of the local radii the four neighbours are equally far
-    and at right angles under any tilt. A smooth map from grid to picture then has to fit every dot.
+    """Find the largest square lattice among dots; None for fewer than 9 dots or a single row.
+    Measured in local radii, a dot's four neighbours are equally far and at right angles under any tilt.
     """
     if len(dots) < 9:
         return None
@@ -60,8 +57,6 @@ def find_lattice(dots: Dots) -> Lattice | None:
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """Dots with the local foreshortening and the nearest dots of each."""
-
     uv_px: Floats  # (n, 2)
     metric: Floats  # (n, 2, 2): v^T metric v = 1 for v one pitch long
     near: Ints  # (n, k)
@@ -101,7 +96,6 @@ class _Field:
         return (first, second) if turned < 0 else (first, -second)
 
     def seeds(self) -> list[int]:
-        """Return the dots that have a cross of neighbours, the central ones first."""
         crosses = [k for k in range(len(self.uv_px)) if self.steps_from(k) is not None]
         middle = np.median(self.uv_px, axis=0)
         return sorted(crosses, key=lambda k: float(np.hypot(*(self.uv_px[k] - middle))))
@@ -145,8 +139,6 @@ class _Field:
 
 @dataclass(frozen=True, eq=False)
 class _Map:
-    """A homography from grid indices to pixels, then cubic terms in the index."""
-
     homography: Floats  # (3, 3)
     middle: Floats  # (2,), of the grid indices
     size: float
@@ -190,7 +182,6 @@ class _Map:
         return np.stack([self(index + e[a]) - self(index - e[a]) for a in (0, 1)], axis=-1)
 
     def misses(self, index: Ints, uv_px: Floats) -> Floats:
-        """Return the distances (n,) of pixels from their expected positions, in pitches."""
         away = np.linalg.solve(self.steps(index), (uv_px - self(index))[..., None])[..., 0]
         miss: Floats = np.hypot(away[:, 0], away[:, 1])
         return miss
@@ -234,9 +225,8 @@ def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints, _Map | 
 
 
 def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> PlateView:
-    """Identify the dots of a picture on the plate; `name` of the picture appears in the reason.
-    Placements by quarter turns and shifts must keep all dots on the plate, with the larger ones exactly at the visible
-    fiducials. One placement: `tied`; several: `floating`; none: `refused`.
+    """Identify the dots of a picture on the plate by trying quarter turns and shifts; `name` appears in the reason.
+    The larger dots must be exactly the visible fiducials. One placement: `tied`; several: `floating`; none: `refused`.
     """
     lattice = find_lattice(dots)
     if lattice is None or len(lattice.index) < LEAST_DOTS:
@@ -275,7 +265,7 @@ def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> Plat
 
 
 def _placements(index: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
-    """Return all placements (m, 3), as in `placed`, of a lattice on the plate that its larger dots allow."""
+    """Return the placements (m, 3) of a lattice on the plate that its larger dots allow."""
     found: list[tuple[int, int, int]] = []
     for quarters in range(4):
         at = quarter_turned(index, quarters)

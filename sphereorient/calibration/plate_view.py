@@ -13,8 +13,8 @@ from sphereorient.errors import refusal
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlateView:
     """Points of the plate and their pixels in one picture.
-    `tied`: every point is identified. `floating`: each row of `placements` is a possible place of the lattice on the
-    plate, and `points_plate_mm` are those before any placement. `refused`: unusable, all arrays are empty.
+    `tied`: every point is identified. `floating`: each row of `placements` is a possible place on the plate;
+    `points_plate_mm` are those before any. `refused`: unusable, all arrays are empty.
     """
 
     points_plate_mm: Floats  # (n, 3), plate frame
@@ -56,9 +56,7 @@ def quarter_turned(index: Ints, quarters: int) -> Ints:
 
 
 def placed(view: PlateView, plate: CalibrationTarget, placement: Ints | Sequence[int]) -> PlateView:
-    """Return a floating view as `tied`; `placement` (3,), a row of `view.placements`: quarter turns, shift of column,
-    of row.
-    """
+    """Return a floating view as `tied` by a placement (3,): quarter turns, shift along columns, shift along rows."""
     quarters, shift_i, shift_j = (int(p) for p in placement)
     index = quarter_turned(view.index, quarters) + np.array([shift_i, shift_j])
     return replace(

@@ -70,11 +70,9 @@ class Calibrated:
 
 def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: Progress | None = None) -> Calibrated:
     """Calibrate the cameras of a calibration.yaml, loaded or by path, in the lab that the surveyed pose defines.
-    Return them with covariances and a report of each picture; `progress` is called with stage, done and total.
 
     Raises:
-        CameraError: a picture that is unreadable or of another size, no picture of the plate, or undetermined
-            parameters.
+        CameraError: an unreadable picture or one of another size, no plate in them, or undetermined parameters.
     """
     progress = progress or (lambda stage, done, total: None)
     document = calibration if isinstance(calibration, CalibrationDocument) else load_calibration(calibration)
@@ -165,7 +163,6 @@ def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView])
 
 
 def _has_pose(rig: Rig, picture: Picture) -> bool:
-    """Return whether the guess has the plate's pose; pictures with few points give none."""
     return bool(torch.isfinite(rig.T_lab_plate_mm[picture.row]).all())
 
 
@@ -189,9 +186,7 @@ def _problem(document: CalibrationDocument, rig: Rig, tied: Mapping[Picture, Pla
 def tie_floating(
     document: CalibrationDocument, rig: Rig, views: Mapping[Picture, PlateView]
 ) -> dict[Picture, PlateView]:
-    """Tie views without fiducials through cameras that saw the same pose with them.
-    A view stays floating if its pose is unknown, or if not exactly one placement fits.
-    """
+    """Tie views without fiducials through cameras that saw the same pose, if exactly one placement fits."""
     assert document.plate is not None
     known = {picture.row for picture, view in views.items() if view.state == "tied" and _has_pose(rig, picture)}
     tied = {}

@@ -98,10 +98,7 @@ def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[Came
 
 def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repaired:
     """Repair cameras (cameras.yaml) that moved after their calibration, with a track.h5 that was made with them.
-
-    Raises:
-        CameraError: unreadable cameras, or too few frames that both saw.
-        TrackError: an unreadable track, or one of other cameras.
+    CameraError for unreadable cameras or too few frames that both saw; TrackError for a track of other cameras.
     """
     cameras = load_cameras(cameras_path)
     track = Trajectory.load(track_path)
@@ -111,9 +108,8 @@ def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repai
 
 def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraObservations]) -> Repaired:
     """Rotate and shift two or more cameras until they see the sphere in one position and one orientation.
-    The first camera stays: a common motion of all cameras cannot be observed. Lines of sight must meet, and
-    orientations agree up to a small constant rotation. The distance between cameras and motions within the common plane
-    of the lines of sight change only the sphere's apparent size; a prior keeps them near their old values.
+    The first camera stays: a common motion is not observable. Orientations may differ by a small constant rotation. A
+    prior holds motions that change only the apparent size: distance and the common plane of the lines of sight.
 
     Raises:
         CameraError: one camera, or too few frames that both saw.
@@ -148,7 +144,7 @@ def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraO
 
 
 class _Pair:
-    """Residuals of one camera against the first; the unknowns (9,) are its motion (6,) and a constant rotation bias."""
+    """Residuals of one camera against the first; unknowns (9,): its motion (6,) and a constant rotation bias."""
 
     def __init__(self, still: Camera, loose: Camera, seen: CameraObservations, seen_loose: CameraObservations) -> None:
         both = torch.isfinite(seen.centre_px + seen_loose.centre_px).all(-1)

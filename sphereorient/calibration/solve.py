@@ -1,5 +1,3 @@
-"""Least squares of the calibration: derivatives, damped steps, covariances, fit of one camera to points."""
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -25,8 +23,7 @@ UNDETERMINED = 1e-9  # smallest eigenvalue of the scaled information: float64 ca
 
 def slopes_along(function: Callable[[Tensor], Tensor], at: Tensor, directions: Sequence[Tensor] | Tensor) -> Tensor:
     """Return derivatives along K directions (shape of `at`) of a function, (..., K) where the function returns (...).
-    The double-vjp trick calls the function once; forward differentiation calls it K times and takes ten times as long.
-    Source: the double-vjp trick (Townsend 2017).
+    Source: double vjp (Townsend 2017); it calls the function once, forward differentiation K times (ten times slower).
     """
     with torch.enable_grad():
         point = at.detach().requires_grad_()
@@ -51,7 +48,7 @@ def least_squares(
     steps: int = 100,
 ) -> Tensor:
     """Return the unknowns (K,) that minimise the sum of squared residuals, or of their soft L1 losses.
-    Normal equations need a third of the slopes that scipy's least_squares takes for a whole calibration.
+    scipy's least_squares needs three times as many slopes of a whole calibration.
     Source: Marquardt 1963; weights of the soft L1 loss, Triggs et al. 2000 (appendix).
 
     Args:
@@ -96,9 +93,7 @@ def least_squares(
 
 
 def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tensor:
-    """Invert an information matrix of parameters in different units.
-    A direction without information gets a huge variance; with `names`, CameraError names its parameters.
-    """
+    """Invert an information matrix; undetermined parameters get a huge variance or, with `names`, CameraError."""
     scale = _scale(information)
     values, vectors = torch.linalg.eigh(scale[:, None] * information * scale)
     if names and float(values[0]) < UNDETERMINED:
@@ -112,9 +107,8 @@ def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tenso
 
 
 def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_px: Tensor) -> AnyCamera:
-    """Fit the parameters `names` of a camera (any model, also behind a port) to lab points (n, 3), mm, and pixels (n,
-    2).
-    The camera must be near enough. The covariance assumes equal errors, from the residuals or at least 0.05 px.
+    """Fit the parameters `names` of any camera, also behind a port, to lab points (n, 3), mm, and pixels (n, 2).
+    The start must be near. The covariance is from the residuals, at least 0.05 px.
 
     Raises:
         CameraError: too few points, numbers that are not finite, or undetermined parameters, named.
@@ -144,9 +138,7 @@ def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_
 
 
 def checked_points(x_lab_mm: Tensor, uv_px: Tensor) -> tuple[Tensor, Tensor]:
-    """Return points (n, 3) and pixels (n, 2) as float64 on the CPU; CameraError for a row not finite, ShapeError for
-    shapes.
-    """
+    """Return points (n, 3) and pixels (n, 2) as float64 on the CPU; refuse other shapes and non-finite numbers."""
     for name, numbers, size in (("x_lab_mm", x_lab_mm, 3), ("uv_px", uv_px, 2)):
         check_points(name, numbers, size)
         if numbers.dim() != 2:

@@ -1,5 +1,3 @@
-"""Systematic errors of a track: propagate the covariance of the calibration to position and orientation."""
-
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -30,10 +28,8 @@ class Systematic:
 def systematic_errors(
     cameras: Mapping[str, Camera], covariance: ParameterCovariance, position_lab_mm: Tensor, radius_mm: float
 ) -> Systematic:
-    """Propagate the covariance of camera parameters to positions (N, 3), lab, mm, and orientation; NaN where the
-    position is.
-    `covariance` names parameters camera.parameter and may correlate cameras; `radius_mm` is the sphere's.
-    A small error of the cameras acts on the pictures like a small, linear change of pose, estimated from cap and limb.
+    """Propagate the cameras' covariance to position (N, 3), lab, mm, and orientation; NaN where the position is.
+    Parameters are named camera.parameter. A small camera error acts on cap and limb like a small change of pose.
     Source: first-order propagation of errors; least squares of the pose with fixed design.
     """
     known = torch.isfinite(position_lab_mm).all(-1)

@@ -119,9 +119,8 @@ class DotPlate(CalibrationTarget):
 
 @dataclass(frozen=True, kw_only=True)
 class Chessboard(CalibrationTarget):
-    """A chessboard of columns x rows inner corners; the pitch is the side of a square.
-    Grid index (0, 0) is the lower left corner; the square to its lower left is dark. Views of a board with a rotational
-    symmetry are floating.
+    """A chessboard of columns x rows inner corners; the pitch is the side of a square; floating if it has a symmetry.
+    Index (0, 0) is the lower left corner; the square to its lower left is dark.
     """
 
     def __post_init__(self) -> None:
@@ -139,7 +138,7 @@ class Chessboard(CalibrationTarget):
 @dataclass(frozen=True, kw_only=True)
 class CharucoBoard(CalibrationTarget):
     """A chessboard of columns x rows squares with markers in the bright ones; a visible part is enough.
-    Grid index (0, 0) is the lower left inner corner of the board as OpenCV draws it.
+    Index (0, 0) is the lower left inner corner as OpenCV draws it.
     """
 
     marker_mm: float  # side of a marker
@@ -171,9 +170,8 @@ class CharucoBoard(CalibrationTarget):
 @dataclass(frozen=True, kw_only=True)
 class CircleGrid(CalibrationTarget):
     """Equal circles, in a square lattice or (asymmetric) with every other row shifted by half a step.
-    Grid index (0, 0) is the lower left circle. Asymmetric, as OpenCV draws it: `columns` circles in a row, `pitch_mm`
-    between rows and twice that between circles of a row; from the top every second row is shifted to the right. Views
-    of a grid with a rotational symmetry are floating.
+    Index (0, 0) is the lower left circle. Asymmetric, as OpenCV draws it: `pitch_mm` between rows and twice that in a
+    row; from the top every second row is shifted to the right. Views of a grid with a symmetry are floating.
     """
 
     dot_diameter_mm: float
@@ -213,11 +211,7 @@ def target_keys(kind: type[CalibrationTarget]) -> dict[str, tuple[str, bool]]:
 
 
 def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> CalibrationTarget:
-    """Build the target from the parsed `plate` of calibration.yaml; `name` is file and key, for the message.
-
-    Raises:
-        CameraError: not a mapping, an unknown type or key, a missing key, or an impossible value.
-    """
+    """Build the target from the parsed `plate` of calibration.yaml; CameraError, naming the key, if impossible."""
     kind = entry.get("type") if isinstance(entry, Mapping) else None
     if not isinstance(kind, str) or kind not in KINDS:
         expected = f"a mapping with `type` one of {', '.join(KINDS)}"

@@ -1,7 +1,7 @@
 """Tsai's calibration of one camera.
 
-Distortion is radial: a pixel and its point have the same direction from the optical axis, which is taken to meet the
-middle of the picture. This gives R, T_x, T_y and then f, T_z by linear equations; a search refines f, T_z, kappa1.
+Distortion is radial: a pixel and its point have the same direction from the optical axis, taken at the picture's
+middle. Linear equations give R, T_x, T_y, then f, T_z; a search refines f, T_z, kappa1.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ def tsai_stages(
     x_lab_mm: Tensor, uv_px: Tensor, image_size: tuple[int, int], pixel_pitch_mm: tuple[float, float]
 ) -> TsaiCamera:
     """Calibrate a camera by Tsai's two stages: R, T_x, T_y from radial alignment, then f, T_z and kappa1.
-    The covariance is that of f, T_z and kappa1 with R, T_x, T_y exact; with noise, `calibrate_tsai` is more accurate.
+    The covariance takes R, T_x, T_y as exact; with noise, `calibrate_tsai` is more accurate.
     Source: Tsai 1987, stages 1 and 2, which the paper uses without error.
 
     Args:
-        x_lab_mm: (n, 3), lab, mm, right-handed; for points in one plane the mirror image fits too: give the seen side.
+        x_lab_mm: (n, 3), lab, mm, right-handed; points in one plane also fit mirrored: give the seen side.
         uv_px: (n, 2), their pixels.
         image_size: (W, H), px.
         pixel_pitch_mm: along u and v; s_x is 1.
@@ -74,12 +74,8 @@ def calibrate_tsai(
     also: Sequence[str] = (),
 ) -> TsaiCamera:
     """Calibrate a camera as `tsai_stages`, then fit all parameters together by least squares in the picture.
-    `also` names which of sx, centre_u, centre_v are fitted besides f, kappa1, R and T. sx needs points outside one
-    plane; the centre needs strong perspective. The camera has the covariance of the fitted parameters.
-
-    Raises:
-        CameraError: as `tsai_stages`; or another name in `also`, or sx from points in a plane.
-        ShapeError: arrays of another shape.
+    `also` names which of sx (needs points outside one plane), centre_u, centre_v (strong perspective) are fitted
+    besides f, kappa1, R and T. Errors as in `tsai_stages`; CameraError for other names in `also`.
     """
     for name in also:
         if name not in ALSO:
@@ -97,8 +93,6 @@ def calibrate_tsai(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Frame:
-    """Principal axes of the points: two along the best plane, the third normal to it."""
-
     middle_lab_mm: Tensor  # (3,)
     R_own_lab: Tensor  # (3, 3)
     narrow: float  # width over length
@@ -115,14 +109,13 @@ class _Frame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Start:
-    """A first pose and focal length; T_z and f may still be missing (0)."""
+    """A first pose and focal length; T_z and f are 0 while unknown."""
 
     R_cam_lab: Tensor  # (3, 3)
     T_cam_lab_mm: Tensor  # (3,)
     f_mm: float = 0.0
 
     def before(self, points: Tensor) -> bool:
-        """Whether all points are in front of the camera."""
         return bool((points @ self.R_cam_lab[2] + self.T_cam_lab_mm[2] > 0).all())
 
 
@@ -156,9 +149,7 @@ def _aligned_space(own: Tensor, sensor_mm: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _aligned_plane(own: Tensor, sensor_mm: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Solve the same for points with z = 0: two rotations, mirror images of each other in depth.
-    The larger singular value of a rotation's 2 x 2 corner is 1: Tsai's formula for T_y^2, without division by T_y.
-    """
+    """Solve the same for z = 0: two mirrored rotations, whose 2 x 2 corner has the larger singular value 1."""
     x, y, flat = sensor_mm[:, :1], sensor_mm[:, 1:], own[:, :2]
     a = _null_vector(torch.cat([y * flat, y, -x * flat, -x], dim=-1)).reshape(2, 3)
     a = a / torch.linalg.matrix_norm(a[:, :2], ord=2)

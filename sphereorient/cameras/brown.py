@@ -1,5 +1,3 @@
-"""Brown's radial and tangential polynomial, its inverse, and OpenCV's camera, which applies it to slopes."""
-
 from __future__ import annotations
 
 import math
@@ -67,9 +65,7 @@ class PolynomialCamera(CentralCamera):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BrownCamera(PolynomialCamera):
-    """Perspective with Brown-Conrady distortion of the slopes X/Z and Y/Z; k and p have no unit.
-    Source: OpenCV's pinhole model with the coefficients k1, k2, p1, p2, k3.
-    """
+    """Perspective with Brown-Conrady distortion of X/Z and Y/Z; k, p without unit, as OpenCV's k1, k2, p1, p2, k3."""
 
     f_px: Tensor  # (2,), fx and fy
 
@@ -101,8 +97,7 @@ class BrownCamera(PolynomialCamera):
 
 
 def bent(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
-    """Apply the polynomial to points (..., 2), any unit, about the centre of distortion; NaN, gradient 0, from the fold
-    on.
+    """Apply the polynomial to points (..., 2), any unit, about the distortion's centre; NaN, gradient 0, past the fold.
     k (3,): radial k1, k2, k3, unit^-2, -4, -6. p (2,): tangential p1, p2 in OpenCV's order, unit^-1.
     Source: Brown 1966 as OpenCV writes it: x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2).
     """
@@ -180,7 +175,6 @@ def _before_fold(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
 
 
 def _radius_before(goal: Tensor, k: Tensor, fold: float) -> Tensor:
-    """Return the radius that the radial part alone takes to `goal`, at most `fold`."""
     k1, k2, k3 = k.unbind()
 
     def value_and_slope(r: Tensor) -> tuple[Tensor, Tensor]:

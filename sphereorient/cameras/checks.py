@@ -14,7 +14,7 @@ MAX_SIDE_PX = 65_536  # of a picture: twice what any camera has
 
 
 def as_parameter(name: str, value: Tensor | float | Sequence[float], *shape: int) -> Tensor:
-    """Return a parameter as float64 tensor, still part of its graph; CameraError for another shape or beyond LARGEST."""
+    """Return a parameter as float64 tensor, still part of its graph; refuse other shapes and numbers beyond LARGEST."""
     # as_tensor alone would round plain numbers to float32 first.
     tensor = value.to(torch.float64) if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
     if tuple(tensor.shape) != shape:

@@ -1,8 +1,7 @@
 """What all camera models share: pose, principal point, and one table of keys that defines the file and the parameters.
 
 To add a model, derive a dataclass with `MODEL` and `KEYS` from `CentralCamera` (one projection centre) or
-`CameraModel`, and add it to `MODELS` in io/cameras_yaml.py. `KEYS` define files, parameter names, covariances and
-checks.
+`CameraModel`, and add it to `MODELS` in io/cameras_yaml.py. `KEYS` define file, parameter names and checks.
 """
 
 from __future__ import annotations
@@ -74,18 +73,14 @@ class CameraModel(ABC):
 
     @classmethod
     def completed(cls, values: dict[str, Any]) -> dict[str, Any]:
-        """Return the keys of cameras.yaml with defaults (centre: middle of the picture); CameraError for impossible
-        values.
-        """
+        """Return the keys of cameras.yaml with defaults (centre: middle of picture); CameraError if impossible."""
         return (
             values | {"centre": middle_of_picture(values["image_size"])} if values.get("centre", 0) is None else values
         )
 
     @classmethod
     def ideal_lens(cls, f_px: float, pitch_mm: Sequence[float]) -> dict[str, Any]:
-        """Return the model's own fields for a lens without distortion, from f in pixels along v and the pitch along u
-        and v.
-        """
+        """Return the model's own fields for a lens without distortion: f in px along v, pitch along u and v."""
         got, do = cls.MODEL, "calibrate model tsai, pinhole or brown"
         raise CameraError(refusal("model", expected="one that a calibration can start from", got=got, do=do))
 
@@ -123,9 +118,7 @@ class CentralCamera(CameraModel):
         """(2,), pixels per unit of slope X/Z and Y/Z on the axis."""
 
     def project(self, x_lab_mm: Tensor) -> Tensor:
-        """Project lab points (..., 3), mm, to pixels (..., 2); NaN for points that are not in front of the camera.
-        Source: docs/conventions.md (X_cam = R X_lab + T, x_u = f X/Z).
-        """
+        """Project lab points (..., 3), mm, to pixels (..., 2); NaN for points that are not in front of the camera."""
         check_points("x_lab_mm", x_lab_mm, 3)
         x_cam_mm = x_lab_mm @ self.R_cam_lab.to(x_lab_mm).mT + self.T_cam_lab_mm.to(x_lab_mm)
         depth = x_cam_mm[..., 2:]

@@ -41,9 +41,7 @@ def parameter_names(camera: Camera) -> tuple[str, ...]:
 
 
 def with_parameters(camera: AnyCamera, names: Sequence[str], delta: Tensor) -> AnyCamera:
-    """Return the camera with small changes `delta` (P,) of P different parameters, in their units, differentiable in
-    them.
-    Model and covariance stay; the names are those of `parameter_names`.
+    """Return the camera with small changes `delta` (P,) of the parameters `names`, in their units; differentiable.
 
     Raises:
         CameraError: an unknown name, a name twice, or changes that make the camera impossible.

@@ -27,9 +27,7 @@ class PinholeCamera(CentralCamera):
 
     @classmethod
     def completed(cls, values: dict[str, Any]) -> dict[str, Any]:
-        """Return the keys with f_px from vfov_deg (one of both, else CameraError), and the centre from the picture's
-        size.
-        """
+        """Return the keys with f_px from vfov_deg (one of both, else CameraError), and a default centre."""
         f_px, vfov_deg = values["f_px"], values["vfov_deg"]
         if (f_px is None) == (vfov_deg is None):
             got, do = "none" if f_px is None else "both", "write one of the two"

@@ -1,5 +1,3 @@
-"""A flat wall between camera and liquid: Snell's law at both faces, in both directions."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -65,9 +63,8 @@ class Port:
         return self.offset_mm + self.thickness_mm
 
     def refract(self, air: Rays) -> Rays:
-        """Refract rays in air (lab; each a whole line) into the liquid, from the wall's liquid side.
-        Rays that do not go towards the wall are NaN, with gradient 0.
-        Source: Snell's law: the direction's part along the wall is divided by the index (docs/conventions.md).
+        """Refract rays in air (whole lines) into the liquid, from the wall's liquid side; NaN, gradient 0, if away.
+        Source: Snell's law divides the direction's part along the wall by the index (docs/conventions.md).
         """
         d = air.direction_lab
         normal = self.normal_lab.to(d)
@@ -87,9 +84,8 @@ class Port:
         return Rays(origin_lab_mm=torch.where(passes, origin, nan), direction_lab=torch.where(passes, direction, nan))
 
     def entry_point(self, x_lab_mm: Tensor, centre_lab_mm: Tensor) -> Tensor:
-        """Return where light from points in the liquid (..., 3) to a centre in air (3,) leaves the wall; lab, mm.
-        NaN, with gradient 0, for points that are not in the liquid.
-        Source: Snell's law in the plane of normal and point (textbook), solved for the share of the way along the wall.
+        """Return where light from points (..., 3) in the liquid to a centre (3,) in air leaves the wall; lab, mm.
+        NaN, with gradient 0, for points that are not in the liquid. Source: Snell's law (textbook).
         """
         normal = self.normal_lab.to(x_lab_mm)
         centre = centre_lab_mm.to(x_lab_mm)
@@ -189,8 +185,8 @@ class PortCamera:
 
     def _apparent_point(self, x_lab_mm: Tensor) -> Tensor:
         """Return the points in air with the image of `x_lab_mm` in the liquid, for cameras without one centre.
-        Each iteration shifts the point along the wall by the miss of its ray. The miss shrinks by 1 - 1/n or more for
-        steep rays, and is 0 after one iteration for parallel rays.
+        Each iteration shifts the point along the wall by the miss of its ray. This leaves at most 1 - 1/n of the miss
+        for steep rays, and nothing for parallel rays.
         """
         normal = self.port.normal_lab.to(x_lab_mm)
         inside = (x_lab_mm @ normal <= self.port.offset_mm.to(x_lab_mm))[..., None]

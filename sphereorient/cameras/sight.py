@@ -8,13 +8,8 @@ from sphereorient.cameras.checks import check_points
 
 
 def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
-    """Return the middle (..., 3), lab, mm, of the shortest segment between two rays, and its length (...), mm, 0 or
-    more.
-    Both are NaN, with gradient 0, for parallel rays; the rays broadcast.
-    Source: the common perpendicular of two skew lines (textbook).
-
-    Raises:
-        ShapeError: a last axis is not 3.
+    """Return the middle (..., 3), lab, mm, of the shortest segment between two rays, and its length (...), mm.
+    Both are NaN, with gradient 0, for parallel rays; the rays broadcast. Source: common perpendicular (textbook).
     """
     for name, rays in (("rays_a", rays_a), ("rays_b", rays_b)):
         check_points(f"{name}.origin_lab_mm", rays.origin_lab_mm, 3)
@@ -34,14 +29,9 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
 
 
 def R_cam_view(direction_cam: Tensor) -> Tensor:
-    """Return the smallest rotation (..., 3, 3) from the camera's z axis to directions (..., 3), camera frame, any
-    length.
-    It takes view to camera components; its last column is the unit direction. NaN, gradient 0, for the backward
-    direction.
+    """Return the smallest rotation (..., 3, 3) from the camera's z axis to directions (..., 3), camera frame.
+    It takes view to camera components; the last column is the unit direction. NaN, gradient 0, for the backward one.
     Source: docs/errata.md A1 (the paper's R_persp has the axis of OpenGL's camera); Rodrigues, axis z x direction.
-
-    Raises:
-        ShapeError: the last axis is not 3.
     """
     check_points("direction_cam", direction_cam, 3)
     unit = direction_cam / direction_cam.norm(dim=-1, keepdim=True)

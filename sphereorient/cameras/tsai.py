@@ -16,9 +16,7 @@ FOLD = -4.0 / 27.0  # below this value of kappa1 r_u^2 the cubic has no root on 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TsaiCamera(CentralCamera):
-    """Perspective with x_u = x_d (1 + kappa1 r_d^2), r_d the distorted radius on the sensor, mm.
-    Source: docs/conventions.md (Tsai). OpenCV's polynomial acts on the undistorted point instead.
-    """
+    """Perspective with Tsai's x_u = x_d (1 + kappa1 r_d^2), r_d distorted, on the sensor, mm (docs/conventions.md)."""
 
     f_mm: Tensor  # (), effective focal length
     pixel_pitch_mm: Tensor  # (2,)

@@ -17,9 +17,7 @@ ROOM = "check the space left and the permissions of the folder"
 
 @contextmanager
 def whole_hdf5(path: Path, do: str = ROOM) -> Iterator[h5py.File]:
-    """Open an HDF5 file for writing that replaces `path` once it is complete and on the disk.
-    OutputError with the remedy `do` if it cannot be written; the old file is kept.
-    """
+    """Open an HDF5 file that replaces `path` once complete and on the disk; else OutputError with the remedy `do`."""
     # HDF5 reports a full disk as either error.
     with put_aside(path, do, also=(RuntimeError,)) as aside, GuardedFile(aside) as guarded:
         with h5py.File(guarded, "w", track_order=False) as file:

@@ -1,5 +1,3 @@
-"""Picture files of unknown origin: the size that the header claims, and the grey values."""
-
 from __future__ import annotations
 
 import warnings

@@ -31,7 +31,6 @@ def sha256(path: Path) -> str:
 
 
 def _digest(files: Sequence[Path]) -> str:
-    """Return the hash of one file, or of the hashes of several in order."""
     hashes = [sha256(file) for file in files]
     return hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
 

@@ -15,7 +15,7 @@ def read_whole(path: Path, largest: int, expected: str, error: type[SphereOrient
     Refuse a pipe or a device before opening it: reading it might never end.
     """
     try:
-        found = os.stat(path)  # noqa: PTH116 -- follows links as open does, and tells why where Path.is_file only says no
+        found = os.stat(path)  # noqa: PTH116 -- follows links as open does, and gives the reason, which Path.is_file does not
         if stat.S_ISREG(found.st_mode) and found.st_size <= largest:
             with path.open("rb") as file:
                 return file.read(found.st_size)  # no more: files under /proc claim 0 bytes, and some never end

@@ -1,5 +1,3 @@
-"""Movies of Phantom cameras (.cine), memory-mapped."""
-
 from __future__ import annotations
 
 import struct
@@ -42,8 +40,6 @@ class _Layout:
 
 @dataclass(frozen=True, eq=False)
 class _Header:
-    """The header of a .cine file, checked against the size of the file; missing fields of SETUP are 0."""
-
     compression: int  # 0 none, 1 JPEG, 2 raw colour filter array
     packing: int  # 0 none, 256: 10 bit, 1024: 12 bit
     bits: int  # stored, of a pixel
@@ -131,9 +127,7 @@ def _prefix_and_size(content: NDArray[np.uint8], offset: int) -> tuple[int, int]
 
 
 def _read_header(path: Path) -> _Header:
-    """Read the header; nothing larger than the file is allocated, whatever the header claims.
-    Source: the vendor's description of the format; all numbers little-endian, packed without gaps.
-    """
+    """Read the header (little-endian, packed without gaps); allocate nothing larger than the file."""
     with path.open("rb") as file:
         size = file.seek(0, 2)
         kind, header_size, compression, _, _, _, first, count, at_bitmap, at_setup, at_table, trigger = _unpack(
@@ -155,7 +149,6 @@ def _read_header(path: Path) -> _Header:
         stamps = _read_stamps(file, at_setup + length, min(at_table, size)) if length else None
 
     def field(offset: int, form: str) -> int:
-        """Return a field of SETUP, 0 where this version lacks it."""
         there = offset + struct.calcsize(form) <= len(setup)
         return int(struct.unpack_from(form, setup, offset)[0]) if there else 0
 
@@ -201,7 +194,6 @@ def _read_stamps(file: BinaryIO, at: int, end: int) -> NDArray[np.uint64] | None
 
 
 def _seconds(stamps: NDArray[np.uint64], trigger: int) -> NDArray[np.float64]:
-    """Return times from the trigger; subtract integers, before rounding."""
     since = (stamps & ~FLAG_BITS) - (np.uint64(trigger) & ~FLAG_BITS)  # may wrap round; right again as signed
     return since.view(np.int64) / 2.0**32
 

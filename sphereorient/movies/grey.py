@@ -21,9 +21,7 @@ PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # pixel formats that begin so ma
 
 
 def luma(red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any]) -> NDArray[Any]:
-    """Return the grey values of a colour picture (...), uint8 or uint16; exact where R = G = B.
-    Source: ITU-R BT.601.
-    """
+    """Return the grey values of a colour picture (...), uint8 or uint16, by ITU-R BT.601; exact where R = G = B."""
     total = RED * red.astype(np.uint32) + GREEN * green.astype(np.uint32) + BLUE * blue.astype(np.uint32)
     return ((total + 500) // 1000).astype(red.dtype)
 

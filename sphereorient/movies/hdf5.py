@@ -1,5 +1,3 @@
-"""Movies in HDF5: one data set (N, H, W), with its times beside it."""
-
 from __future__ import annotations
 
 import math
@@ -74,7 +72,6 @@ def _shown(name: object) -> str:
 
 @contextmanager
 def _opened(path: Path, file: Path) -> Iterator[Any]:
-    """Open the file; errors of HDF5 inside the block mean damage."""
     try:
         with h5py.File(file, "r") as opened:
             yield opened
@@ -145,9 +142,7 @@ def _is_movie(data: Any) -> bool:
 
 
 def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int] | None]:
-    """Return the number of frames up to the last written one, and the written chunks along the first axis.
-    Contiguous values give None for the chunks. Nothing is read; the stated shape is not trusted.
-    """
+    """Return the number of frames up to the last written one, and the written chunks, None if contiguous."""
     stated, height, width = (int(size) for size in data.shape)
     frame_bytes = height * width * data.dtype.itemsize
     if frame_bytes > LARGEST_RATIO * file_bytes:

@@ -52,9 +52,7 @@ class Movie:
         return self._read(self._range(first, last))
 
     def readable(self, first: int = 0, last: int | None = None) -> Iterator[Grey | None]:
-        """Yield frames first .. last - 1 in order, None for unreadable ones; MovieError outside the movie.
-        Frames predicted from a damaged one are None too, up to the next key frame.
-        """
+        """Yield frames first .. last - 1, None for damaged ones and those predicted from them (MovieError outside)."""
         return self._read_on(self._range(first, last))
 
     def sample(self, indices: Sequence[int]) -> Grey:
@@ -110,9 +108,7 @@ class FlippedMovie(Movie):
 
 
 def flipped(movie: Movie, how: str) -> Movie:
-    """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both; else
-    MovieError.
-    """
+    """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both."""
     if how not in FLIPS:
         do = "write one of these"
         raise MovieError(refusal(f"{movie.path}, flip", expected=", ".join(FLIPS), got=f"'{how}'", do=do))

@@ -1,5 +1,3 @@
-"""From a path to a movie, by suffix. To add a format: one module and one line of READERS."""
-
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -49,9 +47,7 @@ def open_movie(path: Path | str) -> Movie:
 
 
 def movie_files(path: Path | str) -> list[Path]:
-    """Return the files of a movie as `open_movie` takes it: one, or the pictures of a sequence (MovieError without
-    any).
-    """
+    """Return the files of a movie: one, or the pictures of a sequence (MovieError without any)."""
     path = Path(path)
     return sequence_files(path) if _is_sequence(path) else [split_path(path)[0]]
 

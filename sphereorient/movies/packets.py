@@ -65,10 +65,7 @@ class PacketIndex:
         return runs
 
     def spoilt_by(self, number: int) -> Sequence[int]:
-        """Return the frames, itself included, that cannot be trusted once frame `number` is damaged.
-        Those decoded after it up to the next key frame, or later but shown before that; if frames can only be counted:
-        all that follow.
-        """
+        """Return the frames that damage in frame `number` may spoil, itself included; all later ones if unknown."""
         if not self.order:
             return range(number, self.count)
         if self.each_alone or number not in self.order:
@@ -80,9 +77,8 @@ class PacketIndex:
 
 
 def index_packets(packets: list[Packet], guessed: bool, step: Fraction | None = None) -> PacketIndex:
-    """Number packets, in file order, by their time stamps, or by byte offsets if stamps are ambiguous.
-    `guessed`: the demuxer guessed the presentation stamps. `step`: frame period by the header, in stamp units; a gap
-    between evenly spaced stamps is a lost frame.
+    """Number packets, in file order, by their time stamps, or by byte offsets if stamps are ambiguous or `guessed`.
+    A gap between stamps spaced by `step` (frame period by the header, in stamp units) is a lost frame.
     """
     stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
     if not guessed and len(stamps) == len(packets):

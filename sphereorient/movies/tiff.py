@@ -116,7 +116,6 @@ def _first_page(path: Path, file: TiffFile) -> Any:
 
 
 def _check_claim(page: Any) -> None:
-    """Refuse a page that claims more pixels than its bytes can hold."""
     stored = min(sum(page.databytecounts), page.parent.filehandle.size)  # the counts are a claim too
     if not page.nbytes or page.nbytes > LARGEST_RATIO * stored:
         raise ValueError(f"a page {page.shape} with {stored} bytes of pixels")

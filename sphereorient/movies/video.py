@@ -104,10 +104,7 @@ class VideoMovie(Movie):
     def _pictures(
         self, container: av.container.InputContainer, numbers: list[int], key: int
     ) -> Iterator[Grey | MovieError]:
-        """Yield the picture or the error of each of increasing frame numbers, from a container at frame `key` or before
-        it.
-        Ignore damage before `key`: the seek may have cut off what that frame depends on.
-        """
+        """Yield picture or error of increasing frame numbers; ignore damage before `key`, which the seek may cause."""
         waiting = iter(numbers)
         wanted = next(waiting, None)
         spoilt: dict[int, str] = {}
@@ -196,9 +193,7 @@ def _first_frame(container: av.container.InputContainer) -> av.VideoFrame | None
 
 
 def _check_sums_right(packet: bytes) -> bool:
-    """Verify the check sums of all slices of an FFV1 packet; FFmpeg's decoder only logs them.
-    Source: RFC 9043, sections 4.9 and 4.9.3.
-    """
+    """Verify the check sums of all slices of an FFV1 packet, which the decoder only logs (RFC 9043, 4.9 and 4.9.3)."""
     end = len(packet)
     while end > 0:
         first = end - TRAILER - int.from_bytes(packet[end - TRAILER : end - TRAILER + 3], "big")
@@ -230,7 +225,6 @@ def _stated_frames(container: av.container.InputContainer, count: int) -> int:
     stream = container.streams.video[0]
     if stream.frames:
         return int(stream.frames)
-    # Matroska states no number of frames, but the duration.
     matroska = "matroska" in container.format.name and len(container.streams) == 1
     if not (matroska and container.duration and stream.average_rate):
         return 0

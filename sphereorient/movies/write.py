@@ -29,14 +29,13 @@ def write_movie(
     times_s: NDArray[np.float64] | None = None,
     frame_rate_hz: float = PLAYER_RATE_HZ,
 ) -> int:
-    """Write grey frames (H, W), uint8 or uint16, as FFV1 (.mkv) or HDF5 (.h5, .hdf5) and return their number.
-    The file replaces an old one at the end. A frame None keeps its number: unreadable in HDF5, black in .mkv. `times_s`
-    (N,), s, go into the HDF5 file, or beside the .mkv into `MOVIE.times.csv`, which experiment.yaml takes as `times:`.
-    `frame_rate_hz` of .mkv is for players only.
+    """Write grey frames (H, W), uint8 or uint16, as FFV1 (.mkv) or HDF5 (.h5, .hdf5); return their number.
+    A frame None keeps its number: unreadable in HDF5, black in .mkv. `times_s` (N,), s, go into the HDF5 file, or
+    beside the .mkv into `MOVIE.times.csv`, for `times:` of experiment.yaml; players alone use `frame_rate_hz` of .mkv.
 
     Raises:
         MovieError: another suffix, no frame, or frames of different size or type.
-        OutputError: the file cannot be written.
+        OutputError: the file cannot be written; an old file is kept.
     """
     path = Path(path)
     if path.suffix.lower() not in WRITERS:

@@ -98,8 +98,7 @@ ENTRIES = {name: _entry(kind) for name, kind in MODELS.items()}
 
 
 def load_cameras(path: Path | str) -> dict[str, Camera]:
-    """Read all cameras of a cameras.yaml, in the file's order; a camera with a `port` becomes a PortCamera.
-    Source: docs/cameras.md.
+    """Read all cameras of a cameras.yaml (docs/cameras.md), in its order; a camera with a `port` becomes a PortCamera.
 
     Raises:
         CameraError: missing, not YAML, another schema, an unknown key or model, or an impossible parameter.
@@ -121,10 +120,7 @@ def load_cameras(path: Path | str) -> dict[str, Camera]:
 
 def load_covariance(path: Path | str, cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
     """Read the joint covariance of the given cameras from cameras.yaml, with parameters named camera.parameter.
-    Without a joint one: the cameras' own covariances, taken as independent; None where a camera has no covariance.
-
-    Raises:
-        CameraError: an impossible covariance, or an unknown parameter.
+    Without a joint one: the cameras' own as independent blocks, None where one is missing. CameraError if impossible.
     """
     path = Path(path)
     entry = read_document(path, SCHEMA, CameraError).get("covariance")
@@ -150,7 +146,7 @@ def save_cameras(
     covariance: ParameterCovariance | None = None,
 ) -> None:
     """Write cameras, by name, to a file that `load_cameras` reads back to the last bit; replace an old file atomically.
-    `comment` stands at the top of the file; `covariance` is that of a joint fit of all cameras.
+    `comment` stands at its top; `covariance` is that of a joint fit.
 
     Raises:
         CameraError: a camera of a model that is not in MODELS.
@@ -198,7 +194,6 @@ def _with_port_and_covariance(camera: CameraModel, entry: CameraEntry) -> Camera
 
 
 def _described(camera: Camera) -> dict[str, Any]:
-    """Invert `_build`."""
     if isinstance(camera, PortCamera):
         inner = {key: value for key, value in _described(camera.camera).items() if key != "covariance"}
         return inner | {"port": _values(Port.KEYS, camera.port)} | _covariance_keys(camera.covariance)

@@ -27,10 +27,9 @@ Array = NDArray[np.float64]
 
 
 def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> BrownCamera:
-    """Read a camera that OpenCV's calibration has written; its first pixel's centre is (0, 0), as here.
-    The file has `camera_matrix` and `distortion_coefficients`, optionally `R` or `rvec`, `T` or `tvec` (mm; without
-    them the lab is the camera frame), `image_width` and `image_height`; `image_size` (W, H), px, is for files without
-    it.
+    """Read a camera that OpenCV's calibration has written; the first pixel's centre is (0, 0).
+    The file has `camera_matrix`, `distortion_coefficients`, optional `R` or `rvec`, `T` or `tvec` (mm; without them the
+    lab is the camera frame), `image_width` and `image_height` (without them give `image_size`, (W, H) px).
 
     Raises:
         CameraError: no OpenCV file, a missing or impossible key, shear, or distortion beyond k1, k2, p1, p2, k3.
@@ -66,8 +65,7 @@ def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> 
 
 
 def save_opencv(path: Path | str, camera: BrownCamera) -> None:
-    """Write a camera, with T in mm, as OpenCV's calibration does, to the last bit; OpenCV has no key for the
-    covariance.
+    """Write a camera, T in mm, as OpenCV does, to the last bit, without covariance.
 
     Raises:
         OutputError: an ending other than .yml, .yaml, .xml or .json, or a file that cannot be written.
@@ -121,7 +119,7 @@ def _node(storage: cv2.FileStorage, key: str) -> Array | None:
 
 
 def _claims_few(node: cv2.FileNode) -> bool:
-    """Return whether a matrix claims at most MOST numbers, by its rows and columns or by the sizes of its axes."""
+    """Return whether a matrix claims at most MOST numbers, by rows and columns or by the sizes of its axes."""
     axes = node.getNode("sizes")
     if axes.empty():
         sides = [_whole(node.getNode(side)) for side in ("rows", "cols")]

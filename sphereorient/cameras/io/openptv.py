@@ -105,11 +105,7 @@ def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
 
 
 def load_ptv_par(path: Path | str) -> PtvPar:
-    """Read the sensor and the media from ptv.par.
-
-    Raises:
-        CameraError: a missing, truncated or malformed file, or interlaced cameras.
-    """
+    """Read the sensor and the media from ptv.par; CameraError if missing, malformed or interlaced."""
     path = Path(path)
     words = _words(path, "\n")
     count = words[0].strip() if words else ""
@@ -134,11 +130,7 @@ def load_ptv_par(path: Path | str) -> PtvPar:
 
 
 def save_ptv_par(path: Path | str, par: PtvPar, names: Sequence[str]) -> None:
-    """Write ptv.par for cameras that share sensor and media, with pictures img/NAME. and cal/NAME.tif.
-
-    Raises:
-        OutputError: a file that cannot be written.
-    """
+    """Write ptv.par for cameras with common sensor and media, pictures img/NAME. and cal/NAME.tif (or OutputError)."""
     lines = [str(len(names))]
     for name in names:
         lines += [f"img/{name}.", f"cal/{name}.tif"]
