@@ -70,6 +70,7 @@ class Calibrated:
 
 def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: Progress | None = None) -> Calibrated:
     """Calibrate the cameras of a calibration.yaml, loaded or by path, in the lab that the surveyed pose defines.
+    `progress` is called with stage, done and total.
 
     Raises:
         CameraError: an unreadable picture or one of another size, no plate in them, or undetermined parameters.
