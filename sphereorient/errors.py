@@ -1,17 +1,5 @@
 """All errors that sphereorient raises on purpose.
 
-    SphereOrientError
-    ├── ShapeError (ValueError)     a tensor of another shape than the function works on
-    ├── CameraError                 cameras that are no cameras, or do not belong to the picture
-    ├── MovieError                  a movie that is missing, unreadable, empty or of another size
-    ├── TextureError                a texture map that is none
-    ├── PaintError                  movies from which no map of the paint can be learnt
-    ├── ExperimentError             experiment.yaml: missing, malformed, inconsistent
-    ├── SettingsError (ValueError)  an unknown or impossible setting
-    ├── TrackError                  a file that is no track, or of another schema
-    ├── CheckpointError             a file that is no trained proposer, or one of another ball
-    └── OutputError                 a result that cannot be written
-
 Every message is worded by `refusal`: what was looked at, what was expected, what came, what to do.
 """
 
@@ -44,7 +32,7 @@ class TextureError(SphereOrientError):
 
 
 class PaintError(SphereOrientError):
-    """Movies from which no map of the paint can be learnt."""
+    """Movies from which no texture map can be learnt."""
 
 
 class ExperimentError(SphereOrientError):
@@ -60,11 +48,11 @@ class TrackError(SphereOrientError):
 
 
 class CheckpointError(SphereOrientError):
-    """A file is not a trained proposer that this version reads, or belongs to another ball."""
+    """A file is not a trained proposer that this version reads, or belongs to another sphere."""
 
 
 class BenchError(SphereOrientError):
-    """Results of a benchmark that are missing, damaged, or of another version or plan."""
+    """Results of a benchmark are missing, damaged, or of another version or plan."""
 
 
 class OutputError(SphereOrientError):
@@ -72,28 +60,12 @@ class OutputError(SphereOrientError):
 
 
 def refusal(name: str, *, expected: str, got: str, do: str) -> str:
-    """Word a refusal in one line: subject first, remedy last.
-
-    Args:
-        name: what was looked at, with its file.
-        expected: what would have been accepted.
-        got: what came instead.
-        do: the remedy, as an imperative without the full stop.
-    """
+    """Word a refusal in one line; `name` is the thing with its file, `do` the remedy, without full stop."""
     return f"{name}: expected {expected}, got {got}; {do}."
 
 
 def check_tail(name: str, tensor: Tensor, *tail: int) -> None:
-    """Refuse a tensor whose last axes are not `tail`.
-
-    Args:
-        name: the argument's name, for the message.
-        tensor: (..., *tail), any leading shape.
-        tail: the sizes that the last axes must have.
-
-    Raises:
-        ShapeError: the last axes differ.
-    """
+    """Refuse a tensor whose last axes are not `tail`, after any leading shape (ShapeError)."""
     if tuple(tensor.shape[-len(tail) :]) != tail:
         expected = ", ".join(["...", *map(str, tail)])
         raise ShapeError(

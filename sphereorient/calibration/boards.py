@@ -1,5 +1,3 @@
-"""Targets in a picture: dot plates, and through OpenCV chessboards, ChArUco boards and circle grids."""
-
 from __future__ import annotations
 
 from dataclasses import replace
@@ -36,17 +34,7 @@ def see_plate(
     name: str = "plate picture",
     settings: DotSettings | None = None,
 ) -> PlateView:
-    """Find a target in one picture; a picture that shows nothing usable gives a `refused` view with the reason.
-
-    Args:
-        picture: (H, W), grey, any number type.
-        plate: the target, from `plate_from_entry`.
-        name: of the picture, for the reason.
-        settings: of the detection of dots.
-
-    Raises:
-        CameraError: not a grey picture.
-    """
+    """Find `plate` in a grey picture (H, W), any number type (or CameraError); `refused` with a reason if unusable."""
     if isinstance(plate, Chessboard):
         return _chessboard(picture, plate, name)
     if isinstance(plate, CharucoBoard):
@@ -58,7 +46,7 @@ def see_plate(
 
 
 def _chessboard(picture: NDArray[np.generic], board: Chessboard, name: str) -> PlateView:
-    """Find the inner corners of a whole chessboard; floating where the board is the same after a rotation."""
+    """Find all inner corners of a chessboard; floating where the board has a rotational symmetry."""
     grey = _eight_bits(picture)
     found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=SHARP)
     if not found:
@@ -74,7 +62,7 @@ def _chessboard(picture: NDArray[np.generic], board: Chessboard, name: str) -> P
 
 
 def _charuco(picture: NDArray[np.generic], board: CharucoBoard, name: str) -> PlateView:
-    """Find the corners of a ChArUco board or a part of it; its markers identify every corner."""
+    """Find the corners of a ChArUco board or a part of it."""
     detector = cv2.aruco.CharucoDetector(board.opencv())
     corners, ids, _, markers = detector.detectBoard(_eight_bits(picture))
     count = 0 if ids is None else len(ids)
@@ -93,10 +81,7 @@ def _charuco(picture: NDArray[np.generic], board: CharucoBoard, name: str) -> Pl
 
 
 def _circles(picture: NDArray[np.generic], grid: CircleGrid, name: str) -> PlateView:
-    """Find the circles of a whole grid; floating where the grid is the same after a rotation.
-
-    `find_dots` finds and measures the circles; OpenCV only orders them.
-    """
+    """Find and measure all circles by `find_dots`; OpenCV only orders them."""
     dots = find_dots(picture, dark=grid.dark)
     order = _circles_in_order(dots, grid)
     if order is None:
@@ -119,7 +104,6 @@ def _view(plate: CalibrationTarget, index: Ints, uv_px: Floats, sigma_px: Floats
 
 
 def _settled(view: PlateView, plate: CalibrationTarget, placements: list[Ints], name: str) -> PlateView:
-    """Return the view tied if one placement is left, else floating."""
     if len(placements) == 1:
         return placed(view, plate, placements[0])
     expected, got = "a plate that looks the same from one side only", f"{len(placements)} possible rotations"
@@ -138,7 +122,6 @@ def _eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
 
 
 def _refined(grey: NDArray[np.uint8], uv_px: Floats) -> Floats:
-    """Refine corners by OpenCV's sub-pixel step, in windows that hold one corner each."""
     away = np.linalg.norm(uv_px[:, None] - uv_px[None], axis=-1) + np.diag(np.full(len(uv_px), np.inf))
     half = int(np.clip(WINDOW * away.min(), 2, 15))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
@@ -158,9 +141,9 @@ def _homography(index: Floats | Ints, uv_px: Floats) -> Floats:
 
 
 def _seen_from_front(index: Ints, uv_px: Floats) -> Ints:
-    """Return the indices, with rows reversed where OpenCV counts as if seen from behind."""
+    """Reverse the rows where OpenCV counts as if the target were seen from behind."""
     h = _homography(index - index.mean(axis=0), uv_px)
-    # Jacobian at the middle of the board; v runs down, so from the front its determinant is negative.
+    # Determinant of the Jacobian: v runs down, so from the front it is negative.
     slope = h[:2, :2] / h[2, 2] - np.outer(h[:2, 2], h[2, :2]) / h[2, 2] ** 2
     if np.linalg.det(slope) < 0:
         return index
@@ -188,7 +171,6 @@ def _lower_left_is_dark(grey: NDArray[np.uint8], index: Ints, uv_px: Floats) -> 
 
 
 def _circles_in_order(dots: Dots, grid: CircleGrid) -> Ints | None:
-    """Return the dots in OpenCV's order, row by row, or None."""
     if len(dots) < grid.columns * grid.rows:
         return None
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if grid.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID

@@ -1,4 +1,4 @@
-"""Bundle adjustment: all cameras and all plate poses fitted together to all points seen, with covariances."""
+"""Bundle adjustment: fit all cameras and plate poses together to all points, with covariances."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ GAIN = (1e-5, 1e-8)  # relative gain of the cost at which a round ends: all roun
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rig:
-    """Cameras and the plate's P poses; made by the guess, improved by the fit."""
+    """Cameras and the plate's P poses."""
 
     cameras: Mapping[str, Camera]
     R_lab_plate: Tensor  # (P, 3, 3)
@@ -40,7 +40,7 @@ class Rig:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SeenPoints:
-    """All n points that one camera saw of the plate, over all pictures."""
+    """The n points of the plate that one camera saw in all pictures."""
 
     pose: Tensor  # (n,) int64, row of the rig's poses
     points_plate_mm: Tensor  # (n, 3)
@@ -66,7 +66,7 @@ def fitted_parameters(camera: Camera, of_port: Sequence[str] = ()) -> tuple[str,
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
-    """Residuals and their slopes as functions of one vector: the cameras' changes, then those of the free poses."""
+    """Residuals and their derivatives as functions of one vector: changes of the cameras, then of the free poses."""
 
     rig: Rig
     seen: Mapping[str, SeenPoints]
@@ -75,7 +75,7 @@ class Problem:
 
     @property
     def free(self) -> list[int]:
-        """Rows of the poses that are fitted: those that a camera saw and that do not define the lab."""
+        """Rows of the fitted poses: those that a camera saw and that do not define the lab."""
         rows = {row for seen in self.seen.values() for row in seen.pose.tolist()}
         return sorted(rows - self.fixed)
 
@@ -124,10 +124,7 @@ class Problem:
         return torch.cat(parts)
 
     def slopes(self, change: Tensor) -> Tensor:
-        """Return the derivatives of the residuals (2 n, size).
-
-        A point's image depends on its own camera and its own pose, so all poses are differentiated in one pass.
-        """
+        """Return the derivatives of the residuals (2 n, size)."""
         shares, poses = self._split(change)
         free, first_pose, offset, parts = self.free, self.size - POSE_PARTS * len(self.free), 0, []
         for name, seen in self.seen.items():
@@ -145,7 +142,6 @@ class Problem:
         return torch.cat(parts)
 
     def _split(self, change: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-        """Split a vector of changes into those of each camera and those of all poses (P, 6)."""
         lengths = [len(names) for names in self.names.values()]
         *shares, poses = torch.split(change, [*lengths, POSE_PARTS * len(self.free)])
         whole = change.new_zeros(len(self.rig.R_lab_plate), POSE_PARTS)
@@ -160,7 +156,6 @@ class Problem:
         return self._expected(name, share, poses)
 
     def _expected(self, name: str, share: Tensor, poses: Tensor) -> Tensor:
-        """Return the expected pixels of one camera's points, (n, 2)."""
         seen = self.seen[name]
         R = (so3.exp(poses[:, :3]) @ self.rig.R_lab_plate)[seen.pose]
         T = (self.rig.T_lab_plate_mm + poses[:, 3:])[seen.pose]
@@ -180,11 +175,8 @@ class Fitted:
 
 
 def adjust(problem: Problem) -> Fitted:
-    """Fit cameras and poses; the covariance is the inverse information times the residuals' variance.
-
-    Args:
-        problem: its rig must be near enough: dots fall nearer to their own images than to their neighbours'.
-
+    """Fit cameras and poses from a start that places each dot nearest to its own image.
+    The covariance is the inverse information times the variance of the residuals.
     Source: Triggs et al. 2000 (bundle adjustment); soft L1 loss, Huber 1981.
     """
     change = torch.zeros(problem.size, dtype=torch.float64)
@@ -236,30 +228,21 @@ def _solved(problem: Problem, start: Tensor, shifts: Mapping[str, Tensor], rows:
 def disk_centre_shift(
     camera: Camera, R_lab_plate: Tensor, T_lab_plate: Tensor, points_plate: Tensor, dot_diameter: Tensor
 ) -> Tensor:
-    """Return the centroids of the images of disks minus the images of their centres.
-
-    A measured centroid minus this shift is the image of the dot's centre. The centroid is an integral along the rim
-    (Green), the rim a trigonometric polynomial through RIM_POINTS points; image blur does not move it.
+    """Return centroid minus image of the centre (..., n, 2), px, for disks of a plate; differentiable in everything.
+    NaN where part of a disk is not imaged; blur does not move the centroid.
+    Source: Green's theorem, area = 1/2 loop(u dv - v du), area times centroid_u = 1/2 loop(u^2 dv), likewise v.
 
     Args:
         camera: any camera, also behind a port.
         R_lab_plate: (..., 3, 3), takes plate components to lab components.
         T_lab_plate: (..., 3), lab, mm: X_lab = R_lab_plate X_plate + T_lab_plate.
-        points_plate: (..., n, 3), the disks' centres, plate frame, mm; the disks lie in the plane z = const.
+        points_plate: (..., n, 3), centres, plate frame, mm; the disks lie in planes z = const.
         dot_diameter: (..., n), mm; 0 for a corner, whose shift is 0.
-
-    Returns:
-        (..., n, 2), px; NaN where a part of the disk is not imaged. Differentiable in everything.
-
-    Raises:
-        ShapeError: the last axis of points_plate is not 3.
-
-    Source: Green's theorem, area = 1/2 loop(u dv - v du), area times centroid_u = 1/2 loop(u^2 dv), likewise v.
     """
     check_points("points_plate", points_plate, 3)
     angle = torch.arange(RIM_POINTS, dtype=torch.float64, device=points_plate.device) * (2 * math.pi / RIM_POINTS)
     circle = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1).to(points_plate)
-    # A corner has no rim and would give 0/0: it gets a rim here, and its shift is set to 0 below.
+    # A corner would give 0/0: it gets a rim here and shift 0 below.
     is_disk = dot_diameter > 0
     radius = torch.where(is_disk, dot_diameter, torch.ones_like(dot_diameter)) / 2
     centres = points_plate[..., None, :]
@@ -275,10 +258,7 @@ def disk_centre_shift(
 
 
 def _slope_matrix(like: Tensor) -> Tensor:
-    """Return the (RIM_POINTS, RIM_POINTS) matrix of d/d angle of the trigonometric polynomial through the points.
-
-    Source: Trefethen, Spectral Methods in MATLAB, eq. (3.10), even number of points.
-    """
+    """Return d/d angle (RIM_POINTS, RIM_POINTS) of the trigonometric interpolant (Trefethen 2000, eq. 3.10, even)."""
     k = torch.arange(RIM_POINTS, device=like.device)
     apart = (k[:, None] - k[None, :]).to(torch.float64) * (math.pi / RIM_POINTS)
     sign = 1.0 - 2.0 * ((k[:, None] - k[None, :]) % 2)

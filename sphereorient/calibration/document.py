@@ -1,5 +1,3 @@
-"""calibration.yaml: the pictures or point tables, the plate, and what is known in advance."""
-
 from __future__ import annotations
 
 import csv
@@ -79,7 +77,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CalibrationDocument:
-    """A checked calibration.yaml; made by `load_calibration`."""
+    """A checked calibration.yaml."""
 
     path: Path
     image_size: tuple[int, int]  # W, H px
@@ -100,11 +98,7 @@ class CalibrationDocument:
 
 
 def load_calibration(path: Path | str) -> CalibrationDocument:
-    """Read calibration.yaml, without its pictures and tables.
-
-    Raises:
-        CameraError: missing, malformed, or incomplete.
-    """
+    """Read calibration.yaml, without its pictures and tables; CameraError if missing, malformed or incomplete."""
     path = Path(path)
     keys = validated(CalibrationKeys, read_document(path, SCHEMA, CameraError), str(path), CameraError)
     if bool(keys.pictures) == bool(keys.points):
@@ -132,11 +126,7 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
 
 
 def read_points(path: Path) -> NDArray[np.float64]:
-    """Read a CSV table with the columns x, y, z (lab, mm), u, v (px), in any order, as (n, 5).
-
-    Raises:
-        CameraError: unreadable, a missing column, or something that is not a number.
-    """
+    """Read a CSV table with columns x, y, z (lab, mm), u, v (px), in any order, as (n, 5); CameraError if malformed."""
     content = read_whole(path, TABLE_BYTES, "a table", CameraError, "correct the path")
     try:
         text = content.decode("utf-8-sig")

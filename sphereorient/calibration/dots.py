@@ -1,5 +1,3 @@
-"""Dots of a calibration plate: found at many grey levels, measured by fitting blurred ellipses."""
-
 from __future__ import annotations
 
 from typing import Any
@@ -39,18 +37,8 @@ class DotSettings(BaseModel):
 
 
 def find_dots(picture: NDArray[np.generic], *, dark: bool = True, settings: DotSettings | None = None) -> Dots:
-    """Find all dots that lie wholly in a picture, and measure their centres, from top to bottom.
-
-    Blobs are taken from many grey levels, so uneven light needs no setting. A blurred ellipse is then fitted to each
-    (`fit_ellipses`). Whether the dots belong to a plate is decided later.
-
-    Args:
-        picture: (H, W), grey, any number type.
-        dark: dark dots on a bright background; False: the reverse.
-        settings: of the detection.
-
-    Raises:
-        CameraError: not a grey picture, or NaN in it.
+    """Find dots wholly inside a grey picture (H, W) of any number type and measure their centres, from top to bottom.
+    `dark` dots lie on a bright background; uneven light needs no setting. CameraError for other pictures or NaN.
     """
     settings = settings or DotSettings()
     grey = as_grey(picture)
@@ -64,7 +52,7 @@ def find_dots(picture: NDArray[np.generic], *, dark: bool = True, settings: DotS
         good = inside & (fit.misfit < settings.worst_misfit) & (fit.contrast > 0.1) & (moved < 0.5)
         good &= np.isfinite(fit.sigma_px) & (fit.area_px >= settings.smallest_area_px)
     if good.any():
-        # Noise can look like faint dots; the contrast of a plate's own dots is the same in any light.
+        # Noise can look like faint dots; dots of one plate have the same contrast in any light.
         good &= fit.contrast > settings.faintest * np.percentile(fit.contrast[good], 95)
     good &= _first_of_equals(fit.uv_px, fit.shape, good)
     kept = np.flatnonzero(good)
@@ -72,11 +60,7 @@ def find_dots(picture: NDArray[np.generic], *, dark: bool = True, settings: DotS
 
 
 def as_grey(picture: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Return a picture (H, W) of any number type as grey values.
-
-    Raises:
-        CameraError: not a grey picture of 16 x 16 px or more, or NaN in it.
-    """
+    """Return a grey picture (H, W), 16 x 16 px or more, as float32; CameraError for anything else or NaN."""
     if picture.ndim != 2 or min(picture.shape) < 16:
         do = "convert it to one grey picture"
         raise CameraError(refusal("plate picture", expected="(H, W) of 16 px or more", got=f"{picture.shape}", do=do))
@@ -96,10 +80,7 @@ def _first_of_equals(uv_px: Floats, shape: Floats, good: NDArray[np.bool_]) -> N
 
 
 def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Floats]:
-    """Return centres (n, 2), px, and shapes (n, 2, 2) of dark blobs that are ellipses over three grey levels or more.
-
-    A dot is an ellipse at every threshold between its own grey and that of its background; noise at one or two.
-    """
+    """Return centres (n, 2), px, and shapes (n, 2, 2) of dark blobs that are ellipses at three grey levels or more."""
     smooth = cv2.GaussianBlur(grey, (0, 0), settings.smooth_px) if settings.smooth_px > 0 else grey
     low, high = np.percentile(smooth, [0.1, 99.9])
     done: list[_Chain] = []
@@ -125,7 +106,7 @@ def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Fl
 def _ellipses_at(
     mask: NDArray[np.bool_], settings: DotSettings
 ) -> tuple[NDArray[np.int32], dict[int, int], Floats, Floats, Floats]:
-    """Return the labels of the mask's components, and number, area, centre and shape of those that are ellipses."""
+    """Return labels of the mask's components; number, area, centre and shape of the ellipses among them."""
     height, width = mask.shape
     pieces: Any = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     labels, stats = pieces[1], pieces[2]

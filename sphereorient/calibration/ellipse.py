@@ -1,5 +1,3 @@
-"""Blurred ellipses fitted to the grey values around dots."""
-
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -22,7 +20,7 @@ LEAST_BLUR_PX = 0.2  # a rim is never sharper than its pixels make it (0.29)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dots:
-    """Dots in a picture; made by `find_dots`, read by `index_dots`. What did not converge to an ellipse is NaN."""
+    """Dots in a picture; NaN where the fit did not converge to an ellipse."""
 
     uv_px: Floats  # (n, 2), centres of the ellipses
     shape: Floats  # (n, 2, 2), 1/px^2: x^T shape x = 1 on the rim, x from the centre
@@ -32,7 +30,6 @@ class Dots:
     misfit: Floats  # (n,), rms of the picture around the fitted dot, relative to its contrast
 
     def __len__(self) -> int:
-        """Return the number of dots."""
         return len(self.uv_px)
 
     @property
@@ -42,29 +39,20 @@ class Dots:
         return area
 
     def __getitem__(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> Dots:
-        """Return some of the dots."""
         return Dots(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
 
 
 def fit_ellipses(grey: NDArray[np.float32], centre_px: Floats, shape: Floats, *, dark: bool) -> Dots:
-    """Fit rim, blur, light and contrast of dots to the grey values around them.
-
-    The model is light(u, v) (1 - contrast cover(u, v)): the light is a plane, the cover of the dark part an error
-    function of the distance from an ellipse. It is symmetric about the centre except for the light, so blur, a wrong
-    profile of the rim and truncation at the picture's edge do not move the centre.
-
-    Args:
-        grey: (H, W).
-        centre_px: (n, 2), first guess.
-        shape: (n, 2, 2), first guess, 1/px^2: x^T shape x = 1 on the rim.
-        dark: dark dots on a bright background; False: the reverse.
+    """Fit rim, blur, light and contrast of n dots to the grey values (H, W) around centres (n, 2), px.
+    `shape` (n, 2, 2), 1/px^2: first guess of the rim x^T shape x = 1. The model is light times 1 - contrast cover.
+    Light is a plane and cover symmetric: blur, a wrong rim profile and the picture's edge do not move the centre.
     """
     n = len(centre_px)
     values = np.full((n, PARAMETERS), np.nan)
     sigma, misfit = np.full(n, np.nan), np.full(n, np.nan)
     owner = _owners(grey.shape, centre_px, shape)
     half = _window(shape)
-    # Windows of similar size are fitted together; one large blob must not pad all others.
+    # Group windows of similar size, so that one large blob does not pad all others.
     bucket = np.ceil(np.log(np.maximum(half, 1)) / np.log(1.35)).astype(int)
     for size in np.unique(bucket):
         some = np.flatnonzero(bucket == size)
@@ -82,7 +70,6 @@ def fit_ellipses(grey: NDArray[np.float32], centre_px: Floats, shape: Floats, *,
 
 
 def _window(shape: Floats) -> Ints:
-    """Return half the sides (n,) of the windows, px."""
     return np.asarray(np.ceil(RING * half_box(shape) + LEAST_RING_PX).astype(int).max(axis=1, initial=0))
 
 
@@ -94,7 +81,7 @@ def half_box(shape: Floats) -> Floats:
 
 
 def _owners(size: tuple[int, ...], centre_px: Floats, shape: Floats) -> NDArray[np.int32]:
-    """Return (H, W): the dot of each pixel, -1 for the background; where dots overlap, the first wins."""
+    """Return the dot of each pixel (H, W), -1 for the background; where dots overlap, the first wins."""
     owner = np.full(size, -1, dtype=np.int32)
     box = OTHERS * half_box(shape)
     for k in range(len(centre_px) - 1, -1, -1):
@@ -110,7 +97,7 @@ def _owners(size: tuple[int, ...], centre_px: Floats, shape: Floats) -> NDArray[
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Pixels around some dots, (n, K): position relative to the first guess of the centre, grey value, weight."""
+    """Pixels around some dots, (n, K): position relative to the first centre, grey value, weight."""
 
     x: Floats
     y: Floats
@@ -121,7 +108,6 @@ class _Windows:
     def cut(
         cls, grey: NDArray[np.float32], owner: NDArray[np.int32], which: Ints, centre_px: Floats, shape: Floats
     ) -> _Windows:
-        """Cut the windows of the dots `which`; a pixel of another dot has no weight."""
         height, width = grey.shape
         half = int(_window(shape).max())
         steps = np.arange(-half, half + 1)
@@ -140,7 +126,6 @@ class _Windows:
         return cls(*(np.take_along_axis(part, first, axis=1) for part in parts))
 
     def only(self, some: NDArray[np.bool_]) -> _Windows:
-        """Return some of the windows."""
         return _Windows(self.x[some], self.y[some], self.grey[some], self.weight[some])
 
     def fit(self, shape: Floats, dark: bool) -> tuple[Floats, Floats, Floats]:
@@ -201,7 +186,7 @@ class _Windows:
         return np.where(ellipse & (values[:, 5] > LEAST_BLUR_PX) & np.isfinite(cost), cost, np.inf)
 
     def _descend(self, start: Floats, dark: bool) -> Floats:
-        """Return the parameters (n, 10) after Levenberg-Marquardt; windows that have converged are dropped."""
+        """Return the parameters (n, 10) after Levenberg-Marquardt; converged windows are dropped."""
         values = start.copy()
         moving, windows, damping = np.arange(len(start)), self, np.full(len(start), 1e-3)
         model, slope = windows._model(start, dark)
@@ -228,7 +213,7 @@ class _Windows:
 
 
 def _normal(jacobian: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return J^T W J (n, P, P) scaled to a diagonal of ones, and the scale of each parameter (n, P)."""
+    """Return J^T W J (n, P, P) scaled to unit diagonal, and the scale of each parameter (n, P)."""
     normal = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
     scale = np.sqrt(np.maximum(np.einsum("npp->np", normal), 1e-12))
     return normal / scale[:, :, None] / scale[:, None, :], scale
@@ -248,7 +233,7 @@ class _Rim:
     metric: tuple[Floats, Floats, Floats]  # a, b, c of A = [[a, b], [b, c]], (n, 1)
 
     def slopes(self, pull: Floats, out: Floats) -> None:
-        """Write pull times the slopes of the distance in centre u, centre v, a, b, c into out (n, 5, K)."""
+        """Write pull times d distance / d (centre u, centre v, a, b, c) into out (n, 5, K)."""
         a, b, c = self.metric
         by_q2, by_h = pull * (1 - 0.5 / self.q) / self.h, -pull * self.distance / self.h**2
         by_u, by_v = by_h * self.along_u, by_h * self.along_v
@@ -260,7 +245,7 @@ class _Rim:
 
 
 def _distance(x: Floats, y: Floats, a: Floats, b: Floats, c: Floats) -> _Rim:
-    """Return the distances from the rim x^T A x = 1, A = [[a, b], [b, c]]; x, y (n, K) px, a, b, c (n,)."""
+    """Return distances of x, y (n, K), px, from the rim x^T A x = 1, A = [[a, b], [b, c]] (n,)."""
     a, b, c = a[:, None], b[:, None], c[:, None]
     along_u, along_v = a * x + b * y, b * x + c * y
     h = np.maximum(np.sqrt(along_u**2 + along_v**2), 1e-9)

@@ -1,5 +1,3 @@
-"""Start of the fit: each camera by Zhang's method, plate poses chained from camera to camera."""
-
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -27,8 +25,6 @@ Pose = tuple[Tensor, Tensor]  # R (3, 3) and T (3,), mm
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Start:
-    """A camera without distortion, as it would be without a wall."""
-
     f_px: float  # along v
     centre_px: tuple[float, float]
     R_cam_lab: Tensor  # (3, 3)
@@ -36,18 +32,8 @@ class _Start:
 
 
 def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, PlateView]]) -> Rig:
-    """Return cameras without distortion and plate poses, to start the fit.
-
-    Args:
-        document: the calibration.
-        views: tied views of each camera, by row of the pose.
-
-    Returns:
-        The rig; T of a pose that no picture with enough points shows is NaN.
-
-    Raises:
-        CameraError: too few pictures of a camera, or a camera that shares no pose with the others.
-
+    """Return cameras without distortion and plate poses from the tied views of each camera, keyed by row of the pose.
+    T is NaN for a pose without enough points; CameraError for too few pictures or a camera that shares no pose.
     Source: Zhang 2000 (OpenCV's calibrateCamera).
     """
     lenses = {name: _zhang(name, seen, document) for name, seen in views.items()}
@@ -64,13 +50,7 @@ def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, Pl
 
 
 def guess_from_points(document: CalibrationDocument, name: str, x_lab_mm: Tensor, uv_px: Tensor) -> Camera:
-    """Return a camera without distortion from lab points (n, 3) and their pixels (n, 2), to start the fit.
-
-    Raises:
-        CameraError: points that do not determine a camera.
-
-    Source: Tsai 1987.
-    """
+    """Return a camera without distortion from lab points (n, 3), mm, and pixels (n, 2), by Tsai 1987 (CameraError)."""
     found = calibrate_tsai(x_lab_mm, uv_px, document.image_size, document.pixel_pitch_mm)
     start = _Start(
         f_px=float(found.f_mm) / document.pixel_pitch_mm[1],
@@ -93,7 +73,7 @@ def _camera(document: CalibrationDocument, name: str, start: _Start) -> Camera:
 def _zhang(
     name: str, seen: Mapping[int, PlateView], document: CalibrationDocument
 ) -> tuple[float, tuple[float, float], dict[int, Pose]]:
-    """Return focal length (px along v), centre (px) and the plate's poses in the frame of one camera."""
+    """Return focal length (px along v), centre (px) and the plate's poses in one camera's frame."""
     rows = [row for row, view in sorted(seen.items()) if len(view) >= POINTS_MIN]
     if len(rows) < VIEWS_MIN:
         got, do = f"{len(rows)}", "take pictures of the plate in more poses, tilted differently"
@@ -141,11 +121,7 @@ def _chained(
 
 
 def _in_air(start: _Start, port: Port) -> _Start:
-    """Return the camera in air whose picture through a wall is about that of a camera in the liquid without it.
-
-    For rays near the normal, Snell's law is a stretch: angles in air are n times those in the liquid, and the camera's
-    distance to the wall is 1/n of the apparent one.
-    """
+    """Return the camera in air for one in the liquid: small-angle Snell, angles times n, distance to the wall / n."""
     R, T, normal, n = start.R_cam_lab, start.T_cam_lab_mm, port.normal_lab, float(port.n_fluid)
     centre = -(R.mT @ T)
     height = float(centre @ normal) - float(port.offset_mm)

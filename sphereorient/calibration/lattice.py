@@ -1,5 +1,3 @@
-"""Dots of a plate: a square lattice among them, and its place on the plate from the fiducials."""
-
 from __future__ import annotations
 
 from collections import deque
@@ -37,11 +35,8 @@ class Lattice:
 
 
 def find_lattice(dots: Dots) -> Lattice | None:
-    """Find the largest square lattice among dots; None for fewer than 9 dots, or a single row.
-
-    The shape of a dot shows the local foreshortening of the plate: measured in radii of the dots around it, the four
-    neighbours of a dot are equally far and at right angles under any tilt. Steps from dot to dot use that. Then a
-    smooth map from grid to picture (homography, with cubic terms for many dots) has to agree with every dot.
+    """Find the largest square lattice among dots; None for fewer than 9 dots or a single row.
+    Measured in local radii, a dot's four neighbours are equally far and at right angles under any tilt.
     """
     if len(dots) < 9:
         return None
@@ -62,8 +57,6 @@ def find_lattice(dots: Dots) -> Lattice | None:
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """Dots with the local foreshortening and the nearest dots of each."""
-
     uv_px: Floats  # (n, 2)
     metric: Floats  # (n, 2, 2): v^T metric v = 1 for v one pitch long
     near: Ints  # (n, k)
@@ -74,7 +67,7 @@ class _Field:
         tree: cKDTree[None] = cKDTree(dots.uv_px)
         k = min(NEIGHBOURS, len(dots) - 1)
         near = np.asarray(tree.query(dots.uv_px, k=k + 1)[1], dtype=np.int64)
-        # The median over neighbours removes the size of a fiducial or a stray blob.
+        # The median over neighbours removes the effect of fiducials and stray blobs.
         shape = np.median(dots.shape[near[:, : min(k, 8) + 1]], axis=1)
         away = dots.uv_px[near[:, 1:]] - dots.uv_px[:, None]
         radii = np.sqrt(np.einsum("nka,nab,nkb->nk", away, shape, away))
@@ -103,7 +96,6 @@ class _Field:
         return (first, second) if turned < 0 else (first, -second)
 
     def seeds(self) -> list[int]:
-        """Return the dots that have a cross of neighbours, the central ones first."""
         crosses = [k for k in range(len(self.uv_px)) if self.steps_from(k) is not None]
         middle = np.median(self.uv_px, axis=0)
         return sorted(crosses, key=lambda k: float(np.hypot(*(self.uv_px[k] - middle))))
@@ -133,7 +125,7 @@ class _Field:
     def _local_basis(
         self, k: int, at: tuple[int, int], dot_at: dict[tuple[int, int], int], guess: tuple[Floats, Floats]
     ) -> tuple[Floats, Floats]:
-        # Steps to neighbours already placed follow the perspective; without one the parent's step is used.
+        # Steps to neighbours already placed follow the perspective; otherwise the parent's step is used.
         found: list[Floats] = []
         for axis in (0, 1):
             seen = []
@@ -147,8 +139,6 @@ class _Field:
 
 @dataclass(frozen=True, eq=False)
 class _Map:
-    """A smooth map from grid indices to pixels: a homography, then cubic terms in the index."""
-
     homography: Floats  # (3, 3)
     middle: Floats  # (2,), of the grid indices
     size: float
@@ -181,7 +171,7 @@ class _Map:
         return uv_px
 
     def nearest(self, uv_px: Floats) -> Ints:
-        """Return the nearest grid indices (n, 2) of pixels, by the homography: cubic terms do not extrapolate."""
+        """Return the nearest grid indices (n, 2), by the homography: cubic terms do not extrapolate."""
         h = np.column_stack([uv_px, np.ones(len(uv_px))]) @ np.linalg.inv(self.homography).T
         nearest: Ints = np.rint(h[:, :2] / h[:, 2:] * self.size + self.middle).astype(np.int64)
         return nearest
@@ -192,7 +182,6 @@ class _Map:
         return np.stack([self(index + e[a]) - self(index - e[a]) for a in (0, 1)], axis=-1)
 
     def misses(self, index: Ints, uv_px: Floats) -> Floats:
-        """Return the distances (n,) of pixels from their expected positions, in pitches."""
         away = np.linalg.solve(self.steps(index), (uv_px - self(index))[..., None])[..., 0]
         miss: Floats = np.hypot(away[:, 0], away[:, 1])
         return miss
@@ -208,7 +197,7 @@ def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
     taken = {tuple(at) for at in index.tolist()}
     low, high = index.min(axis=0), index.max(axis=0)
     free = np.array([tuple(at) not in taken for at in there.tolist()], dtype=bool) if len(rest) else np.zeros(0, bool)
-    # Only gaps are filled: outside the reached area a stray blob is more likely than a dot.
+    # Fill gaps only: outside the reached area a stray blob is more likely than a dot.
     free &= ((there >= low) & (there <= high)).all(axis=1)
     fits = np.flatnonzero(free)
     fits = fits[lattice_map.misses(there[fits], dots.uv_px[rest[fits]]) < MODEL_MISS]
@@ -222,7 +211,7 @@ def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
 
 
 def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints, _Map | None]:
-    """Drop the worst dots, a few at a time, until all are within MODEL_MISS of the map of the remaining ones."""
+    """Drop the worst dots, a few at a time, until all are within MODEL_MISS of the map of the others."""
     while True:
         enough = len(which) >= 9 and (np.ptp(index, axis=0) >= 1).all()
         lattice_map = _Map.fitted(index, dots.uv_px[which]) if enough else None
@@ -236,16 +225,8 @@ def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints, _Map | 
 
 
 def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> PlateView:
-    """Identify the dots of a picture on the plate.
-
-    All placements of the lattice (`find_lattice`) on the plate are tried, by quarter turns and shifts: dots must lie on
-    the plate, and the larger ones must be exactly the visible fiducials. One placement is left: `tied`. Several:
-    `floating`. None: `refused`.
-
-    Args:
-        dots: from `find_dots`.
-        plate: the target.
-        name: of the picture, for the reason.
+    """Identify the dots of a picture on the plate by trying quarter turns and shifts; `name` appears in the reason.
+    The larger dots must be exactly the visible fiducials. One placement: `tied`; several: `floating`; none: `refused`.
     """
     lattice = find_lattice(dots)
     if lattice is None or len(lattice.index) < LEAST_DOTS:
@@ -284,7 +265,7 @@ def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> Plat
 
 
 def _placements(index: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
-    """Return all placements (m, 3), as in `placed`, of a lattice on the plate that its larger dots allow."""
+    """Return the placements (m, 3) of a lattice on the plate that its larger dots allow."""
     found: list[tuple[int, int, int]] = []
     for quarters in range(4):
         at = quarter_turned(index, quarters)
@@ -297,7 +278,6 @@ def _placements(index: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
 
 def _shifts(at: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
     if large.any():
-        # The first larger dot must be one of the three fiducials.
         onto: Ints = np.array(plate.fiducials, dtype=np.int64) - at[large][0]
         return onto
     low, high = np.array(plate.first) - at.min(axis=0), np.array(plate.last) - at.max(axis=0)
@@ -306,7 +286,7 @@ def _shifts(at: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
 
 
 def _sizes(lattice: Lattice, plate: DotPlate) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which dots are as large as fiducials, and which are as large as neither."""
+    """Return which dots have the size of fiducials, and which have neither size."""
     dot, fiducial = plate.dot_diameter_mm / plate.pitch_mm, plate.fiducial_diameter_mm / plate.pitch_mm
     large = lattice.width > np.sqrt(dot * fiducial)
     stated = np.where(large, fiducial, dot)

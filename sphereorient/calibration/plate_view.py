@@ -1,5 +1,3 @@
-"""What one picture shows of a calibration target: points of the plate and their pixels."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -14,11 +12,9 @@ from sphereorient.errors import refusal
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlateView:
-    """Points of the plate and their pixels in one picture; made by `see_plate`, read by the fit of cameras.
-
-    `tied`: every point is identified. `floating`: the lattice is found but not its place on the plate; each row of
-    `placements` is one possibility, and `points_plate_mm` are those before any placement. `refused`: nothing is usable,
-    all arrays are empty.
+    """Points of the plate and their pixels in one picture.
+    `tied`: every point is identified. `floating`: each row of `placements` is a possible place on the plate;
+    `points_plate_mm` are those before any. `refused`: unusable, all arrays are empty.
     """
 
     points_plate_mm: Floats  # (n, 3), plate frame
@@ -31,18 +27,16 @@ class PlateView:
     placements: Ints = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))  # (m, 3): see `placed`
 
     def __post_init__(self) -> None:
-        """Check the lengths."""
         n = len(self.index)
         shapes = (self.points_plate_mm.shape, self.uv_px.shape, self.sigma_px.shape, self.diameter_mm.shape)
         assert shapes == ((n, 3), (n, 2), (n,), (n,)), shapes
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.index)
 
 
 def refused_view(name: str, *, expected: str, got: str, do: str) -> PlateView:
-    """Return the view of a picture that shows nothing usable, with the reason worded by `refusal`."""
+    """Return a `refused` view with the reason worded by `refusal`."""
     return PlateView(
         points_plate_mm=np.zeros((0, 3)),
         uv_px=np.zeros((0, 2)),
@@ -55,20 +49,14 @@ def refused_view(name: str, *, expected: str, got: str, do: str) -> PlateView:
 
 
 def quarter_turned(index: Ints, quarters: int) -> Ints:
-    """Rotate grid indices (n, 2) by quarter turns, each of which takes (i, j) to (-j, i)."""
+    """Rotate grid indices (n, 2) by quarter turns; each takes (i, j) to (-j, i)."""
     for _ in range(quarters % 4):
         index = np.stack([-index[:, 1], index[:, 0]], axis=1)
     return index
 
 
 def placed(view: PlateView, plate: CalibrationTarget, placement: Ints | Sequence[int]) -> PlateView:
-    """Return a floating view as `tied`, with one of its placements applied.
-
-    Args:
-        view: from `see_plate`; its `index` is the one before any placement.
-        plate: the target.
-        placement: (3,), a row of `view.placements`: quarter turns, shift along columns and along rows.
-    """
+    """Return a floating view as `tied` by a placement (3,): quarter turns, shift along columns, shift along rows."""
     quarters, shift_i, shift_j = (int(p) for p in placement)
     index = quarter_turned(view.index, quarters) + np.array([shift_i, shift_j])
     return replace(

@@ -1,4 +1,4 @@
-"""Calibration step by step: pictures of a plate, or tables -> points -> guess -> joint fit -> cameras."""
+"""Calibration from pictures of a plate or tables of points: points -> guess -> joint fit -> cameras."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a pla
 Progress = Callable[[str, int, int], None]
 SIGMA_PX = 0.05  # of points in tables; only ratios matter, because the residuals give the scale
 CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tied where one placement fits this well
-# Standard deviations that count as undetermined: of focal length, distance, picture's width; rad
+# Sigmas from which a parameter counts as undetermined: of focal length, distance, picture's width; rad
 LOOSE = {"f": 0.01, "T": 0.01, "centre": 0.02, "rotation": 0.01}
 LOOSE_PORT = {"port_offset": 5.0, "port_thickness": 5.0, "port_n_glass": 0.1, "port_n_fluid": 0.05, "port_tilt": 0.05}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureReport:
-    """The result of one picture; made by `calibrate_cameras`, read by table and figure."""
+    """The result of one picture."""
 
     picture: Picture
     pose: int
@@ -53,7 +53,7 @@ class PictureReport:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibrated:
-    """Cameras with covariances; made by `calibrate_cameras`."""
+    """Cameras with covariances."""
 
     cameras: Mapping[str, Camera]  # each with its own covariance
     covariance: ParameterCovariance  # of all cameras together, names such as cam1.f
@@ -69,18 +69,11 @@ class Calibrated:
 
 
 def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: Progress | None = None) -> Calibrated:
-    """Calibrate the cameras of a calibration.yaml.
-
-    Args:
-        calibration: loaded, or the path of its file.
-        progress: called with stage, done and total.
-
-    Returns:
-        Cameras in the lab that the surveyed pose defines, with covariances, and a report of each picture.
+    """Calibrate the cameras of a calibration.yaml, loaded or by path, in the lab that the surveyed pose defines.
+    `progress` is called with stage, done and total.
 
     Raises:
-        CameraError: an unreadable picture or one of another size, no picture that shows the plate, or poses that leave
-            a parameter undetermined.
+        CameraError: an unreadable picture or one of another size, no plate in them, or undetermined parameters.
     """
     progress = progress or (lambda stage, done, total: None)
     document = calibration if isinstance(calibration, CalibrationDocument) else load_calibration(calibration)
@@ -119,7 +112,7 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
     """Read all pictures and find the plate in them."""
     assert document.plate is not None
     plate = document.plate
-    # All files are read first, so that a faulty one is reported before the long computation.
+    # Read all files first, to report a faulty one before the long computation.
     grey = [_read_grey(picture.path, document.image_size) for picture in document.pictures]
     views = {}
     with ThreadPoolExecutor(2) as pool:
@@ -133,10 +126,9 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
 
 
 def _read_grey(path: Path, image_size: tuple[int, int]) -> NDArray[Any]:
-    """Read a grey picture (H, W) of a given size, or refuse it."""
     content = read_whole(path, LARGEST_BYTES, "a picture", CameraError, "correct the path")
     pixels = claimed_pixels(content)
-    # A file that claims more pixels than any camera has is not decoded.
+    # Do not decode a file that claims more pixels than any camera has.
     picture = decoded_grey(content) if pixels is not None and pixels <= LARGEST_PIXELS else None
     if picture is None:
         raise camera_error(str(path), "a picture", "a file that is no picture or too large", "save it as PNG")
@@ -172,7 +164,6 @@ def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView])
 
 
 def _has_pose(rig: Rig, picture: Picture) -> bool:
-    """Return whether the guess has the plate's pose; of a picture with few points it has not."""
     return bool(torch.isfinite(rig.T_lab_plate_mm[picture.row]).all())
 
 
@@ -196,10 +187,7 @@ def _problem(document: CalibrationDocument, rig: Rig, tied: Mapping[Picture, Pla
 def tie_floating(
     document: CalibrationDocument, rig: Rig, views: Mapping[Picture, PlateView]
 ) -> dict[Picture, PlateView]:
-    """Tie views without fiducials through cameras that saw the same pose with them.
-
-    A view stays floating where its pose is not known, or not exactly one placement of it fits.
-    """
+    """Tie views without fiducials through cameras that saw the same pose, if exactly one placement fits."""
     assert document.plate is not None
     known = {picture.row for picture, view in views.items() if view.state == "tied" and _has_pose(rig, picture)}
     tied = {}
@@ -224,7 +212,6 @@ def _missed(rig: Rig, picture: Picture, view: PlateView) -> float:
 
 
 def _check_determined(document: CalibrationDocument, fitted: Fitted) -> None:
-    """Refuse a fit with a hardly determined camera parameter; name the worst."""
     loose = []
     for name, camera in fitted.rig.cameras.items():
         for parameter, sigma in _sigmas(camera).items():
@@ -243,7 +230,6 @@ def _sigmas(camera: Camera) -> dict[str, float]:
 
 
 def _loose_sigma(camera: Camera, parameter: str, document: CalibrationDocument) -> float:
-    """Return the standard deviation at which a parameter counts as undetermined."""
     if parameter.startswith("T_"):
         return LOOSE["T"] * float(camera.T_cam_lab_mm.norm())
     if parameter.startswith("rotation"):

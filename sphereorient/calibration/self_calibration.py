@@ -1,4 +1,4 @@
-"""Cameras that moved after their calibration: checked and repaired with the tracked sphere."""
+"""Check and repair cameras that moved after their calibration, with the tracked sphere."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ROUNDS = 4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraObservations:
-    """What one camera alone measures of the sphere in N frames; NaN where nothing."""
+    """What one camera alone measures of the sphere in N frames; NaN where missing."""
 
     centre_px: Tensor  # (N, 2)
     R_lab_body: Tensor  # (N, 3, 3), with the camera before the repair
@@ -41,7 +41,7 @@ class CameraObservations:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Repaired:
-    """Cameras that fit together; made by `self_calibrate`."""
+    """Cameras that fit together."""
 
     cameras: Mapping[str, Camera]
     moved: Mapping[str, Tensor]  # camera -> (6,) rotation (rad, camera frame) and T (mm), as in `with_parameters`
@@ -54,23 +54,19 @@ class Repaired:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraCheck:
-    """Consistency of two cameras over a movie; made by `check_cameras`."""
+    """Consistency of two cameras over a movie."""
 
     names: tuple[str, str]
     gap_mm: NDArray[np.float64]  # (n,), distance between the lines of sight to the sphere's centre
     miss_px: NDArray[np.float64]  # (n,), distance from each centre to the projected midpoint, the larger of the two
 
     def percentile(self, share: float) -> tuple[float, float]:
-        """Return a percentile of both, mm and px."""
+        """Return a percentile of both measures, mm and px."""
         return float(np.percentile(self.gap_mm, share)), float(np.percentile(self.miss_px, share))
 
 
 def observations_of(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[str, CameraObservations]:
-    """Return what each camera alone measures of the sphere.
-
-    Raises:
-        TrackError: a camera that the track does not have.
-    """
+    """Return what each camera alone measures of the sphere; TrackError if the track lacks a camera."""
     found = {}
     for name in cameras:
         if name not in track.cameras:
@@ -101,15 +97,8 @@ def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[Came
 
 
 def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repaired:
-    """Repair cameras that moved after their calibration, with a track that was made with them.
-
-    Args:
-        cameras_path: cameras.yaml that the track was made with.
-        track_path: track.h5 of both cameras.
-
-    Raises:
-        CameraError: unreadable cameras, or too few frames that both saw.
-        TrackError: an unreadable track, or one of other cameras.
+    """Repair cameras (cameras.yaml) that moved after their calibration, with a track.h5 that was made with them.
+    CameraError for unreadable cameras or too few frames that both saw; TrackError for a track of other cameras.
     """
     cameras = load_cameras(cameras_path)
     track = Trajectory.load(track_path)
@@ -118,15 +107,9 @@ def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repai
 
 
 def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraObservations]) -> Repaired:
-    """Rotate and shift cameras until they see the sphere in one position and one orientation.
-
-    The first camera stays, because a common motion of all cameras cannot be observed. Lines of sight must meet, and
-    orientations agree up to a small constant rotation. The distance between the cameras and motions within the common
-    plane of the lines of sight change only the sphere's apparent size; a prior keeps them near their old values.
-
-    Args:
-        cameras: two or more.
-        observed: of each camera.
+    """Rotate and shift two or more cameras until they see the sphere in one position and one orientation.
+    The first camera stays: a common motion is not observable. Orientations may differ by a small constant rotation. A
+    prior holds motions that change only the apparent size: distance and the common plane of the lines of sight.
 
     Raises:
         CameraError: one camera, or too few frames that both saw.
@@ -161,7 +144,7 @@ def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraO
 
 
 class _Pair:
-    """Residuals of one camera against the first; the unknowns (9,) are its motion (6,) and a constant rotation bias."""
+    """Residuals of one camera against the first; unknowns (9,): its motion (6,) and a constant rotation bias."""
 
     def __init__(self, still: Camera, loose: Camera, seen: CameraObservations, seen_loose: CameraObservations) -> None:
         both = torch.isfinite(seen.centre_px + seen_loose.centre_px).all(-1)
@@ -185,12 +168,12 @@ class _Pair:
         return apart
 
     def rotations(self, change: Tensor) -> Tensor:
-        """Rotation vectors (N, 3) from the loose camera's orientation of the body to the still one's, rad, lab."""
+        """Rotation vectors (N, 3), rad, lab, from the loose camera's orientation of the body to the still one's."""
         camera = with_parameters(self.loose, MOVED, change)
         return so3.log(self.R_still @ (_R_lab_view(camera, self.centre_px) @ self.R_view_body).mT)
 
     def solved(self) -> tuple[Tensor, Tensor]:
-        """Return the motion (6,) and its standard deviations; the scatter of frames is measured at the solution."""
+        """Return the motion (6,) and its sigmas from the scatter of frames at the solution."""
         at = torch.zeros(9, dtype=torch.float64)
         for _ in range(ROUNDS):
             at = self._improved(at, *self._scatter(at[:6]))
@@ -201,11 +184,11 @@ class _Pair:
         return least_squares(lambda x: self._residuals(x, spread, kept), lambda x: self._slopes(x, spread, kept), at)
 
     def _scatter(self, change: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the robust spread of gap (mm) and rotations (rad), (4,), and which frames are inliers, (N,)."""
+        """Return the robust spread (4,) of gap (mm) and rotations (rad), and the inlier frames (N,)."""
         found = torch.cat([self.gaps(change)[:, None], self.rotations(change)], dim=-1)
         away = found - found.median(dim=0).values
         spread = (1.4826 * away.abs().median(dim=0).values).clamp_min(1e-6)
-        # Frames are rejected: a soft loss would soften the prior too, and mirrored orientations would still pull.
+        # Reject frames: a soft loss would soften the prior too, and mirrored orientations would still pull.
         return spread, (away.abs() <= OUTLIER * spread).all(-1)
 
     def _residuals(self, at: Tensor, spread: Tensor, kept: Tensor) -> Tensor:
@@ -219,7 +202,7 @@ class _Pair:
 
 
 def _R_lab_view(camera: Camera, uv_px: Tensor) -> Tensor:
-    """Return frames (N, 3, 3) fixed to the camera's view at pixels: z along the line of sight, x along rows."""
+    """Return frames (N, 3, 3) at pixels: z along the line of sight, x along rows."""
     step = torch.zeros_like(uv_px)
     step[:, 0] = 1.0
     z = camera.rays(uv_px).direction_lab

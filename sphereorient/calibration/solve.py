@@ -1,5 +1,3 @@
-"""Least squares of the calibration: derivatives, damped steps, covariances, and the fit of one camera to points."""
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -24,14 +22,8 @@ UNDETERMINED = 1e-9  # smallest eigenvalue of the scaled information: float64 ca
 
 
 def slopes_along(function: Callable[[Tensor], Tensor], at: Tensor, directions: Sequence[Tensor] | Tensor) -> Tensor:
-    """Return the derivatives of a function at a point along K directions, (..., K) where the function returns (...).
-
-    The backward pass is linear in the weights of the outputs; its derivative by them is the slope. The function is
-    called once for all directions; forward differentiation calls it for each and takes ten times as long.
-
-    The directions have the shape of `at`.
-
-    Source: the double-vjp trick (Townsend 2017).
+    """Return derivatives along K directions (shape of `at`) of a function, (..., K) where the function returns (...).
+    Source: double vjp (Townsend 2017); it calls the function once, forward differentiation K times (ten times slower).
     """
     with torch.enable_grad():
         point = at.detach().requires_grad_()
@@ -56,9 +48,8 @@ def least_squares(
     steps: int = 100,
 ) -> Tensor:
     """Return the unknowns (K,) that minimise the sum of squared residuals, or of their soft L1 losses.
-
-    Normal equations: scipy's least_squares decomposes the whole Jacobian at each step, and its trust region starts at
-    one sigma; it takes three times as many slopes of a whole calibration.
+    scipy's least_squares needs three times as many slopes of a whole calibration.
+    Source: Marquardt 1963; weights of the soft L1 loss, Triggs et al. 2000 (appendix).
 
     Args:
         residuals: of unknowns (K,), (n,); NaN counts as FAR. A step whose residuals raise CameraError is rejected.
@@ -67,8 +58,6 @@ def least_squares(
         soft: residual beyond which the loss grows linearly.
         gain: relative decrease of the cost at which the iteration ends.
         steps: maximum number.
-
-    Source: Marquardt 1963; weights of the soft L1 loss, Triggs et al. 2000 (appendix).
     """
 
     def tried(at: Tensor) -> tuple[Tensor, float]:
@@ -104,13 +93,7 @@ def least_squares(
 
 
 def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tensor:
-    """Invert an information matrix of parameters in different units.
-
-    A direction without information gets a huge variance; with `names` it is refused instead.
-
-    Raises:
-        CameraError: an undetermined direction; its parameters are named.
-    """
+    """Invert an information matrix; undetermined parameters get a huge variance or, with `names`, CameraError."""
     scale = _scale(information)
     values, vectors = torch.linalg.eigh(scale[:, None] * information * scale)
     if names and float(values[0]) < UNDETERMINED:
@@ -124,16 +107,8 @@ def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tenso
 
 
 def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_px: Tensor) -> AnyCamera:
-    """Fit some parameters of a camera to points and their pixels.
-
-    Args:
-        camera: near enough, of any model, also behind a port.
-        names: of the fitted parameters, as in `parameter_names`.
-        x_lab_mm: (n, 3), lab, mm.
-        uv_px: (n, 2), px, all equally certain.
-
-    Returns:
-        The camera with the covariance of the fitted parameters, from the residuals or at least from 0.05 px.
+    """Fit the parameters `names` of any camera, also behind a port, to lab points (n, 3), mm, and pixels (n, 2).
+    The start must be near. The covariance is from the residuals, at least 0.05 px.
 
     Raises:
         CameraError: too few points, numbers that are not finite, or undetermined parameters, named.
@@ -163,12 +138,7 @@ def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_
 
 
 def checked_points(x_lab_mm: Tensor, uv_px: Tensor) -> tuple[Tensor, Tensor]:
-    """Return points (n, 3) and their pixels (n, 2) as float64 on the CPU.
-
-    Raises:
-        CameraError: a row that is not finite, named.
-        ShapeError: another shape, or unequal numbers of rows.
-    """
+    """Return points (n, 3) and pixels (n, 2) as float64 on the CPU; refuse other shapes and non-finite numbers."""
     for name, numbers, size in (("x_lab_mm", x_lab_mm, 3), ("uv_px", uv_px, 2)):
         check_points(name, numbers, size)
         if numbers.dim() != 2:

@@ -1,5 +1,3 @@
-"""Systematic errors of a track: the covariance of the calibration propagated to position and orientation."""
-
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -21,7 +19,7 @@ DIRECT_FRAMES = 200  # positions computed directly; a quadratic in position inte
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Systematic:
-    """Covariances of the errors that all N frames share; made by `systematic_errors`."""
+    """Covariances of the errors that all N frames share."""
 
     position_mm2: Tensor  # (N, 3, 3), lab
     orientation_rad2: Tensor  # (N, 3, 3), of delta in R_true = exp([delta]x) R, lab
@@ -30,20 +28,8 @@ class Systematic:
 def systematic_errors(
     cameras: Mapping[str, Camera], covariance: ParameterCovariance, position_lab_mm: Tensor, radius_mm: float
 ) -> Systematic:
-    """Propagate the covariance of camera parameters to position and orientation.
-
-    A small error of the cameras has the same effect on the pictures as a small change of pose. That change is linear in
-    the parameters' errors; it is estimated from points of the visible cap and of the limb.
-
-    Args:
-        cameras: the cameras of the track.
-        covariance: of all their parameters, named camera.parameter; different cameras may be correlated.
-        position_lab_mm: (N, 3), lab; NaN where missing.
-        radius_mm: of the sphere.
-
-    Returns:
-        The covariances; NaN where the position is.
-
+    """Propagate the cameras' covariance to position (N, 3), lab, mm, and orientation; NaN where the position is.
+    Parameters are named camera.parameter. A small camera error acts on cap and limb like a small change of pose.
     Source: first-order propagation of errors; least squares of the pose with fixed design.
     """
     known = torch.isfinite(position_lab_mm).all(-1)
@@ -67,7 +53,7 @@ def systematic_errors(
 
 
 def _quadratic(positions: Tensor, usual: Tensor) -> Tensor:
-    """Return all monomials up to second order of positions (N, 3), standardised by `usual`, (N, 10)."""
+    """Return all monomials (N, 10) up to second order of positions (N, 3), standardised by `usual`."""
     x = (positions - usual.mean(0)) / usual.std(0).clamp_min(1e-6)
     products = [x[:, i : i + 1] * x[:, i:] for i in range(3)]
     return torch.cat([torch.ones_like(x[:, :1]), x, *products], dim=1)
@@ -76,11 +62,10 @@ def _quadratic(positions: Tensor, usual: Tensor) -> Tensor:
 def _pose_by_parameters(
     cameras: Mapping[str, Camera], names: tuple[str, ...], positions: Tensor, radius_mm: float
 ) -> Tensor:
-    """Return the derivative of the fitted pose (delta in rad, position in mm) by the parameters, (N, 6, P)."""
+    """Return the derivative (N, 6, P) of the fitted pose (delta in rad, position in mm) by the parameters."""
     information = positions.new_zeros(len(positions), 6, 6)
     pull = positions.new_zeros(len(positions), 6, len(names))
     for name, camera in cameras.items():
-        # Parameters of cameras that are not in use have no effect.
         own = [k for k, label in enumerate(names) if label.partition(".")[0] == name]
         by_pose, by_parameter = _slopes(camera, [names[k].partition(".")[2] for k in own], positions, radius_mm)
         information += by_pose.mT @ by_pose
@@ -93,7 +78,7 @@ def _pose_by_parameters(
 
 
 def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
-    """Return the derivatives of cap and limb pixels by pose and parameters, (N, M, 6) and (N, M, P), px."""
+    """Return the derivatives of cap and limb pixels by pose (N, M, 6) and parameters (N, M, P), px."""
     towards = torch.nn.functional.normalize(camera.rays(camera.project(positions)).direction_lab, dim=-1)
     R_lab_view = camera.R_cam_lab.mT @ R_cam_view(towards @ camera.R_cam_lab.mT)
     paint, limb = (pattern @ R_lab_view.mT * radius_mm for pattern in (_cap(), _limb()))
@@ -121,10 +106,7 @@ def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: floa
 
 
 def _grazed(camera: Camera, positions: Tensor, arms: Tensor, radius_mm: float) -> Tensor:
-    """Return arms (N, M, 3), lab, mm, to the points where lines of sight are tangent to the sphere.
-
-    Only these points move with the limb in the picture.
-    """
+    """Return arms (N, M, 3), lab, mm, to the tangent points of lines of sight; only these move with the limb."""
     outward = torch.nn.functional.normalize(arms, dim=-1)
     for _ in range(GRAZING_ROUNDS):
         along = camera.rays(camera.project(positions[:, None] + arms)).direction_lab
@@ -135,7 +117,7 @@ def _grazed(camera: Camera, positions: Tensor, arms: Tensor, radius_mm: float) -
 
 
 def _cap() -> Tensor:
-    """Return unit vectors of the visible cap in the view frame (z along the line of sight), (M, 3)."""
+    """Return unit vectors (M, 3) of the visible cap in the view frame (z along the line of sight)."""
     angle = torch.arange(PER_RING, dtype=torch.float64) * (2 * torch.pi / PER_RING)
     rings = []
     for k, share in enumerate(CAP_RINGS):

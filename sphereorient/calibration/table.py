@@ -1,5 +1,3 @@
-"""Results of a calibration as short tables and lines on the screen."""
-
 from __future__ import annotations
 
 import math
@@ -87,7 +85,7 @@ def check_lines(checks: Sequence[CameraCheck]) -> list[str]:
 
 
 def contradiction_lines(track: Trajectory) -> list[str]:
-    """Return advice where the cameras see the sphere in different positions for most of a movie; else nothing."""
+    """Return advice where the cameras disagree on the sphere's position for most of a movie; else an empty list."""
     reasons = [camera.reason for camera in track.cameras.values()]
     seen = sum(all(why in OBSERVED for why in frame) for frame in zip(*reasons, strict=True))
     contrary = sum(Reason.CONTRADICTS in frame for frame in zip(*reasons, strict=True))

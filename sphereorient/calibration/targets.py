@@ -29,7 +29,6 @@ class CalibrationTarget:
     pitch_mm: float
 
     def __post_init__(self) -> None:
-        """Refuse impossible counts and lengths."""
         for name in ("columns", "rows"):
             count = getattr(self, name)
             if not _is_whole(count) or not 2 <= count <= MOST:
@@ -57,7 +56,6 @@ class CalibrationTarget:
 @dataclass(frozen=True, kw_only=True)
 class DotPlate(CalibrationTarget):
     """A square lattice of dots; three larger ones, the fiducials, define the axes.
-
     Grid index (0, 0) is the origin dot, in the middle of the grid (with an even number: the first after the middle).
     """
 
@@ -67,7 +65,6 @@ class DotPlate(CalibrationTarget):
     dark: bool = True  # dark dots on a bright plate; False: bright dots on a dark plate
 
     def __post_init__(self) -> None:
-        """Refuse dots that touch, fiducials that are not larger, and fiducials that do not define the axes."""
         super().__post_init__()
         largest = 2 * self.pitch_mm - self.dot_diameter_mm
         if not self.dot_diameter_mm < self.pitch_mm or not self.fiducial_diameter_mm < largest:
@@ -90,12 +87,12 @@ class DotPlate(CalibrationTarget):
 
     @property
     def first(self) -> tuple[int, int]:
-        """The smallest grid index along columns and along rows."""
+        """The smallest grid indices."""
         return -(self.columns // 2), -(self.rows // 2)
 
     @property
     def last(self) -> tuple[int, int]:
-        """The largest grid index along columns and along rows."""
+        """The largest grid indices."""
         return self.first[0] + self.columns - 1, self.first[1] + self.rows - 1
 
     @property
@@ -122,14 +119,11 @@ class DotPlate(CalibrationTarget):
 
 @dataclass(frozen=True, kw_only=True)
 class Chessboard(CalibrationTarget):
-    """A chessboard; its points are the inner corners, columns x rows of them; the pitch is the side of a square.
-
-    Grid index (0, 0) is the lower left corner; the square to its lower left is dark. A view of a board that is the same
-    after a rotation is floating.
+    """A chessboard of columns x rows inner corners; the pitch is the side of a square; floating if it has a symmetry.
+    Index (0, 0) is the lower left corner; the square to its lower left is dark.
     """
 
     def __post_init__(self) -> None:
-        """Refuse fewer than 3 x 3 corners."""
         super().__post_init__()
         if min(self.columns, self.rows) < 3:
             got, do = f"{self.columns} x {self.rows}", "count the corners between squares, without the border"
@@ -143,9 +137,8 @@ class Chessboard(CalibrationTarget):
 
 @dataclass(frozen=True, kw_only=True)
 class CharucoBoard(CalibrationTarget):
-    """A chessboard of columns x rows squares with markers in the bright ones, so that a part of it is enough.
-
-    Grid index (0, 0) is the lower left inner corner of the board as OpenCV draws it.
+    """A chessboard of columns x rows squares with markers in the bright ones; a visible part is enough.
+    Index (0, 0) is the lower left inner corner as OpenCV draws it.
     """
 
     marker_mm: float  # side of a marker
@@ -153,7 +146,6 @@ class CharucoBoard(CalibrationTarget):
     legacy_pattern: bool = False  # as OpenCV before 4.6 draws it
 
     def __post_init__(self) -> None:
-        """Refuse markers larger than squares, and a dictionary that is unknown or too small."""
         super().__post_init__()
         if self.marker_mm >= self.pitch_mm:
             got, do = f"{self.marker_mm:g} mm in {self.pitch_mm:g} mm", "measure the board"
@@ -178,10 +170,8 @@ class CharucoBoard(CalibrationTarget):
 @dataclass(frozen=True, kw_only=True)
 class CircleGrid(CalibrationTarget):
     """Equal circles, in a square lattice or (asymmetric) with every other row shifted by half a step.
-
-    Grid index (0, 0) is the lower left circle. Asymmetric: `columns` circles in a row, `pitch_mm` between rows and
-    twice that between circles of a row; the top row is not shifted, the one below it is, to the right (as OpenCV draws
-    it). A view of a grid that is the same after a rotation is floating.
+    Index (0, 0) is the lower left circle. Asymmetric, as OpenCV draws it: `pitch_mm` between rows and twice that in a
+    row; from the top every second row is shifted to the right. Views of a grid with a symmetry are floating.
     """
 
     dot_diameter_mm: float
@@ -189,7 +179,6 @@ class CircleGrid(CalibrationTarget):
     dark: bool = True  # dark circles on a bright plate
 
     def __post_init__(self) -> None:
-        """Refuse circles that touch, and an asymmetric grid with an even number of rows."""
         super().__post_init__()
         if self.asymmetric and self.rows % 2 == 0:  # the same upside down, and OpenCV does not find it
             raise camera_error("plate, rows", "an odd number", f"{self.rows}", "count the rows, or cover one of them")
@@ -217,20 +206,12 @@ KINDS: Mapping[str, type[CalibrationTarget]] = {
 
 
 def target_keys(kind: type[CalibrationTarget]) -> dict[str, tuple[str, bool]]:
-    """Return the field of each key of calibration.yaml, and whether the key must be there."""
+    """Return the field of each key of calibration.yaml, and whether the key is required."""
     return {_key(one.name): (one.name, one.default is MISSING) for one in fields(kind)}
 
 
 def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> CalibrationTarget:
-    """Build the target from `plate` of calibration.yaml.
-
-    Args:
-        entry: the parsed YAML.
-        name: file and key, for the message.
-
-    Raises:
-        CameraError: not a mapping, an unknown type or key, a missing key, or an impossible value.
-    """
+    """Build the target from the parsed `plate` of calibration.yaml; CameraError, naming the key, if impossible."""
     kind = entry.get("type") if isinstance(entry, Mapping) else None
     if not isinstance(kind, str) or kind not in KINDS:
         expected = f"a mapping with `type` one of {', '.join(KINDS)}"

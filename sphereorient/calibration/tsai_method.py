@@ -1,8 +1,7 @@
 """Tsai's calibration of one camera.
 
-Distortion moves points along radii only: the direction of a pixel from the picture's middle is that of the point from
-the optical axis. This radial alignment gives R, T_x and T_y by linear equations; f and T_z follow linearly, and a
-search for f, T_z and kappa1 starts there. The optical axis is taken to meet the middle of the picture.
+Distortion is radial: a pixel and its point have the same direction from the optical axis, taken at the picture's
+middle. Linear equations give R, T_x, T_y, then f, T_z; a search refines f, T_z, kappa1.
 """
 
 from __future__ import annotations
@@ -35,25 +34,18 @@ def tsai_stages(
     x_lab_mm: Tensor, uv_px: Tensor, image_size: tuple[int, int], pixel_pitch_mm: tuple[float, float]
 ) -> TsaiCamera:
     """Calibrate a camera by Tsai's two stages: R, T_x, T_y from radial alignment, then f, T_z and kappa1.
-
-    The last search holds R, T_x and T_y; with noise, `calibrate_tsai` is more accurate.
+    The covariance takes R, T_x, T_y as exact; with noise, `calibrate_tsai` is more accurate.
+    Source: Tsai 1987, stages 1 and 2, which the paper uses without error.
 
     Args:
-        x_lab_mm: (n, 3), lab, mm; right-handed. Points in one plane also fit as their mirror image: give the side of
-            the plane that the camera sees.
+        x_lab_mm: (n, 3), lab, mm, right-handed; points in one plane also fit mirrored: give the seen side.
         uv_px: (n, 2), their pixels.
         image_size: (W, H), px.
         pixel_pitch_mm: along u and v; s_x is 1.
 
-    Returns:
-        The camera, with the covariance of f, T_z and kappa1 as if the other parameters were exact.
-
     Raises:
-        CameraError: points that are too few, on a line, in a plane parallel to the sensor, mirrored, not finite, or
-            not those of the pixels.
+        CameraError: points too few, collinear, parallel to the sensor, mirrored, not finite, or of other pixels.
         ShapeError: arrays of another shape.
-
-    Source: Tsai 1987, stages 1 and 2, which the paper uses without error.
     """
     points, pixels = checked_points(x_lab_mm, uv_px)
     _check_count(points, POINTS_OF_PLANE, "in one plane")
@@ -81,17 +73,9 @@ def calibrate_tsai(
     pixel_pitch_mm: tuple[float, float],
     also: Sequence[str] = (),
 ) -> TsaiCamera:
-    """Calibrate a camera by `tsai_stages`, then fit all parameters together by least squares in the picture.
-
-    `also` names which of sx, centre_u, centre_v are fitted in addition to f, kappa1, R and T. sx needs points outside
-    one plane; the centre is well determined only where the perspective is strong. Other arguments as in `tsai_stages`.
-
-    Returns:
-        The camera with the covariance of the fitted parameters.
-
-    Raises:
-        CameraError: as `tsai_stages`; or another name in `also`, or sx from points in a plane.
-        ShapeError: arrays of another shape.
+    """Calibrate a camera as `tsai_stages`, then fit all parameters together by least squares in the picture.
+    `also` names which of sx (needs points outside one plane), centre_u, centre_v (strong perspective) are fitted
+    besides f, kappa1, R and T. Errors as in `tsai_stages`; CameraError for other names in `also`.
     """
     for name in also:
         if name not in ALSO:
@@ -109,8 +93,6 @@ def calibrate_tsai(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Frame:
-    """Principal axes of the points: two along the best plane, the third normal to it."""
-
     middle_lab_mm: Tensor  # (3,)
     R_own_lab: Tensor  # (3, 3)
     narrow: float  # width over length
@@ -127,14 +109,13 @@ class _Frame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Start:
-    """A first pose and focal length; T_z and f may still be missing (0)."""
+    """A first pose and focal length; T_z and f are 0 while unknown."""
 
     R_cam_lab: Tensor  # (3, 3)
     T_cam_lab_mm: Tensor  # (3,)
     f_mm: float = 0.0
 
     def before(self, points: Tensor) -> bool:
-        """Whether all points are in front of the camera."""
         return bool((points @ self.R_cam_lab[2] + self.T_cam_lab_mm[2] > 0).all())
 
 
@@ -168,11 +149,7 @@ def _aligned_space(own: Tensor, sensor_mm: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _aligned_plane(own: Tensor, sensor_mm: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Solve the same for points with z = 0: two rotations, mirror images of each other in depth.
-
-    A 2 x 2 matrix is the corner of a rotation if its larger singular value is 1 (the smaller is the cosine of the
-    tilt): Tsai's formula for T_y^2, without its division by T_y.
-    """
+    """Solve the same for z = 0: two mirrored rotations, whose 2 x 2 corner has the larger singular value 1."""
     x, y, flat = sensor_mm[:, :1], sensor_mm[:, 1:], own[:, :2]
     a = _null_vector(torch.cat([y * flat, y, -x * flat, -x], dim=-1)).reshape(2, 3)
     a = a / torch.linalg.matrix_norm(a[:, :2], ord=2)
@@ -195,11 +172,8 @@ def _facing(rows: Tensor, T_xy: Tensor, own: Tensor, sensor_mm: Tensor) -> tuple
 
 
 def _null_vector(equations: Tensor) -> Tensor:
-    """Return the null vector of homogeneous equations (n, k).
-
-    Tsai divides by T_y instead, which fails where the lab's origin appears on the picture's middle row.
-    """
-    # Sensor and point coordinates have different units; columns of length 1 make them comparable.
+    """Return the null vector of equations (n, k); Tsai's division by T_y fails with the origin on the middle row."""
+    # Columns of length 1 make sensor and point coordinates comparable despite different units.
     scale = equations.norm(dim=0).clamp_min(torch.finfo(equations.dtype).tiny)
     n, k = equations.shape
     # With fewer equations than unknowns only the full V holds the vector.
@@ -223,7 +197,7 @@ def _with_depth(pose: _Start, points: Tensor, sensor_mm: Tensor) -> _Start:
 
 
 def _best(starts: Sequence[TsaiCamera], points: Tensor, pixels: Tensor) -> TsaiCamera:
-    """Fit f, T_z and kappa1 from each start; return the best, leaving out starts that do not determine them."""
+    """Fit f, T_z and kappa1 from each start; return the best, skipping undetermined ones."""
     fitted, refused = [], CameraError("")
     for start in starts:
         try:
@@ -247,7 +221,6 @@ def _check_count(points: Tensor, least: int, where: str) -> None:
 
 
 def _no_start(points: Tensor) -> str:
-    """Word why no pose puts the points in front of the camera."""
     if _Frame.of(points).relief < FLAT:
         return _parallel("none")
     do = "check the points' order and the axes' signs (lab right-handed, u to the right, v downwards)"

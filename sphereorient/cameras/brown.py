@@ -1,5 +1,3 @@
-"""Brown's radial and tangential polynomial, its inverse, and OpenCV's camera, which applies it to slopes."""
-
 from __future__ import annotations
 
 import math
@@ -28,7 +26,7 @@ class PolynomialCamera(CentralCamera):
     p: Tensor  # (2,), tangential p1, p2
 
     def __post_init__(self) -> None:
-        """Refuse impossible parameters, and a distortion that folds inside the picture (its rim is enough)."""
+        """Refuse also a distortion that folds inside the picture; its rim is enough."""
         super().__post_init__()
         width, height = self.image_size
         across = torch.linspace(-0.5, width - 0.5, RIM_STEPS, dtype=torch.float64)
@@ -48,7 +46,7 @@ class PolynomialCamera(CentralCamera):
 
     @abstractmethod
     def _plane(self, uv_px: Tensor, distorted: bool) -> Tensor:
-        """Return where pixels lie on the plane of the polynomial."""
+        """Return pixels as points on the plane of the polynomial."""
 
     @abstractmethod
     def _pixel(self, xy: Tensor, distorted: bool) -> Tensor:
@@ -67,10 +65,7 @@ class PolynomialCamera(CentralCamera):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BrownCamera(PolynomialCamera):
-    """Perspective with Brown-Conrady distortion of the slopes X/Z and Y/Z; k and p have no unit.
-
-    Source: OpenCV's pinhole model with the coefficients k1, k2, p1, p2, k3.
-    """
+    """Perspective with Brown-Conrady distortion of X/Z and Y/Z; k, p without unit, as OpenCV's k1, k2, p1, p2, k3."""
 
     f_px: Tensor  # (2,), fx and fy
 
@@ -102,16 +97,8 @@ class BrownCamera(PolynomialCamera):
 
 
 def bent(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
-    """Apply the polynomial to points.
-
-    Args:
-        xy: (..., 2), any unit, from the centre of the distortion.
-        k: (3,), radial k1, k2, k3, in the unit to the powers -2, -4, -6.
-        p: (2,), tangential p1, p2 in OpenCV's order, in the inverse unit.
-
-    Returns:
-        (..., 2), unit of `xy`; NaN, with gradient 0, at and beyond the fold.
-
+    """Apply the polynomial to points (..., 2), any unit, about the distortion's centre; NaN, gradient 0, past the fold.
+    k (3,): radial k1, k2, k3, unit^-2, -4, -6. p (2,): tangential p1, p2 in OpenCV's order, unit^-1.
     Source: Brown 1966 as OpenCV writes it: x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2).
     """
     ahead = _before_fold(xy, k, p)
@@ -120,7 +107,7 @@ def bent(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
 
 
 def straightened(xy_bent: Tensor, k: Tensor, p: Tensor) -> Tensor:
-    """Invert `bent`: return the points (..., 2) that it takes to `xy_bent`; NaN, with gradient 0, if there is none."""
+    """Invert `bent`: return the points (..., 2) that it takes to `xy_bent`; NaN, with gradient 0, without solution."""
     goal, kk, pp = xy_bent, k.to(xy_bent), p.to(xy_bent)
     with torch.no_grad():
         radius = goal.norm(dim=-1, keepdim=True)
@@ -139,16 +126,16 @@ def straightened(xy_bent: Tensor, k: Tensor, p: Tensor) -> Tensor:
 
 
 def fold2(k: Tensor) -> float:
-    """Return the squared radius at which the radial polynomial folds, infinite where it never does."""
+    """Return the squared radius at which the radial polynomial folds; infinite without fold."""
     k1, k2, k3 = k.detach().tolist()
-    # 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 = 0 in 1/s: the leading coefficient is then 1, whatever the others are.
+    # 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 = 0, solved for 1/s: the leading coefficient is then 1 for any k.
     roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
     inverse = float(roots.real[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].max(initial=0.0))
     return 1.0 / inverse if inverse > 1e-300 else math.inf
 
 
 def _bent(xy: Tensor, k: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-    """Return moved points and the three different entries of the (symmetric) Jacobian: xx, xy, yy."""
+    """Return moved points and the entries xx, xy, yy of the symmetric Jacobian."""
     x, y = xy.unbind(-1)
     k1, k2, k3 = k.unbind()
     p1, p2 = p.unbind()
@@ -188,7 +175,6 @@ def _before_fold(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
 
 
 def _radius_before(goal: Tensor, k: Tensor, fold: float) -> Tensor:
-    """Return the radius that the radial part alone takes to `goal`, at most `fold`."""
     k1, k2, k3 = k.unbind()
 
     def value_and_slope(r: Tensor) -> tuple[Tensor, Tensor]:

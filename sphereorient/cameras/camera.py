@@ -1,5 +1,3 @@
-"""The camera interface: lab points to pixels, pixels to rays."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -12,18 +10,16 @@ from sphereorient.cameras.covariance import ParameterCovariance
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rays:
-    """Half lines in the lab along which pixels see; made by cameras, read by triangulation and renderers."""
+    """Half lines in the lab along which pixels see."""
 
     origin_lab_mm: Tensor  # (..., 3), a point of the ray: the projection centre, or the refracting wall's liquid side
     direction_lab: Tensor  # (..., 3), unit length, away from the camera
 
 
 class Camera(Protocol):
-    """A calibrated camera.
-
-    All methods take any leading shape and compute in the dtype of the argument. They are differentiable in the argument
-    and in those camera parameters that require gradients. A point without an image is NaN, with gradient 0. Pixels are
-    (u, v), also outside the picture. Arguments with another last axis raise ShapeError.
+    """A calibrated camera: lab points to pixels (u, v), also outside the picture, and pixels to rays.
+    Methods take any leading shape (else ShapeError), compute in the argument's dtype, and are differentiable in it and
+    in camera parameters that require gradients. A point without an image is NaN, with gradient 0.
     """
 
     @property
@@ -40,7 +36,7 @@ class Camera(Protocol):
 
     @property
     def covariance(self) -> ParameterCovariance | None:
-        """Covariance of the parameters, where a calibration has estimated it."""
+        """Covariance of the parameters from a calibration."""
 
     def project(self, x_lab_mm: Tensor) -> Tensor:
         """Project lab points (..., 3), mm, to pixels (..., 2) as (u, v), px; NaN behind the camera."""

@@ -1,5 +1,3 @@
-"""Checks of camera parameters and of points."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -16,12 +14,8 @@ MAX_SIDE_PX = 65_536  # of a picture: twice what any camera has
 
 
 def as_parameter(name: str, value: Tensor | float | Sequence[float], *shape: int) -> Tensor:
-    """Return a camera parameter as float64 tensor, still part of its graph.
-
-    Raises:
-        CameraError: another shape, or a number that is not finite or beyond LARGEST.
-    """
-    # Not as_tensor alone: it would round plain numbers to float32 first.
+    """Return a parameter as float64 tensor, still part of its graph; refuse other shapes and numbers beyond LARGEST."""
+    # as_tensor alone would round plain numbers to float32 first.
     tensor = value.to(torch.float64) if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
     if tuple(tensor.shape) != shape:
         raise camera_error(name, f"shape {shape}", f"shape {tuple(tensor.shape)}")

@@ -1,5 +1,3 @@
-"""Covariance of camera parameters."""
-
 from __future__ import annotations
 
 from collections.abc import Iterable
@@ -16,13 +14,12 @@ ASYMMETRY = 1e-6  # of the correlation matrix: covariances written with seven di
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ParameterCovariance:
-    """Covariance of the small changes that `with_parameters` applies; made by calibrations, kept in cameras.yaml."""
+    """Covariance of the small changes that `with_parameters` applies."""
 
     names: tuple[str, ...]  # P different names, as in `parameter_names`
     matrix: Tensor  # (P, P) float64, in the products of the parameters' units
 
     def __post_init__(self) -> None:
-        """Refuse repeated names, a wrong shape, or a matrix that is not positive semidefinite."""
         object.__setattr__(self, "names", tuple(self.names))
         matrix = torch.as_tensor(self.matrix, dtype=torch.float64).detach()
         object.__setattr__(self, "matrix", matrix)
@@ -41,7 +38,7 @@ class ParameterCovariance:
         return dict(zip(self.names, self.matrix.diagonal().sqrt().tolist(), strict=True))
 
     def of(self, cameras: Iterable[str]) -> ParameterCovariance | None:
-        """Return the block of some cameras, where names are such as cam1.f; None where it has no parameter of them."""
+        """Return the block of some cameras, for names like cam1.f; None without parameters of them."""
         wanted = set(cameras)
         kept = [k for k, name in enumerate(self.names) if name.partition(".")[0] in wanted]
         if not kept:

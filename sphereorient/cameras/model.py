@@ -1,8 +1,7 @@
 """What all camera models share: pose, principal point, and one table of keys that defines the file and the parameters.
 
-A new model is one file: a dataclass that derives from `CentralCamera` (one projection centre) or `CameraModel`, with
-its `MODEL` and `KEYS`. Add the class to `MODELS` in io/cameras_yaml.py; reading, writing, parameter names, covariances
-and checks follow from `KEYS`.
+To add a model, derive a dataclass with `MODEL` and `KEYS` from `CentralCamera` (one projection centre) or
+`CameraModel`, and add it to `MODELS` in io/cameras_yaml.py. `KEYS` define file, parameter names and checks.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class Key:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraModel(ABC):
-    """A camera whose parameters are float64 tensors; those that require gradients receive them."""
+    """A camera whose parameters are float64 tensors; gradients reach those that require them."""
 
     image_size: tuple[int, int]  # W, H px
     R_cam_lab: Tensor  # (3, 3)
@@ -49,7 +48,6 @@ class CameraModel(ABC):
     ALSO: ClassVar[tuple[str, ...]] = ()  # further keys of the file, which `completed` converts
 
     def __post_init__(self) -> None:
-        """Refuse parameters of wrong shape, not finite or out of range."""
         check_image_size("image_size", self.image_size)
         object.__setattr__(self, "image_size", tuple(self.image_size))
         shapes: dict[str, tuple[int, ...]] = {"R_cam_lab": (3, 3), "T_cam_lab_mm": (3,)}
@@ -65,7 +63,7 @@ class CameraModel(ABC):
 
     @classmethod
     def parameter_fields(cls) -> dict[str, tuple[str, int | None]]:
-        """Return the field and the index in it of each parameter but rotation and translation, by parameter name."""
+        """Return field and index in it of each parameter except rotation and translation, by name."""
         found: dict[str, tuple[str, int | None]] = {}
         for key in cls.KEYS:
             found |= {part: (key.field, k) for k, part in enumerate(key.parts)}
@@ -75,23 +73,14 @@ class CameraModel(ABC):
 
     @classmethod
     def completed(cls, values: dict[str, Any]) -> dict[str, Any]:
-        """Return the keys of cameras.yaml with optional values filled in; the centre defaults to the picture's middle.
-
-        Raises:
-            CameraError: contradicting or impossible values.
-        """
+        """Return the keys of cameras.yaml with defaults (centre: middle of picture); CameraError if impossible."""
         return (
             values | {"centre": middle_of_picture(values["image_size"])} if values.get("centre", 0) is None else values
         )
 
     @classmethod
     def ideal_lens(cls, f_px: float, pitch_mm: Sequence[float]) -> dict[str, Any]:
-        """Return the model's own fields for a lens without distortion; a calibration starts from them.
-
-        Args:
-            f_px: focal length in pixels along v.
-            pitch_mm: (2,), pixel pitch along u and v.
-        """
+        """Return the model's own fields for a lens without distortion: f in px along v, pitch along u and v."""
         got, do = cls.MODEL, "calibrate model tsai, pinhole or brown"
         raise CameraError(refusal("model", expected="one that a calibration can start from", got=got, do=do))
 
@@ -104,7 +93,7 @@ class CameraModel(ABC):
         """Return the rays of pixels (..., 2)."""
 
     def undistort(self, uv_px: Tensor) -> Tensor:
-        """Return the pixels (..., 2) that the camera without distortion would show; this default changes nothing."""
+        """Return the pixels (..., 2) of the camera without distortion; this default changes nothing."""
         check_points("uv_px", uv_px, 2)
         return uv_px
 
@@ -116,7 +105,7 @@ class CameraModel(ABC):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CentralCamera(CameraModel):
-    """A camera whose rays all meet in one point; a model adds its focal length and its distortion."""
+    """A camera whose rays meet in one point; a model adds focal length and distortion."""
 
     @property
     def centre_lab_mm(self) -> Tensor:
@@ -129,10 +118,7 @@ class CentralCamera(CameraModel):
         """(2,), pixels per unit of slope X/Z and Y/Z on the axis."""
 
     def project(self, x_lab_mm: Tensor) -> Tensor:
-        """Project lab points (..., 3), mm, to pixels (..., 2); NaN for points that are not in front of the camera.
-
-        Source: docs/conventions.md (X_cam = R X_lab + T, x_u = f X/Z).
-        """
+        """Project lab points (..., 3), mm, to pixels (..., 2); NaN for points that are not in front of the camera."""
         check_points("x_lab_mm", x_lab_mm, 3)
         x_cam_mm = x_lab_mm @ self.R_cam_lab.to(x_lab_mm).mT + self.T_cam_lab_mm.to(x_lab_mm)
         depth = x_cam_mm[..., 2:]

@@ -1,5 +1,3 @@
-"""OpenPTV's camera: Brown's polynomial in mm about the middle of the sensor, then a shear."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -16,11 +14,8 @@ from sphereorient.cameras.model import Key, middle_of_picture
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OpenPTVCamera(PolynomialCamera):
     """Perspective about `centre_px`, distorted about the middle of the picture; sensor in mm, its y up.
-
     k in mm^-2, mm^-4, mm^-6; p in 1/mm and in OpenPTV's order: its p1 goes with r^2 + 2 x^2, OpenCV's with r^2 + 2 y^2.
-
-    Source: OpenPTV's order of operations: sensor shift, polynomial, affine part x' = scx x - sin(she) y,
-    y' = cos(she) y (its classic form).
+    Source: OpenPTV: sensor shift, polynomial, affine part x' = scx x - sin(she) y, y' = cos(she) y (its classic form).
     """
 
     f_mm: Tensor  # (), principal distance
@@ -40,7 +35,6 @@ class OpenPTVCamera(PolynomialCamera):
     )
 
     def __post_init__(self) -> None:
-        """Refuse impossible parameters, and a distortion that folds inside the picture."""
         check_positive("cos(she)", torch.as_tensor(self.she, dtype=torch.float64).cos())
         super().__post_init__()
 

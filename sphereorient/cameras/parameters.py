@@ -1,10 +1,9 @@
 """The names of a camera's parameters, and cameras with small changes of them.
 
-All models have `rotation_x`, `rotation_y`, `rotation_z` (rad, camera frame: R_true = exp([delta]x) R, T unchanged)
-and `T_x`, `T_y`, `T_z` (mm). The others have the names of cameras.yaml, with pairs as `centre_u` and `centre_v` and
-lists as `k1`, `k2`, `k3`. A port has `port_offset`, `port_thickness` (mm), `port_n_glass`, `port_n_fluid`, and
-`port_tilt_x`, `port_tilt_y`, `port_tilt_z` (rad, lab frame: normal_true = exp([delta]x) normal, offset unchanged; a
-rotation about the normal itself changes nothing).
+All models have `rotation_x`, `rotation_y`, `rotation_z` (rad, camera frame: R_true = exp([delta]x) R, T unchanged) and
+`T_x`, `T_y`, `T_z` (mm). Others are named as in cameras.yaml, in parts `centre_u`, `centre_v`, `k1`, `k2`, `k3`. A port
+has `port_offset`, `port_thickness` (mm), `port_n_glass`, `port_n_fluid`, and `port_tilt_x`, `port_tilt_y`,
+`port_tilt_z` (rad, lab: normal_true = exp([delta]x) normal, offset unchanged; about the normal no effect).
 """
 
 from __future__ import annotations
@@ -32,11 +31,7 @@ PORT_NUMBERS = {f"port_{key.name}": key.field for key in Port.KEYS if not key.pa
 
 
 def parameter_names(camera: Camera) -> tuple[str, ...]:
-    """Return the names of all parameters that `with_parameters` can change.
-
-    Raises:
-        CameraError: not a `CameraModel`.
-    """
+    """Return the names of all parameters that `with_parameters` can change; CameraError unless a `CameraModel`."""
     if isinstance(camera, PortCamera):
         return (*parameter_names(camera.camera), *PORT_NUMBERS, *PORT_TILT)
     if not isinstance(camera, CameraModel):
@@ -46,12 +41,7 @@ def parameter_names(camera: Camera) -> tuple[str, ...]:
 
 
 def with_parameters(camera: AnyCamera, names: Sequence[str], delta: Tensor) -> AnyCamera:
-    """Return the camera, of the same model and with the same covariance, with small changes of some parameters.
-
-    Args:
-        camera: of any model, also behind a port.
-        names: P different names out of `parameter_names(camera)`.
-        delta: (P,), changes in the parameters' units; the camera is differentiable in them.
+    """Return the camera with small changes `delta` (P,) of the parameters `names`, in their units; differentiable.
 
     Raises:
         CameraError: an unknown name, a name twice, or changes that make the camera impossible.

@@ -1,5 +1,3 @@
-"""The pinhole camera: perspective without distortion."""
-
 from __future__ import annotations
 
 import math
@@ -29,11 +27,7 @@ class PinholeCamera(CentralCamera):
 
     @classmethod
     def completed(cls, values: dict[str, Any]) -> dict[str, Any]:
-        """Return the keys with f_px from vfov_deg, and the centre from the picture's size.
-
-        Raises:
-            CameraError: both or none of vfov_deg and f_px, or an impossible angle.
-        """
+        """Return the keys with f_px from vfov_deg (one of both, else CameraError), and a default centre."""
         f_px, vfov_deg = values["f_px"], values["vfov_deg"]
         if (f_px is None) == (vfov_deg is None):
             got, do = "none" if f_px is None else "both", "write one of the two"
@@ -56,11 +50,7 @@ class PinholeCamera(CentralCamera):
 
 
 def focal_of_field(height_px: int, vfov_deg: float) -> float:
-    """Return the focal length, px, for a field of `vfov_deg` degrees over the full height of the picture.
-
-    Raises:
-        CameraError: the angle is not between 0 and 180 degrees.
-    """
+    """Return the focal length, px, for a vertical field of `vfov_deg`, 0 to 180 degrees (else CameraError)."""
     if not 0.0 < vfov_deg < 180.0:
         raise camera_error("vfov_deg", "an angle between 0 and 180", f"{vfov_deg:g}", "correct the camera")
     return 0.5 * height_px / math.tan(math.radians(vfov_deg) / 2)

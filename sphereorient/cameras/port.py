@@ -1,5 +1,3 @@
-"""A flat wall between camera and liquid: Snell's law at both faces, in both directions."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -21,7 +19,7 @@ ROUNDS = 40  # of the iteration for cameras without one centre; one is exact for
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Port:
-    """A flat transparent wall: air before it, liquid behind it. Numbers float64; they may require gradients."""
+    """A flat transparent wall, air before it, liquid behind it; float64, may require gradients."""
 
     normal: Tensor  # (3,), lab, unit length to three digits, towards the camera
     offset_mm: Tensor  # (), normal . X of the wall's liquid side, lab
@@ -38,7 +36,6 @@ class Port:
     )
 
     def __post_init__(self) -> None:
-        """Refuse numbers that describe no wall."""
         for key in self.KEYS:
             shape = (len(key.parts),) if key.parts else ()
             value = as_parameter(f"port, {key.field}", getattr(self, key.field), *shape)
@@ -66,11 +63,8 @@ class Port:
         return self.offset_mm + self.thickness_mm
 
     def refract(self, air: Rays) -> Rays:
-        """Refract rays in air (lab; each is taken as a whole line) into the liquid, from the wall's liquid side.
-
-        Rays that do not go towards the wall are NaN, with gradient 0.
-
-        Source: Snell's law: the direction's part along the wall is divided by the index (docs/conventions.md).
+        """Refract rays in air (whole lines) into the liquid, from the wall's liquid side; NaN, gradient 0, if away.
+        Source: Snell's law divides the direction's part along the wall by the index (docs/conventions.md).
         """
         d = air.direction_lab
         normal = self.normal_lab.to(d)
@@ -79,7 +73,7 @@ class Port:
         passes = cosine > 0
         cosine = torch.where(passes, cosine, torch.ones_like(cosine))
         along_wall = torch.where(passes, d, -normal) + cosine * normal  # its length is the sine in air
-        # n cos(angle inside) = sqrt(n^2 - sin^2): written so that n = 1 gives back the cosine itself.
+        # n cos(angle inside) = sqrt(n^2 - sin^2), in a form that gives the cosine itself at n = 1.
         in_glass = (n_glass.square() - 1 + cosine.square()).sqrt()
         in_fluid = (n_fluid.square() - 1 + cosine.square()).sqrt()
         height = (air.origin_lab_mm @ normal)[..., None] - self.air_side_mm.to(d)
@@ -90,11 +84,8 @@ class Port:
         return Rays(origin_lab_mm=torch.where(passes, origin, nan), direction_lab=torch.where(passes, direction, nan))
 
     def entry_point(self, x_lab_mm: Tensor, centre_lab_mm: Tensor) -> Tensor:
-        """Return where light from points in the liquid (..., 3) leaves the wall on its way to a centre in air (3,).
-
-        All in the lab, mm. NaN, with gradient 0, for points that are not in the liquid.
-
-        Source: Snell's law in the plane of normal and point (textbook), solved for the share of the way along the wall.
+        """Return where light from points (..., 3) in the liquid to a centre (3,) in air leaves the wall; lab, mm.
+        NaN, with gradient 0, for points that are not in the liquid. Source: Snell's law (textbook).
         """
         normal = self.normal_lab.to(x_lab_mm)
         centre = centre_lab_mm.to(x_lab_mm)
@@ -109,11 +100,9 @@ class Port:
 
     def _share_in_air(self, across2: Tensor, height: Tensor, depth: Tensor) -> Tensor:
         """Return the fraction of the distance along the wall that light covers in air, in (0, 1].
-
-        With s the sine in air the distance is height tan + thickness s / sqrt(n_g^2 - s^2) + depth s /
-        sqrt(n_f^2 - s^2). Divided by the whole distance it is g(share) = 1 below; it needs no square root of the
-        distance, so gradients exist also straight below the camera. g rises and is concave: Newton starts at the share
-        of steep rays, which is too small, and converges from below.
+        With s the sine in air the distance is height tan + thickness s / sqrt(n_g^2 - s^2) + depth s / sqrt(n_f^2 -
+        s^2). Divided by the distance it is g(share) = 1 below, without square root of the distance: gradients exist
+        also at s = 0. g rises and is concave: Newton converges from below, from the share of steep rays.
         """
         layers = [(self.thickness_mm.to(depth), self.n_glass.to(depth)), (depth, self.n_fluid.to(depth))]
 
@@ -138,8 +127,7 @@ class Port:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PortCamera:
     """Any camera model behind a flat wall; R, T and image_size are those of the camera in air.
-
-    `undistort` and `distort` are the inner camera's: they correct the lens, not the refraction, which depends on depth.
+    `undistort` and `distort` correct the lens, not the refraction, which depends on depth.
     """
 
     camera: Camera  # as it would be in air
@@ -147,7 +135,6 @@ class PortCamera:
     covariance: ParameterCovariance | None = None  # of the camera's and the port's parameters together
 
     def __post_init__(self) -> None:
-        """Refuse a camera whose centre is not in front of the wall, or that looks away from it."""
         if self.covariance is None:
             object.__setattr__(self, "covariance", self.camera.covariance)
         normal, wall = self.port.normal_lab.detach(), float(self.port.air_side_mm.detach())
@@ -197,10 +184,9 @@ class PortCamera:
         return self.camera.project(self._apparent_point(x_lab_mm))
 
     def _apparent_point(self, x_lab_mm: Tensor) -> Tensor:
-        """Return the points in air whose image is that of `x_lab_mm` in the liquid, for cameras without one centre.
-
-        Each iteration shifts the apparent point along the wall by the miss of its own ray. The miss shrinks by 1 - 1/n
-        or more for steep rays, and is 0 after the first iteration for parallel rays.
+        """Return the points in air with the image of `x_lab_mm` in the liquid, for cameras without one centre.
+        Each iteration shifts the point along the wall by the miss of its ray. This leaves at most 1 - 1/n of the miss
+        for steep rays, and nothing for parallel rays.
         """
         normal = self.port.normal_lab.to(x_lab_mm)
         inside = (x_lab_mm @ normal <= self.port.offset_mm.to(x_lab_mm))[..., None]

@@ -1,5 +1,3 @@
-"""Geometry of lines of sight: triangulation, and the view frame."""
-
 from __future__ import annotations
 
 import torch
@@ -10,19 +8,8 @@ from sphereorient.cameras.checks import check_points
 
 
 def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
-    """Return the middle of the shortest segment between two rays, and its length.
-
-    Args:
-        rays_a: origin (..., 3) mm and unit direction (..., 3), lab.
-        rays_b: rays of the other camera; broadcasts against `rays_a`.
-
-    Returns:
-        Points (..., 3), lab, mm, and gaps (...), mm, not negative. Both NaN, with gradient 0, for parallel rays.
-
-    Raises:
-        ShapeError: a last axis is not 3.
-
-    Source: the common perpendicular of two skew lines (textbook).
+    """Return the middle (..., 3), lab, mm, of the shortest segment between two rays, and its length (...), mm.
+    Both are NaN, with gradient 0, for parallel rays; the rays broadcast. Source: common perpendicular (textbook).
     """
     for name, rays in (("rays_a", rays_a), ("rays_b", rays_b)):
         check_points(f"{name}.origin_lab_mm", rays.origin_lab_mm, 3)
@@ -42,20 +29,9 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
 
 
 def R_cam_view(direction_cam: Tensor) -> Tensor:
-    """Return the smallest rotation that takes the camera's z axis to a direction.
-
-    Args:
-        direction_cam: (..., 3), camera frame, any length above zero.
-
-    Returns:
-        (..., 3, 3), takes view components to camera components; its last column is the unit direction.
-        NaN, with gradient 0, for the backward direction, where the rotation is not defined.
-
-    Raises:
-        ShapeError: the last axis is not 3.
-
-    Source: docs/errata.md A1 (the paper's R_persp has the axis of OpenGL's camera); Rodrigues' formula with
-    z x direction.
+    """Return the smallest rotation (..., 3, 3) from the camera's z axis to directions (..., 3), camera frame.
+    It takes view to camera components; the last column is the unit direction. NaN, gradient 0, for the backward one.
+    Source: docs/errata.md A1 (the paper's R_persp has the axis of OpenGL's camera); Rodrigues, axis z x direction.
     """
     check_points("direction_cam", direction_cam, 3)
     unit = direction_cam / direction_cam.norm(dim=-1, keepdim=True)

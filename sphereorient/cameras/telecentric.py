@@ -1,5 +1,3 @@
-"""The telecentric camera: all rays are parallel."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -15,10 +13,7 @@ from sphereorient.cameras.model import CameraModel, Key
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TelecentricCamera(CameraModel):
-    """Orthographic projection: u = X_cam / scale + centre, at every depth.
-
-    The rays start in the plane z = 0 of the camera frame. The third number of T changes no picture.
-    """
+    """Orthographic projection: u = X_cam / scale + centre, at every depth; T_z changes no picture."""
 
     scale_mm_px: Tensor  # (), mm in the lab per pixel
 
@@ -35,7 +30,7 @@ class TelecentricCamera(CameraModel):
         return x_cam_mm / self.scale_mm_px.to(x_lab_mm) + self.centre_px.to(x_lab_mm)
 
     def rays(self, uv_px: Tensor) -> Rays:
-        """Return the rays of pixels (..., 2), which start in the camera's plane z = 0 and have one direction."""
+        """Return the parallel rays of pixels (..., 2), which start in the camera's plane z = 0."""
         check_points("uv_px", uv_px, 2)
         x_cam_mm = (uv_px - self.centre_px.to(uv_px)) * self.scale_mm_px.to(uv_px)
         x_cam_mm = torch.cat([x_cam_mm, torch.zeros_like(x_cam_mm[..., :1])], dim=-1)

@@ -1,5 +1,3 @@
-"""Tsai's camera: the radial polynomial acts on the distorted point."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -18,10 +16,7 @@ FOLD = -4.0 / 27.0  # below this value of kappa1 r_u^2 the cubic has no root on 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TsaiCamera(CentralCamera):
-    """Perspective with x_u = x_d (1 + kappa1 r_d^2), r_d the distorted radius on the sensor, mm.
-
-    Source: docs/conventions.md (Tsai). OpenCV's polynomial acts on the undistorted point instead.
-    """
+    """Perspective with Tsai's x_u = x_d (1 + kappa1 r_d^2), r_d distorted, on the sensor, mm (docs/conventions.md)."""
 
     f_mm: Tensor  # (), effective focal length
     pixel_pitch_mm: Tensor  # (2,)
@@ -38,7 +33,7 @@ class TsaiCamera(CentralCamera):
     )
 
     def __post_init__(self) -> None:
-        """Refuse impossible parameters, and a distortion that folds inside the picture."""
+        """Refuse also a distortion that folds inside the picture."""
         super().__post_init__()
         width, height = self.image_size
         corners = self.centre_px.new_tensor([(u, v) for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])
@@ -87,14 +82,8 @@ class TsaiCamera(CentralCamera):
 
 
 def shrinkage(bend: Tensor) -> Tensor:
-    """Return s = r_d / r_u, the root of s (1 + bend s^2) = 1 on the branch through s(0) = 1.
-
-    Args:
-        bend: (...), kappa1 r_u^2, no unit.
-
-    Returns:
-        (...), no unit; NaN, with gradient 0, at and below -4/27, where there is no such root.
-
+    """Return s = r_d / r_u, the root of s (1 + bend s^2) = 1 with s(0) = 1, for bend = kappa1 r_u^2 of any shape.
+    No unit; NaN, with gradient 0, at and below -4/27, where the root does not exist.
     Source: Cardano's closed form; z = sqrt(27 |bend| / 4), s = 3 sin(asin(z) / 3) / z (bend < 0; sinh for bend > 0).
     """
     exists = bend > FOLD
@@ -103,8 +92,7 @@ def shrinkage(bend: Tensor) -> Tensor:
         # The floor avoids 0/0; the Newton steps remove its error (1e-9).
         z = (27.0 / 4.0 * bend.abs()).sqrt().clamp_min(1e-4)
         s = torch.where(bend < 0, (z.clamp_max(1.0).asin() / 3).sin(), (z.asinh() / 3).sinh()) * 3 / z
-    # The root has no gradient at bend = 0 (sqrt). The first Newton step carries its first derivative, the second
-    # step its second derivative.
+    # sqrt has no gradient at 0. The first Newton step carries the root's first derivative, the second its second.
     for _ in range(2):
         s = s - (s * (1 + bend * s * s) - 1) / (1 + 3 * bend * s * s)
     return torch.where(exists, s, torch.full_like(s, torch.nan))

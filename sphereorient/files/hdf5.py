@@ -1,5 +1,3 @@
-"""HDF5 files that appear whole or not at all, even if the disk is full or the power fails."""
-
 from __future__ import annotations
 
 import io
@@ -12,18 +10,14 @@ import h5py
 
 from sphereorient.files.outputs import put_aside
 
-# What h5py raises on damaged files, depending on the place where HDF5 notices.
+# What h5py raises on damaged files, depending on the place of the damage.
 DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)
 ROOM = "check the space left and the permissions of the folder"
 
 
 @contextmanager
 def whole_hdf5(path: Path, do: str = ROOM) -> Iterator[h5py.File]:
-    """Open an HDF5 file for writing that replaces `path` once it is complete and on the disk.
-
-    Raises:
-        OutputError: it cannot be written, with the remedy `do`; the old file is kept.
-    """
+    """Open an HDF5 file that replaces `path` once complete and on the disk; else OutputError with the remedy `do`."""
     # HDF5 reports a full disk as either error.
     with put_aside(path, do, also=(RuntimeError,)) as aside, GuardedFile(aside) as guarded:
         with h5py.File(guarded, "w", track_order=False) as file:
@@ -34,7 +28,6 @@ def whole_hdf5(path: Path, do: str = ROOM) -> Iterator[h5py.File]:
 
 class GuardedFile(io.FileIO):
     """A file that ignores writes after the first error, and keeps the error for `check`.
-
     HDF5 cannot close a file that it cannot write: it fails again at every object and may crash the process.
     """
 

@@ -1,5 +1,3 @@
-"""Results that appear whole or not at all: written under another name first."""
-
 from __future__ import annotations
 
 from collections.abc import Iterator
@@ -14,14 +12,7 @@ ROOM = "choose a folder that exists, may be written and has room"
 @contextmanager
 def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()) -> Iterator[Path]:
     """Give a temporary name with the same suffix; the file replaces `path` at the end, or is deleted after an error.
-
-    Args:
-        path: the file.
-        do: the remedy, for the message.
-        also: errors of a library, beside OSError, that mean a failed write.
-
-    Raises:
-        OutputError: it cannot be written; the old file is kept.
+    OutputError with the remedy `do` for OSError or an error of `also`; the old file is kept.
     """
     aside = path.with_name(f".{path.stem}.partial{path.suffix}")
     failures: tuple[type[Exception], ...] = (OSError, *also)

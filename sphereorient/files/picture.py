@@ -1,5 +1,3 @@
-"""Picture files from anybody: the size that the header claims, before anything is decoded, and the grey values."""
-
 from __future__ import annotations
 
 import warnings

@@ -1,5 +1,3 @@
-"""Where a result comes from: versions, command, hashes of the inputs."""
-
 from __future__ import annotations
 
 import hashlib
@@ -33,24 +31,19 @@ def sha256(path: Path) -> str:
 
 
 def _digest(files: Sequence[Path]) -> str:
-    """Return the hash of one file, or of the hashes of several in order."""
     hashes = [sha256(file) for file in files]
     return hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
 
 
 def provenance(inputs: Mapping[Path, Sequence[Path]], folder: Path, command: str) -> dict[str, Any]:
     """Return the track's attribute `provenance`, ready for JSON.
-
-    Args:
-        inputs: each input with its files: itself, or the pictures of a sequence in order.
-        folder: inputs are named relative to it.
-        command: the command that made the result.
+    `inputs`: each path with its file or the pictures of its sequence in order; named relative to `folder`.
     """
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
         "platform": f"{platform.system()} {platform.machine()}, {sys.implementation.name}",
         "versions": versions(),
-        # By their path relative to experiment.yaml: two cameras' movies in two folders often share a name.
+        # By path relative to experiment.yaml: two cameras' movies in two folders often share a name.
         "sha256": {Path(os.path.relpath(path, folder)).as_posix(): _digest(files) for path, files in inputs.items()},
     }

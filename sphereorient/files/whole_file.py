@@ -1,5 +1,3 @@
-"""Reading small files whole, with a bound on their size."""
-
 from __future__ import annotations
 
 import os
@@ -13,22 +11,11 @@ TABLE_BYTES = 5_000_000  # of a table of points: 100,000 of them
 
 
 def read_whole(path: Path, largest: int, expected: str, error: type[SphereOrientError], do: str) -> bytes:
-    """Read a file of at most `largest` bytes.
-
-    A pipe or a device is refused before it is opened: reading it might never end.
-
-    Args:
-        path: the file.
-        largest: bytes.
-        expected: what the file should be, for the message.
-        error: the error to raise.
-        do: the remedy if the file does not exist, for the message.
-
-    Raises:
-        error: missing, a folder, not a plain file, too large, or unreadable.
+    """Read a plain file of at most `largest` bytes; raise `error` for anything else, with `expected` and remedy `do`.
+    Refuse a pipe or a device before opening it: reading it might never end.
     """
     try:
-        found = os.stat(path)  # noqa: PTH116 -- follows links as open does, and tells why where Path.is_file only says no
+        found = os.stat(path)  # noqa: PTH116 -- follows links as open does, and gives the reason, which Path.is_file does not
         if stat.S_ISREG(found.st_mode) and found.st_size <= largest:
             with path.open("rb") as file:
                 return file.read(found.st_size)  # no more: files under /proc claim 0 bytes, and some never end

@@ -1,4 +1,4 @@
-"""Reading and writing YAML files: plain values only, bounded in size; every fault is one line with file and key."""
+"""Reading and writing bounded YAML files of plain values; every fault is one line with file and key."""
 
 from __future__ import annotations
 
@@ -30,11 +30,7 @@ FAULTS = (yaml.YAMLError, ValueError, OverflowError)  # a date that does not exi
 
 
 def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> dict[str, Any]:
-    """Read a YAML file whose key `schema` must be `schema`; return the mapping without this key.
-
-    Raises:
-        error: missing, unreadable, not YAML, not a mapping, or of another schema.
-    """
+    """Read a YAML mapping whose key `schema` must be `schema`, without this key; raise `error` for anything else."""
     document = read_yaml(path, error)
     if not isinstance(document, dict):
         got = "an empty file" if document is None else short(document)
@@ -47,11 +43,7 @@ def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> di
 
 
 def read_yaml(path: Path, error: type[SphereOrientError]) -> Any:
-    """Read a YAML file of plain values, UTF-8, at most TEXT_BYTES; None for an empty one.
-
-    Raises:
-        error: missing, unreadable, not text, or not YAML as `parse_yaml` accepts it.
-    """
+    """Read a YAML file of plain values, UTF-8, at most TEXT_BYTES; None if empty; raise `error` for anything else."""
     content = read_whole(path, TEXT_BYTES, "a YAML file", error, "correct the path")
     try:
         return parse_yaml(content.decode("utf-8-sig"))  # some editors put a byte order mark in front
@@ -63,17 +55,7 @@ def read_yaml(path: Path, error: type[SphereOrientError]) -> Any:
 
 
 def validated(model: type[Model], data: Any, where: str, error: type[SphereOrientError]) -> Model:
-    """Validate data from a YAML file against a model, and word its first fault in one line.
-
-    Args:
-        model: its keys and their types; it must forbid extra keys.
-        data: content of the file.
-        where: file and place in it, for the message.
-        error: the error to raise.
-
-    Raises:
-        error: an unknown key (with the nearest known one), a missing key, or an impossible value.
-    """
+    """Validate YAML data against a model that forbids extra keys; raise `error` with the first fault and `where`."""
     try:
         return model.model_validate(data)
     except ValidationError as fault:
@@ -90,12 +72,8 @@ def refuse_unknown(key: object, known: Iterable[str], where: str) -> str:
 
 
 def write_document(path: Path, schema: str, document: Mapping[str, Any], comment: str = "") -> None:
-    """Write a YAML file with its schema as first key and `comment` above; it replaces an old file at once.
-
+    """Write YAML with its schema as first key and `comment` above, replacing an old file at once (else OutputError).
     Small numbers are written as 1.0e-05: YAML 1.1 reads 1e-05 as text.
-
-    Raises:
-        OutputError: the file cannot be written.
     """
     lines = "".join(f"# {line}\n" for line in comment.splitlines())
     content = {"schema": schema, **document}
@@ -111,7 +89,7 @@ def short(value: object) -> str:
 
 
 def yaml_words(fault: Exception) -> str:
-    """Word what is wrong with a YAML text in one short line."""
+    """Word the fault of a YAML text in one short line."""
     mark = getattr(fault, "problem_mark", None)
     problem = " ".join((getattr(fault, "problem", None) or str(fault).partition("\n")[0]).split())
     problem = problem if len(problem) <= 120 else problem[:117] + "..."
@@ -119,7 +97,7 @@ def yaml_words(fault: Exception) -> str:
 
 
 def parse_yaml(text: str) -> Any:
-    """Parse one YAML document of mappings, lists, texts, numbers and dates; aliases are allowed, tags are not.
+    """Parse one bounded YAML document of plain values; aliases are allowed, tags and repeated keys are not.
 
     Raises:
         yaml.YAMLError: not YAML, or with tags, repeated keys, keys that are not names, or beyond a bound above.
@@ -135,10 +113,7 @@ def is_one_line(text: str) -> bool:
 
 
 class _BoundedLoader(yaml.SafeLoader):
-    """PyYAML's safe loader, with bounds that are checked while nodes are composed, before any value is built.
-
-    An alias counts with its size: what walks through the values later meets it as often as it is used.
-    """
+    """PyYAML's safe loader with bounds, checked before any value is built; an alias counts with its size."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -147,7 +122,6 @@ class _BoundedLoader(yaml.SafeLoader):
         self._size: dict[yaml.Node, int] = {}  # nodes of each finished node, itself included
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a node and count it."""
         event, before = self._next(), self._nodes
         self._depth, self._nodes = self._depth + 1, self._nodes + 1
         self._check(self._depth <= MAX_DEPTH, f"more than {MAX_DEPTH} levels", event)
@@ -163,7 +137,6 @@ class _BoundedLoader(yaml.SafeLoader):
         return node
 
     def compose_scalar_node(self, anchor: Any) -> yaml.ScalarNode:
-        """Compose a text or a number of bounded length."""
         event = self._next()
         node = super().compose_scalar_node(anchor)
         longest = MAX_NUMBER if node.tag in NUMBERS else MAX_TEXT
@@ -172,7 +145,6 @@ class _BoundedLoader(yaml.SafeLoader):
         return node
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        """Compose a mapping whose keys are different names."""
         node = super().compose_mapping_node(anchor)
         seen = set()
         for key, _ in node.value:
@@ -206,7 +178,6 @@ def _worded(fault: ValidationError, model: type[BaseModel], where: str) -> str:
 
 
 def _keys(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the model at a place inside another."""
     for step in place:
         if str(step) in model.model_fields:  # others are names or numbers from the file, such as a camera's
             annotation = model.model_fields[str(step)].annotation

@@ -1,5 +1,3 @@
-"""Movies of Phantom cameras (.cine), memory-mapped."""
-
 from __future__ import annotations
 
 import struct
@@ -32,8 +30,6 @@ Rows = NDArray[np.uint8]  # (H, stride), as stored
 
 @dataclass(frozen=True)
 class _Layout:
-    """How the pixels of one row are stored."""
-
     name: str
     bits: int  # of a pixel in the file
     dtype: type[np.uint8] | type[np.uint16]
@@ -44,8 +40,6 @@ class _Layout:
 
 @dataclass(frozen=True, eq=False)
 class _Header:
-    """The header of a .cine file, checked against the size of the file; fields of SETUP that it lacks are 0."""
-
     compression: int  # 0 none, 1 JPEG, 2 raw colour filter array
     packing: int  # 0 none, 256: 10 bit, 1024: 12 bit
     bits: int  # stored, of a pixel
@@ -63,11 +57,7 @@ class _Header:
 
 
 class CineMovie(Movie):
-    """A .cine file of uncompressed or packed images.
-
-    Raises:
-        MovieError: not a .cine file, damaged, compressed, or of raw colours of a filter array.
-    """
+    """A .cine file of uncompressed or packed images; MovieError for compressed ones, filter arrays or damage."""
 
     def __init__(self, path: Path) -> None:
         header = self._header = _read_header(path)
@@ -137,10 +127,7 @@ def _prefix_and_size(content: NDArray[np.uint8], offset: int) -> tuple[int, int]
 
 
 def _read_header(path: Path) -> _Header:
-    """Read the header; nothing larger than the file is allocated, whatever it claims.
-
-    Source: the vendor's description of the format; all numbers little-endian, packed without gaps.
-    """
+    """Read the header (little-endian, packed without gaps); allocate nothing larger than the file."""
     with path.open("rb") as file:
         size = file.seek(0, 2)
         kind, header_size, compression, _, _, _, first, count, at_bitmap, at_setup, at_table, trigger = _unpack(
@@ -162,7 +149,6 @@ def _read_header(path: Path) -> _Header:
         stamps = _read_stamps(file, at_setup + length, min(at_table, size)) if length else None
 
     def field(offset: int, form: str) -> int:
-        """Return a field of SETUP, 0 where this version of it ends before."""
         there = offset + struct.calcsize(form) <= len(setup)
         return int(struct.unpack_from(form, setup, offset)[0]) if there else 0
 
@@ -193,7 +179,7 @@ def _unpack(path: Path, file: BinaryIO, at: int, layout: struct.Struct) -> tuple
 
 
 def _read_stamps(file: BinaryIO, at: int, end: int) -> NDArray[np.uint64] | None:
-    """Return the TIME64 of each image from the tagged blocks between `at` and `end`, None if there are none."""
+    """Return the TIME64 of each image from the tagged blocks between `at` and `end`; None without."""
     for _ in range(MAX_BLOCKS):
         if at + BLOCK_HEADER.size > end:
             break
@@ -208,13 +194,12 @@ def _read_stamps(file: BinaryIO, at: int, end: int) -> NDArray[np.uint64] | None
 
 
 def _seconds(stamps: NDArray[np.uint64], trigger: int) -> NDArray[np.float64]:
-    """Return times from the trigger; differences are taken in integers, before rounding."""
     since = (stamps & ~FLAG_BITS) - (np.uint64(trigger) & ~FLAG_BITS)  # may wrap round; right again as signed
     return since.view(np.int64) / 2.0**32
 
 
 def _times(header: _Header, count: int) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """Return the time of each frame from the trigger, (count,), s, by stamps or frame rate, and a remark."""
+    """Return the time (count,), s, of each frame from the trigger, by stamps or frame rate, and a remark."""
     remark = "it has no time stamps"
     if header.times_s is not None and len(header.times_s) >= count:
         times_s = header.times_s[:count]
@@ -259,7 +244,7 @@ def _colour_16(rows: Rows, width: int) -> NDArray[Any]:
 
 
 def _ten_packed(rows: Rows, width: int) -> NDArray[Any]:
-    """Four pixels in five bytes, the most significant bits first."""
+    """Unpack four pixels from five bytes, the most significant bits first."""
     b = _groups(rows, width, pixels=4, size=5)
     first = (b[..., 0] << 2) | (b[..., 1] >> 6)
     second = ((b[..., 1] & 0x3F) << 4) | (b[..., 2] >> 4)
@@ -269,7 +254,7 @@ def _ten_packed(rows: Rows, width: int) -> NDArray[Any]:
 
 
 def _twelve_packed(rows: Rows, width: int) -> NDArray[Any]:
-    """Two pixels in three bytes, the most significant bits first."""
+    """Unpack two pixels from three bytes, the most significant bits first."""
     b = _groups(rows, width, pixels=2, size=3)
     first = (b[..., 0] << 4) | (b[..., 1] >> 4)
     second = ((b[..., 1] & 0x0F) << 8) | b[..., 2]

@@ -14,17 +14,14 @@ from sphereorient.movies.movie import Grey
 if TYPE_CHECKING:
     import av
 
-# Thousandths that add up to 1000: R = G = B comes out as it is.
+# Thousandths that add up to 1000: R = G = B keeps its value.
 RED, GREEN, BLUE = 299, 587, 114
 COLOUR_REMARK = "colour, made grey (0.299 R + 0.587 G + 0.114 B)"
 PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # pixel formats that begin so may have a grey first plane
 
 
 def luma(red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any]) -> NDArray[Any]:
-    """Return the grey values of a colour picture (...), uint8 or uint16; exact where R = G = B.
-
-    Source: ITU-R BT.601.
-    """
+    """Return the grey values of a colour picture (...), uint8 or uint16, by ITU-R BT.601; exact where R = G = B."""
     total = RED * red.astype(np.uint32) + GREEN * green.astype(np.uint32) + BLUE * blue.astype(np.uint32)
     return ((total + 500) // 1000).astype(red.dtype)
 
@@ -35,11 +32,7 @@ def grey_dtype(pixel_format: av.VideoFormat) -> np.dtype[Any]:
 
 
 def check_format(name: str, pixel_format: av.VideoFormat) -> None:
-    """Refuse pixel formats without exact grey values.
-
-    Raises:
-        MovieError: neither a format with an integer grey plane nor a colour format.
-    """
+    """Refuse pixel formats without exact grey values: no integer grey plane and no colour (MovieError)."""
     colour = (pixel_format.is_rgb or pixel_format.has_palette) and not pixel_format.is_bit_stream
     if not (colour or _has_grey_plane(pixel_format)):
         do = "convert it, lossless: ffmpeg -i MOVIE -c:v ffv1 -pix_fmt gray MOVIE.mkv"
@@ -50,7 +43,7 @@ def grey_values(frame: av.VideoFrame) -> Grey:
     """Return the first plane of grey and YUV frames unchanged, the luma of RGB frames; (H, W), row 0 on top."""
     if _has_grey_plane(frame.format):
         return _plane_0(frame)
-    # FFmpeg only interleaves the channels here: its own grey follows another formula than the other formats'.
+    # FFmpeg only interleaves the channels here: its grey formula differs from that of the other formats.
     deep = grey_dtype(frame.format).itemsize == 2
     interleaved = frame.reformat(format="rgb48le" if deep else "rgb24")
     values = _plane_0(interleaved, samples=3).reshape(frame.height, frame.width, 3)
@@ -60,19 +53,18 @@ def grey_values(frame: av.VideoFrame) -> Grey:
 
 
 def _has_grey_plane(pixel_format: av.VideoFormat) -> bool:
-    """Return whether plane 0 holds only grey; packed formats (yuyv422, ya8) share it."""
+    """Return whether plane 0 holds only grey; in packed formats (yuyv422, ya8) it does not."""
     grey, *others = pixel_format.components
     alone = all(other.plane != grey.plane for other in others)
     return alone and pixel_format.name.startswith(PLANE_0_IS_GREY) and "f32" not in pixel_format.name
 
 
 def _plane_0(frame: av.VideoFrame, samples: int = 1) -> Grey:
-    """Return the first plane, (H, samples W)."""
     plane, height, width = frame.planes[0], frame.height, frame.width * samples
     dtype = grey_dtype(frame.format)
     stored = dtype.newbyteorder(">" if frame.format.is_big_endian else "<")
-    # Rows are padded to line_size, which is negative for pictures stored bottom-up; buffer_ptr is then the top row,
-    # the last one in memory. Read by address: PyAV releases differ in where their buffer begins.
+    # Rows are padded to line_size, negative for pictures stored bottom-up: buffer_ptr is then the top row, the last in
+    # memory. Read by address: PyAV releases differ in where their buffer begins.
     reach = (height - 1) * plane.line_size
     size = abs(reach) + width * dtype.itemsize
     memory = memoryview((ctypes.c_uint8 * size).from_address(plane.buffer_ptr + min(reach, 0))).cast("B")

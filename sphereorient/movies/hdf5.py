@@ -1,5 +1,3 @@
-"""Movies in HDF5: one data set (N, H, W), with its times beside it."""
-
 from __future__ import annotations
 
 import math
@@ -62,20 +60,18 @@ class Hdf5Movie(Movie):
 
 
 def split_path(path: Path) -> tuple[Path, str]:
-    """Return the file and the name of the data set in it, empty where `path` names none."""
+    """Return the file and the name of the data set in it, empty if `path` has none."""
     file, _, name = str(path).partition(SEPARATOR)
     return Path(file), name
 
 
 def _shown(name: object) -> str:
-    """Return a name from the file as one line of at most 60 characters."""
     text = str(name)
     return (text if text.isprintable() else repr(text))[:60]
 
 
 @contextmanager
 def _opened(path: Path, file: Path) -> Iterator[Any]:
-    """Open the file; errors of HDF5 inside the block mean damage."""
     try:
         with h5py.File(file, "r") as opened:
             yield opened
@@ -126,7 +122,6 @@ def _follow(path: Path, file: Any, name: str) -> Any:
 
 
 def _candidates(file: Any) -> list[str]:
-    """Return the names of the data sets that can be movies."""
     found: list[str] = []
     seen = 0
 
@@ -147,10 +142,7 @@ def _is_movie(data: Any) -> bool:
 
 
 def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int] | None]:
-    """Return the number of frames up to the last written one, and the written chunks along the first axis.
-
-    None instead of chunks: the values are contiguous. Nothing is read, and no claim of the shape is trusted.
-    """
+    """Return the number of frames up to the last written one, and the written chunks, None if contiguous."""
     stated, height, width = (int(size) for size in data.shape)
     frame_bytes = height * width * data.dtype.itemsize
     if frame_bytes > LARGEST_RATIO * file_bytes:
@@ -173,7 +165,7 @@ def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int
 
 
 def _times(data: Any, stated: int, count: int) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """Return the times beside a data set, (count,), s, or a remark why they are not used."""
+    """Return the times (count,), s, beside a data set, or a remark why they are not used."""
     for name in TIMES:
         if not isinstance(data.parent.get(name, getlink=True), h5py.HardLink):
             continue

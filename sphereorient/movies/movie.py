@@ -1,5 +1,3 @@
-"""The one interface to movies, and what the readers of all formats share."""
-
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
@@ -36,7 +34,7 @@ class Movie:
         raise NotImplementedError
 
     def _read_on(self, numbers: Sequence[int]) -> Iterator[Grey | None]:
-        """Yield the frames of these numbers, None for damaged ones: restart after each, as frames are independent."""
+        """Yield these frames, None for damaged ones; restart after each, as frames are independent."""
         while numbers:
             try:
                 for picture in self._read(numbers):
@@ -47,33 +45,18 @@ class Movie:
                 numbers = numbers[1:]
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return self._count
 
     def frames(self, first: int = 0, last: int | None = None) -> Iterator[Grey]:
-        """Yield frames first .. last - 1 in order, (H, W) each, as copies.
-
-        Raises:
-            MovieError: the range lies outside the movie, or a frame cannot be decoded.
-        """
+        """Yield frames first .. last - 1 in order, as copies (H, W); MovieError outside the movie or at damage."""
         return self._read(self._range(first, last))
 
     def readable(self, first: int = 0, last: int | None = None) -> Iterator[Grey | None]:
-        """Yield frames first .. last - 1 in order, None for those that cannot be decoded.
-
-        Frames that are predicted from a damaged one are None too, up to the next key frame.
-
-        Raises:
-            MovieError: the range lies outside the movie.
-        """
+        """Yield frames first .. last - 1, None for damaged ones and those predicted from them (MovieError outside)."""
         return self._read_on(self._range(first, last))
 
     def sample(self, indices: Sequence[int]) -> Grey:
-        """Return frames in the given order, (n, H, W).
-
-        Raises:
-            MovieError: an index lies outside the movie, or a frame cannot be decoded.
-        """
+        """Return frames in the given order, (n, H, W); MovieError outside the movie or at damage."""
         asked = [int(index) for index in indices]
         outside = [index for index in asked if not 0 <= index < len(self)]
         if outside:
@@ -95,12 +78,10 @@ class Movie:
         return MovieError(refusal(str(self.path), expected=f"frames within {within}", got=got, do=do))
 
     def _damage(self, number: int, got: str) -> MovieError:
-        """Word the refusal of a frame that cannot be read."""
         do = "export the movie again, or leave the frame out with frames: in the experiment"
         return MovieError(refusal(f"{self.path}, frame {number}", expected="a decodable picture", got=got, do=do))
 
     def __enter__(self) -> Self:
-        """Return the movie."""
         return self
 
     def __exit__(
@@ -127,11 +108,7 @@ class FlippedMovie(Movie):
 
 
 def flipped(movie: Movie, how: str) -> Movie:
-    """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both.
-
-    Raises:
-        MovieError: another word.
-    """
+    """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both."""
     if how not in FLIPS:
         do = "write one of these"
         raise MovieError(refusal(f"{movie.path}, flip", expected=", ".join(FLIPS), got=f"'{how}'", do=do))
@@ -147,10 +124,7 @@ def flipped_picture(picture: NDArray[Any], how: str) -> NDArray[Any]:
 def mapped(
     path: Path, numbers: Sequence[int], dtype: np.dtype[Any], offset: int, shape: tuple[int, ...]
 ) -> Iterator[tuple[int, NDArray[Any]]]:
-    """Yield each frame number with the array of a file mapped into memory, from a new map for every 64 frames.
-
-    Pages once read stay in memory while the process holds the map: new maps keep memory flat.
-    """
+    """Yield frame numbers with the array of a file mapped into memory; a new map every 64 frames keeps memory flat."""
     for place, number in enumerate(numbers):
         if place % FRAMES_A_MAP == 0:
             values = np.memmap(path, dtype, "r", offset, shape)
@@ -158,7 +132,7 @@ def mapped(
 
 
 def refused(path: Path, expected: str, got: str, do: str) -> MovieError:
-    """Word the refusal of a movie file."""
+    """Return the MovieError of a movie file."""
     return MovieError(refusal(str(path), expected=expected, got=got, do=do))
 
 

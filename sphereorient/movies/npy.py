@@ -1,5 +1,3 @@
-"""Movies in one numpy array, memory-mapped."""
-
 from __future__ import annotations
 
 import math
@@ -40,7 +38,6 @@ class NpyMovie(Movie):
 
 
 def _header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
-    """Return shape and type of the array, and the offset of its values."""
     with path.open("rb") as file:
         try:
             version = np.lib.format.read_magic(file)

@@ -1,5 +1,3 @@
-"""From a path to a movie, by suffix. A new format is one module and one line of READERS."""
-
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -24,11 +22,8 @@ READERS: dict[str, Callable[[Path], Movie]] = {
 
 def open_movie(path: Path | str) -> Movie:
     """Open a movie by the suffix of its file.
-
-    Args:
-        path: .mkv, .avi, .mp4, .mov (any codec that FFmpeg decodes), .cine, .tif, .tiff (a stack), .npy ((N, H, W),
-            uint8 or uint16), .h5, .hdf5 (its only such data set, or `file.h5::group/dataset`); or single pictures: a
-            folder, or a pattern with * or %05d in its last part.
+    Videos: .mkv, .avi, .mp4, .mov (any codec of FFmpeg), .cine. Stacks of uint8 or uint16: .tif, .tiff, .npy (N, H, W),
+    .h5, .hdf5 (its only such data set, or `file.h5::group/dataset`). Pictures: a folder, or a pattern with * or %05d.
 
     Raises:
         MovieError: missing, of another suffix, unreadable, or empty.
@@ -52,11 +47,7 @@ def open_movie(path: Path | str) -> Movie:
 
 
 def movie_files(path: Path | str) -> list[Path]:
-    """Return the files of a movie as `open_movie` takes it: one, or the pictures of a sequence.
-
-    Raises:
-        MovieError: a folder or a pattern without pictures.
-    """
+    """Return the files of a movie: one, or the pictures of a sequence (MovieError without any)."""
     path = Path(path)
     return sequence_files(path) if _is_sequence(path) else [split_path(path)[0]]
 
@@ -66,7 +57,7 @@ def _is_sequence(path: Path) -> bool:
 
 
 def _is(path: Path, kind: Callable[[Path], bool]) -> bool:
-    """Call `Path.is_dir` or `Path.is_file`, False for names that are too long for any file."""
+    """Call `Path.is_dir` or `Path.is_file`; False for names that are too long for any file."""
     try:
         return kind(path)
     except OSError:

@@ -46,7 +46,7 @@ class PacketIndex:
         return sorted(set(range(self.count)) - set(self.order)) if len(self.order) not in (0, self.count) else []
 
     def number(self, pts: int | None, pos: int | None) -> int | None:
-        """Return the frame number of a packet, None where it is unknown."""
+        """Return the frame number of a packet, None if unknown."""
         mark = pos if self.by_place else pts
         return None if mark is None or self.number_of is None else self.number_of.get(mark)
 
@@ -65,11 +65,7 @@ class PacketIndex:
         return runs
 
     def spoilt_by(self, number: int) -> Sequence[int]:
-        """Return the frames that cannot be trusted once frame `number` is damaged, itself included.
-
-        These are the frames decoded after it up to the next key frame, and frames decoded after that key frame but
-        shown before it. If frames can only be counted: all that follow.
-        """
+        """Return the frames that damage in frame `number` may spoil, itself included; all later ones if unknown."""
         if not self.order:
             return range(number, self.count)
         if self.each_alone or number not in self.order:
@@ -81,12 +77,8 @@ class PacketIndex:
 
 
 def index_packets(packets: list[Packet], guessed: bool, step: Fraction | None = None) -> PacketIndex:
-    """Number the packets of a video by their time stamps, or by their byte offsets if stamps are ambiguous.
-
-    Args:
-        packets: in the order of the file.
-        guessed: whether the presentation stamps were guessed by the demuxer.
-        step: frame period by the header, in stamp units; a gap between evenly spaced stamps is a lost frame.
+    """Number packets, in file order, by their time stamps, or by byte offsets if stamps are ambiguous or `guessed`.
+    A gap between stamps spaced by `step` (frame period by the header, in stamp units) is a lost frame.
     """
     stamps = sorted({packet.pts for packet in packets if packet.pts is not None})
     if not guessed and len(stamps) == len(packets):

@@ -1,5 +1,3 @@
-"""Movies of one picture file a frame: a folder, or a pattern with * or %05d."""
-
 from __future__ import annotations
 
 import math
@@ -27,7 +25,7 @@ DIGITS = re.compile(r"(\d+)")
 MOST_MISSING = 100  # times the pictures in the folder: with more gaps the numbers are not frame numbers
 SHOWN = 5  # gaps named in a remark
 ENOUGH, TRIED = 5, 64  # pictures that determine the size, and how many are tried if the first ones are damaged
-# The largest compression ratio of a black picture: a header that claims more has no such picture behind it.
+# The largest compression ratio of a black picture; no real picture exceeds it.
 LARGEST_RATIO = 1200
 MOST_PIXELS = 1 << 26  # more than any movie camera has
 LARGEST_BYTES = 1 << 28  # of a picture file, which is read whole
@@ -75,11 +73,7 @@ def is_pattern(path: Path) -> bool:
 
 
 def sequence_files(path: Path) -> list[Path]:
-    """Return the pictures of a folder or pattern, sorted by name.
-
-    Raises:
-        MovieError: there are none.
-    """
+    """Return the pictures of a folder or pattern, sorted by name; MovieError without any."""
     folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)
     if not folder.is_dir():
         raise refused(path, "a folder", "no such folder", "correct the path")
@@ -142,11 +136,7 @@ def _number_remarks(numbers: list[int], step: int, count: int) -> Iterator[str]:
 
 
 def _read_picture(path: Path) -> tuple[Grey, bool]:
-    """Return a picture (H, W), uint8 or uint16, row 0 on top, and whether it was in colour.
-
-    Raises:
-        MovieError: missing, not a picture, or not of 8 or 16 bit.
-    """
+    """Return a picture (H, W), uint8 or uint16, row 0 on top, and whether it was in colour (else MovieError)."""
     if not path.is_file():
         raise refused(path, "a picture", "no such file", "find it, or record it as missing")
     if path.suffix.lower() in TIFF:

@@ -1,5 +1,3 @@
-"""What some frames of a movie show, and what is wrong with them."""
-
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
@@ -36,7 +34,7 @@ class SurveyedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What some frames of a movie show; made by `survey`, read by the contact sheet."""
+    """What some frames of a movie show, and their faults."""
 
     frames: tuple[SurveyedFrame, ...]  # evenly spread over the movie, to be shown
     looked: int  # number of frames examined
@@ -48,14 +46,7 @@ class Survey:
 def survey(
     movie: Movie, count: int = 24, every: bool = False, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Survey:
-    """Examine frames spread over a movie, each with the one before it, or every frame.
-
-    Args:
-        movie: any movie.
-        count: frames to examine and to keep.
-        every: examine all frames; `count` are kept.
-        progress: called with the number of frames done and in all.
-    """
+    """Examine `count` frames spread over a movie, each with the one before it; with `every` all, keeping `count`."""
     kept = {int(number) for number in np.linspace(0, len(movie) - 1, min(count, len(movie))).round()}
     seen: list[SurveyedFrame] = []
     for number, before, picture in _pairs(movie, None if every else sorted(kept)):
@@ -77,7 +68,6 @@ def survey(
 
 
 def _pairs(movie: Movie, numbers: Iterable[int] | None) -> Iterator[tuple[int, Grey | None, Grey | None]]:
-    """Yield number, frame before and frame of these numbers, or of all."""
     if numbers is None:
         for number, (before, picture) in enumerate(pairwise(chain([None], movie.readable()))):
             yield number, before, picture
@@ -112,7 +102,6 @@ def _fault(one: SurveyedFrame, usual: float, scale: int) -> str:
 
 
 def _reduced(picture: Grey) -> NDArray[np.float32]:
-    """Return a picture averaged over whole-number blocks to at most SHOWN_PX."""
     times = max(1, -(-max(picture.shape) // SHOWN_PX))
     height, width = picture.shape[0] // times, picture.shape[1] // times
     tiles = picture[: height * times, : width * times].reshape(height, times, width, times)

@@ -1,5 +1,3 @@
-"""Stacks of pictures in one TIFF file: pages, or contiguous values as ImageJ writes them."""
-
 from __future__ import annotations
 
 import logging
@@ -20,7 +18,7 @@ from sphereorient.movies.movie import Grey, Movie, error_words, mapped, refused,
 if TYPE_CHECKING:
     from tifffile import TiffFile
 
-# What tifffile and imagecodecs raise on damaged files, depending on the place where they notice.
+# What tifffile and imagecodecs raise on damaged files, depending on the place of the damage.
 DAMAGE = (
     *(ValueError, TypeError, LookupError, ArithmeticError, AttributeError, OSError, EOFError, RuntimeError),
     *(MemoryError, AssertionError, struct.error, zlib.error, lzma.LZMAError),
@@ -50,8 +48,7 @@ class TiffMovie(Movie):
             self._white_is_zero = page.photometric == WHITE_IS_ZERO
             self._steps = _steps(path, page)
             self._stored = np.dtype(page.dtype).newbyteorder(file.byteorder)
-            # ImageJ's stacks above 4 GB have one page only, and a stack that was cut off has lost its table of pages:
-            # in both the values follow one another without gaps.
+            # ImageJ's stacks above 4 GB have one page, truncated stacks lack the table of pages: values are contiguous.
             whole = 0
             if stated > pages and page.compression == UNCOMPRESSED and page.is_contiguous:
                 whole = int((path.stat().st_size - page.dataoffsets[0]) // page.nbytes)
@@ -106,7 +103,6 @@ def _opened(path: Path) -> Iterator[TiffFile]:
 
 
 def _first_page(path: Path, file: TiffFile) -> Any:
-    """Return the first page; refuse pixels other than grey or colour of 8 or 16 bit."""
     try:
         page: Any = file.pages[0]
         kind = f"{np.dtype(page.dtype)}, photometric {page.photometric}, {page.shape}"
@@ -120,7 +116,6 @@ def _first_page(path: Path, file: TiffFile) -> Any:
 
 
 def _check_claim(page: Any) -> None:
-    """Refuse a page that claims more pixels than its bytes can hold."""
     stored = min(sum(page.databytecounts), page.parent.filehandle.size)  # the counts are a claim too
     if not page.nbytes or page.nbytes > LARGEST_RATIO * stored:
         raise ValueError(f"a page {page.shape} with {stored} bytes of pixels")

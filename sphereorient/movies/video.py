@@ -77,7 +77,6 @@ class VideoMovie(Movie):
         return (None if isinstance(got, MovieError) else got for got in self._decode(numbers))
 
     def _decode(self, numbers: Sequence[int]) -> Iterator[Grey | MovieError]:
-        """Yield the picture or the error of each of increasing frame numbers."""
         with _opened(self.path) as container:
             for run in self._index.runs(numbers):
                 key = self._seek(container, run[0])
@@ -93,7 +92,7 @@ class VideoMovie(Movie):
                     yield from pictures
 
     def _seek(self, container: av.container.InputContainer, number: int) -> int:
-        """Go to the last key frame at or before frame `number`, and return its number."""
+        """Go to the last key frame at or before frame `number`; return its number."""
         key, stamp = self._index.key_before(number)
         if key > 0:  # a fresh container is at frame 0 already
             try:
@@ -105,13 +104,7 @@ class VideoMovie(Movie):
     def _pictures(
         self, container: av.container.InputContainer, numbers: list[int], key: int
     ) -> Iterator[Grey | MovieError]:
-        """Yield the picture or the error of each of increasing frame numbers.
-
-        Args:
-            container: positioned at frame `key` or before it.
-            numbers: frames wanted.
-            key: damage before this frame is ignored: the seek may have cut off what it depends on.
-        """
+        """Yield picture or error of increasing frame numbers; ignore damage before `key`, which the seek may cause."""
         waiting = iter(numbers)
         wanted = next(waiting, None)
         spoilt: dict[int, str] = {}
@@ -188,7 +181,7 @@ def _demuxed(container: av.container.InputContainer) -> Iterator[Any]:
 
 
 def _first_frame(container: av.container.InputContainer) -> av.VideoFrame | None:
-    """Return the first frame that can be decoded: a damaged one at the start does not make the movie unreadable."""
+    """Return the first decodable frame: damage at the start does not make the movie unreadable."""
     for packet in _demuxed(container):
         try:
             frames: list[av.VideoFrame] = packet.decode()
@@ -200,10 +193,7 @@ def _first_frame(container: av.container.InputContainer) -> av.VideoFrame | None
 
 
 def _check_sums_right(packet: bytes) -> bool:
-    """Verify the check sums of all slices of an FFV1 packet, which FFmpeg's decoder only logs.
-
-    Source: RFC 9043, sections 4.9 and 4.9.3.
-    """
+    """Verify the check sums of all slices of an FFV1 packet, which the decoder only logs (RFC 9043, 4.9 and 4.9.3)."""
     end = len(packet)
     while end > 0:
         first = end - TRAILER - int.from_bytes(packet[end - TRAILER : end - TRAILER + 3], "big")
@@ -231,11 +221,10 @@ def _remarks(container: av.container.InputContainer, pixels: str, index: PacketI
 
 
 def _stated_frames(container: av.container.InputContainer, count: int) -> int:
-    """Return how many frames the header states, 0 where it states none or no more than there are."""
+    """Return how many frames the header states; 0 without, or if not more than there are."""
     stream = container.streams.video[0]
     if stream.frames:
         return int(stream.frames)
-    # Matroska states no number of frames, but the duration of what was written.
     matroska = "matroska" in container.format.name and len(container.streams) == 1
     if not (matroska and container.duration and stream.average_rate):
         return 0
@@ -244,7 +233,6 @@ def _stated_frames(container: av.container.InputContainer, count: int) -> int:
 
 
 def _loss(context: av.CodecContext) -> str:
-    """Return in words whether a codec loses grey values."""
     if not context.codec.lossy:
         return LOSSLESS
     return "may be lossy" if context.codec.lossless else "lossy"

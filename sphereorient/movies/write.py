@@ -1,5 +1,3 @@
-"""Writing movies without loss: FFV1 in Matroska, or HDF5."""
-
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
@@ -31,21 +29,13 @@ def write_movie(
     times_s: NDArray[np.float64] | None = None,
     frame_rate_hz: float = PLAYER_RATE_HZ,
 ) -> int:
-    """Write grey frames as FFV1 (.mkv) or HDF5 (.h5, .hdf5), replacing an old file at the end; return their number.
-
-    A frame that is None keeps its number: in HDF5 it is not written and reads as unreadable; in .mkv it is black.
-    Times are written beside the frames in HDF5, for .mkv into the table `MOVIE.times.csv`, which experiment.yaml takes
-    as `times:`.
-
-    Args:
-        path: the movie.
-        frames: (H, W) uint8 or uint16 each, all alike; taken one by one.
-        times_s: (N,) s, if known.
-        frame_rate_hz: of .mkv, for players only.
+    """Write grey frames (H, W), uint8 or uint16, as FFV1 (.mkv) or HDF5 (.h5, .hdf5); return their number.
+    A frame None keeps its number: unreadable in HDF5, black in .mkv. `times_s` (N,), s, go into the HDF5 file, or
+    beside the .mkv into `MOVIE.times.csv`, for `times:` of experiment.yaml; players alone use `frame_rate_hz` of .mkv.
 
     Raises:
-        MovieError: another suffix, no frame, or frames that are not alike.
-        OutputError: the file cannot be written.
+        MovieError: another suffix, no frame, or frames of different size or type.
+        OutputError: the file cannot be written; an old file is kept.
     """
     path = Path(path)
     if path.suffix.lower() not in WRITERS:
@@ -87,7 +77,7 @@ def write_ffv1(path: Path | str, frames: Iterable[Grey | None], frame_rate_hz: f
 
 
 def _write_hdf5(aside: Path, path: Path, frames: Iterable[Grey | None], times_s: NDArray[np.float64] | None) -> int:
-    """Write frames as the data set `frames` (N, H, W), a chunk each, and times as `time` (N,)."""
+    """Write frames as the data set `frames` (N, H, W), one chunk each, and times as `time` (N,)."""
     count, first, checked = _checked(path, frames)
     with GuardedFile(aside) as guarded:
         with h5py.File(guarded, "w") as file:
@@ -117,11 +107,7 @@ def _write_hdf5(aside: Path, path: Path, frames: Iterable[Grey | None], times_s:
 
 
 def _checked(path: Path, frames: Iterable[Grey | None]) -> tuple[int, Grey, Iterator[Grey | None]]:
-    """Return how many leading frames are None, the first picture, and all frames from it on, checked one by one.
-
-    Raises:
-        MovieError: no picture, or pictures that are not alike (H, W) uint8 or uint16.
-    """
+    """Return how many leading frames are None, the first picture, and all frames from it on, checked one by one."""
     rest = iter(frames)
     dead = 0
     for picture in rest:

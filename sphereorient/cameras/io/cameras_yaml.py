@@ -1,5 +1,3 @@
-"""cameras.yaml: camera models by name, read and written."""
-
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -31,7 +29,7 @@ MOST = 100  # cameras of a file
 Triple = tuple[float, float, float]
 HOLDS: dict[int, Any] = {0: float, 2: tuple[float, float], 3: Triple}  # by the number of a key's parts
 
-# A further model: one file with the camera, one name here.
+# To add a model: one file with the camera, one name here.
 MODELS: dict[str, type[CameraModel]] = {
     kind.MODEL: kind for kind in (TsaiCamera, PinholeCamera, BrownCamera, TelecentricCamera, OpenPTVCamera)
 }
@@ -84,7 +82,6 @@ class CameraEntry(Entry):
 
 
 def _entry(kind: type[CameraModel]) -> type[CameraEntry]:
-    """Return the pydantic model of a camera model's keys."""
     fields: dict[str, Any] = dict.fromkeys(kind.ALSO, (float | None, None))
     for key in kind.KEYS:
         holds = HOLDS[len(key.parts)]
@@ -101,12 +98,10 @@ ENTRIES = {name: _entry(kind) for name, kind in MODELS.items()}
 
 
 def load_cameras(path: Path | str) -> dict[str, Camera]:
-    """Read all cameras of a cameras.yaml, in the file's order; a camera with a `port` comes as PortCamera.
+    """Read all cameras of a cameras.yaml (docs/cameras.md), in its order; a camera with a `port` becomes a PortCamera.
 
     Raises:
         CameraError: missing, not YAML, another schema, an unknown key or model, or an impossible parameter.
-
-    Source: docs/cameras.md.
     """
     path = Path(path)
     document = read_document(path, SCHEMA, CameraError)
@@ -124,18 +119,8 @@ def load_cameras(path: Path | str) -> dict[str, Camera]:
 
 
 def load_covariance(path: Path | str, cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
-    """Read the joint covariance of the cameras in use, with parameters named camera.parameter.
-
-    Args:
-        path: cameras.yaml.
-        cameras: those of the file that are in use.
-
-    Returns:
-        The covariance. Where the file has no joint one: the cameras' own covariances as blocks, taken as independent;
-        None where a camera has no covariance.
-
-    Raises:
-        CameraError: an impossible covariance, or an unknown parameter.
+    """Read the joint covariance of the given cameras from cameras.yaml, with parameters named camera.parameter.
+    Without a joint one: the cameras' own as independent blocks, None where one is missing. CameraError if impossible.
     """
     path = Path(path)
     entry = read_document(path, SCHEMA, CameraError).get("covariance")
@@ -160,13 +145,8 @@ def save_cameras(
     comment: str = "",
     covariance: ParameterCovariance | None = None,
 ) -> None:
-    """Write cameras to a file that `load_cameras` reads back to the last bit, with ports and covariances.
-
-    Args:
-        path: the file; an existing one is replaced atomically.
-        cameras: name -> camera.
-        comment: lines for the top of the file.
-        covariance: of all cameras together, from a joint fit.
+    """Write cameras, by name, to a file that `load_cameras` reads back to the last bit; replace an old file atomically.
+    `comment` stands at its top; `covariance` is that of a joint fit.
 
     Raises:
         CameraError: a camera of a model that is not in MODELS.
@@ -214,7 +194,6 @@ def _with_port_and_covariance(camera: CameraModel, entry: CameraEntry) -> Camera
 
 
 def _described(camera: Camera) -> dict[str, Any]:
-    """Return the keys of a camera in cameras.yaml: the inverse of `_build`."""
     if isinstance(camera, PortCamera):
         inner = {key: value for key, value in _described(camera.camera).items() if key != "covariance"}
         return inner | {"port": _values(Port.KEYS, camera.port)} | _covariance_keys(camera.covariance)
@@ -238,7 +217,7 @@ def _covariance_keys(covariance: ParameterCovariance | None) -> dict[str, Any]:
 
 
 def _independent(cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
-    """Return the cameras' own covariances as blocks of one; None where a camera has none."""
+    """Return the cameras' own covariances as diagonal blocks; None where a camera has none."""
     parts = {name: camera.covariance for name, camera in cameras.items() if camera.covariance is not None}
     if not parts or len(parts) < len(cameras):
         return None

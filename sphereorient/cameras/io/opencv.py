@@ -1,5 +1,3 @@
-"""OpenCV's calibration files (FileStorage: .yml, .yaml, .xml, .json), read and written."""
-
 from __future__ import annotations
 
 import math
@@ -20,7 +18,7 @@ from sphereorient.files.yaml_file import short
 
 SUFFIXES = (".yml", ".yaml", ".xml", ".json")  # OpenCV chooses the format by them
 MOST = 64  # numbers of a matrix: OpenCV allocates what the file claims before it counts
-# OpenCV's parser recurses at each level and can crash. Each level needs one of these; OpenCV's files have dozens.
+# OpenCV's parser recurses at each level and can crash. Each level needs one of these; usual files have dozens.
 OPENER = re.compile(rb"[\[{]|-\s|<[^/?!]")
 MOST_OPENERS, MOST_BLANKS = 3000, 200  # the second: levels by indentation
 LENGTHS = (4, 5, 8, 12, 14)  # of distortion_coefficients, in OpenCV's order k1 k2 p1 p2 k3 ...
@@ -29,18 +27,12 @@ Array = NDArray[np.float64]
 
 
 def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> BrownCamera:
-    """Read a camera that OpenCV's calibration has written.
-
-    Args:
-        path: with `camera_matrix` and `distortion_coefficients`, and optionally `R` or `rvec`, `T` or `tvec` (taken as
-            mm; without them the lab is the camera frame), `image_width` and `image_height`.
-        image_size: (W, H), px, for files without it.
+    """Read a camera that OpenCV's calibration has written; the first pixel's centre is (0, 0).
+    The file has `camera_matrix`, `distortion_coefficients`, optional `R` or `rvec`, `T` or `tvec` (mm; without them the
+    lab is the camera frame), `image_width` and `image_height` (without them give `image_size`, (W, H) px).
 
     Raises:
-        CameraError: missing, not OpenCV's, a key that is missing or impossible, a camera matrix with shear, or a
-            distortion beyond k1, k2, p1, p2, k3.
-
-    Source: the sample programs' keys; the first pixel's centre is (0, 0), as here.
+        CameraError: no OpenCV file, a missing or impossible key, shear, or distortion beyond k1, k2, p1, p2, k3.
     """
     path = Path(path)
     storage = _opened(path)
@@ -73,14 +65,10 @@ def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> 
 
 
 def save_opencv(path: Path | str, camera: BrownCamera) -> None:
-    """Write a camera as OpenCV's calibration does, to the last bit; OpenCV has no key for the covariance.
-
-    Args:
-        path: ending in .yml, .yaml, .xml or .json, which chooses the format.
-        camera: its T is written in mm.
+    """Write a camera, T in mm, as OpenCV does, to the last bit, without covariance.
 
     Raises:
-        OutputError: another ending, or a file that cannot be written.
+        OutputError: an ending other than .yml, .yaml, .xml or .json, or a file that cannot be written.
     """
     path = Path(path)
     expected, got, do = f"a name ending in {', '.join(SUFFIXES)}", f"'{path.suffix}'", "rename it"
@@ -131,7 +119,7 @@ def _node(storage: cv2.FileStorage, key: str) -> Array | None:
 
 
 def _claims_few(node: cv2.FileNode) -> bool:
-    """Return whether a matrix claims at most MOST numbers, by its rows and columns or by the sizes of its axes."""
+    """Return whether a matrix claims at most MOST numbers, by rows and columns or by the sizes of its axes."""
     axes = node.getNode("sizes")
     if axes.empty():
         sides = [_whole(node.getNode(side)) for side in ("rows", "cols")]
@@ -142,7 +130,6 @@ def _claims_few(node: cv2.FileNode) -> bool:
 
 
 def _whole(node: cv2.FileNode) -> int | None:
-    """Return a whole number; None for anything else."""
     if not (node.isInt() or node.isReal()):
         return None
     number = float(node.real())

@@ -1,7 +1,6 @@
-"""OpenPTV's calibration files: .ori and .addpar of each camera, ptv.par of all; read and written.
+"""OpenPTV's calibration files: .ori and .addpar of each camera, ptv.par of all.
 
-OpenPTV counts pixels from the picture's corner: the first pixel's centre is (0.5, 0.5), ours is (0, 0). Its camera
-looks along its -z with y up.
+OpenPTV's first pixel has its centre at (0.5, 0.5), ours at (0, 0). Its camera looks along its -z with y up.
 """
 
 from __future__ import annotations
@@ -53,17 +52,12 @@ class PtvPar:
 
 
 def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None) -> Camera:
-    """Read a camera of OpenPTV, behind a port where the media refract; the lab is OpenPTV's world, mm.
-
-    Args:
-        ori: .ori file; as in OpenPTV, the angles are used and the matrix is not.
-        par: from `load_ptv_par`.
-        addpar: .addpar file; None: no distortion.
+    """Read a camera from .ori and .addpar (None: no distortion), behind a port where the media refract.
+    The lab is OpenPTV's world, mm; as in OpenPTV, the angles of the .ori file count, not its matrix.
+    Source: OpenPTV's read_ori; dm = Rx(omega) Ry(phi) Rz(kappa), R_cam_lab = diag(1, -1, -1) dm^T.
 
     Raises:
         CameraError: a missing, truncated or malformed file, or impossible parameters.
-
-    Source: OpenPTV's read_ori; dm = Rx(omega) Ry(phi) Rz(kappa), R_cam_lab = diag(1, -1, -1) dm^T.
     """
     ori = Path(ori)
     v = _numbers(ori, None, ORI_NUMBERS, ORI_PARTS)
@@ -111,11 +105,7 @@ def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
 
 
 def load_ptv_par(path: Path | str) -> PtvPar:
-    """Read the sensor and the media from ptv.par.
-
-    Raises:
-        CameraError: a missing, truncated or malformed file, or interlaced cameras.
-    """
+    """Read the sensor and the media from ptv.par; CameraError if missing, malformed or interlaced."""
     path = Path(path)
     words = _words(path, "\n")
     count = words[0].strip() if words else ""
@@ -140,11 +130,7 @@ def load_ptv_par(path: Path | str) -> PtvPar:
 
 
 def save_ptv_par(path: Path | str, par: PtvPar, names: Sequence[str]) -> None:
-    """Write ptv.par for cameras that share sensor and media; their pictures are img/NAME. and cal/NAME.tif.
-
-    Raises:
-        OutputError: a file that cannot be written.
-    """
+    """Write ptv.par for cameras with common sensor and media, pictures img/NAME. and cal/NAME.tif (or OutputError)."""
     lines = [str(len(names))]
     for name in names:
         lines += [f"img/{name}.", f"cal/{name}.tif"]
@@ -154,11 +140,7 @@ def save_ptv_par(path: Path | str, par: PtvPar, names: Sequence[str]) -> None:
 
 
 def par_of(camera: Camera) -> PtvPar:
-    """Return the content of ptv.par for a camera.
-
-    Raises:
-        CameraError: another model than OpenPTV's.
-    """
+    """Return the content of ptv.par for an OpenPTV camera; CameraError for another model."""
     inner = _openptv_of(camera)
     pitch_u, pitch_v = inner.pixel_pitch_mm.tolist()
     par = PtvPar(image_size=inner.image_size, pixel_pitch_mm=(pitch_u, pitch_v))
