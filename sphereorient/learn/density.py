@@ -1,4 +1,4 @@
-"""From a density over SO(3) to candidates: its modes, their orientation and probability."""
+"""From a density over SO(3) to candidates."""
 
 from __future__ import annotations
 
@@ -25,14 +25,9 @@ class Modes:
 
 
 def find_modes(logits: Tensor, grid: Tensor, count: int, temperature: float = 1.0) -> Modes:
-    """Find the K likeliest modes of densities on a grid.
+    """Find the `count` (K) likeliest modes of log densities (F, G), each up to a constant, on rotations (G, 3, 3).
 
-    Args:
-        logits: (F, G), log density up to a constant of each disk.
-        grid: (G, 3, 3) rotations, evenly spread.
-        count: K.
-        temperature: divides the logits for probabilities and order only. The orientation of a mode is the mean of the
-            density as it was learnt: a sharper density would shift it to the nearest grid point.
+    The temperature divides the logits for probabilities and order only: it would bias the mean orientations.
     """
     flat = grid.flatten(1)
     probability = logits.softmax(-1)

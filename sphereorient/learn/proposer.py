@@ -34,14 +34,7 @@ def probability_of(score: Tensor) -> Tensor:
 
 
 class LearnedProposer:
-    """Proposes the modes of the density over SO(3) that a trained network predicts.
-
-    Args:
-        correlator: the trained network.
-        texture: (H, 2 H), the ball's map, 0 black .. 1 white.
-        temperature: of the logits, for calibrated probabilities.
-        candidates: at most, of each disk.
-    """
+    """Proposes modes of the density that a network predicts for a map (H, 2 H), 0 black .. 1 white."""
 
     def __init__(
         self, correlator: Correlator, texture: Tensor, *, temperature: float = 1.0, candidates: int = CANDIDATES
@@ -58,14 +51,10 @@ class LearnedProposer:
 
     @torch.inference_mode()
     def propose(self, disks: Tensor) -> Proposals:
-        """Propose orientations in the view frames of disks, with `score_of` their probability.
+        """Propose orientations, view frame, of disks (F, S, S) float32, any grey, outline at the borders; see
+        `score_of`.
 
-        Args:
-            disks: (F, S, S) float32, grey levels of any scale; the outline touches the borders. A uniform disk has no
-                proposals (`LOW_SCORE`).
-
-        Raises:
-            ShapeError: disks of another size.
+        A uniform disk has no proposals (`LOW_SCORE`); raise ShapeError for disks of another size.
         """
         if disks.shape[1:] != (self.size_px, self.size_px):
             size = f"(F, {self.size_px}, {self.size_px})"
@@ -85,7 +74,6 @@ class LearnedProposer:
         )
 
     def _modes(self, disks: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the modes of one full batch: rotations (B, K, 3, 3) and probabilities (B, K)."""
         logits = self._network.logits(self._network.seen(disks), self._bank)
         modes = find_modes(logits, self._network.grid, self._candidates, self._temperature)
         return modes.R_view_body, modes.probability

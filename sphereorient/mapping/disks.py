@@ -1,4 +1,4 @@
-"""The ball's disks normalised against light, with their slopes: for comparing pictures before there is a map."""
+"""Locally normalised disks of the sphere with their slopes, to compare pictures before there is a map."""
 
 from __future__ import annotations
 
@@ -23,10 +23,7 @@ DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Disks:
-    """Normalised disks of N instants and C cameras.
-
-    A disk's picture is (S, S), the limb touches its edges; its view frame is x right, y down, z to the ball.
-    """
+    """Normalised disks (S, S), limb at the edges, of N instants and C cameras; view: x right, y down, z to the sphere."""
 
     layers: Tensor  # (N, C, 3, S, S) float32: normalised grey, its slope to the right and down, per radius
     share: Tensor  # (S, S), weight of a pixel, 0 at the limb .. 1
@@ -36,11 +33,10 @@ class Disks:
     shown: Tensor | None = None  # (N, C, S, S) float32, 0 where something hides the ball .. 1; None: nothing does
 
     def __len__(self) -> int:
-        """Return the number of instants."""
         return len(self.layers)
 
     def where(self, rows: Tensor | slice, cameras: slice = slice(None)) -> Disks:
-        """Return some of the instants and cameras."""
+        """Select instants and cameras."""
         shown = None if self.shown is None else self.shown[rows, cameras]
         names = ("layers", "R_lab_view", "distance_radii", "seen")
         return Disks(share=self.share, shown=shown, **{name: getattr(self, name)[rows, cameras] for name in names})
@@ -53,11 +49,7 @@ class Disks:
     def sampled(
         self, rows: Tensor | slice, camera: int, every: int = 1, slant_power: int = 1
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each n-th (`every`) pixel of some disks (R,) of a camera; weights have the slant's cosine to a power.
-
-        Returns:
-            Directions in the view frame (3, P), grey (R, P) and weight (R, P).
-        """
+        """Return each n-th pixel of disks (R,): view directions (3, P), grey (R, P), weight (R, P) by slant."""
         far, size = self.distance_radii[:, camera].median(), self.size_px
         view = perspective_view(size, float(far))
         pixel = torch.nonzero(view.inside.reshape(-1))[:, 0]
@@ -113,15 +105,9 @@ def normalised_disks(
     settings: MapSettings,
     shown: Tensor | None = None,
 ) -> Disks:
-    """Remove the light from disks: difference from the local mean over the local deviation.
+    """Return disks of pictures (N, C, S, S), any finite grey levels; local mean removed, over the local deviation.
 
-    Args:
-        pictures: (N, C, S, S), grey levels of any scale, finite also where not seen.
-        R_lab_view: (N, C, 3, 3).
-        distance_radii: (N, C), above 1.
-        seen: (N, C) bool.
-        settings: of `detail` and `window`.
-        shown: (N, C, S, S), 0 where something hides the ball .. 1; None: nothing does.
+    R_lab_view is (N, C, 3, 3), distance_radii (N, C), above 1, seen (N, C) bool; `shown` (N, C, S, S), 0 hidden .. 1.
     """
     size = pictures.shape[-1]
     share = rim_share(size)
@@ -157,7 +143,7 @@ def _with_slopes(grey: Tensor) -> Tensor:
 
 
 def reduced(disks: Disks, factor: int) -> Disks:
-    """Return the disks with pictures smaller by a whole factor."""
+    """Return the disks with pictures reduced by a whole factor."""
     return replace(
         disks,
         layers=_with_slopes(F.avg_pool2d(disks.layers[:, :, 0], factor)),
@@ -167,11 +153,9 @@ def reduced(disks: Disks, factor: int) -> Disks:
 
 
 def disk_places(normal_view: Tensor, distance_radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Project directions (..., 3, P), view frame, onto a disk seen from a distance (...), radii.
+    """Return places (..., 2, P), radii, of directions (..., 3, P), view, on a disk seen from a distance (...), radii.
 
-    Returns:
-        Places (..., 2, P) in radii of the disk, their derivative by x and y of the direction (..., 1, P), and the
-        cosine of the slant (..., P), not positive where invisible.
+    Return also their derivative by x and y (..., 1, P) and the slant's cosine (..., P), not positive where invisible.
     """
     D = distance_radii[..., None, None]
     x_y, z = normal_view[..., :2, :], normal_view[..., 2:, :]

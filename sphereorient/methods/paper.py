@@ -1,4 +1,4 @@
-"""Section III of the paper, corrected, step by step: each camera by itself, then their fusion."""
+"""Section III of the paper, corrected, step by step: each camera alone, then their fusion."""
 
 from __future__ import annotations
 
@@ -35,14 +35,7 @@ def learn(job: Job, progress: Progress) -> None:
 def track(
     job: Job, follower: Follower | None, measured: Iterable[list[Poses]], progress: Progress
 ) -> tuple[Trajectory, None]:
-    """Measure the movies as the paper does; uneven times must keep to a grid.
-
-    Args:
-        job: what to measure.
-        follower: not used.
-        measured: not used.
-        progress: called with stage, frames done and frames in all.
-    """
+    """Measure the movies as in the paper, on a regular time grid; `follower` and `measured` are not used."""
     settings = job.settings
     grid, place = job.recording.gridded()
     cameras, clock = grid.cameras, grid.clock
@@ -89,7 +82,7 @@ def locate_sphere(recording: Recording, stream: CameraStream, settings: Settings
 def propose_orientations(
     stream: CameraStream, sightings: Sightings, texture: Tensor, settings: Settings, progress: Progress
 ) -> Candidates:
-    """Propose orientations for every frame in which one camera has the sphere, in the lab frame."""
+    """Propose orientations, lab frame, for every frame in which one camera has the sphere."""
     stage = f"{stream.name}: orient"
     total = len(stream)
     progress(stage, 0, total)
@@ -118,13 +111,7 @@ BLIND = (Reason.UNDECODABLE, Reason.MISSING, Reason.REPEATED, Reason.DARK, Reaso
 
 
 def in_the_lab(proposals: Proposals, camera: Camera, centre_px: Tensor) -> Candidates:
-    """Turn orientations from the view frame of each frame into the lab, the perspective removed (docs/errata.md A1).
-
-    Args:
-        proposals: of N frames.
-        camera: that saw them.
-        centre_px: (N, 2), the outline's centre.
-    """
+    """Convert N proposals from view to lab frame, perspective removed (docs/errata.md A1); centre_px (N, 2)."""
     direction_cam = camera.rays(centre_px).direction_lab @ camera.R_cam_lab.mT
     R_lab_view = camera.R_cam_lab.mT @ R_cam_view(direction_cam)
     frame = torch.repeat_interleave(torch.arange(len(centre_px)), proposals.offset.diff())
@@ -137,7 +124,7 @@ def in_the_lab(proposals: Proposals, camera: Camera, centre_px: Tensor) -> Candi
 
 
 def resume(job: Job, learnt: Learnt) -> Follower:
-    """Refuse what another run learnt."""
+    """Refuse results of another run."""
     do = "leave it out, or use method precise"
     raise SettingsError(refusal("learnt", expected="method precise", got="method paper", do=do))
 

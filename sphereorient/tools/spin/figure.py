@@ -1,4 +1,4 @@
-"""The figure of a spin: each photograph beside the ball as the spin predicts it."""
+"""The figure of a spin: each photograph beside the predicted ball."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST = 36  # photographs that are drawn, the first ones
 
 @in_style
 def spin_figure(found: SpinFound, texture: Tensor, time_s: Tensor, names: Sequence[str]) -> Figure:
-    """Draw photographs and the texture map (H, 2 H) at the first spin's attitudes, in the order of the times (F,)."""
+    """Draw photographs and the map (H, 2 H) at the first spin's orientations, in order of the times (F,), s."""
     chosen = time_s.argsort()[:MOST].tolist()
     size, rows = found.disks.shape[-1], math.ceil(len(chosen) / COLUMNS)
     texture = reduced_texture(texture.float(), size)

@@ -1,8 +1,4 @@
-"""Uniform spins R(t) = exp(omega (t - t0)) R(t0) through the candidate attitudes of many pictures.
-
-Pictures at multiples of one time step cannot distinguish omega from omega + 2 pi k / step along its axis. All these
-aliases below a limit are fitted and reported.
-"""
+"""Uniform spins R(t) = exp(omega (t - t0)) R(t0) through candidates; at a constant step omega has aliases."""
 
 from __future__ import annotations
 
@@ -32,7 +28,7 @@ REPORTED = 32  # spins at most
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureCandidates:
-    """Candidate attitudes of F pictures, C each, padded."""
+    """Candidate orientations of F pictures, C each, padded."""
 
     time_s: Tensor  # (F,) float64
     R_view_body: Tensor  # (F, C, 3, 3) float64
@@ -40,7 +36,7 @@ class PictureCandidates:
 
     @property
     def step_s(self) -> float:
-        """Shortest time between two pictures, averaged over all gaps, taken as multiples of it."""
+        """Shortest time, s, between two pictures, averaged over all gaps as multiples of it."""
         gap = self.time_s.sort().values.diff()
         gap = gap[gap > 0]
         return float(gap.sum() / (gap / gap.min()).round().sum())
@@ -58,15 +54,14 @@ class Spins:
     covariance: Tensor  # (K, 6, 6), of a small rotation of R0 (view, rad) and of omega (rad/s)
 
     def __len__(self) -> int:
-        """Return K."""
         return len(self.evidence)
 
     def of(self, chosen: Tensor) -> Spins:
-        """Return some of them, by mask or by index."""
+        """Select spins by mask or by index."""
         return Spins(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
 
     def R_view_body(self, time_s: Tensor) -> Tensor:
-        """Return attitudes (K, F, 3, 3) at times (F,)."""
+        """Return orientations (K, F, 3, 3) at times (F,), s."""
         since = time_s - self.time0_s[:, None]
         return so3.exp(self.omega_view_rad_s[:, None] * since[..., None]) @ self.R0_view_body[:, None]
 
@@ -77,14 +72,7 @@ class Spins:
 
 
 def picture_candidates(time_s: Tensor, offset: Tensor, R_view_body: Tensor, weight: Tensor) -> PictureCandidates:
-    """Pad candidates to one record.
-
-    Args:
-        time_s: (F,), any order.
-        offset: (F + 1,) int64; the candidates of picture f are the rows offset[f] .. offset[f + 1].
-        R_view_body: (M, 3, 3).
-        weight: (M,), not negative, any unit: only ratios within a picture count.
-    """
+    """Pad candidates (M, 3, 3), weights (M,): offset[f] .. offset[f + 1] belong to picture f of times (F,), s."""
     counts = offset.diff()
     width = max(int(counts.max()) if len(counts) else 0, 1)
     there = torch.arange(width) < counts[:, None]
@@ -96,10 +84,7 @@ def picture_candidates(time_s: Tensor, offset: Tensor, R_view_body: Tensor, weig
 
 
 def fit_spins(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
-    """Find the best uniform spin below a limit and all its aliases, best first.
-
-    None is found where no two neighbouring pictures have candidates.
-    """
+    """Find the best uniform spin below a limit and all its aliases, best first; none without neighbours."""
     spins = _guesses(seen, omega_max_rad_s)
     if not len(spins):
         return spins
@@ -121,13 +106,7 @@ def fit_spins(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
 
 
 def refine_spins(seen: PictureCandidates, spins: Spins, *, iterations: int, span_s: float = math.inf) -> Spins:
-    """Fit spins to the candidates within a span of their own time0, by expectation and maximisation.
-
-    Each picture's candidates share its weight with the case that none is right; the scatter of right candidates about
-    the spin is estimated too.
-
-    Source: Dempster et al. 1977; the slope of exp is its left Jacobian.
-    """
+    """Fit spins and their scatter to candidates within a span of time0, by EM (Dempster et al. 1977)."""
     since = seen.time_s - spins.time0_s[:, None]
     near = (since.abs() <= span_s).double()
     for _ in range(iterations):
@@ -157,7 +136,7 @@ def refine_spins(seen: PictureCandidates, spins: Spins, *, iterations: int, span
 
 
 def evidence_of(seen: PictureCandidates, spins: Spins) -> Tensor:
-    """Return each picture's part of the evidence, (K, F): below 0 where no candidate is near."""
+    """Return each picture's part of the evidence, (K, F): below 0 if no candidate is near."""
     return _matched(seen, spins)[2]
 
 
@@ -211,12 +190,7 @@ def _aliases(best: Spins, seen: PictureCandidates, omega_max_rad_s: float) -> Sp
 
 
 def _matched(seen: PictureCandidates, spins: Spins) -> tuple[Tensor, Tensor, Tensor]:
-    """Compare spins with candidates.
-
-    Returns:
-        Rotations (K, F, C, 3) from the spin's attitudes to the candidates, view frame; the probability (K, F, C) that
-        each is the right one; the log of the likelihood over that of random attitudes (K, F).
-    """
+    """Return rotations (K, F, C, 3), view, from spins to candidates, probabilities (K, F, C), log evidence (K, F)."""
     predicted = spins.R_view_body(seen.time_s)  # (K, F, 3, 3)
     turn = so3.log(seen.R_view_body @ predicted[:, :, None].mT)
     scatter = spins.scatter_rad[:, None, None]
@@ -230,7 +204,7 @@ def _matched(seen: PictureCandidates, spins: Spins) -> tuple[Tensor, Tensor, Ten
 
 
 def _slope(omega: Tensor, since: Tensor) -> Tensor:
-    """Return the derivative of the attitudes (K, F, 3, 6), view frame, by a rotation of R0 and by omega."""
+    """Return the derivative of the orientations (K, F, 3, 6), view frame, by a rotation of R0 and by omega."""
     swept = omega[:, None] * since[..., None]
     angle = swept.norm(dim=-1)[..., None, None]
     axis = torch.nn.functional.normalize(swept, dim=-1)
@@ -246,7 +220,7 @@ def _joined(parts: Sequence[Spins]) -> Spins:
 
 
 def _distinct(spins: Spins, time_s: Tensor, by_spin: bool = False) -> Spins:
-    """Return spins, best first, without those with the attitudes (`by_spin`: and the rate) of a better one."""
+    """Return spins, best first, without those with the orientations (`by_spin`: and the rate) of a better one."""
     spins = spins.of(spins.evidence.argsort(descending=True, stable=True))
     R = spins.R_view_body(time_s)
     apart = torch.stack([so3.geodesic_distance(R, one).amax(-1) for one in R]) if len(R) else R.new_zeros(0, 0)

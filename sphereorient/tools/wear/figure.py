@@ -1,4 +1,4 @@
-"""The figure of a series of texture maps: what changed, map by map, and how the worn share grows."""
+"""The figure of a series of texture maps: changes of each map, and growth of the worn share."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _mark(axes: Axes, series: WearSeries, k: int) -> None:
 
 
 def _draw_growth(axes: Axes, series: WearSeries, names: Sequence[str]) -> None:
-    """Draw the worn share of each map's known area, and that of the largest places, over the series."""
+    """Draw the worn share of each map's known area, and of the largest places."""
     at = np.arange(1, len(series.wear) + 1)
     whole = 100 * np.array([one.worn for one in series.growth])
     axes.plot(np.append(0, at), np.append(0, whole), marker=ALL.marker, label="all, of the known area", **ALL.drawn)

@@ -67,7 +67,7 @@ class WornPlace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WearSeries:
-    """How one ball wore from map to map."""
+    """The wear of one ball from map to map."""
 
     wear: tuple[Wear, ...]  # of all maps but the first
     number: Tensor  # (H, 2 H) int64, place of each texel, from 1 on; 0 where no map is worn
@@ -81,15 +81,9 @@ class WearSeries:
 
 
 def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
-    """Find the wear of a ball between movies: compare each map (H, 2 H) with the first, in its body frame.
+    """Compare maps (H, 2 H), 0 black .. 1 white, NaN unknown, in time order with the first, in its body frame.
 
-    Args:
-        maps: 0 black .. 1 white, NaN where unknown; in the order of the movies.
-        turned: find the rotations between the body frames first; False: they are the same.
-
-    Raises:
-        PaintError: fewer than two maps, or they do not show one ball.
-        ShapeError: not 2:1.
+    `turned`: find the rotations between body frames. Raise PaintError for other balls, ShapeError if not 2:1.
     """
     if len(maps) < 2:
         do = "give the maps in the order of their movies"
@@ -104,7 +98,6 @@ def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
 
 
 def _shares(height: int) -> Tensor:
-    """Return the texels' shares of the sphere's area, (height, 2 height) float64."""
     return texel_areas(height) / (4 * math.pi)
 
 
@@ -144,7 +137,6 @@ def _figures(now: Wear, before: Wear | None) -> WearFigures:
 
 
 def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
-    """Return the middle of a place (H, 2 H) bool, and its worn share in each map."""
     area = _shares(len(inside))
     direction = map_directions(len(inside))[inside].double()
     x, y, z = (direction * area[inside][:, None]).sum(0).tolist()
