@@ -148,6 +148,7 @@ def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats
     """Return geodesic distances (N,), degrees, of R (N, 3, 3) from the truth; NaN: not measured.
 
     `align`: "none"; "body" fits B in R B (arbitrary body axes); "both" fits A and B in A R B (any frame of reference).
+    Raise BenchError for another word.
     """
     if align not in ALIGNMENTS:
         raise BenchError(refusal("--align", expected="none, body or both", got=repr(align)[:40], do="choose one"))

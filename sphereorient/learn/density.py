@@ -1,5 +1,3 @@
-"""From a density over SO(3) to candidates."""
-
 from __future__ import annotations
 
 import math

@@ -1,5 +1,3 @@
-"""Metrics of proposals: recall of the right orientation, and calibration of the probabilities."""
-
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence

@@ -1,5 +1,3 @@
-"""The trained network as a proposer, in place of the template search."""
-
 from __future__ import annotations
 
 from pathlib import Path
@@ -34,7 +32,10 @@ def probability_of(score: Tensor) -> Tensor:
 
 
 class LearnedProposer:
-    """Proposes modes of the density that a network predicts for a map (H, 2 H), 0 black .. 1 white."""
+    """Proposes modes of the density that a network predicts for a map (H, 2 H), 0 black .. 1 white.
+
+    At most `candidates` for each disk; `temperature` divides the logits, for calibrated probabilities.
+    """
 
     def __init__(
         self, correlator: Correlator, texture: Tensor, *, temperature: float = 1.0, candidates: int = CANDIDATES

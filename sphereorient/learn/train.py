@@ -1,5 +1,3 @@
-"""Training of a proposer: from settings to a folder with its checkpoint."""
-
 from __future__ import annotations
 
 import logging

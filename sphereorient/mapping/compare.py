@@ -200,7 +200,6 @@ def _common_turn(direction: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _shrunk(score: Tensor, known: Tensor) -> Tensor:
-    """Shrink correlations (M,) where little is known in both maps."""
     return score * known / (known + KNOWN_USUAL)
 
 
@@ -243,7 +242,7 @@ class Correction:
 
 
 def corrected(learnt: LearntMap, old: Tensor) -> Correction:
-    """Express a learnt map in the frame of an old one (h, 2 h), used where unseen; raise PaintError for other spheres."""
+    """Express a learnt map in the frame of an old one (h, 2 h), used where unseen; raise PaintError on a mismatch."""
     comparison = compare_maps(learnt.texture, old)
     Q = comparison.R_other_reference
     height = max(len(old), len(learnt.texture))

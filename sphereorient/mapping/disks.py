@@ -23,7 +23,7 @@ DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Disks:
-    """Normalised disks (S, S), limb at the edges, of N instants and C cameras; view: x right, y down, z to the sphere."""
+    """Normalised disks (S, S), limb at the edges, of N instants, C cameras; view: x right, y down, z to the sphere."""
 
     layers: Tensor  # (N, C, 3, S, S) float32: normalised grey, its slope to the right and down, per radius
     share: Tensor  # (S, S), weight of a pixel, 0 at the limb .. 1
@@ -42,14 +42,17 @@ class Disks:
         return Disks(share=self.share, shown=shown, **{name: getattr(self, name)[rows, cameras] for name in names})
 
     def weight(self, rows: Tensor | slice, camera: int) -> Tensor:
-        """Return the weights (R, S * S) of the pixels of some disks: 0 where not seen or hidden."""
+        """Return pixel weights (R, S * S) of some disks: 0 where not seen or hidden."""
         counts = self.seen[rows, camera][:, None] * torch.ones(self.size_px**2)
         return counts if self.shown is None else counts * self.shown[rows, camera].flatten(1)
 
     def sampled(
         self, rows: Tensor | slice, camera: int, every: int = 1, slant_power: int = 1
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each n-th pixel of disks (R,): view directions (3, P), grey (R, P), weight (R, P) by slant."""
+        """Return each n-th (`every`) pixel of disks (R,): view directions (3, P), grey (R, P), weight (R, P).
+
+        Weights are multiplied by the slant's cosine to the power `slant_power`.
+        """
         far, size = self.distance_radii[:, camera].median(), self.size_px
         view = perspective_view(size, float(far))
         pixel = torch.nonzero(view.inside.reshape(-1))[:, 0]

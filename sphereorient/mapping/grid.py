@@ -31,7 +31,6 @@ def _spline(place: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _spline_slope(place: Tensor) -> Tensor:
-    """Return the derivative of the weights by the place, (..., 4)."""
     t = place - place.floor()
     s = 1 - t
     slopes = [-s * s, t * (3 * t - 4), s * (4 - 3 * s), t * t]
@@ -90,7 +89,6 @@ def look_up(texture: Tensor, direction_body: Tensor) -> Tensor:
 
 
 def _tangents(direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Return two orthogonal unit tangents of the sphere at directions (M, 3)."""
     helper = torch.where(
         direction[:, 2:].abs() < 0.9, direction.new_tensor([0.0, 0, 1]), direction.new_tensor([1.0, 0, 0])
     )

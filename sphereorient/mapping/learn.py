@@ -265,7 +265,6 @@ def _counts(state: State, direction_body: Tensor) -> Tensor:
 
 
 def _not_hidden(view: CameraView, place_lab_mm: Tensor) -> Tensor:
-    """Return whether places (..., 3) are not hidden in a camera's picture, (...)."""
     width, height = view.camera.image_size
     u, v = view.camera.project(place_lab_mm).nan_to_num().round().long().unbind(-1)
     shown = torch.from_numpy(view.background.shown)

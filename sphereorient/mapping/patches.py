@@ -41,7 +41,6 @@ class Patches:
 
 
 def _offsets(step_deg: float) -> Tensor:
-    """Return the sample places of a patch in its tangent plane, (P, 2) float64, rad."""
     count = math.floor(RADIUS_DEG / step_deg)
     at = torch.arange(-count, count + 1, dtype=torch.float64) * math.radians(step_deg)
     grid = torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).reshape(-1, 2)

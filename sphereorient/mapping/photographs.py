@@ -69,7 +69,12 @@ class Evidence:
     score_min: float
 
     def log_odds(self, pairs: RelativeRotations) -> Tensor:
-        """Return the log-odds (E,) of pairs: Fisher's z over n places, mean 0 or 2 `score_min` (Fisher 1921)."""
+        """Return the log-odds (E,) of pairs, from Fisher's z of their correlations over n independent places.
+
+        Its mean is 0 for different patches, about twice that of `score_min` for the same; the variance is 1 / n.
+
+        Source: Fisher 1921, On the probable error of a coefficient of correlation.
+        """
         middle = math.atanh(self.score_min)
         z = pairs.score.clamp(-LIKE_MAX, LIKE_MAX).atanh()
         return 2 * middle * self.cells * pairs.overlap * (z - middle)

@@ -1,5 +1,3 @@
-"""The result of mapping: the texture map and all that was estimated with it."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -88,7 +88,6 @@ def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Propose
 
 
 def _proposer(texture: Tensor, settings: ProposeSettings, templates: Callable[[], Proposer]) -> Proposer:
-    """Return the network, the templates, or both; a template bank is made only if it is needed."""
     network = trained_network(texture, settings)
     if network is not None and settings.when == "always":
         return network

@@ -168,7 +168,6 @@ def _keys(tree: Mapping[str, Any]) -> list[str]:
 
 
 def _renamed(text: str, remarks: list[str]) -> str:
-    """Return an override under the key's new name."""
     key, equals, value = text.partition("=")
     new = RENAMED.get(key.strip())
     if new is None:

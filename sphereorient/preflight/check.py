@@ -1,5 +1,3 @@
-"""The check before a run: sample the movies, run every check, collect the findings."""
-
 from __future__ import annotations
 
 import math
@@ -47,7 +45,9 @@ class Preflight:
 def preflight(
     experiment: Experiment | Path | str, settings: Settings | None = None, progress: Progress = silent
 ) -> Preflight:
-    """Check an experiment before a run: files, cameras, movies, ball, paint, light; `progress` gets stage, done, total.
+    """Check an experiment before a run: files, cameras, movies, ball, paint, light.
+
+    `settings` of the planned run, None: the defaults; `progress` gets stage, done, total.
 
     Raises:
         SphereOrientError: a file is missing or unreadable, or contradicts the others.

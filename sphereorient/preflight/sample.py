@@ -141,7 +141,6 @@ def sample_more(sample: MovieSample, frames: Sequence[int], settings: LocateSett
 
 
 def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:
-    """Screen the pictures as the tracker does, and find the ball in the usable ones."""
     screen: list[Reason] = []
     found: list[Found] = []
     rows = sample.row

@@ -98,7 +98,6 @@ def _cos_latitude(height: int) -> Tensor:
 
 
 def _patch_rad(texture: Tensor, mean: float) -> float:
-    """Return the typical width of a patch, rad, from the autocorrelation of the map."""
     rng = torch.Generator().manual_seed(0)
     at, side = torch.nn.functional.normalize(torch.randn(2, DRAWS, 3, generator=rng), dim=-1)
     side = torch.nn.functional.normalize(side - (side * at).sum(-1, keepdim=True) * at, dim=-1)

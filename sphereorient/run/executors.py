@@ -107,7 +107,7 @@ class DaskExecutor:
 
 
 def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
-    """Connect to Dask: a scheduler's address or file (.json), or `local` (workers None: one per core).
+    """Connect to Dask: a scheduler (tcp://host:8786), its file (.json), or `local` (workers None: one per core).
 
     Raises:
         SettingsError: Dask is not installed, or the scheduler does not answer.

@@ -1,5 +1,3 @@
-"""Results of the benchmark: by scene, by degradation and level, and compared between two runs."""
-
 from __future__ import annotations
 
 import json

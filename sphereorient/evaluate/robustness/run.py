@@ -1,5 +1,3 @@
-"""The run of the benchmark: render, track and measure each scene; finished scenes are kept."""
-
 from __future__ import annotations
 
 import json

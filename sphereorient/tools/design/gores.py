@@ -126,7 +126,7 @@ def _draw_rule(axes: Axes, gores: Gores) -> None:
 
 
 def write_gores(texture: Tensor, gores: Gores, folder: Path) -> list[Path]:
-    """Write strips and stencil at true size as PDF and SVG, and instructions; return the files, or raise OutputError."""
+    """Write strips and stencil as PDF and SVG of true size, and instructions; return the files or raise OutputError."""
     written = []
     for name, filled in (("gores", True), ("stencil", False)):
         for suffix, when in ((".pdf", "CreationDate"), (".svg", "Date")):

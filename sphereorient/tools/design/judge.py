@@ -101,7 +101,6 @@ def lon_lat_deg(direction_body: Tensor) -> Tensor:
 
 
 def _spread(values: Tensor) -> dict[str, float | None]:
-    """Return least, middle and greatest value; None for infinity."""
     named = {"min": values.min(), "median": values.median(), "max": values.max()}
     return {name: float(value) if bool(value.isfinite()) else None for name, value in named.items()}
 

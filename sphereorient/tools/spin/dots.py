@@ -82,7 +82,6 @@ class DotTable:
 
 
 def _half_width_deg(profile: Tensor, guess_deg: float) -> float:
-    """Return the angle, degrees, at which a profile is halfway from its middle to the white around."""
     outer = profile[round(2 * guess_deg) :]
     around = float(outer.median()) if len(outer) else math.nan
     middle = float(profile[0]) if len(profile) else math.nan

@@ -1,5 +1,3 @@
-"""The figure of a spin: each photograph beside the predicted ball."""
-
 from __future__ import annotations
 
 import math

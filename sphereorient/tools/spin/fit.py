@@ -1,4 +1,7 @@
-"""Uniform spins R(t) = exp(omega (t - t0)) R(t0) through candidates; at a constant step omega has aliases."""
+"""Uniform spins R(t) = exp(omega (t - t0)) R(t0) through candidates.
+
+At multiples of one step, omega and its aliases omega + 2 pi k / step agree; all aliases below a limit are reported.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +75,10 @@ class Spins:
 
 
 def picture_candidates(time_s: Tensor, offset: Tensor, R_view_body: Tensor, weight: Tensor) -> PictureCandidates:
-    """Pad candidates (M, 3, 3), weights (M,): offset[f] .. offset[f + 1] belong to picture f of times (F,), s."""
+    """Pad candidates (M, 3, 3): rows offset[f] .. offset[f + 1] belong to the picture at time_s[f] (F,), s.
+
+    Weights (M,), not negative, any unit: only ratios within a picture count.
+    """
     counts = offset.diff()
     width = max(int(counts.max()) if len(counts) else 0, 1)
     there = torch.arange(width) < counts[:, None]
@@ -84,7 +90,7 @@ def picture_candidates(time_s: Tensor, offset: Tensor, R_view_body: Tensor, weig
 
 
 def fit_spins(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
-    """Find the best uniform spin below a limit and all its aliases, best first; none without neighbours."""
+    """Find the best uniform spin below a limit and all its aliases, best first; none without neighbouring pictures."""
     spins = _guesses(seen, omega_max_rad_s)
     if not len(spins):
         return spins

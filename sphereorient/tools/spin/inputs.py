@@ -1,5 +1,3 @@
-"""Inputs of `sphereorient spin`: photographs, times, and the texture as map or table of dots."""
-
 from __future__ import annotations
 
 import csv

@@ -70,7 +70,7 @@ def spin_of(
 ) -> SpinFound:
     """Find the uniform spin of a ball of known texture from photographs of a far, uncalibrated camera.
 
-    With one time step, several spins agree, whole turns per step apart: all below the limit are returned.
+    Times at multiples of one step allow several spins, whole turns per step apart: all below the limit are returned.
 
     Args:
         photographs: with their times.
@@ -135,7 +135,6 @@ def _searched(
 
 
 def _greatest(spins: Spins) -> float:
-    """Return the evidence of the best spin; 0 (random orientations) for none."""
     return float(spins.evidence.max()) if len(spins) else 0.0
 
 

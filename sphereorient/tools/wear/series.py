@@ -102,7 +102,6 @@ def _shares(height: int) -> Tensor:
 
 
 def _sizes(number: Tensor) -> Tensor:
-    """Return the share of the sphere of each numbered place, 0 first."""
     area = _shares(len(number)).reshape(-1)
     return torch.zeros(int(number.max()) + 1, dtype=torch.float64).index_add(0, number.reshape(-1), area)
 
@@ -152,7 +151,6 @@ def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
 
 
 def _large_enough(worn: Tensor) -> Tensor:
-    """Return a mask (H, 2 H) without its smallest connected places."""
     number = _places(worn)
     kept = _sizes(number) >= 0.5 * (1 - math.cos(math.radians(LEAST_DEG)))  # area of a cap over that of the sphere
     kept[0] = False
