@@ -117,10 +117,10 @@ def jacobian(render: SphereRenderer, R_view_body: Tensor) -> Tensor:
 def _inverse(information: Tensor, count: int = 6) -> Tensor:
     """Invert information (..., 6, 6) of the first `count` unknowns, the others known; infinity: undetermined."""
     own = information.diagonal(dim1=-2, dim2=-1).clamp_min(0)
-    # Compare with all unknowns, the outline's too: the first `count` may all be undetermined.
+    # Compare with all unknowns: the first `count` may all be undetermined.
     greatest = own.amax(-1, keepdim=True).clamp_min(torch.finfo(own.dtype).tiny)
     own, information = own[..., :count], information[..., :count, :count]
-    # Scale each unknown's own information to 1, as far as it has any: rad and px cannot be compared.
+    # Scale each unknown's own information to 1: rad and px cannot be compared.
     unit = torch.where(own > ROUNDING * greatest, own, greatest).rsqrt()
     value, axis = torch.linalg.eigh(information * unit[..., None] * unit[..., None, :])
     open_ = value < DETERMINED

@@ -123,7 +123,7 @@ def _checked(tree: Any, name: str) -> Checkpoint:
     if schema != SCHEMA:
         got = short(schema) if isinstance(schema, str) else "none"
         _refuse(name, f"schema {SCHEMA}", got, "train it anew with this version, or install the one that wrote it")
-    # The defaults are for those who make a checkpoint: a file has every key.
+    # A file has every key; the defaults are for new checkpoints.
     absent = dict.fromkeys(Checkpoint.model_fields.keys() - tree.keys(), "absent")
     content = {key: value for key, value in tree.items() if key != "schema"}
     checkpoint = validated(Checkpoint, content | absent, name, CheckpointError)

@@ -31,7 +31,6 @@ def find_modes(logits: Tensor, grid: Tensor, count: int, temperature: float = 1.
     probability = logits.softmax(-1)
     point = logits.topk(min(SEARCHED, logits.shape[1]), dim=1).indices
     mode = distinct(grid[point], math.radians(APART_DEG))
-    # The first `count` modes; a stable sort keeps their order.
     order = (~mode).int().argsort(dim=1, stable=True)[:, :count]
     chosen, exists = point.gather(1, order), mode.gather(1, order)
     near = flat[chosen] @ flat.T  # (F, K, G), trace of the relative rotation

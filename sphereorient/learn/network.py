@@ -149,7 +149,7 @@ def _convolution(into: int, out: int, stride: int = 1) -> nn.Sequential:
 def map_blurs(textures: Tensor, side: int) -> Tensor:
     """Return blurs (T, side^2, B) float32, in deviations, of maps (T, H, 2 H), 0 black .. 1 white, on an octahedron."""
     direction = octahedral_directions(side).float()
-    # Solid angle of a cell, which is flat on the octahedron's face.
+    # Solid angle of a cell of the octahedron.
     area = direction.abs().sum(-1).pow(3)
     paint = torch.stack([sample_texture(reduced_texture(each.float(), 0.8 * side), direction) for each in textures], -1)
     share = (area / area.sum())[:, None]

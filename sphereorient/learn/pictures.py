@@ -42,8 +42,7 @@ class TrainingBatch(NamedTuple):
 
 def generator_of(*numbers: int) -> torch.Generator:
     """Return a generator seeded by whole numbers, not negative."""
-    # torch reads 32 bits of its seed: sums of seed, epoch and step would repeat. The count comes first, or zeros at
-    # the end would not matter.
+    # torch reads 32 bits of its seed: sums would repeat. The count comes first, else zeros at the end are ignored.
     return torch.Generator().manual_seed(int(np.random.SeedSequence((len(numbers), *numbers)).generate_state(1)[0]))
 
 
@@ -96,7 +95,7 @@ def film_with(
 ) -> Tensor:
     """Render a map with given degradations, (F, S, S)."""
     filmed = worn(texture, values.get("paint_wear", 0.0), rng)
-    # For a comparison, an error of the map is the same as an error of the ball.
+    # An error of the sphere has the same effect as an error of the map.
     filmed = misdrawn(filmed, values.get("texture_error", 0.0), rng)
     return film_disks(filmed, R_view_body, values, rng, settings.disks)
 

@@ -13,8 +13,7 @@ from sphereorient.learn.network import Correlator, map_blurs
 from sphereorient.search.proposer import Proposals
 from sphereorient.trajectory import Reason
 
-# Disks at once, padded with empty disks: the last bits of a product depend on its number of rows, and the result of a
-# disk must not depend on other disks.
+# Disks at once, padded: the last bits of a product depend on its number of rows, a disk's result must not.
 BATCH = 32
 CANDIDATES = 8
 PROBABILITY_MIN = 1e-5  # of a candidate

@@ -34,7 +34,7 @@ FEWEST = 4  # such pairs
 class PairwiseAttitudes:
     """Orientations of N instants from pairs of pictures alone."""
 
-    rows: Tensor  # (N,) int64, rising, of the instants among the disks given; the others have no attitude
+    rows: Tensor  # (N,) int64, rising, of the instants among the disks given; the others have no orientation
     R_lab_body: Tensor  # (N, 3, 3) float64; identity at the first one
     closure: Closure
 
@@ -69,7 +69,7 @@ def _chained_pairs(disks: Disks, settings: MapSettings) -> tuple[Tensor, Relativ
     first = torch.arange(count - 1)
     still = torch.eye(3, dtype=torch.float64).expand(count - 1, 3, 3)
     start = search_pairs(reduced(disks, SMALLER), first, first + 1, still, grid, SEARCH_EVERY)
-    # All neighbours are kept: nothing else connects the frames before them with those after.
+    # Keep all neighbours: nothing else connects the frames before and after.
     parts = [refine_pairs(disks, first, first + 1, start, ITERATIONS, EVERY)]
     R = chained(parts[0].R_ji)
     for step in settings.baselines:

@@ -85,7 +85,7 @@ def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:
         in_camera = X @ camera.R_cam_lab.mT + camera.T_cam_lab_mm
         far[:, c] = in_camera.norm(dim=-1) / crops.radius_mm
         R[:, c] = camera.R_cam_lab.mT @ R_cam_view(in_camera)
-        # The limb lies a little before the great circle that `radius_px` measures.
+        # The limb lies slightly before the great circle of `radius_px`.
         limb = view.radius_px(X, crops.radius_mm) / (1 - far[:, c] ** -2).clamp_min(1e-3).sqrt()
         middle = camera.project(X)
         for k, frame in enumerate(frames.tolist()):
@@ -123,7 +123,7 @@ def normalised_disks(
         flat = usual + (flat - usual) * part
     rough = fine(flat) - wide(flat)
     whole = (rough.square() * share).sum((1, 2), keepdim=True) / share.sum()
-    # Half of the disk's deviation is added: where the texture is uniform the local one would amplify noise.
+    # Add half of the disk's deviation: in uniform texture the local one would amplify noise.
     local = (wide(rough.square()) + 0.25 * whole).sqrt().clamp_min(1e-12)
     even = (rough / local).clamp(-3.0, 3.0) * seen.reshape(-1, 1, 1)
     return Disks(
@@ -163,6 +163,6 @@ def disk_places(normal_view: Tensor, distance_radii: Tensor) -> tuple[Tensor, Te
     D = distance_radii[..., None, None]
     x_y, z = normal_view[..., :2, :], normal_view[..., 2:, :]
     scale = (D.square() - 1).sqrt() / (D + z)
-    # Visible where the outward normal points at the camera, which is D away along -z.
+    # Visible if the normal points at the camera, D away along -z.
     depth = (-z - 1 / D) / (1 - 1 / D)
     return x_y * scale, scale, depth[..., 0, :]

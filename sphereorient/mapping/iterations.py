@@ -40,7 +40,7 @@ TEXEL_PX = 0.75  # of the widest disk's middle
 ROW, FINEST_ROWS = 32, 512  # the fitted map has a multiple of the one as rows, and at most the other
 SEPARATE_ITERATIONS = 2  # each instant by itself: a joint step would trust the map, which is still blurred
 LIGHT_ITERATIONS = 8  # in which light, noise and blur are estimated anew
-SMOOTHEST = 0.2  # as the setting `smooth`, of the first iteration: attitudes must not follow the map's noise
+SMOOTHEST = 0.2  # as the setting `smooth`, of the first iteration: orientations must not follow the map's noise
 BLUR_FRAMES = 32
 BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
 BLUR_PX = (0.25, 3.0)  # narrowest and widest
@@ -255,7 +255,7 @@ def _with_map(state: State, smooth: float) -> tuple[State, float]:
         expected += float((at.precision * at.variance).sum())
     normal = NormalMatrix(vstack(parts, format="csr"))
     tie = smooth * _typical(normal.diagonal())
-    # The penalty is on the whole map, not on the correction alone: else noise would grow with the iterations.
+    # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
     right -= tie * (stiffness(height) @ state.texture.double().numpy().ravel())
     texture = state.texture + solve_map(normal, right, height, tie).float()
     return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND)), squares / max(expected, 1e-9)

@@ -61,7 +61,6 @@ class Linearisation:
             counts.append(torch.full(own.shape, nodes * READS))
         count = torch.cat(counts, dim=1)
         start = np.concatenate([[0], count.reshape(-1).cumsum(0).numpy()])
-        # Disk after disk, the inner pixels before the outer ones.
         columns = torch.cat([part.flatten(1) for part in places], dim=1).reshape(-1).to(torch.int32)
         entries = torch.cat([part.flatten(1) for part in values], dim=1).reshape(-1).float()
         shape = (count.numel(), 2 * height * height)
@@ -88,7 +87,7 @@ def linearise(
         residual=at.residual,
         weight=at.weight,
         variance=at.variance,
-        # Near the limb the map is not learnt, so it must not move the pose there either.
+        # Near the limb the map is not learnt; it must not move the pose there.
         by_pose=grey_by_pose(at.view, at.lit * (depth > DEPTH_MIN), at.over),
         by_light=at.design[:, POSE:],
     )
@@ -107,7 +106,7 @@ class LinearSystem:
 def linear_system(at: Linearisation, height: int) -> LinearSystem:
     """Return the linear system of a linearisation; `height` is the map's H."""
     root = at.precision.sqrt()
-    # The rows of the light are made orthonormal: the frame's own light takes what is along them.
+    # Orthonormal rows: the frame's own light is projected out along them.
     rows = (at.by_light * root[:, None]).double()
     size = rows.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
     rows = rows / size

@@ -33,8 +33,7 @@ from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import CameraView, widest_px
 from sphereorient.synth.textures import map_directions
 
-# Cosine of the slant down to which a picture shows a texel. Texels seen only at larger slants are displaced by a degree
-# and more (measured: rms 0.74 degrees with texels down to 0.2, 0.15 from 0.4 on).
+# Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).
 SHOWN_MIN = 0.4
 FINER = 2  # rows of the sharpened map over those of the fitted one
 RECOVERY_AFTER = (3, 6)  # iterations after which instants that do not fit are searched again
@@ -44,8 +43,8 @@ POSE_ITERATIONS = 2  # of each pose by itself with the final map
 POSITION_ITERATIONS = 4  # that find the position of a ball that stays in its place
 FEW_PIXELS = 250_000  # of photographs together
 PIXELS_A_TEXEL = 3.0
-# Blur of photographs, in radii, of the first iterations, and their number. Errors: 0.8 degrees after the comparison of
-# pairs, 0.06 after these, 0.05 at the end (12 pictures of 200 px); without these, 0.09 after twice as many others.
+# Blur (radii) and number of the first iterations of photographs. Errors: 0.8 degrees before, 0.06 after, 0.05 at the
+# end (12 pictures of 200 px); without them 0.09 after twice as many others.
 COARSE, COARSE_ITERATIONS = 0.015, 5
 
 
@@ -76,7 +75,7 @@ def fit_map(crops: Crops, settings: MapSettings, progress: Progress) -> LearntMa
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Start:
     crops: Crops  # with the estimated position of a ball that stays in its place
-    frames: Tensor  # (M,) int64, of the crops, that have an attitude
+    frames: Tensor  # (M,) int64, of the crops, that have an orientation
     rows: Tensor  # (n,) int64, of those, that the map is fitted to
     chain: PairwiseAttitudes  # of the M frames
     state: State  # of the n
@@ -86,8 +85,7 @@ def _start_from_movie(crops: Crops, settings: MapSettings, progress: Progress) -
     start = _from_chain(crops, settings, progress)
     if not crops.fixed:
         return start
-    # The outline of what changes in the pictures is a pixel or two off, and the chain's rotations with it; a few
-    # iterations correct the position, and the chain starts anew.
+    # The outline of the changes is 1 to 2 px off, as are the rotations: correct the position, restart the chain.
     state = start.state
     for k in range(POSITION_ITERATIONS):
         progress("place", k, POSITION_ITERATIONS)
@@ -170,7 +168,7 @@ def _finished(start: _Start, state: State, iterations: tuple[Iteration, ...], ar
     X = torch.full((count, 3), torch.nan, dtype=torch.float64)
     score = torch.full((count, cameras), torch.nan, dtype=torch.float64)
     valid, used = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
-    found = crops.seen.any(1)  # photographs without an attitude have a position all the same
+    found = crops.seen.any(1)  # photographs without an orientation have a position all the same
     R[frames], X[found] = so3.nearest_rotation(all_R @ Q.mT), crops.position_lab_mm[found]
     X[frames[rows]] = state.position_lab_mm
     score[frames[rows]] = torch.where(state.use, fit.score, torch.nan)

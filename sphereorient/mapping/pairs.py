@@ -164,7 +164,7 @@ def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, gri
             tried = some @ R
             views = _first_views(disks, i.expand(len(tried)), every)
             _, _, score, overlap = _normal_equations(disks, j.expand(len(tried)), tried, views, slopes=False)
-            # Shrunk: a correlation over a small overlap proves little.
+            # A correlation over a small overlap proves little.
             scores.append(score * (overlap / (overlap + OVERLAP_MIN)))
         best.append(grid[int(torch.cat(scores).argmax())] @ R)
     return torch.stack(best).double()
@@ -231,7 +231,7 @@ def _graph_step(R: Tensor, pairs: RelativeRotations, residual: Tensor, weight: T
     right = torch.zeros(count, 3, dtype=R.dtype)
     right.index_add_(0, j, pulled)
     right.index_add_(0, i, -(carry.mT @ pulled[..., None])[..., 0])
-    # The first attitude is held; unconnected ones stay.
+    # The first orientation is fixed; unconnected ones stay.
     diagonal = torch.full((3 * count,), 1e-9, dtype=R.dtype)
     diagonal[:3] = 1e9
     every = torch.arange(3 * count)

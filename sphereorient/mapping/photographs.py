@@ -42,12 +42,11 @@ CHI2_MEDIAN = 0.4549  # of the square of a normal number
 JOIN_ITERATIONS = 4  # of the refinement of a pair between two sets
 FEWEST = 3  # pictures: each pair of the smallest set is confirmed by the two others
 LIKE_MAX = 0.98  # largest correlation that counts
-# Log-odds above which two sets are joined. Among 5 million rotations tried for 30 pictures, the best wrong ones have
-# about 20 (measured); a wrong join costs more than a picture left out.
+# Log-odds above which two sets are joined; the best wrong of 5 million rotations of 30 pictures has about 20.
 SURE = 25.0
-REACH_RAD = math.radians(10.0)  # by which a pair may differ from the attitudes of the others
+REACH_RAD = math.radians(10.0)  # by which a pair may differ from the orientations of the others
 SCALE_RAD = math.radians(2.0)  # scatter of pairs that share only slanted places, by errors of the outlines
-SETTLE = 2  # comparisons in fine detail, each from the attitudes of all together
+SETTLE = 2  # comparisons in fine detail, each from the orientations of all together
 OTHER_SHARE, OTHER_LEAST = 0.5, 4  # of the largest set, and pictures: a second set so large is another ball
 
 

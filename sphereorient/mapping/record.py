@@ -21,14 +21,14 @@ class Closure:
     closed: int  # accepted and kept by the graph
     drift_before_rad: float  # rms error of the closed loops in the chain
     drift_after_rad: float  # and afterwards
-    moved_rad: float  # rms move of the attitudes, the body frame's own turn removed
+    moved_rad: float  # rms move of the orientations, the body frame's own turn removed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Iteration:
     """One iteration of orientations, light and map."""
 
-    moved_rad: float  # rms move of the attitudes
+    moved_rad: float  # rms move of the orientations
     misfit: float  # chi^2 per pixel, before the map is solved anew
     blur_px: float
 
@@ -45,7 +45,7 @@ class LearntMap:
     sigma: Tensor  # (H, 2 H) float32, standard deviation of the texture by noise alone; infinite where never seen
     R_lab_body: Tensor  # (N, 3, 3) float64, NaN where the sphere was not found
     position_lab_mm: Tensor  # (N, 3) float64, NaN likewise
-    valid: Tensor  # (N,) bool, frames with an attitude
+    valid: Tensor  # (N,) bool, frames with an orientation
     fitted: Tensor  # (N,) bool, frames that the map was fitted to; the others follow them
     score: Tensor  # (N, C), share of each picture's variance that the map explains; NaN where not fitted
     views: Sequence[CameraView]  # with the scenes without the ball
@@ -53,7 +53,7 @@ class LearntMap:
     blur_px: float  # estimated with the map
     closure: Closure
     rounds: tuple[Iteration, ...]
-    arrived: bool  # whether the last iteration moved attitudes by less than the setting `arrived_deg`
+    arrived: bool  # whether the last iteration moved orientations by less than the setting `arrived_deg`
 
     @property
     def seen_share(self) -> float:

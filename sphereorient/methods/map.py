@@ -26,7 +26,7 @@ class MapResult:
 
     experiment: Experiment
     learnt: LearntMap
-    track: Trajectory  # the attitudes of all frames
+    track: Trajectory  # the orientations of all frames
     comparison: MapComparison | None  # with the old map, where one was given
     kept_share: float  # of the sphere with the old map's texture, because it was never seen
     remarks: tuple[str, ...]  # on the inputs

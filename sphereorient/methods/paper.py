@@ -89,7 +89,7 @@ def propose_orientations(
     if not sightings.placed.any():
         return in_the_lab(Proposals.none(sightings.reason), stream.camera, sightings.centre_px)
     proposer = paper_proposer(texture, locate.size_of(sightings, settings.orient.size_px), settings)
-    # A place that was filled in from the neighbours helps nothing where the picture is none.
+    # An interpolated position is of no use without a picture.
     readable = torch.tensor([reason not in BLIND for reason in sightings.reason])
     placed = sightings.placed & readable
     proposals = [Proposals.none(sightings.reason[:0])]

@@ -29,7 +29,7 @@ def learn(job: Job, progress: Progress) -> Follower:
     opened = open_views(recording, settings, progress)
     progress("appearance", 0, 1)
     frames = sample_frames(recording, opened.views, settings.refine.appearance_frames)
-    # Only blurred pictures need templates that are blurred as well; sharp ones share one first guess.
+    # Only blurred pictures need blurred templates; sharp ones share one first guess.
     seen_px = settings.refine.blur_px or estimate_blur_px(opened.views, frames, settings.locate)
     blur_px = seen_px if defocus_radii(seen_px, opened.search.diameter_px) else FIRST_BLUR_PX
     first = Initialiser(

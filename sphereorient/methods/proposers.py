@@ -98,7 +98,7 @@ def trained_network(texture: Tensor, settings: ProposeSettings) -> Proposer | No
     """Return the network of a checkpoint; None if the settings name none."""
     if settings.checkpoint is None:
         return None
-    # Not before it is wanted: most runs do without.
+    # Import late: most runs use no network.
     from sphereorient.learn.checkpoint import check_texture, correlator_of, load_checkpoint
     from sphereorient.learn.proposer import LearnedProposer
 

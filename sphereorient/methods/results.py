@@ -193,7 +193,7 @@ def map_track(
             score=learnt.score[:, c].numpy(),
             reason=reasons,
         )
-    # Frames beyond those that the map was fitted to only follow these.
+    # Frames to which the map was not fitted.
     flags = torch.where(learnt.valid & ~learnt.fitted, int(Flag.EXTRAPOLATED), 0)
     return replace(
         empty,
@@ -223,7 +223,7 @@ def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], l
     """Return flags (N,) int64 of frames that one camera alone measured, and of poor fits."""
     found = chosen.choice >= 0
     one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)
-    # Halfway from the least score of a right pose to the usual one.
+    # Halfway between the least and the usual score of a right pose.
     poor = 0.5 * (learnt.score_min + learnt.right_score)
     best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
     doubtful = found & (best < poor)

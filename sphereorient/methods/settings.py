@@ -28,7 +28,7 @@ from sphereorient.synth.settings import SynthSettings
 
 Model = TypeVar("Model", bound=BaseModel)
 DEFAULT_METHOD = "precise"
-# What each method reads: branches, and single keys of a branch that it does not read.
+# What each method reads: branches, without the keys in NOT_READ.
 BRANCHES: dict[str, tuple[str, ...]] = {
     "precise": ("locate", "propose", "search", "refine", "path", "smooth"),
     "paper": ("locate", "propose", "orient", "assemble", "motion"),
@@ -37,7 +37,7 @@ BRANCHES: dict[str, tuple[str, ...]] = {
 }
 _OF_GAPS = ("locate.gap_frames_max", "locate.spline_knot_frames", "locate.outlier_px", "locate.outlier_factor")
 NOT_READ: dict[str, tuple[str, ...]] = {"precise": _OF_GAPS}
-# Keys of the version before; accepted with a remark.
+# Old names of keys; accepted with a remark.
 RENAMED: dict[str, str] = {
     "refine.block_frames": "refine.chunk_frames",
     "refine.lanes": "refine.chunks",
@@ -65,7 +65,7 @@ class Settings(BaseModel):
     statistics: StatisticsSettings = Field(default_factory=StatisticsSettings, description="numbers of a report")
 
 
-# How many names a key has, parted by dots.
+# Numbers of dotted names in a key.
 DEPTHS: dict[type[BaseModel], tuple[int, ...]] = {Settings: (2,), SynthSettings: (1,), ProposerSettings: (2, 3)}
 
 

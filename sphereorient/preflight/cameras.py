@@ -13,8 +13,7 @@ from sphereorient.cameras import Camera, triangulate
 from sphereorient.preflight.finding import Finding, fault, ok, warning
 from sphereorient.preflight.sample import MovieSample
 
-# px between lines of sight, median. Exact cameras leave 0.2 to 0.5, by the outlines; at 1.5 the tracker takes a camera
-# as moved.
+# Median px between lines of sight: 0.2 to 0.5 for exact cameras; from 1.5 the tracker assumes a moved camera.
 GOOD_PX, BAD_PX = 0.7, 1.5
 CLEARLY = 0.2  # swapped or mirrored movies are reported if they leave this share of the gap
 ENOUGH = 3  # frames with a ball in both cameras

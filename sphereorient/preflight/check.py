@@ -119,7 +119,7 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
         return
     yield (similar := texture_map.look_alikes(seen.similar))
     yield from (texture_map.map_fits(match, seen.matches) for match in seen.matches)
-    # Movies out of step, or ambiguous views, would be reported as errors of the cameras.
+    # Unsynchronised movies or ambiguous views would be reported as camera errors.
     in_step = seen.scan is None or seen.scan.shift == 0
     if len(seen.matches) == 2 and in_step and similar.severity is not Severity.FAULT:
         yield texture_map.one_orientation(seen.matches)

@@ -191,7 +191,7 @@ def _profiles(
     clear = whole & (step > 12 * sample.background.typical_noise)
     even = (within.std(1) < 0.12 * step) & (beyond.std(1) < 0.12 * step) & clear
     share = (profile[even] - outside[even, None]) / step[even, None]
-    # Each fit: where the profile last stands above a half.
+    # The last sample of each profile above a half.
     last = share.shape[1] - 1 - (share[:, ::-1] > 0.5).argmax(1)
     shifted = []
     for one, k in zip(share, last, strict=True):

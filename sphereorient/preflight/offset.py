@@ -87,7 +87,7 @@ def scan_offsets(
     best, least_px = _least(gap)
     meet_px = max(GOOD_PX, MEET * moved_px)
     if not least_px <= meet_px:
-        # Cameras that were bumped leave a constant gap at any offset: use the varying part, if the motion varies.
+        # Moved cameras leave a constant gap at any offset: use the varying part, if the motion varies.
         best, least_px = _least(varying)
         varies_px = float(motion.std()) if len(motion) > 1 else 0.0
         best = best if varies_px > MOVES_PX and least_px <= meet_px else math.nan

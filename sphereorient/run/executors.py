@@ -60,7 +60,7 @@ class ProcessExecutor:
 
 
 def _worker() -> ProcessPoolExecutor:
-    # Not forked: a process that has used torch's threads hangs in its children.
+    # Spawn: forked children of a process that used torch's threads hang.
     start = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(1, mp_context=start, initializer=_prepare)
 

@@ -82,8 +82,7 @@ class _Job:
                 self.counts = end.value
 
 
-# A worker gets many tasks of one run: opening it costs as much as hundreds of frames. `run_id` is new for each call of
-# `run_many`, so that no later run is measured with what an earlier one learnt.
+# Opening a run costs as much as hundreds of frames; `run_id` is new for each `run_many`, so no later run reuses it.
 @lru_cache(maxsize=1)
 def _work(request: Request, run_id: str) -> tuple[Work, ExitStack]:
     stack = ExitStack()

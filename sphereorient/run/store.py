@@ -203,7 +203,7 @@ def read_poses(path: Path) -> list[Poses] | None:
     except (OSError, KeyError, ValueError, RuntimeError):
         return None
     return [
-        # Copies: rows of one array would keep the whole of it.
+        # Copy: a row would keep the whole array in memory.
         Poses(**{name: parts[name][k].clone() for name in POSE_PARTS}, use=use[k].clone(), reason=tuple(reason[k]))
         for k in range(len(count))
     ]

@@ -54,7 +54,7 @@ class Judgement:
     settings: DesignSettings
     direction_body: Tensor  # (V, 3), middles of the views
     white: Tensor  # (V,), share of the view that is white
-    bound_rad: Tensor  # (V,), Cramér-Rao bound of the attitude, rms, position unknown; infinite: undetermined
+    bound_rad: Tensor  # (V,), Cramér-Rao bound of the orientation, rms, position unknown; infinite: undetermined
     alike: float  # greatest similarity of two distinct views under any light, 1: the same
     alike_views: Tensor  # (2, 3, 3), these two
     stroke_deg: float  # widest brush that paints the map

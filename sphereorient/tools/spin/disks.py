@@ -48,7 +48,7 @@ def find_disk(picture: Photograph, name: str = "photograph") -> BallOutline:
         raise _nothing(name, "nothing that stands out")
     fine = np.asarray(cv2.resize(difference, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR), np.float32)
     rough = _outlined(fine, 0.5 * float(np.median(difference[inside])))
-    # A lit ball is dimmer at its rim than in its middle: the border lies at half of what is just inside of it.
+    # A lit ball is dimmer at its rim: the border lies at half of the level just inside.
     row, column = np.ogrid[: fine.shape[0], : fine.shape[1]]
     away = np.hypot(row - rough[1], column - rough[0]) / max(rough[2], 1.0)
     rim = fine[(away > RIM[0]) & (away < RIM[1])]

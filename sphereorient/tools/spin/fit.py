@@ -23,7 +23,7 @@ LOOSE_RAD, TIGHT_RAD = math.radians(12.0), math.radians(1.0)  # scatter of right
 ITERATIONS = 3  # of each fit while the span grows
 LAST_ITERATIONS = 12
 STRAYS = 0.2  # share of pictures, at first guess, without a right candidate
-SAME_RAD = math.radians(6.0)  # spins whose attitudes at all pictures' times are this near are the same
+SAME_RAD = math.radians(6.0)  # spins whose orientations at all pictures' times are this near are the same
 PRIOR = 1e-6  # information of the unknowns before any picture, so that undetermined ones do not move
 ALIAS_SCATTER = 3.0  # initial scatter of an alias over that of the best spin: times are multiples but for jitter
 REPORTED = 32  # spins at most
@@ -52,7 +52,7 @@ class Spins:
     omega_view_rad_s: Tensor  # (K, 3), view frame: x right, y down, z from the camera to the ball
     R0_view_body: Tensor  # (K, 3, 3), at time0_s
     time0_s: Tensor  # (K,)
-    evidence: Tensor  # (K,), log of the candidates' likelihood over that with random attitudes
+    evidence: Tensor  # (K,), log of the candidates' likelihood over that with random orientations
     scatter_rad: Tensor  # (K,), of right candidates about the spin, each axis
     covariance: Tensor  # (K, 6, 6), of a small rotation of R0 (view, rad) and of omega (rad/s)
 
@@ -94,7 +94,7 @@ def fit_spins(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
     spins = _guesses(seen, omega_max_rad_s)
     if not len(spins):
         return spins
-    # To more and more pictures, from a few about each guess to all; only the better guesses go on.
+    # From a few pictures about each guess to all; only the better guesses continue.
     usual = float(seen.time_s.sort().values.diff().median())
     spans = [FIRST_SPAN * max(usual, seen.step_s)]
     while spans[-1] < float(seen.time_s.max() - seen.time_s.min()):
@@ -183,7 +183,7 @@ def _guesses(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
 
 def _aliases(best: Spins, seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
     """Return a spin with whole turns per step added, in both directions, up to the limit."""
-    # R0 is moved to the time of a picture: only there do all aliases have the same attitude.
+    # Move R0 to the time of a picture: only there do all aliases agree.
     nearest = (seen.time_s - best.time0_s).abs().argmin()[None]
     best = replace(best, R0_view_body=best.R_view_body(seen.time_s)[:, nearest[0]], time0_s=seen.time_s[nearest])
     rate = float(best.omega_view_rad_s.norm())
@@ -200,7 +200,7 @@ def _matched(seen: PictureCandidates, spins: Spins) -> tuple[Tensor, Tensor, Ten
     predicted = spins.R_view_body(seen.time_s)  # (K, F, 3, 3)
     turn = so3.log(seen.R_view_body @ predicted[:, :, None].mT)
     scatter = spins.scatter_rad[:, None, None]
-    # Density over SO(3), whose volume is 8 pi^2, over that of random attitudes.
+    # Density over SO(3), whose volume is 8 pi^2, over that of random orientations.
     height = math.log(8 * math.pi**2) - 1.5 * math.log(2 * math.pi) - 3 * scatter.log()
     log = height - 0.5 * turn.square().sum(-1) / scatter**2 + seen.weight.clamp_min(1e-300).log()
     log = log + math.log(1 - STRAYS)

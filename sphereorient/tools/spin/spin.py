@@ -29,7 +29,7 @@ from sphereorient.tools.spin.fit import (
 
 FINEST = 0.05  # detail of the last fit, radii: a pixel of a disk of 40
 REFINEMENT_STEPS = 6
-FOLLOWED_RAD = math.radians(20.0)  # how far a picture's own attitude may lie from the spin's
+FOLLOWED_RAD = math.radians(20.0)  # how far a picture's own orientation may lie from the spin's
 LAST_ITERATIONS = 8
 AS_EVIDENT = 6.0  # difference of evidence (log) below which pictures do not distinguish two spins
 AT_ONCE = 4  # photographs between two reports of progress
@@ -54,8 +54,8 @@ class SpinFound:
     ambiguous: int  # number of spins that the pictures do not distinguish; 1: the first is the only one
     evidence: Tensor  # (K, F), of each picture for each spin, log
     mirrored_evidence: float  # of the best spin of the mirrored texture
-    alone: Proposals  # attitudes from each picture alone, best first
-    R_view_body: Tensor  # (F, 3, 3), each picture's own attitude near the first spin's, else that spin's
+    alone: Proposals  # orientations from each picture alone, best first
+    R_view_body: Tensor  # (F, 3, 3), each picture's own orientation near the first spin's, else that spin's
     residual_rad: Tensor  # (F,), between the two; NaN where the picture has none
     score: Tensor  # (F,), share of the picture's variance that the texture explains there
     balls: tuple[BallOutline, ...]
@@ -94,7 +94,7 @@ def spin_of(
     view = orthographic_view(settings.search.size_px)
     level = detail_level(view, texture_table(drawn.float(), FINEST), FINEST, every=1)
     own, _ = _refined(level, disks, spins.R_view_body(time_s)[0], REFINEMENT_STEPS)
-    # The spins are fitted anew to one attitude a picture; their evidence stays that of all candidates.
+    # Refit the spins to one orientation per picture; keep the evidence of all candidates.
     single = picture_candidates(time_s, torch.arange(len(own) + 1), own, torch.ones(len(own)))
     fitted = refine_spins(single, spins, iterations=LAST_ITERATIONS)
     total = evidence_of(seen, spins).sum(1)

@@ -113,7 +113,7 @@ def _wear(texture: Tensor, first: Tensor, turned: bool) -> Wear:
     gain, offset = fit_levels(first, there)
     off = (there - (gain * first + offset)).abs()
     known = torch.isfinite(off)
-    # The median ignores worn places and the rims of displaced ones.
+    # The median ignores worn places and borders of displaced ones.
     scatter = 1.4826 * float(off[known].median()) if known.any() else math.nan
     worn = _large_enough(change.abs() > max(CHANGED, BEYOND * scatter))  # an unknown texel is not
     return Wear(comparison=without_changed(comparison, change, CHANGED), change=change, scatter=scatter, worn=worn)
