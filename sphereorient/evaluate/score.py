@@ -162,7 +162,9 @@ def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats
 
 
 def _alignment(measured: torch.Tensor, true: torch.Tensor, align: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return A and B with the least squared chords, fitted in turn; other starts than the first frame's B can fail."""
+    """Return A and B with the least squared chords, fitted in turn; starting from the first frame's B avoids wrong
+    optima.
+    """
     left = right = torch.eye(3, dtype=measured.dtype)
     if align == "none":
         return left, right

@@ -75,8 +75,7 @@ def benchmark_checkpoint(
 ) -> ProposerBenchmark:
     """Measure a checkpoint on unseen maps and pictures; a fine-tuned one on its own map, that of `settings`.
 
-    `pictures` of each degradation and level, ten times as many mixed ones; `progress` gets stage, finished and all
-    maps. `seed` does not change the maps.
+    `pictures` of each degradation and level, ten times as many mixed; `progress` gets stage, finished maps, all maps.
 
     Raises:
         CheckpointError: another picture size, or another map than that of the fine-tuning.

@@ -25,7 +25,8 @@ class Modes:
 def find_modes(logits: Tensor, grid: Tensor, count: int, temperature: float = 1.0) -> Modes:
     """Find the `count` (K) likeliest modes of log densities (F, G), each up to a constant, on rotations (G, 3, 3).
 
-    The temperature divides the logits for probabilities and order only: it would bias the mean orientations.
+    The temperature divides the logits for probabilities and order only; orientations are means of the density as
+    learnt.
     """
     flat = grid.flatten(1)
     probability = logits.softmax(-1)

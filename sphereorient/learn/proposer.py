@@ -51,8 +51,7 @@ class LearnedProposer:
 
     @torch.inference_mode()
     def propose(self, disks: Tensor) -> Proposals:
-        """Propose orientations, view frame, of disks (F, S, S) float32, any grey, outline at the borders; see
-        `score_of`.
+        """Propose orientations, view frame, of disks (F, S, S) float32, any grey, outline at the borders; see score_of.
 
         A uniform disk has no proposals (`LOW_SCORE`); raise ShapeError for disks of another size.
         """

@@ -45,8 +45,7 @@ def train_proposer(
 ) -> Trained:
     """Train a proposer and write proposer.ckpt, last.ckpt and metrics.csv into the folder `out`, created if missing.
 
-    `resume` continues from last.ckpt, to the same weights unless `minutes` is set; `progress` gets stage, steps, all
-    steps.
+    `resume` continues from last.ckpt, to the same weights unless `minutes` is set; `progress` gets stage, done, total.
 
     Raises:
         CheckpointError: training.start or last.ckpt cannot be used.

@@ -121,8 +121,7 @@ def fit_levels(texture: Tensor, reference: Tensor) -> tuple[float, float]:
 
 
 def texture_change(new: Tensor, old: Tensor) -> Tensor:
-    """Return the change of grey (H, 2 H), -1 darker .. 1, of a new map against an old one in the same frame; NaN:
-    unknown.
+    """Return the change of grey (H, 2 H), -1 darker .. 1, of a map from an old one in the same frame; NaN: unknown.
 
     0: a displacement up to `RADIUS_DEG` explains it. The old grey levels are fitted to the new ones first.
     """

@@ -108,9 +108,9 @@ def normalised_disks(
     settings: MapSettings,
     shown: Tensor | None = None,
 ) -> Disks:
-    """Return disks of pictures (N, C, S, S), any finite grey levels; local mean removed, over the local deviation.
+    """Return disks of pictures (N, C, S, S), any finite grey: difference from the local mean over the local deviation.
 
-    R_lab_view is (N, C, 3, 3), distance_radii (N, C), above 1, seen (N, C) bool; `shown` (N, C, S, S), 0 hidden .. 1.
+    R_lab_view (N, C, 3, 3), distance_radii (N, C) above 1, seen (N, C) bool, shown (N, C, S, S) 0 hidden .. 1, None: 1.
     """
     size = pictures.shape[-1]
     share = rim_share(size)

@@ -153,7 +153,7 @@ def _correlation(w: Tensor, a: Tensor, b: Tensor, aa: Tensor, bb: Tensor, ab: Te
 
 
 def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, grid: Tensor, every: int = 1) -> Tensor:
-    """Return the best of rotations grid[m] @ about[e], (E, 3, 3), on small disks: detail would hide the maximum."""
+    """Return the best of all rotations grid[m] @ about[e], (E, 3, 3), for pairs (E,); the disks should be small."""
     best = []
     grid = grid.float()
     places = math.pi / 4 * disks.size_px**2 / every

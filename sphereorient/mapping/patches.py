@@ -59,6 +59,8 @@ def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: P
     """Return shifts (D, 2) float64, rad east and north, of the reference's patches in another map, and (D,) found.
 
     `rough` and `fine`: blurred tables of the other map and of the reference, for search and refinement.
+
+    Source: normalised correlation, then direct alignment with gain and offset, Lucas and Kanade 1981.
     """
     shift = start = _searched(rough, patches)
     offset = _offsets(FINE_DEG)

@@ -175,7 +175,7 @@ def joined_sets(evidence: Evidence, found: RelativeRotations) -> tuple[Tensor, T
 def _compared_at(
     evidence: Evidence, R_lab_body: Tensor, wanted: Tensor, iterations: int
 ) -> tuple[RelativeRotations, Tensor]:
-    """Compare pairs `wanted` (N, N) at given orientations; return rotations and log-odds (E,), far ones low."""
+    """Compare pairs `wanted` (N, N) at given orientations; return rotations and log-odds (E,), low if far away."""
     near = sight_cosines(evidence.disks, R_lab_body, torch.arange(len(R_lab_body)))
     first, second = torch.nonzero(wanted & (near > math.cos(math.radians(TILT_DEG)))).T
     about = R_lab_body[second] @ R_lab_body[first].mT

@@ -94,7 +94,8 @@ def read_settings(path: Path | None = None, overrides: Iterable[str] = (), metho
         method: refuse keys that this method does not read; None: accept all keys.
 
     Raises:
-        SettingsError: no such file, an unknown key, an impossible value, or a key that the method does not read.
+        SettingsError: no such file, an unknown key, an impossible value, or a key that the method does not read (in a
+            file: with another value than the default).
     """
     remarks: list[str] = []
     overrides = [_renamed(text, remarks) for text in overrides]

@@ -65,7 +65,7 @@ class MovieSample:
 
     @property
     def row(self) -> NDArray[np.int64]:
-        """(n,), index in the movie; NONE where there is no picture."""
+        """Index in the movie, (n,); NONE without a picture."""
         return self.stream.rows[self.frame]
 
     @cached_property

@@ -51,7 +51,7 @@ class ProcessExecutor:
         self._workers[worker] = _worker()
 
     def close(self) -> None:
-        """Terminate the workers; what is done is in the stores."""
+        """Terminate the workers; finished work is in the stores."""
         for worker in self._workers:
             processes = list((getattr(worker, "_processes", None) or {}).values())
             worker.shutdown(wait=False, cancel_futures=True)

@@ -1,4 +1,4 @@
-"""What a run is asked to do, and the fingerprint that distinguishes it from others."""
+"""The request of a run, and the fingerprint that distinguishes it from others."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Request:
 
 
 def fingerprint(request: Request) -> dict[str, str]:
-    """Return what identifies a run: inputs by size and time, text of experiment.yaml, settings, version."""
+    """Return the identity of a run: inputs by size and time, text of experiment.yaml, settings, version."""
     given = request.experiment
     experiment = given if isinstance(given, Experiment) else load_experiment(given)
     found = {
@@ -60,7 +60,7 @@ def fingerprint(request: Request) -> dict[str, str]:
 
 
 def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
-    """Return the names of what differs between two fingerprints."""
+    """Return the names of the entries that differ between two fingerprints."""
     return sorted(name for name in {*one, *other} if one.get(name) != other.get(name))
 
 

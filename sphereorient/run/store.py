@@ -77,9 +77,11 @@ class FolderStore:
 
     @contextmanager
     def held(self, request: Request, *, resume: bool) -> Iterator[None]:
-        """Create the folder, or resume from it, and lock it; raise TrackError, OutputError.
+        """Create the folder, or resume from it, and lock it against other runs.
 
-        TrackError: a run with other inputs or settings. OutputError: not writable, or another run is writing it.
+        Raises:
+            TrackError: the folder to resume from belongs to a run with other inputs or settings.
+            OutputError: it cannot be written, or another run is writing it.
         """
         with ExitStack() as locks:
             if self._run.is_file():

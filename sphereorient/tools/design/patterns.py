@@ -58,7 +58,10 @@ def patterned_texture(kind: str, size_deg: float, seed: int, height: int = 512) 
 
 
 def stroke_deg(texture: Tensor) -> float:
-    """Return the whole-degree width of the widest brush that paints both colours (Matheron 1975); 0: none."""
+    """Return the width, whole degrees, of the widest round brush that paints both colours but for 2 % of the sphere.
+
+    White is above one half; 0: no brush. Source: opening by a disk, Matheron 1975.
+    """
     directions = view_directions(POINTS)
     points, white = directions.numpy(), (sample_texture(texture.double(), directions) >= 0.5).numpy()
     if white.all() or not white.any():

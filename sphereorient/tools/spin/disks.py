@@ -40,7 +40,7 @@ class BallOutline:
 
 
 def find_disk(picture: Photograph, name: str = "photograph") -> BallOutline:
-    """Find the ball in a photograph (H, W) or (H, W, 3), one corner free; raise PaintError without one."""
+    """Find the ball, whole or cut, in a photograph (H, W) or (H, W, 3) with a free corner; else raise PaintError."""
     levels = _channels(picture, name)
     difference = np.asarray(cv2.medianBlur(_unlike_corners(levels), SPECK), np.float32)
     inside = difference > _otsu(difference)

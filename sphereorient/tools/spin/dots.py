@@ -67,7 +67,8 @@ class DotTable:
     def measured(self, disks: Tensor, R_view_body: Tensor) -> DotTable:
         """Return the table with the radius measured in disks (F, S, S) at R_view_body (F, 3, 3), blur included.
 
-        The radius must be right to a factor of 2 before; raise PaintError if no dot is darker than the white around.
+        R_view_body must be right to half a dot, the present radius to a factor of 2. Raise PaintError if no dot is
+        darker than the white around it.
         """
         direction, guess_deg = self.unit(), self.radius_deg
         view = orthographic_view(disks.shape[-1], torch.float64)
