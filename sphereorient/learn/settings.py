@@ -10,7 +10,7 @@ from sphereorient.synth.textures import KINDS
 
 
 class NetworkSettings(BaseModel):
-    """Shape of the network; stands in its checkpoints."""
+    """Shape of the network; part of its checkpoints."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -23,7 +23,7 @@ class NetworkSettings(BaseModel):
 
 
 class PictureSettings(BaseModel):
-    """Which pictures a network learns from; drawn anew for each step."""
+    """The pictures from which a network learns; drawn anew for each step."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -80,7 +80,7 @@ class Evidence:
 
 
 def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> PairwiseAttitudes:
-    """Find orientations of N unordered photographs by disks and finer ones; only the largest connected set gets any.
+    """Find orientations of N unordered photographs in disks, finally in `finer` ones; only the largest set gets any.
 
     Raises:
         PaintError: fewer than three pictures, no common patch, a sphere that does not rotate, or two spheres.

@@ -282,13 +282,13 @@ def settings_yaml(settings: Settings | None = None) -> str:
 
 
 def synth_settings_yaml() -> str:
-    """Write the settings of a synthetic experiment as YAML, commented likewise."""
+    """Write the settings of a synthetic experiment as commented YAML."""
     head = "# A synthetic experiment; any key may be left out. --set key=value overrides one."
     return "\n".join([head, "", *_commented(SynthSettings(), ""), ""])
 
 
 def proposer_settings_yaml(settings: ProposerSettings | None = None) -> str:
-    """Write the settings of a proposer's training as YAML, commented likewise."""
+    """Write the settings of a proposer's training as commented YAML."""
     head = "# Training of a proposer; any key may be left out. --set room.key=value overrides one."
     return _tree_yaml(head, settings or ProposerSettings())
 

@@ -177,7 +177,7 @@ def _begun(request: Request, resume: bool, workers: int) -> _Job:
 
 
 def _take(future: Future[Any], job: _Job, task: Task, executor: Executor, worker: int) -> None:
-    """Take the result of a task: a value, a refusal, or the death of its worker."""
+    """Handle the outcome of a task: a value, a refusal, or the death of its worker."""
     try:
         result = future.result()
     except SphereOrientError as error:

@@ -19,7 +19,7 @@ MIXED_SEED = 20110  # of the random combinations
 
 
 class BenchSettings(BaseModel):
-    """The list of scenes; results are compared scene by scene, so these settings are part of the results."""
+    """The list of scenes, part of the results: these are compared scene by scene."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

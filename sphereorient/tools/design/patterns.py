@@ -44,7 +44,7 @@ def facing(direction_body: Tensor) -> Tensor:
 def patterned_texture(kind: str, size_deg: float, seed: int, height: int = 512) -> Tensor:
     """Draw a map (height, 2 height) float32, 0 black .. 1 white, with patches about `size_deg` wide.
 
-    `kind`: blobs (wavy), patches (polygons), dots (round on white). Raise PaintError if unknown or out of range.
+    `kind`: blobs (wavy), patches (polygons), dots (black on white). Raise PaintError if kind or size is invalid.
     """
     if kind not in PATTERNS:
         raise PaintError(
@@ -140,7 +140,7 @@ def _dots(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
 
 
 def _apart(points: Tensor) -> Tensor:
-    """Push points (D, 3) apart, like charges, until they are spread but no lattice."""
+    """Push points (D, 3) apart, like charges, until they are spread but not a lattice."""
     step = 0.1 * math.sqrt(4 * math.pi / len(points))
     for _ in range(PUSHES):
         away = points[:, None] - points

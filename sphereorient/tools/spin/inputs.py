@@ -24,8 +24,9 @@ MOST_PHOTOGRAPHS = 1000
 
 
 def load_photographs(paths: Sequence[Path], times: str) -> Photographs:
-    """Read photographs, files in order of time or one folder by name; times: a table .csv (file, t_s in s) or a rate,
-    1/s.
+    """Read photographs: files in order of time, or one folder by name.
+
+    `times`: a table .csv with the columns file and t_s, s, or pictures per second at equal intervals.
 
     Raises:
         PaintError: missing or unreadable files, too many of them, or times that do not match.
@@ -42,7 +43,7 @@ def load_photographs(paths: Sequence[Path], times: str) -> Photographs:
 
 
 def load_ball(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
-    """Read a map or a table .csv of dots: x, y, z in each line, no header.
+    """Read a texture map, or a table .csv of dots: x, y, z of a direction in each line, no header.
 
     Raises:
         PaintError: the table is missing, or its lines are no directions.
