@@ -1,4 +1,4 @@
-"""The Cramér-Rao bound: how well any unbiased method can do on one picture."""
+"""The Cramér-Rao bound of any unbiased method on one picture."""
 
 from __future__ import annotations
 
@@ -23,37 +23,36 @@ SAMPLING = Sampling(supersampling=6)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bound:
-    """Least covariance of six unknowns from single pictures; made by `cramer_rao_bound`.
+    """Least covariance of delta of R = exp([delta]x) R_view_body, view, rad (3), centre (u, v), px, and radius, px.
 
-    Order of the unknowns: delta of R = exp([delta]x) R_view_body, view components, rad (three); centre (u, v), px;
-    radius, px. What the picture does not determine has infinite variance and covariance 0 with the others.
+    Made by `cramer_rao_bound`. Undetermined unknowns have infinite variance, and covariance 0 with the others.
     """
 
     information: Tensor  # (..., 6, 6)
 
     @property
     def covariance(self) -> Tensor:
-        """(..., 6, 6), inverse of the information."""
+        """Covariance (..., 6, 6): inverse of the information."""
         return _inverse(self.information)
 
     @property
     def orientation_rms_rad(self) -> Tensor:
-        """(...), rms geodesic error, centre and radius unknown too."""
+        """Rms geodesic error (...), rad, centre and radius unknown."""
         return _root_trace(self.covariance[..., :3, :3])
 
     @property
     def orientation_known_place_rms_rad(self) -> Tensor:
-        """(...), the same with centre and radius known."""
+        """Rms geodesic error (...), rad, centre and radius known."""
         return _root_trace(_inverse(self.information, 3))
 
     @property
     def centre_rms_px(self) -> Tensor:
-        """(...), rms distance of the centre from the true one."""
+        """Rms distance (...), px, of the centre from the true one."""
         return _root_trace(self.covariance[..., 3:5, 3:5])
 
     @property
     def radius_rms_px(self) -> Tensor:
-        """(...), rms error of the radius."""
+        """Rms error (...), px, of the radius."""
         return _root_trace(self.covariance[..., 5:, 5:])
 
 
@@ -65,24 +64,22 @@ def cramer_rao_bound(
     noise_share: float = 0.05,
     sampling: Sampling = SAMPLING,
 ) -> Bound:
-    """Return the bound for pictures of an evenly lit sphere in orthographic view, the light's gain and offset known.
+    """Return the bound for orthographic pictures in white noise, even light of known gain and offset.
 
-    The pictures are `SphereRenderer`'s in white noise. For the rms over attitudes take the mean of the variances, not
-    of the roots.
+    For the rms over orientations average the variances, not their roots.
 
     Args:
         texture: (H, 2 H), the map, 0 black .. 1 white.
-        R_view_body: (..., 3, 3), attitudes; dtype of the result.
+        R_view_body: (..., 3, 3), orientations; dtype of the result.
         diameter_px: of the disk.
-        noise_share: standard deviation of a pixel's noise over the step from black to white; the bound is
-            proportional to it.
+        noise_share: standard deviation of the noise over the step from black to white; the bound is proportional.
         sampling: blur and background; 6 fine samples per pixel and axis are right to 3 % from 20 px up, 4 from 40 px.
 
     Raises:
-        ShapeError: attitudes that are not 3 x 3, or a map that is not 2:1.
+        ShapeError: orientations that are not 3 x 3, or a map that is not 2:1.
         SettingsError: a diameter, noise or supersampling that is not positive.
 
-    Source: docs/errata.md, The bound; for white noise the information is J^T J / sigma^2, J the picture's derivatives.
+    Source: docs/errata.md, The bound.
     """
     check_tail("R_view_body", R_view_body, 3, 3)
     numbers = {"diameter_px": diameter_px, "noise_share": noise_share, "supersampling": sampling.supersampling}
@@ -107,10 +104,7 @@ def disk_renderer(texture: Tensor, diameter_px: float, sampling: Sampling = SAMP
 
 
 def jacobian(render: SphereRenderer, R_view_body: Tensor) -> Tensor:
-    """Return derivatives (K, S^2, 6) of pictures by central differences, the disk in the middle; unknowns as `Bound`'s.
-
-    Automatic derivatives would see the map's kinks and the samples on the limb as noise.
-    """
+    """Return derivatives (K, S^2, 6) by `Bound`'s unknowns, by central differences: kinks disturb automatic ones."""
     step = STEP_PX * R_view_body.new_tensor([1 / render.radius_mm] * 3 + [1.0] * 3)
     both = torch.cat([torch.diag(step), -torch.diag(step)])  # (12, 6)
     R = so3.exp(both[:, :3]) @ R_view_body[:, None]
@@ -121,12 +115,12 @@ def jacobian(render: SphereRenderer, R_view_body: Tensor) -> Tensor:
 
 
 def _inverse(information: Tensor, count: int = 6) -> Tensor:
-    """Invert information (..., 6, 6) of the first `count` unknowns, the others known; infinity where undetermined."""
+    """Invert information (..., 6, 6) of the first `count` unknowns, the others known; infinity: undetermined."""
     own = information.diagonal(dim1=-2, dim2=-1).clamp_min(0)
-    # Compare with all unknowns, the outline's too: the first `count` may all be undetermined.
+    # Compare with all unknowns: the first `count` may all be undetermined.
     greatest = own.amax(-1, keepdim=True).clamp_min(torch.finfo(own.dtype).tiny)
     own, information = own[..., :count], information[..., :count, :count]
-    # Scale each unknown's own information to 1, as far as it has any: rad and px cannot be compared.
+    # Scale each unknown's own information to 1: rad and px cannot be compared.
     unit = torch.where(own > ROUNDING * greatest, own, greatest).rsqrt()
     value, axis = torch.linalg.eigh(information * unit[..., None] * unit[..., None, :])
     open_ = value < DETERMINED

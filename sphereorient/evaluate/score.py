@@ -52,11 +52,7 @@ def _percentiles(values: Floats) -> Floats:
 
 
 def score_track(track: Trajectory, truth_path: str | Path) -> Score:
-    """Compare a track with the exact truth (docs/data-format.md), matched by time to half a frame.
-
-    Raises:
-        TrackError: no truth file, or times that do not match.
-    """
+    """Compare a track with the truth (docs/data-format.md) by time to half a frame; raise TrackError on a mismatch."""
     truth = _read_truth(truth_path, "position", *RATES)
     row = _rows(truth["time"], track.time, truth_path)
     relative, coverage = {}, {}
@@ -79,21 +75,13 @@ def score_track(track: Trajectory, truth_path: str | Path) -> Score:
 
 
 def true_orientations(path: Path, time_s: Floats) -> Floats:
-    """Return R_lab_body (N, 3, 3) of truth.h5 at times (N,), matched to half a frame.
-
-    Raises:
-        TrackError: no truth file, or times that do not match.
-    """
+    """Return R_lab_body (N, 3, 3) of truth.h5 at times (N,), s, to half a frame; raise TrackError without a match."""
     truth = _read_truth(path)
     return truth["orientation"][_rows(truth["time"], time_s, path)]
 
 
 def orientations_at(path: Path, frame: Frames) -> Floats:
-    """Return R_lab_body (N, 3, 3) of truth.h5 in frames (N,), counted from its first.
-
-    Raises:
-        TrackError: no truth file, or too few frames.
-    """
+    """Return R_lab_body (N, 3, 3) of truth.h5 in frames (N,), from 0; raise TrackError if there are too few."""
     R = _read_truth(path)["orientation"]
     if len(frame) and (frame.min() < 0 or frame.max() >= len(R)):
         expected, got = f"frames 0 .. {len(R) - 1}", f"{frame.min()} .. {frame.max()}"
@@ -102,7 +90,6 @@ def orientations_at(path: Path, frame: Frames) -> Floats:
 
 
 def _read_truth(path: str | Path, *names: str) -> dict[str, Floats]:
-    """Read time, orientation and other datasets of truth.h5."""
     try:
         with h5py.File(path) as file:
             schema = str(file.attrs.get("schema", ""))  # old truths have none
@@ -136,14 +123,10 @@ def _angle_deg(A: Floats, B: Floats) -> Floats:
 
 
 def read_fictrac(path: Path) -> tuple[Frames, Floats]:
-    """Read frames (N,), from 0, and orientations (N, 3, 3), body to camera axes, of a .dat file of FicTrac 2.
+    """Read frames (N,), from 0, and orientations (N, 3, 3), body to camera axes, of a FicTrac 2 .dat file.
 
-    The frame of reference is that of FicTrac's first frame, and the sphere's axes are its own: align with "both".
-
-    Raises:
-        BenchError: the file is missing or not of this form.
-
-    Source: FicTrac's doc/data_header.txt, columns 1 and 9 to 11; exp(vector) is the rotation since its first frame.
+    They are relative to its first frame, in axes of its own: align with "both". Raise BenchError for other files.
+    Source: FicTrac's doc/data_header.txt.
     """
     do = "pass FicTrac's .dat file"
     try:
@@ -162,16 +145,10 @@ READERS: dict[str, Callable[[Path], tuple[Frames, Floats]]] = {"fictrac": read_f
 
 
 def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats:
-    """Return the geodesic distances of orientations, (N,) degrees, after the best constant rotations.
+    """Return geodesic distances (N,), degrees, of R (N, 3, 3) from the truth; NaN: not measured.
 
-    Args:
-        R: (N, 3, 3), measured; NaN: not measured, as in the result.
-        R_true: (N, 3, 3).
-        align: "none"; "body" fits B in R B, for arbitrary body axes; "both" fits A and B in A R B, for an arbitrary
-            frame of reference too.
-
-    Raises:
-        BenchError: another word for align.
+    `align`: "none"; "body" fits B in R B (arbitrary body axes); "both" fits A and B in A R B (any frame of reference).
+    Raise BenchError for another word.
     """
     if align not in ALIGNMENTS:
         raise BenchError(refusal("--align", expected="none, body or both", got=repr(align)[:40], do="choose one"))
@@ -185,9 +162,8 @@ def aligned_errors_deg(R: Floats, R_true: Floats, align: str = "none") -> Floats
 
 
 def _alignment(measured: torch.Tensor, true: torch.Tensor, align: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return A and B with the least sum of squared chords, fitted in turn.
-
-    B starts from the first frame: from elsewhere the iteration can converge far from the optimum.
+    """Return A and B with the least squared chords, fitted in turn; starting from the first frame's B avoids wrong
+    optima.
     """
     left = right = torch.eye(3, dtype=measured.dtype)
     if align == "none":

@@ -1,4 +1,1 @@
-"""The optional learned proposer: a network, its training data and its training.
-
-`train` and `module` import pytorch_lightning, which takes seconds: only `sphereorient train` imports them.
-"""
+"""The optional learned proposer. Only training imports `train` and `module`: pytorch_lightning takes seconds."""

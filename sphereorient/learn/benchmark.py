@@ -1,4 +1,4 @@
-"""A checkpoint on maps that no training sees: recall by degradation, metrics, speed, and example pictures."""
+"""A checkpoint on unseen maps: recall by degradation, metrics, speed, and example pictures."""
 
 from __future__ import annotations
 
@@ -73,17 +73,12 @@ class Example:
 def benchmark_checkpoint(
     checkpoint: Checkpoint, settings: PictureSettings, pictures: int, progress: Progress, seed: int = 0
 ) -> ProposerBenchmark:
-    """Measure a checkpoint on maps and pictures that no training sees.
+    """Measure a checkpoint on unseen maps and pictures; a fine-tuned one on its own map, that of `settings`.
 
-    Args:
-        checkpoint: of the network; a fine-tuned one is measured on its own map.
-        settings: of the pictures; its map is that of the fine-tuning.
-        pictures: of each degradation and level, rounded up to whole groups; ten times as many mixed ones.
-        progress: called with stage, finished maps, all maps.
-        seed: of orientations, light and degradations; the maps are always the same.
+    `pictures` of each degradation and level, ten times as many mixed; `progress` gets stage, finished maps, all maps.
 
     Raises:
-        CheckpointError: pictures of another size, or another map than that of the fine-tuning.
+        CheckpointError: another picture size, or another map than that of the fine-tuning.
         TextureError: the map cannot be read.
     """
     _check(checkpoint, settings)
@@ -143,14 +138,7 @@ def _recall(name: str, level: int, rank: Tensor) -> DegradationRecall:
 
 @torch.no_grad()
 def make_examples(checkpoint: Checkpoint, count: int, shown: int = 4, seed: int = 0) -> tuple[Example, ...]:
-    """Film maps that training has not seen, and propose orientations.
-
-    Args:
-        checkpoint: of the network; a fine-tuned one is shown its own map.
-        count: of examples, each with another map and other degradations, the first without any.
-        shown: proposals of each, K.
-        seed: of orientations, light and degradations.
-    """
+    """Render `count` unseen maps (fine-tuned: its own), the first undegraded, and keep the first `shown` proposals."""
     settings, network = checkpoint.settings.pictures, correlator_of(checkpoint)
     maps = make_textures(settings, network.settings.nodes, count=count, first_seed=VALIDATION_SEED)
     examples = []

@@ -38,12 +38,7 @@ class Checkpoint(BaseModel):
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; equal checkpoints have equal bytes.
-
-    Raises:
-        CheckpointError: `load_checkpoint` would refuse it.
-        OutputError: the file cannot be written.
-    """
+    """Write a checkpoint, equal ones with equal bytes; raise CheckpointError if invalid, OutputError if unwritable."""
     state = {name: tensor.detach().cpu().float().contiguous().clone() for name, tensor in checkpoint.state.items()}
     tree = {
         "schema": SCHEMA,
@@ -59,11 +54,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint on the CPU, without executing code.
-
-    Raises:
-        CheckpointError: the file is missing, too large, damaged, of another version, or has code or other weights.
-    """
+    """Read a checkpoint on the CPU without executing code; raise CheckpointError if file or weights are invalid."""
     name = f"checkpoint {path}"
     _check_archive(path, name)
     try:
@@ -91,11 +82,7 @@ def texture_sha256(texture: Tensor) -> str:
 
 
 def check_texture(checkpoint: Checkpoint, texture: Tensor) -> None:
-    """Refuse a map, (H, 2 H), not reduced, other than that of the fine-tuning.
-
-    Raises:
-        CheckpointError: another map.
-    """
+    """Raise CheckpointError if a map, (H, 2 H), not reduced, is not that of the fine-tuning."""
     own = checkpoint.texture_sha256
     if own is not None and own != (other := texture_sha256(texture)):
         expected, got = f"the map that it was fine-tuned on ({own[:12]})", f"another map ({other[:12]})"
@@ -107,7 +94,7 @@ def _refuse(name: str, expected: str, got: str, do: str, cause: Exception | None
 
 
 def _check_archive(path: Path, name: str) -> None:
-    """Refuse a file that is not torch's archive, or that would expand when it is read."""
+    """Refuse a file that is not torch's archive, or that expands when it is read."""
     try:
         size = path.stat().st_size if path.is_file() else -1
     except OSError as error:
@@ -129,7 +116,6 @@ def _check_archive(path: Path, name: str) -> None:
 
 
 def _checked(tree: Any, name: str) -> Checkpoint:
-    """Return the checkpoint of a file's content, after a check of every part."""
     if isinstance(tree, dict) and "pytorch-lightning_version" in tree:
         do = "pass the proposer.ckpt beside it; last.ckpt is for `sphereorient train --resume`"
         _refuse(name, f"schema {SCHEMA}", "a checkpoint of Lightning", do)
@@ -137,7 +123,7 @@ def _checked(tree: Any, name: str) -> Checkpoint:
     if schema != SCHEMA:
         got = short(schema) if isinstance(schema, str) else "none"
         _refuse(name, f"schema {SCHEMA}", got, "train it anew with this version, or install the one that wrote it")
-    # The defaults are for those who make a checkpoint: a file has every key.
+    # A file has every key; the defaults are for new checkpoints.
     absent = dict.fromkeys(Checkpoint.model_fields.keys() - tree.keys(), "absent")
     content = {key: value for key, value in tree.items() if key != "schema"}
     checkpoint = validated(Checkpoint, content | absent, name, CheckpointError)
@@ -146,7 +132,7 @@ def _checked(tree: Any, name: str) -> Checkpoint:
 
 
 def _check_state(checkpoint: Checkpoint, name: str) -> None:
-    """Refuse weights that are not finite, or not those of the network that the settings describe."""
+    """Refuse weights that are not finite, or do not fit the network of the settings."""
     state, known = checkpoint.state, Correlator(checkpoint.settings.network).state_dict()
     if state.keys() != known.keys():
         different = ", ".join(sorted(short(key) for key in state.keys() ^ known.keys())[:3])

@@ -1,5 +1,3 @@
-"""From a density over SO(3) to candidates: its modes, their orientation and probability."""
-
 from __future__ import annotations
 
 import math
@@ -25,20 +23,15 @@ class Modes:
 
 
 def find_modes(logits: Tensor, grid: Tensor, count: int, temperature: float = 1.0) -> Modes:
-    """Find the K likeliest modes of densities on a grid.
+    """Find the `count` (K) likeliest modes of log densities (F, G), each up to a constant, on rotations (G, 3, 3).
 
-    Args:
-        logits: (F, G), log density up to a constant of each disk.
-        grid: (G, 3, 3) rotations, evenly spread.
-        count: K.
-        temperature: divides the logits for probabilities and order only. The orientation of a mode is the mean of the
-            density as it was learnt: a sharper density would shift it to the nearest grid point.
+    The temperature divides the logits for probabilities and order only; orientations are means of the density as
+    learnt.
     """
     flat = grid.flatten(1)
     probability = logits.softmax(-1)
     point = logits.topk(min(SEARCHED, logits.shape[1]), dim=1).indices
     mode = distinct(grid[point], math.radians(APART_DEG))
-    # The first `count` modes; a stable sort keeps their order.
     order = (~mode).int().argsort(dim=1, stable=True)[:, :count]
     chosen, exists = point.gather(1, order), mode.gather(1, order)
     near = flat[chosen] @ flat.T  # (F, K, G), trace of the relative rotation

@@ -1,5 +1,3 @@
-"""Metrics of proposals: recall of the right orientation, and calibration of the probabilities."""
-
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
@@ -28,7 +26,7 @@ class Predictions:
 
     @classmethod
     def joined(cls, parts: Sequence[Predictions]) -> Predictions:
-        """Return several predictions as one."""
+        """Join several predictions."""
         return cls(
             logits=torch.cat([one.logits for one in parts]), R_view_body=torch.cat([one.R_view_body for one in parts])
         )
@@ -81,13 +79,7 @@ def metrics_of(predictions: Predictions, grid: Tensor, spread_rad: float, temper
 
 
 def fitted_temperature(predictions: Predictions, grid: Tensor) -> float:
-    """Return the temperature that calibrates the first candidate's probability of being right.
-
-    It maximises the likelihood of the outcomes right and wrong. The likelihood of the density would not do: the
-    smoothed target is wider than the truth.
-
-    Source: Guo et al. 2017 (temperature scaling).
-    """
+    """Return the temperature that calibrates the first candidate's probability of being right (Guo et al. 2017)."""
 
     def cost(temperature: float) -> float:
         rank, probability = _ranked(predictions, grid, temperature)

@@ -1,4 +1,4 @@
-"""What Lightning trains: data, loss and learning rate, checkpoints, time limit."""
+"""The training for Lightning: data, loss and learning rate, checkpoints, time limit."""
 
 from __future__ import annotations
 
@@ -32,13 +32,7 @@ Row = dict[str, float]
 
 
 class TrainingData(LightningDataModule):
-    """Training pictures, drawn in each step, and validation pictures, drawn once.
-
-    A training batch depends on the seed, the epoch and the step alone.
-
-    Raises:
-        TextureError: the one map of a fine-tuning cannot be read.
-    """
+    """Training pictures, a function of seed, epoch and step alone, and validation pictures, drawn once."""
 
     def __init__(self, settings: ProposerSettings) -> None:
         super().__init__()
@@ -134,7 +128,7 @@ class ProposerModule(LightningModule):
         return row
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the settings: training is resumed with the same ones only."""
+        """Add the settings: training is resumed only with the same ones."""
         checkpoint["sphereorient_settings"] = self.settings.model_dump(mode="json")
 
 
@@ -157,12 +151,7 @@ class TrainingTimer(Timer):
 
 
 class CheckpointCallback(Callback):
-    """Keeps the history, the weights of the best validation, and last.ckpt after each epoch.
-
-    Args:
-        out: folder.
-        progress: called with the finished steps.
-    """
+    """Keeps the history, the weights of the best validation, and last.ckpt after each epoch, in the folder `out`."""
 
     state_key = "Keeper"  # its name in checkpoints
 
@@ -204,7 +193,7 @@ class CheckpointCallback(Callback):
             self.best = {name: tensor.detach().cpu().clone() for name, tensor in module.network.state_dict().items()}
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write last.ckpt, whole or not at all."""
+        """Write last.ckpt atomically."""
         with put_aside(self._out / LAST, also=(RuntimeError,)) as aside:
             trainer.save_checkpoint(aside)
 

@@ -1,4 +1,4 @@
-"""A network that predicts a density over SO(3): it correlates features of the picture with those of the rotated map."""
+"""A network that predicts a density over SO(3): it correlates features of picture and rotated map."""
 
 from __future__ import annotations
 
@@ -69,10 +69,7 @@ class PictureNetwork(nn.Module):
 
 
 class MapNetwork(nn.Module):
-    """Features of every point of a map: a function of the isotropic blurs there.
-
-    The features of a rotated ball are the rotated features, so one evaluation serves all orientations.
-    """
+    """Features of the points of a map by their isotropic blurs, so that one evaluation serves all orientations."""
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
@@ -89,7 +86,7 @@ class MapNetwork(nn.Module):
 
 
 class Correlator(nn.Module):
-    """Density over SO(3) of a disk's orientation, given the ball's map: logits on a Lattman grid."""
+    """Density over SO(3) of a disk's orientation, given the texture map: logits on a Lattman grid."""
 
     grid: Tensor
     cells: Tensor
@@ -150,17 +147,9 @@ def _convolution(into: int, out: int, stride: int = 1) -> nn.Sequential:
 
 
 def map_blurs(textures: Tensor, side: int) -> Tensor:
-    """Blur maps with wider and wider kernels, sampled in the cells of an octahedral map.
-
-    Args:
-        textures: (T, H, 2 H), 0 black .. 1 white.
-        side: cells along each axis, N = side^2.
-
-    Returns:
-        (T, N, B) float32, in standard deviations of each map from its mean.
-    """
+    """Return blurs (T, side^2, B) float32, in deviations, of maps (T, H, 2 H), 0 black .. 1 white, on an octahedron."""
     direction = octahedral_directions(side).float()
-    # Solid angle of a cell, which is flat on the octahedron's face.
+    # Solid angle of a cell of the octahedron.
     area = direction.abs().sum(-1).pow(3)
     paint = torch.stack([sample_texture(reduced_texture(each.float(), 0.8 * side), direction) for each in textures], -1)
     share = (area / area.sum())[:, None]

@@ -41,18 +41,13 @@ class TrainingBatch(NamedTuple):
 
 
 def generator_of(*numbers: int) -> torch.Generator:
-    """Return a generator with a seed made of whole numbers from 0 up."""
-    # torch reads 32 bits of its seed: sums of seed, epoch and step would repeat. The count comes first, or zeros at
-    # the end would not matter.
+    """Return a generator seeded by whole numbers, not negative."""
+    # torch reads 32 bits of its seed: sums would repeat. The count comes first, else zeros at the end are ignored.
     return torch.Generator().manual_seed(int(np.random.SeedSequence((len(numbers), *numbers)).generate_state(1)[0]))
 
 
 def make_textures(settings: PictureSettings, nodes: int, *, count: int, first_seed: int) -> RandomTextures:
-    """Draw maps with consecutive seeds, or read the one map of a fine-tuning.
-
-    Raises:
-        TextureError: the map cannot be read.
-    """
+    """Draw maps with consecutive seeds, or read the map of a fine-tuning; raise TextureError if it is unreadable."""
     rows = settings.texture_rows
     if settings.texture is not None:
         own = load_texture(Path(settings.texture))
@@ -78,7 +73,7 @@ def _random_map(settings: PictureSettings, seed: int, number: int) -> Tensor:
 def draw_batch(
     maps: RandomTextures, settings: PictureSettings, rng: torch.Generator, shape: tuple[int, int, int]
 ) -> TrainingBatch:
-    """Film random maps; `shape`: maps, groups of each, pictures of each group, which has its own degradations."""
+    """Render random maps; `shape`: maps, groups of each, pictures of each group with its own degradations."""
     count, groups, group = shape
     rows = []
     for k in torch.randint(len(maps.textures), (count,), generator=rng).tolist():
@@ -91,16 +86,16 @@ def draw_batch(
 
 
 def film_group(texture: Tensor, R_view_body: Tensor, settings: PictureSettings, rng: torch.Generator) -> Tensor:
-    """Film a map with one random draw of degradations for all pictures, (F, S, S)."""
+    """Render a map with one random draw of degradations for all pictures, (F, S, S)."""
     return film_with(texture, R_view_body, draw_values(settings, rng), rng, settings)
 
 
 def film_with(
     texture: Tensor, R_view_body: Tensor, values: Mapping[str, float], rng: torch.Generator, settings: PictureSettings
 ) -> Tensor:
-    """Film a map with given degradations, (F, S, S)."""
+    """Render a map with given degradations, (F, S, S)."""
     filmed = worn(texture, values.get("paint_wear", 0.0), rng)
-    # For a comparison, an error of the map is the same as an error of the ball.
+    # An error of the sphere has the same effect as an error of the map.
     filmed = misdrawn(filmed, values.get("texture_error", 0.0), rng)
     return film_disks(filmed, R_view_body, values, rng, settings.disks)
 

@@ -1,5 +1,3 @@
-"""The trained network as a proposer, in place of the template search."""
-
 from __future__ import annotations
 
 from pathlib import Path
@@ -15,8 +13,7 @@ from sphereorient.learn.network import Correlator, map_blurs
 from sphereorient.search.candidates import Candidates
 from sphereorient.trajectory import Reason
 
-# Disks at once, padded with empty disks: the last bits of a product depend on its number of rows, and the result of a
-# disk must not depend on other disks.
+# Disks at once, padded: the last bits of a product depend on its number of rows, a disk's result must not.
 BATCH = 32
 CANDIDATES = 8
 PROBABILITY_MIN = 1e-5  # of a candidate
@@ -34,13 +31,9 @@ def probability_of(score: Tensor) -> Tensor:
 
 
 class LearnedProposer:
-    """Proposes the modes of the density over SO(3) that a trained network predicts.
+    """Proposes modes of the density that a network predicts for a map (H, 2 H), 0 black .. 1 white.
 
-    Args:
-        correlator: the trained network.
-        texture: (H, 2 H), the ball's map, 0 black .. 1 white.
-        temperature: of the logits, for calibrated probabilities.
-        candidates: at most, of each disk.
+    At most `candidates` for each disk; `temperature` divides the logits, for calibrated probabilities.
     """
 
     def __init__(
@@ -60,12 +53,7 @@ class LearnedProposer:
     def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations in the view frames of disks, with `score_of` their probability.
 
-        Args:
-            disks: (F, S, S) float32, grey levels of any scale; the outline touches the borders. A uniform disk has no
-                proposals (`LOW_SCORE`).
-
-        Raises:
-            ShapeError: disks of another size.
+        A uniform disk has no proposals (`LOW_SCORE`); raise ShapeError for disks of another size.
         """
         if disks.shape[1:] != (self.size_px, self.size_px):
             size = f"(F, {self.size_px}, {self.size_px})"
@@ -85,7 +73,6 @@ class LearnedProposer:
         )
 
     def _modes(self, disks: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the modes of one full batch: rotations (B, K, 3, 3) and probabilities (B, K)."""
         logits = self._network.logits(self._network.seen(disks), self._bank)
         modes = find_modes(logits, self._network.grid, self._candidates, self._temperature)
         return modes.R_view_body, modes.probability

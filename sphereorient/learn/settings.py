@@ -1,5 +1,3 @@
-"""Settings of the learned proposer: its network, the pictures that it learns from, and its training."""
-
 from __future__ import annotations
 
 from typing import Self
@@ -12,7 +10,7 @@ from sphereorient.synth.textures import KINDS
 
 
 class NetworkSettings(BaseModel):
-    """Shape of the network; stands in its checkpoints."""
+    """Shape of the network; part of its checkpoints."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -25,7 +23,7 @@ class NetworkSettings(BaseModel):
 
 
 class PictureSettings(BaseModel):
-    """Which pictures a network learns from; drawn anew all the time."""
+    """The pictures from which a network learns; drawn anew for each step."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -71,7 +69,7 @@ class TrainingSettings(BaseModel):
 
 
 class ProposerSettings(BaseModel):
-    """The tree of configs/train_proposer.yaml."""
+    """The settings of configs/train_proposer.yaml."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -1,5 +1,3 @@
-"""Training of a proposer: from settings to a folder with its checkpoint."""
-
 from __future__ import annotations
 
 import logging
@@ -45,14 +43,9 @@ class Trained:
 def train_proposer(
     settings: ProposerSettings, out: Path, *, resume: bool = False, progress: Progress = silent
 ) -> Trained:
-    """Train a proposer and write proposer.ckpt, last.ckpt and metrics.csv into a folder.
+    """Train a proposer and write proposer.ckpt, last.ckpt and metrics.csv into the folder `out`, created if missing.
 
-    Args:
-        settings: of network, pictures and training.
-        out: folder; created if missing.
-        resume: continue from last.ckpt in the folder, to the same weights as without the interruption, unless
-            `minutes` is set.
-        progress: called with stage, finished steps, steps at most.
+    `resume` continues from last.ckpt, to the same weights unless `minutes` is set; `progress` gets stage, done, total.
 
     Raises:
         CheckpointError: training.start or last.ckpt cannot be used.
@@ -117,12 +110,7 @@ def train_proposer(
 
 
 def prepare(settings: ProposerSettings, out: Path, resume: bool = False) -> Correlator:
-    """Check the inputs, create the folder, and return the initial network.
-
-    Raises:
-        CheckpointError: training.start or last.ckpt cannot be used.
-        OutputError: the folder cannot be created.
-    """
+    """Check the inputs as `train_proposer`, create the folder, and return the initial network."""
     if resume:
         _check_last(out / LAST, settings)
     network = _initial_network(settings)
@@ -135,7 +123,6 @@ def prepare(settings: ProposerSettings, out: Path, resume: bool = False) -> Corr
 
 
 def _initial_network(settings: ProposerSettings) -> Correlator:
-    """Return a network with random weights, or with those of training.start."""
     start = settings.training.start
     if start is None:
         with torch.random.fork_rng(devices=[]):
@@ -170,7 +157,7 @@ def _without_length(settings: ProposerSettings) -> dict[str, Any]:
 
 
 def _fit(trainer: Trainer, module: ProposerModule, data: TrainingData, last: str | None) -> None:
-    """Train; raise KeyboardInterrupt on Ctrl-C, which Lightning would turn into an exit."""
+    """Train; raise KeyboardInterrupt on Ctrl-C, where Lightning would exit."""
     main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGINT) if main else None
     try:
@@ -186,7 +173,6 @@ def _fit(trainer: Trainer, module: ProposerModule, data: TrainingData, last: str
 
 @contextmanager
 def _quiet_lightning() -> Iterator[None]:
-    """Silence Lightning's advice on hardware and data loaders."""
     loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:

@@ -1,4 +1,4 @@
-"""The texture map from movies or photographs: relative rotations, loops, then attitudes, light and map together."""
+"""The texture map from movies or photographs: relative rotations, loops, then orientations, light and map together."""
 
 from sphereorient.mapping.crops import take_crops
 from sphereorient.mapping.learn import fit_map

@@ -1,4 +1,4 @@
-"""Attitudes of a movie's frames without a map: compare neighbours, chain the rotations, close loops."""
+"""Orientations of a movie's frames without a map: compare neighbours, chain the rotations, close loops."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ FEWEST = 4  # such pairs
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairwiseAttitudes:
-    """Attitudes of N instants from pairs of pictures alone."""
+    """Orientations of N instants from pairs of pictures alone."""
 
-    rows: Tensor  # (N,) int64, rising, of the instants among the disks given; the others have no attitude
+    rows: Tensor  # (N,) int64, rising, of the instants among the disks given; the others have no orientation
     R_lab_body: Tensor  # (N, 3, 3) float64; identity at the first one
     closure: Closure
 
 
 def find_chain(disks: Disks, settings: MapSettings) -> PairwiseAttitudes:
-    """Find the attitudes of a movie's frames from disks of N instants, each seen by a camera at least.
+    """Find the orientations of N instants from disks, each seen by at least one camera.
 
     Raises:
-        PaintError: the sphere does not turn, the cameras see different rotations, or no patch is seen twice.
+        PaintError: the sphere does not rotate, the cameras see different rotations, or no patch is seen twice.
     """
     if len(disks) < 2:
         raise too_few(len(disks))
@@ -54,7 +54,7 @@ def find_chain(disks: Disks, settings: MapSettings) -> PairwiseAttitudes:
 
 
 def check_turned(R_lab_body: Tensor, settings: MapSettings) -> None:
-    """Raise PaintError if attitudes (N, 3, 3) turn by less than the setting."""
+    """Raise PaintError if orientations (N, 3, 3) rotate by less than the setting."""
     turned = float(so3.geodesic_distance(R_lab_body[:1], R_lab_body).max())
     if turned < math.radians(settings.turned_min_deg):
         got = f"{math.degrees(turned):.2g} degrees in all frames together"
@@ -63,13 +63,13 @@ def check_turned(R_lab_body: Tensor, settings: MapSettings) -> None:
 
 
 def _chained_pairs(disks: Disks, settings: MapSettings) -> tuple[Tensor, RelativeRotations]:
-    """Compare neighbours, then frames further apart from the attitudes that this gives."""
+    """Compare neighbours, then, from the resulting orientations, frames further apart."""
     count = len(disks)
     grid = so3.local_grid(math.radians(SEARCH_STEP_DEG), math.radians(settings.turn_max_deg))
     first = torch.arange(count - 1)
     still = torch.eye(3, dtype=torch.float64).expand(count - 1, 3, 3)
     start = search_pairs(reduced(disks, SMALLER), first, first + 1, still, grid, SEARCH_EVERY)
-    # All neighbours are kept: nothing else connects the frames before them with those after.
+    # Keep all neighbours: nothing else connects the frames before and after.
     parts = [refine_pairs(disks, first, first + 1, start, ITERATIONS, EVERY)]
     R = chained(parts[0].R_ji)
     for step in settings.baselines:
@@ -82,7 +82,7 @@ def _chained_pairs(disks: Disks, settings: MapSettings) -> tuple[Tensor, Relativ
 
 
 def chained(R_next: Tensor) -> Tensor:
-    """Return attitudes (N, 3, 3) from rotations (N - 1, 3, 3) between neighbours, the first one the identity."""
+    """Return orientations (N, 3, 3) from rotations (N - 1, 3, 3) between neighbours, the first one the identity."""
     R = [torch.eye(3, dtype=R_next.dtype)]
     for turn in R_next:
         R.append(turn @ R[-1])
@@ -90,17 +90,7 @@ def chained(R_next: Tensor) -> Tensor:
 
 
 def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, settings: MapSettings) -> PairwiseAttitudes:
-    """Find the same patches again after long times and between cameras, and remove the drift.
-
-    Args:
-        disks: of N instants.
-        R_lab_body: (N, 3, 3), with drift.
-        pairs: of neighbours, that gave them.
-        settings: of mapping.
-
-    Raises:
-        PaintError: no two keyframes show the same patch.
-    """
+    """Match distant keyframes, and remove the drift of orientations (N, 3, 3); raise PaintError without a match."""
     first, second = _candidates(disks, R_lab_body, settings)
     about = R_lab_body[second] @ R_lab_body[first].mT
     reach = math.radians(settings.loop_reach_deg)
@@ -135,7 +125,6 @@ def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, sett
 
 
 def _keyframes(R_lab_body: Tensor, step_rad: float) -> Tensor:
-    """Return the instants (K,) that are at least a step away from the one before, the first and the last included."""
     keys = [0]
     for k in range(1, len(R_lab_body)):
         if float(so3.geodesic_distance(R_lab_body[keys[-1]], R_lab_body[k])) >= step_rad:
@@ -146,10 +135,7 @@ def _keyframes(R_lab_body: Tensor, step_rad: float) -> Tensor:
 
 
 def _candidates(disks: Disks, R_lab_body: Tensor, settings: MapSettings) -> tuple[Tensor, Tensor]:
-    """Return pairs of keyframes (first, second), no neighbours, that should show the same patch.
-
-    Of too many, evenly spread ones are taken, so that they cover all times.
-    """
+    """Return distant pairs of keyframes that should share a patch; of too many, evenly spread ones."""
     keys = _keyframes(R_lab_body, math.radians(settings.keyframe_deg))
     near = sight_cosines(disks, R_lab_body, keys)
     a, b = torch.triu_indices(len(keys), len(keys), offset=2)
@@ -162,7 +148,7 @@ def _candidates(disks: Disks, R_lab_body: Tensor, settings: MapSettings) -> tupl
 
 
 def sight_cosines(disks: Disks, R_lab_body: Tensor, rows: Tensor) -> Tensor:
-    """Return the cosine between the nearest lines of sight in the body of all pairs of some instants (K,), (K, K)."""
+    """Return the cosine between the nearest lines of sight in the body for all pairs of instants (K,), (K, K)."""
     sight = -disks.R_lab_view[rows, :, :, 2].double()  # from the ball to the camera
     in_body = (R_lab_body[rows].mT[:, None] @ sight[..., None])[..., 0]
     cosine = torch.einsum("acx,bdx->abcd", in_body, in_body)
@@ -171,7 +157,6 @@ def sight_cosines(disks: Disks, R_lab_body: Tensor, rows: Tensor) -> Tensor:
 
 
 def _check_one_ball(disks: Disks, R_lab_body: Tensor) -> None:
-    """Raise PaintError if the median difference of two cameras' own rotations is too large."""
     cameras = disks.layers.shape[1]
     keys = _keyframes(R_lab_body, 2 * ENOUGH_TURN_RAD)
     keys = keys[disks.seen[keys].all(1)]

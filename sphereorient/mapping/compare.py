@@ -1,4 +1,4 @@
-"""Compare two texture maps of one ball: rotation of the body frame, displacements, changes; correct an old map."""
+"""Compare two texture maps of one sphere: body frame, displacements, changes; correct an old map."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ REACHES = 16  # directions of that search
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapComparison:
-    """How two maps of one ball differ; directions are in the reference's body frame."""
+    """How two maps of one sphere differ; directions are in the reference's body frame."""
 
     R_other_reference: Tensor  # (3, 3) float64: what the reference shows at d, the other shows at R d
     correlation: float  # of both maps after that rotation, where both are known
@@ -49,33 +49,26 @@ class MapComparison:
 
     @property
     def length_rad(self) -> Tensor:
-        """Length of the displacements that could be measured, (n,)."""
+        """Length of the measured displacements, rad, (n,)."""
         length = self.moved_rad.norm(dim=-1)
         known: Tensor = length[torch.isfinite(length)]
         return known
 
     @property
     def rms_rad(self) -> float:
-        """Root mean square of the displacements, NaN where none was measured."""
+        """Root mean square of the displacements, rad; NaN if none was measured."""
         return float(self.length_rad.square().mean().sqrt()) if len(self.length_rad) else math.nan
 
     @property
     def max_rad(self) -> float:
-        """Largest displacement, NaN where none was measured."""
+        """Largest displacement, rad; NaN if none was measured."""
         return float(self.length_rad.max()) if len(self.length_rad) else math.nan
 
 
 def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapComparison:
-    """Measure the displacement of a map against a reference, NaN where unknown; sizes may differ.
+    """Measure the displacement of a map (H, 2 H), 0 black .. 1 white, against a reference (h, 2 h); NaN: unknown.
 
-    Args:
-        other: (H, 2 H), 0 black .. 1 white.
-        reference: (h, 2 h).
-        turned: find the rotation between the body frames first; False: they are the same.
-
-    Raises:
-        PaintError: the maps do not show one ball.
-        ShapeError: not 2:1.
+    `turned`: find the rotation between the body frames. Raise PaintError for different spheres, ShapeError if not 2:1.
     """
     maps = [_known(texture) for texture in (other, reference)]
     finest = [texture_table(grey, math.radians(FINE_BLUR_DEG), SIDE) for grey, _ in maps]
@@ -114,10 +107,7 @@ def turned_map(texture: Tensor, R_map_new: Tensor, height: int | None = None) ->
 
 
 def fit_levels(texture: Tensor, reference: Tensor) -> tuple[float, float]:
-    """Return gain and offset that bring a map's grey levels to a reference's of the same size and frame.
-
-    Outliers (a new spot, a seam) have little weight.
-    """
+    """Return gain and offset, robust, that fit a map's grey levels to a reference's of the same size and frame."""
     known = torch.isfinite(texture) & torch.isfinite(reference)
     x, y = texture[known].double(), reference[known].double()
     columns = torch.stack([x, torch.ones_like(x)], dim=1)
@@ -131,13 +121,9 @@ def fit_levels(texture: Tensor, reference: Tensor) -> tuple[float, float]:
 
 
 def texture_change(new: Tensor, old: Tensor) -> Tensor:
-    """Return how far the new map's grey lies outside of all grey levels that the old map has near, (H, 2 H).
+    """Return the change of grey (H, 2 H), -1 darker .. 1, of a map from an old one in the same frame; NaN: unknown.
 
-    Both are in one frame; the old grey levels are fitted to the new ones first.
-
-    Returns:
-        -1 .. 1, negative where the texture became darker; 0 where a displacement of up to `RADIUS_DEG` explains all;
-        NaN where either map is unknown.
+    0: a displacement up to `RADIUS_DEG` explains it. The old grey levels are fitted to the new ones first.
     """
     gain, offset = fit_levels(old, new)
     grey = old * gain + offset
@@ -157,7 +143,7 @@ def texture_change(new: Tensor, old: Tensor) -> Tensor:
 
 
 def without_changed(comparison: MapComparison, change: Tensor, most: float) -> MapComparison:
-    """Return a comparison without the patches in which the texture changed by more than `most`: their shift is void."""
+    """Return a comparison without displacements of patches whose texture changed by more than `most`."""
     spots = Patches(direction=comparison.direction_body, R_other_reference=comparison.R_other_reference).points(1.0)
     changed = (change.abs() > most).double()  # an unknown texel has not changed
     spoilt = sample_texture(changed, spots).mean(1) > CHANGED_SHARE
@@ -165,10 +151,7 @@ def without_changed(comparison: MapComparison, change: Tensor, most: float) -> M
 
 
 def fibonacci_directions(count: int) -> Tensor:
-    """Return evenly spread directions on a spiral from pole to pole, (count, 3) float64, without the poles.
-
-    Source: Swinbank and Purser 2006, Fibonacci grids.
-    """
+    """Return evenly spread directions, (count, 3) float64, without the poles (Swinbank and Purser 2006)."""
     k = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - 2 * k / count
     angle = math.pi * (1 + math.sqrt(5.0)) * k
@@ -177,7 +160,7 @@ def fibonacci_directions(count: int) -> Tensor:
 
 
 def _known(texture: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a map with its mean where unknown, and where it is known, (H, 2 H) float32 each."""
+    """Return a map with its mean where unknown, and the mask of the known texels, (H, 2 H) float32 each."""
     if texture.ndim != 2 or texture.shape[1] != 2 * texture.shape[0]:
         raise ShapeError(refusal("map", expected="(H, 2 H)", got=str(tuple(texture.shape)), do="pass one map"))
     known = torch.isfinite(texture)
@@ -186,7 +169,6 @@ def _known(texture: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _best_rotation(tables: dict[float, list[TextureTable]], shares: list[Tensor], place: Tensor) -> Tensor:
-    """Search all rotations, and refine the best ones."""
     grid = so3.lattman_grid(math.radians(SEARCH_DEG)).double()
     few = fibonacci_directions(SEARCH_PLACES)
     tried = [_correlations(tables[SEARCH_BLUR_DEG], shares, few, some) for some in torch.split(grid, CHUNK)]
@@ -217,12 +199,11 @@ def _common_turn(direction: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _shrunk(score: Tensor, known: Tensor) -> Tensor:
-    """Shrink correlations (M,) where both maps know little."""
     return score * known / (known + KNOWN_USUAL)
 
 
 def _correlations(tables: list[TextureTable], shares: list[Tensor], place: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
-    """Return correlations of the other map, turned by (M, 3, 3), with the reference, and known shares, (M,) each."""
+    """Return correlations of the other map, rotated by (M, 3, 3), with the reference, and known shares, (M,) each."""
     there = R @ place.T
     a, _ = tables[0].sample(there.float())
     b, _ = tables[1].sample(place.T[None].float())
@@ -234,7 +215,6 @@ def _correlations(tables: list[TextureTable], shares: list[Tensor], place: Tenso
 
 
 def _refined(tables: list[TextureTable], shares: list[Tensor], place: Tensor, R: Tensor) -> Tensor:
-    """Gauss-Newton on the rotation, gain and offset between the maps."""
     reference, _ = tables[1].sample(place.T[None].float())
     ones = torch.ones_like(reference[0])
     for _ in range(STEPS):
@@ -261,11 +241,7 @@ class Correction:
 
 
 def corrected(learnt: LearntMap, old: Tensor) -> Correction:
-    """Bring a learnt map and its attitudes into the body frame of an old map (h, 2 h); keep that where never seen.
-
-    Raises:
-        PaintError: the old map is not one of this ball.
-    """
+    """Express a learnt map in the frame of an old one (h, 2 h), used where unseen; raise PaintError on a mismatch."""
     comparison = compare_maps(learnt.texture, old)
     Q = comparison.R_other_reference
     height = max(len(old), len(learnt.texture))
@@ -286,7 +262,7 @@ def corrected(learnt: LearntMap, old: Tensor) -> Correction:
 
 
 def nearest_texels(values: Tensor, R_map_new: Tensor, height: int) -> Tensor:
-    """Return values of a map in another body frame, those of the nearest texel, (height, 2 height)."""
+    """Return a map's values in another body frame by the nearest texel, (height, 2 height)."""
     rows = len(values)
     longitude, latitude = texture_coordinates(map_directions(height) @ R_map_new.double().mT)
     column = ((longitude / torch.pi + 1) * rows).long() % (2 * rows)

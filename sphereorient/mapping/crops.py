@@ -1,4 +1,4 @@
-"""The ball cut out of every frame, so that movies are read once."""
+"""The sphere cut out of every frame, so that movies are read once."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Crop:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Crops:
-    """The ball's surroundings in N frames of C cameras."""
+    """The sphere's surroundings in N frames of C cameras."""
 
     views: Sequence[CameraView]
     crops: Sequence[Sequence[Crop | None]]  # C times N; None where the ball was not found
@@ -57,11 +57,10 @@ class Crops:
     fixed: bool  # whether all positions are the same
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.position_lab_mm)
 
     def picture(self, frame: int, camera: int) -> Picture:
-        """Return a whole picture: the crop pasted on the empty scene."""
+        """Return a whole picture: the crop pasted on the background."""
         crop, scene = self.crops[camera][frame], self.views[camera].background.mean
         whole: Picture = scene.astype(np.float32)
         if crop is not None:
@@ -74,7 +73,7 @@ class Crops:
         return [[self.picture(k, c) for c in range(len(self.views))] for k in frames.tolist()]
 
     def frames_with_ball(self) -> Tensor:
-        """Return the frames (M,) int64 in which a camera sees the ball; raise PaintError if fewer than two."""
+        """Return the frames (M,) int64 in which a camera sees the sphere; raise PaintError if fewer than two."""
         frames = torch.nonzero(self.seen.any(1))[:, 0]
         if len(frames) < 2:
             raise too_few(len(frames))
@@ -82,18 +81,13 @@ class Crops:
 
 
 def too_few(count: int) -> PaintError:
-    """Word the refusal of a movie with one frame."""
+    """Return the error about a movie with one frame."""
     do = "use a movie in which the ball turns"
     return PaintError(refusal("movies", expected="the ball in 2 frames at least", got=f"{count}", do=do))
 
 
 def take_crops(recording: Recording, settings: MapSettings, locating: LocateSettings, progress: Progress) -> Crops:
-    """Read the movies, find the ball in every frame, and cut it out.
-
-    Raises:
-        ExperimentError: the ball is not found.
-        PaintError: the cameras see different balls.
-    """
+    """Crop the sphere in every frame; raise ExperimentError if it is not found, PaintError if cameras disagree."""
     experiment = recording.experiment
     views, rows, sightings = [], [], {}
     for stream in recording.streams:
@@ -150,7 +144,7 @@ def _cut(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
 
 
 def pixels_of(crops: Crops, fitter: Fitter, frames: Tensor, wanted: int, extra_px: float = 0.0) -> Pixels:
-    """Return about as many pixels as wanted of each disk, the picture blurred first by `extra_px`."""
+    """Return about `wanted` pixels of each disk, after a blur of the picture by `extra_px`."""
     level = replace(fitter.optics.fine, extra_px=extra_px)
     X = crops.position_lab_mm[frames]
     radius_px = float(fitter.largest_px(X).max())

@@ -1,4 +1,4 @@
-"""The ball's disks normalised against light, with their slopes: for comparing pictures before there is a map."""
+"""Locally normalised disks of the sphere with their slopes, to compare pictures before there is a map."""
 
 from __future__ import annotations
 
@@ -23,10 +23,7 @@ DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Disks:
-    """Normalised disks of N instants and C cameras.
-
-    A disk's picture is (S, S), the limb touches its edges; its view frame is x right, y down, z to the ball.
-    """
+    """Normalised disks (S, S), limb at the edges, of N instants, C cameras; view: x right, y down, z to the sphere."""
 
     layers: Tensor  # (N, C, 3, S, S) float32: normalised grey, its slope to the right and down, per radius
     share: Tensor  # (S, S), weight of a pixel, 0 at the limb .. 1
@@ -36,27 +33,25 @@ class Disks:
     shown: Tensor | None = None  # (N, C, S, S) float32, 0 where something hides the ball .. 1; None: nothing does
 
     def __len__(self) -> int:
-        """Return the number of instants."""
         return len(self.layers)
 
     def where(self, rows: Tensor | slice, cameras: slice = slice(None)) -> Disks:
-        """Return some of the instants and cameras."""
+        """Select instants and cameras."""
         shown = None if self.shown is None else self.shown[rows, cameras]
         names = ("layers", "R_lab_view", "distance_radii", "seen")
         return Disks(share=self.share, shown=shown, **{name: getattr(self, name)[rows, cameras] for name in names})
 
     def weight(self, rows: Tensor | slice, camera: int) -> Tensor:
-        """Return the weights (R, S * S) of the pixels of some disks: 0 where not seen or hidden."""
+        """Return pixel weights (R, S * S) of some disks: 0 where not seen or hidden."""
         counts = self.seen[rows, camera][:, None] * torch.ones(self.size_px**2)
         return counts if self.shown is None else counts * self.shown[rows, camera].flatten(1)
 
     def sampled(
         self, rows: Tensor | slice, camera: int, every: int = 1, slant_power: int = 1
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each n-th (`every`) pixel of some disks (R,) of a camera; weights have the slant's cosine to a power.
+        """Return each n-th (`every`) pixel of disks (R,): view directions (3, P), grey (R, P), weight (R, P).
 
-        Returns:
-            Directions in the view frame (3, P), grey (R, P) and weight (R, P).
+        Weights are multiplied by the slant's cosine to the power `slant_power`.
         """
         far, size = self.distance_radii[:, camera].median(), self.size_px
         view = perspective_view(size, float(far))
@@ -90,7 +85,7 @@ def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:
         in_camera = X @ camera.R_cam_lab.mT + camera.T_cam_lab_mm
         far[:, c] = in_camera.norm(dim=-1) / crops.radius_mm
         R[:, c] = camera.R_cam_lab.mT @ R_cam_view(in_camera)
-        # The limb lies a little before the great circle that `radius_px` measures.
+        # The limb lies slightly before the great circle of `radius_px`.
         limb = view.radius_px(X, crops.radius_mm) / (1 - far[:, c] ** -2).clamp_min(1e-3).sqrt()
         middle = camera.project(X)
         for k, frame in enumerate(frames.tolist()):
@@ -113,15 +108,9 @@ def normalised_disks(
     settings: MapSettings,
     shown: Tensor | None = None,
 ) -> Disks:
-    """Remove the light from disks: difference from the local mean over the local deviation.
+    """Return disks of pictures (N, C, S, S), any finite grey: difference from the local mean over the local deviation.
 
-    Args:
-        pictures: (N, C, S, S), grey levels of any scale, finite also where not seen.
-        R_lab_view: (N, C, 3, 3).
-        distance_radii: (N, C), above 1.
-        seen: (N, C) bool.
-        settings: of `detail` and `window`.
-        shown: (N, C, S, S), 0 where something hides the ball .. 1; None: nothing does.
+    R_lab_view (N, C, 3, 3), distance_radii (N, C) above 1, seen (N, C) bool, shown (N, C, S, S) 0 hidden .. 1, None: 1.
     """
     size = pictures.shape[-1]
     share = rim_share(size)
@@ -134,7 +123,7 @@ def normalised_disks(
         flat = usual + (flat - usual) * part
     rough = fine(flat) - wide(flat)
     whole = (rough.square() * share).sum((1, 2), keepdim=True) / share.sum()
-    # Half of the disk's deviation is added: where the texture is uniform the local one would amplify noise.
+    # Add half of the disk's deviation: in uniform texture the local one would amplify noise.
     local = (wide(rough.square()) + 0.25 * whole).sqrt().clamp_min(1e-12)
     even = (rough / local).clamp(-3.0, 3.0) * seen.reshape(-1, 1, 1)
     return Disks(
@@ -157,7 +146,7 @@ def _with_slopes(grey: Tensor) -> Tensor:
 
 
 def reduced(disks: Disks, factor: int) -> Disks:
-    """Return the disks with pictures smaller by a whole factor."""
+    """Return the disks with pictures reduced by a whole factor."""
     return replace(
         disks,
         layers=_with_slopes(F.avg_pool2d(disks.layers[:, :, 0], factor)),
@@ -167,15 +156,13 @@ def reduced(disks: Disks, factor: int) -> Disks:
 
 
 def disk_places(normal_view: Tensor, distance_radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Project directions (..., 3, P), view frame, onto a disk seen from a distance (...), radii.
+    """Return places (..., 2, P), radii, of directions (..., 3, P), view, on a disk seen from a distance (...), radii.
 
-    Returns:
-        Places (..., 2, P) in radii of the disk, their derivative by x and y of the direction (..., 1, P), and the
-        cosine of the slant (..., P), not positive where invisible.
+    Return also their derivative by x and y (..., 1, P) and the slant's cosine (..., P), not positive where invisible.
     """
     D = distance_radii[..., None, None]
     x_y, z = normal_view[..., :2, :], normal_view[..., 2:, :]
     scale = (D.square() - 1).sqrt() / (D + z)
-    # Visible where the outward normal points at the camera, which is D away along -z.
+    # Visible if the normal points at the camera, D away along -z.
     depth = (-z - 1 / D) / (1 - 1 / D)
     return x_y * scale, scale, depth[..., 0, :]

@@ -1,4 +1,4 @@
-"""The texture map as unknowns of a linear system: spline look-ups, the smoothness penalty, solving, sharpening."""
+"""The texture map as unknowns of a linear system: splines, smoothness penalty, solution, sharpening."""
 
 from __future__ import annotations
 
@@ -22,10 +22,7 @@ SHARPENING_ITERATIONS = 200
 
 
 def _spline(place: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the four texels about places (...) in texels, (..., 4) int64, and their weights.
-
-    Source: Unser 1999, Splines, a perfect fit, eq. 3.
-    """
+    """Return the four texels (..., 4) int64 about places (...), and their weights (Unser 1999, eq. 3)."""
     below = place.floor()
     t = place - below
     s = 1 - t
@@ -34,7 +31,6 @@ def _spline(place: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _spline_slope(place: Tensor) -> Tensor:
-    """Return the derivative of the weights by the place, (..., 4)."""
     t = place - place.floor()
     s = 1 - t
     slopes = [-s * s, t * (3 * t - 4), s * (4 - 3 * s), t * t]
@@ -42,16 +38,11 @@ def _spline_slope(place: Tensor) -> Tensor:
 
 
 def _place(longitude: Tensor, latitude: Tensor, height: int) -> tuple[Tensor, Tensor]:
-    """Return column and row (...) in a map, texels."""
     return (longitude + math.pi) * (height / math.pi) - 0.5, (math.pi / 2 - latitude) * (height / math.pi) - 0.5
 
 
 def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
-    """Return the 16 texels that a cubic B-spline, whose coefficients they are, reads in directions (..., 3).
-
-    Returns:
-        Indices (..., 16) int64 in the flattened map (H, 2 H), H at least 4, and weights (..., 16), sum 1.
-    """
+    """Return indices (..., 16) int64 in the flat map (H, 2 H), H >= 4, and B-spline weights (..., 16), sum 1."""
     width = 2 * height
     column, row = _place(*texture_coordinates(direction_body), height)
     (columns, along), (rows, across) = _spline(column), _spline(row)
@@ -63,7 +54,7 @@ def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
 
 
 class SplineTable(TextureTable):
-    """A texture map (H, 2 H), blurred by `blur_rad`, looked up by its spline exactly; records the texels read."""
+    """A texture map (H, 2 H) with the blur `blur_rad`, sampled by its spline exactly; records the texels read."""
 
     def __init__(self, texture: Tensor, blur_rad: float) -> None:
         super().__init__(torch.zeros(1, 4), blur_rad)
@@ -71,7 +62,7 @@ class SplineTable(TextureTable):
         self.reads: list[tuple[Tensor, Tensor]] = []  # of each look-up: texels and weights, (L, P, 16)
 
     def sample(self, direction_body: Tensor) -> tuple[Tensor, Tensor]:
-        """Look up value and slope; see `TextureTable.sample`."""
+        """Return value and slope; see `TextureTable.sample`."""
         height = len(self.texture)
         direction = direction_body.movedim(1, -1)
         place, weight = texel_weights(direction, height)
@@ -98,7 +89,6 @@ def look_up(texture: Tensor, direction_body: Tensor) -> Tensor:
 
 
 def _tangents(direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Return two orthogonal unit vectors tangent to the sphere at directions (M, 3)."""
     helper = torch.where(
         direction[:, 2:].abs() < 0.9, direction.new_tensor([0.0, 0, 1]), direction.new_tensor([1.0, 0, 0])
     )
@@ -120,17 +110,14 @@ def map_table(texture: Tensor, blur_rad: float) -> TextureTable:
 
 
 def texel_areas(height: int) -> Tensor:
-    """Return the solid angle of every texel, (H, 2 H) float64, sr; their sum is 4 pi."""
+    """Return the solid angle of every texel, (H, 2 H) float64, sr; the sum is 4 pi."""
     edge = math.pi / 2 - math.pi * torch.arange(height + 1, dtype=torch.float64) / height
     band = (edge[:-1].sin() - edge[1:].sin()) * (math.pi / height)
     return band[:, None].expand(height, 2 * height)
 
 
 def stiffness(height: int) -> csr_matrix:
-    """Return L with m^T L m = the integral of the map's squared slope over the sphere.
-
-    Source: finite volumes; the edge between two texels counts with its length over their distance.
-    """
+    """Return L, m^T L m being the integral of the map's squared slope over the sphere (finite volumes)."""
     width = 2 * height
     step = math.pi / height
     number = np.arange(height * width).reshape(height, width)
@@ -147,13 +134,12 @@ def stiffness(height: int) -> csr_matrix:
 
 
 class NormalMatrix:
-    """J^T J of a weighted Jacobian (S, T), never multiplied out: that would take longer than solving with it."""
+    """J^T J of a weighted Jacobian (S, T), never multiplied out: that would take longer than the solution."""
 
     def __init__(self, jacobian: csr_matrix) -> None:
         self._jacobian = jacobian
 
     def __matmul__(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return its product with values (T,)."""
         seen = self._jacobian @ values.astype(self._jacobian.dtype)
         return np.asarray(self._jacobian.T @ seen, np.float64)
 
@@ -170,7 +156,7 @@ def texel_sums(jacobian: csr_matrix) -> NDArray[np.float64]:
 def map_sums(
     direction_body: Tensor, value: Tensor, weight: Tensor, height: int
 ) -> tuple[csr_matrix, NDArray[np.float64]]:
-    """Return the normal equations (T, T) and (T,) of a map from samples: directions (S, 3), values and weights (S,)."""
+    """Return a map's normal equations (T, T), (T,) from samples: directions (S, 3), values and weights (S,)."""
     place, share = texel_weights(direction_body.double(), height)
     texels = 2 * height * height
     root = weight.double().clamp_min(0).sqrt()
@@ -183,15 +169,7 @@ def map_sums(
 def solve_map(
     normal: csr_matrix | NormalMatrix, right: NDArray[np.float64], height: int, smooth: float, iterations: int = 60
 ) -> Tensor:
-    """Solve normal equations (T, T), (T,) for the map, (H, 2 H) float64, with a smoothness penalty.
-
-    Args:
-        normal: of the pixels.
-        right: of the pixels.
-        height: H.
-        smooth: weight of the integral of the squared slope, in the unit of the pixels' weights.
-        iterations: of conjugate gradients, at most.
-    """
+    """Solve normal equations (T, T), (T,) for the map (H, 2 H) float64; `smooth` weighs its squared slope."""
     ties = smooth * stiffness(height)
     diagonal = normal.diagonal() + ties.diagonal()
     diagonal[diagonal <= 0] = 1.0
@@ -227,10 +205,7 @@ def blur_matrix(direction_body: Tensor, blur_rad: float, height: int) -> csr_mat
 
 
 def sharpened(blurred: Tensor, blur_rad: float, noise: float = NOISE) -> Tensor:
-    """Undo a Gaussian blur of a map's coefficients (H, 2 H), float64, as far as noise allows.
-
-    Source: Tikhonov 1963, the slope's square as the penalty.
-    """
+    """Remove a Gaussian blur from a map's coefficients (H, 2 H) float64 (Tikhonov 1963); `noise` limits it."""
     height = len(blurred)
     direction = map_directions(height).reshape(-1, 3)
     seen = look_up(blurred.double(), direction).numpy()

@@ -1,4 +1,4 @@
-"""Attitudes, light and texture map in turns, and then together: what the iterations start with and do."""
+"""The iterations of mapping: orientations, light and map in turn, and then poses and map together."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ TEXEL_PX = 0.75  # of the widest disk's middle
 ROW, FINEST_ROWS = 32, 512  # the fitted map has a multiple of the one as rows, and at most the other
 SEPARATE_ITERATIONS = 2  # each instant by itself: a joint step would trust the map, which is still blurred
 LIGHT_ITERATIONS = 8  # in which light, noise and blur are estimated anew
-SMOOTHEST = 0.2  # as the setting `smooth`, of the first iteration: attitudes must not follow the map's noise
+SMOOTHEST = 0.2  # as the setting `smooth`, of the first iteration: orientations must not follow the map's noise
 BLUR_FRAMES = 32
 BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
 BLUR_PX = (0.25, 3.0)  # narrowest and widest
@@ -55,7 +55,7 @@ OUTLIER2 = 25.0  # squared residuals over the noise expected are cut off here
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
-    """What an iteration improves: n instants of C cameras that the map is fitted to."""
+    """The unknowns of an iteration: n instants of C cameras to which the map is fitted."""
 
     frames: Tensor  # (n,) int64
     pixels: Pixels  # of n * C disks
@@ -82,18 +82,18 @@ class State:
         return self.pixels.where((cameras * rows[:, None] + torch.arange(cameras)).reshape(-1))
 
     def linearised(self) -> Iterator[Linearisation]:
-        """Yield the linearisation of all disks, some at a time; what is not seen has no weight."""
+        """Yield the linearisation of all disks in batches; unseen disks have weight 0."""
         for rows, pixels in self.batches():
             yield self.linearised_at(rows, pixels, self.blur_px)
 
     def linearised_at(self, rows: Tensor, pixels: Pixels, blur_px: float) -> Linearisation:
-        """Linearise the disks of some instants, the blur taken to be `blur_px`."""
+        """Linearise the disks of some instants for the blur `blur_px`."""
         at = linearise(self.fitter, self.texture, pixels, self.position_lab_mm[rows], self.R_lab_body[rows], blur_px)
         return replace(at, weight=at.weight * self.use[rows].reshape(-1, 1))
 
 
 def map_height(views: Sequence[CameraView], settings: MapSettings) -> int:
-    """Return the rows of the fitted map: texels a little finer than pixels in the widest disk's middle."""
+    """Return the rows of the fitted map: texels slightly finer than pixels at the centre of the widest disk."""
     if settings.height is not None:
         return settings.height
     rows = math.pi / 2 / TEXEL_PX * widest_px(views)
@@ -116,10 +116,7 @@ def first_map(disks: Disks, R_lab_body: Tensor, height: int) -> Tensor:
 def first_state(
     crops: Crops, frames: Tensor, R_lab_body: Tensor, texture: Tensor, settings: MapSettings, extra_px: float = 0.0
 ) -> State:
-    """Return what the iterations start with: attitudes (n, 3, 3) of some frames (n,), a map, light unknown.
-
-    A Gaussian of `extra_px` is laid over the pictures first.
-    """
+    """Return the initial state from orientations (n, 3, 3) of frames (n,) and a map; `extra_px`: added blur."""
     blur_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
     fitter = Fitter(
         views=crops.views,
@@ -141,7 +138,7 @@ def first_state(
 
 
 def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iteration]:
-    """Improve attitudes, light and map once; k counts the iterations from 0."""
+    """Improve orientations, light and map once; k counts the iterations from 0."""
     before = state.R_lab_body
     smooth = max(settings.smooth, SMOOTHEST * 0.5**k)
     if k < SEPARATE_ITERATIONS:
@@ -159,17 +156,13 @@ def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iterati
 
 
 def optics_of(blurred: Tensor, views: Sequence[CameraView], blur_px: float) -> Optics:
-    """Return the optics of a map (H, 2 H) that is blurred as the pictures are."""
+    """Return the optics of a map (H, 2 H) that has the blur of the pictures."""
     widest = widest_px(views)
     return Optics(map_table(blurred, 2 * blur_px / widest), blur_px, widest)
 
 
 def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[State, FittedPoses]:
-    """Fit each instant's pose to the present map.
-
-    With crops all their pixels are used: the map needs a part of them, a final pose all. A position that all instants
-    share is not moved then.
-    """
+    """Fit each instant's pose to the present map; with crops to all pixels, and a shared position stays fixed."""
     fitter = state.map_fitter()
     fine = fitter.optics.fine
     held = HELD * torch.eye(3, dtype=torch.float64) if state.fixed and crops is not None else None
@@ -188,7 +181,6 @@ def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[S
 
 
 def _with_light(state: State) -> State:
-    """Estimate light and noise from all frames."""
     cameras, basis = state.use.shape[1], state.fitter.light.difference.shape[-1]
     normal = torch.zeros(cameras, 2 * basis, 2 * basis, dtype=torch.float64)
     right = torch.zeros(cameras, 2 * basis, dtype=torch.float64)
@@ -220,7 +212,7 @@ def _rescaled(state: State) -> State:
 
 
 def _better_blur(state: State) -> float:
-    """Return the blur, px, near the present one with which the limb and slanted texture fit best."""
+    """Return the blur, px, near the present one with which limb and slanted texture fit best."""
     rows = evenly_spread(torch.arange(len(state.use)), BLUR_FRAMES)
     pixels = state.disks(rows)
     expected = state.linearised_at(rows, pixels, state.blur_px)
@@ -235,10 +227,7 @@ def _better_blur(state: State) -> float:
 
 
 def _with_joint_step(state: State, smooth: float) -> State:
-    """Move all poses by one joint step; `smooth` is relative to the typical weight of a texel.
-
-    The map's own step is dropped: `_with_map` solves for the map exactly at the new poses.
-    """
+    """Move all poses by one joint step, without its map: `_with_map` solves for that exactly."""
     height = len(state.texture)
     parts, weight = [], np.zeros(2 * height * height)
     for at in state.linearised():
@@ -255,7 +244,7 @@ def _with_joint_step(state: State, smooth: float) -> State:
 
 
 def _with_map(state: State, smooth: float) -> tuple[State, float]:
-    """Solve for the map at the present poses; return also chi^2 per pixel before."""
+    """Solve for the map at the present poses; return also chi2 per pixel before."""
     height = len(state.texture)
     parts, right = [], np.zeros(2 * height * height)
     squares = expected = 0.0
@@ -266,7 +255,7 @@ def _with_map(state: State, smooth: float) -> tuple[State, float]:
         expected += float((at.precision * at.variance).sum())
     normal = NormalMatrix(vstack(parts, format="csr"))
     tie = smooth * _typical(normal.diagonal())
-    # The penalty is on the whole map, not on the correction alone: else noise would grow with the iterations.
+    # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
     right -= tie * (stiffness(height) @ state.texture.double().numpy().ravel())
     texture = state.texture + solve_map(normal, right, height, tie).float()
     return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND)), squares / max(expected, 1e-9)
@@ -280,5 +269,4 @@ def map_weight(state: State) -> Tensor:
 
 
 def _typical(weight: NDArray[np.float64]) -> float:
-    """Return the median weight of the texels that are seen at all."""
     return float(np.median(weight[weight > 0])) if (weight > 0).any() else 1.0

@@ -1,4 +1,4 @@
-"""The pictures linearised about map and poses, and one Gauss-Newton step of all poses and the map together."""
+"""Linearise pictures about map and poses, and solve for one joint Gauss-Newton step of all."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Linearisation:
 
     @property
     def precision(self) -> Tensor:
-        """Weight over variance, (L, P), less towards the limb, where errors of the light grow."""
+        """Weight over variance, (L, P), smaller towards the limb, where errors of the light grow."""
         slanted = torch.where(self.depth > DEPTH_MIN, self.depth.square(), 1.0)
         return self.weight / self.variance * slanted
 
@@ -61,7 +61,6 @@ class Linearisation:
             counts.append(torch.full(own.shape, nodes * READS))
         count = torch.cat(counts, dim=1)
         start = np.concatenate([[0], count.reshape(-1).cumsum(0).numpy()])
-        # Disk after disk, the inner pixels before the outer ones.
         columns = torch.cat([part.flatten(1) for part in places], dim=1).reshape(-1).to(torch.int32)
         entries = torch.cat([part.flatten(1) for part in values], dim=1).reshape(-1).float()
         shape = (count.numel(), 2 * height * height)
@@ -71,15 +70,9 @@ class Linearisation:
 def linearise(
     fitter: Fitter, texture: Tensor, pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, blur_px: float
 ) -> Linearisation:
-    """Compare pictures with a map (H, 2 H), blurred as they are, and linearise, each frame's light at its best.
+    """Linearise B * C disks, adjacent cameras, about a map (H, 2 H) of their blur and poses (B, 3) mm, (B, 3, 3).
 
-    Args:
-        fitter: of views and light; its own map is not used.
-        texture: the map.
-        pixels: of B * C disks, the cameras of an instant next to each other.
-        position_lab_mm: (B, 3).
-        R_lab_body: (B, 3, 3).
-        blur_px: of the pictures.
+    The light of each frame is at its best; the fitter gives views and light, not the map.
     """
     table = SplineTable(texture, 0.0)
     model = replace(fitter.model(fitter.optics.fine), paint=table, blur_px=blur_px)
@@ -94,7 +87,7 @@ def linearise(
         residual=at.residual,
         weight=at.weight,
         variance=at.variance,
-        # Near the limb the map is not learnt, so it must not move the pose there either.
+        # Near the limb the map is not learnt; it must not move the pose there.
         by_pose=grey_by_pose(at.view, at.lit * (depth > DEPTH_MIN), at.over),
         by_light=at.design[:, POSE:],
     )
@@ -111,9 +104,9 @@ class LinearSystem:
 
 
 def linear_system(at: Linearisation, height: int) -> LinearSystem:
-    """Return the linear problem of a linearisation; `height` is the map's H."""
+    """Return the linear system of a linearisation; `height` is the map's H."""
     root = at.precision.sqrt()
-    # The rows of the light are made orthonormal: the frame's own light takes what is along them.
+    # Orthonormal rows: the frame's own light is projected out along them.
     rows = (at.by_light * root[:, None]).double()
     size = rows.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
     rows = rows / size
@@ -130,18 +123,11 @@ def linear_system(at: Linearisation, height: int) -> LinearSystem:
 def joint_step(
     parts: Sequence[LinearSystem], use: Tensor, texture: Tensor, smooth: float, radius_mm: float, fixed: bool
 ) -> Tensor:
-    """Solve for a step of all poses and the map; return that of the poses (N, 6) float64, rad and mm.
+    """Return the step of all poses (N, 6) float64, rad and mm, from one solution for poses and map together.
 
-    Args:
-        parts: of N instants with C cameras each, in order.
-        use: (N, C) bool.
-        texture: (H, 2 H), the map, whose slopes are penalised.
-        smooth: weight of the integral of its squared slope.
-        radius_mm: of the sphere.
-        fixed: whether all instants share one position.
+    The map (H, 2 H) has its squared slopes penalised by `smooth`; use is (N, C) bool; `fixed`: one shared position.
 
-    Source: Gauss-Newton by preconditioned conjugate gradients, the light of each frame projected out (Golub and
-    Pereyra 1973); bundle adjustment in the large, Agarwal et al. 2010.
+    Source: each frame's light projected out, Golub and Pereyra 1973; bundle adjustment, Agarwal et al. 2010.
     """
     count, cameras = use.shape
     height = len(texture)
@@ -199,17 +185,16 @@ def _dot(a_pose: Tensor, b_pose: Tensor, a_map: Array, b_map: Array) -> float:
 
 
 def _shared(pose: Tensor, fixed: bool) -> Tensor:
-    """Sum what all instants share: (N, 6), or (3 N + 3,) with one position for all."""
+    """Sum over instants what they share: (N, 6), or (3 N + 3,) with one position for all."""
     return torch.cat([pose[:, :3].reshape(-1), pose[:, 3:].sum(0)]) if fixed else pose
 
 
 def _spread(pose: Tensor, count: int, fixed: bool) -> Tensor:
-    """Return (N, 6) of what `_shared` made."""
     return torch.cat([pose[:-3].reshape(count, 3), pose[-3:].expand(count, 3)], dim=1) if fixed else pose
 
 
 def _inverse_blocks(blocks: Tensor, damp: Tensor, fixed: bool) -> Callable[[Tensor], Tensor]:
-    """Return the preconditioner of the poses: each instant by itself."""
+    """Return the preconditioner of the poses, one block for each instant."""
     blocks = blocks + torch.diag_embed(damp)
     if not fixed:
         inverse = torch.linalg.inv(blocks.double()).float()

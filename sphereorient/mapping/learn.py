@@ -1,4 +1,4 @@
-"""The texture map, the attitudes and the light from movies or photographs: start without a map, iterate, finish."""
+"""The texture map, orientations and light from movies or photographs: start without a map, iterate, finish."""
 
 from __future__ import annotations
 
@@ -33,8 +33,7 @@ from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import CameraView, widest_px
 from sphereorient.synth.textures import map_directions
 
-# Cosine of the slant down to which a picture shows a texel. Texels seen only at larger slants are displaced by a degree
-# and more (measured: rms 0.74 degrees with texels down to 0.2, 0.15 from 0.4 on).
+# Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).
 SHOWN_MIN = 0.4
 FINER = 2  # rows of the sharpened map over those of the fitted one
 RECOVERY_AFTER = (3, 6)  # iterations after which instants that do not fit are searched again
@@ -44,20 +43,18 @@ POSE_ITERATIONS = 2  # of each pose by itself with the final map
 POSITION_ITERATIONS = 4  # that find the position of a ball that stays in its place
 FEW_PIXELS = 250_000  # of photographs together
 PIXELS_A_TEXEL = 3.0
-# Blur of photographs, in radii, of the first iterations, and their number. Errors: 0.8 degrees after the comparison of
-# pairs, 0.06 after these, 0.05 at the end (12 pictures of 200 px); without these, 0.09 after twice as many others.
+# Blur (radii) and number of the first iterations of photographs. Errors: 0.8 degrees before, 0.06 after, 0.05 at the
+# end (12 pictures of 200 px); without them 0.09 after twice as many others.
 COARSE, COARSE_ITERATIONS = 0.015, 5
 
 
 def fit_map(crops: Crops, settings: MapSettings, progress: Progress) -> LearntMap:
-    """Learn the texture map, all attitudes and the light from the crops of opened movies.
+    """Learn the texture map, all orientations and the light from the crops of opened movies.
 
     Raises:
-        PaintError: one frame only, a sphere that does not turn, no patch seen twice, or cameras that see different
-            balls; of photographs (the setting `unordered`): fewer than three with a common patch, or two balls.
+        PaintError: too few frames, no rotation, no common patch, or different spheres.
 
-    Source: direct alignment of pictures (Lucas and Kanade 1981) on the sphere, a pose graph, and bundle adjustment on
-    grey values with the map among the unknowns.
+    Source: direct alignment (Lucas and Kanade 1981), a pose graph, bundle adjustment on grey values.
     """
     start = (_start_from_photographs if settings.unordered else _start_from_movie)(crops, settings, progress)
     state, chain = start.state, start.chain.R_lab_body[start.rows]
@@ -77,22 +74,18 @@ def fit_map(crops: Crops, settings: MapSettings, progress: Progress) -> LearntMa
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Start:
-    """What the iterations start with."""
-
     crops: Crops  # with the estimated position of a ball that stays in its place
-    frames: Tensor  # (M,) int64, of the crops, that have an attitude
+    frames: Tensor  # (M,) int64, of the crops, that have an orientation
     rows: Tensor  # (n,) int64, of those, that the map is fitted to
     chain: PairwiseAttitudes  # of the M frames
     state: State  # of the n
 
 
 def _start_from_movie(crops: Crops, settings: MapSettings, progress: Progress) -> _Start:
-    """Find attitudes from neighbouring frames and loops, and a first map; raises as `fit_map`."""
     start = _from_chain(crops, settings, progress)
     if not crops.fixed:
         return start
-    # The outline of what changes in the pictures is a pixel or two off, and the chain's rotations with it; a few
-    # iterations correct the position, and the chain starts anew.
+    # The outline of the changes is 1 to 2 px off, as are the rotations: correct the position, restart the chain.
     state = start.state
     for k in range(POSITION_ITERATIONS):
         progress("place", k, POSITION_ITERATIONS)
@@ -116,10 +109,7 @@ def _from_chain(crops: Crops, settings: MapSettings, progress: Progress) -> _Sta
 
 
 def _start_from_photographs(crops: Crops, settings: MapSettings, progress: Progress) -> _Start:
-    """Find attitudes of pictures in any order, and a first map; raises as `fit_map`.
-
-    Of more than `frames_max` pictures, evenly spread ones are used; the others get no attitude.
-    """
+    """Find orientations of unordered pictures, at most `frames_max` evenly spread ones, and a first map."""
     progress("photographs", 0, 1)
     frames = evenly_spread(crops.frames_with_ball(), settings.frames_max)
     disks = disks_of(crops, frames, finer_settings(settings, widest_px(crops.views)))
@@ -140,10 +130,7 @@ def _start_from_photographs(crops: Crops, settings: MapSettings, progress: Progr
 
 
 def _settings_of_few(settings: MapSettings, crops: Crops, frames: Tensor) -> MapSettings:
-    """Return settings for few pictures: more pixels of each, and fewer texels than pixels.
-
-    With a texel for each pixel the map explains the pictures at any attitudes, and these never improve.
-    """
+    """Return settings for few pictures: more pixels, fewer texels, else the map fits any orientation."""
     disks = int(crops.seen[frames].sum())
     pixels = max(settings.pixels, FEW_PIXELS // disks)
     seen = disks * min(pixels, math.pi / 4 * widest_px(crops.views) ** 2)
@@ -155,10 +142,7 @@ def _settings_of_few(settings: MapSettings, crops: Crops, frames: Tensor) -> Map
 def _coarse(
     crops: Crops, frames: Tensor, disks: Disks, R_lab_body: Tensor, settings: MapSettings, progress: Progress
 ) -> tuple[Tensor, Tensor]:
-    """Return attitudes (M, 3, 3) and positions (M, 3), mm, after iterations in blurred pictures.
-
-    Errors of the pairs' attitudes are larger than a pixel, too large for sharp pictures.
-    """
+    """Return orientations (M, 3, 3) and positions (M, 3), mm, refined in blurred pictures."""
     extra_px = COARSE * widest_px(crops.views) / 2
     whole_px = math.hypot(settings.blur_px or FIRST_BLUR_PX, extra_px)
     rows = max(ROW, map_height(crops.views, settings) // 2)
@@ -172,7 +156,7 @@ def _coarse(
 
 
 def _finished(start: _Start, state: State, iterations: tuple[Iteration, ...], arrived: bool) -> LearntMap:
-    """Fit the final poses, and express all in the body frame of the first attitude."""
+    """Fit the final poses, and express all in the body frame of the first orientation."""
     crops, frames, rows, chain = start.crops, start.frames, start.rows, start.chain
     count, cameras = crops.seen.shape
     state, fit = fitted(state, POSE_ITERATIONS, crops)
@@ -184,7 +168,7 @@ def _finished(start: _Start, state: State, iterations: tuple[Iteration, ...], ar
     X = torch.full((count, 3), torch.nan, dtype=torch.float64)
     score = torch.full((count, cameras), torch.nan, dtype=torch.float64)
     valid, used = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
-    found = crops.seen.any(1)  # photographs without an attitude have a position all the same
+    found = crops.seen.any(1)  # photographs without an orientation have a position all the same
     R[frames], X[found] = so3.nearest_rotation(all_R @ Q.mT), crops.position_lab_mm[found]
     X[frames[rows]] = state.position_lab_mm
     score[frames[rows]] = torch.where(state.use, fit.score, torch.nan)
@@ -208,7 +192,7 @@ def _finished(start: _Start, state: State, iterations: tuple[Iteration, ...], ar
 
 
 def interpolated(chain: Tensor, rows: Tensor, known: Tensor) -> Tensor:
-    """Return attitudes of all instants (M, 3, 3): of `rows` (n,) as `known`, of the others by the corrected chain."""
+    """Return all orientations (M, 3, 3): of `rows` (n,) as `known`, of the others by the corrected chain."""
     off = so3.log(known @ chain[rows].mT)
     at = torch.arange(len(chain)).clamp(int(rows[0]), int(rows[-1]))
     upper = torch.searchsorted(rows, at).clamp(0, len(rows) - 1)
@@ -241,12 +225,11 @@ def recovered(crops: Crops, state: State, chain: Tensor) -> State:
 
 
 def _scores(fit: FittedPoses, use: Tensor) -> Tensor:
-    """Return the mean score of the cameras that see each instant, (n,)."""
     return torch.where(use, fit.score, torch.nan).nanmean(1)
 
 
 def _final_map(state: State, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Sharpen the map and turn it by Q: texture, counts and sigma, (H, 2 H) each."""
+    """Sharpen the map and rotate it by Q: texture, counts and sigma, (H, 2 H) each."""
     height = FINER * len(state.texture)
     direction = map_directions(height) @ Q  # Q^T d: where the fitted map holds the new texel
     blur_rad = 2 * state.blur_px / widest_px(state.fitter.views)
@@ -259,7 +242,7 @@ def _final_map(state: State, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _counts(state: State, direction_body: Tensor) -> Tensor:
-    """Count the pictures that show each direction (..., 3) of the body, not too slanted."""
+    """Count the pictures that show each direction (..., 3) of the body at a small enough slant."""
     seen = torch.zeros(direction_body.shape[:-1], dtype=torch.int64)
     radius_mm = state.fitter.radius_mm
     for k, R in enumerate(state.R_lab_body):
@@ -280,7 +263,6 @@ def _counts(state: State, direction_body: Tensor) -> Tensor:
 
 
 def _not_hidden(view: CameraView, place_lab_mm: Tensor) -> Tensor:
-    """Return whether nothing in a camera's picture hides places (..., 3), (...)."""
     width, height = view.camera.image_size
     u, v = view.camera.project(place_lab_mm).nan_to_num().round().long().unbind(-1)
     shown = torch.from_numpy(view.background.shown)

@@ -1,4 +1,4 @@
-"""Relative rotations of pairs of instants from their pictures alone, and attitudes that agree with most of them."""
+"""Relative rotations of pairs of instants from pictures alone, and orientations from them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,6 @@ class RelativeRotations:
     overlap: Tensor  # (E,), in disks
 
     def __len__(self) -> int:
-        """Return the number of pairs."""
         return len(self.score)
 
     def where(self, chosen: Tensor) -> RelativeRotations:
@@ -45,22 +44,18 @@ class RelativeRotations:
         return RelativeRotations(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
 
     def residual(self, R_lab_body: Tensor) -> Tensor:
-        """Return delta (E, 3), rad, between the pairs and attitudes (N, 3, 3): R_ji = exp([delta]x) R(j) R(i)^T."""
+        """Return delta (E, 3), rad, between the pairs and orientations (N, 3, 3): R_ji = exp([delta]x) R(j) R(i)^T."""
         return so3.log(self.R_ji @ (R_lab_body[self.second] @ R_lab_body[self.first].mT).mT)
 
 
 def all_rotations(parts: list[RelativeRotations]) -> RelativeRotations:
-    """Return the pairs of all parts in one record."""
+    """Join several records of pairs."""
     names = RelativeRotations.__dataclass_fields__
     return RelativeRotations(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
 
 def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slopes: bool) -> Sampled:
-    """Look up the disks of `second` (E,) in directions (E, 3, P), lab.
-
-    Returns:
-        Grey (E, P), its derivative by delta in the lab (E, 3, P) or (E, 0, P) without slopes, and weight (E, P).
-    """
+    """Sample disks `second` (E,) at (E, 3, P), lab: grey (E, P), derivative by delta (E, 3 or 0, P), weight (E, P)."""
     R = disks.R_lab_view[second, camera]
     normal = R.mT @ normal_lab
     place, scale, depth = disk_places(normal, disks.distance_radii[second, camera])
@@ -102,12 +97,7 @@ def _first_views(disks: Disks, first: Tensor, every: int) -> list[Sampled]:
 def refine_pairs(
     disks: Disks, first: Tensor, second: Tensor, R_ji: Tensor, iterations: int, every: int = 1
 ) -> RelativeRotations:
-    """Refine rough relative rotations R_ji (E, 3, 3) by Gauss-Newton, all cameras of both instants (E,) together.
-
-    Only each n-th (`every`) pixel is used.
-
-    Source: direct alignment, Lucas and Kanade 1981; robust weights, Geman and McClure 1987.
-    """
+    """Refine R_ji (E, 3, 3) on each n-th pixel (Lucas and Kanade 1981; weights: Geman and McClure 1987)."""
     parts = []
     for rows in torch.split(torch.arange(len(first)), BATCH):
         i, j, R = first[rows], second[rows], R_ji[rows].float()
@@ -163,10 +153,7 @@ def _correlation(w: Tensor, a: Tensor, b: Tensor, aa: Tensor, bb: Tensor, ab: Te
 
 
 def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, grid: Tensor, every: int = 1) -> Tensor:
-    """Return the best of all rotations grid[m] @ about[e], (E, 3, 3), for pairs of instants (E,).
-
-    The disks should be small ones: detail finer than the grid (M, 3, 3) only hides the right place.
-    """
+    """Return the best of all rotations grid[m] @ about[e], (E, 3, 3), for pairs (E,); the disks should be small."""
     best = []
     grid = grid.float()
     places = math.pi / 4 * disks.size_px**2 / every
@@ -177,23 +164,16 @@ def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, gri
             tried = some @ R
             views = _first_views(disks, i.expand(len(tried)), every)
             _, _, score, overlap = _normal_equations(disks, j.expand(len(tried)), tried, views, slopes=False)
-            # Shrunk: a correlation over a small overlap proves little.
+            # A correlation over a small overlap proves little.
             scores.append(score * (overlap / (overlap + OVERLAP_MIN)))
         best.append(grid[int(torch.cat(scores).argmax())] @ R)
     return torch.stack(best).double()
 
 
 def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tensor, every: int) -> Tensor:
-    """Compare one disk with all first ones of a camera, for all rotations of a grid; return correlations (N, M).
+    """Return correlations (N, M) of all first disks of a camera with one disk, `second`, at rotations (M, 3, 3).
 
-    A turned disk is looked up once for all disks; the rest are matrix products.
-
-    Args:
-        disks: N, small ones, as in `search_pairs`.
-        cameras: of the first disks and of the second one.
-        second: instant of the second one.
-        grid: (M, 3, 3), from the first disk's view frame to the second one's.
-        every: use each n-th pixel.
+    `cameras`: of the first disks and of the second; the rotations take the first view frame to the second.
     """
     camera, other = cameras
     normal, grey, own = disks.sampled(torch.arange(len(disks)), camera, every)
@@ -213,15 +193,9 @@ def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tens
 
 
 def solve_graph(R_lab_body: Tensor, pairs: RelativeRotations, scale_rad: float) -> tuple[Tensor, Tensor]:
-    """Fit attitudes (N, 3, 3) float64 to relative rotations that connect them; the first attitude stays.
+    """Fit orientations (N, 3, 3) float64, the first fixed, to relative rotations; return also residuals (E, 3), rad.
 
-    Pairs with residuals beyond `scale_rad` lose weight.
-
-    Returns:
-        Attitudes (N, 3, 3) and residuals of the pairs (E, 3), rad.
-
-    Source: pose graph on SO(3) by Gauss-Newton; robust weights, Geman and McClure 1987, narrowed step by step as in
-    graduated non-convexity (Yang et al. 2020).
+    Source: weights at `scale_rad`, Geman and McClure 1987, graduated non-convexity (Yang et al. 2020).
     """
     R = R_lab_body.clone()
     typical = pairs.information.diagonal(dim1=1, dim2=2).mean().clamp_min(1e-12)
@@ -257,7 +231,7 @@ def _graph_step(R: Tensor, pairs: RelativeRotations, residual: Tensor, weight: T
     right = torch.zeros(count, 3, dtype=R.dtype)
     right.index_add_(0, j, pulled)
     right.index_add_(0, i, -(carry.mT @ pulled[..., None])[..., 0])
-    # The first attitude is held; unconnected ones stay.
+    # The first orientation is fixed; unconnected ones stay.
     diagonal = torch.full((3 * count,), 1e-9, dtype=R.dtype)
     diagonal[:3] = 1e9
     every = torch.arange(3 * count)

@@ -29,7 +29,7 @@ class Patches:
     R_other_reference: Tensor  # (3, 3)
 
     def points(self, step_deg: float) -> Tensor:
-        """Return the places of all patches, (D, P, 3), so many degrees apart."""
+        """Return the sample places of all patches, (D, P, 3), at a spacing in degrees."""
         return self.shifted(_offsets(step_deg), torch.zeros(len(self.direction), 2, dtype=torch.float64))
 
     def shifted(self, offset: Tensor, shift: Tensor) -> Tensor:
@@ -41,7 +41,6 @@ class Patches:
 
 
 def _offsets(step_deg: float) -> Tensor:
-    """Return the places of a patch in its tangent plane, (P, 2) float64, rad."""
     count = math.floor(RADIUS_DEG / step_deg)
     at = torch.arange(-count, count + 1, dtype=torch.float64) * math.radians(step_deg)
     grid = torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).reshape(-1, 2)
@@ -57,17 +56,11 @@ def compass(direction: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: Patches) -> tuple[Tensor, Tensor]:
-    """Find patches of the reference in another map.
+    """Return shifts (D, 2) float64, rad east and north, of the reference's patches in another map, and (D,) found.
 
-    Args:
-        rough: blurred tables of the other map and of the reference, for the search.
-        fine: likewise, for the refinement.
-        patches: of the reference.
+    `rough` and `fine`: blurred tables of the other map and of the reference, for search and refinement.
 
-    Returns:
-        Shifts (D, 2) float64, rad east and north, and whether each patch was found (D,).
-
-    Source: normalised correlation; then direct alignment, Lucas and Kanade 1981, with gain and offset.
+    Source: normalised correlation, then direct alignment with gain and offset, Lucas and Kanade 1981.
     """
     shift = start = _searched(rough, patches)
     offset = _offsets(FINE_DEG)
@@ -90,7 +83,7 @@ def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: P
 
 
 def _contradicted(direction: Tensor, shift: Tensor, sure: Tensor) -> Tensor:
-    """Return which patches (D,) contradict their neighbours, with which they overlap: they found another edge."""
+    """Return which patches (D,) contradict their overlapping neighbours: they match another edge."""
     east, north = compass(direction)
     moved = shift[:, :1] * east + shift[:, 1:] * north
     near = (direction @ direction.mT).fill_diagonal_(-1) * sure - (~sure).double()
@@ -103,7 +96,6 @@ def _contradicted(direction: Tensor, shift: Tensor, sure: Tensor) -> Tensor:
 
 
 def _searched(tables: list[TextureTable], patches: Patches) -> Tensor:
-    """Try all shifts within reach, (D, 2)."""
     count, offset = len(patches.direction), _offsets(2 * FINE_DEG)
     reference, _ = tables[1].sample(patches.points(2 * FINE_DEG).mT.float())
     steps = round(REACH_DEG / ROUGH_DEG)
@@ -116,7 +108,6 @@ def _searched(tables: list[TextureTable], patches: Patches) -> Tensor:
 
 
 def _sampled(table: TextureTable, patches: Patches, offset: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the other map's grey (D, P) at shifted patches, and its derivative by the shift (D, 2, P)."""
     place = patches.shifted(offset, shift)
     value, slope = table.sample((place @ patches.R_other_reference.mT).mT.float())
     in_reference = slope.mT.double() @ patches.R_other_reference
@@ -129,6 +120,5 @@ def _sampled(table: TextureTable, patches: Patches, offset: Tensor, shift: Tenso
 
 
 def _correlation(a: Tensor, b: Tensor) -> Tensor:
-    """Return the correlations (D,) of (D, P) with (D, P)."""
     a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
     return (a * b).sum(1) / ((a * a).sum(1) * (b * b).sum(1)).clamp_min(1e-12).sqrt()

@@ -1,4 +1,4 @@
-"""Attitudes of photographs in any order: compare all pairs over all rotations, join sets that agree."""
+"""Orientations of unordered photographs: compare all pairs over all rotations, join consistent sets."""
 
 from __future__ import annotations
 
@@ -42,21 +42,16 @@ CHI2_MEDIAN = 0.4549  # of the square of a normal number
 JOIN_ITERATIONS = 4  # of the refinement of a pair between two sets
 FEWEST = 3  # pictures: each pair of the smallest set is confirmed by the two others
 LIKE_MAX = 0.98  # largest correlation that counts
-# Log-odds above which two sets are joined. Among 5 million rotations tried for 30 pictures, the best wrong ones have
-# about 20 (measured); a wrong join costs more than a picture left out.
+# Log-odds above which two sets are joined; the best wrong of 5 million rotations of 30 pictures has about 20.
 SURE = 25.0
-REACH_RAD = math.radians(10.0)  # by which a pair may differ from the attitudes of the others
+REACH_RAD = math.radians(10.0)  # by which a pair may differ from the orientations of the others
 SCALE_RAD = math.radians(2.0)  # scatter of pairs that share only slanted places, by errors of the outlines
-SETTLE = 2  # comparisons in fine detail, each from the attitudes of all together
+SETTLE = 2  # comparisons in fine detail, each from the orientations of all together
 OTHER_SHARE, OTHER_LEAST = 0.5, 4  # of the largest set, and pictures: a second set so large is another ball
 
 
 def finer_settings(settings: MapSettings, diameter_px: float) -> MapSettings:
-    """Return settings of finer disks, up to the resolution of the pictures.
-
-    Coarse disks give rotations that are wrong where the view is slanted: 2 degrees instead of 0.4 in fine ones
-    (30 pictures of 200 px).
-    """
+    """Return settings of finer disks, up to the pictures' resolution: coarse ones are 2 degrees off at slants."""
     factor = min(max(diameter_px / settings.disk_px, 1.0), FINER, DISK_PX_MAX / settings.disk_px)
     size = 2 * round(factor * settings.disk_px / 2)
     return settings.model_copy(
@@ -73,10 +68,9 @@ class Evidence:
     score_min: float
 
     def log_odds(self, pairs: RelativeRotations) -> Tensor:
-        """Return the log-odds of pairs, (E,).
+        """Return the log-odds (E,) of pairs, from Fisher's z of their correlations over n independent places.
 
-        Fisher's z of a correlation over n independent places is normal with variance 1 / n, about 0 for different
-        patches and about twice that of `score_min` for the same: halfway the odds are even.
+        Its mean is 0 for different patches, about twice that of `score_min` for the same; the variance is 1 / n.
 
         Source: Fisher 1921, On the probable error of a coefficient of correlation.
         """
@@ -86,15 +80,10 @@ class Evidence:
 
 
 def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> PairwiseAttitudes:
-    """Find attitudes of photographs in any order; those outside of the largest connected set get none.
-
-    Args:
-        disks: of N instants, each seen by a camera at least.
-        finer: the same with more pixels and detail, for the last comparison.
-        settings: of mapping.
+    """Find orientations of N unordered photographs in disks, finally in `finer` ones; only the largest set gets any.
 
     Raises:
-        PaintError: fewer than three pictures, none with a common patch, a ball that does not turn, or two balls.
+        PaintError: fewer than three pictures, no common patch, a sphere that does not rotate, or two spheres.
     """
     if len(disks) < FEWEST:
         do = "take more pictures of the ball, of all its sides"
@@ -125,7 +114,7 @@ def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> Pairw
 
 
 def measured_evidence(disks: Disks, settings: MapSettings) -> Evidence:
-    """Measure at random rotations how well different patches correlate."""
+    """Measure the correlation of different patches at random rotations."""
     rng = torch.Generator().manual_seed(CHANCE_SEED)
     first = torch.randint(len(disks), (CHANCE_PAIRS,), generator=rng)
     second = (first + 1 + torch.randint(len(disks) - 1, (CHANCE_PAIRS,), generator=rng)) % len(disks)
@@ -136,7 +125,7 @@ def measured_evidence(disks: Disks, settings: MapSettings) -> Evidence:
 
 
 def all_pairs(disks: Disks) -> RelativeRotations:
-    """Compare all disks with all over all rotations, and refine the best few rotations of each pair."""
+    """Compare all pairs of disks over all rotations, and refine the best few rotations of each pair."""
     small = reduced(disks, SMALLER)
     grid = so3.lattman_grid(math.radians(STEP_DEG))
     grid = grid[grid[:, 2, 2] > math.cos(math.radians(TILT_DEG))]
@@ -161,13 +150,7 @@ def _starts(small: Disks, grid: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor
 
 
 def joined_sets(evidence: Evidence, found: RelativeRotations) -> tuple[Tensor, Tensor]:
-    """Join pictures to sets, and sets to larger ones, where all their pictures together agree, best pairs first.
-
-    `found` are possible rotations; several of one pair contradict each other.
-
-    Returns:
-        The number of each picture's set (N,) int64, and attitudes (N, 3, 3), comparable within a set.
-    """
+    """Join pictures, then sets whose pairs all agree; return sets (N,) int64 and orientations (N, 3, 3) within them."""
     count = len(evidence.disks)
     label, R = torch.arange(count), torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
     odds = evidence.log_odds(found)
@@ -192,11 +175,7 @@ def joined_sets(evidence: Evidence, found: RelativeRotations) -> tuple[Tensor, T
 def _compared_at(
     evidence: Evidence, R_lab_body: Tensor, wanted: Tensor, iterations: int
 ) -> tuple[RelativeRotations, Tensor]:
-    """Compare the pairs `wanted` (N, N) bool at given attitudes; leave out pairs that should share too little.
-
-    Returns:
-        Relative rotations and their log-odds (E,); a pair that ends far from the attitudes counts as different.
-    """
+    """Compare pairs `wanted` (N, N) at given orientations; return rotations and log-odds (E,), low if far away."""
     near = sight_cosines(evidence.disks, R_lab_body, torch.arange(len(R_lab_body)))
     first, second = torch.nonzero(wanted & (near > math.cos(math.radians(TILT_DEG)))).T
     about = R_lab_body[second] @ R_lab_body[first].mT
@@ -206,7 +185,7 @@ def _compared_at(
 
 
 def _solved(R_lab_body: Tensor, pairs: RelativeRotations, chosen: Tensor) -> Tensor:
-    """Fit the chosen attitudes (N,) bool to the pairs among them; return all, (N, 3, 3)."""
+    """Fit the chosen orientations (N,) bool to the pairs among them; return all, (N, 3, 3)."""
     own = pairs.where(chosen[pairs.first] & chosen[pairs.second])
     place = chosen.cumsum(0) - 1
     R = R_lab_body.clone()
@@ -215,11 +194,7 @@ def _solved(R_lab_body: Tensor, pairs: RelativeRotations, chosen: Tensor) -> Ten
 
 
 def _settled(evidence: Evidence, rows: Tensor, R_lab_body: Tensor) -> tuple[Tensor, Tensor, RelativeRotations]:
-    """Compare all pairs of a set (M,) that should share a patch, and fit attitudes (N, 3, 3) to those that do.
-
-    Returns:
-        Rows of the pictures that belong to the set by all their pairs together, attitudes and pairs, of N.
-    """
+    """Fit orientations (N, 3, 3) to all matching pairs of a set (M,); return confirmed rows, orientations and pairs."""
     inside = torch.zeros(len(R_lab_body), dtype=torch.bool)
     inside[rows] = True
     pairs, odds = _compared_at(evidence, R_lab_body, (inside[:, None] & inside).triu(1), ITERATIONS)

@@ -1,5 +1,3 @@
-"""Settings of mapping."""
-
 from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field

@@ -1,4 +1,4 @@
-"""What a movie's frames taught, kept in a file: other runs then measure with the same knowledge, to the last bit."""
+"""The appearance and motion that a run learnt, in a file: another run uses it to measure the same to the last bit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NUMBERS = ("blur_px", "widest_px", "score_min", "right_score", "usual_apart_rad"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Learnt:
-    """Everything that the precise method learns from the movies before and after it measures; made by the pipeline."""
+    """Everything that the precise method learns from the movies, before and after tracking; made by the pipeline."""
 
     backgrounds: Mapping[str, Background]  # by camera, in the order of the fit
     diameter_px: Mapping[str, float]
@@ -56,11 +56,7 @@ class Learnt:
         )
 
     def appearance(self, recording: Recording) -> Appearance:
-        """Return the appearance as it was estimated, for movies of the same cameras.
-
-        Raises:
-            TrackError: other cameras, or pictures of another size.
-        """
+        """Return the estimated appearance; raise TrackError for other cameras or another picture size."""
         views = []
         for stream in recording.streams:
             background = self.backgrounds.get(stream.name)
@@ -88,21 +84,13 @@ class Learnt:
         )
 
     def save(self, path: Path) -> None:
-        """Write everything as HDF5, aside and then under its name.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write everything as HDF5, atomically; raise OutputError if the file cannot be written."""
         with whole_hdf5(path) as file:
             _write(self, file)
 
     @classmethod
     def load(cls, path: Path) -> Learnt:
-        """Read what `save` wrote.
-
-        Raises:
-            TrackError: no such file, another schema, or a damaged one.
-        """
+        """Read what `save` wrote; raise TrackError if the file is missing, damaged or of another schema."""
         do = "write one with `sphereorient track --save-learnt FILE`"
         if not path.is_file():
             raise TrackError(refusal(str(path), expected="a file of what was learnt", got="no such file", do=do))
@@ -181,6 +169,6 @@ def _process(group: h5py.Group) -> ProcessNoise:
 
 
 def with_motion(learnt: Learnt, process: ProcessNoise, acceleration_rad_s2: float) -> Learnt:
-    """Return the same with what the finished track tells of the motion."""
+    """Return the same with the motion statistics of the finished track."""
     told = acceleration_rad_s2 if np.isfinite(acceleration_rad_s2) else None
     return replace(learnt, process=process, acceleration_rad_s2=told)

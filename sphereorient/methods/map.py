@@ -1,4 +1,4 @@
-"""The method of `sphereorient map`: learn the texture map from movies in which the ball turns."""
+"""The method of `sphereorient map`: learn the texture map from movies in which the sphere rotates."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from sphereorient.trajectory import Trajectory
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapResult:
-    """What `learn_map` learnt."""
+    """The result of `learn_map`."""
 
     experiment: Experiment
     learnt: LearntMap
-    track: Trajectory  # the attitudes of all frames
+    track: Trajectory  # the orientations of all frames
     comparison: MapComparison | None  # with the old map, where one was given
     kept_share: float  # of the sphere with the old map's texture, because it was never seen
     remarks: tuple[str, ...]  # on the inputs
@@ -51,18 +51,18 @@ def learn_map(
     progress: Progress = silent,
     command: str = "sphereorient.learn_map",
 ) -> MapResult:
-    """Learn the texture map of a ball, and its attitudes, from movies or photographs; no map is needed.
+    """Learn the texture map and the orientations of a sphere from movies or photographs, without a known map.
 
     Args:
         experiment: as loaded, or the path of its experiment.yaml.
         settings: the branches `paint` and `locate` are used; None: the defaults.
         init: an old map (H, 2 H) or its file: gives the body frame, and the texture of what is never seen.
-        cameras: names of those to use; None: all.
+        cameras: names of the cameras to use; None: all.
         progress: called with stage, steps done, and all steps.
         command: recorded in the track's provenance.
 
     Raises:
-        SphereOrientError: inputs are missing, unreadable or inconsistent, or the map cannot be learnt from them.
+        SphereOrientError: missing, unreadable or inconsistent inputs, or movies from which no map can be learnt.
     """
     settings = settings or Settings()
     check_settings(settings, "map")

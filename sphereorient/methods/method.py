@@ -1,4 +1,4 @@
-"""What `run` asks of a method."""
+"""The interface between `run` and a method."""
 
 from __future__ import annotations
 
@@ -28,10 +28,7 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Method:
-    """The stages of a method, in the order in which `run` calls them.
-
-    A method that looks at the whole movie at once returns no follower; its `join` then does all.
-    """
+    """The stages of a method, in the order of `run`; without a follower, `join` does all (paper)."""
 
     learn: Callable[[Job, Progress], Follower | None]
     resume: Callable[[Job, Learnt], Follower]  # instead of learn, with what is known
@@ -40,7 +37,7 @@ class Method:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Keep torch to one thread for a while: its tensors here are small, and idle threads that spin starve decoding."""
+    """Limit torch to one thread: its tensors here are small, and idle threads that spin slow down decoding."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,4 +1,4 @@
-"""Section III of the paper, corrected, step by step: each camera by itself, then their fusion."""
+"""Section III of the paper, corrected, step by step: each camera alone, then their fusion."""
 
 from __future__ import annotations
 
@@ -36,14 +36,7 @@ def learn(job: Job, progress: Progress) -> None:
 def track(
     job: Job, follower: Follower | None, measured: Iterable[list[Poses]], progress: Progress
 ) -> tuple[Trajectory, None]:
-    """Measure the movies as the paper does; uneven times must keep to a grid.
-
-    Args:
-        job: what to measure.
-        follower: not used.
-        measured: not used.
-        progress: called with stage, frames done and frames in all.
-    """
+    """Measure the movies as in the paper, on a regular time grid; `follower` and `measured` are not used."""
     settings = job.settings
     grid, place = job.recording.gridded()
     cameras, clock = grid.cameras, grid.clock
@@ -90,14 +83,14 @@ def locate_sphere(recording: Recording, stream: CameraStream, settings: Settings
 def propose_orientations(
     stream: CameraStream, sightings: Sightings, texture: Tensor, settings: Settings, progress: Progress
 ) -> Candidates:
-    """Propose orientations for every frame in which one camera has the sphere, in the lab frame."""
+    """Propose orientations, lab frame, for every frame in which one camera has the sphere."""
     stage = f"{stream.name}: orient"
     total = len(stream)
     progress(stage, 0, total)
     if not sightings.placed.any():
         return in_the_lab(Candidates.none(sightings.reason), stream.camera, sightings.centre_px)
     proposer = paper_proposer(texture, locate.size_of(sightings, settings.orient.size_px), settings)
-    # A place that was filled in from the neighbours helps nothing where the picture is none.
+    # An interpolated position is of no use without a picture.
     readable = torch.tensor([reason not in BLIND for reason in sightings.reason])
     placed = sightings.placed & readable
     proposals = [Candidates.none(sightings.reason[:0])]
@@ -125,7 +118,7 @@ def in_the_lab(proposals: Candidates, camera: Camera, centre_px: Tensor) -> Cand
 
 
 def resume(job: Job, learnt: Learnt) -> Follower:
-    """Refuse what another run learnt."""
+    """Refuse results of another run."""
     do = "leave it out, or use method precise"
     raise SettingsError(refusal("learnt", expected="method precise", got="method paper", do=do))
 

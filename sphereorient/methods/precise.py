@@ -1,4 +1,4 @@
-"""The precise method: appearance of the movie, pose after pose, the most likely path, then its motion."""
+"""The precise method: appearance of the movie, pose after pose, the most likely path, its motion."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def learn(job: Job, progress: Progress) -> Follower:
     opened = open_views(recording, settings, progress)
     progress("appearance", 0, 1)
     frames = sample_frames(recording, opened.views, settings.refine.appearance_frames)
-    # Only blurred pictures need templates that are blurred as well; sharp ones share one first guess.
+    # Only blurred pictures need blurred templates; sharp ones share one first guess.
     seen_px = settings.refine.blur_px or estimate_blur_px(opened.views, frames, settings.locate)
     blur_px = seen_px if defocus_radii(seen_px, opened.search.diameter_px) else FIRST_BLUR_PX
     first = Initialiser(
@@ -44,14 +44,14 @@ def learn(job: Job, progress: Progress) -> Follower:
 
 
 def resume(job: Job, learnt: Learnt) -> Follower:
-    """Return the follower that `learn` would, from what another run or process learnt."""
+    """Return the follower of `learn`, from what another run or process learnt."""
     appearance = learnt.appearance(job.recording)
     search = BlurMatchedSearch(job.recording.texture, job.settings, widest_px(appearance.fitter.views))
     return follower(job, appearance, search)
 
 
 def follower(job: Job, appearance: Appearance, search: BlurMatchedSearch) -> Follower:
-    """Choose how frames are followed: all cameras together, or one by one where they disagree."""
+    """Choose how to follow frames: all cameras together, or one by one if they disagree."""
     settings, views = job.settings, appearance.fitter.views
     proposers = search.by_camera(views, appearance.fitter.optics.blur_px)
     begin = appearance.search(proposers, settings.locate, settings.refine.candidates)
@@ -70,14 +70,7 @@ def follower(job: Job, appearance: Appearance, search: BlurMatchedSearch) -> Fol
 def join(
     job: Job, follower: Follower | None, measured: Iterable[list[Poses]], progress: Progress
 ) -> tuple[Trajectory, Learnt]:
-    """Choose the path through the candidates of all frames, smooth it, and return the track and what was learnt.
-
-    Args:
-        job: with the times, and the motion that another run learnt.
-        follower: that measured the frames.
-        measured: the poses of each frame, batch by batch.
-        progress: not called.
-    """
+    """Choose the path through all frames' candidates and smooth it; return the track and what was learnt."""
     assert follower is not None  # `learn` and `resume` return one
     clock, given, settings = job.recording.clock, job.given, job.settings
     table = joined_tables([pose_table(poses, len(job.recording.streams)) for poses in measured])

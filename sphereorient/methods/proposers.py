@@ -1,4 +1,4 @@
-"""Who proposes orientations: the one place that knows both the template searches and the trained network."""
+"""The choice of proposer: the only place that knows both the template searches and the trained network."""
 
 from __future__ import annotations
 
@@ -23,27 +23,15 @@ DEFAULT = "default"  # the checkpoint that comes along
 
 
 def precise_proposer(texture: Tensor, settings: Settings, blur: float = 0.0) -> Proposer:
-    """Return who proposes for the precise method.
+    """Return the proposer of the precise method for a map (H, 2 H), 0 black .. 1 white, and a blur, radii (0: sharp).
 
-    Args:
-        texture: (H, 2 H), the map, 0 black .. 1 white.
-        settings: branches `propose` and `search`.
-        blur: standard deviation of the pictures' own blur, radii, which templates then have as well; 0: sharp.
-
-    Raises:
-        CheckpointError: a checkpoint that cannot be used with this map.
+    Raise CheckpointError if the checkpoint cannot be used with this map.
     """
     return _proposer(texture, settings.propose, lambda: TemplateBank(texture, settings.search, blur))
 
 
 class BlurMatchedSearch:
-    """Who proposes for pictures of some blur: one bank of templates for all that are sharp, others as they are asked.
-
-    Args:
-        texture: (H, 2 H), the map, 0 black .. 1 white.
-        settings: branches `propose` and `search`.
-        diameter_px: of the disks that blurs are compared with.
-    """
+    """Proposers by blur for a map (H, 2 H): one template bank for sharp pictures, others made on demand."""
 
     def __init__(self, texture: Tensor, settings: Settings, diameter_px: float) -> None:
         self.diameter_px = diameter_px
@@ -51,7 +39,7 @@ class BlurMatchedSearch:
         self._made: dict[float, Proposer] = {}
 
     def of(self, blur_px: float) -> Proposer:
-        """Return who proposes for pictures of a blur, px."""
+        """Return the proposer for pictures of a blur, px."""
         blur = defocus_radii(blur_px, self.diameter_px)
         if blur not in self._made:
             self._made[blur] = precise_proposer(self._texture, self._settings, blur)
@@ -64,7 +52,7 @@ class BlurMatchedSearch:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Opened:
-    """What a movie is first measured with; made by `open_views`."""
+    """Background, texture table and proposer of the first measurement; made by `open_views`."""
 
     views: list[CameraView]
     base: TextureTable  # the finest
@@ -72,7 +60,7 @@ class Opened:
 
 
 def open_views(recording: Recording, settings: Settings, progress: Progress) -> Opened:
-    """Estimate the cameras' backgrounds, and build texture table and template bank meanwhile."""
+    """Estimate the cameras' backgrounds, and build texture table and template bank in parallel."""
     with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products leave the interpreter free
         opening = [pool.submit(open_view, recording, stream, settings, progress) for stream in recording.streams]
         known = [known_diameter_px(recording, stream.name, settings.locate) for stream in recording.streams]
@@ -100,7 +88,6 @@ def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Propose
 
 
 def _proposer(texture: Tensor, settings: ProposeSettings, templates: Callable[[], Proposer]) -> Proposer:
-    """Return the network, the templates, or both; a bank of templates is made only where it is asked."""
     network = trained_network(texture, settings)
     if network is not None and settings.when == "always":
         return network
@@ -108,10 +95,10 @@ def _proposer(texture: Tensor, settings: ProposeSettings, templates: Callable[[]
 
 
 def trained_network(texture: Tensor, settings: ProposeSettings) -> Proposer | None:
-    """Return the network of a checkpoint, None where none is asked for."""
+    """Return the network of a checkpoint; None if the settings name none."""
     if settings.checkpoint is None:
         return None
-    # Not before it is wanted: most runs do without.
+    # Import late: most runs use no network.
     from sphereorient.learn.checkpoint import check_texture, correlator_of, load_checkpoint
     from sphereorient.learn.proposer import LearnedProposer
 
@@ -121,7 +108,7 @@ def trained_network(texture: Tensor, settings: ProposeSettings) -> Proposer | No
 
 
 def checkpoint_path(named: str) -> Path:
-    """Return the file of a checkpoint, of the one that comes along for `default`."""
+    """Return the file of a checkpoint; `default` is the bundled one."""
     from sphereorient.learn.proposer import DEFAULT_CHECKPOINT
 
     return DEFAULT_CHECKPOINT if named == DEFAULT else Path(named)

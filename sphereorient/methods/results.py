@@ -1,4 +1,4 @@
-"""From the rooms' records to the noun that comes out, one function a method."""
+"""From the stages' results to the trajectory, one function for each method."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 
 def paper_camera(sightings: Sightings, candidates: Candidates, path: Path) -> CameraTrack:
-    """Collect what one camera saw."""
+    """Collect the results of one camera."""
     track = CameraTrack.empty(len(sightings))
     lost = torch.isnan(path.score)
     reason = [
@@ -55,7 +55,7 @@ def paper_track(
     moved: Motion,
     tracks: Mapping[str, CameraTrack],
 ) -> Trajectory:
-    """Put everything into the noun that comes out."""
+    """Collect all results of the paper's method in a trajectory."""
     empty = Trajectory.empty(
         clock.numpy(), cameras=tuple(tracks), frame_rate=experiment.frame_rate_hz, experiment=experiment.name
     )
@@ -76,14 +76,7 @@ def paper_track(
 
 
 def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], learnt: Appearance) -> CameraTrack:
-    """Collect what one camera says at the poses chosen.
-
-    Args:
-        place: of the camera among those of the fit.
-        table: all poses.
-        picked: the parts of the chosen ones, see `PoseTable.rows`.
-        learnt: with the views.
-    """
+    """Collect one camera's results at the chosen poses; `place`: its index in the fit, `picked`: `PoseTable.rows`."""
     view = learnt.fitter.views[place]
     frames = len(table)
     tells = torch.tensor([why[place] in (Reason.OK, Reason.CONTRADICTS) for why in table.reason], dtype=torch.bool)
@@ -114,7 +107,7 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
 def precise_track(
     experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Chosen, smoothed: Smoothed, learnt: Appearance
 ) -> Trajectory:
-    """Put everything into the noun that comes out."""
+    """Collect all results of the precise method in a trajectory."""
     names = [view.name for view in learnt.fitter.views]
     empty = Trajectory.empty(
         clock.numpy(), cameras=tuple(names), frame_rate=experiment.frame_rate_hz, experiment=experiment.name
@@ -148,15 +141,7 @@ def precise_track(
 def map_track(
     experiment: Experiment, clock: Tensor, learnt: LearntMap, settings: str, provenance: Mapping[str, Any]
 ) -> Trajectory:
-    """Put the attitudes that were learnt with a map into the noun that comes out; nothing tells their errors.
-
-    Args:
-        experiment: what was filmed.
-        clock: (N,), times of its frames, s.
-        learnt: with as many frames.
-        settings: YAML text of all settings.
-        provenance: where it comes from.
-    """
+    """Return the orientations of a learnt map as a trajectory, without errors; clock: times (N,), s, of its frames."""
     names = [view.name for view in learnt.views]
     empty = Trajectory.empty(
         clock.numpy(),
@@ -186,7 +171,7 @@ def map_track(
             score=learnt.score[:, c].numpy(),
             reason=reasons,
         )
-    # Frames beyond those that the map was fitted to only follow these.
+    # Frames to which the map was not fitted.
     flags = torch.where(learnt.valid & ~learnt.fitted, int(Flag.EXTRAPOLATED), 0)
     return replace(
         empty,
@@ -200,7 +185,7 @@ def map_track(
 
 
 def _margin(table: PoseTable, choice: Tensor) -> tuple[Tensor, Tensor]:
-    """Return by how much the next distinct orientation is less likely, and its angle, (N,) each; NaN without one."""
+    """Return log-likelihood margin and angle to the next distinct orientation, (N,) each; NaN without one."""
     frame, place = torch.arange(len(table)), choice.clamp_min(0)
     others = table.mask.clone()
     others[frame, place] = False
@@ -213,10 +198,10 @@ def _margin(table: PoseTable, choice: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], learnt: Appearance) -> Tensor:
-    """Frames that one camera alone measured, and fits that explain their picture badly, (N,) int64."""
+    """Return flags (N,) int64 of frames that one camera alone measured, and of poor fits."""
     found = chosen.choice >= 0
     one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)
-    # Halfway from the least score of a right pose to the usual one.
+    # Halfway between the least and the usual score of a right pose.
     poor = 0.5 * (learnt.score_min + learnt.right_score)
     best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
     doubtful = found & (best < poor)
@@ -226,14 +211,7 @@ def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], l
 def with_systematic_errors(
     track: Trajectory, cameras: Mapping[str, Camera], covariance: ParameterCovariance | None, radius_mm: float
 ) -> Trajectory:
-    """Add what errors of the calibration do to the poses; nothing where the cameras' errors are not known.
-
-    Args:
-        track: with positions.
-        cameras: those that made it.
-        covariance: of their parameters, named camera.parameter.
-        radius_mm: of the sphere.
-    """
+    """Add the calibration's systematic errors to the poses; unchanged without a covariance of the camera parameters."""
     if covariance is None:
         return track
     position = torch.from_numpy(track.position)
@@ -248,6 +226,5 @@ def with_systematic_errors(
 
 
 def _subsets(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield all choices of one name or more."""
     for count in range(1, len(names) + 1):
         yield from combinations(names, count)

@@ -28,7 +28,7 @@ from sphereorient.synth.settings import SynthSettings
 
 Model = TypeVar("Model", bound=BaseModel)
 DEFAULT_METHOD = "precise"
-# What each method reads: branches, and single keys of a branch that it does not read.
+# What each method reads: branches, without the keys in NOT_READ.
 BRANCHES: dict[str, tuple[str, ...]] = {
     "precise": ("locate", "propose", "search", "refine", "path", "smooth"),
     "paper": ("locate", "propose", "orient", "assemble", "motion"),
@@ -37,7 +37,7 @@ BRANCHES: dict[str, tuple[str, ...]] = {
 }
 _OF_GAPS = ("locate.gap_frames_max", "locate.spline_knot_frames", "locate.outlier_px", "locate.outlier_factor")
 NOT_READ: dict[str, tuple[str, ...]] = {"precise": _OF_GAPS}
-# Keys of the version before; accepted with a remark.
+# Old names of keys; accepted with a remark.
 RENAMED: dict[str, str] = {
     "refine.block_frames": "refine.chunk_frames",
     "refine.lanes": "refine.chunks",
@@ -65,20 +65,20 @@ class Settings(BaseModel):
     statistics: StatisticsSettings = Field(default_factory=StatisticsSettings, description="numbers of a report")
 
 
-# How many names a key has, parted by dots.
+# Numbers of dotted names in a key.
 DEPTHS: dict[type[BaseModel], tuple[int, ...]] = {Settings: (2,), SynthSettings: (1,), ProposerSettings: (2, 3)}
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """Settings as read, and what the user should know of them."""
+    """Settings as read, and remarks for the user."""
 
     settings: Settings
     remarks: tuple[str, ...]
 
 
 def load_settings(path: Path | None = None, overrides: Iterable[str] = (), method: str | None = None) -> Settings:
-    """Read settings from a file and single overrides; see `read_settings`, whose remarks become warnings."""
+    """Read settings from a file and single overrides, as `read_settings`; its remarks become warnings."""
     loaded = read_settings(path, overrides, method)
     for remark in loaded.remarks:
         warnings.warn(remark, stacklevel=2)
@@ -89,13 +89,13 @@ def read_settings(path: Path | None = None, overrides: Iterable[str] = (), metho
     """Read settings from a file and single overrides.
 
     Args:
-        path: YAML as `sphereorient settings` writes it, any keys left out; None: the defaults.
+        path: YAML as `sphereorient settings` writes it; missing keys keep their defaults. None: all defaults.
         overrides: texts `room.key=value`, value in YAML; later ones win.
-        method: refuse keys that this method does not read; None: accept the keys of all.
+        method: refuse keys that this method does not read; None: accept all keys.
 
     Raises:
-        SettingsError: no such file, an unknown key (the nearest known one is named), an impossible value, or a key that
-            the method does not read: as an override, or in a file with another value than the default.
+        SettingsError: no such file, an unknown key, an impossible value, or a key that the method does not read (in a
+            file: with another value than the default).
     """
     remarks: list[str] = []
     overrides = [_renamed(text, remarks) for text in overrides]
@@ -121,11 +121,7 @@ def is_read(key: str, method: str) -> bool:
 
 
 def check_settings(settings: Settings, method: str, source: str = "settings") -> None:
-    """Refuse settings that differ from the default in a key that the method does not read.
-
-    Raises:
-        SettingsError: names the key, and the nearest one that is read.
-    """
+    """Raise SettingsError if a key that the method does not read differs from its default."""
     default = Settings()
     for branch in Settings.model_fields:
         for name in type(getattr(settings, branch)).model_fields:
@@ -138,7 +134,7 @@ def check_settings(settings: Settings, method: str, source: str = "settings") ->
 
 
 def _not_read(name: str, key: str, method: str) -> str:
-    """Word the refusal of a key that a method does not read; name the nearest one that it reads."""
+    """Return the message about a key that a method does not read, with the nearest one that it reads."""
     known = [
         f"{branch}.{name}"
         for branch in BRANCHES[method]
@@ -173,7 +169,6 @@ def _keys(tree: Mapping[str, Any]) -> list[str]:
 
 
 def _renamed(text: str, remarks: list[str]) -> str:
-    """Return an override under the key's new name."""
     key, equals, value = text.partition("=")
     new = RENAMED.get(key.strip())
     if new is None:
@@ -183,7 +178,6 @@ def _renamed(text: str, remarks: list[str]) -> str:
 
 
 def _rename(tree: dict[str, Any], path: Path | None, remarks: list[str]) -> None:
-    """Give the old keys of a file their new names."""
     for old, new in RENAMED.items():
         branch, _, name = old.partition(".")
         part = tree.get(branch)
@@ -203,7 +197,6 @@ def load_proposer_settings(path: Path | None = None, overrides: Iterable[str] = 
 
 
 def _load(model: type[Model], tree: dict[str, Any], source: str, overrides: Iterable[str]) -> Model:
-    """Put overrides into a tree, and check it."""
     for text in overrides:
         _override(tree, text, DEPTHS[model])
     try:
@@ -217,7 +210,7 @@ def _load(model: type[Model], tree: dict[str, Any], source: str, overrides: Iter
 
 
 def _not_finite(value: Any) -> str:
-    """Return the key of a number that is infinite or none; nothing where all are finite."""
+    """Return the key of a number that is infinite or NaN; "" if all are finite."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, tuple | list) else ()
     for key, inner in items:
         if isinstance(inner, float) and not math.isfinite(inner):
@@ -241,7 +234,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _override(tree: dict[str, Any], text: str, depths: tuple[int, ...]) -> None:
-    """Put `key=value` into a tree, the key with a room before it where there are rooms."""
+    """Put `key=value` into a tree; the key begins with its room if there are rooms."""
     key, equals, value = text.partition("=")
     *rooms, leaf = key.strip().split(".")
     if not equals or len(rooms) + 1 not in depths:
@@ -261,7 +254,7 @@ def _override(tree: dict[str, Any], text: str, depths: tuple[int, ...]) -> None:
 
 
 def _explain(error: ValidationError, source: str, model: type[BaseModel]) -> str:
-    """Word pydantic's first complaint in one line."""
+    """Return pydantic's first error in one line."""
     first = error.errors()[0]
     if isinstance(refused := first.get("ctx", {}).get("error"), SettingsError):  # a room has worded it already
         return f"{source}, {refused}"
@@ -289,13 +282,13 @@ def settings_yaml(settings: Settings | None = None) -> str:
 
 
 def synth_settings_yaml() -> str:
-    """Write the settings of a synthetic experiment as YAML, commented likewise."""
+    """Write the settings of a synthetic experiment as commented YAML."""
     head = "# A synthetic experiment; any key may be left out. --set key=value overrides one."
     return "\n".join([head, "", *_commented(SynthSettings(), ""), ""])
 
 
 def proposer_settings_yaml(settings: ProposerSettings | None = None) -> str:
-    """Write the settings of a proposer's training as YAML, commented likewise."""
+    """Write the settings of a proposer's training as commented YAML."""
     head = "# Training of a proposer; any key may be left out. --set room.key=value overrides one."
     return _tree_yaml(head, settings or ProposerSettings())
 

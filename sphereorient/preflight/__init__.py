@@ -1,4 +1,4 @@
-"""The check before a run: it samples a few frames and reports what can go wrong and what to do."""
+"""The check before a run: sample a few frames, report problems and advice."""
 
 from sphereorient.preflight.check import Preflight, preflight
 from sphereorient.preflight.finding import Finding, Severity

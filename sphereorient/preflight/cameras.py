@@ -13,8 +13,7 @@ from sphereorient.cameras import Camera, triangulate
 from sphereorient.preflight.finding import Finding, fault, ok, warning
 from sphereorient.preflight.sample import MovieSample
 
-# px between lines of sight, median. Exact cameras leave 0.2 to 0.5, by the outlines; at 1.5 the tracker takes a camera
-# as moved.
+# Median px between lines of sight: 0.2 to 0.5 for exact cameras; from 1.5 the tracker assumes a moved camera.
 GOOD_PX, BAD_PX = 0.7, 1.5
 CLEARLY = 0.2  # swapped or mirrored movies are reported if they leave this share of the gap
 ENOUGH = 3  # frames with a ball in both cameras
@@ -41,14 +40,7 @@ class Gaps:
 
 
 def gaps_between(cameras: Sequence[Camera], centre_px: Sequence[Tensor]) -> Gaps:
-    """Compare the lines of sight of two cameras.
-
-    Args:
-        cameras: two.
-        centre_px: of each, (n, 2), px; NaN: no ball.
-
-    Source: the common perpendicular of two skew lines (textbook); the epipolar residual in px.
-    """
+    """Return the gaps (common perpendiculars) of two cameras' lines of sight to centres (n, 2), px; NaN: no ball."""
     a, b = (camera.rays(uv) for camera, uv in zip(cameras, centre_px, strict=True))
     position, _ = triangulate(a, b)
     across = torch.linalg.cross(a.direction_lab, b.direction_lab)
@@ -65,12 +57,12 @@ def gaps_between(cameras: Sequence[Camera], centre_px: Sequence[Tensor]) -> Gaps
 
 
 def sample_gaps(samples: Sequence[MovieSample]) -> Gaps:
-    """Compare the lines of sight of two cameras in the same sampled frames."""
+    """Return the gaps between the lines of sight of two cameras in the same sampled frames."""
     return gaps_between([one.camera for one in samples], [one.sightings.centre_px for one in samples])
 
 
 def lines_of_sight(samples: Sequence[MovieSample], in_step_px: float | None) -> Finding:
-    """Judge the distance between the lines of sight; `in_step_px`: the gap once the movies are in step, if not now."""
+    """Judge the distance between the lines of sight; `in_step_px`: the gap after synchronising the movies."""
     title, gaps = "lines of sight", sample_gaps(samples)
     count = int(torch.isfinite(gaps.signed_mm).sum())
     if count < ENOUGH:
@@ -95,7 +87,6 @@ def lines_of_sight(samples: Sequence[MovieSample], in_step_px: float | None) -> 
 
 
 def _median_size(values: Tensor) -> float:
-    """Return the median of the finite absolute values; NaN if there are none."""
     finite = values[torch.isfinite(values)].abs()
     return float(finite.median()) if len(finite) else math.nan
 
@@ -120,11 +111,7 @@ def _other_readings(samples: Sequence[MovieSample]) -> list[tuple[float, str]]:
 
 
 def expected_outline_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
-    """Return the expected outline, (..., AROUND, 2) px, of a sphere with its centre at position_lab_mm, (..., 3).
-
-    The outline lies before the great circle by asin(radius / distance). The distance is that in air without a port:
-    its error changes the outline by the square of a small angle's error only.
-    """
+    """Return the outline (..., AROUND, 2), px, of a sphere at (..., 3), mm, lab; a port's effect is negligible."""
     sight = camera.rays(camera.project(position_lab_mm)).direction_lab
     side = torch.linalg.cross(sight, camera.R_cam_lab[1].expand_as(sight))
     side = side / side.norm(dim=-1, keepdim=True)
@@ -168,7 +155,7 @@ def ball_size(samples: Sequence[MovieSample], diameter_mm: float) -> Finding:
 
 
 def ball_size_px(sample: MovieSample) -> Finding:
-    """Report the size of the ball in one camera; one camera cannot tell a nearer ball from a larger one."""
+    """Report the size of the ball in one camera, which does not separate distance from size."""
     title, radius = f"size of the ball, {sample.name}", sample.sightings.radius_px
     seen = 2 * radius[torch.isfinite(radius)]
     if not len(seen):

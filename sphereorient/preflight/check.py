@@ -1,5 +1,3 @@
-"""The check before a run: sample the movies, run every check, collect the findings."""
-
 from __future__ import annotations
 
 import math
@@ -47,15 +45,12 @@ class Preflight:
 def preflight(
     experiment: Experiment | Path | str, settings: Settings | None = None, progress: Progress = silent
 ) -> Preflight:
-    """Check an experiment in seconds, before hours of work: files, cameras, movies, ball, paint, light.
+    """Check an experiment before a run: files, cameras, movies, ball, paint, light.
 
-    Args:
-        experiment: as loaded, or the path of its experiment.yaml.
-        settings: of the planned run; None: the defaults.
-        progress: called with stage, done, total.
+    `settings` of the planned run, None: the defaults; `progress` gets stage, done, total.
 
     Raises:
-        SphereOrientError: a file is missing, unreadable, or does not fit the others at all.
+        SphereOrientError: a file is missing or unreadable, or contradicts the others.
     """
     settings = settings or Settings()
     with open_recording(experiment, textured=False) as recording, ThreadPoolExecutor(3) as pool:
@@ -91,7 +86,6 @@ def preflight(
 
 
 def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Finding]:
-    """Run every check, in the order of the list that the user reads."""
     yield movies.frames(seen.experiment, seen.timeline)
     yield from movies.outside(seen.experiment)
     yield from wrong_sizes
@@ -125,14 +119,14 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
         return
     yield (similar := texture_map.look_alikes(seen.similar))
     yield from (texture_map.map_fits(match, seen.matches) for match in seen.matches)
-    # Movies out of step, or ambiguous views, would be reported as errors of the cameras.
+    # Unsynchronised movies or ambiguous views would be reported as camera errors.
     in_step = seen.scan is None or seen.scan.shift == 0
     if len(seen.matches) == 2 and in_step and similar.severity is not Severity.FAULT:
         yield texture_map.one_orientation(seen.matches)
 
 
 def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[str, float | None], list[Finding]]:
-    """Return the expected diameter in each camera, px, None if unknown; and the impossible ones as findings."""
+    """Return the expected diameter in each camera, px, None if unknown, and findings for impossible ones."""
     sizes: dict[str, float | None] = dict.fromkeys(experiment.cameras, settings.locate.diameter_px)
     findings = []
     for name in experiment.cameras:
@@ -148,7 +142,7 @@ def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[st
 def _offsets(
     samples: Sequence[MovieSample], settings: Settings, pool: ThreadPoolExecutor
 ) -> tuple[tuple[tuple[MovieSample, ...], ...], offset.OffsetScan | None]:
-    """Sample the stretches in which the ball moves most, and scan the offset between two movies."""
+    """Sample the stretches with most motion, and scan the offset between two movies."""
     if len(samples) != 2:
         return (), None
     parts = [

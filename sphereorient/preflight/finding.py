@@ -1,5 +1,3 @@
-"""One finding of the check, in words."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -74,11 +74,7 @@ def movie_file(sample: MovieSample) -> Finding:
 
 
 def pictures(samples: Sequence[MovieSample]) -> Finding:
-    """Count the sampled frames that cannot show a ball.
-
-    Args:
-        samples: of one camera, consecutive frames in each.
-    """
+    """Count the sampled frames of one camera that cannot show a ball; each sample is of consecutive frames."""
     seen: dict[int, Reason] = {}
     for sample in samples:
         # A frame in two samples is repeated if either sample has its neighbour.
@@ -98,7 +94,7 @@ def pictures(samples: Sequence[MovieSample]) -> Finding:
 
 
 def ball(sample: MovieSample) -> Finding:
-    """Count the frames with a ball, and the reasons why others have none."""
+    """Count the frames with a ball, and the reasons for those without."""
     usable = [k for k, reason in enumerate(sample.screen) if reason in (Reason.OK, Reason.REPEATED)]
     reasons = Counter(sample.found[k][1] for k in usable)
     title, seen = f"ball {sample.name}", reasons.pop(Reason.OK, 0)
@@ -166,11 +162,7 @@ def sharpness(sample: MovieSample) -> Finding:
 
 
 def limb_blur_px(sample: MovieSample) -> float:
-    """Return the blur of the ball's limb, a Gaussian's standard deviation, px; NaN if it cannot be measured.
-
-    The limb's profiles are shifted to their half height and averaged; the blur is half the distance between 84 and
-    16 %. It includes optics, pixel and motion, without the variance of the interpolation.
-    """
+    """Return the blur of the ball's limb, standard deviation, px: optics, pixel and motion; NaN: not measurable."""
     offset = np.arange(-REACH, REACH + FINE / 2, FINE)
     profiles = [_profiles(sample, picture, outline, offset) for picture, outline in sample.balls]
     shifted = np.concatenate([np.zeros((0, len(offset))), *profiles])
@@ -184,7 +176,7 @@ def limb_blur_px(sample: MovieSample) -> float:
 def _profiles(
     sample: MovieSample, picture: NDArray[np.generic], outline: Outline, offset: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return profiles across the limb, 1 inside and 0 outside, in directions with even paint at the limb."""
+    """Return profiles across the limb, 1 inside and 0 outside, where the paint at the limb is even."""
     angle = np.arange(AROUND) * (2 * np.pi / AROUND)
     reach = outline.radius_px + offset
     u = (outline.u_px + np.cos(angle)[:, None] * reach).astype(np.float32)
@@ -199,7 +191,7 @@ def _profiles(
     clear = whole & (step > 12 * sample.background.typical_noise)
     even = (within.std(1) < 0.12 * step) & (beyond.std(1) < 0.12 * step) & clear
     share = (profile[even] - outside[even, None]) / step[even, None]
-    # Each fit: where the profile last stands above a half.
+    # The last sample of each profile above a half.
     last = share.shape[1] - 1 - (share[:, ::-1] > 0.5).argmax(1)
     shifted = []
     for one, k in zip(share, last, strict=True):

@@ -1,4 +1,4 @@
-"""The check whether two movies are in step: the gap of the lines of sight at each offset in frames."""
+"""Check whether two movies are synchronised: the gap of the lines of sight at each offset in frames."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class OffsetScan:
 
     @property
     def shift(self) -> int:
-        """Whole frames by which the second movie is late; 0 if unknown."""
+        """Delay of the second movie, whole frames; 0 if unknown."""
         return 0 if math.isnan(self.best) else round(self.best)
 
     @property
@@ -48,11 +48,7 @@ class OffsetScan:
 
 
 def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
-    """Choose stretches of consecutive frames in which the ball moves most across the lines of sight.
-
-    The second stretch has the motion that differs most from that of the first: a rotated camera shifts the gap alike
-    in both, a late movie does not.
-    """
+    """Choose stretches of consecutive frames with much motion, then different: a late movie's gap varies."""
     count = len(samples[0].stream)
     starts = pair_starts(count)
     if not starts:
@@ -77,10 +73,7 @@ def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
 def scan_offsets(
     names: Sequence[str], cameras: Sequence[Camera], stretches: Sequence[tuple[Tensor, Tensor]]
 ) -> OffsetScan:
-    """Measure the gap for each offset between the movies of two cameras.
-
-    A stretch holds the centres (L, 2) of both in L consecutive frames, px; NaN: no ball.
-    """
+    """Measure the gap at each offset; stretches hold both cameras' centres (L, 2), px, NaN: no ball."""
     moved = [torch.zeros(0, dtype=torch.float64)]
     for centres in stretches:
         gaps = gaps_between(cameras, centres)
@@ -94,7 +87,7 @@ def scan_offsets(
     best, least_px = _least(gap)
     meet_px = max(GOOD_PX, MEET * moved_px)
     if not least_px <= meet_px:
-        # Cameras that were bumped leave a constant gap at any offset: use the varying part, if the motion varies.
+        # Moved cameras leave a constant gap at any offset: use the varying part, if the motion varies.
         best, least_px = _least(varying)
         varies_px = float(motion.std()) if len(motion) > 1 else 0.0
         best = best if varies_px > MOVES_PX and least_px <= meet_px else math.nan
@@ -109,7 +102,7 @@ def scan_offsets(
 
 
 def _gap_at(cameras: Sequence[Camera], stretches: Sequence[tuple[Tensor, Tensor]], offset: int) -> tuple[float, float]:
-    """Return the root mean square gap of frames k and k + offset, px, with and without its constant part."""
+    """Return the rms gap of frames k and k + offset, px, with and without its constant part."""
     parts = [torch.zeros(0, dtype=torch.float64)]
     for first, second in stretches:
         length = len(first) - abs(offset)
@@ -124,7 +117,7 @@ def _gap_at(cameras: Sequence[Camera], stretches: Sequence[tuple[Tensor, Tensor]
 
 
 def _trimmed_rms(values: Tensor) -> float:
-    """Return the root mean square without the largest tenth, which may come from a wrong outline."""
+    """Return the rms without the largest tenth, possibly wrong outlines."""
     kept = values.abs().sort().values[: math.ceil(0.9 * len(values))]
     return float(kept.square().mean().sqrt())
 
@@ -143,7 +136,7 @@ def _least(gap_px: Tensor) -> tuple[float, float]:
 
 
 def in_step(scan: OffsetScan, start: Mapping[str, int]) -> Finding:
-    """Judge whether the movies are in step; `start` is that of the experiment."""
+    """Judge whether the movies are synchronised; `start` is that of the experiment."""
     title, (first, second) = "movies in step", scan.names
     if scan.moved_px <= MOVES_PX:
         return ok(title, f"unknown: the ball moves {scan.moved_px:.2f} px a frame across the lines of sight")
@@ -168,7 +161,7 @@ def in_step(scan: OffsetScan, start: Mapping[str, int]) -> Finding:
 
 
 def starts_in_step(start: Mapping[str, int], scan: OffsetScan) -> tuple[int, int]:
-    """Return the values of `start:`, not below 0, that put the movies of the two cameras in step."""
+    """Return the values of `start:`, not negative, that synchronise the movies of the two cameras."""
     first, second = (start.get(name, 0) for name in scan.names)
     second += scan.shift
     return first + max(0, -second), max(0, second)

@@ -1,4 +1,4 @@
-"""The frames that the check reads: a spread sample, neighbours, two stretches; and the ball in them."""
+"""The sampled frames of the check, and the ball in them."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ class MovieSample:
 
     @property
     def camera(self) -> Camera:
-        """The camera."""
+        """Camera of the sample."""
         return self.stream.camera
 
     @property
     def row(self) -> NDArray[np.int64]:
-        """(n,), index in the movie; NONE where there is no picture."""
+        """Index in the movie, (n,); NONE without a picture."""
         return self.stream.rows[self.frame]
 
     @cached_property
@@ -93,9 +93,7 @@ def frames_to_sample(count: int) -> list[int]:
 def sample_movie(
     stream: CameraStream, experiment: Experiment, diameter_px: float | None, settings: LocateSettings
 ) -> MovieSample:
-    """Read a spread sample of one camera's frames, learn the background, and find the ball.
-
-    Without an expected diameter, the diameter is measured in the pictures.
+    """Sample one camera's frames, background and ball; measure its diameter if None.
 
     Raises:
         MovieError: no sampled frame can be decoded.
@@ -143,7 +141,6 @@ def sample_more(sample: MovieSample, frames: Sequence[int], settings: LocateSett
 
 
 def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:
-    """Screen the pictures as the tracker does, and find the ball in the usable ones."""
     screen: list[Reason] = []
     found: list[Found] = []
     rows = sample.row
@@ -162,7 +159,7 @@ def _searched(sample: MovieSample, settings: LocateSettings) -> MovieSample:
 
 
 def _surroundings(pictures: Grey) -> Background:
-    """Guess the background of a ball that never moves: the median grey level of the pictures."""
+    """Return the median grey level of the pictures, as background of a ball that never moves."""
     measured = measure_background(pictures)
     middle = np.full(measured.mean.shape, np.median(measured.mean), np.float32)
     noise = np.full(middle.shape, measured.typical_noise, np.float32)
@@ -170,7 +167,7 @@ def _surroundings(pictures: Grey) -> Background:
 
 
 def _measured_size_px(pictures: Sequence[Grey], background: Background, settings: LocateSettings) -> float | None:
-    """Return the diameter at which outlines have the best coverage; None if there are no outlines."""
+    """Return the diameter, px, whose outlines have the best coverage; None without outlines."""
     largest = 0.9 * min(background.mean.shape)
     chosen = [pictures[k] for k in spread_frames(range(len(pictures)), BALLS)]
     best, size = 0.0, None

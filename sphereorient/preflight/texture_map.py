@@ -93,13 +93,11 @@ def measure_texture(texture: Tensor) -> TextureMeasures:
 
 
 def _cos_latitude(height: int) -> Tensor:
-    """Return the area of each texel, (H, 2 H), any unit."""
     cosine: Tensor = map_directions(height)[..., :2].norm(dim=-1)
     return cosine
 
 
 def _patch_rad(texture: Tensor, mean: float) -> float:
-    """Return the typical width of a patch, from the autocorrelation of the map."""
     rng = torch.Generator().manual_seed(0)
     at, side = torch.nn.functional.normalize(torch.randn(2, DRAWS, 3, generator=rng), dim=-1)
     side = torch.nn.functional.normalize(side - (side * at).sum(-1, keepdim=True) * at, dim=-1)
@@ -143,12 +141,7 @@ def contrast(measures: TextureMeasures, radius_px: float) -> Finding:
 
 
 def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPair:
-    """Find two views, far apart, of which one explains most of the other.
-
-    Args:
-        texture: (H, 2 H), 0 black .. 1 white.
-        settings: of the search for orientations.
-    """
+    """Find two distant views of a map (H, 2 H), 0 black .. 1 white, one of which explains most of the other."""
     size = settings.size_px
     view = orthographic_view(size)
     normal = view.normal_view.T.contiguous()
@@ -182,7 +175,7 @@ def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPai
 
 
 def views_towards(direction_body: Tensor) -> Tensor:
-    """Return orientations R_view_body, (n, 3, 3), with body directions (n, 3) towards the viewer, against z of V."""
+    """Return R_view_body (n, 3, 3) that turn body directions (n, 3) towards the viewer, against z of V."""
     back = -direction_body
     helper = torch.eye(3, dtype=back.dtype)[back.abs().argmin(-1)]
     right = torch.nn.functional.normalize(torch.linalg.cross(helper, back), dim=-1)
@@ -274,7 +267,7 @@ def one_orientation(matches: Sequence[TextureMatch]) -> Finding:
 
 
 def _median_angle_deg(matches: Sequence[TextureMatch], cameras: tuple[Camera, Camera]) -> float:
-    """Return the median angle between the orientations in the lab, degrees; NaN: no frame in common."""
+    """Return the median angle between the lab orientations, degrees; NaN: no common frame."""
     lab = []
     for match, camera in zip(matches, cameras, strict=True):
         direction_cam = camera.rays(match.centre_px).direction_lab @ camera.R_cam_lab.mT

@@ -31,11 +31,7 @@ class Executor(Protocol):
 
 
 class ProcessExecutor:
-    """Worker processes, each in a pool of its own: one that dies does not stop the others.
-
-    Args:
-        size: number of workers.
-    """
+    """`size` worker processes, each in a pool of its own: one that dies does not stop the others."""
 
     def __init__(self, size: int) -> None:
         self._workers = [_worker() for _ in range(size)]
@@ -55,7 +51,7 @@ class ProcessExecutor:
         self._workers[worker] = _worker()
 
     def close(self) -> None:
-        """Terminate the workers; what is done is in the stores."""
+        """Terminate the workers; finished work is in the stores."""
         for worker in self._workers:
             processes = list((getattr(worker, "_processes", None) or {}).values())
             worker.shutdown(wait=False, cancel_futures=True)
@@ -64,7 +60,7 @@ class ProcessExecutor:
 
 
 def _worker() -> ProcessPoolExecutor:
-    # Not forked: a process that has used torch's threads hangs in its children.
+    # Spawn: forked children of a process that used torch's threads hang.
     start = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(1, mp_context=start, initializer=_prepare)
 
@@ -84,11 +80,7 @@ def _prepare() -> None:
 
 
 class DaskExecutor:
-    """The workers of a Dask cluster; the scheduler chooses which of them does a task.
-
-    Args:
-        client: `distributed.Client` of a running cluster; its workers see the same files under the same names.
-    """
+    """The workers of a Dask cluster (`distributed.Client`); they must see the same files under the same names."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
@@ -96,12 +88,12 @@ class DaskExecutor:
 
     @property
     def size(self) -> int:
-        """Number of tasks that the cluster does side by side, at least one."""
+        """Number of tasks that the cluster does in parallel, at least one."""
         threads: dict[str, int] = self._client.nthreads()
         return max(1, sum(threads.values()))
 
     def submit(self, worker: int, task: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Start a task."""
+        """Start a task; the scheduler chooses the worker."""
         future: Future[Any] = self._executor.submit(task, *arguments)
         return future
 
@@ -109,21 +101,16 @@ class DaskExecutor:
         """Do nothing: a cluster replaces its workers itself."""
 
     def close(self) -> None:
-        """Disconnect; the cluster goes on for others."""
+        """Disconnect; the cluster continues for others."""
         self._executor.shutdown(wait=False)
         self._client.close()
 
 
 def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
-    """Join a Dask cluster.
-
-    Args:
-        cluster: address of a scheduler (tcp://host:8786), path of a scheduler file (.json), or `local`: workers of this
-            machine.
-        workers: of a local cluster; None: one per core.
+    """Connect to Dask: a scheduler (tcp://host:8786), its file (.json), or `local` (workers None: one per core).
 
     Raises:
-        SettingsError: Dask is not installed, or nobody answers.
+        SettingsError: Dask is not installed, or the scheduler does not answer.
     """
     try:
         import distributed
@@ -147,13 +134,10 @@ def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
 
 
 class _Owning(DaskExecutor):
-    """A cluster that is stopped at the end."""
-
     def __init__(self, client: Any, cluster: Any) -> None:
         super().__init__(client)
         self._cluster = cluster
 
     def close(self) -> None:
-        """Stop the cluster."""
         super().close()
         self._cluster.close()

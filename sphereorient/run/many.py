@@ -1,4 +1,4 @@
-"""Many experiments, or one long movie, on many workers: which task comes next, and what to do when a worker dies."""
+"""Many experiments, or one long movie, on many workers: the order of tasks, and the death of a worker."""
 
 from __future__ import annotations
 
@@ -47,8 +47,6 @@ class Outcome:
 
 @dataclass(eq=False)
 class _Job:
-    """One experiment in progress."""
-
     request: Request
     run_id: str
     began: float
@@ -68,7 +66,6 @@ class _Job:
         return self.error is not None or self.counts is not None
 
     def done(self) -> tuple[int, int]:
-        """Frames measured and frames in all."""
         if self.batches is None:
             return 0, 1
         left = FolderStore(self.request.parts).missing(self.batches) if self.counts is None else []
@@ -76,7 +73,7 @@ class _Job:
         return total - sum(map(len, left)), total
 
     def advance(self) -> None:
-        """Go to the next stage where all tasks of this one are done."""
+        """Go to the next stage when all tasks of this one are done."""
         while self.todo is not None and not (self.waiting or self.running or self.over):
             results, self.results = self.results, []
             try:
@@ -85,8 +82,7 @@ class _Job:
                 self.counts = end.value
 
 
-# A worker gets many tasks of one run: opening it costs as much as hundreds of frames. `run_id` is new for each call of
-# `run_many`, so that no later run is measured with what an earlier one learnt.
+# Opening a run costs as much as hundreds of frames; `run_id` is new for each `run_many`, so no later run reuses it.
 @lru_cache(maxsize=1)
 def _work(request: Request, run_id: str) -> tuple[Work, ExitStack]:
     stack = ExitStack()
@@ -103,22 +99,13 @@ def do_task(request: Request, run_id: str, task: Task) -> Any:
 def run_many(
     requests: Sequence[Request], executor: Executor, *, resume: bool = False, progress: Progress = silent
 ) -> list[Outcome]:
-    """Track experiments on the workers of an executor: stages of several, batches of one movie, side by side.
+    """Track experiments on the workers of an executor; return the outcomes in the order of the requests.
 
-    Every track is the same as that of a single process, to the last bit. An experiment that fails does not stop the
-    others. A worker that dies is replaced, and its experiment goes on from what is done.
-
-    Args:
-        requests: with different tracks.
-        executor: closed at the end.
-        resume: go on with the stores of runs that were cut off.
-        progress: called with the name of a track, its frames done and its frames in all.
-
-    Returns:
-        The result of each, in the order of the requests.
+    Each track equals that of a single process to the last bit; failures and dead workers do not stop the others. The
+    executor is closed. `resume` continues from stores; `progress` gets a track's name, frames done and all frames.
 
     Raises:
-        SettingsError: two requests with one track.
+        SettingsError: two requests have the same track.
     """
     _refuse_same(requests)
     todo = deque(range(len(requests)))
@@ -190,7 +177,7 @@ def _begun(request: Request, resume: bool, workers: int) -> _Job:
 
 
 def _take(future: Future[Any], job: _Job, task: Task, executor: Executor, worker: int) -> None:
-    """Take the result of a task: a value, a refusal, or the death of its worker."""
+    """Handle the outcome of a task: a value, a refusal, or the death of its worker."""
     try:
         result = future.result()
     except SphereOrientError as error:
@@ -223,10 +210,7 @@ def _outcome(job: _Job) -> Outcome:
 
 
 def tracks_of(experiments: Sequence[Path], out: Path) -> list[Path]:
-    """Return the paths of the tracks of experiments: the file itself for one, files in a folder for several.
-
-    In a folder each track has the name of its experiment's folder; of its file, where two share that.
-    """
+    """Return the tracks' paths: `out` for one experiment, else files in folder `out`, named by experiment folder."""
     if len(experiments) == 1 and not out.is_dir():
         return [out]
     names = [path.resolve().parent.name for path in experiments]

@@ -1,4 +1,4 @@
-"""What a run is asked to do, and the fingerprint that distinguishes it from others."""
+"""The request of a run, and the fingerprint that distinguishes it from others."""
 
 from __future__ import annotations
 
@@ -31,27 +31,19 @@ class Request:
 
     @property
     def track(self) -> Path:
-        """The path of the track.
-
-        Raises:
-            OutputError: the request has none.
-        """
+        """The path of the track; raise OutputError if the request has none."""
         if self.out is None:
             raise OutputError(refusal("out", expected="the path of a track", got="none", do="pass out="))
         return self.out
 
     @property
     def parts(self) -> Path:
-        """The folder beside the track that keeps what is done until the track is whole."""
+        """The folder beside the track that keeps intermediate results until the track is complete."""
         return self.track.with_name(self.track.name + ".parts")
 
 
 def fingerprint(request: Request) -> dict[str, str]:
-    """Return what distinguishes a run: its inputs by size and time, experiment.yaml by its text, settings, version.
-
-    Raises:
-        SphereOrientError: the experiment or its cameras cannot be read.
-    """
+    """Return the identity of a run: inputs by size and time, text of experiment.yaml, settings, version."""
     given = request.experiment
     experiment = given if isinstance(given, Experiment) else load_experiment(given)
     found = {
@@ -68,12 +60,12 @@ def fingerprint(request: Request) -> dict[str, str]:
 
 
 def differing(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
-    """Return the names of what differs between two fingerprints."""
+    """Return the names of the entries that differ between two fingerprints."""
     return sorted(name for name in {*one, *other} if one.get(name) != other.get(name))
 
 
 def _files(request: Request, experiment: Experiment) -> list[tuple[Path, int]]:
-    """Return the input files, each with the number of others of its name before it."""
+    """Return the input files, each with the number of earlier files of the same name."""
     named = [path for paths in input_files(experiment, request.cameras).values() for path in paths]
     named = [path for path in named if path != experiment.path]  # compared by its text
     if isinstance(request.learnt, Path):

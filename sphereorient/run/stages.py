@@ -1,7 +1,4 @@
-"""One way through: learn, follow, join. Every command, the Python API and the workers come through here.
-
-movies -> locate -> search -> pose -> follow -> assemble -> motion -> Trajectory
-"""
+"""One way through a run, for every command, the Python API and the workers: learn, follow, join."""
 
 from __future__ import annotations
 
@@ -43,19 +40,12 @@ class Task:
 
 
 def run(request: Request, store: Store, *, resume: bool = False, progress: Progress = silent) -> Trajectory:
-    """Track one experiment in this process.
+    """Track one experiment in this process; `progress` gets stage, frames done and frames in all.
 
-    A run that was cut off at any moment can be resumed from a folder store: the track is the same to the last bit.
-
-    Args:
-        request: what to do.
-        store: keeps what is done until the track is whole.
-        resume: go on with what the store holds.
-        progress: called with stage, frames done and frames in all.
+    `resume` continues an interrupted run from a folder store; the track is the same to the last bit.
 
     Raises:
-        SphereOrientError: inputs that are missing, unreadable or do not fit together; a store of another run; a track
-            that cannot be written, and then the store keeps what is done.
+        SphereOrientError: unusable inputs, a store of another run, or a track that cannot be written (the store stays).
     """
     check_out(request)
     with opened(request, store) as work, store.held(request, resume=resume):
@@ -70,13 +60,9 @@ def run(request: Request, store: Store, *, resume: bool = False, progress: Progr
 
 
 def stages(store: Store, workers: int | None = None) -> Generator[list[Task], list[Any], Any]:
-    """Yield the tasks of a run, stage by stage; those of one stage may be done side by side.
+    """Yield the tasks of a run, stage by stage; send all results of a stage to get the next one.
 
-    Send the results of all tasks of a stage to get the next stage.
-
-    Args:
-        store: of the run.
-        workers: that share the frames; None: one task follows all.
+    The tasks of one stage are independent. The `workers` share the frames; None: one task follows all.
     """
     (batches,) = yield [Task("learn")]
     left = store.missing(batches)
@@ -106,7 +92,7 @@ class Work:
         return self.follow(task.batches, progress) if task.stage == "follow" else self.join(progress)
 
     def learn(self, progress: Progress) -> list[Batch]:
-        """Learn what frames are measured with, unless it is known, keep it, and return the batches to follow."""
+        """Estimate what is needed before tracking, unless it is known; keep it, and return the batches to follow."""
         if not self._learnt:
             known = self.job.given or self.store.known
             if known is not None:
@@ -133,7 +119,7 @@ class Work:
         return count
 
     def join(self, progress: Progress) -> Trajectory:
-        """Make the track of the measured batches, write it, and empty the store."""
+        """Join the measured batches to a track, write it, and empty the store."""
         batches = self.learn(progress)
         progress("join", 0, 1)
         measured = (self.store.read(batch) for batch in batches)
@@ -150,11 +136,7 @@ class Work:
 
 @contextmanager
 def opened(request: Request, store: Store) -> Iterator[Work]:
-    """Open the inputs of a request.
-
-    Raises:
-        SphereOrientError: inputs or settings that are missing, unreadable or do not fit together.
-    """
+    """Open the inputs of a request; raise SphereOrientError if they are missing, unreadable or inconsistent."""
     method = check_method(request)
     given = Learnt.load(request.learnt) if isinstance(request.learnt, Path) else request.learnt
     device = torch_device(request.device)
@@ -175,7 +157,7 @@ def track_movies(
     progress: Progress = silent,
     command: str = "sphereorient.track_movies",
 ) -> Trajectory:
-    """Measure position and absolute orientation of the sphere in every frame.
+    """Measure position (mm) and orientation of the sphere in every frame; see docs/data-format.md for the result.
 
     Args:
         experiment: as loaded, or the path of its experiment.yaml.
@@ -183,17 +165,13 @@ def track_movies(
         settings: None: the defaults.
         cameras: names of the cameras to use; None: all.
         device: where fits are computed, as torch names it: cpu, cuda, cuda:1.
-        learnt: what another run learnt of background, light and motion; None: learn it (method precise).
-        proposer: checkpoint of a network that proposes orientations, "default" for the bundled one
-            (docs/proposer.md); None: as the settings say.
+        learnt: background, light and motion from another run; None: estimate them (method precise).
+        proposer: checkpoint of a network (docs/proposer.md), "default": the bundled one; None: as in the settings.
         progress: called with stage, frames done and frames in all.
         command: recorded as the origin in the track's provenance.
 
-    Returns:
-        The trajectory, frame by frame; lengths in mm, angles in rad, see docs/data-format.md.
-
     Raises:
-        SphereOrientError: inputs that are missing, unreadable or do not fit together.
+        SphereOrientError: missing, unreadable or inconsistent inputs.
     """
     request = Request(
         experiment=experiment if isinstance(experiment, Experiment) else Path(experiment),
@@ -208,7 +186,7 @@ def track_movies(
 
 
 def finished(track: Trajectory, job: Job, request: Request) -> Trajectory:
-    """Add the effect of the calibration's errors, and the origin, to a track."""
+    """Add the systematic errors of the calibration, and the provenance, to a track."""
     recording, settings = job.recording, job.settings
     track = results.with_systematic_errors(track, recording.cameras, recording.covariance, recording.radius_mm)
     inputs = input_files(recording.experiment, list(recording.cameras))
@@ -220,18 +198,14 @@ def finished(track: Trajectory, job: Job, request: Request) -> Trajectory:
 
 
 def with_proposer(settings: Settings, proposer: str | Path | None) -> Settings:
-    """Return settings with a checkpoint that proposes; unchanged for None."""
+    """Return settings with a checkpoint as proposer; unchanged for None."""
     if proposer is None:
         return settings
     return settings.model_copy(update={"propose": settings.propose.model_copy(update={"checkpoint": str(proposer)})})
 
 
 def check_method(request: Request) -> Method:
-    """Return the method of a request.
-
-    Raises:
-        SettingsError: an unknown method, or settings or knowledge that the method does not read.
-    """
+    """Return the method of a request; raise SettingsError if it is unknown, or does not read the settings."""
     if request.method not in METHODS:
         got, do = repr(request.method), "name one of these"
         raise SettingsError(refusal("method", expected=" or ".join(METHODS), got=got, do=do))
@@ -243,22 +217,14 @@ def check_method(request: Request) -> Method:
 
 
 def check_out(request: Request) -> None:
-    """Check that the output folder exists before starting.
-
-    Raises:
-        OutputError: it does not.
-    """
+    """Check that the output folder exists before starting; raise OutputError if it does not."""
     if request.out is not None and not request.out.parent.is_dir():
         expected, do = f"an existing folder {request.out.parent}", "make it first"
         raise OutputError(refusal(str(request.out), expected=expected, got="none", do=do))
 
 
 def torch_device(name: str) -> torch.device:
-    """Return a device that torch can use.
-
-    Raises:
-        SettingsError: torch cannot use it.
-    """
+    """Return a torch device; raise SettingsError if torch cannot use it."""
     try:
         device = torch.device(name)
         torch.zeros(1, device=device)

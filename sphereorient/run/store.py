@@ -1,4 +1,4 @@
-"""Where a run keeps what is done: in memory, or in a folder beside the track from which it can be resumed."""
+"""Where a run keeps its intermediate results: in memory, or in a folder beside the track, to resume from."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class MemoryStore:
 
     @contextmanager
     def held(self, request: Request, *, resume: bool) -> Iterator[None]:
-        """Do nothing: nobody else sees this store."""
+        """Do nothing: no other process uses this store."""
         yield
 
     def keep(self, learnt: Learnt) -> None:
@@ -52,7 +52,7 @@ class MemoryStore:
         return self._poses.pop(batch.first)
 
     def missing(self, batches: Sequence[Batch]) -> list[Batch]:
-        """Return the batches that are still to be measured."""
+        """Return the batches that are not measured yet."""
         return [batch for batch in batches if batch.first not in self._poses]
 
     def remove(self) -> None:
@@ -77,10 +77,10 @@ class FolderStore:
 
     @contextmanager
     def held(self, request: Request, *, resume: bool) -> Iterator[None]:
-        """Make the folder, or go on with what it holds, and lock it against other runs.
+        """Create the folder, or resume from it, and lock it against other runs.
 
         Raises:
-            TrackError: to be resumed, but of a run on other inputs or settings.
+            TrackError: the folder to resume from belongs to a run with other inputs or settings.
             OutputError: it cannot be written, or another run is writing it.
         """
         with ExitStack() as locks:
@@ -137,7 +137,6 @@ class FolderStore:
         return self.folder / "run.json"
 
     def _fingerprint(self) -> dict[str, str] | None:
-        """Return the fingerprint of the run that made the folder; None without one."""
         try:
             known = json.loads(self._run.read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -146,7 +145,7 @@ class FolderStore:
 
     @property
     def known(self) -> Learnt | None:
-        """What was learnt before the first frame; None where the file is missing or damaged."""
+        """What was learnt before the first frame; None if the file is missing or damaged."""
         try:
             return Learnt.load(self.learnt)
         except TrackError:
@@ -161,11 +160,7 @@ class FolderStore:
         write_poses(self.poses(batch), poses)
 
     def read(self, batch: Batch) -> list[Poses]:
-        """Return the poses of one batch.
-
-        Raises:
-            TrackError: the file is damaged; it is removed, so that the next run measures the batch again.
-        """
+        """Return the poses of one batch; raise TrackError and remove the file if it is damaged."""
         path = self.poses(batch)
         poses = read_poses(path) if path.is_file() else None
         if poses is None or len(poses) != len(batch):
@@ -175,7 +170,7 @@ class FolderStore:
         return poses
 
     def missing(self, batches: Sequence[Batch]) -> list[Batch]:
-        """Return the batches that are still to be measured."""
+        """Return the batches that are not measured yet."""
         return [batch for batch in batches if not self.poses(batch).is_file()]
 
     def remove(self) -> None:
@@ -188,11 +183,7 @@ Store = MemoryStore | FolderStore
 
 
 def write_poses(path: Path, poses: Sequence[Poses]) -> None:
-    """Write the poses of consecutive frames: aside, onto the disk, and then under their name.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the poses of consecutive frames atomically; raise OutputError if the file cannot be written."""
     with whole_hdf5(path, "check the space left, then run again with --resume") as file:
         file.attrs["schema"] = SCHEMA
         file["count"] = np.array([len(one) for one in poses])
@@ -203,7 +194,7 @@ def write_poses(path: Path, poses: Sequence[Poses]) -> None:
 
 
 def read_poses(path: Path) -> list[Poses] | None:
-    """Return what `write_poses` wrote; None where the file is not whole."""
+    """Return what `write_poses` wrote; None if the file is not whole."""
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("schema") != SCHEMA:
@@ -214,7 +205,7 @@ def read_poses(path: Path) -> list[Poses] | None:
     except (OSError, KeyError, ValueError, RuntimeError):
         return None
     return [
-        # Copies: rows of one array would keep the whole of it.
+        # Copy: a row would keep the whole array in memory.
         Poses(**{name: parts[name][k].clone() for name in POSE_PARTS}, use=use[k].clone(), reason=tuple(reason[k]))
         for k in range(len(count))
     ]

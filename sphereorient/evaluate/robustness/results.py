@@ -1,5 +1,3 @@
-"""Results of the benchmark: of a scene, summed up by degradation and level, and compared between two runs."""
-
 from __future__ import annotations
 
 import json
@@ -57,7 +55,7 @@ class SceneResult:
 
     @property
     def errors_deg(self) -> Floats:
-        """(frames,), NaN: no orientation."""
+        """Errors (frames,), degrees; NaN: no orientation."""
         return np.array([np.nan if x is None else x for x in self.orientation_deg], np.float64)
 
     @property
@@ -72,7 +70,7 @@ class SceneResult:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> SceneResult:
-        """Return the result of which a JSON file holds `asdict`."""
+        """Return the result from the content of its JSON file."""
         values: dict[str, Any] = {entry.name: tree[entry.name] for entry in fields(cls)}
         return cls(**values | {name: tuple(value) for name, value in values.items() if isinstance(value, list)})
 
@@ -162,11 +160,7 @@ def save_results(results: Results, path: Path) -> None:
 
 
 def load_results(path: Path) -> Results:
-    """Read results of `save_results`.
-
-    Raises:
-        BenchError: the file is missing, not JSON, or of another version.
-    """
+    """Read results of `save_results`; raise BenchError if the file is missing, not JSON, or of another version."""
     do = "pass a results.json of `sphereorient bench robustness`"
     try:
         tree = json.loads(path.read_text("utf-8"))
@@ -208,7 +202,6 @@ class Change:
         return self._significant() < 0
 
     def _significant(self) -> float:
-        """Return the difference, 0 if it is not significant."""
         relative = self.what.startswith("median")
         size = float(np.log(self.now / self.before)) if relative else self.now - self.before
         least = np.log(LEAST_RATIO) if relative else LEAST_FRAMES
@@ -216,11 +209,7 @@ class Change:
 
 
 def compare_runs(now: Results, baseline: Results) -> list[Change]:
-    """Compare the scenes and methods that two runs have in common.
-
-    Raises:
-        BenchError: the runs have no scene in common.
-    """
+    """Compare the scenes and methods that two runs have in common; raise BenchError if there are none."""
     same = all(getattr(now.settings, key) == getattr(baseline.settings, key) for key in SAME_PLAN)
     known = {(one.scene, one.method): one for one in baseline.outcomes if same}
     groups: dict[Key, list[tuple[SceneResult, SceneResult]]] = {}

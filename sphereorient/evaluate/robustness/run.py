@@ -1,5 +1,3 @@
-"""The run of the benchmark: each scene is rendered, tracked by all methods and measured; finished scenes are kept."""
-
 from __future__ import annotations
 
 import json
@@ -46,11 +44,7 @@ DEFAULT = ("precise", "paper")
 
 
 def trackers_of(names: Sequence[str]) -> dict[str, Tracker]:
-    """Return the trackers of some methods.
-
-    Raises:
-        BenchError: an unknown name.
-    """
+    """Return the trackers of some methods; raise BenchError for an unknown name."""
     for name in names:
         if name not in TRACKERS:
             do = "choose among these"
@@ -66,17 +60,10 @@ def run_benchmark(
     jobs: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> Results:
-    """Render all scenes, track each with all methods, measure; an interrupted run of the same plan is continued.
+    """Render all scenes, track each with all methods (None: precise and paper), measure; results.json holds all.
 
-    Args:
-        folder: of the run; created if missing. results.json holds everything at the end.
-        settings: the scenes.
-        trackers: by the method's name; None: precise and paper.
-        jobs: processes, one scene each.
-        progress: called with finished scenes and all scenes.
-
-    Raises:
-        OutputError: the folder holds another run, or cannot be written.
+    The folder is created; an interrupted run of the same plan is continued. `jobs` processes do one scene each;
+    `progress` gets finished and all scenes. Raise OutputError if the folder is unwritable, or holds another run.
     """
     chosen = trackers_of(DEFAULT) if trackers is None else trackers
     _prepare(folder, settings)
@@ -106,7 +93,6 @@ def limit_threads() -> None:
 
 
 def _prepare(folder: Path, settings: BenchSettings) -> None:
-    """Create the folder; refuse one with another run."""
     plan: dict[str, Any] = {"schema": SCHEMA, "settings": settings.model_dump(mode="json")}
     path, name, do = folder / PLAN, f"--out {folder}", "choose a new --out, or the same settings to go on"
     if folder.exists() and not folder.is_dir():
@@ -133,11 +119,7 @@ def _missing(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracker
 
 
 def kept_result(path: Path) -> SceneResult:
-    """Read the result of a scene.
-
-    Raises:
-        BenchError: the file is damaged.
-    """
+    """Read the result of a scene; raise BenchError if the file is damaged."""
     try:
         return SceneResult.from_tree(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, KeyError, TypeError):
@@ -210,7 +192,7 @@ def no_track(frames: int, message: str) -> dict[str, Any]:
 
 
 def _ranks(seen: CameraTrack, R_true: Floats) -> Floats:
-    """Return the rank, 0 the best, of the right orientation among a camera's candidates, (N,); inf: not among them."""
+    """Return the rank (N,), 0 the best, of the right orientation among a camera's candidates; inf: missing."""
     counts = np.diff(seen.candidate_offset)
     frame = np.repeat(np.arange(len(counts)), counts)
     pair = (torch.from_numpy(seen.candidate_orientation), torch.from_numpy(R_true[frame]))
@@ -224,7 +206,7 @@ def _ranks(seen: CameraTrack, R_true: Floats) -> Floats:
 
 
 def _inside(track: Trajectory, R_true: Floats) -> tuple[int, int]:
-    """Return the number of frames with a covariance, and of those with the truth within its 95 % region."""
+    """Return the number of frames with a covariance, and of those with the truth in its 95 % region."""
     known = track.valid & np.isfinite(track.orientation_cov).all((1, 2)) & np.isfinite(track.orientation).all((1, 2))
     R, cov = torch.from_numpy(track.orientation[known]), track.orientation_cov[known]
     delta = so3.log(torch.from_numpy(R_true[known]) @ R.mT).numpy()

@@ -1,5 +1,3 @@
-"""The scenes of the benchmark: their settings, list and rendering."""
-
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
@@ -21,7 +19,7 @@ MIXED_SEED = 20110  # of the random combinations
 
 
 class BenchSettings(BaseModel):
-    """The list of scenes; results are compared scene by scene, so these settings are part of the results."""
+    """The list of scenes, part of the results: these are compared scene by scene."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -77,7 +75,6 @@ def scenes_of(settings: BenchSettings) -> list[BenchmarkScene]:
 
 
 def _of_seed(settings: BenchSettings, seed: int) -> Iterator[tuple[str, int, int, dict[str, int]]]:
-    """Yield kind, level, number and degradations of the scenes of one seed."""
     yield CLEAN, 0, 0, {}
     for name in settings.degradations:
         for level in settings.levels:

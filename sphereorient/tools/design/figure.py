@@ -1,5 +1,3 @@
-"""The figure of a judged map: its views and how much each of them determines."""
-
 from __future__ import annotations
 
 import math
@@ -49,7 +47,6 @@ def _map_part(axes: Axes, texture: Tensor, judgement: Judgement, title: str) -> 
 
 
 def _named_views(judgement: Judgement) -> list[tuple[str, Tensor, str]]:
-    """Return name, direction and colour of the views that are drawn."""
     at = judgement.direction_body
     return [
         ("W worst view", at[judgement.worst], WORST),
@@ -85,7 +82,6 @@ def _degrees(angle_rad: float) -> str:
 
 
 def _information_part(axes: Axes, judgement: Judgement) -> None:
-    """Draw the bound of every view at its middle on the map."""
     place = lon_lat_deg(judgement.direction_body).numpy()
     bound = np.rad2deg(judgement.bound_rad.numpy())
     fine = np.isfinite(bound)
@@ -103,7 +99,6 @@ def _information_part(axes: Axes, judgement: Judgement) -> None:
 
 
 def _balance_part(axes: Axes, judgement: Judgement) -> None:
-    """Draw the distribution of the share of white."""
     white = 100 * judgement.white.numpy()
     axes.hist(white, bins=list(range(0, 105, 5)), color=SHADE, edgecolor=GREY, linewidth=0.5)
     axes.axvline(float(np.median(white)), color="black", linewidth=1, linestyle="--")

@@ -1,8 +1,6 @@
-"""Gores: a texture map as strips from pole to pole that lie flat on paper and wrap a ball, printed at true size.
+"""Gores: a texture map as strips from pole to pole (sinusoidal projection) that wrap a ball, printed at true size.
 
-On the sheet x grows to the right and y upwards, mm; the strips touch along the equator, which is pi D long, the first
-one at longitude -180 degrees. North is up and east is right, as seen from outside. Parallels and the middle meridian
-of each strip have their true lengths (the sinusoidal projection, strip by strip).
+Sheet: x right, y up, mm, first strip at longitude -180 degrees; north up and east right, seen from outside.
 """
 
 from __future__ import annotations
@@ -38,17 +36,12 @@ FOLD: dict[str, Any] = {"color": "#00A0A0", "linewidth": 0.3, "linestyle": (0, (
 
 @dataclass(frozen=True, kw_only=True)
 class Gores:
-    """Strips for a ball.
-
-    Raises:
-        PaintError: the number of strips or the diameter is out of range.
-    """
+    """Strips for a ball; raises PaintError if their number or the diameter is out of range."""
 
     count: int
     diameter_mm: float
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         for name, value, (low, high), unit in (
             ("gores", self.count, GORES, ""),
             ("diameter", self.diameter_mm, DIAMETERS_MM, " mm"),
@@ -59,7 +52,7 @@ class Gores:
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width (the equator) and height (from pole to pole) of the strips."""
+        """Width (the equator) and height (pole to pole) of the strips."""
         return math.pi * self.diameter_mm, math.pi * self.diameter_mm / 2
 
     @property
@@ -73,7 +66,7 @@ class Gores:
         return [-math.pi + 2 * math.pi * (k + 0.5) / self.count for k in range(self.count)]
 
     def outline_mm(self, points: int = 181) -> list[NDArray[np.float64]]:
-        """Return the closed outline of each strip, (2 points, 2), mm: the line to cut along."""
+        """Return the closed cutting line of each strip, (2 points, 2), mm."""
         latitude = np.linspace(-math.pi / 2, math.pi / 2, points)
         half = math.pi / self.count * np.cos(latitude)
         edges = [np.column_stack([side * half, latitude]) for side in (-1, 1)]
@@ -82,10 +75,7 @@ class Gores:
 
 
 def _gore_texture(gores: Gores, texture: Tensor, strip: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return x (columns) and y (rows), mm, on the sheet, and the texture (rows, columns) of one strip.
-
-    Beyond the outline the texture goes on, so that borders run up to it.
-    """
+    """Return x (columns), y (rows), mm, and texture (rows, columns) of one strip, continued beyond its outline."""
     radius = 0.5 * gores.diameter_mm
     step = min(STEP_MM, radius * STEP_RAD)
     height, half = gores.size_mm[1], math.pi * radius / gores.count
@@ -125,7 +115,6 @@ def gores_figure(texture: Tensor, gores: Gores, *, filled: bool) -> Figure:
 
 
 def _draw_rule(axes: Axes, gores: Gores) -> None:
-    """Draw a line of known length below the strips, with its text."""
     width, height = gores.size_mm
     length = RULE_MM[1] if width >= RULE_MM[1] else RULE_MM[0]
     start, level = -gores.sheet_mm[0] / 2 + MARGIN_MM, -height / 2 - 0.4 * MARGIN_MM
@@ -137,11 +126,7 @@ def _draw_rule(axes: Axes, gores: Gores) -> None:
 
 
 def write_gores(texture: Tensor, gores: Gores, folder: Path) -> list[Path]:
-    """Write the strips and their stencil as PDF and SVG of true size, and instructions; return the files.
-
-    Raises:
-        OutputError: they cannot be written.
-    """
+    """Write strips and stencil as PDF and SVG of true size, and instructions; return the files or raise OutputError."""
     written = []
     for name, filled in (("gores", True), ("stencil", False)):
         for suffix, when in ((".pdf", "CreationDate"), (".svg", "Date")):
@@ -160,7 +145,7 @@ def write_gores(texture: Tensor, gores: Gores, folder: Path) -> list[Path]:
 
 
 def instructions(gores: Gores) -> str:
-    """Return the page of text that comes with the strips."""
+    """Return the text page for the strips."""
     (width, height), sheet = gores.size_mm, gores.sheet_mm
     slope = math.pi / gores.count * math.sin(math.pi / 4)  # of a strip's edge against its middle, at latitude 45
     return f"""\

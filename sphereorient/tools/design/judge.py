@@ -1,4 +1,4 @@
-"""Judge how well a texture map fixes the orientation, and search for a good one that can be painted by hand."""
+"""Judge how precisely a texture map determines the orientation; search for a good one to paint by hand."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WHITE_SHARE = (0.15, 0.85)  # of a view, in a search
 
 
 class DesignSettings(BaseModel):
-    """Pictures that a map is judged for."""
+    """Pictures for which a map is judged."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -54,7 +54,7 @@ class Judgement:
     settings: DesignSettings
     direction_body: Tensor  # (V, 3), middles of the views
     white: Tensor  # (V,), share of the view that is white
-    bound_rad: Tensor  # (V,), Cramér-Rao bound of the attitude, rms, position unknown; infinite: undetermined
+    bound_rad: Tensor  # (V,), Cramér-Rao bound of the orientation, rms, position unknown; infinite: undetermined
     alike: float  # greatest similarity of two distinct views under any light, 1: the same
     alike_views: Tensor  # (2, 3, 3), these two
     stroke_deg: float  # widest brush that paints the map
@@ -101,17 +101,12 @@ def lon_lat_deg(direction_body: Tensor) -> Tensor:
 
 
 def _spread(values: Tensor) -> dict[str, float | None]:
-    """Return least, middle and greatest value; None for infinity."""
     named = {"min": values.min(), "median": values.median(), "max": values.max()}
     return {name: float(value) if bool(value.isfinite()) else None for name, value in named.items()}
 
 
 def judge_texture(texture: Tensor, settings: DesignSettings | None = None) -> Judgement:
-    """Judge a map (H, 2 H): balance, information and similarity of its views, and the brush that it needs.
-
-    Source: the bound is that of docs/errata.md; similarity is the correlation of normalised pictures, as in the grey
-    search.
-    """
+    """Judge a map (H, 2 H): balance, bound (docs/errata.md), similarity of normalised views, widest brush."""
     settings = DesignSettings() if settings is None else settings
     direction = view_directions(settings.views)
     R = facing(direction)
@@ -129,15 +124,9 @@ def judge_texture(texture: Tensor, settings: DesignSettings | None = None) -> Ju
 
 
 def most_similar_views(texture: Tensor, R_view_body: Tensor, apart_deg: float) -> tuple[float, Tensor]:
-    """Find the two most similar views that are at least `apart_deg` apart.
+    """Return the greatest similarity, <= 1, of two views at least `apart_deg` apart, and these, (2, 3, 3) float64.
 
-    Args:
-        texture: (H, 2 H).
-        R_view_body: (V, 3, 3), views that are compared with all of SO(3).
-        apart_deg: degrees.
-
-    Returns:
-        Their similarity, 1 at most, and the two, (2, 3, 3) float64.
+    Views (V, 3, 3) of a map (H, 2 H) are compared with all of SO(3).
     """
     size = SEARCH.size_px
     texture, view = reduced_texture(texture.float(), size), orthographic_view(size)
@@ -150,7 +139,7 @@ def most_similar_views(texture: Tensor, R_view_body: Tensor, apart_deg: float) -
     best, match = torch.full((len(own),), -1.0), R_view_body.clone()
 
     def compare(rows: slice, others: Tensor) -> None:
-        """Keep the best of more attitudes (K, 3, 3) for some of the views."""
+        """Keep the best of more orientations (K, 3, 3) for some of the views."""
         similarity = own[rows] @ vectors(others).T
         trace = R_view_body[rows].flatten(1) @ others.flatten(1).T
         similarity = similarity.masked_fill(trace > 1 + 2 * math.cos(math.radians(apart_deg)), -1.0)
@@ -179,24 +168,20 @@ def design_texture(
     seed: int = 0,
     advance: Callable[[int, int], None] | None = None,
 ) -> tuple[Tensor, Judgement, str]:
-    """Search for the map with the best worst view among those that a brush can paint.
+    """Return the paintable map (512, 1024) with the best worst view, its judgement and its description.
 
-    Sizes from 1.5 to 5 times the brush and seeds are tried. The best few by the bound of the worst view are judged in
-    full; the one with the least bound / margin wins: precise, and hard to confuse.
+    Sizes are 1.5 to 5 times the brush; of the best few, the least bound / margin wins: precise, hard to confuse.
 
     Args:
         kinds: of `PATTERNS`.
-        stroke: least width of brush, degrees.
+        stroke: least width of the brush, degrees.
         settings: expected pictures.
         tries: maps of each kind.
         seed: of the search.
         advance: called with the number of maps tried, and of all.
 
-    Returns:
-        The map (512, 1024), its judgement, and its description.
-
     Raises:
-        PaintError: none of them can be painted with such a brush.
+        PaintError: no map can be painted with such a brush.
     """
     settings = DesignSettings() if settings is None else settings
     # The ratio of bounds hardly depends on the diameter: the first judgement is for a small one.
@@ -227,7 +212,6 @@ def design_texture(
 
 
 def _white(texture: Tensor, R_view_body: Tensor) -> Tensor:
-    """Return the share of each view (V,) that is white."""
     size = SEARCH.size_px
     texture = reduced_texture(texture.float(), size)
     return orthographic_view(size).paint(texture, R_view_body.float()).mean(-1).double()

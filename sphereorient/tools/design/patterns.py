@@ -1,4 +1,4 @@
-"""Black and white texture maps to paint on a ball, and measures of their coarseness."""
+"""Black and white texture maps to paint on a ball, and their coarseness."""
 
 from __future__ import annotations
 
@@ -42,16 +42,9 @@ def facing(direction_body: Tensor) -> Tensor:
 
 
 def patterned_texture(kind: str, size_deg: float, seed: int, height: int = 512) -> Tensor:
-    """Draw a map (height, 2 height) float32, 0 black .. 1 white, with patches of a given size.
+    """Draw a map (height, 2 height) float32, 0 black .. 1 white, with patches about `size_deg` wide.
 
-    Args:
-        kind: of `PATTERNS`: blobs (wavy patches), patches (polygons) or dots (round and black on white).
-        size_deg: typical width of a patch, degrees on the sphere.
-        seed: the same seed gives the same map.
-        height: of the map.
-
-    Raises:
-        PaintError: an unknown kind, or a size out of range.
+    `kind`: blobs (wavy), patches (polygons), dots (black on white). Raise PaintError if kind or size is invalid.
     """
     if kind not in PATTERNS:
         raise PaintError(
@@ -65,11 +58,9 @@ def patterned_texture(kind: str, size_deg: float, seed: int, height: int = 512) 
 
 
 def stroke_deg(texture: Tensor) -> float:
-    """Return the width of the widest round brush, whole degrees, that paints a map but for 2 % of the sphere.
+    """Return the width, whole degrees, of the widest round brush that paints both colours but for 2 % of the sphere.
 
-    Black and white must both be paintable; 0: even the finest brush is too wide. White is what is above one half.
-
-    Source: opening by a disk, Matheron 1975; on points of a sphere.
+    White is above one half; 0: no brush. Source: opening by a disk, Matheron 1975.
     """
     directions = view_directions(POINTS)
     points, white = directions.numpy(), (sample_texture(texture.double(), directions) >= 0.5).numpy()
@@ -89,12 +80,7 @@ def stroke_deg(texture: Tensor) -> float:
 
 
 def border_length(texture: Tensor) -> float:
-    """Return the length of all borders between black and white on a ball of radius 1; a great circle has 2 pi.
-
-    Accurate to 2 %; borders along steps of whole texels count up to 7 % longer.
-
-    Source: Crofton's formula: a great circle crosses borders of length L on average L / pi times.
-    """
+    """Return the length of all borders, radii, to 2 %; along whole texels up to 7 % more (Crofton's formula)."""
     R = facing(view_directions(CIRCLES)).float()  # each circle is the outline of a view
     around = 2 * math.pi * torch.arange(AROUND) / AROUND
     rim = torch.stack([around.cos(), around.sin(), torch.zeros(AROUND)], -1)
@@ -154,7 +140,7 @@ def _dots(size_rad: float, height: int, rng: torch.Generator) -> Tensor:
 
 
 def _apart(points: Tensor) -> Tensor:
-    """Push points (D, 3) apart, like charges, until they are spread but no lattice."""
+    """Push points (D, 3) apart, like charges, until they are spread but not a lattice."""
     step = 0.1 * math.sqrt(4 * math.pi / len(points))
     for _ in range(PUSHES):
         away = points[:, None] - points

@@ -1,4 +1,4 @@
-"""Photographs of a ball cut to disks: found without a picture of the empty scene, grey by the ball's own colour."""
+"""Disks of a ball from photographs without a background picture, grey by the ball's own colour."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NO_CIRCLE = math.nan, math.nan, math.nan, 0.0
 
 @dataclass(frozen=True, kw_only=True)
 class BallOutline:
-    """Where the ball is in one photograph."""
+    """Outline of the ball in one photograph."""
 
     u_px: float
     v_px: float
@@ -40,15 +40,7 @@ class BallOutline:
 
 
 def find_disk(picture: Photograph, name: str = "photograph") -> BallOutline:
-    """Find the ball in a photograph, whole or cut by the picture's border.
-
-    Args:
-        picture: (H, W) or (H, W, 3), any grey or colour levels; at least one corner shows the scene.
-        name: for the message.
-
-    Raises:
-        PaintError: nothing round stands out from the scene.
-    """
+    """Find the ball, whole or cut, in a photograph (H, W) or (H, W, 3) with a free corner; else raise PaintError."""
     levels = _channels(picture, name)
     difference = np.asarray(cv2.medianBlur(_unlike_corners(levels), SPECK), np.float32)
     inside = difference > _otsu(difference)
@@ -56,7 +48,7 @@ def find_disk(picture: Photograph, name: str = "photograph") -> BallOutline:
         raise _nothing(name, "nothing that stands out")
     fine = np.asarray(cv2.resize(difference, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR), np.float32)
     rough = _outlined(fine, 0.5 * float(np.median(difference[inside])))
-    # A lit ball is dimmer at its rim than in its middle: the border lies at half of what is just inside of it.
+    # A lit ball is dimmer at its rim: the border lies at half of the level just inside.
     row, column = np.ogrid[: fine.shape[0], : fine.shape[1]]
     away = np.hypot(row - rough[1], column - rough[0]) / max(rough[2], 1.0)
     rim = fine[(away > RIM[0]) & (away < RIM[1])]
@@ -69,11 +61,7 @@ def find_disk(picture: Photograph, name: str = "photograph") -> BallOutline:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Photographs:
-    """F photographs of one flight.
-
-    Raises:
-        PaintError: fewer than three, or times that do not fit them.
-    """
+    """F photographs of one flight; raises PaintError for fewer than three, or times that do not match."""
 
     pictures: Sequence[Photograph]  # (H, W) or (H, W, 3) each, sizes may differ
     time_s: Tensor  # (F,) float64, from any origin, all different
@@ -81,7 +69,6 @@ class Photographs:
     balls: Sequence[BallOutline] | None = None  # where the ball is; None: it is searched
 
     def __post_init__(self) -> None:
-        """Check the number of pictures and the times."""
         count, time_s = len(self.pictures), self.time_s
         do = "give one time in seconds for each photograph"
         if count < PICTURES_MIN:
@@ -94,11 +81,7 @@ class Photographs:
             raise PaintError(refusal("times", expected="different times", got="one of them twice", do=do))
 
     def disks(self, size_px: int) -> tuple[Tensor, tuple[BallOutline, ...]]:
-        """Find the ball in each photograph; return its disks (F, S, S) float32, grey, and the outlines.
-
-        Raises:
-            PaintError: a photograph without a ball, or an array of another shape.
-        """
+        """Find the balls; return grey disks (F, S, S) float32 and outlines, or raise PaintError."""
         names = self.names or [f"photograph {k}" for k in range(len(self.pictures))]
         found = tuple(self.balls or [find_disk(*each) for each in zip(self.pictures, names, strict=True)])
         disks = [
@@ -109,10 +92,7 @@ class Photographs:
 
 
 def _own_grey(levels: NDArray[np.float32], ball: BallOutline) -> NDArray[np.float32]:
-    """Return the part of the ball's mean colour in each pixel, (H, W), of levels (H, W, C).
-
-    Black is dark and white bright in it whatever the ball's colour; the channel with most signal counts most.
-    """
+    """Return the share of the ball's mean colour in each pixel (H, W): white is bright whatever the ball's colour."""
     row, column = np.ogrid[: levels.shape[0], : levels.shape[1]]
     inside = np.hypot(row - ball.v_px, column - ball.u_px) < ball.radius_px
     colour = levels[inside].mean(0) if inside.any() else np.ones(levels.shape[2], np.float32)
@@ -121,7 +101,6 @@ def _own_grey(levels: NDArray[np.float32], ball: BallOutline) -> NDArray[np.floa
 
 
 def _channels(picture: Photograph, name: str) -> NDArray[np.float32]:
-    """Return the levels of a photograph, (H, W, C)."""
     if picture.ndim not in (2, 3) or min(picture.shape[:2]) < 2 * RADIUS_MIN_PX or picture.shape[2:] not in ((), (3,)):
         expected, do = "(H, W) or (H, W, 3), 12 px at least", "pass pictures as arrays, colours in the last axis"
         raise PaintError(refusal(name, expected=expected, got=str(picture.shape), do=do))
@@ -157,10 +136,7 @@ def _outlined(fine: NDArray[np.float32], level: float) -> tuple[float, float, fl
 
 
 def _circle(points: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Fit a circle to points (K, 2) robustly: centre, radius, share of points on it.
-
-    Source: the algebraic fit of Kasa 1976, repeated with weights of Geman and McClure 1987.
-    """
+    """Fit a circle to points (K, 2): centre, radius, share on it (Kasa 1976; weights of Geman and McClure 1987)."""
     if len(points) < 8:
         return NO_CIRCLE
     columns = np.column_stack([2 * points, np.ones(len(points))])

@@ -1,4 +1,4 @@
-"""A ball with dots: from a table of their directions to a map, their size in pictures, and the search for attitudes."""
+"""A ball with dots: table of directions, map, size in pictures, and search for orientations."""
 
 from __future__ import annotations
 
@@ -30,20 +30,15 @@ DOT_SEARCH = GreySearchSettings(score_min=0.05, peaks=24, finalists=16)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DotTable:
-    """Where the dots of a ball are, and their size.
+    """Directions of a ball's dots, right-handed, and their radius; a left-handed table fits no picture.
 
-    A table in a left-handed frame is that of the mirror image: no attitude fits the pictures.
-
-    Raises:
-        PaintError: no dots, lengths that differ from 1 by over 5 %, or a radius out of range.
-        ShapeError: directions that do not end in 3.
+    Raise PaintError for no dots, lengths over 5 % from 1, or a radius out of range; ShapeError if not (D, 3).
     """
 
     direction_body: Tensor  # (D, 3), middles of the dots
     radius_deg: float = 6.0  # angle at the ball's centre between a dot's middle and its border
 
     def __post_init__(self) -> None:
-        """Check directions and radius."""
         check_tail("direction_body", self.direction_body, 3)
         length = self.direction_body.reshape(-1, 3).double().norm(dim=-1)
         if not len(length) or not bool(((length - 1).abs() < LENGTH_TOLERANCE).all()):
@@ -70,16 +65,10 @@ class DotTable:
         return replace(self, direction_body=self.direction_body * self.direction_body.new_tensor([1.0, -1.0, 1.0]))
 
     def measured(self, disks: Tensor, R_view_body: Tensor) -> DotTable:
-        """Return the table with the dots' radius measured in pictures: where the mean dot is half as dark.
+        """Return the table with the radius measured in disks (F, S, S) at R_view_body (F, 3, 3), blur included.
 
-        Blur and motion during the exposure are in that radius.
-
-        Args:
-            disks: (F, S, S), grey levels, the outline touching the borders; far cameras.
-            R_view_body: (F, 3, 3), attitudes, to half a dot; the present radius is right to a factor of 2.
-
-        Raises:
-            PaintError: no dot is darker in its middle than the white around it.
+        R_view_body must be right to half a dot, the present radius to a factor of 2. Raise PaintError if no dot is
+        darker than the white around it.
         """
         direction, guess_deg = self.unit(), self.radius_deg
         view = orthographic_view(disks.shape[-1], torch.float64)
@@ -94,7 +83,6 @@ class DotTable:
 
 
 def _half_width_deg(profile: Tensor, guess_deg: float) -> float:
-    """Return the angle, degrees, at which a profile is halfway from its middle to the white around."""
     outer = profile[round(2 * guess_deg) :]
     around = float(outer.median()) if len(outer) else math.nan
     middle = float(profile[0]) if len(profile) else math.nan
@@ -109,11 +97,7 @@ def _half_width_deg(profile: Tensor, guess_deg: float) -> float:
 
 
 class DotSearch:
-    """Search all of SO(3) for the views of a table of dots: the grey search proposes, the dots decide.
-
-    A dot of the table that is missing in the picture counts against an attitude; dark that is not in the table (a
-    maker's name, dirt) hardly does.
-    """
+    """Search all of SO(3) for a table of dots: the grey search proposes; missing dots count, other dark hardly."""
 
     def __init__(self, table: DotTable, settings: GreySearchSettings = DOT_SEARCH) -> None:
         self._search = TemplateBank(table.texture(), settings)
@@ -145,7 +129,6 @@ class DotSearch:
         return replace(found, R_view_body=found.R_view_body[order], score=score[order])
 
     def _scores(self, disk: Tensor, R_view_body: Tensor) -> Tensor:
-        """Return the scores (Q,) of attitudes (Q, 3, 3) for a disk (S, S)."""
         even = (disk / self._even(disk[None].float())[0].clamp_min(1e-6))[self._inside].double()
         dark = ((1 - even) / (1 - even).quantile(DARKEST).clamp_min(1e-6)).clamp(0, 1)
         away = torch.acos(((self._normal @ R_view_body) @ self._direction.mT).clamp(-1, 1)).amin(-1)

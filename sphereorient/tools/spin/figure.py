@@ -1,5 +1,3 @@
-"""The figure of a spin: each photograph beside the ball as the spin predicts it."""
-
 from __future__ import annotations
 
 import math
@@ -19,7 +17,7 @@ MOST = 36  # photographs that are drawn, the first ones
 
 @in_style
 def spin_figure(found: SpinFound, texture: Tensor, time_s: Tensor, names: Sequence[str]) -> Figure:
-    """Draw photographs and the texture map (H, 2 H) at the first spin's attitudes, in the order of the times (F,)."""
+    """Draw photographs and the map (H, 2 H) at the first spin's orientations, in order of the times (F,), s."""
     chosen = time_s.argsort()[:MOST].tolist()
     size, rows = found.disks.shape[-1], math.ceil(len(chosen) / COLUMNS)
     texture = reduced_texture(texture.float(), size)

@@ -1,7 +1,6 @@
-"""Uniform spins R(t) = exp(omega (t - t0)) R(t0) through the candidate attitudes of many pictures.
+"""Uniform spins R(t) = exp(omega (t - t0)) R(t0) through candidates.
 
-Pictures at multiples of one time step cannot distinguish omega from omega + 2 pi k / step along its axis. All these
-aliases below a limit are fitted and reported.
+At multiples of one step, omega and its aliases omega + 2 pi k / step agree; all aliases below a limit are reported.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ LOOSE_RAD, TIGHT_RAD = math.radians(12.0), math.radians(1.0)  # scatter of right
 ITERATIONS = 3  # of each fit while the span grows
 LAST_ITERATIONS = 12
 STRAYS = 0.2  # share of pictures, at first guess, without a right candidate
-SAME_RAD = math.radians(6.0)  # spins whose attitudes at all pictures' times are this near are the same
+SAME_RAD = math.radians(6.0)  # spins whose orientations at all pictures' times are this near are the same
 PRIOR = 1e-6  # information of the unknowns before any picture, so that undetermined ones do not move
 ALIAS_SCATTER = 3.0  # initial scatter of an alias over that of the best spin: times are multiples but for jitter
 REPORTED = 32  # spins at most
@@ -32,7 +31,7 @@ REPORTED = 32  # spins at most
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureCandidates:
-    """Candidate attitudes of F pictures, C each, padded."""
+    """Candidate orientations of F pictures, C each, padded."""
 
     time_s: Tensor  # (F,) float64
     R_view_body: Tensor  # (F, C, 3, 3) float64
@@ -40,7 +39,7 @@ class PictureCandidates:
 
     @property
     def step_s(self) -> float:
-        """Shortest time between two pictures, averaged over all gaps, taken as multiples of it."""
+        """Shortest time, s, between two pictures, averaged over all gaps as multiples of it."""
         gap = self.time_s.sort().values.diff()
         gap = gap[gap > 0]
         return float(gap.sum() / (gap / gap.min()).round().sum())
@@ -53,20 +52,19 @@ class Spins:
     omega_view_rad_s: Tensor  # (K, 3), view frame: x right, y down, z from the camera to the ball
     R0_view_body: Tensor  # (K, 3, 3), at time0_s
     time0_s: Tensor  # (K,)
-    evidence: Tensor  # (K,), log of the candidates' likelihood over that with random attitudes
+    evidence: Tensor  # (K,), log of the candidates' likelihood over that with random orientations
     scatter_rad: Tensor  # (K,), of right candidates about the spin, each axis
     covariance: Tensor  # (K, 6, 6), of a small rotation of R0 (view, rad) and of omega (rad/s)
 
     def __len__(self) -> int:
-        """Return K."""
         return len(self.evidence)
 
     def of(self, chosen: Tensor) -> Spins:
-        """Return some of them, by mask or by index."""
+        """Select spins by mask or by index."""
         return Spins(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
 
     def R_view_body(self, time_s: Tensor) -> Tensor:
-        """Return attitudes (K, F, 3, 3) at times (F,)."""
+        """Return orientations (K, F, 3, 3) at times (F,), s."""
         since = time_s - self.time0_s[:, None]
         return so3.exp(self.omega_view_rad_s[:, None] * since[..., None]) @ self.R0_view_body[:, None]
 
@@ -77,13 +75,9 @@ class Spins:
 
 
 def picture_candidates(time_s: Tensor, offset: Tensor, R_view_body: Tensor, weight: Tensor) -> PictureCandidates:
-    """Pad candidates to one record.
+    """Pad candidates (M, 3, 3): rows offset[f] .. offset[f + 1] belong to the picture at time_s[f] (F,), s.
 
-    Args:
-        time_s: (F,), any order.
-        offset: (F + 1,) int64; the candidates of picture f are the rows offset[f] .. offset[f + 1].
-        R_view_body: (M, 3, 3).
-        weight: (M,), not negative, any unit: only ratios within a picture count.
+    Weights (M,), not negative, any unit: only ratios within a picture count.
     """
     counts = offset.diff()
     width = max(int(counts.max()) if len(counts) else 0, 1)
@@ -96,14 +90,11 @@ def picture_candidates(time_s: Tensor, offset: Tensor, R_view_body: Tensor, weig
 
 
 def fit_spins(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
-    """Find the best uniform spin below a limit and all its aliases, best first.
-
-    None is found where no two neighbouring pictures have candidates.
-    """
+    """Find the best uniform spin below a limit and all its aliases, best first; none without neighbouring pictures."""
     spins = _guesses(seen, omega_max_rad_s)
     if not len(spins):
         return spins
-    # To more and more pictures, from a few about each guess to all; only the better guesses go on.
+    # From a few pictures about each guess to all; only the better guesses continue.
     usual = float(seen.time_s.sort().values.diff().median())
     spans = [FIRST_SPAN * max(usual, seen.step_s)]
     while spans[-1] < float(seen.time_s.max() - seen.time_s.min()):
@@ -121,13 +112,7 @@ def fit_spins(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
 
 
 def refine_spins(seen: PictureCandidates, spins: Spins, *, iterations: int, span_s: float = math.inf) -> Spins:
-    """Fit spins to the candidates within a span of their own time0, by expectation and maximisation.
-
-    Each picture's candidates share its weight with the case that none is right; the scatter of right candidates about
-    the spin is estimated too.
-
-    Source: Dempster et al. 1977; the slope of exp is its left Jacobian.
-    """
+    """Fit spins and their scatter to candidates within a span of time0, by EM (Dempster et al. 1977)."""
     since = seen.time_s - spins.time0_s[:, None]
     near = (since.abs() <= span_s).double()
     for _ in range(iterations):
@@ -157,7 +142,7 @@ def refine_spins(seen: PictureCandidates, spins: Spins, *, iterations: int, span
 
 
 def evidence_of(seen: PictureCandidates, spins: Spins) -> Tensor:
-    """Return each picture's part of the evidence, (K, F): below 0 where no candidate is near."""
+    """Return each picture's part of the evidence, (K, F): below 0 if no candidate is near."""
     return _matched(seen, spins)[2]
 
 
@@ -198,7 +183,7 @@ def _guesses(seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
 
 def _aliases(best: Spins, seen: PictureCandidates, omega_max_rad_s: float) -> Spins:
     """Return a spin with whole turns per step added, in both directions, up to the limit."""
-    # R0 is moved to the time of a picture: only there do all aliases have the same attitude.
+    # Move R0 to the time of a picture: only there do all aliases agree.
     nearest = (seen.time_s - best.time0_s).abs().argmin()[None]
     best = replace(best, R0_view_body=best.R_view_body(seen.time_s)[:, nearest[0]], time0_s=seen.time_s[nearest])
     rate = float(best.omega_view_rad_s.norm())
@@ -211,16 +196,11 @@ def _aliases(best: Spins, seen: PictureCandidates, omega_max_rad_s: float) -> Sp
 
 
 def _matched(seen: PictureCandidates, spins: Spins) -> tuple[Tensor, Tensor, Tensor]:
-    """Compare spins with candidates.
-
-    Returns:
-        Rotations (K, F, C, 3) from the spin's attitudes to the candidates, view frame; the probability (K, F, C) that
-        each is the right one; the log of the likelihood over that of random attitudes (K, F).
-    """
+    """Return rotations (K, F, C, 3), view, from spins to candidates, probabilities (K, F, C), log evidence (K, F)."""
     predicted = spins.R_view_body(seen.time_s)  # (K, F, 3, 3)
     turn = so3.log(seen.R_view_body @ predicted[:, :, None].mT)
     scatter = spins.scatter_rad[:, None, None]
-    # Density over SO(3), whose volume is 8 pi^2, over that of random attitudes.
+    # Density over SO(3), whose volume is 8 pi^2, over that of random orientations.
     height = math.log(8 * math.pi**2) - 1.5 * math.log(2 * math.pi) - 3 * scatter.log()
     log = height - 0.5 * turn.square().sum(-1) / scatter**2 + seen.weight.clamp_min(1e-300).log()
     log = log + math.log(1 - STRAYS)
@@ -230,7 +210,7 @@ def _matched(seen: PictureCandidates, spins: Spins) -> tuple[Tensor, Tensor, Ten
 
 
 def _slope(omega: Tensor, since: Tensor) -> Tensor:
-    """Return the derivative of the attitudes (K, F, 3, 6), view frame, by a rotation of R0 and by omega."""
+    """Return the derivative of the orientations (K, F, 3, 6), view frame, by a rotation of R0 and by omega."""
     swept = omega[:, None] * since[..., None]
     angle = swept.norm(dim=-1)[..., None, None]
     axis = torch.nn.functional.normalize(swept, dim=-1)
@@ -246,7 +226,7 @@ def _joined(parts: Sequence[Spins]) -> Spins:
 
 
 def _distinct(spins: Spins, time_s: Tensor, by_spin: bool = False) -> Spins:
-    """Return spins, best first, without those with the attitudes (`by_spin`: and the rate) of a better one."""
+    """Return spins, best first, without those with the orientations (`by_spin`: and the rate) of a better one."""
     spins = spins.of(spins.evidence.argsort(descending=True, stable=True))
     R = spins.R_view_body(time_s)
     apart = torch.stack([so3.geodesic_distance(R, one).amax(-1) for one in R]) if len(R) else R.new_zeros(0, 0)

@@ -1,5 +1,3 @@
-"""Inputs of `sphereorient spin`: photographs, their times, and the texture as map or table of dots."""
-
 from __future__ import annotations
 
 import csv
@@ -26,14 +24,12 @@ MOST_PHOTOGRAPHS = 1000
 
 
 def load_photographs(paths: Sequence[Path], times: str) -> Photographs:
-    """Read photographs and their times.
+    """Read photographs: files in order of time, or one folder by name.
 
-    Args:
-        paths: files in the order of their times, or one folder, whose pictures are read in the order of their names.
-        times: a table .csv with the columns file and t_s, s, or pictures a second at equal intervals.
+    `times`: a table .csv with the columns file and t_s, s, or pictures per second at equal intervals.
 
     Raises:
-        PaintError: missing or unreadable files, too many of them, or times that do not fit them.
+        PaintError: missing or unreadable files, too many of them, or times that do not match.
     """
     files = list(paths)
     if len(files) == 1 and files[0].is_dir():
@@ -47,7 +43,7 @@ def load_photographs(paths: Sequence[Path], times: str) -> Photographs:
 
 
 def load_ball(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
-    """Read a texture map, or a table .csv of dots: x, y, z of a direction a line, without head.
+    """Read a texture map, or a table .csv of dots: x, y, z of a direction in each line, no header.
 
     Raises:
         PaintError: the table is missing, or its lines are no directions.
@@ -74,7 +70,6 @@ def load_ball(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
 
 
 def _times(times: str, files: Sequence[Path]) -> Tensor:
-    """Return the times (F,), s, of photographs."""
     try:
         rate_hz = float(times)
     except ValueError:
@@ -112,7 +107,6 @@ def _text(path: Path, expected: str) -> str:
 
 
 def _picture(path: Path) -> Photograph:
-    """Read a photograph, (H, W, 3) uint8."""
     content = read_whole(path, PICTURE_BYTES, "a picture file", PaintError, "name a file that exists")
     do = "export it again as PNG"
     try:

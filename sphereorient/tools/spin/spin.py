@@ -1,4 +1,4 @@
-"""The spin of a ball from a few photographs: attitudes from each alone, then one uniform spin through all of them."""
+"""The spin of a ball from a few photographs: orientations from each alone, then one uniform spin."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sphereorient.tools.spin.fit import (
 
 FINEST = 0.05  # detail of the last fit, radii: a pixel of a disk of 40
 REFINEMENT_STEPS = 6
-FOLLOWED_RAD = math.radians(20.0)  # how far a picture's own attitude may lie from the spin's
+FOLLOWED_RAD = math.radians(20.0)  # how far a picture's own orientation may lie from the spin's
 LAST_ITERATIONS = 8
 AS_EVIDENT = 6.0  # difference of evidence (log) below which pictures do not distinguish two spins
 AT_ONCE = 4  # photographs between two reports of progress
@@ -48,10 +48,7 @@ class SpinSettings(BaseModel):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SpinFound:
-    """A spin from F photographs, with K - 1 aliases.
-
-    The view frame is the camera's at the ball: x right, y down, z from the camera to the ball.
-    """
+    """A spin from F photographs, with K - 1 aliases; view frame: x right, y down, z from the camera to the ball."""
 
     spins: Spins  # those that the pictures do not distinguish first, by rate; then by evidence
     ambiguous: int  # number of spins that the pictures do not distinguish; 1: the first is the only one
@@ -71,10 +68,9 @@ def spin_of(
     settings: SpinSettings | None = None,
     progress: Progress = silent,
 ) -> SpinFound:
-    """Find the uniform spin of a ball of known texture from photographs; no calibrated camera is needed.
+    """Find the uniform spin of a ball of known texture from photographs of a far, uncalibrated camera.
 
-    The ball may be anywhere in a photograph; the camera is taken to be far. Photographs at multiples of one time step
-    allow several spins, whole turns per step apart: all below the limit are returned.
+    Times at multiples of one step allow several spins, whole turns per step apart: all below the limit are returned.
 
     Args:
         photographs: with their times.
@@ -83,7 +79,7 @@ def spin_of(
         progress: called with stage, photographs done, and all photographs.
 
     Raises:
-        PaintError: no ball, no spin that explains more than chance, or a texture whose mirror image explains more.
+        PaintError: no ball, no spin better than chance, or a mirrored texture that fits better.
     """
     settings = SpinSettings() if settings is None else settings
     time_s = photographs.time_s.double()
@@ -98,7 +94,7 @@ def spin_of(
     view = orthographic_view(settings.search.size_px)
     level = detail_level(view, texture_table(drawn.float(), FINEST), FINEST, every=1)
     own, _ = _refined(level, disks, spins.R_view_body(time_s)[0], REFINEMENT_STEPS)
-    # The spins are fitted anew to one attitude a picture; their evidence stays that of all candidates.
+    # Refit the spins to one orientation per picture; keep the evidence of all candidates.
     single = picture_candidates(time_s, torch.arange(len(own) + 1), own, torch.ones(len(own)))
     fitted = refine_spins(single, spins, iterations=LAST_ITERATIONS)
     total = evidence_of(seen, spins).sum(1)
@@ -140,12 +136,11 @@ def _searched(
 
 
 def _greatest(spins: Spins) -> float:
-    """Return the evidence of the best spin; 0, that of random attitudes, where there is none."""
     return float(spins.evidence.max()) if len(spins) else 0.0
 
 
 def _refined(level: DetailLevel, disks: Tensor, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Refine each disk's own attitude (F, 3, 3) float64 from a given one; return also its score (F,)."""
+    """Refine each disk's own orientation (F, 3, 3) float64 from a given one; return also its score (F,)."""
     each = [
         refine_rotation(level, level_reference(level, disk), R[None].float(), steps)
         for disk, R in zip(disks, R_view_body, strict=True)
@@ -155,7 +150,7 @@ def _refined(level: DetailLevel, disks: Tensor, R_view_body: Tensor, steps: int)
 
 
 def _check_explained(best: float, mirror: float) -> None:
-    """Refuse a spin that explains no more than chance, which the mirrored texture shows."""
+    """Refuse a spin no better than chance, which the mirrored texture shows."""
     got = f"evidence {best:.0f}, and {mirror:.0f} for its mirror image"
     if mirror > best + AS_EVIDENT:
         do = "flip the map left to right, or change the sign of one column of the table"

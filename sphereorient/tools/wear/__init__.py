@@ -1,1 +1,1 @@
-"""How a texture map changes over a series of movies."""
+"""Changes of a texture map over a series of movies."""

@@ -1,5 +1,3 @@
-"""The figure of a series of texture maps: what changed, map by map, and how the worn share grows."""
-
 from __future__ import annotations
 
 import math
@@ -58,7 +56,6 @@ def _label(axes: Axes, title: str) -> None:
 
 
 def _mark(axes: Axes, series: WearSeries, k: int) -> None:
-    """Outline the worn places of one map, and number the largest ones."""
     worn = series.wear[k].worn.numpy()
     if worn.any():
         axes.contour(worn.astype(float), [0.5], colors=BLACK, linewidths=0.6, extent=EXTENT, origin="upper")
@@ -75,7 +72,6 @@ def _mark(axes: Axes, series: WearSeries, k: int) -> None:
 
 
 def _draw_growth(axes: Axes, series: WearSeries, names: Sequence[str]) -> None:
-    """Draw the worn share of each map's known area, and that of the largest places, over the series."""
     at = np.arange(1, len(series.wear) + 1)
     whole = 100 * np.array([one.worn for one in series.growth])
     axes.plot(np.append(0, at), np.append(0, whole), marker=ALL.marker, label="all, of the known area", **ALL.drawn)

@@ -67,7 +67,7 @@ class WornPlace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WearSeries:
-    """How one ball wore from map to map."""
+    """The wear of one ball from map to map."""
 
     wear: tuple[Wear, ...]  # of all maps but the first
     number: Tensor  # (H, 2 H) int64, place of each texel, from 1 on; 0 where no map is worn
@@ -81,15 +81,9 @@ class WearSeries:
 
 
 def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
-    """Find the wear of a ball between movies: compare each map (H, 2 H) with the first, in its body frame.
+    """Compare maps (H, 2 H), 0 black .. 1 white, NaN unknown, in time order with the first, in its body frame.
 
-    Args:
-        maps: 0 black .. 1 white, NaN where unknown; in the order of the movies.
-        turned: find the rotations between the body frames first; False: they are the same.
-
-    Raises:
-        PaintError: fewer than two maps, or they do not show one ball.
-        ShapeError: not 2:1.
+    `turned`: find the rotations between body frames. Raise PaintError for other balls, ShapeError if not 2:1.
     """
     if len(maps) < 2:
         do = "give the maps in the order of their movies"
@@ -104,12 +98,10 @@ def wear_series(maps: Sequence[Tensor], turned: bool = True) -> WearSeries:
 
 
 def _shares(height: int) -> Tensor:
-    """Return the texels' shares of the sphere's area, (height, 2 height) float64."""
     return texel_areas(height) / (4 * math.pi)
 
 
 def _sizes(number: Tensor) -> Tensor:
-    """Return the share of the sphere of each numbered place, 0 first."""
     area = _shares(len(number)).reshape(-1)
     return torch.zeros(int(number.max()) + 1, dtype=torch.float64).index_add(0, number.reshape(-1), area)
 
@@ -121,7 +113,7 @@ def _wear(texture: Tensor, first: Tensor, turned: bool) -> Wear:
     gain, offset = fit_levels(first, there)
     off = (there - (gain * first + offset)).abs()
     known = torch.isfinite(off)
-    # The median ignores worn places and the rims of displaced ones.
+    # The median ignores worn places and borders of displaced ones.
     scatter = 1.4826 * float(off[known].median()) if known.any() else math.nan
     worn = _large_enough(change.abs() > max(CHANGED, BEYOND * scatter))  # an unknown texel is not
     return Wear(comparison=without_changed(comparison, change, CHANGED), change=change, scatter=scatter, worn=worn)
@@ -144,7 +136,6 @@ def _figures(now: Wear, before: Wear | None) -> WearFigures:
 
 
 def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
-    """Return the middle of a place (H, 2 H) bool, and its worn share in each map."""
     area = _shares(len(inside))
     direction = map_directions(len(inside))[inside].double()
     x, y, z = (direction * area[inside][:, None]).sum(0).tolist()
@@ -160,7 +151,6 @@ def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
 
 
 def _large_enough(worn: Tensor) -> Tensor:
-    """Return a mask (H, 2 H) without its smallest connected places."""
     number = _places(worn)
     kept = _sizes(number) >= 0.5 * (1 - math.cos(math.radians(LEAST_DEG)))  # area of a cap over that of the sphere
     kept[0] = False
