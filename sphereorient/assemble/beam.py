@@ -1,8 +1,7 @@
 """Beam search over the histories of a movie, forward and backward: the best one, and each candidate's probability.
 
 A history names the right candidate of each frame, or none, and the frames where the motion breaks. A state is the last
-two frames with an orientation, however far back: the next candidate is compared with the omega between them. States far
-worse than the best are dropped.
+two frames with an orientation: the next candidate is compared with the omega between them.
 """
 
 from __future__ import annotations
@@ -51,12 +50,7 @@ class Histories:
 
 
 def search(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> Histories:
-    """Find the most probable history of a movie, and the share of each candidate in all of them.
-
-    Args:
-        rows: candidates of at least one frame.
-        cost: of the path.
-        gap_frames_max: longest gap over which a motion is followed, in usual frame intervals.
+    """Find the most probable history of a movie, and each candidate's probability; `gap_frames_max` in frame intervals.
 
     Source: Viterbi 1967; Baum and others 1970 (forward-backward); pruned as in a beam search.
     """
@@ -64,8 +58,6 @@ def search(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> H
 
 
 class _Search:
-    """The search over one movie; costs in nats."""
-
     def __init__(self, rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> None:
         self.rows, self.cost = rows, cost
         self.time, self.offset = rows.time_s, rows.offset
@@ -76,7 +68,6 @@ class _Search:
         self.chain_cost, self.chain_turn, self.first_pin, self.last_pin = self._pins(gap_frames_max + 2)
 
     def run(self) -> Histories:
-        """Sweep forward, then backward."""
         states = PathStates.begin(NOT_YET, np.full(1, NOT_YET, dtype=np.int64))
         least, total = np.zeros(1), np.zeros(1)
         steps: list[BeamStep] = []
@@ -96,7 +87,7 @@ class _Search:
         return self._read(steps, totals, int(least.argmin()))
 
     def _step(self, states: PathStates, least: Floats, f: int) -> BeamStep:
-        """Return all ways from some states to frame f: begin at a candidate, go on to one, or to none."""
+        """Return all ways from some states to frame f: begin at a candidate, continue to one, or to none."""
         dt, alive = self._alive(states, f)
         fresh = (states.frame == f - 1).astype(np.int64)
         hit, miss = self.hit[fresh], self.miss[fresh]
@@ -138,7 +129,7 @@ class _Search:
         return self.cost.candidate(log_ratio, self.still[rows]) - self.rows.log_weight[rows]
 
     def _begin(self, source: Ints, cost: Floats, f: int) -> BeamStep:
-        """Begin a motion at each candidate: it may point anywhere, so its ratio to the uniform density is 1."""
+        """Begin a motion at each candidate: it may have any orientation, so its ratio to the uniform density is 1."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         return BeamStep(
             frame=f,
@@ -149,7 +140,7 @@ class _Search:
         )
 
     def _go_on(self, states: PathStates, source: Ints, dt: Floats, cost: Floats, f: int) -> BeamStep:
-        """Go on from states with an omega, by the rotation nearest to its prediction."""
+        """Continue states that have an omega, by the rotation nearest to its prediction."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         R, R_before = self.rows.R_lab_body[rows], self.rows.R_lab_body[states.row]
         expected = states.omega * dt[:, None]
@@ -180,7 +171,7 @@ class _Search:
         return replace(step, source=source[of_state], cost=total.ravel())
 
     def _second(self, states: PathStates, source: Ints, dt: Floats, cost: Floats, f: int) -> BeamStep:
-        """Go on from where a motion began: slowly, or by any rotation that the time allows."""
+        """Continue from the first frame of a motion: slowly, or by any rotation that the time allows."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         angle, axis = rotation_between(self.rows.R_lab_body[states.row][:, None], self.rows.R_lab_body[rows])
         zones = self.rows.zones(dt)
@@ -197,7 +188,7 @@ class _Search:
         return replace(step, source=source[of_source], cost=total)
 
     def _onward(self, f: int, states: PathStates, of_state: Ints, row: Ints, turn: Floats, around: Ints) -> BeamStep:
-        """Return one edge and one state for each way on; `merge_equal` merges states of equal key (`target`)."""
+        """Return one edge and one state for each continuation; `merge_equal` merges states of equal key (`target`)."""
         before, dt = states.row[of_state], self.time[f] - self.time[states.frame[of_state]]
         key = (before * (self.offset[f + 1] - self.offset[f]) + row - self.offset[f]) * (1 << 20) + around
         onward = PathStates(
@@ -236,14 +227,10 @@ class _Search:
         return pruned, new_least[near], new_total[near]
 
     def _pins(self, length: int) -> tuple[Floats, Floats, Bools, Ints]:
-        """Find runs of frames with one candidate each that follow the motion: no search is needed inside.
+        """Find runs of frames with one candidate each that follow the motion: all good histories contain them.
 
-        No gap bridges a run, and leaving out a frame of it gains nothing, so all good histories go through it in one
-        way. Near its ends the search goes on, because another candidate may be better there.
-
-        Returns:
-            Cost (F,) and rotation (F, 3) from the two frames before; (F,) bool, the first frame of each run inside its
-            margins; (F,), the last frame of the run, at its second frame, elsewhere -1.
+        Return the cost (F,) and rotation (F, 3) from the two frames before; (F,) bool, the first frame of each run
+        inside its margins; (F,), the last frame of the run at its second frame, -1 elsewhere.
         """
         frames = len(self.time)
         cost, turn = np.zeros(frames), np.zeros((frames, 3))
@@ -271,7 +258,7 @@ class _Search:
         return cost, turn, first, last
 
     def _jump(self, step: BeamStep, last: int) -> tuple[BeamStep, float]:
-        """Go through a pinned run, from its second frame to its last."""
+        """Pass through a pinned run, from its second frame to its last."""
         span = self.time[last] - self.time[last - 1]
         row = int(self.offset[last])
         states = PathStates(
@@ -316,7 +303,7 @@ class _Search:
 def still_log_ratio(rows: CandidateRows, cost: SecondOrderCost) -> Floats:
     """Return the log density ratio (M,) of each row if a candidate of the last frames stays; -inf in the first frame.
 
-    False candidates stay: glare and dirt do. A motionless candidate thus proves little by following a motion.
+    False candidates (glare, dirt) stay, so that following the motion proves little for a candidate at rest.
     """
     best = np.full(len(rows.variance), -np.inf)
     for lag in range(1, min(STUCK_FRAMES, len(rows.time_s) - 1) + 1):

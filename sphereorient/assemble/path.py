@@ -40,17 +40,12 @@ class Path:
 def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings) -> dict[str, Path]:
     """Choose one candidate of each frame for each camera, by the least cost over the whole movie.
 
-    Frames without candidates are skipped: the cost of the link over them is divided by its time.
-
-    Args:
-        candidates: of each camera, N frames.
-        time_s: (N,), increasing.
-        settings: of the path; candidates below `quality_min` are left out.
+    `time_s` (N,) increases. Frames without candidates of `quality_min` are skipped: the cost of the link over them is
+    divided by its time.
+    Source: the paper's assembly of III (directed graph between direct neighbours); docs/errata.md A6.
 
     Raises:
         ShapeError: a camera has another number of frames than there are times.
-
-    Source: the paper's assembly of III (directed graph between direct neighbours); docs/errata.md A6.
     """
     for name, each in candidates.items():
         if len(each) != len(time_s):
@@ -61,7 +56,7 @@ def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, setting
 
 
 def assemble_path(candidates: Candidates, time_s: Tensor, settings: AssembleSettings) -> Path:
-    """Choose one candidate a frame for a single camera; as `assemble_paths`."""
+    """Choose one candidate per frame for a single camera; as `assemble_paths`."""
     return assemble_paths({"": candidates}, time_s, settings)[""]
 
 
@@ -72,7 +67,6 @@ def graph_of(candidates: Candidates, quality_min: float) -> Graph:
 
 
 def _path(graph: Graph, time_s: Tensor, settings: AssembleSettings) -> Path:
-    """Return the cheapest path, its links, spikes and segments."""
     R_all, score_all, mask = graph
     choice = shortest_path(edges_over_gaps(R_all, score_all, time_s, mask), mask).choice
     there = choice >= 0
@@ -113,19 +107,14 @@ def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Te
 
 
 def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
-    """Return the paper's cost from each candidate of a step to each of the next, (..., N - 1, C, C), rad/s.
+    """Return the paper's cost, rad/s, from each candidate to each of the next step, (..., N - 1, C, C), rows from.
 
-    It is d(A, B) (2 - T_A - T_B) / dt, rows from, columns to, in the dtype of the rotations.
-
-    Args:
-        R_lab_body: (..., N, C, 3, 3), rotations, not checked.
-        score: (..., N, C), quality T, 0 .. 1.
-        time_s: (..., N), increasing.
+    It is d(A, B) (2 - T_A - T_B) / dt, for R_lab_body (..., N, C, 3, 3), score T (..., N, C) and increasing time_s
+    (..., N).
+    Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
 
     Raises:
-        ShapeError: the inputs are not of the same steps and candidates.
-
-    Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
+        ShapeError: the inputs differ in steps or candidates.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     check_tail("score", score, *R_lab_body.shape[-4:-2])
@@ -156,13 +145,8 @@ def moving(values: Tensor, window: int) -> Tensor:
 def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
     """Return the links (N,) bool with xi many robust deviations (MAD) above the moving median, and a large angle.
 
-    Spikes do not raise median and MAD. A multiple of the median would not do: that of a fast sphere is large.
-
-    Args:
-        xi: (N,), rad/s, cost of the link that enters each frame; NaN without a link.
-        turn: (N,), rad, angle of that link.
-        settings: window, factor, least angle.
-
+    xi (N,), rad/s, and turn (N,), rad, are cost and angle of the link that enters each frame; xi is NaN without a link.
+    A multiple of the median would not do: that of a fast sphere is large.
     Source: the paper's assembly of III (spikes of xi), which gives no numbers.
     """
     windows = moving(xi, settings.spike_window_frames)
@@ -173,14 +157,11 @@ def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
 
 
 def number_segments(present: Tensor, spike: Tensor, gap_frames_max: int) -> Tensor:
-    """Number the segments, stretches of one motion: (N,) int64 from 0, -1 outside; gaps inside belong to them.
+    """Number the segments of one motion: (N,) int64 from 0, -1 outside; gaps up to `gap_frames_max` inside belong to
+    them.
 
-    A single wrong frame has a spike into it and one out of it: it is a segment of one frame.
-
-    Args:
-        present: (N,) bool, frames with an orientation.
-        spike: (N,) bool, frames that a spike enters.
-        gap_frames_max: longest gap inside a segment, frames.
+    `present` (N,) marks frames with an orientation, `spike` (N,) frames that a spike enters. A single wrong frame is a
+    segment of its own.
     """
     frame = torch.nonzero(present)[:, 0]
     number = torch.full(present.shape, -1, dtype=torch.int64, device=present.device)

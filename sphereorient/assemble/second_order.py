@@ -1,4 +1,4 @@
-"""The second-order path: which candidate is right, by the pictures and by how omega changes.
+"""The second-order path: the choice of candidates by the pictures and by how omega changes.
 
 The scale of the angular acceleration is estimated from the path itself, in turn with the search.
 """
@@ -41,7 +41,6 @@ class Hypotheses:
     mask: Tensor  # (N, C) bool, where there is a candidate
 
     def __post_init__(self) -> None:
-        """Compare the sizes of the parts."""
         check_tail("Hypotheses.R_lab_body", self.R_lab_body, 3, 3)
         for entry in fields(self):
             tail = (3, 3) if entry.name in ("R_lab_body", "covariance_rad2") else ()
@@ -53,7 +52,6 @@ class Hypotheses:
                 raise ShapeError(refusal(name, expected=sizes, got=str(tuple(part.shape)), do=do))
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.mask)
 
 
@@ -78,25 +76,16 @@ class Chosen:
 
 
 def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings) -> Chosen:
-    """Choose one candidate of each frame, or none, so that the history of the movie is the most probable one.
+    """Choose one candidate of each frame, or none, so that the history has the highest probability by
+    `SecondOrderCost`.
 
-    A history names the right candidate of each frame, or none, and the frames where one motion breaks off and another
-    begins. Its probability is that of `SecondOrderCost`.
-
-    Args:
-        hypotheses: N frames.
-        time_s: (N,), increasing, even or not.
-        settings: of the path.
-
-    Returns:
-        The choices with their probabilities. Flags: `AMBIGUOUS` where the choice is not sure, `RECOVERED` on the first
-        frame with an orientation after a gap or a break, `SPIKE` where a rotation does not follow from the motion.
+    `time_s` (N,) increases. Flags of the result: `AMBIGUOUS` where the choice is not sure, `RECOVERED` on the first
+    frame with an orientation after a gap or a break, `SPIKE` where a rotation does not follow from the motion.
+    Source: textbook hidden Markov model of second order; unlike the paper's cost, a prior on the change of omega does
+    not favour candidates at rest (docs/errata.md A6).
 
     Raises:
-        ShapeError: not one time a frame.
-
-    Source: textbook hidden Markov model of second order; unlike the paper's cost, a prior on the change of omega does
-        not favour candidates that stand still (docs/errata.md A6).
+        ShapeError: the number of times is not N.
     """
     if tuple(time_s.shape) != (len(hypotheses),):
         do, got = "pass one time a frame", str(tuple(time_s.shape))
@@ -134,7 +123,6 @@ def _chosen(
     cost: SecondOrderCost,
     settings: PathSettings,
 ) -> Chosen:
-    """Convert the best history from rows to frames and places."""
     device, mask, empty = hypotheses.mask.device, hypotheses.mask.cpu(), _nothing(hypotheses)
     place = torch.arange(mask.shape[1]).expand_as(mask)[mask]
     row = torch.from_numpy(histories.row)
@@ -171,7 +159,6 @@ def _chosen(
 
 
 def _nothing(hypotheses: Hypotheses) -> Chosen:
-    """Return the path of frames without candidates."""
     frames, device = len(hypotheses), hypotheses.mask.device
     none = torch.full((frames,), -1, dtype=torch.int64, device=device)
     missing = torch.full((frames, 3, 3), torch.nan, dtype=torch.float64, device=device)
@@ -212,10 +199,7 @@ def _bounds(rows: CandidateRows) -> tuple[float, float]:
 
 
 def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> SecondOrderCost:
-    """Return the cost with the acceleration under which some parts of the movie show a motion most clearly.
-
-    The best candidates by the pictures alone are no guide: they may stand still.
-    """
+    """Return the cost with the acceleration under which parts of the movie show a motion most clearly."""
     frames, parts = len(rows.time_s), [rows]
     if frames > SAMPLES * SAMPLE_FRAMES:
         firsts = np.linspace(0, frames - SAMPLE_FRAMES, SAMPLES).astype(np.int64).tolist()
@@ -235,9 +219,8 @@ def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> S
 def _misfits(rows: CandidateRows, histories: Histories, cost: SecondOrderCost) -> tuple[Ints, Floats, Floats, Floats]:
     """Compare each orientation of a history with the prediction from the two before it.
 
-    Returns:
-        Frames (L,) with a prediction; angle between orientation and prediction, rad (L,); its variance per axis by the
-        orientations' own errors, rad^2 (L,); its drift per unit of acceleration, s^2 (L,).
+    Return frames (L,) with a prediction, and for each: misfit angle, rad; its variance per axis, rad^2, from the errors
+    of the orientations; its drift per unit of acceleration, s^2.
     """
     frame = np.flatnonzero(histories.row >= 0)
     row, begins = histories.row[frame], histories.begins[frame]

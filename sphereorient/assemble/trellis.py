@@ -34,24 +34,23 @@ class SoftPath:
 def shortest_path(
     edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None = None, triple_cost: Tensor | None = None
 ) -> ShortestPath:
-    """Find the cheapest path that visits one candidate in each step.
+    """Find the cheapest path that visits one candidate in each step; of equal paths the one with the lowest last
+    indices.
 
     Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with candidates.
-    Movies with different gaps, or of different length (empty steps at the end), share a batch.
+    Movies of different length share a batch by empty steps at the end.
+    Source: Bellman 1957, Viterbi 1967.
 
     Args:
-        edge_cost: (..., N - 1, C, C), from row to column, any sign, inf for a wall; None: 0, with `triple_cost` only.
+        edge_cost: (..., N - 1, C, C), from row to column, any sign, inf for a wall; None: 0, with `triple_cost`
+            only.
         mask: (..., N, C) bool, True for a candidate; costs of masked candidates do not matter.
         node_cost: (..., N, C), of a candidate by itself.
-        triple_cost: (..., N - 2, C, C, C), of three candidates in the order of time; makes the path of second order.
-
-    Returns:
-        The path; of equally cheap ones the one that ends in, and then comes from, the lowest index.
+        triple_cost: (..., N - 2, C, C, C), of three candidates in the order of time; makes the path of second
+            order.
 
     Raises:
-        ShapeError: costs and mask do not belong together.
-
-    Source: Bellman 1957, Viterbi 1967.
+        ShapeError: costs and mask differ in shape.
     """
     order = _checked_order(edge_cost, mask, node_cost, triple_cost)
     if 0 in mask.shape[-2:]:
@@ -82,20 +81,13 @@ def soft_path(
     node_cost: Tensor | None = None,
     triple_cost: Tensor | None = None,
 ) -> SoftPath:
-    """Weigh all paths that visit one candidate in each step; towards temperature 0 only `shortest_path` remains.
-
-    Args:
-        edge_cost: as `shortest_path`.
-        mask: as `shortest_path`.
-        temperature: above 0, unit of the costs.
-        node_cost: as `shortest_path`.
-        triple_cost: as `shortest_path`.
-
-    Raises:
-        ShapeError: costs and mask do not belong together.
-        SettingsError: the temperature is not above 0.
+    """Weigh all paths by exp(-cost / temperature), temperature > 0; the other arguments are those of `shortest_path`.
 
     Source: Baum and others 1970 (forward-backward); Mensch and Blondel 2018, Differentiable dynamic programming.
+
+    Raises:
+        ShapeError: costs and mask differ in shape.
+        SettingsError: the temperature is not above 0.
     """
     order = _checked_order(edge_cost, mask, node_cost, triple_cost)
     if not 0 < temperature < torch.inf:
@@ -211,7 +203,7 @@ def _like(edge_cost: Tensor | None, triple_cost: Tensor | None) -> Tensor:
 
 
 def _checked_order(edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None, triple_cost: Tensor | None) -> int:
-    """Refuse costs that do not belong to the mask; return the order of the path."""
+    """Raise where costs do not fit the mask; return the order of the path."""
     _like(edge_cost, triple_cost)
     *batch, steps, width = mask.shape
     for name, cost, back in (
@@ -228,7 +220,7 @@ def _checked_order(edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | N
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Visits:
-    """The M steps that a movie visits at most; one that visits fewer waits behind its end in place 0, at no cost."""
+    """The at most M steps that a movie visits; one that visits fewer waits behind its end in place 0, at no cost."""
 
     step: Tensor  # (..., M) int64, of the N steps; behind the end any
     real: Tensor  # (..., M) bool, False behind the end

@@ -1,4 +1,4 @@
-"""Two cameras, one sphere: repair of stretches where they disagree, and the weighted mean on SO(3)."""
+"""Two cameras, one sphere: repair of frames where they disagree, and the weighted mean on SO(3)."""
 
 from __future__ import annotations
 
@@ -40,27 +40,18 @@ class Fused:
 def fuse(
     paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings
 ) -> Fused:
-    """Fuse the paths of one or two cameras, in the lab frame, into one.
+    """Fuse the paths of one or two cameras, in the lab frame, into one; `time_s` (N,).
 
-    Stretches where they differ by more than `repair_deg` are repaired. Then each frame is the mean of both, weighted by
-    the inverse moving variance of xi. These variances are relative; their scale comes from the differences of the
-    cameras over the whole movie, so that there is none with one camera.
-
-    Args:
-        paths: of one or two cameras, N frames.
-        candidates: of the same cameras.
-        time_s: (N,).
-        settings: of the fusion.
-
-    Returns:
-        The fused track. Frames seen by one camera carry `ONE_CAMERA`; frames of an undecided repair `AMBIGUOUS`.
+    Runs of frames where they differ by more than `repair_deg` are repaired. Then each frame is the mean of both,
+    weighted by the inverse moving variance of xi. The differences between the cameras scale these relative variances,
+    so that one camera alone gives no sigma. Frames seen by one camera carry `ONE_CAMERA`; frames of an undecided repair
+    `AMBIGUOUS`.
+    Source: the paper's two cameras; docs/errata.md A7 (which camera is right) and A8 (the variance of xi contains the
+    motion's, so that uneven motion makes the weights more equal).
 
     Raises:
         ExperimentError: no camera, or more than two.
-        ShapeError: paths, candidates and times are not of the same cameras and frames.
-
-    Source: the paper's two cameras; docs/errata.md A7 (which camera is right) and A8 (the variance of xi contains the
-        motion's, so that uneven motion makes the weights more equal).
+        ShapeError: paths, candidates and times differ in cameras or frames.
     """
     _check(paths, candidates, time_s)
     names = list(paths)
@@ -104,8 +95,8 @@ def fuse(
 def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tensor:
     """Return the moving variance (K, N) of each camera's xi (N,), above 0; only ratios between cameras have a meaning.
 
-    It is clamped to within a factor of `VARIANCE_RANGE` of the camera's median, which also stands in where fewer than
-    `LINKS_MIN` links are near.
+    It is within a factor of `VARIANCE_RANGE` of the camera's median, which replaces it where `LINKS_MIN` links are not
+    near.
     """
     windows = [moving(each, settings.weight_window_frames) for each in xi]
     count = torch.stack([torch.isfinite(window).sum(-1) for window in windows])
@@ -160,7 +151,7 @@ def _sigma(variance: Tensor, share: Tensor, apart: Tensor, calm: Tensor) -> Tens
 
     With errors of variance s^2 variance_i per axis, d^2 / (s^2 (variance_1 + variance_2)) is chi-squared with three
     degrees of freedom. Its median gives s^2 in spite of a few wrong frames. Frames near a spike are left out where
-    there are others: the spike raises their variance, not their d.
+    possible: the spike raises their variance, not their d.
     """
     if not len(apart):
         return apart
@@ -172,7 +163,6 @@ def _sigma(variance: Tensor, share: Tensor, apart: Tensor, calm: Tensor) -> Tens
 
 
 def _check(paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor) -> None:
-    """Refuse what is not one or two cameras of the same frames."""
     if not 1 <= len(paths) <= 2:
         do = "name one or two cameras"
         raise ExperimentError(refusal("paths", expected="one or two cameras", got=str(len(paths)), do=do))
@@ -218,14 +208,12 @@ class Repair:
 
 
 def repair(tracks: tuple[Track, Track], graphs: tuple[Graph, Graph], settings: AssembleSettings) -> Repair:
-    """Repair each stretch where the cameras disagree; the better supported camera leads.
+    """Repair each run of frames where the cameras disagree; the better supported camera leads.
 
-    Each camera in turn is assumed right. The other then takes, in every frame, its candidate nearest to that
-    orientation, or none beyond `repair_deg`, which counts as T = 0. The assumption with the larger mean T of both
-    cameras holds. Where the two differ by less than `repair_margin`, or neither finds a candidate (T of different
-    cameras cannot be compared), the leader with the smaller largest rotation into, within and out of the stretch holds,
-    and the frames are ambiguous.
-
+    Each camera in turn is assumed right. The other takes, in every frame, its candidate nearest to that orientation;
+    beyond `repair_deg` it takes none, which counts as T = 0. The assumption with the larger mean T of both cameras
+    holds. Where the two differ by less than `repair_margin`, or neither finds a candidate, the leader with the smaller
+    largest rotation into, within and out of the run holds, and the frames are ambiguous.
     Source: the paper's two cameras, which does not say which camera is right; docs/errata.md A7.
     """
     limit = math.radians(settings.repair_deg)
@@ -264,7 +252,7 @@ def _stretches(wrong: Tensor, both: Tensor, gap_frames_max: int) -> list[Tensor]
 
 
 def _follow(leader: Track, graph: Graph, frames: Tensor, limit: float) -> Track:
-    """Return the candidates nearest to the leader's orientations in some frames; NaN without any within the limit."""
+    """Return the candidates nearest to the leader's orientations in some frames; NaN beyond the limit."""
     R_all, score_all, mask = (part[frames] for part in graph)
     distance = so3.geodesic_distance(leader.R_lab_body[frames][:, None], R_all)
     near, which = torch.where(mask, distance, torch.inf).min(-1)
@@ -277,7 +265,6 @@ def _follow(leader: Track, graph: Graph, frames: Tensor, limit: float) -> Track:
 
 
 def _merit(leader: Track, follower: Track) -> float:
-    """Return the mean T over both cameras and all frames of a stretch."""
     return float((leader.score + follower.score.nan_to_num(0.0)).mean() / 2)
 
 

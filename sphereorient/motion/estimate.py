@@ -1,4 +1,4 @@
-"""One kind of track, positions or orientations: estimate its process, reject outliers, smooth every segment."""
+"""Positions or orientations of a track: estimate the process, reject outliers, smooth every segment."""
 
 from __future__ import annotations
 
@@ -71,14 +71,8 @@ def estimate(
 ) -> tuple[list[Estimate], float, ProcessPrior | None]:
     """Estimate the process from all segments of one kind, then smooth each by itself.
 
-    Args:
-        paths: one for each segment.
-        band: cycles per frame; None estimates it.
-        settings: limits.
-        known: the process of another track, or of this one; None estimates it.
-
-    Returns:
-        The estimates, the ratio of true errors to sigmas of the measurements, slow errors included, and the process.
+    `band`: cycles per frame; None estimates it. `known`: the process of another track; None estimates it. Return the
+    estimates, the ratio of true errors to sigmas of the measurements (slow errors included), and the process.
     """
     if known is None:
         pieces = _pieces(paths, settings.learn_frames)
@@ -90,7 +84,7 @@ def estimate(
 
 
 def _pieces(paths: Sequence[SegmentTrack], most: int) -> list[SegmentTrack]:
-    """Return pieces of the segments for the estimation, distributed evenly where there are too many."""
+    """Return pieces of the segments for the estimation, evenly distributed where there are too many."""
     starts = [(path, k) for path in paths for k in range(0, len(path.time), PIECE)]
     total = sum(len(path.time) for path in paths)
     if total > most:
@@ -137,7 +131,7 @@ def _settled(
 
 
 def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: float) -> Bools:
-    """Return which measurements are used: outliers no longer, and those that fit again."""
+    """Return which measurements are used: outliers are dropped, and those that fit again return."""
     out = path.seen & ~path.used
     used = path.used.copy()
     if out.any():
@@ -152,7 +146,7 @@ def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: flo
 
 
 def _stand_out(mahalanobis: Floats, limit: float) -> Bools:
-    """Return the frames beyond the limit and beyond all near them; those near are judged again without them."""
+    """Return the frames beyond the limit and beyond all near them; those near are tested again without them."""
     wrong = mahalanobis > limit
     for k in range(1, min(NEAR, len(mahalanobis) - 1) + 1):
         wrong[k:] &= mahalanobis[k:] >= mahalanobis[:-k]
@@ -161,7 +155,7 @@ def _stand_out(mahalanobis: Floats, limit: float) -> Bools:
 
 
 def _wanted(pole: float) -> Floats:
-    """Return the rows that take value, rate and its change from a state."""
+    """Return the rows that extract value, rate and its change from a state."""
     view = np.eye(3)
     wanted = np.zeros((9, SIZE))
     wanted[VALUE, DELTA] = view
@@ -191,7 +185,6 @@ def _smoothed(path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings
 
 
 def _alone(path: SegmentTrack) -> Estimate:
-    """Return the measurements as they are, without derivatives."""
     unknown = np.full((len(path.time), 3), np.nan)
     covariance = np.full((len(path.time), 9, 9), np.nan)
     covariance[path.seen, VALUE, VALUE] = path.covariance[path.seen]
@@ -204,16 +197,16 @@ def _alone(path: SegmentTrack) -> Estimate:
 def estimate_process(
     paths: Sequence[SegmentTrack], scales: tuple[float, float], band: float | None, before: ProcessPrior | None = None
 ) -> ProcessPrior:
-    """Find the prior and the factor on the measurements' sigmas under which the measurements are most likely.
+    """Find the prior and the factor on the measurements' sigmas with the highest likelihood.
+
+    Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form, with FREE fewer
+    degrees of freedom a path.
 
     Args:
         paths: segments with at least five measurements each.
         scales: least and largest factor accepted.
-        band: cycles per frame; fixes the prior, so that only the factor is learnt. None learns both.
+        band: cycles per frame; fixes the prior, so that only the factor is estimated. None estimates both.
         before: the estimate of the same segments with other references or rejections, as a start.
-
-    Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form, with FREE fewer
-    degrees of freedom a path.
     """
     sigma = float(np.median([path.sigma for path in paths]))
     if band is not None:

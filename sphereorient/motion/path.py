@@ -1,7 +1,7 @@
 """Segments as chains of small deviations from a reference: positions on R^3, orientations on SO(3) for any rotation.
 
-The state of an instant is 3 (2 + ORDER) numbers: the small deviation delta from the reference, the deviation of the
-constant rate from the reference's, and the random rate w, w' / pole, w'' / pole^2, ... itself. Time is in frames.
+The state has 3 (2 + ORDER) numbers: the deviation delta from the reference, the deviation of the constant rate from the
+reference's, and the random rate w, w' / pole, w'' / pole^2, ... itself. Time is in frames.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ DELTA, MEAN, RATE = slice(0, 3), slice(3, 6), slice(6, SIZE)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentTrack:
-    """One segment: what was measured, and the reference that the states are deviations from."""
+    """The measurements of one segment, and the reference of the states."""
 
     time: Floats  # (N,), frames, increasing
     covariance: Floats  # (N, 3, 3), of the measurements
@@ -52,8 +52,8 @@ class SegmentTrack:
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
         """Return rotations (N - 1, NODES + 1, 3, 3) and jumps (N - 1, 3) of the reference's steps.
 
-        The rotations take a deviation from the nodes of a step, and from its begin, to its end. The jumps are what
-        remains of the steps after the integral of the reference's rate.
+        The rotations take a deviation from the nodes of a step, and from its begin, to its end. The jumps are the steps
+        less the integral of the reference's rate.
         """
         raise NotImplementedError
 
@@ -81,10 +81,8 @@ class SegmentTrack:
     def steps(self, prior: Prior, weight: Floats, by_rate: Floats) -> tuple[Floats, Floats]:
         """Return the transition of a step from the state, (M, 3, SIZE), and its drift (M, 3).
 
-        Args:
-            prior: of the rate.
-            weight: (M, NODES), of the nodes of each step.
-            by_rate: (M, NODES, ORDER), the same times how the rate's state grows to them.
+        `weight` (M, NODES) holds the weights of the nodes, `by_rate` (M, NODES, ORDER) the same times the growth of the
+        rate's state to them.
         """
         count = len(weight)
         carry, jump = self.jumps(prior)
@@ -206,7 +204,7 @@ class RotationTrack(SegmentTrack):
 
     @classmethod
     def of(cls, time: Floats, value: Floats, covariance: Floats, seen: Bools) -> Self:
-        """Return the segment about a first estimate: measurements that follow from each other, gaps interpolated."""
+        """Return the segment about a first estimate: consistent measurements, gaps interpolated."""
         reference, omega, trusted = _first_guess(time, value, seen)
         mean = omega.mean(0)
         rate = np.zeros((len(time), ORDER, 3))
@@ -274,7 +272,7 @@ def rotvec_between(begin: Floats, end: Floats) -> Floats:
 
 
 def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int = 3) -> Floats:
-    """Return the turns (M, 3, 3) over steps (M,) by omega_lab = mean + w(t), w by its state (M, ORDER, 3) at the begin.
+    """Return the rotations (M, 3, 3) over steps (M,) by omega_lab = mean + w(t), from the state of w (M, ORDER, 3).
 
     Source: Magnus expansion of fourth order at the two Gauss nodes (Iserles and Norsett 1999).
     """
@@ -291,8 +289,7 @@ def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int
 def _first_guess(time: Floats, R: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
     """Return orientations (N, 3, 3) and omega_lab (N, 3), rad per frame, at all instants, and the frames trusted.
 
-    Over a gap, where more than half a turn may have passed, omega is interpolated smoothly; of the rotations that fit,
-    the one nearest to it is taken.
+    Gaps may exceed half a turn: of the rotations that fit, the one nearest to the interpolated omega is taken.
     """
     frames = np.flatnonzero(seen)
     if len(frames) < 2:
@@ -341,14 +338,9 @@ def _around(x: Floats, width: int) -> Floats:
 
 
 def _consistent(kink: Callable[[int], Floats], count: int, way: float) -> NDArray[np.int64]:
-    """Return the frames that follow from each other, by least cost; to leave out a frame has a cost, too.
+    """Return the frames that follow from each other, by dynamic programming; leaving out a frame has a cost.
 
-    Args:
-        kink: for a lag, the steps (count - lag, 3) from each frame to the one so much later, less the typical rate.
-        count: of frames.
-        way: typical length of a step; the typical rate is known to a few hundredths of it.
-
-    Source: dynamic programming over the frame before; kinks are in units of the median kink.
+    `kink` gives for a lag the steps (count - lag, 3) between frames less the typical rate; `way` is the typical step.
     """
     reach = min(LEFT_OUT + 1, count - 1)
     kinks = [np.linalg.norm(kink(lag), axis=1) / lag for lag in range(1, reach + 1)]

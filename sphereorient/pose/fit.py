@@ -1,4 +1,4 @@
-"""Pose to hundredths of a degree: Gauss-Newton on rotation and place, all cameras at once, light solved inside."""
+"""Pose to hundredths of a degree: Gauss-Newton on rotation and position, all cameras at once, light eliminated."""
 
 from __future__ import annotations
 
@@ -92,16 +92,9 @@ class PoseStart:
 def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4) -> FittedPoses:
     """Fit poses to pictures: robust Gauss-Newton, the light's coefficients eliminated in every step.
 
-    Args:
-        pixels: of B * C disks, the cameras of a pose next to each other.
-        begin: start of the B poses.
-        model: of the sphere's pictures.
-        iterations: steps, at least 1, the same for all poses, so that none depends on its neighbours in the batch.
-
-    Returns:
-        The fit, its covariance that of the robust estimate with errors shared within tiles of the picture. All but
-        the pose is as it was before the last step, which `step` holds: a fit that has arrived does not move any more.
-
+    `pixels` holds B * C disks, the cameras of a pose next to each other. `iterations` is at least 1, the same for all
+    poses, so that no pose depends on its batch. The covariance is that of the robust estimate with errors shared within
+    tiles. All results but the pose belong to the pose before the last step.
     Source: variable projection, Golub and Pereyra 1973; covariance of an M-estimate from clustered scores, Liang and
     Zeger 1986.
     """
@@ -168,7 +161,7 @@ def residuals(
 
     Args:
         pixels: of B * C disks.
-        X: (B, 3), places of the centre in the lab, mm.
+        X: (B, 3), position in the lab, mm.
         R: (B, 3, 3), R_lab_body.
         state: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
         model: of the sphere's pictures.
@@ -216,7 +209,7 @@ def residuals(
 
 
 def grey_by_pose(view: SphereView, lit: Tensor, over: Tensor) -> Tensor:
-    """Return how grey changes with delta (rad) and place (mm), (L, 6, P); `lit` and `over` as in `Residuals`."""
+    """Return the derivatives (L, 6, P) of grey by delta (rad) and position (mm); `lit`, `over` as in `Residuals`."""
     paint, limb = lit[:, None], over[:, None]
     return torch.cat(
         [paint * view.paint_by_rotation, paint * view.paint_by_position + limb * view.coverage_by_position], dim=1
@@ -229,7 +222,7 @@ def by_pose(disks: Tensor, cameras: int) -> Tensor:
 
 
 def _variance(grey: Tensor, noise: Tensor) -> Tensor:
-    """Noise expected at grey levels (L, P) by the curves (L, 4)."""
+    """Return the noise variance expected at grey levels (L, P) by the curves (L, 4)."""
     grey = grey.clamp_min(0.0)
     a, b, c, d = noise[..., None].unbind(1)
     variance: Tensor = a + grey * (b + grey * (c + grey * d))
@@ -237,7 +230,7 @@ def _variance(grey: Tensor, noise: Tensor) -> Tensor:
 
 
 def _deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
-    """Robust standard deviation of residuals over the noise expected, (L,); 1 where the noise explains them."""
+    """Return the robust standard deviation of residuals over the noise expected, (L,), at least 1."""
     # A quarter of the places tells as much: they are in order of distance from the middle.
     residual, variance, inside = residual[:, ::4], variance[:, ::4], inside[:, ::4]
     scaled = torch.where(inside, residual.abs() * variance.rsqrt(), torch.nan)
@@ -245,7 +238,7 @@ def _deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
 
 
 def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Eliminate the light's coefficients: information (L, 6, 6), gradient (L, 6), what the pose takes from them."""
+    """Eliminate the light's coefficients: information (L, 6, 6), gradient (L, 6), coupling to the pose."""
     light = normal[:, 6:, 6:]
     light = light + 1e-7 * torch.diag_embed(light.diagonal(dim1=-2, dim2=-1) + 1e-12)
     mixed = torch.linalg.solve(light, normal[:, 6:, :6])
@@ -254,15 +247,10 @@ def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Te
 
 
 def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) -> Tensor:
-    """Shorten steps that change a picture by over 0.1 radii, pose by pose: beyond, the slopes say nothing.
+    """Shorten steps (B, 6) that change a picture by over 0.1 radii, beyond which the slopes do not hold.
 
-    Along a line of sight the picture only grows: there a step may be as long as its share of the distance allows.
-
-    Args:
-        step: (B, 6), rad and mm.
-        to_centre: (B, C, 3), from where each camera looks to the sphere, mm.
-        seen: (B, C), 1 for the cameras in use.
-        radius_mm: of the sphere.
+    Along a line of sight the picture only grows: there a step may have the same share of the distance. `to_centre` (B,
+    C, 3), mm, leads from the cameras to the sphere; `seen` (B, C) is 1 for those in use.
     """
     distance = to_centre.norm(dim=-1, keepdim=True).clamp_min(radius_mm)
     move, sight = step[:, None, 3:], to_centre / distance
@@ -274,7 +262,7 @@ def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) ->
 
 
 def _edge_errors(pixels: Pixels, to_centre: Tensor, cameras: int, radius_mm: float) -> Tensor:
-    """Return by how much (B, C, 3), mm, an edge that is EDGE_PX off moves the sphere along each line of sight."""
+    """Return the displacement (B, C, 3), mm, along each line of sight by an edge that is EDGE_PX off."""
     distance = to_centre.norm(dim=-1, keepdim=True)
     px_mm = by_pose(pixels.pitch_mm, cameras)[..., None] + by_pose(pixels.pitch_rad, cameras)[..., None] * distance
     off: Tensor = to_centre * (EDGE_PX * px_mm / radius_mm)
@@ -290,7 +278,7 @@ def _bounded_alone(freed: Tensor, to_centre: Tensor, radius_mm: float) -> Tensor
 
 
 def _shared_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:
-    """Sum over tiles of the outer products of their scores, (L, 6, 6): neighbours' errors are not independent."""
+    """Sum over tiles the outer products of their scores, (L, 6, 6): errors of neighbours are not independent."""
     by_pose = at.design[:, :6] - mixed.mT.to(at.design.dtype) @ at.design[:, 6:]
     score = by_pose * (precision * at.residual)[:, None]
     tiles = score.new_zeros(*score.shape[:2], int(tile.max()) + 1 if len(tile) else 1)
@@ -302,17 +290,16 @@ def _shared_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor
 
 
 def _loss(at: Residuals, inside: Tensor) -> Tensor:
-    """Tukey's loss with its scale's own term (L,), natural units: what a wider scatter gains, it pays for."""
+    """Return Tukey's loss (L,) with the normalisation of its scale, nats."""
     share = (at.residual.square() / (TUKEY**2 * at.variance)).clamp_max(1.0)
     loss = (TUKEY**2 / 6.0) * (1.0 - (1.0 - share) ** 3) + at.deviation.clamp_min(1.0).log()[:, None]
     return (loss * inside).sum(-1).double()
 
 
 def _score(at: Residuals, inside: Tensor) -> Tensor:
-    """Share of the disk's variance that the model explains, (L,).
+    """Return the share of the disk's variance that the model explains, (L,).
 
-    Every pixel of the ball counts: those that do not fit are what tells a wrong pose. A bubble counts as dark or
-    bright as paint is, however much brighter it shines.
+    Every pixel counts: those that do not fit reveal a wrong pose. A bubble counts at most as bright as paint.
     """
     share = at.view.coverage * inside
     share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)

@@ -1,4 +1,4 @@
-"""Refinement at three widths of detail, and what it needs of each camera."""
+"""The fit at three levels of blur, and what it needs of each camera."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class CameraView:
         return cls(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
 
     def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
-        """Half the width (...), px, of the ball's picture at places (..., 3), along the camera's own right."""
+        """Return the radius (...), px, of the sphere's picture at positions (..., 3), mm, along the camera's x."""
         right = self.camera.R_cam_lab[0] * radius_mm
         centre, rim = self.camera.project(torch.stack([position_lab_mm, position_lab_mm + right]))
         radius_px: Tensor = (rim - centre).norm(dim=-1)
@@ -56,12 +56,12 @@ class CameraView:
 
 
 def widest_px(views: Sequence[CameraView]) -> float:
-    """Return the expected diameter of the ball in the camera that sees it largest, px."""
+    """Return the expected diameter of the sphere, px, in the camera that sees it largest."""
     return max(view.diameter_px for view in views)
 
 
 def unknown_light(views: Sequence[CameraView]) -> Light:
-    """Return the light that first fits begin with: flat, with the scene's noise and a little of a sensor's."""
+    """Return the light of the first fits: flat, with the scene's noise and a little sensor noise."""
     noise = torch.tensor([[view.background.typical_noise**2, 0.02, 0.001, 0.0] for view in views])
     return Light.unknown(len(views), noise)
 
@@ -85,10 +85,10 @@ def _stencil(radius_px: float, step_px: int) -> Stencil:
 
 
 class Optics:
-    """The paint at the widths of detail that fits go through, for one blur of the pictures.
+    """Texture tables at the levels of blur of the fits, for one blur of the pictures.
 
     Args:
-        base: finest table of the paint.
+        base: finest table of the texture.
         blur_px: of optics, pixel and exposure together, px.
         diameter_px: typical diameter of the disk, px.
     """
@@ -152,7 +152,7 @@ class Fitter:
         return replace(self, views=[self.views[camera]], light=self.light.of(camera))
 
     def largest_px(self, position_lab_mm: Tensor) -> Tensor:
-        """Radius (B,), px, of the largest disk that a ball at places (B, 3) shows in any picture."""
+        """Return the radius (B,), px, of the largest disk that a sphere at positions (B, 3) shows in any picture."""
         radii = torch.stack([view.radius_px(position_lab_mm, self.radius_mm) for view in self.views])
         return radii.nan_to_num().amax(0)
 
@@ -165,11 +165,8 @@ class Fitter:
     ) -> Pixels:
         """Cut the disks of B poses out of the pictures of C views.
 
-        Args:
-            pictures: B times C frames.
-            position_lab_mm: (B, 3), where the ball is, to a few pixels.
-            level: of detail.
-            radius_px: of the disks; None: that of the largest one, on which the others' last bits then depend.
+        `position_lab_mm` (B, 3) is right to a few pixels. Without `radius_px` the largest disk sets it, so that the
+        last bits depend on the batch.
         """
         middles = [torch.nan_to_num(view.camera.project(position_lab_mm)).tolist() for view in self.views]
         if radius_px is None:
@@ -214,7 +211,7 @@ class Fitter:
 
 
 def base_table(texture: Tensor, diameter_px: float) -> TextureTable:
-    """Return the finest table of a map that disks of some diameter can tell, from which all others are blurred."""
+    """Return the finest table of a map that disks of some diameter resolve; all others are blurred from it."""
     return texture_table(texture, max(BASE_RAD, FINEST_PX * 2 / diameter_px))
 
 

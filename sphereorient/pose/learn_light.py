@@ -1,4 +1,4 @@
-"""Light and noise of a movie, learnt from fitted poses."""
+"""Light and noise of a movie, estimated from fitted poses."""
 
 from __future__ import annotations
 
@@ -14,14 +14,7 @@ from sphereorient.pose.pixels import Pixels
 
 
 def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Light:
-    """Learn the light and the noise of a movie from fitted poses.
-
-    Args:
-        pixels: of B * C disks.
-        fit: of them.
-        use: (B, C) bool, disks to learn from.
-        model: with which the poses were fitted.
-    """
+    """Estimate the light and the noise of a movie from the fits of B * C disks, those of `use` (B, C) bool."""
     cameras = use.shape[1]
     X, R = fit.position_lab_mm, fit.R_lab_body
     at = residuals(pixels, X, R, None, model, cameras)
@@ -38,10 +31,7 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
 def light_sums(view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:
     """Return the normal equations of light maps of L disks, (L, 2 K, 2 K) and (L, 2 K) float64.
 
-    Args:
-        view: of the disks at their poses.
-        pixels: of the disks.
-        precision: (L, P), weight over variance of each pixel.
+    `precision` (L, P) is weight over variance of each pixel.
     """
     basis = light_basis(view.across)
     columns = torch.cat([(view.coverage * view.paint)[:, None] * basis, view.coverage[:, None] * basis], dim=1)
@@ -62,10 +52,7 @@ def light_maps(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
 def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:
     """Return the coefficients (4,), not negative, of the noise's variance as a polynomial in the grey level.
 
-    Args:
-        model: (N,), expected grey levels.
-        residual: (N,), grey levels.
-        inside: (N,) bool, pixels that count.
+    From expected grey levels and residuals (N,) where `inside` (N,) holds.
     """
     model, residual = model[inside].clamp_min(0).double(), residual[inside].double()
     order = model.argsort(stable=True)

@@ -1,4 +1,4 @@
-"""How bright white and black paint look at each place of the disk: learnt from the movie, low order, per camera."""
+"""Brightness of white and black paint over the disk: low-order maps per camera, estimated from the movie."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Light:
 
     @cached_property
     def _map(self) -> Tensor:
-        """Difference and black over the square about the disk, (C * S * S, 2): a look-up beats 25 functions."""
+        """Return difference and black over the square about the disk, (C * S * S, 2): a look-up beats 25 functions."""
         at = (torch.arange(MAP_SIDE, dtype=torch.float32, device=self.difference.device) + 0.5) * (2.0 / MAP_SIDE) - 1.0
         y, x = torch.meshgrid(at, at, indexing="ij")
         across = torch.stack([x, y]).reshape(2, -1)

@@ -43,22 +43,12 @@ class SphereView:
 
 
 def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model: SphereModel) -> SphereView:
-    """Render the sphere through pixels whose aperture is a Gaussian.
+    """Render the sphere at position_lab_mm (L, 3) and R_lab_body (L, 3, 3) through pixels with a Gaussian aperture.
 
-    A pixel near the limb sees the paint about the middle of that part of its aperture which the sphere covers, and
-    along the radius the sphere's curvature stretches the aperture over more paint: two look-ups, one standard deviation
-    to both sides of the mean of a Gaussian cut off at the limb, make both right; the table's own blur does the rest.
-    Near the limb there are four, at the quantiles of what is left of the Gaussian.
-
-    Args:
-        pixels: of L disks, float32.
-        position_lab_mm: (L, 3), centre of the sphere.
-        R_lab_body: (L, 3, 3).
-        model: radius, paint and blur; light is not used.
-
-    Returns:
-        The view. In its derivatives the spread of the look-ups is held fixed.
-
+    A pixel near the limb sees the paint about the middle of the covered part of its aperture; along the radius the
+    curvature stretches the aperture over more paint. Two look-ups, one standard deviation to both sides of the mean of
+    the Gaussian cut off at the limb, reproduce both; near the limb there are four, at its quantiles. Derivatives hold
+    their spread fixed. The model's light is not used.
     Source: docs/errata.md A4 (the cap and the ellipse that a perspective camera sees); mean and variance of a cut-off
     Gaussian, Johnson, Kotz and Balakrishnan 1994, section 13.10.
     """
@@ -104,7 +94,7 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
 
 
 def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
-    """Return look-ups along the radius where the limb is near, and how each moves with the pixel, (L, n, P) each.
+    """Return look-ups along the radius near the limb, and the derivative of each by the pixel, (L, n, P) each.
 
     They are quantiles of the cut-off Gaussian, drawn towards its middle by what the table's own blur adds.
     """
@@ -117,8 +107,6 @@ def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, midd
 
 
 class _LineOfSight(NamedTuple):
-    """Lines of sight past the sphere's centre."""
-
     direction: Tensor  # (L, 3, P), unit
     outward: Tensor  # (L, 3, P), unit, from the centre to the line
     nearest: Tensor  # (L, P), distance of the centre from the line, mm
@@ -127,14 +115,9 @@ class _LineOfSight(NamedTuple):
 def _sample(
     at: Tensor, moves: Tensor, line: _LineOfSight, R: Tensor, model: SphereModel
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean paint of some look-ups (L, P) and its derivatives by rotation and place (L, 3, P).
+    """Return the mean paint of some look-ups (L, P) and its derivatives by rotation and position (L, 3, P).
 
-    Args:
-        at: (L, n, P), distance of each look-up from the disk's middle, radii.
-        moves: (L, n, P) or (L, 1, P), by how much it moves with the pixel.
-        line: of the pixels.
-        R: (L, 3, 3).
-        model: radius and paint.
+    `at` (L, n, P) is the distance of each look-up from the disk's middle, radii; `moves` its derivative by the pixel's.
     """
     d, outward, nearest = line
     # In body components, where the paint is: the derivatives are turned back once, at the end.

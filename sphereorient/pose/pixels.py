@@ -1,4 +1,4 @@
-"""The pixels of a ball in a frame, each with its own line of sight: what refinement compares with the model."""
+"""The pixels of a sphere in a frame, each with its own line of sight: the data of the fit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pixels:
-    """Pixels of L disks (one camera's view of one frame each) with P places each; made here, read by refine.
+    """Pixels of L disks (one camera's view of one frame each) with P places each.
 
     Grey levels and geometry are float32: a line of sight is right to 3e-5 mm half a metre away.
     """
@@ -53,7 +53,7 @@ class Pixels:
         return replace(self, **parts)
 
     def thinned(self, step: int) -> Pixels:
-        """Return every so-many-th place of all disks."""
+        """Return every `step`-th place of all disks."""
         places = torch.arange(0, self.grey.shape[1], step)
         places = places[: whole_vectors(len(places))]
         names = ("grey", "behind", "inside", "direction")
@@ -64,20 +64,16 @@ class Pixels:
 
 
 def whole_vectors(count: int) -> int:
-    """Return the largest number up to `count` that fills the processor's vectors: the rest is computed otherwise.
+    """Return the largest number up to `count` that fills the processor's vectors.
 
-    What is left over at the end of a batch goes through other code whose last bits differ, and a disk's numbers would
-    depend on whether it is the last one.
+    The remainder of a batch takes other code whose last bits differ, so that a disk's numbers would depend on its
+    batch.
     """
     return max(count // VECTOR, 1) * VECTOR
 
 
 class LinesOfSight:
-    """The lines of sight of all pixels of a camera, once and for all frames.
-
-    Args:
-        camera: any model.
-    """
+    """The lines of sight of all pixels of a camera, computed once for all frames."""
 
     def __init__(self, camera: Camera) -> None:
         width, height = camera.image_size
@@ -93,7 +89,7 @@ class LinesOfSight:
         self.size = width, height
 
     def pitch(self, u: int, v: int) -> tuple[Tensor, Tensor]:
-        """Return by how much the line of sight differs from the next ones, right and below: angle, start (mm)."""
+        """Return the change of the line of sight to the next pixel: angle, rad, and start, mm."""
         d = self.direction
         turned = 0.5 * ((d[:, v, u + 1] - d[:, v, u]).norm() + (d[:, v + 1, u] - d[:, v, u]).norm())
         if self.one_origin:
@@ -141,19 +137,16 @@ def cut_pixels(
     blur_px: float = 0.0,
     shown: NDArray[np.bool_] | None = None,
 ) -> Pixels:
-    """Take a disk's pixels out of a frame, as they are: no resampling, so the noise of neighbours stays independent.
+    """Return a disk's pixels without resampling, so that the noise of neighbours stays independent.
 
     Args:
         frame: (H, W), grey levels.
-        background: (H, W), the scene without the ball.
+        background: (H, W), the scene without the sphere.
         sight: of the camera.
-        middle_px: (u, v), near the ball's centre.
+        middle_px: (u, v), near the sphere's centre.
         stencil: of the places.
-        blur_px: standard deviation of a Gaussian laid over frame and background first; tames detail for coarse fits.
-        shown: (H, W), False where something hides the ball; None: nowhere.
-
-    Returns:
-        One disk.
+        blur_px: standard deviation of a Gaussian laid over frame and background first, for coarse fits.
+        shown: (H, W), False where something hides the sphere; None: nowhere.
     """
     width, height = sight.size
     u, v = round(middle_px[0]), round(middle_px[1])

@@ -61,16 +61,14 @@ class PoseFitter(nn.Module):
         R_lab_body: ArrayLike | Tensor,
         position_lab_mm: ArrayLike | Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Fit poses.
+        """Fit poses; return R_lab_body (..., 3, 3), position_lab_mm (..., 3) and the covariance (..., 6, 6), float64.
+
+        The covariance is of delta (rad, lab) and position (mm).
 
         Args:
             pictures: (..., C, H, W), grey levels; (..., H, W) for a single camera.
             R_lab_body: (..., 3, 3), start, to about 10 degrees.
             position_lab_mm: (..., 3), start, to a few pixels.
-
-        Returns:
-            R_lab_body (..., 3, 3), position_lab_mm (..., 3), and the covariance (..., 6, 6) of delta (rad, lab) and
-            position (mm); float64.
 
         Raises:
             ShapeError: shapes that do not fit together.
