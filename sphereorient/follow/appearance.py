@@ -1,4 +1,4 @@
-"""Appearance of a movie (light, blur, noise), estimated from a few of its frames before the others are measured."""
+"""Appearance of a movie (light, blur, noise), estimated from a few frames before tracking."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Appearance:
         return replace(self, fitter=self.fitter.on(device))
 
     def search(self, proposers: Mapping[str, Proposer], locating: LocateSettings, candidates: int) -> Initialiser:
-        """Return what finds poses in frames of this appearance without history."""
+        """Return the initialiser for frames of this appearance."""
         return Initialiser(
             fitter=self.fitter,
             proposers=proposers,
@@ -82,13 +82,9 @@ class Appearance:
 def estimate_appearance(
     first: Initialiser, frames: Sequence[Sequence[Frame]], base: TextureTable, settings: RefineSettings
 ) -> Appearance:
-    """Estimate light, blur and noise of movies.
+    """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies.
 
-    Args:
-        first: finds poses with the blur and the light that are assumed at first.
-        frames: n times C, spread over the movies.
-        base: finest table of the texture.
-        settings: blur, if given.
+    `first` finds poses with an assumed blur and light; `base` is the finest table of the texture.
 
     Raises:
         ExperimentError: no frame has a pose, or none is better than wrong poses.
@@ -139,7 +135,7 @@ def estimate_appearance(
 
 
 def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
-    """Return the median angle between the turns of two cameras that see the ball together; infinite without any."""
+    """Return the median angle between the rotations of two cameras that see the sphere together; inf without any."""
     angles = [
         (fit.own_turn[:, k] - fit.own_turn[:, m]).norm(dim=-1)[use[:, k] & use[:, m]]
         for k, m in combinations(range(use.shape[1]), 2)
@@ -149,12 +145,10 @@ def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
 
 
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
-    """Measure on a few frames whether the cameras see one ball in one place, as they do unless one was moved.
+    """Measure on a few frames whether the cameras see one sphere at one position.
 
-    Returns:
-        The ratio of the variance left unexplained by all cameras together to that by each alone, and the distance
-        between the lines of sight, px; both in the worst quarter of the frames, as cameras may agree in one part of
-        the volume.
+    Return the variance left unexplained by all cameras together over that by each alone, and the distance between the
+    lines of sight, px; both in the worst quarter of frames, as cameras may agree in a part of the volume.
     """
     cameras = len(fitter.views)
     whole = [k for k, poses in enumerate(found) if len(poses) and bool(poses.use.all())]
@@ -188,7 +182,6 @@ Rows = tuple[list[int], Tensor, Tensor, Tensor]  # frames, places (n, 3), rotati
 
 
 def _seen_by_all(found: Sequence[Poses]) -> Rows:
-    """Return the clear poses of all cameras together."""
     chosen = _clear(found)
     X = torch.cat([found[k].position_lab_mm[:1] for k in chosen])
     R = torch.cat([found[k].R_lab_body[:1] for k in chosen])
@@ -196,7 +189,6 @@ def _seen_by_all(found: Sequence[Poses]) -> Rows:
 
 
 def _seen_by_each(each: Sequence[Sequence[Poses]]) -> Rows:
-    """Return the clear poses of each camera alone."""
     rows = [(k, camera) for camera, found in enumerate(each) for k in _clear(found)]
     X = torch.stack([each[camera][k].position_lab_mm[0] for k, camera in rows])
     R = torch.stack([each[camera][k].R_lab_body[0] for k, camera in rows])
@@ -215,7 +207,7 @@ def _scores(found: Sequence[Poses]) -> tuple[float, float]:
 def _times_better(found: Sequence[Poses]) -> float:
     """Return the median ratio of the variances that the second and the best pose of a clear frame leave unexplained.
 
-    Blurred pictures are mostly disk, and any pose explains most of one; only the ratio separates them.
+    Blurred pictures are mostly disk, which any pose explains; only the ratio separates poses.
     """
     rows = [(found[k].score[:2], found[k].use) for k in _clear(found) if len(found[k]) > 1]
     if not rows:
@@ -225,7 +217,7 @@ def _times_better(found: Sequence[Poses]) -> float:
 
 
 def _nothing(found: Sequence[Poses]) -> ExperimentError:
-    """Word what was missing in all frames: the ball, or a pose that looks like it."""
+    """Return the error of a movie without the sphere, or without a pose that fits."""
     reasons = {str(why) for poses in found for why in poses.reason}
     got = f"none ({', '.join(sorted(reasons))})"
     if Reason.LOW_SCORE in reasons:
@@ -236,7 +228,7 @@ def _nothing(found: Sequence[Poses]) -> ExperimentError:
 
 
 def _unexplained(score: float) -> ExperimentError:
-    """Word that the best poses are no better than wrong ones: the pictures do not show this map."""
+    """Return the error of a movie that does not show this map."""
     do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
     got = f"poses that explain {100 * score:.0f} % of the pictures, as wrong ones do"
     return ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
@@ -258,9 +250,9 @@ def _clear_of(typical: float) -> float:
 def _light_and_blur(
     fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor, *, given: bool
 ) -> tuple[Fitter, FittedPoses]:
-    """Learn light, then blur, then light again; return the fitter that knows both, and its fit.
+    """Estimate light, then blur, then light again; return the fitter that has both, and its fit.
 
-    Light that was learnt with a wrong blur favours that blur: for blurred pictures they alternate several times.
+    Light estimated with a wrong blur favours that blur: for blurred pictures they alternate several times.
     """
     diameter_px = widest_px(fitter.views)
     fitter, fit = _with_light(fitter, pixels, fit, use, LIGHT_ROUNDS)
@@ -276,7 +268,7 @@ def _light_and_blur(
 def _with_light(
     fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor, rounds: int
 ) -> tuple[Fitter, FittedPoses]:
-    """Learn the light and fit again, several times."""
+    """Estimate the light and fit again, several times."""
     for _ in range(rounds):
         fitter = fitter.with_light_of(pixels, fit, use)
         fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
@@ -313,6 +305,5 @@ def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: Fitted
 
 
 def _blurs_tried(radius_px: float) -> tuple[float, ...]:
-    """Return the blurs that are tried, px."""
     steps = math.log(max(WIDEST * radius_px / FINEST_PX, FINER**7)) / math.log(FINER)
     return tuple(FINEST_PX * FINER**k for k in range(math.ceil(steps) + 1))

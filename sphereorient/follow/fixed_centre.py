@@ -1,4 +1,4 @@
-"""The fixed centre of a ball that turns in one place, from a few frames; all frames are then measured there."""
+"""The fixed centre of a sphere that only rotates, from a few frames; all frames are then fitted there."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ITERATIONS = 3  # of the fits that tell the place: they begin where a search has
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FixedCentre:
-    """Centre of a ball in all frames; made by `find_fixed_centre`."""
+    """Centre of a sphere in all frames; made by `find_fixed_centre`."""
 
     position_lab_mm: Tensor  # (3,) float64
     covariance_mm2: Tensor  # (3, 3), of its error, which is one and the same in all frames
@@ -47,15 +47,9 @@ class FixedCentre:
 
 
 def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Frame]], score_min: float) -> FixedCentre | None:
-    """Find the centre of a ball that turns in one place.
+    """Find the centre of a sphere that only rotates, from n x C frames; poses below `score_min` are not used.
 
-    Args:
-        search: finds poses of single frames.
-        frames: n times C, spread over the movie.
-        score_min: of poses that are used.
-
-    Returns:
-        The centre; None where no frame has a pose that all of its pictures support.
+    None where no frame has a pose that all of its pictures support.
     """
     fitter = search.fitter
     with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
@@ -91,14 +85,9 @@ def _follows(fitter: Fitter, pixels: Pixels, place: Tensor, R: Tensor, use: Tens
 
 
 def mean_place(position_lab_mm: Tensor, covariance_mm2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the robust mean of positions; outliers hardly count.
+    """Return the robust mean (3,) of n >= 1 independent positions (n, 3), mm, and its covariance (3, 3).
 
-    Args:
-        position_lab_mm: (n, 3), independent, n >= 1.
-        covariance_mm2: (n, 3, 3), of them.
-
-    Returns:
-        The mean (3,) and its covariance (3, 3), wider where the measurements scatter more than their covariances.
+    It is wider where the positions scatter more than their covariances (n, 3, 3).
     """
     X, precision = position_lab_mm.double(), torch.linalg.inv(covariance_mm2.double())
     place, weight, away = X.median(0).values, X.new_ones(len(X)), X.new_zeros(len(X))

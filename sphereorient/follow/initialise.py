@@ -43,10 +43,10 @@ class Initialiser:
     finalists: int = 2  # poses that are fitted to all detail
 
     def poses(self, shots: Sequence[Frame]) -> Poses:
-        """Find all poses that the C pictures of one instant allow; pictures that cannot be used take no part.
+        """Find all poses that the C pictures of one instant allow; unusable pictures take no part.
 
         Black paint that hides half of a rim leaves arcs that a smaller circle fits as well: where no picture is
-        explained well, outlines nearer to the usual size are tried, and then the texture tells where the disk is.
+        explained well, outlines nearer to the usual size are tried, and the texture locates the disk.
         """
         poses = self._with_outlines(shots, self.locating)
         if not any(shot.usable for shot in shots):
@@ -121,7 +121,7 @@ class Initialiser:
         )
 
     def _narrow(self, pictures: Sequence[Picture], place: Tensor, precision: Tensor, R: Tensor, frame: Poses) -> Poses:
-        """Fit all starts to coarse detail, then the best distinct ones to finer and finer."""
+        """Fit all starts on the coarsest level, then the best distinct ones on finer levels."""
         fitter, optics, use = self.fitter, self.fitter.optics, frame.use
         X = place.expand(len(R), 3)
         # (level, every which pixel, iterations, poses kept): coarse detail needs few pixels, the last fit all.
@@ -151,12 +151,8 @@ def _best_score(poses: Poses) -> float:
 def explaining_first(nll: Tensor, score: Tensor) -> Tensor:
     """Return likelihoods (M,) in which poses that explain clearly less of the pictures come behind the others.
 
-    Likelihood forgives a wide scatter before it forgives worn paint or dirt: of a right pose a tenth of the pixels may
-    be off by many standard deviations, of a wrong one half of them by few of larger ones.
-
-    Args:
-        nll: (M,), negative log-likelihood.
-        score: (M,), share of the pictures' variance that each pose explains.
+    Likelihood forgives a wide scatter before it forgives worn paint or dirt. `nll` (M,) is the negative log-likelihood,
+    `score` (M,) the share of the pictures' variance that each pose explains.
     """
     behind = score < score.nan_to_num(-1.0).max() - CLEARLY_LESS
     if not bool((~behind & torch.isfinite(nll)).any()):
@@ -178,16 +174,9 @@ def distinct_indices(R: Tensor, nll: Tensor, count: int) -> Tensor:
 
 
 def relocalise(frame: Picture, view: CameraView, proposer: Proposer, locating: LocateSettings) -> Found:
-    """Find the place about a blob where the texture map explains a disk of the usual size best.
+    """Find the position about a blob where the texture map explains a disk of the usual size best.
 
-    Args:
-        frame: (H, W), grey levels.
-        view: of the camera.
-        proposer: its scores measure how well the map explains a disk.
-        locating: how blobs are found.
-
-    Returns:
-        An outline without edges, with a wide error; None with the reason without a blob.
+    The result is an outline without edges, with a wide error; None with the reason without a blob.
     """
     difference = view.background.difference(frame)
     blobs = find_blobs(difference, view.background.noise, view.diameter_px, locating)

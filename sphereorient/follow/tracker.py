@@ -1,4 +1,4 @@
-"""Poses of all frames: a full search at the first frame of a chunk, then each frame from the ones before it."""
+"""Poses of all frames: a full search at the first frame of a chunk, then each frame from those before it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ASTRAY_SHARE = 0.01  # of the radius: how far a place may be from the extrapolat
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Expected:
-    """What a frame's predecessors predict."""
+    """The prediction of a frame from its predecessors."""
 
     position_lab_mm: Tensor  # (3,)
     R_lab_body: Tensor  # (3, 3)
@@ -108,16 +108,10 @@ class _Chunk:
 
 
 class ChunkTracker:
-    """Follows the ball through chunks of frames, each chunk by itself.
+    """Tracks the sphere through chunks of frames, each chunk by itself from a search without history.
 
-    A chunk begins with a search without history. Frame numbers alone decide where chunks begin: no batch, worker or
-    restart can change a result, and a pose gone wrong is lost with its chunk.
-
-    Args:
-        appearance: of the movies.
-        search: finds poses without history.
-        settings: lengths of chunks and batches.
-        centre: of a ball that turns in one place; None: each frame gives its own.
+    Frame numbers alone decide where chunks begin: no batch, worker or restart can change a result, and a wrong pose is
+    lost with its chunk. `centre` is that of a sphere that only rotates; None: each frame has its own position.
     """
 
     def __init__(
@@ -131,10 +125,8 @@ class ChunkTracker:
         self.centre = centre
 
     def batches(self, frames: range) -> list[list[int]]:
-        """Return the lengths of the chunks of each batch; multiples of the setting `chunk_frames` begin a chunk.
-
-        Args:
-            frames: the experiment's frame numbers.
+        """Return the lengths of the chunks of each batch of an experiment's frames; chunks begin at multiples of
+        `chunk_frames`.
         """
         length = self.settings.chunk_frames
         firsts = [frames.start, *range((frames.start // length + 1) * length, frames.stop, length)] if frames else []
@@ -142,15 +134,10 @@ class ChunkTracker:
         return [lengths[k : k + self.settings.chunks] for k in range(0, len(lengths), self.settings.chunks)]
 
     def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
-        """Follow the chunks of one batch.
+        """Yield the poses of each frame of one batch, in order.
 
-        Args:
-            shots: of each view, the frames of these chunks in order.
-            batch: lengths of the chunks.
-            time_s: of the same frames.
-
-        Yields:
-            The poses of each frame, in order.
+        `shots` holds for each view the frames of these chunks, `batch` the lengths of the chunks, `time_s` the times of
+        all.
         """
         firsts = list(accumulate([0, *batch[:-1]]))
         chunks = [_Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
@@ -247,7 +234,7 @@ class ChunkTracker:
         precision: Tensor,
         rough: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Bring rough poses (B,) bool within reach of the finest detail, through coarser ones."""
+        """Bring rough poses (B,) bool into the basin of the finest level, through coarser ones."""
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
             pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px)
             fit = self.fitter.fit(pixels.thinned(every), X, R, use, level, iterations, precision)
@@ -258,7 +245,7 @@ class ChunkTracker:
     def _fitted(
         self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor
     ) -> FittedPoses:
-        """Fit poses that are about right: to some pixels, longer where that moves them, then to all."""
+        """Fit poses that are nearly right: to some pixels, repeated where that moves them, then to all."""
         if self.centre is None:
             # All cameras together give the place; one of two gives a distance that is known better from before.
             precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
@@ -280,7 +267,7 @@ class ChunkTracker:
         return fit
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
-        """Return where a further fit begins, (B, 3): where the last one ended, or at the fixed centre."""
+        """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
         return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
 
     def _far(self, fit: FittedPoses, use: Tensor) -> Tensor:
@@ -369,7 +356,7 @@ class ChunkTracker:
         return poses_of(fit, fit.nll.argsort(stable=True), _only(each, main)[0], reason)
 
     def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
-        """Fit poses to all pictures, kept if that explains all: a disk without an outline may still be there."""
+        """Fit poses to all pictures, kept if that explains all: a disk without an outline may be visible."""
         X, R, optics = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics
         every = usable.expand(len(poses), -1)
         for level, iterations in ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)):
@@ -384,14 +371,13 @@ class ChunkTracker:
 
 
 def _only(usable: Tensor, camera: int) -> Tensor:
-    """Return the mask (B, C) of one usable camera."""
     only = torch.zeros_like(usable)
     only[:, camera] = usable[:, camera]
     return only
 
 
 def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> FittedPoses:
-    """Record what a camera alone gives beside poses (B,) that it did not contribute to."""
+    """Record what a camera alone gives beside poses (B,) to which it did not contribute."""
     if not bool(rows.any()):
         return fit
     own = {

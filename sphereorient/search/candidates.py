@@ -1,4 +1,4 @@
-"""The record between orient and assemble: where could the sphere point, frame by frame."""
+"""The candidates of every frame, before the path."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from sphereorient.trajectory import Reason
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidates:
-    """Possible orientations of every frame of one camera; made by orient, read by assemble.
+    """Possible orientations of every frame of one camera: N frames, M rows.
 
-    The candidates of frame k are the rows `offset[k] .. offset[k + 1]`, best score first. N frames, M rows.
+    The candidates of frame k are the rows `offset[k] .. offset[k + 1]`, best score first.
     """
 
     offset: Tensor  # (N + 1,) int64, offset[0] = 0, offset[N] = M
@@ -24,7 +24,6 @@ class Candidates:
     reason: tuple[Reason, ...]  # N, why a frame has no candidate; Reason.OK where it has
 
     def __post_init__(self) -> None:
-        """Compare the lengths of the parts."""
         check_tail("Candidates.R_lab_body", self.R_lab_body, 3, 3)
         rows = int(self.offset[-1])
         if not len(self.R_lab_body) == len(self.score) == rows or len(self.reason) != len(self.offset) - 1:
@@ -33,7 +32,6 @@ class Candidates:
             raise ShapeError(refusal("Candidates", expected=expected, got=got, do="pass one row a candidate"))
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.offset) - 1
 
     @property

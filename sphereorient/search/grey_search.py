@@ -32,16 +32,15 @@ DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that 
 
 
 class GreySearch(nn.Module):
-    """Searches all of SO(3) for the views of a texture map that look like a disk, under any smooth light.
+    """Searches all of SO(3) on the CPU for the views of a texture map that look like a disk, under any smooth light.
 
-    The bank covers SO(3): every rotation is within (1/2 + 1/sqrt 2) step of a template (`so3.lattman_grid`), and
-    detail finer than `detail` is removed from templates and pictures, so that the nearest template still correlates.
-    It computes on the CPU.
+    The bank covers SO(3): every rotation is within (1/2 + 1/sqrt 2) step of a template (`so3.lattman_grid`), and detail
+    finer than `detail` is removed from templates and pictures, so that the nearest template still correlates.
 
     Args:
         texture: (H, 2 H), the texture map, 0 black .. 1 white.
         settings: of the search; None: the defaults.
-        blur: standard deviation of the pictures' own blur, radii, where it is wider than `detail` or nearly so.
+        blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
     """
 
     def __init__(
@@ -71,17 +70,14 @@ class GreySearch(nn.Module):
 
     @property
     def templates(self) -> Tensor:
-        """Rotations of the bank, (K, 3, 3) float32."""
+        """Return the rotations of the bank, (K, 3, 3) float32."""
         return self._grid.flatten(0, 1)
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
-        """Return the best orientations of each disk, padded.
+        """Return R_view_body (..., K, 3, 3) and score (..., K) float64 of each disk, best first; NaN beyond the last
+        one.
 
-        Args:
-            disks: (..., S, S), grey levels of any scale, the outline touching the borders.
-
-        Returns:
-            R_view_body (..., K, 3, 3) and score (..., K) float64, best first; NaN beyond a disk's last candidate.
+        `disks` (..., S, S) are grey levels of any scale, the outline touching the borders.
 
         Raises:
             ShapeError: the disks are of another size.
@@ -103,15 +99,10 @@ class GreySearch(nn.Module):
         return (torch._int_mm(steps, self._bank.T) / scale**2).reshape(*grey.shape[:-2], -1)
 
     def propose(self, disks: Tensor) -> Proposals:
-        """Propose the best orientations that a disk allows, at least `distinct_deg` apart.
+        """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
 
-        Args:
-            disks: (F, S, S) float32, grey levels of any scale, the outline touching the borders.
-
-        Returns:
-            Proposals, best first. The score is the share of the disk's deviation from smooth light that the paint
-            explains, 0 .. 1 (the square of their correlation). A disk whose best score stays below `score_min` has
-            none (`LOW_SCORE`).
+        The outline touches the borders. The score is the share of the disk's deviation from smooth light that the paint
+        explains, 0 .. 1 (the square of their correlation). A disk below `score_min` has no proposal (`LOW_SCORE`).
 
         Raises:
             ShapeError: the disks are of another size.
@@ -126,14 +117,9 @@ class GreySearch(nn.Module):
         return Proposals.joined(parts)
 
     def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
-        """Compare disks with the whole bank.
+        """Return the best templates of the best groups, (F, M) int64, best first, and which are peaks, (F, M) bool.
 
-        Args:
-            disks: (F, S, S) float32; the scores of all are held at once, 36 kB each.
-
-        Returns:
-            Places of the best templates of the best groups, (F, M) int64 in `templates`, best first; and which of
-            them are peaks, (F, M) bool.
+        All scores of the disks (F, S, S) float32 are held at once, 36 kB each.
         """
         scores = torch._int_mm(self._normalised(disks), self._bank.T)
         place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
@@ -154,7 +140,7 @@ class GreySearch(nn.Module):
         return torch.cat([_steps(self._normalise(self._view.picture(paint.sample(R.mT @ normal)[0]))) for R in chunks])
 
     def _refined(self, disk: Tensor, starts: Tensor) -> Proposals:
-        """Refine the peaks of one disk: its proposals, best first."""
+        """Refine the peaks of one disk; return its proposals, best first."""
         settings = self._settings
         R, score = refine_rotation(self._rough, level_reference(self._rough, disk), starts, settings.rough_steps)
         R = R[self._distinct(R, score)[: settings.finalists]]

@@ -1,4 +1,4 @@
-"""Pictures of the ball freed of light: by how much each place differs from its neighbourhood."""
+"""Local normalisation: pictures of the sphere without the light."""
 
 from __future__ import annotations
 
@@ -12,18 +12,13 @@ RIM_WEIGHT_MIN = 0.02  # of the outermost pixels in the comparison
 
 
 def rim_share(size_px: int) -> Tensor:
-    """Return how far the pixels of a disk's picture may be trusted not to show what is beside the ball, (S, S)."""
+    """Return the weight (S, S), 0 .. 1, of a disk's pixels by their distance from the limb."""
     from_limb: Tensor = 1 - disk_offsets(size_px).norm(dim=-1)
     return (from_limb / RIM).clamp(0, 1).float()
 
 
 class Blur:
-    """A Gaussian over the pictures of disks, in which pixels beyond the limb have no share.
-
-    Args:
-        size_px: side S of the pictures, px; the disk fills them.
-        deviation: standard deviation, radii.
-    """
+    """A Gaussian over disks that fill (S, S) pictures, without the pixels beyond the limb; `deviation` in radii."""
 
     def __init__(self, size_px: int, deviation: float) -> None:
         at = (torch.arange(size_px, dtype=torch.float64) + 0.5) * (2.0 / size_px)
@@ -37,16 +32,14 @@ class Blur:
 
 
 class LocalNormalisation:
-    """Makes pictures under any smooth light comparable: the local mean taken off, what sticks out cut off.
-
-    The same is done to templates and to pictures, so that both lose the same; all sizes in radii of the disk.
+    """Makes pictures under any smooth light comparable, templates and pictures alike: grey less the local mean,
+    clipped.
 
     Args:
         size_px: side S of the pictures, px; the disk fills them.
-        detail: standard deviation of the Gaussian laid over a picture first; what is finer does not count.
-        window: standard deviation of the neighbourhood.
-        clip: differences from the local mean beyond this many deviations of the disk are cut off: reflections, and
-            the contrast of well lit places over dim ones.
+        detail: standard deviation of the first blur, radii; finer detail does not count.
+        window: standard deviation of the neighbourhood, radii.
+        clip: limit of the difference from the local mean, in deviations of the disk (reflections, uneven light).
     """
 
     def __init__(self, size_px: int, *, detail: float, window: float, clip: float) -> None:

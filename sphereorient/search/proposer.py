@@ -1,4 +1,4 @@
-"""What the pipeline asks of anyone who proposes orientations: the template search, later a trained network."""
+"""The protocol of proposers of orientations: template search, network, or both."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from sphereorient.trajectory import Reason
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Proposals:
-    """Possible orientations of a batch of disks in their own view frames; made by a Proposer, read by the pipeline.
+    """Possible orientations of a batch of disks in their own view frames: F disks, M rows.
 
-    Those of disk f are the rows `offset[f] .. offset[f + 1]`, best score first. F disks, M rows.
+    Those of disk f are the rows `offset[f] .. offset[f + 1]`, best score first.
     """
 
     offset: Tensor  # (F + 1,) int64
@@ -26,7 +26,7 @@ class Proposals:
 
     @classmethod
     def none(cls, reason: Sequence[Reason]) -> Self:
-        """Return the proposals of disks that have none, for these reasons."""
+        """Return the proposals of disks without any, for these reasons."""
         return cls(
             offset=torch.zeros(len(reason) + 1, dtype=torch.int64),
             R_view_body=torch.zeros(0, 3, 3, dtype=torch.float64),
@@ -46,11 +46,7 @@ class Proposals:
         )
 
     def spread(self, placed: Tensor, reason: Sequence[Reason]) -> Self:
-        """Return one entry a frame where only some frames had a disk.
-
-        Args:
-            placed: (N,) bool, frames whose disk was asked for, F of them.
-            reason: N, why the others had none.
+        """Return one entry per frame; `placed` (N,) bool marks the F frames with a disk, `reason` (N) serves the rest.
         """
         counts = torch.zeros(len(placed), dtype=torch.int64)
         counts[placed] = self.offset.diff()

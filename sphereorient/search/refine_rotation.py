@@ -1,4 +1,4 @@
-"""From a rough orientation to the best one nearby: Gauss-Newton on grey values, the light solved inside."""
+"""From a rough orientation to the best one nearby: Gauss-Newton on grey values, the light eliminated."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PIXEL = 0.5  # standard deviation of a pixel and its resampling, px
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DetailLevel:
-    """One width of detail, and the pixels that are looked at there; P of them."""
+    """One pyramid level and its P pixels."""
 
     blur: Blur
     paint: TextureTable
@@ -35,14 +35,14 @@ class DetailLevel:
 
 
 def detail_level(view: DiskView, paint: TextureTable, detail: float, every: int, blur: float = 0.0) -> DetailLevel:
-    """Prepare a level.
+    """Prepare a pyramid level.
 
     Args:
         view: of the pictures.
         paint: as fine as `detail` at least.
         detail: standard deviation of the Gaussian on the sphere, rad, and on the picture, radii.
         every: 1: all pixels, 2: like the white fields of a chess board.
-        blur: standard deviation of the pictures' own blur, radii, if any is to be reckoned with.
+        blur: standard deviation of the pictures' own blur, radii.
     """
     size = view.size_px
     normal = view.normal_view.T.float()
@@ -64,7 +64,7 @@ def detail_level(view: DiskView, paint: TextureTable, detail: float, every: int,
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Target:
-    """What a level sees of one disk; made by `level_reference`, read by `climb`."""
+    """The pixels of one disk at one level."""
 
     grey: Tensor  # (P,), in units of its deviation from the smoothest light
     unexplained: Tensor  # (), cost where there is light only and no paint
@@ -82,18 +82,10 @@ def level_reference(level: DetailLevel, disk: Tensor) -> Target:
 
 
 def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Turn orientations towards the best fit nearby.
+    """Fit rough orientations R_view_body (Q, 3, 3) float32 by Gauss-Newton steps; return them with scores (Q,).
 
-    Args:
-        level: of detail.
-        target: the disk at this level.
-        R_view_body: (Q, 3, 3) float32, starts.
-        steps: Gauss-Newton steps.
-
-    Returns:
-        R_view_body (Q, 3, 3), and the score (Q,): the share of the disk's deviation from smooth light that paint
-        explains, 1 at most, 0 and below where it explains nothing.
-
+    The score is the share of the disk's deviation from smooth light that paint explains, at most 1; 0 and below where
+    it explains nothing.
     Source: variable projection, Golub and Pereyra 1973; robust weights, Geman and McClure 1987.
     """
     R, weight, whites = R_view_body, level.weight.expand(len(R_view_body), -1), len(level.white)
@@ -132,17 +124,17 @@ def _cost(level: DetailLevel, residual: Tensor) -> Tensor:
 
 
 def _light_columns(level: DetailLevel, value: Tensor) -> Tensor:
-    """What the light's coefficients multiply, (Q, 9, P)."""
+    """Return the columns (Q, 9, P) of the light's coefficients."""
     return torch.cat([value[:, None] * level.white, level.black.expand(len(value), -1, -1)], dim=1)
 
 
 def _trust(residual: Tensor) -> Tensor:
-    """Weight of a pixel, 1 .. 0, by its residual in deviations of the picture."""
+    """Return the weight of a pixel, 1 .. 0, by its residual in deviations of the picture."""
     return 1.0 / (1.0 + residual.square()).square()
 
 
 def _solved(columns: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
-    """Weighted least squares, (Q, C) float32, of columns (Q, C, P)."""
+    """Return the weighted least squares solution, (Q, C) float32, of columns (Q, C, P)."""
     weighted = columns * weight.expand(len(columns), -1)[:, None]
     normal = (weighted @ columns.mT).double()
     right = (weighted @ grey[..., None]).double()

@@ -25,8 +25,8 @@ class TemplateSearch:
 
     Args:
         texture: (H, W), the map, 0 black .. 1 white.
-        size_px: side of the disks at real size; rounded up to an even number, as the bank is made at half of it.
-        settings: of the room.
+        size_px: side of the disks at full size; rounded up to an even number, as the bank is made at half of it.
+        settings: of the search.
     """
 
     def __init__(self, texture: Tensor, size_px: int, settings: OrientSettings) -> None:
@@ -47,14 +47,9 @@ class TemplateSearch:
         return self._size_px
 
     def propose(self, disks: Tensor) -> Proposals:
-        """Propose the best orientation of each group that a disk allows.
+        """Propose the best orientation of each group for disks (F, S, S) float32, whose outlines touch the borders.
 
-        Args:
-            disks: (F, S, S) float32, grey levels, cropped so that the outline touches the borders.
-
-        Returns:
-            Proposals; a disk that fits nearly everywhere gives none (`RUNAWAY`), as does one whose best T stays below
-            `score_min` (`LOW_SCORE`).
+        A disk that fits nearly everywhere has no proposal (`RUNAWAY`), nor one below `score_min` (`LOW_SCORE`).
         """
         parts: list[Proposals] = []
         for first in range(0, len(disks), BATCH):
@@ -66,13 +61,13 @@ class TemplateSearch:
         return Proposals.joined(parts) if parts else Proposals.none(())
 
     def _coarse_scores(self, paint: Tensor) -> Tensor:
-        """T of every coarse template, (F, K): 1/2 + sum of products / (2 pixels counted) (docs/errata.md A2)."""
+        """Return T of every coarse template, (F, K): 1/2 + sum of products / (2 pixels counted) (docs/errata.md A2)."""
         half = torch.nn.functional.avg_pool2d(paint[:, None], 2)[:, 0]
         seen = half[:, self._coarse.inside][:, self._coarse_used]
         return 0.5 + seen @ self._bank.T / (2 * seen.shape[1])
 
     def _groups(self, score: Tensor) -> list[Tensor]:
-        """Best member of each group of possible orientations, best first, for each disk: lists of grid indices."""
+        """Return the grid index of the best member of each group, best first, for each disk."""
         possible = score > score.amax(1, keepdim=True) - self._settings.score_margin
         flat = self._grid.flatten(1)
         near = 1 + 2 * math.cos(math.radians(self._settings.group_deg))  # trace of A^T B at that angle
@@ -88,7 +83,7 @@ class TemplateSearch:
         return [torch.stack(pick) if pick else torch.zeros(0, dtype=torch.long) for pick in picks]
 
     def _fine_search(self, paint: Tensor, group: Tensor) -> Proposals:
-        """Climb from each group's best on the fine grid: the proposals of one disk, best first."""
+        """Refine each group's best on the fine grid; return the proposals of one disk, best first."""
         if len(group) > self._settings.groups_max:
             return Proposals.none([Reason.RUNAWAY])
         seen = paint[self._fine.inside][self._fine_used]
@@ -111,7 +106,7 @@ class TemplateSearch:
         )
 
     def _climb(self, seen: Tensor, R_start: Tensor) -> tuple[Tensor, Tensor]:
-        """Best of the fine grid about a rotation; where it sits at the grid's edge, once more about it."""
+        """Return the best of the fine grid about a rotation; where it is at the grid's edge, once more about it."""
         normal = self._fine.normal_view[self._fine_used]
         edge = math.radians(self._settings.fine_radius_deg - self._settings.fine_step_deg)
         R, score = R_start, seen.new_zeros(())
@@ -126,6 +121,6 @@ class TemplateSearch:
 
 
 def _counted(view: DiskView, disk_share: float) -> tuple[DiskView, Tensor]:
-    """A view and which of its disk's pixels are compared: those within a share of the radius, (P,) bool."""
+    """Return a view and which of its pixels are compared, (P,) bool: those within a share of the radius."""
     radius = disk_offsets(view.size_px).norm(dim=-1)
     return view, (radius <= disk_share)[view.inside]

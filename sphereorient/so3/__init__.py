@@ -1,4 +1,4 @@
-"""Rotations and grids of rotations; knows nothing of pictures.
+"""Rotations and grids of rotations.
 
 Rotations are (..., 3, 3) matrices that act on columns; rotation vectors (..., 3) are axis times angle in rad, by the
 right-hand rule. No function checks that a matrix is a rotation; `nearest_rotation` makes one.

@@ -10,13 +10,7 @@ from sphereorient.errors import check_tail
 
 
 def exp(rotvec: Tensor) -> Tensor:
-    """Return the rotation about an axis by an angle.
-
-    Args:
-        rotvec: (..., 3), axis times angle, rad, any length; the axis by the right-hand rule.
-
-    Returns:
-        (..., 3, 3), the rotation; its columns are the turned unit vectors, in the frame of `rotvec`.
+    """Return the rotations (..., 3, 3) of rotation vectors (..., 3), rad, of any length.
 
     Source: Rodrigues' formula, as the paper prints it.
     """
@@ -25,15 +19,10 @@ def exp(rotvec: Tensor) -> Tensor:
 
 
 def log(R: Tensor) -> Tensor:
-    """Return the rotation vector of a rotation, the shortest one.
+    """Return the shortest rotation vectors (..., 3), rad, of rotations (..., 3, 3); a reflection gives a meaningless
+    value.
 
-    Args:
-        R: (..., 3, 3), rotations; not checked, and a reflection gives a value without meaning.
-
-    Returns:
-        (..., 3), axis times angle, rad, of length <= pi up to rounding. A turn by exactly pi has two; one of them
-        comes, always the same. Its gradient is finite there too.
-
+    At exactly pi the choice between the two vectors is always the same, and the gradient is finite.
     Source: textbook; through the quaternion's largest component, so it keeps all digits at 0 and at pi.
     """
     check_tail("R", R, 3, 3)

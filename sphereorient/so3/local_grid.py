@@ -1,4 +1,4 @@
-"""Rotations spread evenly around the unit rotation."""
+"""A grid of rotations around the unit rotation."""
 
 from __future__ import annotations
 
@@ -18,26 +18,15 @@ HALF_EDGE = 2 ** (1 / 3) / 2
 def local_grid(
     step_rad: float, radius_rad: float, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> Tensor:
-    """Return rotations spread evenly over those that turn by at most an angle.
+    """Return rotations (M, 3, 3) spread evenly up to the angle radius_rad (0 .. pi), the unit first, then by angle.
 
-    Their rotation vectors lie on a body-centred cubic lattice, the best covering of space by a lattice, with one point
-    per step_rad^3 as in a cubic lattice of this step. Covering radius c = 0.704 step_rad (cubic: 0.866): every rotation
-    by at most radius_rad - c is within c of one of them, every one by at most radius_rad within 2 c (exp brings
-    rotation vectors nowhere further apart).
-
-    Args:
-        step_rad: rad, cube root of the volume per rotation.
-        radius_rad: rad, 0 .. pi, the largest angle.
-        dtype: of the result.
-        device: of the result.
-
-    Returns:
-        (M, 3, 3), the unit rotation first, then by angle; with each rotation also its inverse.
+    The rotation vectors are a body-centred cubic lattice with one point per step_rad^3, in rad; each rotation's inverse
+    is included. Covering radius c = 0.704 step_rad: every rotation by at most radius_rad - c is within c of the grid,
+    every one by at most radius_rad within 2 c.
+    Source: Conway and Sloane, Sphere Packings, Lattices and Groups, ch. 2 (covering radius sqrt(5)/4 of the edge).
 
     Raises:
         SettingsError: the step is not above 0, or the radius not in 0 .. pi.
-
-    Source: Conway and Sloane, Sphere Packings, Lattices and Groups, ch. 2 (covering radius sqrt(5)/4 of the edge).
     """
     if not step_rad > 0:
         raise SettingsError(refusal("step_rad", expected="above 0", got=f"{step_rad}", do="give the step in rad"))

@@ -1,4 +1,4 @@
-"""Matrices that are nearly rotations."""
+"""The rotation nearest to a matrix."""
 
 from __future__ import annotations
 
@@ -9,16 +9,10 @@ from sphereorient.errors import check_tail
 
 
 def nearest_rotation(M: Tensor) -> Tensor:
-    """Return the rotation nearest to a matrix, by the sum of squared differences.
+    """Return the rotation nearest to any matrix M (..., 3, 3), by the sum of squared differences; NaN if not finite.
 
-    Args:
-        M: (..., 3, 3), any matrix, any unit.
-
-    Returns:
-        (..., 3, 3), orthogonal, determinant +1; NaN where M has a NaN or infinity. Where several rotations are equally
-        near (rank below 2, or a reflection with its two smallest singular values equal) one of them comes, with
-        gradient 0 in the directions that are undecided. First derivatives only.
-
+    Where several are equally near (rank below 2, or a reflection with equal smallest singular values) it is one of
+    them, with gradient 0 in the undetermined directions. First derivatives only.
     Source: Kabsch 1976, the paper's R_kabsch; derivative of the polar factor, textbook.
     """
     check_tail("M", M, 3, 3)
