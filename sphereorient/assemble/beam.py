@@ -51,7 +51,6 @@ class Histories:
 
 def search(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> Histories:
     """Find the most probable history of a movie, and each candidate's probability; `gap_frames_max` in frame intervals.
-
     Source: Viterbi 1967; Baum and others 1970 (forward-backward); pruned as in a beam search.
     """
     return _Search(rows, cost, gap_frames_max).run()
@@ -228,7 +227,6 @@ class _Search:
 
     def _pins(self, length: int) -> tuple[Floats, Floats, Bools, Ints]:
         """Find runs of frames with one candidate each that follow the motion: all good histories contain them.
-
         Return the cost (F,) and rotation (F, 3) from the two frames before; (F,) bool, the first frame of each run
         inside its margins; (F,), the last frame of the run at its second frame, -1 elsewhere.
         """
@@ -302,7 +300,6 @@ class _Search:
 
 def still_log_ratio(rows: CandidateRows, cost: SecondOrderCost) -> Floats:
     """Return the log density ratio (M,) of each row if a candidate of the last frames stays; -inf in the first frame.
-
     False candidates (glare, dirt) stay, so that following the motion proves little for a candidate at rest.
     """
     best = np.full(len(rows.variance), -np.inf)

@@ -65,7 +65,6 @@ def soft_track(
 
 def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
     """Return the edges (..., N - 1, C, C) of `soft_track`: half the squared rotation, in units of `turn_rad`.
-
     `R_lab_body` (..., N, C, 3, 3) is finite everywhere. An edge starts at the last frame with candidates in the mask
     (..., N, C).
     """
@@ -78,11 +77,9 @@ def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
 
 
 def expected_orientation(R_lab_body: Tensor, marginals: Tensor) -> Tensor:
-    """Return the rotation (..., N, 3, 3) with the least mean squared chord to candidates, weighted by their
-    probabilities.
-
-    R_lab_body (..., N, C, 3, 3) may hold NaN, which does not count; marginals (..., N, C) are not negative. NaN where
-    all marginals are 0. The gradient is finite even where several rotations are equally near.
+    """Return the rotation (..., N, 3, 3) with the least weighted mean squared chord to R_lab_body (..., N, C, 3, 3).
+    NaN in R_lab_body does not count; marginals (..., N, C) are not negative; the result is NaN where all are 0. The
+    gradient is finite even where several rotations are equally near.
     Source: chordal mean, Hartley et al. 2013, Rotation averaging, 5.1; projected by `so3.nearest_rotation`.
 
     Raises:

@@ -29,7 +29,6 @@ MOST |= {"stuck_probability": 0.5, "follow_probability": 0.5}
 
 class PathLayer(nn.Module):
     """Choose among candidate orientations along time; the parameters of the cost can be learnt.
-
     Order 1 is the paper's: an edge costs d(A, B) (2 - T_A - T_B) / dt. Order 2 is that of `track`, `SecondOrderCost`,
     with one more place C for frames without a right candidate. Unlike in `track`, a break of the motion is a mixture
     and no state, rotations between frames visited are below half a turn, and omega is forgotten after a miss.

@@ -39,7 +39,6 @@ class Path:
 
 def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings) -> dict[str, Path]:
     """Choose one candidate of each frame for each camera, by the least cost over the whole movie.
-
     `time_s` (N,) increases. Frames without candidates of `quality_min` are skipped: the cost of the link over them is
     divided by its time.
     Source: the paper's assembly of III (directed graph between direct neighbours); docs/errata.md A6.
@@ -93,7 +92,6 @@ def edges_over_gaps(R_lab_body: Tensor, score: Tensor, time_s: Tensor, mask: Ten
 
 def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:
     """Return cost xi (rad/s) and angle (rad) of the link that enters each frame, (N,) each, NaN without a link.
-
     R_lab_body (N, 3, 3) and score (N,), the quality T, are NaN in frames that are skipped.
     """
     frame = torch.nonzero(torch.isfinite(score))[:, 0]
@@ -108,7 +106,6 @@ def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Te
 
 def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
     """Return the paper's cost, rad/s, from each candidate to each of the next step, (..., N - 1, C, C), rows from.
-
     It is d(A, B) (2 - T_A - T_B) / dt, for R_lab_body (..., N, C, 3, 3), score T (..., N, C) and increasing time_s
     (..., N).
     Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
@@ -144,7 +141,6 @@ def moving(values: Tensor, window: int) -> Tensor:
 
 def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
     """Return the links (N,) bool with xi many robust deviations (MAD) above the moving median, and a large angle.
-
     xi (N,), rad/s, and turn (N,), rad, are cost and angle of the link that enters each frame; xi is NaN without a link.
     A multiple of the median would not do: that of a fast sphere is large.
     Source: the paper's assembly of III (spikes of xi), which gives no numbers.
@@ -158,10 +154,8 @@ def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
 
 def number_segments(present: Tensor, spike: Tensor, gap_frames_max: int) -> Tensor:
     """Number the segments of one motion: (N,) int64 from 0, -1 outside; gaps up to `gap_frames_max` inside belong to
-    them.
-
-    `present` (N,) marks frames with an orientation, `spike` (N,) frames that a spike enters. A single wrong frame is a
-    segment of its own.
+    them. `present` (N,) marks frames with an orientation, `spike` (N,) frames that a spike enters. A single wrong frame
+    is a segment of its own.
     """
     frame = torch.nonzero(present)[:, 0]
     number = torch.full(present.shape, -1, dtype=torch.int64, device=present.device)

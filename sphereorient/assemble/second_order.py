@@ -77,10 +77,9 @@ class Chosen:
 
 def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings) -> Chosen:
     """Choose one candidate of each frame, or none, so that the history has the highest probability by
-    `SecondOrderCost`.
-
-    `time_s` (N,) increases. Flags of the result: `AMBIGUOUS` where the choice is not sure, `RECOVERED` on the first
-    frame with an orientation after a gap or a break, `SPIKE` where a rotation does not follow from the motion.
+    `SecondOrderCost`. `time_s` (N,) increases. Flags of the result: `AMBIGUOUS` where the choice is not sure,
+    `RECOVERED` on the first frame with an orientation after a gap or a break, `SPIKE` where a rotation does not follow
+    from the motion.
     Source: textbook hidden Markov model of second order; unlike the paper's cost, a prior on the change of omega does
     not favour candidates at rest (docs/errata.md A6).
 
@@ -218,7 +217,6 @@ def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> S
 
 def _misfits(rows: CandidateRows, histories: Histories, cost: SecondOrderCost) -> tuple[Ints, Floats, Floats, Floats]:
     """Compare each orientation of a history with the prediction from the two before it.
-
     Return frames (L,) with a prediction, and for each: misfit angle, rad; its variance per axis, rad^2, from the errors
     of the orientations; its drift per unit of acceleration, s^2.
     """
@@ -241,7 +239,6 @@ def _acceleration(
     rows: CandidateRows, searched: Sequence[tuple[CandidateRows, Histories]], cost: SecondOrderCost
 ) -> float:
     """Return the scale of the acceleration in the histories of some parts of a movie, rad/s^2.
-
     Source: textbook, expectation and maximisation of Student's t; its weights make a few wrong links harmless.
     """
     links = [_misfits(part, histories, cost)[1:] for part, histories in searched]

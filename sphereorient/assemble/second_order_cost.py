@@ -75,7 +75,6 @@ class SecondOrderCost:
 
     def log_ratio(self, misfit: Values, variance: Values) -> Values:
         """Return the log density of Student's t in three dimensions, over the uniform one.
-
         `misfit` (...), rad^2, is the squared angle to the expected rotation, or (2 sin(angle / 2))^2; `variance` (...),
         rad^2, the scale per axis.
         """
@@ -109,7 +108,6 @@ class SecondOrderCost:
 
     def candidate(self, log_ratio: Values, still: Values) -> Values:
         """Return the cost of a candidate: its log density if it is false, less that if it is right.
-
         A false candidate stands anywhere, or where one stood before, or follows the motion by chance. `log_ratio` (...)
         is that by the motion, `still` (...) that of staying since a frame before, -inf without such a frame. Staying
         never explains better what the motion explains: otherwise noise would lose a sphere at rest.

@@ -115,7 +115,6 @@ def soft_min(values: Floats, group: Ints, size: int) -> Floats:
 
 def rotation_between(R_from: Floats, R_to: Floats) -> tuple[Floats, Floats]:
     """Return angle (...), rad, 0 .. pi, and lab axis (..., 3) of the shortest rotation from R_from to R_to (..., 3, 3).
-
     The axis of no rotation is 0.
     """
     turn = R_to @ np.swapaxes(R_from, -1, -2)

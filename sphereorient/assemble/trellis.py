@@ -35,10 +35,8 @@ def shortest_path(
     edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None = None, triple_cost: Tensor | None = None
 ) -> ShortestPath:
     """Find the cheapest path that visits one candidate in each step; of equal paths the one with the lowest last
-    indices.
-
-    Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with candidates.
-    Movies of different length share a batch by empty steps at the end.
+    indices. Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with
+    candidates. Movies of different length share a batch by empty steps at the end.
     Source: Bellman 1957, Viterbi 1967.
 
     Args:
@@ -82,7 +80,6 @@ def soft_path(
     triple_cost: Tensor | None = None,
 ) -> SoftPath:
     """Weigh all paths by exp(-cost / temperature), temperature > 0; the other arguments are those of `shortest_path`.
-
     Source: Baum and others 1970 (forward-backward); Mensch and Blondel 2018, Differentiable dynamic programming.
 
     Raises:

@@ -94,7 +94,6 @@ def fuse(
 
 def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tensor:
     """Return the moving variance (K, N) of each camera's xi (N,), above 0; only ratios between cameras have a meaning.
-
     It is within a factor of `VARIANCE_RANGE` of the camera's median, which replaces it where `LINKS_MIN` links are not
     near.
     """
@@ -148,7 +147,6 @@ def _apart(tracks: Sequence[Track]) -> Tensor:
 
 def _sigma(variance: Tensor, share: Tensor, apart: Tensor, calm: Tensor) -> Tensor:
     """Return the standard deviation per axis of the mean, (N,), rad.
-
     With errors of variance s^2 variance_i per axis, d^2 / (s^2 (variance_1 + variance_2)) is chi-squared with three
     degrees of freedom. Its median gives s^2 in spite of a few wrong frames. Frames near a spike are left out where
     possible: the spike raises their variance, not their d.

@@ -83,7 +83,6 @@ def estimate_appearance(
     first: Initialiser, frames: Sequence[Sequence[Frame]], base: TextureTable, settings: RefineSettings
 ) -> Appearance:
     """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies.
-
     `first` finds poses with an assumed blur and light; `base` is the finest table of the texture.
 
     Raises:
@@ -146,7 +145,6 @@ def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
 
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
     """Measure on a few frames whether the cameras see one sphere at one position.
-
     Return the variance left unexplained by all cameras together over that by each alone, and the distance between the
     lines of sight, px; both in the worst quarter of frames, as cameras may agree in a part of the volume.
     """
@@ -206,7 +204,6 @@ def _scores(found: Sequence[Poses]) -> tuple[float, float]:
 
 def _times_better(found: Sequence[Poses]) -> float:
     """Return the median ratio of the variances that the second and the best pose of a clear frame leave unexplained.
-
     Blurred pictures are mostly disk, which any pose explains; only the ratio separates poses.
     """
     rows = [(found[k].score[:2], found[k].use) for k in _clear(found) if len(found[k]) > 1]
@@ -251,7 +248,6 @@ def _light_and_blur(
     fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor, *, given: bool
 ) -> tuple[Fitter, FittedPoses]:
     """Estimate light, then blur, then light again; return the fitter that has both, and its fit.
-
     Light estimated with a wrong blur favours that blur: for blurred pictures they alternate several times.
     """
     diameter_px = widest_px(fitter.views)

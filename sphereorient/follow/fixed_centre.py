@@ -48,7 +48,6 @@ class FixedCentre:
 
 def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Frame]], score_min: float) -> FixedCentre | None:
     """Find the centre of a sphere that only rotates, from n x C frames; poses below `score_min` are not used.
-
     None where no frame has a pose that all of its pictures support.
     """
     fitter = search.fitter
@@ -86,7 +85,6 @@ def _follows(fitter: Fitter, pixels: Pixels, place: Tensor, R: Tensor, use: Tens
 
 def mean_place(position_lab_mm: Tensor, covariance_mm2: Tensor) -> tuple[Tensor, Tensor]:
     """Return the robust mean (3,) of n >= 1 independent positions (n, 3), mm, and its covariance (3, 3).
-
     It is wider where the positions scatter more than their covariances (n, 3, 3).
     """
     X, precision = position_lab_mm.double(), torch.linalg.inv(covariance_mm2.double())
@@ -105,7 +103,6 @@ def mean_place(position_lab_mm: Tensor, covariance_mm2: Tensor) -> tuple[Tensor,
 
 def _edge(fitter: Fitter, position_lab_mm: Tensor) -> Tensor:
     """Return the covariance (3, 3), mm^2, of errors that all frames share.
-
     The modelled limb may lie EDGE_PX off to one side, or all around; with one camera the latter is a distance.
     """
     radius_px = torch.stack([view.radius_px(position_lab_mm, fitter.radius_mm) for view in fitter.views])

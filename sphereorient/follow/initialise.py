@@ -44,7 +44,6 @@ class Initialiser:
 
     def poses(self, shots: Sequence[Frame]) -> Poses:
         """Find all poses that the C pictures of one instant allow; unusable pictures take no part.
-
         Black paint that hides half of a rim leaves arcs that a smaller circle fits as well: where no picture is
         explained well, outlines nearer to the usual size are tried, and the texture locates the disk.
         """
@@ -150,7 +149,6 @@ def _best_score(poses: Poses) -> float:
 
 def explaining_first(nll: Tensor, score: Tensor) -> Tensor:
     """Return likelihoods (M,) in which poses that explain clearly less of the pictures come behind the others.
-
     Likelihood forgives a wide scatter before it forgives worn paint or dirt. `nll` (M,) is the negative log-likelihood,
     `score` (M,) the share of the pictures' variance that each pose explains.
     """
@@ -175,7 +173,6 @@ def distinct_indices(R: Tensor, nll: Tensor, count: int) -> Tensor:
 
 def relocalise(frame: Picture, view: CameraView, proposer: Proposer, locating: LocateSettings) -> Found:
     """Find the position about a blob where the texture map explains a disk of the usual size best.
-
     The result is an outline without edges, with a wide error; None with the reason without a blob.
     """
     difference = view.background.difference(frame)

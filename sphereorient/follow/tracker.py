@@ -109,7 +109,6 @@ class _Chunk:
 
 class ChunkTracker:
     """Tracks the sphere through chunks of frames, each chunk by itself from a search without history.
-
     Frame numbers alone decide where chunks begin: no batch, worker or restart can change a result, and a wrong pose is
     lost with its chunk. `centre` is that of a sphere that only rotates; None: each frame has its own position.
     """
@@ -135,7 +134,6 @@ class ChunkTracker:
 
     def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
         """Yield the poses of each frame of one batch, in order.
-
         `shots` holds for each view the frames of these chunks, `batch` the lengths of the chunks, `time_s` the times of
         all.
         """

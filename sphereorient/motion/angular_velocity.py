@@ -57,7 +57,6 @@ def omega_from_orientations(
 
 def to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
     """Return the body components R^T x (..., 3) of vectors in lab components, in the unit of x.
-
     It also serves alpha: the derivative of R^T omega_lab is R^T alpha_lab, because omega x omega vanishes.
     Source: docs/errata.md E6.
     """
@@ -96,7 +95,6 @@ def mean_over_separations(
     turns: Tensor, usable: Tensor, dt_s: float, separations: Sequence[int], min_separations: int
 ) -> tuple[Tensor, Tensor]:
     """Return the weighted mean omega of S separations and its standard error, (..., N, 3), rad/s.
-
     `turns` (..., N, S, 3, 3) lead from frame k - m to k + m in lab components; unit where not `usable` (..., N, S).
     """
     m = torch.as_tensor(separations, dtype=turns.dtype, device=turns.device)
@@ -123,7 +121,6 @@ def _shifted(R: Tensor, m: int) -> Tensor:
 
 def kabsch(points_a: Tensor, points_b: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return the rotation (..., 3, 3) from points_a (..., K, 3) onto points_b, any unit, by weighted least squares.
-
     Both sets are centred first. The rotation is proper also for points in a plane and for mirror images; points on one
     line leave it undetermined (not checked). Weights (..., K) are not negative; None: all equal.
     Source: W. Kabsch, Acta Cryst. A32, 922 (1976); the paper's R_kabsch, its increment T, docs/errata.md E8.
@@ -146,7 +143,6 @@ def omega_from_markers(
     min_separations: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """Return omega_lab and its standard error as `omega_from_orientations`, from markers seen in both frames of a pair.
-
     `points_lab` (..., N, K, 3), any unit, is NaN where a marker is not seen. The body components stay unknown.
     Source: the paper, section III, R_kabsch; docs/errata.md E8.
     """

@@ -19,7 +19,6 @@ def gaussian_derivative(
     x: Tensor, dt_s: float, sigma_frames: float, order: Order, truncate: float = TRUNCATE
 ) -> Tensor:
     """Return the derivative (..., N, D), x's unit / s^order, by a Gaussian kernel; order 0 only smooths.
-
     The result is NaN where the window reaches a missing value or an end. Polynomials up to degree order + 1 come out
     exactly. A sine of f cycles per frame is damped by about exp(-(2 pi f sigma)^2 / 2).
     Source: the paper, section III, differentiation of trajectories with a Gaussian kernel.
@@ -41,7 +40,6 @@ def gaussian_derivative(
 
 def noise_gain(sigma_frames: float, order: Order, truncate: float = TRUNCATE) -> float:
     """Return the standard deviation of white noise of standard deviation 1 after `gaussian_derivative` with dt_s = 1.
-
     For sigma above about 1.5 frames the orders 0, 1, 2 give 0.531 sigma^-0.5, 0.376 sigma^-1.5 and 0.460 sigma^-2.5;
     noise correlated over frames gives more.
     """
@@ -59,7 +57,6 @@ def gap_aware_stencil(
     dtype: torch.dtype = torch.float64,
 ) -> Tensor:
     """Return the kernel of `gaussian_derivative` for every frame, (..., N, 2 h + 1), corrected for missing frames.
-
     A neighbour is used where its mirror image is measured, too, and both are in the frame's segment; polynomials still
     come out exactly. Towards an end the window shrinks evenly.
 
@@ -115,7 +112,6 @@ def _determinant(gauss: Tensor, step: Tensor, order: int) -> Tensor:
 
 def _with_exact_moments(gauss: Tensor, step: Tensor, order: int) -> Tensor:
     """Correct symmetric weights (..., 2 h + 1) so that moments 0 .. order + 1 are those of the derivative.
-
     The same as a least-squares fit of a polynomial with Gaussian weights (Savitzky-Golay, weighted).
     """
     m0, m2, m4 = ((gauss * step**power).sum(-1, keepdim=True) for power in (0, 2, 4))

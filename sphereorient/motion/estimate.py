@@ -70,7 +70,6 @@ def estimate(
     paths: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings, known: ProcessPrior | None = None
 ) -> tuple[list[Estimate], float, ProcessPrior | None]:
     """Estimate the process from all segments of one kind, then smooth each by itself.
-
     `band`: cycles per frame; None estimates it. `known`: the process of another track; None estimates it. Return the
     estimates, the ratio of true errors to sigmas of the measurements (slow errors included), and the process.
     """
@@ -198,7 +197,6 @@ def estimate_process(
     paths: Sequence[SegmentTrack], scales: tuple[float, float], band: float | None, before: ProcessPrior | None = None
 ) -> ProcessPrior:
     """Find the prior and the factor on the measurements' sigmas with the highest likelihood.
-
     Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form, with FREE fewer
     degrees of freedom a path.
 

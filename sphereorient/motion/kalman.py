@@ -16,7 +16,6 @@ EVERY = 64  # states between stored covariances; the smoother computes the other
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateSpace:
     """A linear problem of N states of size D whose first three numbers are measured.
-
     A step takes the first three numbers to `carried` times the whole state plus `drift`; the other numbers and the
     noise depend only on the step's kind (its length).
     """
@@ -53,7 +52,6 @@ class Filtered:
 
 def run_filter(chain: StateSpace) -> Filtered:
     """Run Kalman's filter.
-
     Source: Kalman 1960.
     """
     count, size = len(chain.measured), chain.start.shape[0]
@@ -127,7 +125,6 @@ class SmoothedStates:
 
 def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedStates:
     """Run backwards over a filtered chain; `wanted` (K, D) holds the rows whose covariance is returned.
-
     Source: Bierman 1973 (modified Bryson-Frazier); the distance from the others: de Jong 1988.
     """
     count, size = filtered.state.shape

@@ -88,7 +88,6 @@ class Prior:
 
 def prior_of_band(band: float, noise: float) -> Prior:
     """Return the prior whose spectrum equals white noise at the band (cycles per frame).
-
     `noise`: standard deviation of the measured value by axis, one measurement a frame.
     """
     rate = 2 * np.pi * band

@@ -25,7 +25,6 @@ M_PER_MM = 1e-3
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
     """Velocities and accelerations of N frames, (..., N, 3), NaN where unknown.
-
     Each sigma is the standard deviation from white measurement noise; the low-pass bias is not in it.
     """
 
@@ -54,7 +53,6 @@ def measure_motion(
     orientation_sigma_rad: Tensor | None = None,
 ) -> Motion:
     """Return velocity, acceleration, omega and alpha of every frame whose neighbours determine them, else NaN.
-
     Nothing crosses the ends of a segment. Single lost frames are bridged; a long gap and the frames next to an end give
     NaN. Body components need the frame's own orientation.
     Source: the paper, section III; docs/errata.md E4 and E6.
@@ -166,7 +164,6 @@ def _to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
 
 def _sigma_in_body(R_lab_body: Tensor, x_lab: Tensor, x_sigma: Tensor, sigma_rad: Tensor | None) -> Tensor:
     """Return the standard deviations by axis of R^T x from those of x (lab) and of the orientation.
-
     An orientation error delta adds delta x x. It is independent of omega, which does not use the frame's own
     orientation, and small in alpha.
     """

@@ -51,7 +51,6 @@ class SegmentTrack:
 
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
         """Return rotations (N - 1, NODES + 1, 3, 3) and jumps (N - 1, 3) of the reference's steps.
-
         The rotations take a deviation from the nodes of a step, and from its begin, to its end. The jumps are the steps
         less the integral of the reference's rate.
         """
@@ -80,7 +79,6 @@ class SegmentTrack:
 
     def steps(self, prior: Prior, weight: Floats, by_rate: Floats) -> tuple[Floats, Floats]:
         """Return the transition of a step from the state, (M, 3, SIZE), and its drift (M, 3).
-
         `weight` (M, NODES) holds the weights of the nodes, `by_rate` (M, NODES, ORDER) the same times the growth of the
         rate's state to them.
         """
@@ -94,7 +92,6 @@ class SegmentTrack:
 
     def chain(self, prior: Prior) -> StateSpace:
         """Return the state space model, linear about the reference.
-
         Source: Barfoot 2017, State Estimation for Robotics, sections 7.2 and 7.3: perturbations from the left.
         """
         step = np.diff(self.time)
@@ -273,7 +270,6 @@ def rotvec_between(begin: Floats, end: Floats) -> Floats:
 
 def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int = 3) -> Floats:
     """Return the rotations (M, 3, 3) over steps (M,) by omega_lab = mean + w(t), from the state of w (M, ORDER, 3).
-
     Source: Magnus expansion of fourth order at the two Gauss nodes (Iserles and Norsett 1999).
     """
     h = step[:, None] / parts
@@ -288,7 +284,6 @@ def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int
 
 def _first_guess(time: Floats, R: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
     """Return orientations (N, 3, 3) and omega_lab (N, 3), rad per frame, at all instants, and the frames trusted.
-
     Gaps may exceed half a turn: of the rotations that fit, the one nearest to the interpolated omega is taken.
     """
     frames = np.flatnonzero(seen)
@@ -339,7 +334,6 @@ def _around(x: Floats, width: int) -> Floats:
 
 def _consistent(kink: Callable[[int], Floats], count: int, way: float) -> NDArray[np.int64]:
     """Return the frames that follow from each other, by dynamic programming; leaving out a frame has a cost.
-
     `kink` gives for a lag the steps (count - lag, 3) between frames less the typical rate; `way` is the typical step.
     """
     reach = min(LEFT_OUT + 1, count - 1)

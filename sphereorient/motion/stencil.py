@@ -20,7 +20,6 @@ def windows(x: Tensor, half: int, fill: float = torch.nan) -> Tensor:
 
 def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
     """Return which neighbours (..., N, 2 half + 1) of a frame were measured and belong to its segment.
-
     `there` (..., N) bool marks measured frames; segment (..., N) is -1 outside any, None is one segment.
     """
     near = windows(there.to(torch.int8), half, fill=0).bool()
@@ -31,7 +30,6 @@ def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor
 
 def paired(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
     """Return which neighbours of a frame can be used in pairs k - j, k + j; arguments as `neighbours_there`.
-
     The weights of pairs have one parity: no lower power of time enters the result, whichever frames are missing.
     """
     near = neighbours_there(there, segment, half)

@@ -91,7 +91,6 @@ class PoseStart:
 
 def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4) -> FittedPoses:
     """Fit poses to pictures: robust Gauss-Newton, the light's coefficients eliminated in every step.
-
     `pixels` holds B * C disks, the cameras of a pose next to each other. `iterations` is at least 1, the same for all
     poses, so that no pose depends on its batch. The covariance is that of the robust estimate with errors shared within
     tiles. All results but the pose belong to the pose before the last step.
@@ -248,7 +247,6 @@ def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Te
 
 def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) -> Tensor:
     """Shorten steps (B, 6) that change a picture by over 0.1 radii, beyond which the slopes do not hold.
-
     Along a line of sight the picture only grows: there a step may have the same share of the distance. `to_centre` (B,
     C, 3), mm, leads from the cameras to the sphere; `seen` (B, C) is 1 for those in use.
     """
@@ -298,7 +296,6 @@ def _loss(at: Residuals, inside: Tensor) -> Tensor:
 
 def _score(at: Residuals, inside: Tensor) -> Tensor:
     """Return the share of the disk's variance that the model explains, (L,).
-
     Every pixel counts: those that do not fit reveal a wrong pose. A bubble counts at most as bright as paint.
     """
     share = at.view.coverage * inside

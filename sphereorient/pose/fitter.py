@@ -164,7 +164,6 @@ class Fitter:
         radius_px: float | None = None,
     ) -> Pixels:
         """Cut the disks of B poses out of the pictures of C views.
-
         `position_lab_mm` (B, 3) is right to a few pixels. Without `radius_px` the largest disk sets it, so that the
         last bits depend on the batch.
         """

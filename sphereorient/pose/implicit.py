@@ -44,7 +44,6 @@ def implicit_pose(
     iterations: int = 30,
 ) -> ImplicitPose:
     """Fit poses by least squares and return them with gradients to all tensors in the residuals.
-
     An undetermined direction stays at the start, with gradient 0.
     Source: implicit function theorem; the Newton-step form, Look and others 2020 (Differentiable implicit layers).
 
@@ -102,7 +101,6 @@ def implicit_pose(
 
 def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
     """Return the poses (B, 3, 3) and (B, 3) with the least sum of squares; steps that make a pose worse are rejected.
-
     Source: Marquardt 1963, damping in units of the diagonal.
     """
     damping = torch.full_like(X[:, 0], START_DAMPING)
@@ -124,7 +122,6 @@ def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: i
 
 def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
     """Apply small errors (B, 6), rad and mm, lab components, from the left, to poses (docs/conventions.md).
-
     Cayley's rotation is smooth at 0, where so3.exp has no second derivative; equal up to the third order.
     """
     half = so3.hat(0.5 * delta[..., :3])
@@ -135,7 +132,6 @@ def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[
 
 def _curvature(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> Tensor:
     """Return the Hessian (B, 6, 6) of half the sum of squares of residuals (B, M) at delta (B, 6).
-
     J^T J would be biased where residuals remain, as with a wrong texture.
     """
     gradient = torch.func.grad(lambda delta: 0.5 * residuals(delta).square().sum())

@@ -30,7 +30,6 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
 
 def light_sums(view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:
     """Return the normal equations of light maps of L disks, (L, 2 K, 2 K) and (L, 2 K) float64.
-
     `precision` (L, P) is weight over variance of each pixel.
     """
     basis = light_basis(view.across)
@@ -51,7 +50,6 @@ def light_maps(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
 
 def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:
     """Return the coefficients (4,), not negative, of the noise's variance as a polynomial in the grey level.
-
     From expected grey levels and residuals (N,) where `inside` (N,) holds.
     """
     model, residual = model[inside].clamp_min(0).double(), residual[inside].double()

@@ -21,7 +21,6 @@ INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pixels:
     """Pixels of L disks (one camera's view of one frame each) with P places each.
-
     Grey levels and geometry are float32: a line of sight is right to 3e-5 mm half a metre away.
     """
 
@@ -65,7 +64,6 @@ class Pixels:
 
 def whole_vectors(count: int) -> int:
     """Return the largest number up to `count` that fills the processor's vectors.
-
     The remainder of a batch takes other code whose last bits differ, so that a disk's numbers would depend on its
     batch.
     """

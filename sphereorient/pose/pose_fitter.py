@@ -62,7 +62,6 @@ class PoseFitter(nn.Module):
         position_lab_mm: ArrayLike | Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Fit poses; return R_lab_body (..., 3, 3), position_lab_mm (..., 3) and the covariance (..., 6, 6), float64.
-
         The covariance is of delta (rad, lab) and position (mm).
 
         Args:

@@ -14,7 +14,6 @@ from sphereorient.trajectory import Reason
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidates:
     """Possible orientations of every frame of one camera: N frames, M rows.
-
     The candidates of frame k are the rows `offset[k] .. offset[k + 1]`, best score first.
     """
 
@@ -41,7 +40,6 @@ class Candidates:
 
     def padded(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return orientations (N, C, 3, 3), scores (N, C) and mask (N, C) with C the largest count, at least 1.
-
         Unused places hold the unit rotation, score 0 and mask False.
         """
         counts = self.counts

@@ -13,7 +13,6 @@ def crop_disk(
     frame: NDArray[np.generic], u_px: float, v_px: float, radius_px: float, size_px: int
 ) -> NDArray[np.float32]:
     """Return the square about a disk, resampled bilinearly to (S, S) float32 grey levels.
-
     Beyond the border of the frame (H, W) the nearest pixel is repeated. `u_px`, `v_px` are column and row of the disk's
     centre; `radius_px`, its radius, becomes half the side `size_px`.
     """

@@ -33,7 +33,6 @@ DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that 
 
 class GreySearch(nn.Module):
     """Searches all of SO(3) on the CPU for the views of a texture map that look like a disk, under any smooth light.
-
     The bank covers SO(3): every rotation is within (1/2 + 1/sqrt 2) step of a template (`so3.lattman_grid`), and detail
     finer than `detail` is removed from templates and pictures, so that the nearest template still correlates.
 
@@ -75,9 +74,7 @@ class GreySearch(nn.Module):
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
         """Return R_view_body (..., K, 3, 3) and score (..., K) float64 of each disk, best first; NaN beyond the last
-        one.
-
-        `disks` (..., S, S) are grey levels of any scale, the outline touching the borders.
+        one. `disks` (..., S, S) are grey levels of any scale, the outline touching the borders.
 
         Raises:
             ShapeError: the disks are of another size.
@@ -100,7 +97,6 @@ class GreySearch(nn.Module):
 
     def propose(self, disks: Tensor) -> Proposals:
         """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
-
         The outline touches the borders. The score is the share of the disk's deviation from smooth light that the paint
         explains, 0 .. 1 (the square of their correlation). A disk below `score_min` has no proposal (`LOW_SCORE`).
 
@@ -118,7 +114,6 @@ class GreySearch(nn.Module):
 
     def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
         """Return the best templates of the best groups, (F, M) int64, best first, and which are peaks, (F, M) bool.
-
         All scores of the disks (F, S, S) float32 are held at once, 36 kB each.
         """
         scores = torch._int_mm(self._normalised(disks), self._bank.T)

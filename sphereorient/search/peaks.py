@@ -11,7 +11,6 @@ from torch import Tensor
 def compact_groups(R: Tensor, size: int) -> Tensor:
     """Divide rotations (K, 3, 3) into groups of neighbours: indices (G, size) int64; some come twice if K / size has a
     rest.
-
     Source: halving along the matrix component that varies most (Bentley 1975); neighbours in the components are
     neighbours on SO(3).
     """
@@ -32,7 +31,6 @@ def compact_groups(R: Tensor, size: int) -> Tensor:
 
 def best_of_groups(scores: Tensor, count: int) -> Tensor:
     """Return the best members of the `count` best groups, (F, count) int64, best first, from scores (F, M, G).
-
     Indices are into the flattened members and groups; all groups where there are fewer.
     """
     groups = scores.shape[2]
@@ -43,7 +41,6 @@ def best_of_groups(scores: Tensor, count: int) -> Tensor:
 
 def distinct(R: Tensor, apart_rad: float) -> Tensor:
     """Return which rotations (..., M, 3, 3), best first, are peaks, (..., M) bool; the first always is.
-
     Non-maximum suppression: any better neighbour within apart_rad suppresses, even a suppressed one.
     """
     flat = R.flatten(-2)

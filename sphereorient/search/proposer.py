@@ -15,7 +15,6 @@ from sphereorient.trajectory import Reason
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Proposals:
     """Possible orientations of a batch of disks in their own view frames: F disks, M rows.
-
     Those of disk f are the rows `offset[f] .. offset[f + 1]`, best score first.
     """
 
@@ -46,8 +45,7 @@ class Proposals:
         )
 
     def spread(self, placed: Tensor, reason: Sequence[Reason]) -> Self:
-        """Return one entry per frame; `placed` (N,) bool marks the F frames with a disk, `reason` (N) serves the rest.
-        """
+        """Return one entry per frame; `placed` (N,) bool marks the F frames with a disk, `reason` (N) the other frames."""
         counts = torch.zeros(len(placed), dtype=torch.int64)
         counts[placed] = self.offset.diff()
         own = iter(self.reason)

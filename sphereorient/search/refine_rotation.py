@@ -83,7 +83,6 @@ def level_reference(level: DetailLevel, disk: Tensor) -> Target:
 
 def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Fit rough orientations R_view_body (Q, 3, 3) float32 by Gauss-Newton steps; return them with scores (Q,).
-
     The score is the share of the disk's deviation from smooth light that paint explains, at most 1; 0 and below where
     it explains nothing.
     Source: variable projection, Golub and Pereyra 1973; robust weights, Geman and McClure 1987.

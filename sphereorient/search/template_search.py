@@ -48,7 +48,6 @@ class TemplateSearch:
 
     def propose(self, disks: Tensor) -> Proposals:
         """Propose the best orientation of each group for disks (F, S, S) float32, whose outlines touch the borders.
-
         A disk that fits nearly everywhere has no proposal (`RUNAWAY`), nor one below `score_min` (`LOW_SCORE`).
         """
         parts: list[Proposals] = []

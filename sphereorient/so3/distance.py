@@ -11,7 +11,6 @@ from sphereorient.so3.exp import vee
 
 def angle(R: Tensor) -> Tensor:
     """Return the angle (...), rad, 0 .. pi, of rotations (..., 3, 3), accurate also near 0 and pi.
-
     The gradient at exactly 0 and pi, which does not exist, is set to 0.
     Source: docs/errata.md A3; acos((Tr - 1)/2), the paper's, loses half the digits near 0 and pi.
     """
@@ -23,7 +22,6 @@ def angle(R: Tensor) -> Tensor:
 
 def geodesic_distance(A: Tensor, B: Tensor) -> Tensor:
     """Return the angle (...), rad, 0 .. pi, of A^T B for rotations (..., 3, 3); exactly 0 for equal inputs.
-
     Gradient as `angle`.
     Source: the paper's d(A, B), worked out by docs/errata.md A3; the cosine from Tr((A-B)(A-B)^T) = 4 (1 - cos d).
     """

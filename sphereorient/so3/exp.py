@@ -11,7 +11,6 @@ from sphereorient.errors import check_tail
 
 def exp(rotvec: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) of rotation vectors (..., 3), rad, of any length.
-
     Source: Rodrigues' formula, as the paper prints it.
     """
     check_tail("rotvec", rotvec, 3)
@@ -20,9 +19,7 @@ def exp(rotvec: Tensor) -> Tensor:
 
 def log(R: Tensor) -> Tensor:
     """Return the shortest rotation vectors (..., 3), rad, of rotations (..., 3, 3); a reflection gives a meaningless
-    value.
-
-    At exactly pi the choice between the two vectors is always the same, and the gradient is finite.
+    value. At exactly pi the choice between the two vectors is always the same, and the gradient is finite.
     Source: textbook; through the quaternion's largest component, so it keeps all digits at 0 and at pi.
     """
     check_tail("R", R, 3, 3)

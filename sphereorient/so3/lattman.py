@@ -23,7 +23,6 @@ def to_lattman(theta: Tensor) -> Tensor:
 
 def from_lattman(lattman: Tensor) -> Tensor:
     """Return the Tait-Bryan angles (..., 3), rad, of Lattman angles theta_plus, theta, theta_minus.
-
     Their ranges over SO(3) are 4 pi, -pi/2 .. pi/2, 2 pi.
     """
     check_tail("lattman", lattman, 3)
@@ -33,7 +32,6 @@ def from_lattman(lattman: Tensor) -> Tensor:
 
 def lattman_steps(theta_y: Tensor, delta: float) -> tuple[Tensor, Tensor]:
     """Return the steps of theta_plus and theta_minus, (...) rad each, that rotate by `delta` rad.
-
     theta_y (...), rad, is in -pi/2 .. pi/2; at these ends, where an angle has no effect, its step is infinite.
     Source: d^2 = dtheta^2 + sin^2(pi/4 + theta/2) dtheta_plus^2 + sin^2(pi/4 - theta/2) dtheta_minus^2, the paper's own
     metric; the steps that it prints do not follow from it (docs/errata.md E5).
@@ -46,7 +44,6 @@ def lattman_grid(
     step_rad: float, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> Tensor:
     """Return a grid of rotations (K, 3, 3), evenly over SO(3); K is about 8 pi^2 / step_rad^3, step_rad at most pi.
-
     Every rotation is within (1/2 + 1/sqrt 2) step_rad of the grid; random ones within sqrt(3)/2 step_rad (measured in
     tests/so3/test_so3_lattman.py). Rows of theta_y from -pi/2, each by theta_plus, then theta_minus. The last row,
     theta_y = pi/2, holds its rotations twice: there 2 pi of theta_plus is a full turn.

@@ -8,7 +8,6 @@ from torch import Tensor
 
 def solve_damped(matrix: Tensor, right: Tensor, ridge: float = 1e-9) -> Tensor:
     """Solve symmetric positive semidefinite systems (..., n, n), (..., n); `ridge` is a share of each diagonal element.
-
     A direction without information gets no step.
     """
     solution: Tensor = torch.linalg.solve_ex(_damped(matrix, ridge), right[..., None]).result

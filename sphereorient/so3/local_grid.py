@@ -19,7 +19,6 @@ def local_grid(
     step_rad: float, radius_rad: float, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> Tensor:
     """Return rotations (M, 3, 3) spread evenly up to the angle radius_rad (0 .. pi), the unit first, then by angle.
-
     The rotation vectors are a body-centred cubic lattice with one point per step_rad^3, in rad; each rotation's inverse
     is included. Covering radius c = 0.704 step_rad: every rotation by at most radius_rad - c is within c of the grid,
     every one by at most radius_rad within 2 c.

@@ -10,7 +10,6 @@ from sphereorient.errors import check_tail
 
 def nearest_rotation(M: Tensor) -> Tensor:
     """Return the rotation nearest to any matrix M (..., 3, 3), by the sum of squared differences; NaN if not finite.
-
     Where several are equally near (rank below 2, or a reflection with equal smallest singular values) it is one of
     them, with gradient 0 in the undetermined directions. First derivatives only.
     Source: Kabsch 1976, the paper's R_kabsch; derivative of the polar factor, textbook.

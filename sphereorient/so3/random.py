@@ -17,7 +17,6 @@ def random_rotations(
     device: torch.device | str | None = None,
 ) -> Tensor:
     """Return rotations (*shape, 3, 3) drawn uniformly from SO(3), from the same numbers in every dtype.
-
     Source: a quaternion of four normal numbers has a uniform direction (Marsaglia 1972).
     """
     leading = (shape,) if isinstance(shape, int) else tuple(shape)

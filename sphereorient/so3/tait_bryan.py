@@ -12,7 +12,6 @@ from sphereorient.errors import check_tail
 
 def from_tait_bryan(theta: Tensor) -> Tensor:
     """Return the rotation (..., 3, 3) of angles theta (..., 3), rad: Rx Ry Rz, the paper's R_lab_body.
-
     Source: the paper's R(theta): rotations about the fixed z, then y, then x; or about the body's x, then its new y,
     then its new z (docs/errata.md E9).
     """
@@ -28,7 +27,6 @@ def from_tait_bryan(theta: Tensor) -> Tensor:
 
 def to_tait_bryan(R: Tensor) -> Tensor:
     """Return the Tait-Bryan angles (..., 3), rad, of rotations (..., 3, 3), with theta_y in -pi/2 .. pi/2; NaN for NaN.
-
     At cos(theta_y) = 0 (below four roundings) only theta_x ± theta_z is defined: theta_z and its gradient are 0.
     Source: docs/errata.md E1, with other elements for theta_y and theta_x, equal for a rotation: asin loses half the
     digits near theta_y = ± pi/2, and -R23, R33 lose all.
@@ -46,7 +44,6 @@ def to_tait_bryan(R: Tensor) -> Tensor:
 
 def second_triplet(theta: Tensor) -> Tensor:
     """Return the other angles (..., 3), rad, not wrapped, of the rotation of theta (..., 3), rad.
-
     They are theta_x + pi, ± pi - theta_y with the sign of theta_y, theta_z + pi.
     Source: the paper's second triplet with sign(0) = 1, docs/errata.md E2.
     """
@@ -58,7 +55,6 @@ def second_triplet(theta: Tensor) -> Tensor:
 
 def rate_matrix_lab(theta: Tensor) -> Tensor:
     """Return H (..., 3, 3) with H dtheta/dt = omega_lab, of the angles of R_lab_body; its determinant is cos(theta_y).
-
     Source: the paper's H, which it assigns to the body (docs/errata.md E3).
     """
     check_tail("theta", theta, 3)
