@@ -249,7 +249,6 @@ class _Search:
         follows &= ratio - np.maximum(self.still[row] + self.log_stuck, 0.0) >= PIN_NATS
         edge = np.diff(np.concatenate([[0], follows.astype(np.int64), [0]]))
         for begin, end in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) + 1, strict=True):
-            # Frames begin .. end, both included: the first to follow is begin + 2.
             if end - begin + 1 >= max(length, 2 * PIN_MARGIN + 4):
                 first[begin + PIN_MARGIN] = True
                 last[begin + PIN_MARGIN + 1] = end - PIN_MARGIN

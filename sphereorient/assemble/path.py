@@ -163,7 +163,6 @@ def number_segments(present: Tensor, spike: Tensor, gap_frames_max: int) -> Tens
         return number
     breaks = (frame.diff() > gap_frames_max + 1) | spike[frame[1:]]
     of_frame = torch.nn.functional.pad(breaks.cumsum(0), (1, 0))
-    # A gap takes the number of the segment that is on both sides of it.
     every = torch.arange(len(present), device=present.device)
     before = torch.searchsorted(frame, every, right=True) - 1
     after = torch.searchsorted(frame, every)

@@ -62,7 +62,7 @@ class SecondOrderCost:
     def picture_log_weight(self, nll: Tensor, mask: Tensor) -> Tensor:
         """Return the log probability (..., C) of each candidate of a frame by the pictures alone; 0 where masked."""
         claimed = torch.where(mask, -self.evidence_scale * nll, -torch.inf)
-        # A frame without candidates has no share: zeros keep the gradient clear of inf - inf.
+        # A frame without candidates: zeros keep the gradient clear of inf - inf.
         weight = torch.softmax(torch.where(mask.any(-1, keepdim=True), claimed, 0.0), -1)
         count = mask.sum(-1)[..., None].clamp_min(1)
         weight = (1 - self.evidence_doubt) * weight + self.evidence_doubt / count

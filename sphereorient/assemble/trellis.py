@@ -151,7 +151,6 @@ def _laid_out(
     edges = torch.where(real[..., 1:, None, None], edges, 0.0)
     edges = torch.where(mask[..., :-1, :, None] & mask[..., 1:, None, :], edges, torch.inf)
     if triple_cost is not None:
-        # Before the first step stands place 0 alone.
         alone = (torch.arange(mask.shape[-1], device=mask.device) == 0).expand_as(mask[..., :1, :])
         start = torch.where(alone[..., 0, :, None], start[..., None, :], torch.inf)
         triples = edges.new_zeros((*edges.shape[:-3], min(edges.shape[-3], 1), *[mask.shape[-1]] * 3))
@@ -160,7 +159,7 @@ def _laid_out(
             triples = torch.cat([triples, late], -4)
         older = torch.cat([alone, mask[..., :-2, :]], -2)[..., : edges.shape[-3], :, None, None]
         edges = torch.where(older, triples + edges[..., None, :, :], torch.inf)
-    # Finite walls: differences of infinities would be NaN. Costs are far smaller, and nothing passes a wall.
+    # Finite walls: differences of infinities would be NaN. Costs are far smaller.
     return start.clamp_max(_wall(start)), edges.clamp_max(_wall(edges))
 
 

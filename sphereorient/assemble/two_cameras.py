@@ -103,7 +103,7 @@ def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tenso
     variance = torch.where(count >= LINKS_MIN, squares / (count - 1).clamp_min(1), torch.nan)
     typical = variance.nanmedian(-1, keepdim=True).values if variance.shape[1] else variance.new_ones(len(xi), 1)
     largest = typical.nan_to_num(0.0).max()
-    # A camera without links, or all of them at rest: no camera is preferred.
+    # All cameras at rest or without links: no camera is preferred.
     typical = torch.where(typical.isnan() | (largest == 0), torch.where(largest > 0, largest, 1.0), typical)
     typical = typical.clamp_min(typical.max() / CAMERAS_RATIO_MAX)
     within = torch.minimum(torch.maximum(variance, typical / VARIANCE_RANGE), typical * VARIANCE_RANGE)

@@ -104,7 +104,7 @@ def estimate_appearance(
     gain, gap_px = _apart(fitter, pictures, found)
     looked = found
     if gain > APART_GAIN or gap_px > APART_PX:
-        # A pose between what the cameras see would teach a light that is nowhere.
+        # A pose between those of disagreeing cameras would give a wrong light.
         each = [search(fitter.of(k), [[frame[k]] for frame in frames]) for k in range(len(fitter.views))]
         frame, X, R, use = _seen_by_each(each)
         looked = [poses for of_camera in each for poses in of_camera]
@@ -120,7 +120,7 @@ def estimate_appearance(
     if max(best, right) < highest + NO_BETTER and _times_better(looked) < TELLING:
         raise _unexplained(best)
     if right < highest + NO_BETTER:
-        # Dirt or a rim that is hidden spoils the light that was learnt: all poses are explained worse than before.
+        # Dirt or a hidden rim spoils the estimated light: all poses are explained worse than before.
         highest = right - (best - highest)
     fitter = replace(fitter, widest_px=widest)
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX

@@ -109,7 +109,7 @@ class Initialiser:
         slack = torch.nan_to_num(placed.covariance_mm2[0])
         slack = slack + (PLACE_SHARE * fitter.radius_mm) ** 2 * torch.eye(3).double()
         if int(use.sum()) == 1:
-            # Arcs of a rim that is dark in part fit a smaller circle as well, with no greater residual.
+            # Arcs of a partly dark rim fit a smaller circle as well, with no greater residual.
             (seeing,) = (view for view, used in zip(views, use.tolist(), strict=True) if used)
             sight = seeing.camera.rays(seeing.camera.project(placed.position_lab_mm))
             along = placed.position_lab_mm[0] - sight.origin_lab_mm[0]
@@ -123,7 +123,7 @@ class Initialiser:
         """Fit all starts on the coarsest level, then the best distinct ones on finer levels."""
         fitter, optics, use = self.fitter, self.fitter.optics, frame.use
         X = place.expand(len(R), 3)
-        # (level, every which pixel, iterations, poses kept): coarse detail needs few pixels, the last fit all.
+        # (level, every n-th pixel, iterations, poses kept): coarse levels need few pixels, the last fit all.
         steps = (
             (optics.coarse, 1, 4, self.finalists + 1),
             (optics.middle, 3, 3, self.finalists),
@@ -132,7 +132,7 @@ class Initialiser:
         )
         for level, every, iterations, keep in steps:
             held = None if level is optics.fine else precision.expand(len(R), 3, 3)
-            # All starts of a level use the same pixels: those about the place that the outlines give.
+            # All starts of a level use the same pixels: those about the position of the outlines.
             one = fitter.pixels([pictures], place, level).thinned(every)
             pixels = one.where(torch.arange(len(one)).repeat(len(R)))
             fit = fitter.fit(pixels, X, R, use.expand(len(R), -1), level, iterations, held)

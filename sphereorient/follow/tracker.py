@@ -77,7 +77,7 @@ class _Chunk:
             turn = (1 + more) * turn - on * before * more * so3.log(R0 @ rows[0].R_lab_body[0].mT)
             a, b = on * (1 + more), on * before * more
             further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * rows[0].covariance[0, 3:, 3:]
-            # Not so the distances that one camera tells: they scatter by more than the ball is accelerated.
+            # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
             if float(further.diagonal().sum()) < (ASTRAY_SHARE * radius_mm) ** 2:
                 move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
         astray = (ASTRAY_SHARE * radius_mm) ** 2 * torch.eye(3, dtype=torch.float64)
@@ -187,8 +187,8 @@ class ChunkTracker:
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
         alone: list[FittedPoses] = []
         if not bool((good | ~within).all()):
-            # One picture without the ball spoils the joint fit: try each camera alone; of two that disagree the one
-            # nearer to the prediction counts.
+            # One picture without the sphere spoils the joint fit: try each camera; of two that disagree the nearer one
+            # counts.
             alone = [self._fitted(frames, X, R, _only(usable, k), precision) for k in range(use.shape[1])]
             supported = [self._supported(one, _only(usable, k)) for k, one in enumerate(alone)]
             astray = [
@@ -200,10 +200,10 @@ class ChunkTracker:
                 chosen = ~good & torch.isfinite(nearest) & (which == k)
                 fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, k), use)
             good = good | torch.isfinite(nearest)
-        # Another camera is judged only where this frame itself asks: results must not depend on the batch.
+        # Another camera is judged only where this frame needs it: results must not depend on the batch.
         doubtful = ~first | before.any(1)
         if bool((usable & ~use).any()):
-            # A camera that was blind may see again: that shows at the joint pose.
+            # A camera without the sphere before may see it again: test it at the joint pose.
             both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, usable, precision)
             unused = good & (usable & ~use).any(1)
             limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
@@ -245,7 +245,7 @@ class ChunkTracker:
     ) -> FittedPoses:
         """Fit poses that are nearly right: to some pixels, repeated where that moves them, then to all."""
         if self.centre is None:
-            # All cameras together give the place; one of two gives a distance that is known better from before.
+            # All cameras together determine the position; for one of two the distance is better known from before.
             precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
         fine, widest = self.fitter.optics.fine, self.fitter.widest_px
         pixels = self.fitter.pixels(frames, X, fine, widest)

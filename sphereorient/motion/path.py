@@ -297,7 +297,6 @@ def _first_guess(time: Floats, R: Floats, seen: Bools) -> tuple[Floats, Floats, 
     still = gone[frames].mT @ R[frames]  # constant where the turning is typical
     way = float(np.median(np.linalg.norm(steps, axis=1)))
     trusted = frames[_consistent(lambda lag: rotvec_between(still[:-lag], still[lag:]), len(frames), way)]
-    # distribute what omega leaves between two trusted frames evenly over the time between them
     at = np.interp(np.arange(len(time)), trusted, np.arange(len(trusted)))
     left = np.minimum(at.astype(int), max(len(trusted) - 2, 0))
     share = np.clip(at - left, 0.0, 1.0)

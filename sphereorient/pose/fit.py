@@ -121,7 +121,6 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         step = _bounded(solve_damped(whole, force), X[:, None] - origin, seen, radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
-    # Where each camera would go from where the last step began, less that step.
     own = solve_damped(
         information[..., :3, :3], pull[..., :3] - (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
     )
@@ -171,7 +170,7 @@ def residuals(
     beyond = (1.0 - view.coverage) * pixels.behind
     noise = model.light.noise.repeat(len(X), 1)
     target = pixels.grey - beyond
-    # The first weights come from the picture itself, which a bubble is part of: a second round does without it.
+    # The first weights come from the picture itself, bubbles included; a second round does without it.
     rounds = (pixels.grey, pixels.inside.to(columns.dtype)) if state is None else state
     for _ in range(1 if state is not None else 2):
         expected, weight = rounds
@@ -230,7 +229,7 @@ def _variance(grey: Tensor, noise: Tensor) -> Tensor:
 
 def _deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
     """Return the robust standard deviation of residuals over the noise expected, (L,), at least 1."""
-    # A quarter of the places tells as much: they are in order of distance from the middle.
+    # A quarter of the places suffices: they are in order of distance from the middle.
     residual, variance, inside = residual[:, ::4], variance[:, ::4], inside[:, ::4]
     scaled = torch.where(inside, residual.abs() * variance.rsqrt(), torch.nan)
     return 1.4826 * torch.nan_to_num(scaled.nanmedian(-1).values)
@@ -304,5 +303,4 @@ def _score(at: Residuals, inside: Tensor) -> Tensor:
     spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
     left = (share * torch.minimum(at.residual.square(), 4.0 * spread[:, None])).sum(-1)
     explained = 1.0 - left / spread.clamp_min(1e-9)
-    # Where no pixel is ball, nothing is explained.
     return torch.where(spread > 1e-6, explained, torch.zeros_like(explained))

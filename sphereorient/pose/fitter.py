@@ -96,7 +96,7 @@ class Optics:
     def __init__(self, base: TextureTable, blur_px: float, diameter_px: float) -> None:
         radius_px = diameter_px / 2
         self.blur_px = blur_px
-        # Each from the one before: the wider the blur, the smaller the table that it is made from.
+        # Each from the one before: a wider blur allows a smaller table.
         self.fine = level_of(base, blur_px, 0.0, radius_px)
         self.middle = level_of(self.fine.paint, blur_px, MIDDLE * radius_px, radius_px)
         self.coarse = level_of(self.middle.paint, blur_px, COARSE * radius_px, radius_px)

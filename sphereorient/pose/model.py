@@ -64,7 +64,6 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
     q0 = nearest / radius_mm
     distance = to_centre[..., 0].norm(dim=1, keepdim=True)
     blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
-    # The Gaussian aperture, cut off at the limb: what share is left, where its middle lies, how wide it is.
     # Half of an aperture on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
     edge = (1.0 - 0.5 * blur * blur - q0) / blur
     coverage = torch.special.ndtr(edge)
@@ -99,7 +98,7 @@ def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, midd
     """
     share = ((torch.arange(RIM_NODES, dtype=q0.dtype, device=q0.device) + 0.5) / RIM_NODES)[:, None]
     z = torch.special.ndtri((share * coverage[:, None]).clamp(1e-6, 1 - 1e-6))
-    # The limb holds back the more of a node the nearer to it the node is.
+    # The limb holds a node back the more, the nearer it is.
     moves = 1.0 - share * density[:, None] / (torch.exp(-0.5 * z * z) * (1.0 / math.sqrt(2.0 * math.pi)))
     middle = middle[:, None]
     return middle + middle * (q0[:, None] + blur[:, None] * z - middle), moves.clamp(0.0, 1.0)
@@ -118,7 +117,7 @@ def _sample(
     `at` (L, n, P) is the distance of each look-up from the disk's middle, radii; `moves` its derivative by the pixel's.
     """
     d, outward, nearest = line
-    # In body components, where the paint is: the derivatives are turned back once, at the end.
+    # In body components, as the texture: the derivatives are rotated back once, at the end.
     sight_b, outward_b = (R.mT @ d)[:, :, None], (R.mT @ outward)[:, :, None]
     qt = at.clamp(0.0, math.sqrt(1.0 - DEPTH_MIN**2))
     depth = (1.0 - qt * qt).sqrt()

@@ -115,7 +115,7 @@ def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stenci
     at = at[at % step_px == 0]
     down, right = (grid.reshape(-1) for grid in np.meshgrid(at, at, indexing="ij"))
     distance2 = right**2 + down**2
-    # Among equals in no order of place: every second one of a list row by row would be the disk's left half.
+    # Random order among equals: every second place of a list row by row would be the disk's left half.
     order = np.lexsort((np.random.default_rng(0).random(len(distance2)), distance2))
     order = order[: whole_vectors(int((distance2 <= radius_px**2).sum()))]
     right, down = right[order], down[order]

@@ -21,8 +21,7 @@ from sphereorient.sphere import orthographic_view, perspective_view
 from sphereorient.sphere.texture_table import TextureTable, texture_table
 from sphereorient.trajectory import Reason
 
-# Disks normalised at once. Fixed and filled up with empty disks: the last bits of sums depend on how many there are,
-# and so would a disk's answer. Products of whole numbers are exact, and may be of any.
+# Disks normalised at once. Fixed, filled up with empty disks: the last bits of sums depend on their number.
 BATCH = 32
 PRODUCT = 128  # disks in one product, at most: the scores of more leave the cache
 GROUP = 8  # neighbouring templates whose best one stands for them in the selection
@@ -57,7 +56,7 @@ class GreySearch(nn.Module):
         self._rough = detail_level(self._view, paint, settings.detail, every=2, blur=blur)
         self._fine = detail_level(self._view, paint, pixel_rad, every=1, blur=blur)
         grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
-        # (GROUP, G): the members of a group lie one below the other, and their maximum is one of whole rows.
+        # (GROUP, G): each group is a column, so that its maximum is one of whole rows.
         self._grid = grid[compact_groups(grid, GROUP).T]
         self._pixels = int(self._view.inside.sum())
         self._bank = self._templates(paint)
@@ -144,7 +143,6 @@ class GreySearch(nn.Module):
         chosen = chosen[score[chosen] >= settings.score_min]
         if not len(chosen):
             return Proposals.none([Reason.LOW_SCORE])
-        # The float32 products back to rotations of float64.
         return Proposals(
             offset=torch.tensor([0, len(chosen)]),
             R_view_body=so3.nearest_rotation(R[chosen].double()),
@@ -161,5 +159,5 @@ class GreySearch(nn.Module):
 def _steps(even: Tensor) -> Tensor:
     """Quantise normalised pictures to -127 .. 127, (B, P) int8, padded to a multiple of 8 pixels."""
     scale = 127.0 / DEVIATIONS * math.sqrt(even.shape[1])
-    # One scale for all templates: as all are of length 1, products of whole numbers rank them as they are.
+    # One scale for all templates: as all have length 1, integer products rank them as they are.
     return F.pad((even * scale).round().clamp(-127, 127), (0, -even.shape[1] % 8)).to(torch.int8)

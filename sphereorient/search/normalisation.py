@@ -48,7 +48,7 @@ class LocalNormalisation:
         self._share = rim_share(size_px) / rim_share(size_px).sum()
         self._detail, self._window = Blur(size_px, detail), Blur(size_px, window)
         self._clip = clip
-        # Near the limb a small error of the outline turns far: pixels count by their foreshortening.
+        # Near the limb a small error of the outline is a large rotation: weigh pixels by foreshortening.
         depth = (1 - radius.square()).clamp_min(0).sqrt().float()
         self._root_weight = (depth * rim_share(size_px).clamp_min(RIM_WEIGHT_MIN)).reshape(-1)[self._inside]
         self._unit = self._root_weight / self._root_weight.norm()

@@ -45,7 +45,7 @@ class Proposals:
         )
 
     def spread(self, placed: Tensor, reason: Sequence[Reason]) -> Self:
-        """Return one entry per frame; `placed` (N,) bool marks the F frames with a disk, `reason` (N) the other frames."""
+        """Return one entry per frame; `placed` (N,) bool marks the F frames with a disk, `reason` (N) all others."""
         counts = torch.zeros(len(placed), dtype=torch.int64)
         counts[placed] = self.offset.diff()
         own = iter(self.reason)

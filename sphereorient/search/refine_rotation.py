@@ -73,7 +73,6 @@ class Target:
 def level_reference(level: DetailLevel, disk: Tensor) -> Target:
     """Return a level's pixels of a disk, (S, S) grey levels of any scale."""
     grey = level.blur(disk[None])[0].reshape(-1)[level.place]
-    # Whatever the camera's units: single precision has few digits.
     grey = grey - (grey * level.weight).sum() / level.weight.sum()
     grey = grey / grey.abs().amax().clamp_min(1e-12)
     rough = grey - (_solved(level.white[None], grey, level.weight) @ level.white)[0]
@@ -96,7 +95,7 @@ def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, ste
         left = target.grey - (found[:, None] @ light)[:, 0]
         weight = level.weight * _trust(left)
         gain = (found[:, None, :whites] @ level.white)[:, 0].clamp_min(GAIN_MIN)
-        # Turning the body by epsilon, R exp(epsilon), changes the paint by epsilon . (slope x normal).
+        # Rotating the body by epsilon, R exp(epsilon), changes the paint by epsilon . (slope x normal).
         turned = _cross(slope, normal_body) * gain[:, None]
         turn = _solved(torch.cat([light, turned], dim=1), left, weight)[:, -3:]
         R = R @ _rotation(turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0))
@@ -113,7 +112,7 @@ def _score(level: DetailLevel, target: Target, R: Tensor, weight: Tensor) -> Ten
     light = _light_columns(level, level.paint.sample(R.mT @ level.normal)[0])
     found = _solved(light, target.grey, weight)
     cost = _cost(level, target.grey - (found[:, None] @ light)[:, 0])
-    # Paint that would have to be lit by less than nothing is the negative of a map.
+    # A negative gain is the negative of the map.
     return torch.where(found[:, 0] > 0, 1.0 - cost / target.unexplained.clamp_min(1e-12), -1.0)
 
 

@@ -15,8 +15,7 @@ from sphereorient.sphere import DirectionTable, DiskView, orthographic_view, red
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.trajectory import Reason
 
-# Disks in one product. Fixed and filled up with empty disks: a product's last bits depend on its number of rows, and
-# so a disk's score would depend on how many others came with it.
+# Disks in one product. Fixed, filled up with empty disks: the last bits of a product depend on its number of rows.
 BATCH = 32
 
 
@@ -92,9 +91,8 @@ class TemplateSearch:
         order = order[score[order] >= self._settings.score_min]
         if not len(order):
             return Proposals.none([Reason.LOW_SCORE])
-        # The float32 products back to rotations of float64.
         R = so3.nearest_rotation(torch.stack([R for R, _ in found]).double()[order])
-        # Two groups may climb to one place: keep the first of those within two fine steps.
+        # Two groups may reach one rotation: keep the first of those within two fine steps.
         gap = so3.geodesic_distance(R[:, None], R[None])
         first = ~torch.tril(gap < 2 * math.radians(self._settings.fine_step_deg), -1).any(1)
         return Proposals(

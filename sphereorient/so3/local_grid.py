@@ -10,8 +10,7 @@ from torch import Tensor
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.so3.exp import exp
 
-# Half the cube's edge of the body-centred cubic lattice that has one point per unit of volume: its points are all
-# multiples of it by three even or three odd whole numbers, two to a cube.
+# Half the cube's edge of the body-centred cubic lattice with one point per unit of volume.
 HALF_EDGE = 2 ** (1 / 3) / 2
 
 

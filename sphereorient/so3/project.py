@@ -19,7 +19,6 @@ def nearest_rotation(M: Tensor) -> Tensor:
     view = torch.eye(3, dtype=M.dtype, device=M.device)
     M = torch.where(finite, M, view)
     U, S, Vh = torch.linalg.svd(M.detach())
-    # The determinant's sign goes to the smallest singular value and its direction.
     sign = torch.linalg.det(U @ Vh).sign()[..., None]
     signs = torch.cat([torch.ones_like(S[..., :2]), sign], -1)
     S, Vh = S * signs, signs[..., None] * Vh
