@@ -1,7 +1,7 @@
 """Beam search over the histories of a movie, forward and backward: the best one, and each candidate's probability.
 
-A history names the right candidate of each frame, or none, and the frames where the motion breaks. A state is the last
-two frames with an orientation: the next candidate is compared with the omega between them.
+A history names the right candidate of each frame, or none, and the breaks of the motion. A state is the last two frames
+with an orientation: the next candidate is compared with the omega between them.
 """
 
 from __future__ import annotations
@@ -106,7 +106,6 @@ class _Search:
         return concatenated(visits)
 
     def _stay(self, states: PathStates, alive: Ints, cost: Floats) -> BeamStep:
-        """Pass the frame without a candidate; the motion continues."""
         return BeamStep(frame=-1, states=states.take(alive), source=alive, target=np.arange(len(alive)), cost=cost)
 
     def _lose(self, source: Ints, cost: Floats) -> BeamStep:
@@ -227,8 +226,8 @@ class _Search:
 
     def _pins(self, length: int) -> tuple[Floats, Floats, Bools, Ints]:
         """Find runs of frames with one candidate each that follow the motion: all good histories contain them.
-        Return the cost (F,) and rotation (F, 3) from the two frames before; (F,) bool, the first frame of each run
-        inside its margins; (F,), the last frame of the run at its second frame, -1 elsewhere.
+        Return, per frame, the cost and rotation from the two frames before, the first frames of runs inside their
+        margins, and the last frame of the run at its second frame, -1 elsewhere.
         """
         frames = len(self.time)
         cost, turn = np.zeros(frames), np.zeros((frames, 3))
@@ -255,7 +254,6 @@ class _Search:
         return cost, turn, first, last
 
     def _jump(self, step: BeamStep, last: int) -> tuple[BeamStep, float]:
-        """Pass through a pinned run, from its second frame to its last."""
         span = self.time[last] - self.time[last - 1]
         row = int(self.offset[last])
         states = PathStates(

@@ -65,8 +65,7 @@ def soft_track(
 
 def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
     """Return the edges (..., N - 1, C, C) of `soft_track`: half the squared rotation, in units of `turn_rad`.
-    `R_lab_body` (..., N, C, 3, 3) is finite everywhere. An edge starts at the last frame with candidates in the mask
-    (..., N, C).
+    R_lab_body (..., N, C, 3, 3) is finite everywhere; an edge starts at the last frame with candidates in the mask.
     """
     frame = torch.arange(mask.shape[-2], device=mask.device)
     last = torch.where(mask.any(-1), frame, 0).cummax(-1).values[..., :-1]  # of the frames up to each one
@@ -78,8 +77,7 @@ def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
 
 def expected_orientation(R_lab_body: Tensor, marginals: Tensor) -> Tensor:
     """Return the rotation (..., N, 3, 3) with the least weighted mean squared chord to R_lab_body (..., N, C, 3, 3).
-    NaN in R_lab_body does not count; marginals (..., N, C) are not negative; the result is NaN where all are 0. The
-    gradient is finite even where several rotations are equally near.
+    NaN does not count; marginals (..., N, C) are not negative; NaN where all are 0. The gradient is always finite.
     Source: chordal mean, Hartley et al. 2013, Rotation averaging, 5.1; projected by `so3.nearest_rotation`.
 
     Raises:

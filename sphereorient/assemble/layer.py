@@ -80,17 +80,14 @@ class PathLayer(nn.Module):
         mask: Values | None = None,
     ) -> ShortestPath | SoftPath:
         """Return the cheapest path, or the probabilities where `soft` is set, differentiable in all but mask and times.
+        The path of order 2 has C + 1 places, the last of which means no candidate.
 
         Args:
             R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.
-            score: (..., N, C), the quality T, 0 .. 1 (order 1), or the log-likelihood of the pictures, nats (order
-                2).
+            score: (..., N, C), quality T, 0 .. 1 (order 1), or log-likelihood of the pictures, nats (order 2).
             time_s: (..., N), increasing; frames without candidates are skipped.
             variance_rad2: (..., N, C), of the orientations, per axis; read by order 2. None: 0.
             mask: (..., N, C) bool, True for a candidate; None: all. Order 1 drops those below `quality_min`.
-
-        Returns:
-            The path; of order 2 with C + 1 places, the last of which means no candidate.
 
         Raises:
             ShapeError: the inputs differ in frames or candidates.
@@ -150,13 +147,8 @@ def triple_costs(
     cost: SecondOrderCost, R_lab_body: Tensor, variance_rad2: Tensor, time_s: Tensor, mask: Tensor
 ) -> Tensor:
     """Return the cost (..., N - 2, C, C, C), nats, of three successive candidates: how badly the third follows.
-
-    Args:
-        cost: with tensors for parameters.
-        R_lab_body: (..., N, C, 3, 3), rotations.
-        variance_rad2: (..., N, C), per axis, as claimed; `LOST_RAD2`: without information.
-        time_s: (..., N), increasing; rotations between frames visited are below half a turn.
-        mask: (..., N, C) bool; frames without candidates are skipped.
+    R_lab_body is (..., N, C, 3, 3), variance_rad2 (..., N, C) per axis (`LOST_RAD2`: unknown), time_s (..., N), mask
+    (..., N, C). Frames without candidates are skipped; rotations between frames visited are below half a turn.
     """
     variance = cost.sigma_scale**2 * variance_rad2
     links, steps, width = _links_of(R_lab_body, time_s, mask), mask.shape[-2], max(mask.shape[-1], 1)

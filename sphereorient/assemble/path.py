@@ -38,9 +38,9 @@ class Path:
 
 
 def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings) -> dict[str, Path]:
-    """Choose one candidate of each frame for each camera, by the least cost over the whole movie.
-    `time_s` (N,) increases. Frames without candidates of `quality_min` are skipped: the cost of the link over them is
-    divided by its time.
+    """Choose one candidate of each frame for each camera, by the least cost over the whole movie; time_s (N,)
+    increases.
+    Frames without candidates of `quality_min` are skipped: the cost of the link over them is divided by its time.
     Source: the paper's assembly of III (directed graph between direct neighbours); docs/errata.md A6.
 
     Raises:
@@ -105,9 +105,8 @@ def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Te
 
 
 def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
-    """Return the paper's cost, rad/s, from each candidate to each of the next step, (..., N - 1, C, C), rows from.
-    It is d(A, B) (2 - T_A - T_B) / dt, for R_lab_body (..., N, C, 3, 3), score T (..., N, C) and increasing time_s
-    (..., N).
+    """Return the paper's cost d(A, B) (2 - T_A - T_B) / dt, rad/s, from each candidate (row) to each of the next step.
+    Shapes: R_lab_body (..., N, C, 3, 3), score T (..., N, C), increasing time_s (..., N), result (..., N - 1, C, C).
     Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
 
     Raises:
@@ -141,8 +140,7 @@ def moving(values: Tensor, window: int) -> Tensor:
 
 def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
     """Return the links (N,) bool with xi many robust deviations (MAD) above the moving median, and a large angle.
-    xi (N,), rad/s, and turn (N,), rad, are cost and angle of the link that enters each frame; xi is NaN without a link.
-    A multiple of the median would not do: that of a fast sphere is large.
+    xi (N,), rad/s, and turn (N,), rad, belong to the link that enters each frame; xi is NaN without a link.
     Source: the paper's assembly of III (spikes of xi), which gives no numbers.
     """
     windows = moving(xi, settings.spike_window_frames)
@@ -153,9 +151,8 @@ def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
 
 
 def number_segments(present: Tensor, spike: Tensor, gap_frames_max: int) -> Tensor:
-    """Number the segments of one motion: (N,) int64 from 0, -1 outside; gaps up to `gap_frames_max` inside belong to
-    them. `present` (N,) marks frames with an orientation, `spike` (N,) frames that a spike enters. A single wrong frame
-    is a segment of its own.
+    """Number the segments of one motion, (N,) int64 from 0, -1 outside; gaps up to `gap_frames_max` belong to them.
+    `present` (N,) marks frames with an orientation, `spike` (N,) frames that a spike enters.
     """
     frame = torch.nonzero(present)[:, 0]
     number = torch.full(present.shape, -1, dtype=torch.int64, device=present.device)

@@ -76,12 +76,12 @@ class Chosen:
 
 
 def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings) -> Chosen:
-    """Choose one candidate of each frame, or none, so that the history has the highest probability by
-    `SecondOrderCost`. `time_s` (N,) increases. Flags of the result: `AMBIGUOUS` where the choice is not sure,
-    `RECOVERED` on the first frame with an orientation after a gap or a break, `SPIKE` where a rotation does not follow
-    from the motion.
-    Source: textbook hidden Markov model of second order; unlike the paper's cost, a prior on the change of omega does
-    not favour candidates at rest (docs/errata.md A6).
+    """Choose one candidate of each frame, or none, for the most probable history (`SecondOrderCost`); time_s (N,)
+    increases.
+    Flags: `AMBIGUOUS` where the choice is not sure, `RECOVERED` on the first frame with an orientation after a gap or a
+    break, `SPIKE` where a rotation does not follow from the motion.
+    Source: textbook hidden Markov model of second order; unlike the paper's cost, it does not favour candidates at rest
+    (docs/errata.md A6).
 
     Raises:
         ShapeError: the number of times is not N.
@@ -216,9 +216,8 @@ def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> S
 
 
 def _misfits(rows: CandidateRows, histories: Histories, cost: SecondOrderCost) -> tuple[Ints, Floats, Floats, Floats]:
-    """Compare each orientation of a history with the prediction from the two before it.
-    Return frames (L,) with a prediction, and for each: misfit angle, rad; its variance per axis, rad^2, from the errors
-    of the orientations; its drift per unit of acceleration, s^2.
+    """Return the frames (L,) with a prediction from the two before, and for each: misfit, rad; its variance per axis,
+    rad^2, from the errors of the orientations; its drift per unit of acceleration, s^2.
     """
     frame = np.flatnonzero(histories.row >= 0)
     row, begins = histories.row[frame], histories.begins[frame]

@@ -75,8 +75,7 @@ class SecondOrderCost:
 
     def log_ratio(self, misfit: Values, variance: Values) -> Values:
         """Return the log density of Student's t in three dimensions, over the uniform one.
-        `misfit` (...), rad^2, is the squared angle to the expected rotation, or (2 sin(angle / 2))^2; `variance` (...),
-        rad^2, the scale per axis.
+        `misfit`, rad^2, is angle^2 or (2 sin(angle / 2))^2 to the expected rotation; `variance`, rad^2, is per axis.
         """
         lib, tail = _library(variance), self.tail
         within = lib.minimum(variance, lib.asarray(VARIANCE_MAX))
@@ -87,14 +86,9 @@ class SecondOrderCost:
     def predicted_variance(
         self, dt_s: Values, span_s: Values, before: Values, here: Values, after: Values | float
     ) -> Values:
-        """Return the variance per axis, rad^2, of an orientation about the one that the mean omega of a span predicts.
-
-        Args:
-            dt_s: (...), step from the span's end to the predicted orientation.
-            span_s: (...), time over which omega was measured.
-            before: (...), rad^2 per axis, of the span's first orientation.
-            here: (...), of its last.
-            after: (...), of the one compared with the prediction.
+        """Return the variance per axis, rad^2, of an orientation about the prediction by the mean omega of a span.
+        dt_s is the step after the span, span_s its length; before, here and after are the variances per axis, rad^2, of
+        the span's first and last orientation and of the one predicted.
         """
         ratio = dt_s / span_s
         drift = self.acceleration_rad_s2 * (span_s + dt_s) / 2 * dt_s
@@ -108,9 +102,9 @@ class SecondOrderCost:
 
     def candidate(self, log_ratio: Values, still: Values) -> Values:
         """Return the cost of a candidate: its log density if it is false, less that if it is right.
-        A false candidate stands anywhere, or where one stood before, or follows the motion by chance. `log_ratio` (...)
-        is that by the motion, `still` (...) that of staying since a frame before, -inf without such a frame. Staying
-        never explains better what the motion explains: otherwise noise would lose a sphere at rest.
+        A false one stands anywhere, or stays (`still`, -inf without a frame before), or follows the motion
+        (`log_ratio`). Staying never explains better what the motion explains: otherwise noise would lose a sphere at
+        rest.
         """
         lib = _library(still)
         shares = 1 - self.stuck_probability - self.follow_probability, self.stuck_probability, self.follow_probability

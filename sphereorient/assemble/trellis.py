@@ -34,18 +34,16 @@ class SoftPath:
 def shortest_path(
     edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None = None, triple_cost: Tensor | None = None
 ) -> ShortestPath:
-    """Find the cheapest path that visits one candidate in each step; of equal paths the one with the lowest last
-    indices. Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with
-    candidates. Movies of different length share a batch by empty steps at the end.
+    """Find the cheapest path that visits one candidate in each step; of equal paths, the one with the lowest last
+    index.
+    Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with candidates.
     Source: Bellman 1957, Viterbi 1967.
 
     Args:
-        edge_cost: (..., N - 1, C, C), from row to column, any sign, inf for a wall; None: 0, with `triple_cost`
-            only.
+        edge_cost: (..., N - 1, C, C), from row to column, inf for a wall; None: 0, with `triple_cost` only.
         mask: (..., N, C) bool, True for a candidate; costs of masked candidates do not matter.
         node_cost: (..., N, C), of a candidate by itself.
-        triple_cost: (..., N - 2, C, C, C), of three candidates in the order of time; makes the path of second
-            order.
+        triple_cost: (..., N - 2, C, C, C), of three candidates in the order of time; makes the order second.
 
     Raises:
         ShapeError: costs and mask differ in shape.

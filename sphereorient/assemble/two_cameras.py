@@ -41,13 +41,10 @@ def fuse(
     paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings
 ) -> Fused:
     """Fuse the paths of one or two cameras, in the lab frame, into one; `time_s` (N,).
-
-    Runs of frames where they differ by more than `repair_deg` are repaired. Then each frame is the mean of both,
-    weighted by the inverse moving variance of xi. The differences between the cameras scale these relative variances,
-    so that one camera alone gives no sigma. Frames seen by one camera carry `ONE_CAMERA`; frames of an undecided repair
-    `AMBIGUOUS`.
-    Source: the paper's two cameras; docs/errata.md A7 (which camera is right) and A8 (the variance of xi contains the
-    motion's, so that uneven motion makes the weights more equal).
+    Frames that differ by more than `repair_deg` are repaired. Then each frame is the mean of both, weighted by the
+    inverse moving variance of xi; their differences give the sigma, so that one camera alone has none. Flags:
+    `ONE_CAMERA`, and `AMBIGUOUS` for an undecided repair.
+    Source: the paper's two cameras; docs/errata.md A7 (which camera is right), A8 (xi contains the motion's variance).
 
     Raises:
         ExperimentError: no camera, or more than two.
@@ -94,8 +91,7 @@ def fuse(
 
 def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tensor:
     """Return the moving variance (K, N) of each camera's xi (N,), above 0; only ratios between cameras have a meaning.
-    It is within a factor of `VARIANCE_RANGE` of the camera's median, which replaces it where `LINKS_MIN` links are not
-    near.
+    It is clamped about the camera's median, which replaces it where fewer than `LINKS_MIN` links are near.
     """
     windows = [moving(each, settings.weight_window_frames) for each in xi]
     count = torch.stack([torch.isfinite(window).sum(-1) for window in windows])
@@ -148,8 +144,7 @@ def _apart(tracks: Sequence[Track]) -> Tensor:
 def _sigma(variance: Tensor, share: Tensor, apart: Tensor, calm: Tensor) -> Tensor:
     """Return the standard deviation per axis of the mean, (N,), rad.
     With errors of variance s^2 variance_i per axis, d^2 / (s^2 (variance_1 + variance_2)) is chi-squared with three
-    degrees of freedom. Its median gives s^2 in spite of a few wrong frames. Frames near a spike are left out where
-    possible: the spike raises their variance, not their d.
+    degrees of freedom; its median gives s^2 robustly. Spikes raise the variance, not d: their frames are left out.
     """
     if not len(apart):
         return apart
@@ -207,11 +202,9 @@ class Repair:
 
 def repair(tracks: tuple[Track, Track], graphs: tuple[Graph, Graph], settings: AssembleSettings) -> Repair:
     """Repair each run of frames where the cameras disagree; the better supported camera leads.
-
-    Each camera in turn is assumed right. The other takes, in every frame, its candidate nearest to that orientation;
-    beyond `repair_deg` it takes none, which counts as T = 0. The assumption with the larger mean T of both cameras
-    holds. Where the two differ by less than `repair_margin`, or neither finds a candidate, the leader with the smaller
-    largest rotation into, within and out of the run holds, and the frames are ambiguous.
+    Each camera in turn is assumed right; the other takes its nearest candidates, none (T = 0) beyond `repair_deg`. The
+    larger mean T of both cameras decides. Within `repair_margin`, or without such candidates, the leader with the
+    smaller largest rotation holds, and the frames are ambiguous.
     Source: the paper's two cameras, which does not say which camera is right; docs/errata.md A7.
     """
     limit = math.radians(settings.repair_deg)

@@ -145,8 +145,8 @@ def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
 
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
     """Measure on a few frames whether the cameras see one sphere at one position.
-    Return the variance left unexplained by all cameras together over that by each alone, and the distance between the
-    lines of sight, px; both in the worst quarter of frames, as cameras may agree in a part of the volume.
+    Return, for the worst quarter of frames, the unexplained variance of all cameras together over that of each alone,
+    and the distance between the lines of sight, px.
     """
     cameras = len(fitter.views)
     whole = [k for k, poses in enumerate(found) if len(poses) and bool(poses.use.all())]

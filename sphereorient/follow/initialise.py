@@ -148,9 +148,8 @@ def _best_score(poses: Poses) -> float:
 
 
 def explaining_first(nll: Tensor, score: Tensor) -> Tensor:
-    """Return likelihoods (M,) in which poses that explain clearly less of the pictures come behind the others.
-    Likelihood forgives a wide scatter before it forgives worn paint or dirt. `nll` (M,) is the negative log-likelihood,
-    `score` (M,) the share of the pictures' variance that each pose explains.
+    """Return likelihoods nll (M,) in which poses that explain clearly less (score (M,)) come behind the others.
+    Likelihood forgives a wide scatter before it forgives worn paint or dirt.
     """
     behind = score < score.nan_to_num(-1.0).max() - CLEARLY_LESS
     if not bool((~behind & torch.isfinite(nll)).any()):

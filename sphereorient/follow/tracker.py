@@ -134,8 +134,7 @@ class ChunkTracker:
 
     def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
         """Yield the poses of each frame of one batch, in order.
-        `shots` holds for each view the frames of these chunks, `batch` the lengths of the chunks, `time_s` the times of
-        all.
+        `shots` holds the frames of each view, `batch` the lengths of the chunks, `time_s` the times of all.
         """
         firsts = list(accumulate([0, *batch[:-1]]))
         chunks = [_Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]

@@ -23,11 +23,9 @@ def omega_from_orientations(
     min_separations: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """Return omega_lab (..., N, 3), rad/s, averaged over symmetric separations, and its standard error (..., N, 3).
-
-    A separation m gives log(R[k + m] R[k - m]^T) / (2 m dt). The mean has weights m^2, optimal for white attitude
-    noise. A lost frame costs its neighbours one separation each. A component of f cycles per frame is damped by sin(2
-    pi f m) / (2 pi f m). 2 max(m) |omega| dt must stay well below pi, which is not checked. The error comes from the
-    scatter of the separations; NaN with fewer than two.
+    A separation m gives log(R[k + m] R[k - m]^T) / (2 m dt), weight m^2, optimal for white attitude noise. It damps f
+    cycles per frame by sin(2 pi f m) / (2 pi f m). 2 max(m) |omega| dt must stay well below pi (not checked). The error
+    comes from the scatter of the separations; NaN with fewer than two.
     Source: the paper, section III, angular velocity from the increment T; docs/errata.md E4 and E6.
 
     Args:
@@ -121,8 +119,8 @@ def _shifted(R: Tensor, m: int) -> Tensor:
 
 def kabsch(points_a: Tensor, points_b: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return the rotation (..., 3, 3) from points_a (..., K, 3) onto points_b, any unit, by weighted least squares.
-    Both sets are centred first. The rotation is proper also for points in a plane and for mirror images; points on one
-    line leave it undetermined (not checked). Weights (..., K) are not negative; None: all equal.
+    Both sets are centred first; points on one line leave it undetermined (not checked). Weights (..., K) are not
+    negative.
     Source: W. Kabsch, Acta Cryst. A32, 922 (1976); the paper's R_kabsch, its increment T, docs/errata.md E8.
     """
     check_tail("points_a", points_a, 3)

@@ -18,20 +18,13 @@ TRUNCATE = 3.0  # holds 99.7 % of the Gaussian
 def gaussian_derivative(
     x: Tensor, dt_s: float, sigma_frames: float, order: Order, truncate: float = TRUNCATE
 ) -> Tensor:
-    """Return the derivative (..., N, D), x's unit / s^order, by a Gaussian kernel; order 0 only smooths.
-    The result is NaN where the window reaches a missing value or an end. Polynomials up to degree order + 1 come out
-    exactly. A sine of f cycles per frame is damped by about exp(-(2 pi f sigma)^2 / 2).
+    """Return the derivative (..., N, D) of x (..., N, D), in its unit / s^order, by a Gaussian kernel; order 0 smooths.
+    NaN where the window (`truncate` sigmas on each side) reaches a missing value or an end. Exact for polynomials up to
+    degree order + 1. A sine of f cycles per frame is damped by about exp(-(2 pi f sigma)^2 / 2).
     Source: the paper, section III, differentiation of trajectories with a Gaussian kernel.
 
-    Args:
-        x: (..., N, D), any unit; NaN where missing.
-        dt_s: time between frames.
-        sigma_frames: width of the Gaussian.
-        order: of the derivative, 0, 1 or 2.
-        truncate: half width of the window in units of sigma.
-
     Raises:
-        SettingsError: another order, or a width that is not positive.
+        SettingsError: an order other than 0, 1, 2, or a width that is not positive.
     """
     kernel = _full_kernel(sigma_frames, order, truncate, x)
     near = windows(x.mT, kernel.shape[-1] // 2)
@@ -40,8 +33,7 @@ def gaussian_derivative(
 
 def noise_gain(sigma_frames: float, order: Order, truncate: float = TRUNCATE) -> float:
     """Return the standard deviation of white noise of standard deviation 1 after `gaussian_derivative` with dt_s = 1.
-    For sigma above about 1.5 frames the orders 0, 1, 2 give 0.531 sigma^-0.5, 0.376 sigma^-1.5 and 0.460 sigma^-2.5;
-    noise correlated over frames gives more.
+    For sigma above 1.5 frames, orders 0, 1, 2: 0.531 sigma^-0.5, 0.376 sigma^-1.5, 0.460 sigma^-2.5.
     """
     return float(_full_kernel(sigma_frames, order, truncate, torch.empty(0, dtype=torch.float64)).norm())
 
@@ -57,20 +49,12 @@ def gap_aware_stencil(
     dtype: torch.dtype = torch.float64,
 ) -> Tensor:
     """Return the kernel of `gaussian_derivative` for every frame, (..., N, 2 h + 1), corrected for missing frames.
-    A neighbour is used where its mirror image is measured, too, and both are in the frame's segment; polynomials still
-    come out exactly. Towards an end the window shrinks evenly.
-
-    Args:
-        there: (..., N) bool, measured frames.
-        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
-        sigma_frames: width of the Gaussian.
-        order: of the derivative, 0, 1 or 2.
-        truncate: half width of the window in units of sigma.
-        min_share: share of the Gaussian's weight that must be measured, else NaN; 1 requires the whole window.
-        dtype: of the result.
+    A neighbour is used where its mirror image is measured and both are in the segment; polynomials stay exact. `there`
+    (..., N) marks measured frames; segment (..., N) is -1 outside any, None is one segment. NaN where less than
+    `min_share` of the Gaussian's weight is measured.
 
     Raises:
-        SettingsError: another order, or a width that is not positive.
+        SettingsError: an order other than 0, 1, 2, or a width that is not positive.
     """
     half = _half_width(sigma_frames, order, truncate)
     like = torch.empty(0, dtype=dtype, device=there.device)

@@ -69,9 +69,8 @@ class Estimate:
 def estimate(
     paths: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings, known: ProcessPrior | None = None
 ) -> tuple[list[Estimate], float, ProcessPrior | None]:
-    """Estimate the process from all segments of one kind, then smooth each by itself.
-    `band`: cycles per frame; None estimates it. `known`: the process of another track; None estimates it. Return the
-    estimates, the ratio of true errors to sigmas of the measurements (slow errors included), and the process.
+    """Estimate the process from all segments of one kind unless `known`, then smooth each; `band` in cycles per frame.
+    Return the estimates, the ratio of true errors to sigmas of the measurements, and the process.
     """
     if known is None:
         pieces = _pieces(paths, settings.learn_frames)
@@ -196,15 +195,9 @@ def _alone(path: SegmentTrack) -> Estimate:
 def estimate_process(
     paths: Sequence[SegmentTrack], scales: tuple[float, float], band: float | None, before: ProcessPrior | None = None
 ) -> ProcessPrior:
-    """Find the prior and the factor on the measurements' sigmas with the highest likelihood.
-    Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form, with FREE fewer
-    degrees of freedom a path.
-
-    Args:
-        paths: segments with at least five measurements each.
-        scales: least and largest factor accepted.
-        band: cycles per frame; fixes the prior, so that only the factor is estimated. None estimates both.
-        before: the estimate of the same segments with other references or rejections, as a start.
+    """Find the prior and the factor (within `scales`) on the measurements' sigmas with the highest likelihood.
+    Paths have at least five measurements each. `band`, cycles per frame, fixes the prior; `before` is a start.
+    Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form.
     """
     sigma = float(np.median([path.sigma for path in paths]))
     if band is not None:

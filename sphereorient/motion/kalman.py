@@ -16,8 +16,7 @@ EVERY = 64  # states between stored covariances; the smoother computes the other
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateSpace:
     """A linear problem of N states of size D whose first three numbers are measured.
-    A step takes the first three numbers to `carried` times the whole state plus `drift`; the other numbers and the
-    noise depend only on the step's kind (its length).
+    A step takes these to `carried` times the state plus `drift`; all else depends on the step's kind (its length).
     """
 
     carried: Floats  # (N - 1, 3, D)
@@ -51,9 +50,7 @@ class Filtered:
 
 
 def run_filter(chain: StateSpace) -> Filtered:
-    """Run Kalman's filter.
-    Source: Kalman 1960.
-    """
+    """Run Kalman's filter (Kalman 1960)."""
     count, size = len(chain.measured), chain.start.shape[0]
     x, P, F = np.zeros(size), chain.start, np.zeros((size, size))
     states, covariances = np.empty((count, size)), np.empty((-(-count // EVERY), size, size))

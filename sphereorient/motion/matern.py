@@ -1,8 +1,7 @@
 """The prior of the smoother: a smooth random rate of change and its integral, in closed form between two instants.
 
 The rate is u = m + w: an unknown constant m, and a stationary Gaussian process w of Matern's kernel with ORDER - 1
-continuous derivatives. Its spectrum is flat up to the band and falls steeply beyond, like that of a heavy body in
-turbulence. An integrated Wiener process has twice the error of acceleration on the shared experiment, from the ends.
+continuous derivatives. An integrated Wiener process doubles the error of acceleration on the shared experiment.
 """
 
 from __future__ import annotations

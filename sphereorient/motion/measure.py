@@ -53,8 +53,7 @@ def measure_motion(
     orientation_sigma_rad: Tensor | None = None,
 ) -> Motion:
     """Return velocity, acceleration, omega and alpha of every frame whose neighbours determine them, else NaN.
-    Nothing crosses the ends of a segment. Single lost frames are bridged; a long gap and the frames next to an end give
-    NaN. Body components need the frame's own orientation.
+    Nothing crosses the ends of a segment; single lost frames are bridged. Body components need the frame's orientation.
     Source: the paper, section III; docs/errata.md E4 and E6.
 
     Args:
@@ -164,8 +163,7 @@ def _to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
 
 def _sigma_in_body(R_lab_body: Tensor, x_lab: Tensor, x_sigma: Tensor, sigma_rad: Tensor | None) -> Tensor:
     """Return the standard deviations by axis of R^T x from those of x (lab) and of the orientation.
-    An orientation error delta adds delta x x. It is independent of omega, which does not use the frame's own
-    orientation, and small in alpha.
+    An orientation error delta adds delta x x, independent of omega, which does not use the frame's own orientation.
     """
     from_x = _to_body(R_lab_body.square(), x_sigma.square())
     unit = torch.eye(3, dtype=x_lab.dtype, device=x_lab.device).expand(*x_lab.shape, 3)

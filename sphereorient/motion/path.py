@@ -1,7 +1,7 @@
 """Segments as chains of small deviations from a reference: positions on R^3, orientations on SO(3) for any rotation.
 
-The state has 3 (2 + ORDER) numbers: the deviation delta from the reference, the deviation of the constant rate from the
-reference's, and the random rate w, w' / pole, w'' / pole^2, ... itself. Time is in frames.
+The state has 3 (2 + ORDER) numbers: delta from the reference, the deviation of the constant rate, and the random rate
+w, w' / pole, w'' / pole^2, ... itself. Time is in frames.
 """
 
 from __future__ import annotations
@@ -50,9 +50,8 @@ class SegmentTrack:
         raise NotImplementedError
 
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
-        """Return rotations (N - 1, NODES + 1, 3, 3) and jumps (N - 1, 3) of the reference's steps.
-        The rotations take a deviation from the nodes of a step, and from its begin, to its end. The jumps are the steps
-        less the integral of the reference's rate.
+        """Return rotations (N - 1, NODES + 1, 3, 3) from nodes and begin of a step to its end, and jumps (N - 1, 3).
+        The jumps are the steps less the integral of the reference's rate.
         """
         raise NotImplementedError
 
@@ -74,13 +73,12 @@ class SegmentTrack:
         return self.rate * (self.pole / prior.pole) ** np.arange(ORDER)[:, None]
 
     def part(self, instants: slice) -> Self:
-        """Return some instants of the path."""
+        """Return some instants of the segment."""
         return replace(self, **{name: getattr(self, name)[instants] for name in BY_INSTANT})
 
     def steps(self, prior: Prior, weight: Floats, by_rate: Floats) -> tuple[Floats, Floats]:
         """Return the transition of a step from the state, (M, 3, SIZE), and its drift (M, 3).
-        `weight` (M, NODES) holds the weights of the nodes, `by_rate` (M, NODES, ORDER) the same times the growth of the
-        rate's state to them.
+        `weight` (M, NODES): of the nodes; `by_rate` (M, NODES, ORDER): the same times the growth of the rate's state.
         """
         count = len(weight)
         carry, jump = self.jumps(prior)

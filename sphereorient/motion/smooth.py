@@ -79,12 +79,10 @@ class MeasuredPoses:
 
 def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: ProcessNoise | None = None) -> Smoothed:
     """Smooth a track, segment by segment, and take its derivatives; the result is on the CPU.
-
-    Velocity and omega_lab are a constant plus a stationary random process. Its band and strength are estimated from the
-    whole track, for positions and for orientations, with one factor on the sigmas of the measurements; `known` gives
-    the processes of another run instead. There is no lag; ends are included; gaps inside a segment are filled; outliers
-    are rejected. A segment with one measured frame has no derivatives; with two it has velocities, from three on
-    accelerations too. Too few frames for the estimation are treated as single ones.
+    Velocity and omega_lab are a constant plus a stationary random process, estimated from the whole track unless
+    `known`, with one factor on the sigmas. There is no lag; ends are included, gaps inside a segment filled, outliers
+    rejected. A segment of one measured frame has no derivatives, of two no accelerations; so have tracks too short for
+    the estimation.
     Source: Gaussian-process smoother: Sarkka and Solin 2019, Applied Stochastic Differential Equations, chapter 12; on
     SO(3): Barfoot 2017, State Estimation for Robotics, chapters 7 and 8.
 

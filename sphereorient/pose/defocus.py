@@ -27,9 +27,8 @@ def defocus_radii(blur_px: float, diameter_px: float) -> float:
 
 
 def estimate_blur_px(views: Sequence[CameraView], shots: Sequence[Sequence[Frame]], locating: LocateSettings) -> float:
-    """Return the standard deviation of the blur, px, of the steepest edges about the sphere: the median of n x C
-    frames. A first guess: noise makes slopes steeper, and paint without edges less steep. 0 where no frame shows a blob
-    of the sphere's size.
+    """Return the standard deviation of the blur, px, of the steepest edges about the sphere: median of n x C frames.
+    A first guess, biased by noise and paint without edges. 0 where no frame shows a blob of the sphere's size.
     Source: a step of height h under a Gaussian blur sigma is h / (sigma sqrt(2 pi)) steep at most.
     """
     found = [

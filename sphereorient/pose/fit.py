@@ -91,11 +91,9 @@ class PoseStart:
 
 def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4) -> FittedPoses:
     """Fit poses to pictures: robust Gauss-Newton, the light's coefficients eliminated in every step.
-    `pixels` holds B * C disks, the cameras of a pose next to each other. `iterations` is at least 1, the same for all
-    poses, so that no pose depends on its batch. The covariance is that of the robust estimate with errors shared within
-    tiles. All results but the pose belong to the pose before the last step.
-    Source: variable projection, Golub and Pereyra 1973; covariance of an M-estimate from clustered scores, Liang and
-    Zeger 1986.
+    `pixels` holds B * C disks, the cameras of a pose next to each other; `iterations` is at least 1. The covariance is
+    robust, with errors shared within tiles. All results but the pose belong to the pose before the last step.
+    Source: variable projection, Golub and Pereyra 1973; covariance from clustered scores, Liang and Zeger 1986.
     """
     use, place_precision, radius_mm = begin.use, begin.place_precision, model.radius_mm
     cameras = use.shape[1]
@@ -155,15 +153,8 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
 def residuals(
     pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel, cameras: int
 ) -> Residuals:
-    """Linearise the pictures about poses, the light's coefficients at their best.
-
-    Args:
-        pixels: of B * C disks.
-        X: (B, 3), position in the lab, mm.
-        R: (B, 3, 3), R_lab_body.
-        state: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
-        model: of the sphere's pictures.
-        cameras: C.
+    """Linearise the pictures of B * C disks about poses X (B, 3), mm, R_lab_body R (B, 3, 3), the light at its best.
+    `state`: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
     """
     view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
     columns, difference, black = light_columns(view, model)
@@ -246,8 +237,7 @@ def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Te
 
 def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) -> Tensor:
     """Shorten steps (B, 6) that change a picture by over 0.1 radii, beyond which the slopes do not hold.
-    Along a line of sight the picture only grows: there a step may have the same share of the distance. `to_centre` (B,
-    C, 3), mm, leads from the cameras to the sphere; `seen` (B, C) is 1 for those in use.
+    Along a line of sight (to_centre (B, C, 3), mm) a step may have the same share of the distance.
     """
     distance = to_centre.norm(dim=-1, keepdim=True).clamp_min(radius_mm)
     move, sight = step[:, None, 3:], to_centre / distance
@@ -294,9 +284,7 @@ def _loss(at: Residuals, inside: Tensor) -> Tensor:
 
 
 def _score(at: Residuals, inside: Tensor) -> Tensor:
-    """Return the share of the disk's variance that the model explains, (L,).
-    Every pixel counts: those that do not fit reveal a wrong pose. A bubble counts at most as bright as paint.
-    """
+    """Return the share of the disk's variance that the model explains, (L,); outliers count up to a limit."""
     share = at.view.coverage * inside
     share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)
     grey = at.model + at.residual

@@ -85,13 +85,7 @@ def _stencil(radius_px: float, step_px: int) -> Stencil:
 
 
 class Optics:
-    """Texture tables at the levels of blur of the fits, for one blur of the pictures.
-
-    Args:
-        base: finest table of the texture.
-        blur_px: of optics, pixel and exposure together, px.
-        diameter_px: typical diameter of the disk, px.
-    """
+    """Texture tables at the levels of blur of the fits: pictures of blur `blur_px` and disks of `diameter_px`, px."""
 
     def __init__(self, base: TextureTable, blur_px: float, diameter_px: float) -> None:
         radius_px = diameter_px / 2
@@ -163,9 +157,8 @@ class Fitter:
         level: PyramidLevel,
         radius_px: float | None = None,
     ) -> Pixels:
-        """Cut the disks of B poses out of the pictures of C views.
-        `position_lab_mm` (B, 3) is right to a few pixels. Without `radius_px` the largest disk sets it, so that the
-        last bits depend on the batch.
+        """Cut the disks of B poses out of the pictures of C views; position_lab_mm (B, 3) is right to a few pixels.
+        Without `radius_px` the largest disk sets it, so that the last bits depend on the batch.
         """
         middles = [torch.nan_to_num(view.camera.project(position_lab_mm)).tolist() for view in self.views]
         if radius_px is None:

@@ -1,9 +1,8 @@
 """A converged fit of poses with its derivatives, by the implicit function theorem (docs/differentiable.md).
 
-At the minimum of sum r(pose, theta)^2 / 2 the gradient g(pose, theta) is 0, so that d pose / d theta = -H^-1 dg/dtheta
-with H = dg/dpose. `implicit_pose` fits without a graph and then takes one Newton step -H^-1 g with H constant: its
-value is close to 0, its derivative that of the theorem. The fit of `track` cannot serve: in single precision, with
-weights, light and slopes fixed in each step, its zero is not that of a function which autograd can differentiate.
+At the minimum of sum r(pose, theta)^2 / 2 the gradient g is 0, so that d pose / d theta = -H^-1 dg/dtheta with H =
+dg/dpose. `implicit_pose` fits without a graph and then takes one Newton step -H^-1 g with H constant. The fit of
+`track` cannot serve: it holds weights, light and slopes fixed, in single precision.
 """
 
 from __future__ import annotations
@@ -48,13 +47,11 @@ def implicit_pose(
     Source: implicit function theorem; the Newton-step form, Look and others 2020 (Differentiable implicit layers).
 
     Args:
-        residual: (B, 3, 3) and (B, 3) to (B, M), row b of pose b alone, in standard deviations; twice
-            differentiable in the pose by torch.func (`expected_grey` is), once in the rest. Residuals that must not
-            count are 0.
+        residual: (B, 3, 3) and (B, 3) to (B, M), row b of pose b alone, in standard deviations, 0 where not
+            counted; twice differentiable in the pose by torch.func (`expected_grey` is), once in the rest.
         R_start_lab_body: (B, 3, 3), start.
         start_lab_mm: (B, 3), start.
-        use: (B,) bool, frames to fit; the others are NaN, with gradient 0, if their residuals have finite
-            derivatives.
+        use: (B,) bool, frames to fit; the others, of finite residual derivatives, are NaN with gradient 0.
         iterations: Levenberg-Marquardt steps, the same for all. The graph does not grow with them.
 
     Raises:
@@ -121,9 +118,7 @@ def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: i
 
 
 def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply small errors (B, 6), rad and mm, lab components, from the left, to poses (docs/conventions.md).
-    Cayley's rotation is smooth at 0, where so3.exp has no second derivative; equal up to the third order.
-    """
+    """Apply small errors (B, 6), rad and mm, lab, from the left, to poses; Cayley's rotation is smooth at 0."""
     half = so3.hat(0.5 * delta[..., :3])
     scale = 2.0 / (1.0 + 0.25 * delta[..., :3].square().sum(-1))
     turned = R_lab_body + scale[..., None, None] * ((half + half @ half) @ R_lab_body)
@@ -131,9 +126,7 @@ def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[
 
 
 def _curvature(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> Tensor:
-    """Return the Hessian (B, 6, 6) of half the sum of squares of residuals (B, M) at delta (B, 6).
-    J^T J would be biased where residuals remain, as with a wrong texture.
-    """
+    """Return the Hessian (B, 6, 6) of half the sum of squares of residuals (B, M) at delta (B, 6); J^T J is biased."""
     gradient = torch.func.grad(lambda delta: 0.5 * residuals(delta).square().sum())
     columns: Tensor = torch.func.vmap(lambda axis: torch.func.jvp(gradient, (delta,), (axis,))[1])(_axes(delta))
     return columns.movedim(0, -1)

@@ -44,7 +44,7 @@ def light_basis(across: Tensor) -> Tensor:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Light:
     """Light on the disk and noise of a movie's pictures, one entry per camera; made by `learn_light`.
-    A pixel of the ball shows paint * difference + black, each a map over the disk; its noise has the variance
+    A pixel of the sphere shows paint * difference + black, each a map over the disk; its noise has the variance
     noise[0] + noise[1] I + noise[2] I^2 + noise[3] I^3 (read-out; photons; grain of all paint, of white paint alone).
     """
 

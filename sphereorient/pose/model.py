@@ -44,11 +44,8 @@ class SphereView:
 
 def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model: SphereModel) -> SphereView:
     """Render the sphere at position_lab_mm (L, 3) and R_lab_body (L, 3, 3) through pixels with a Gaussian aperture.
-
-    A pixel near the limb sees the paint about the middle of the covered part of its aperture; along the radius the
-    curvature stretches the aperture over more paint. Two look-ups, one standard deviation to both sides of the mean of
-    the Gaussian cut off at the limb, reproduce both; near the limb there are four, at its quantiles. Derivatives hold
-    their spread fixed. The model's light is not used.
+    Two look-ups per pixel, four near the limb, reproduce mean and width of the Gaussian cut off at the limb, as the
+    curvature stretches it over the paint. Derivatives hold their spread fixed. The model's light is not used.
     Source: docs/errata.md A4 (the cap and the ellipse that a perspective camera sees); mean and variance of a cut-off
     Gaussian, Johnson, Kotz and Balakrishnan 1994, section 13.10.
     """

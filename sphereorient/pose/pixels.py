@@ -64,8 +64,7 @@ class Pixels:
 
 def whole_vectors(count: int) -> int:
     """Return the largest number up to `count` that fills the processor's vectors.
-    The remainder of a batch takes other code whose last bits differ, so that a disk's numbers would depend on its
-    batch.
+    The remainder takes other code whose last bits differ, so that a disk would depend on its batch.
     """
     return max(count // VECTOR, 1) * VECTOR
 
@@ -135,16 +134,9 @@ def cut_pixels(
     blur_px: float = 0.0,
     shown: NDArray[np.bool_] | None = None,
 ) -> Pixels:
-    """Return a disk's pixels without resampling, so that the noise of neighbours stays independent.
-
-    Args:
-        frame: (H, W), grey levels.
-        background: (H, W), the scene without the sphere.
-        sight: of the camera.
-        middle_px: (u, v), near the sphere's centre.
-        stencil: of the places.
-        blur_px: standard deviation of a Gaussian laid over frame and background first, for coarse fits.
-        shown: (H, W), False where something hides the sphere; None: nowhere.
+    """Return a disk's pixels about middle_px (u, v) without resampling, so that the noise of neighbours is independent.
+    `frame`, `background` and `shown` (False where something hides the sphere) are (H, W); a Gaussian of blur_px is laid
+    over the first two, for coarse fits.
     """
     width, height = sight.size
     u, v = round(middle_px[0]), round(middle_px[1])

@@ -61,13 +61,9 @@ class PoseFitter(nn.Module):
         R_lab_body: ArrayLike | Tensor,
         position_lab_mm: ArrayLike | Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Fit poses; return R_lab_body (..., 3, 3), position_lab_mm (..., 3) and the covariance (..., 6, 6), float64.
-        The covariance is of delta (rad, lab) and position (mm).
-
-        Args:
-            pictures: (..., C, H, W), grey levels; (..., H, W) for a single camera.
-            R_lab_body: (..., 3, 3), start, to about 10 degrees.
-            position_lab_mm: (..., 3), start, to a few pixels.
+        """Return fitted R_lab_body (..., 3, 3), position_lab_mm (..., 3) and covariance (..., 6, 6), float64.
+        The covariance is of delta (rad, lab) and position (mm). Pictures (..., C, H, W) are grey levels, (..., H, W)
+        for a single camera; the start is right to about 10 degrees and a few pixels.
 
         Raises:
             ShapeError: shapes that do not fit together.

@@ -12,9 +12,9 @@ from sphereorient.sphere.view import disk_offsets
 def crop_disk(
     frame: NDArray[np.generic], u_px: float, v_px: float, radius_px: float, size_px: int
 ) -> NDArray[np.float32]:
-    """Return the square about a disk, resampled bilinearly to (S, S) float32 grey levels.
-    Beyond the border of the frame (H, W) the nearest pixel is repeated. `u_px`, `v_px` are column and row of the disk's
-    centre; `radius_px`, its radius, becomes half the side `size_px`.
+    """Return the square about a disk of a frame (H, W), resampled bilinearly to (S, S) float32 grey levels.
+    u_px, v_px: column and row of the disk's centre; radius_px becomes S / 2. Beyond the border the nearest pixel
+    repeats.
     """
     offset = disk_offsets(size_px).numpy() * radius_px
     # The window first: a map over the whole frame would convert all of it to float.

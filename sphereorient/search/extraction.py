@@ -13,10 +13,8 @@ BINS = 32  # of the histograms; finer ones are empty in the small moving region
 
 
 def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_share: float) -> Tensor:
-    """Stretch and clip grey values to 0 .. 1 so that given shares of the disk are black (0) and white (1).
-    `disks` (..., S, S) holds grey levels; `inside` (S, S) the pixels of the disk; the shares are the paper's b and w.
-    The result is 0.5 outside the disk and in a disk of one grey. Where one grey prevents both shares, darkest to
-    brightest become 0 .. 1.
+    """Stretch and clip disks (..., S, S) so that given shares (the paper's b and w) of `inside` (S, S) are 0 and 1.
+    The result is 0.5 outside the disk and in a disk of one grey. Where one grey prevents both shares, it spans 0 .. 1.
     Source: paper section III B; docs/errata.md A2 for what the forced shares cost.
     """
     values = disks[..., inside]
@@ -35,9 +33,9 @@ def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_sh
 
 
 def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the threshold (...), 0 .. 1, between the two classes of a histogram, and the difference of their means
-    (...). `histogram` (..., B) counts values 0 .. 1 in equal bins. The threshold is the middle of a plateau; the
-    difference is 0 where all values lie in one bin.
+    """Return the threshold between the classes of histograms (..., B) of 0 .. 1, and the difference of their means,
+    (...).
+    The threshold is the middle of a plateau; the difference is 0 where all values lie in one bin.
     Source: Otsu 1979, eq. (18): the greatest variance between the classes.
     """
     bins = histogram.shape[-1]
@@ -62,9 +60,8 @@ def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Tensor:
-    """Return the paint of each pixel, (F, S, S) float32: -1 black, +1 white, 0 undecided or outside the disk.
-    Otsu's thresholds of the whole disk and of two moving square regions vote on grey disks (F, S, S) float32; a vote
-    that is not unanimous is 0. `inside` (S, S) bool marks the disk.
+    """Return the paint of grey disks (F, S, S) float32 in the mask (S, S): -1 black, +1 white, 0 undecided or outside.
+    Otsu's thresholds of the whole disk and of two moving square regions must agree.
     Source: paper section III B.
 
     Raises:

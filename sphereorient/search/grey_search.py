@@ -32,8 +32,7 @@ DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that 
 
 class GreySearch(nn.Module):
     """Searches all of SO(3) on the CPU for the views of a texture map that look like a disk, under any smooth light.
-    The bank covers SO(3): every rotation is within (1/2 + 1/sqrt 2) step of a template (`so3.lattman_grid`), and detail
-    finer than `detail` is removed from templates and pictures, so that the nearest template still correlates.
+    Detail finer than `detail` is removed, so that the nearest template of the Lattman grid still correlates.
 
     Args:
         texture: (H, 2 H), the texture map, 0 black .. 1 white.
@@ -72,8 +71,8 @@ class GreySearch(nn.Module):
         return self._grid.flatten(0, 1)
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
-        """Return R_view_body (..., K, 3, 3) and score (..., K) float64 of each disk, best first; NaN beyond the last
-        one. `disks` (..., S, S) are grey levels of any scale, the outline touching the borders.
+        """Return R_view_body (..., K, 3, 3) and score (..., K) float64 of each disk, best first, padded with NaN.
+        Disks (..., S, S) are grey levels of any scale, the outline touching the borders.
 
         Raises:
             ShapeError: the disks are of another size.
@@ -96,8 +95,8 @@ class GreySearch(nn.Module):
 
     def propose(self, disks: Tensor) -> Proposals:
         """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
-        The outline touches the borders. The score is the share of the disk's deviation from smooth light that the paint
-        explains, 0 .. 1 (the square of their correlation). A disk below `score_min` has no proposal (`LOW_SCORE`).
+        The outline touches the borders. The score, 0 .. 1, is the share of the disk's deviation from smooth light that
+        the paint explains. A disk below `score_min` has no proposal (`LOW_SCORE`).
 
         Raises:
             ShapeError: the disks are of another size.

@@ -32,14 +32,9 @@ class Blur:
 
 
 class LocalNormalisation:
-    """Makes pictures under any smooth light comparable, templates and pictures alike: grey less the local mean,
-    clipped.
-
-    Args:
-        size_px: side S of the pictures, px; the disk fills them.
-        detail: standard deviation of the first blur, radii; finer detail does not count.
-        window: standard deviation of the neighbourhood, radii.
-        clip: limit of the difference from the local mean, in deviations of the disk (reflections, uneven light).
+    """Makes pictures under any smooth light comparable: grey less the local mean, clipped.
+    Disks fill (S, S) pictures; `detail`, the first blur, and `window`, the neighbourhood, are standard deviations in
+    radii; `clip` is in deviations of the disk (reflections, uneven light).
     """
 
     def __init__(self, size_px: int, *, detail: float, window: float, clip: float) -> None:

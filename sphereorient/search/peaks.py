@@ -9,10 +9,8 @@ from torch import Tensor
 
 
 def compact_groups(R: Tensor, size: int) -> Tensor:
-    """Divide rotations (K, 3, 3) into groups of neighbours: indices (G, size) int64; some come twice if K / size has a
-    rest.
-    Source: halving along the matrix component that varies most (Bentley 1975); neighbours in the components are
-    neighbours on SO(3).
+    """Divide rotations (K, 3, 3) into groups of neighbours, (G, size) int64; some come twice unless size divides K.
+    Source: halving along the matrix component that varies most (Bentley 1975).
     """
     flat = R.flatten(1)
     groups = math.ceil(len(R) / size)

@@ -35,14 +35,8 @@ class DetailLevel:
 
 
 def detail_level(view: DiskView, paint: TextureTable, detail: float, every: int, blur: float = 0.0) -> DetailLevel:
-    """Prepare a pyramid level.
-
-    Args:
-        view: of the pictures.
-        paint: as fine as `detail` at least.
-        detail: standard deviation of the Gaussian on the sphere, rad, and on the picture, radii.
-        every: 1: all pixels, 2: like the white fields of a chess board.
-        blur: standard deviation of the pictures' own blur, radii.
+    """Prepare a pyramid level: `detail` is a Gaussian on the sphere, rad, and `blur` the pictures' own, radii.
+    `every`: 1: all pixels, 2: like the white fields of a chess board.
     """
     size = view.size_px
     normal = view.normal_view.T.float()
@@ -82,8 +76,7 @@ def level_reference(level: DetailLevel, disk: Tensor) -> Target:
 
 def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Fit rough orientations R_view_body (Q, 3, 3) float32 by Gauss-Newton steps; return them with scores (Q,).
-    The score is the share of the disk's deviation from smooth light that paint explains, at most 1; 0 and below where
-    it explains nothing.
+    The score is the share of the disk's deviation from smooth light that paint explains, at most 1.
     Source: variable projection, Golub and Pereyra 1973; robust weights, Geman and McClure 1987.
     """
     R, weight, whites = R_view_body, level.weight.expand(len(R_view_body), -1), len(level.white)

@@ -20,12 +20,8 @@ BATCH = 32
 
 
 class TemplateSearch:
-    """Searches all of SO(3) for the views of a map that look like a disk (paper sections III B and C).
-
-    Args:
-        texture: (H, W), the map, 0 black .. 1 white.
-        size_px: side of the disks at full size; rounded up to an even number, as the bank is made at half of it.
-        settings: of the search.
+    """Searches all of SO(3) for the views of a map (H, W) that look like a disk (paper sections III B and C).
+    size_px is the side of the disks, rounded up to an even number, as the bank is made at half of it.
     """
 
     def __init__(self, texture: Tensor, size_px: int, settings: OrientSettings) -> None:

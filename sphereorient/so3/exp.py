@@ -18,8 +18,8 @@ def exp(rotvec: Tensor) -> Tensor:
 
 
 def log(R: Tensor) -> Tensor:
-    """Return the shortest rotation vectors (..., 3), rad, of rotations (..., 3, 3); a reflection gives a meaningless
-    value. At exactly pi the choice between the two vectors is always the same, and the gradient is finite.
+    """Return the shortest rotation vectors (..., 3), rad, of rotations (..., 3, 3), not checked.
+    At exactly pi the choice between the two vectors is always the same, and the gradient is finite.
     Source: textbook; through the quaternion's largest component, so it keeps all digits at 0 and at pi.
     """
     check_tail("R", R, 3, 3)

@@ -13,11 +13,10 @@ STEPS = 12
 
 
 def weighted_mean(R: Tensor, weights: Tensor) -> Tensor:
-    """Return the rotation (..., 3, 3) with the smallest weighted sum of squared angles to R (..., K, 3, 3) (Karcher
-    mean). Weights (..., K) are not negative, of any sum; they broadcast against R. NaN rotations of weight 0 do not
-    count; the result is NaN where all weights are 0. Where several means are equally good, the choice is always the
-    same. The number of steps is fixed, from the chordal mean.
-    Source: Hartley et al. 2013, Rotation averaging, algorithm 1.
+    """Return the rotation (..., 3, 3) with the smallest weighted sum of squared angles to R (..., K, 3, 3).
+    Weights (..., K) are not negative, of any sum; NaN rotations of weight 0 do not count; NaN where all weights are 0.
+    Where several means are equally good, the choice is always the same.
+    Source: Karcher mean; Hartley et al. 2013, Rotation averaging, algorithm 1.
     """
     check_tail("R", R, *weights.shape[-1:], 3, 3)
     weights = weights.to(R)
