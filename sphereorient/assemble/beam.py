@@ -109,7 +109,6 @@ class _Search:
         return BeamStep(frame=-1, states=states.take(alive), source=alive, target=np.arange(len(alive)), cost=cost)
 
     def _lose(self, source: Ints, cost: Floats) -> BeamStep:
-        """Pass the frame without a candidate and without a motion."""
         states = PathStates.begin(LOST, np.full(min(len(source), 1), -1))
         return BeamStep(frame=-1, states=states, source=source, target=np.zeros(len(source), dtype=np.int64), cost=cost)
 
@@ -269,7 +268,6 @@ class _Search:
         return BeamStep(frame=last, states=states, source=none, target=none, cost=np.array([cost]), best=none), cost
 
     def _read(self, steps: list[BeamStep], totals: list[Floats], end: int) -> Histories:
-        """Walk back from the end: read the best history, and sum over all of them."""
         frames = len(self.time)
         row, begins, breaks = np.full(frames, -1), np.zeros(frames, dtype=np.bool_), np.zeros(frames, dtype=np.bool_)
         turn, posterior = np.full((frames, 3), np.nan), np.zeros(len(self.still))
@@ -310,7 +308,6 @@ def still_log_ratio(rows: CandidateRows, cost: SecondOrderCost) -> Floats:
 
 
 def _row_pairs(offset: Ints, lag: int) -> tuple[Ints, Ints]:
-    """Return all pairs of a candidate and one `lag` frames later, as rows."""
     counts = np.diff(offset)
     before, after = counts[:-lag], counts[lag:]
     pairs = before * after

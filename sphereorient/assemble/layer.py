@@ -160,7 +160,6 @@ def triple_costs(
 
 
 def _chunk(cost: SecondOrderCost, links: _Links, variance: Tensor, still: Tensor, steps: slice) -> Tensor:
-    """Return the costs of entering some steps, (..., K, C, C, C)."""
     before = links.before[..., steps]
     earlier = links.before.gather(-1, before)
     dt, span = (each[..., None, None, None] for each in (links.dt_s[..., steps], links.dt_s.gather(-1, before)))
@@ -222,7 +221,6 @@ def _squared_chord(expected: Tensor, found: Tensor) -> Tensor:
 
 
 def _taken(part: Tensor, step: Tensor, tail: int) -> Tensor:
-    """Return rows (..., K, *tail) of a part (..., N, *tail) at some steps (..., K)."""
     index = step[(..., *[None] * tail)]
     return part.gather(-tail - 1, index.expand(*step.shape, *part.shape[part.ndim - tail :]))
 

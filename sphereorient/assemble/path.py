@@ -1,5 +1,3 @@
-"""The paper's path of each camera: costs of links, the cheapest path, its spikes and segments."""
-
 from __future__ import annotations
 
 import math

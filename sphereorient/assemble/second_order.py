@@ -191,7 +191,6 @@ def _search(rows: CandidateRows, cost: SecondOrderCost, settings: PathSettings) 
 
 
 def _bounds(rows: CandidateRows) -> tuple[float, float]:
-    """Return the least and largest acceleration, rad/s^2."""
     least = FLOOR_SIGMAS * float(np.sqrt(np.median(rows.variance)))
     most = max(math.radians(CHANGE_MAX_DEG), least)
     return least / rows.frame_s**2, most / rows.frame_s**2

@@ -180,7 +180,6 @@ def _walk_back(last: Tensor, origins: list[Tensor], order: int) -> Tensor:
 
 
 def _cost_along(start: Tensor, edges: Tensor, walk: Tensor, order: int) -> Tensor:
-    """Return the cost (...) of a path; its gradient is the minimum's subgradient."""
     power = edges.shape[-1] ** torch.arange(order, -1, -1, device=walk.device)
     steps = walk.shape[-1] - order
     edge = (torch.stack([walk[..., i : i + steps] for i in range(order + 1)], -1) * power).sum(-1)

@@ -233,7 +233,6 @@ def repair(tracks: tuple[Track, Track], graphs: tuple[Graph, Graph], settings: A
 
 
 def _stretches(wrong: Tensor, both: Tensor, gap_frames_max: int) -> list[Tensor]:
-    """Return the runs of wrong frames, as frame numbers; a short gap of one camera does not end a run."""
     seen = torch.nonzero(both)[:, 0]
     place = torch.nonzero(wrong[seen])[:, 0]
     frame = seen[place]

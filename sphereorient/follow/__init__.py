@@ -1,4 +1,4 @@
-"""Along time: appearance, initialisation, tracking block by block, one tracker per camera."""
+"""Tracking along time: appearance, initialisation, chunks of frames, one tracker per camera."""
 
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.initialise import Initialiser

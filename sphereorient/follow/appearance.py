@@ -240,7 +240,6 @@ def _clear(found: Sequence[Poses]) -> list[int]:
 
 
 def _clear_of(typical: float) -> float:
-    """Return the score that leaves three times as much unexplained as a typical one."""
     return 1 - 3 * (1 - typical)
 
 
@@ -264,7 +263,6 @@ def _light_and_blur(
 def _with_light(
     fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor, rounds: int
 ) -> tuple[Fitter, FittedPoses]:
-    """Estimate the light and fit again, several times."""
     for _ in range(rounds):
         fitter = fitter.with_light_of(pixels, fit, use)
         fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)

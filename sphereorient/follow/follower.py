@@ -78,7 +78,6 @@ def _taken(frames: Iterator[Frame], count: int) -> list[Frame]:
 
 
 def _consecutive(batches: Sequence[Batch]) -> Iterator[list[Batch]]:
-    """Split batches where frames between them are missing."""
     stretch: list[Batch] = []
     for batch in batches:
         if stretch and stretch[-1].last != batch.first:

@@ -86,7 +86,6 @@ class Initialiser:
         return self._search(shots, found)
 
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
-        """Propose orientations inside given outlines, and fit them."""
         fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])
         if not use.any():

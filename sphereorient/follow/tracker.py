@@ -34,8 +34,6 @@ ASTRAY_SHARE = 0.01  # of the radius: how far a place may be from the extrapolat
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Expected:
-    """The prediction of a frame from its predecessors."""
-
     position_lab_mm: Tensor  # (3,)
     R_lab_body: Tensor  # (3, 3)
     use: Tensor  # (C,) bool, cameras that saw the ball
@@ -268,7 +266,6 @@ class ChunkTracker:
         return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
 
     def _far(self, fit: FittedPoses, use: Tensor) -> Tensor:
-        """Return which fits need another step, (B,) bool."""
         turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
         # One camera's distances scatter; a change of its picture shows in the rotation as well.
         far: Tensor = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * self.fitter.radius_mm))
@@ -319,14 +316,12 @@ class ChunkTracker:
     def _looked_at(
         self, frames: Sequence[Picture], X: Tensor, R: Tensor, use: Tensor, level: PyramidLevel, iterations: int
     ) -> FittedPoses:
-        """Fit poses to one frame, at the fixed centre where there is one."""
         X = self._from(X)
         pixels = self.fitter.pixels([frames] * len(X), X, level)
         known = None if self.centre is None else self.centre.precision.expand(len(X), 3, 3)
         return self.fitter.fit(pixels, X, R, use, level, iterations, known)
 
     def _at_centre(self, poses: Poses, frames: Sequence[Picture]) -> Poses:
-        """Fit poses again at the fixed centre."""
         R, optics = poses.R_lab_body, self.fitter.optics
         for level, iterations in ((optics.middle, 3), (optics.fine, 4)):
             fit = self._looked_at(frames, poses.position_lab_mm, R, poses.use.expand(len(R), -1), level, iterations)
@@ -389,7 +384,6 @@ def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> 
 
 
 def _reason(used: bool, contradicts: bool, shot: Frame, before: Reason) -> Reason:
-    """Return why a camera does not count: no picture, it contradicts, or it was blind before."""
     if used:
         return Reason.OK
     if contradicts:

@@ -1,5 +1,3 @@
-"""Angular velocity from orientations or markers: rotations between two frames around a third, several separations."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence

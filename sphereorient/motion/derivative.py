@@ -1,5 +1,3 @@
-"""Derivatives by convolution with derivatives of a Gaussian."""
-
 from __future__ import annotations
 
 import math

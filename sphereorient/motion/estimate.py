@@ -93,7 +93,6 @@ def _pieces(paths: Sequence[SegmentTrack], most: int) -> list[SegmentTrack]:
 
 
 def _learnt(pieces: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings) -> ProcessPrior:
-    """Estimate the process, reject outliers, and estimate it again without them."""
     scales = settings.least_scale, settings.most_scale
     learnt = estimate_process(pieces, scales, band)
     for _ in range(ROUNDS):
@@ -153,7 +152,6 @@ def _stand_out(mahalanobis: Floats, limit: float) -> Bools:
 
 
 def _wanted(pole: float) -> Floats:
-    """Return the rows that extract value, rate and its change from a state."""
     view = np.eye(3)
     wanted = np.zeros((9, SIZE))
     wanted[VALUE, DELTA] = view
@@ -226,7 +224,6 @@ def estimate_process(
 
 
 def _rate_deviation(paths: Sequence[SegmentTrack]) -> float:
-    """Return a robust standard deviation of the measured rates by axis, per frame."""
     away = np.concatenate([np.abs(rates - np.median(rates, axis=0)) for rates in (path.rates() for path in paths)])
     return float(1.48 * np.median(away))
 

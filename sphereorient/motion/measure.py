@@ -1,5 +1,3 @@
-"""Velocities and accelerations of one sphere, with their noise."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -129,7 +129,6 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
 
 
 def _typical_step(time_s: Floats, numbers: NDArray[np.int64]) -> float:
-    """Return the median time between frames of one segment, s."""
     within = (numbers[1:] == numbers[:-1]) & (numbers[1:] >= 0)
     steps = np.diff(time_s)[within]
     return float(np.median(steps)) if len(steps) else 1.0
@@ -165,7 +164,6 @@ class _Instants:
         return out
 
     def take(self, found: Estimate) -> Estimate:
-        """Return an estimate at the frames alone."""
         return Estimate(**{entry.name: getattr(found, entry.name)[self.frames] for entry in fields(Estimate)})
 
 

@@ -1,4 +1,4 @@
-"""What a picture must look like at a pose, and the fit: pixels, model, light, fit, implicit derivative."""
+"""The model of a picture at a pose, and the fit: pixels, model, light, fit, implicit derivative."""
 
 from sphereorient.pose.defocus import estimate_blur_px
 from sphereorient.pose.fitter import CameraView, Fitter, Optics, base_table

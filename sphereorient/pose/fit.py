@@ -257,7 +257,6 @@ def _edge_errors(pixels: Pixels, to_centre: Tensor, cameras: int, radius_mm: flo
 
 
 def _bounded_alone(freed: Tensor, to_centre: Tensor, radius_mm: float) -> Tensor:
-    """Return the moves (B, C, 3) of steps (B, C, 6) that each camera would take alone."""
     count = freed.shape[0] * freed.shape[1]
     alone = torch.ones(count, 1, dtype=freed.dtype, device=freed.device)
     step = _bounded(freed.reshape(count, 6), to_centre.reshape(count, 1, 3), alone, radius_mm)

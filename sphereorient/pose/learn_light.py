@@ -1,5 +1,3 @@
-"""Light and noise of a movie, estimated from fitted poses."""
-
 from __future__ import annotations
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""`PoseFitter`: the pose of a sphere in a picture, with covariance, without the pipeline."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Where could it point, without history: normalisation, template banks, coarse to fine, the Proposer protocol."""
+"""Orientations without history: local normalisation, template banks, coarse to fine, the Proposer protocol."""
 
 from sphereorient.search.candidates import Candidates
 from sphereorient.search.crop import crop_disk

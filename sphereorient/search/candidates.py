@@ -1,5 +1,3 @@
-"""The candidates of every frame, before the path."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass

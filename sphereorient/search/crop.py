@@ -1,5 +1,3 @@
-"""The sphere's disk, cut out of a frame at a common size."""
-
 from __future__ import annotations
 
 import cv2

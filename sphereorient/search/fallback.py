@@ -1,5 +1,3 @@
-"""Two proposers: the second is asked where the first is in doubt."""
-
 from __future__ import annotations
 
 import math

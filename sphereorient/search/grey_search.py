@@ -122,7 +122,6 @@ class GreySearch(nn.Module):
         return place, peak
 
     def _normalised(self, disks: Tensor) -> Tensor:
-        """Return normalised disks, (F, P) int8."""
         filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
         return torch.cat([_steps(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
 
@@ -150,7 +149,6 @@ class GreySearch(nn.Module):
         )
 
     def _distinct(self, R: Tensor, score: Tensor) -> Tensor:
-        """Return the indices of the rotations that are not near a better one, best first."""
         order = score.argsort(descending=True, stable=True)
         return order[distinct(R[order], math.radians(self._settings.distinct_deg))]
 

@@ -1,5 +1,3 @@
-"""Local normalisation: pictures of the sphere without the light."""
-
 from __future__ import annotations
 
 import torch

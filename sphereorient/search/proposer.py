@@ -1,5 +1,3 @@
-"""The protocol of proposers of orientations: template search, network, or both."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence

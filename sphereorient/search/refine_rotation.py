@@ -115,7 +115,6 @@ def _cost(level: DetailLevel, residual: Tensor) -> Tensor:
 
 
 def _light_columns(level: DetailLevel, value: Tensor) -> Tensor:
-    """Return the columns (Q, 9, P) of the light's coefficients."""
     return torch.cat([value[:, None] * level.white, level.black.expand(len(value), -1, -1)], dim=1)
 
 
@@ -125,7 +124,6 @@ def _trust(residual: Tensor) -> Tensor:
 
 
 def _solved(columns: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
-    """Return the weighted least squares solution, (Q, C) float32, of columns (Q, C, P)."""
     weighted = columns * weight.expand(len(columns), -1)[:, None]
     normal = (weighted @ columns.mT).double()
     right = (weighted @ grey[..., None]).double()
@@ -135,6 +133,5 @@ def _solved(columns: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """Return a x b of (Q, 3, P)."""
     (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=1)

@@ -1,5 +1,3 @@
-"""The angle of a rotation, and the distance of two orientations."""
-
 from __future__ import annotations
 
 import torch

@@ -1,5 +1,3 @@
-"""Rotation vectors and rotation matrices, vectors and cross product matrices."""
-
 from __future__ import annotations
 
 import torch

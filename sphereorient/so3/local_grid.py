@@ -1,5 +1,3 @@
-"""A grid of rotations around the unit rotation."""
-
 from __future__ import annotations
 
 import math

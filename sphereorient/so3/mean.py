@@ -1,5 +1,3 @@
-"""The mean of rotations."""
-
 from __future__ import annotations
 
 import torch

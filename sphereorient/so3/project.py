@@ -1,5 +1,3 @@
-"""The rotation nearest to a matrix."""
-
 from __future__ import annotations
 
 import torch

@@ -1,5 +1,3 @@
-"""Random rotations."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence
