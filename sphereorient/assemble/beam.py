@@ -31,17 +31,17 @@ from sphereorient.assemble.states import (
 BEAM_NATS = 30.0  # more than a break and a new beginning cost
 STATES_MAX = 256
 STUCK_FRAMES = 3  # a stuck candidate may be absent for this many frames, less one
-PIN_NATS = 6.0  # what following the motion must gain in every frame of a run that needs no search
+PIN_NATS = 6.0  # least gain of following the motion in every frame of a run without search
 PIN_MARGIN = 3  # frames at either end of such a run that are searched nevertheless
 NEAR_WHOLE_TURN = 1.0  # rad; nearer, two orientations do not determine the axis of the rotation between them
-REST_SHARE = 0.5  # of spheres seen for the first time: as slow as omega's changes; the others rotate at any rate
+REST_SHARE = 0.5  # prior share of new spheres with an omega as small as its changes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Histories:
     """Result of `search`, F frames and M rows."""
 
-    row: Ints  # (F,), row chosen, -1 none
+    row: Ints  # (F,), row chosen, -1 without
     begins: Bools  # (F,), the orientation of the frame begins a motion
     breaks: Bools  # (F,), it begins one although the motion before could have continued
     turn_rad: Floats  # (F, 3), from the orientation before, whole turns included; NaN where a motion begins

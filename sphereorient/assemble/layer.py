@@ -21,7 +21,7 @@ Values = Tensor | NDArray[np.floating]
 
 TRIPLES_AT_ONCE = 1 << 20  # whose misfits are held at once, 8 MB each array
 EVEN = 1e-9  # of a ratio of times: the expected rotation is off by less than 4e-9 rad
-LOST_RAD2 = 1e6  # variance of the place for none: a prediction with it says nothing
+LOST_RAD2 = 1e6  # variance of the place for no candidate: a prediction without information
 LEAST = {"tail": 2.0}  # bounds of parameters, as in PathSettings
 MOST = {name: 1.0 for name in PARAMETERS if name.endswith("probability") or name == "evidence_doubt"}
 MOST |= {"stuck_probability": 0.5, "follow_probability": 0.5}
@@ -195,9 +195,9 @@ def _log_ratio(cost: SecondOrderCost, misfit: Tensor, variance: Tensor) -> Tenso
 class _Links:
     """How each step is reached from the one visited before it."""
 
-    turn: Tensor  # (..., N, C, C, 3, 3), lab, from each candidate there to each here
-    dt_s: Tensor  # (..., N), the time between, 1 where there is none before
-    before: Tensor  # (..., N) int64, the step visited before, 0 where there is none
+    turn: Tensor  # (..., N, C, C, 3, 3), lab, from each candidate before to each here
+    dt_s: Tensor  # (..., N), the time between, 1 without a step before
+    before: Tensor  # (..., N) int64, the step visited before, 0 without one
 
 
 def _links_of(R_lab_body: Tensor, time_s: Tensor, mask: Tensor) -> _Links:

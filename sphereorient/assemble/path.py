@@ -22,10 +22,10 @@ Graph = Sequence[Tensor]  # R (N, C, 3, 3), score (N, C), mask (N, C)
 class Path:
     """Chosen orientations of one camera in N frames; xi and spike of a link stand at the frame that it enters."""
 
-    choice: Tensor  # (N,) int64, row within the frame's candidates; -1 where there is none
-    R_lab_body: Tensor  # (N, 3, 3), NaN where there is none
-    score: Tensor  # (N,), T of the choice, NaN where there is none
-    xi: Tensor  # (N,), rad/s, cost of the link that enters the frame; NaN where none does
+    choice: Tensor  # (N,) int64, row within the frame's candidates; -1 without any
+    R_lab_body: Tensor  # (N, 3, 3), NaN where choice is -1
+    score: Tensor  # (N,), T of the choice, NaN where choice is -1
+    xi: Tensor  # (N,), rad/s, cost of the link that enters the frame; NaN without a link
     spike: Tensor  # (N,) bool, that link is a spike
     segment: Tensor  # (N,) int64, -1 outside any
 

@@ -59,11 +59,11 @@ class Hypotheses:
 class Chosen:
     """The most probable history of N frames; made by `physical_path`."""
 
-    choice: Tensor  # (N,) int64, place of the candidate, -1 where none is right
-    R_lab_body: Tensor  # (N, 3, 3) float64, NaN where none is
-    covariance_rad2: Tensor  # (N, 3, 3), NaN where none is
-    probability: Tensor  # (N,) float64, of the choice among the frame's candidates and none; NaN for none
-    posterior: Tensor  # (N, C) float64, the same of each candidate, 0 where there is none
+    choice: Tensor  # (N,) int64, index of the candidate, -1 where no candidate is right
+    R_lab_body: Tensor  # (N, 3, 3) float64, NaN where choice is -1
+    covariance_rad2: Tensor  # (N, 3, 3), NaN where choice is -1
+    probability: Tensor  # (N,) float64, of the choice, NaN where it is -1
+    posterior: Tensor  # (N, C) float64, of each candidate, 0 where masked
     turn_rad: Tensor  # (N, 3), rad, lab, from the orientation before, may exceed half a turn; NaN where a motion begins
     segment: Tensor  # (N,) int64, -1 outside any; gaps inside a segment belong to it
     flags: Tensor  # (N,) int64, bits of trajectory.Flag

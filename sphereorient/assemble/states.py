@@ -53,7 +53,7 @@ class CandidateRows:
 class PathStates:
     """Ends of histories at one frame, S of them."""
 
-    frame: Ints  # of the last orientation; LOST or NOT_YET where there is none to go on from
+    frame: Ints  # of the last orientation; LOST or NOT_YET without one to continue from
     row: Ints  # of the last orientation
     omega: Floats  # (S, 3), rad/s, mean over the span
     turn: Floats  # (S, 3), rad, over the span

@@ -19,15 +19,15 @@ class ShortestPath:
     """One candidate in each step of each movie."""
 
     choice: Tensor  # (..., N) int64, -1 in steps without candidates, and in all where no path has a finite cost
-    cost: Tensor  # (...), of the path, inf where there is none; differentiable in all costs
+    cost: Tensor  # (...), of the path, inf without a path; differentiable in all costs
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SoftPath:
     """Probabilities of the candidates, each path weighing exp(-cost / temperature); differentiable in all costs."""
 
-    free_energy: Tensor  # (...), -T log of the sum over all paths; inf where there is none, 0 without candidates
-    marginals: Tensor  # (..., N, C), sum 1 in steps with candidates, 0 in others and where there is no path
+    free_energy: Tensor  # (...), -T log of the sum over all paths; inf without a path, 0 without candidates
+    marginals: Tensor  # (..., N, C), sum 1 in steps with candidates, 0 in others and without a path
     pair_marginals: Tensor  # (..., N - 1, C, C), of edge k into step k + 1, from the step visited last; 0 into others
 
 
@@ -220,7 +220,7 @@ class _Visits:
     mask: Tensor  # (..., M, C) bool, candidates; behind the end place 0 alone
     rank: Tensor  # (..., N) int64, which of the M is the last one visited up to each step, 0 before the first
     visited: Tensor  # (..., N) bool
-    whole: bool  # there is no hole in any movie
+    whole: bool  # no movie has a gap
 
     def rows(self, part: Tensor, back: int) -> Tensor:
         """Return rows (..., M - back, *tail) of a part (..., N - back, *tail) whose row k belongs to step k + back."""

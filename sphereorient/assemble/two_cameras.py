@@ -27,14 +27,14 @@ class Fused:
     """The orientation of the sphere in N frames from all cameras."""
 
     R_lab_body: Tensor  # (N, 3, 3), NaN where no camera has one
-    sigma_rad: Tensor  # (N,), standard deviation per axis; NaN where there is nothing to measure it by
+    sigma_rad: Tensor  # (N,), standard deviation per axis; NaN where not measurable
     disagreement_rad: Tensor  # (N,), distance of the two cameras' orientations after repair; NaN with one
     segment: Tensor  # (N,) int64, -1 outside any
     spike: Tensor  # (N,) bool
     flags: Tensor  # (N,) int64, bits of trajectory.Flag
-    weight: Mapping[str, Tensor]  # (N,) of each camera, its share in the mean: their sum is 1, or 0 where none has one
+    weight: Mapping[str, Tensor]  # (N,) of each camera, its share in the mean, of sum 1; 0 without any orientation
     repaired: Mapping[str, Tensor]  # (N,) bool of each camera
-    R_lab_body_of: Mapping[str, Tensor]  # (N, 3, 3) of each camera after the repair, NaN where it has none
+    R_lab_body_of: Mapping[str, Tensor]  # (N, 3, 3) of each camera after the repair, NaN where missing
 
 
 def fuse(

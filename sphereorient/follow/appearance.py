@@ -27,18 +27,18 @@ from sphereorient.trajectory import Reason
 
 TRIED = 6  # frames
 APART_GAIN = 1.5  # cameras that leave this many times more unexplained together than alone are followed one by one
-APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
+APART_PX = 0.4  # a larger distance of lines of sight: estimate light from each camera alone
 FAR_APART_PX = 1.5  # and by more than this, no pose fits all cameras
 FEWEST_BOTH = 4  # frames of two cameras from which their usual disagreement is measured
-TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees a ball, but not where the other does
+TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees the sphere elsewhere than the other
 NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses by less than this
 TELLING = 2.0  # unless wrong poses leave this many times more unexplained, picture by picture; other maps: 1.6 at most
 ENOUGH = 1400  # pixels of each disk that are used: more of them changed nothing
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
-ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the texture locates the ball
+ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the texture locates the sphere
 
 FINER = 1.25  # ratio of the blurs that are tried, from FINEST_PX on
-WIDEST = 0.3  # of the radius: wider ones leave nothing of a paint that a ball can carry
+WIDEST = 0.3  # of the radius: wider ones remove all paint
 LIGHT_ROUNDS, SOFT_ROUNDS = 2, 4
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 
@@ -51,7 +51,7 @@ class Appearance:
     score_min: float  # between right and wrong poses
     right_score: float  # typical of right poses
     usual_apart_rad: float = math.inf  # typical angle between the orientations that two cameras alone give
-    together: bool = True  # whether the cameras see one ball in one place, as they do unless they were bumped
+    together: bool = True  # whether the cameras see the sphere at one position
 
     def of(self, camera: int) -> Appearance:
         """Return the appearance in one camera."""
@@ -176,7 +176,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     return float(torch.stack(gains).amax(0).quantile(0.75)), float(gap_mm.quantile(0.75) * px_mm)
 
 
-Rows = tuple[list[int], Tensor, Tensor, Tensor]  # frames, places (n, 3), rotations (n, 3, 3), cameras in use (n, C)
+Rows = tuple[list[int], Tensor, Tensor, Tensor]  # frames, positions (n, 3), rotations (n, 3, 3), cameras in use (n, C)
 
 
 def _seen_by_all(found: Sequence[Poses]) -> Rows:

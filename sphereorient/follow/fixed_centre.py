@@ -19,10 +19,10 @@ from sphereorient.pose.pixels import Pixels
 ROUNDS = 10  # of robust weights
 USUAL = 2.366  # median of chi squared with three degrees of freedom
 FAR = 2.0  # usual distances at which a frame counts for half
-FOLLOWS_EVERY = 4  # pixel; how attitudes follow the place need not be known well
+FOLLOWS_EVERY = 4  # every n-th pixel; this derivative need not be precise
 ASIDE = 0.005  # of the radius: how far aside that is tried
-FIRM = 0.01  # of the place's error: how far a frame's own idea of the place may move a fit
-ITERATIONS = 3  # of the fits that tell the place: they begin where a search has arrived
+FIRM = 0.01  # of the centre's error: how far a frame may move a fit from the centre
+ITERATIONS = 3  # of the fits; they start at the result of a search
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -23,12 +23,12 @@ from sphereorient.trajectory import Reason
 DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin
 PLACE_SHARE = 0.03  # of the radius: how far an outline's centre may be off, dark rims included
 DEPTH_SHARE = 0.08  # of the distance: how far off it may be where only one outline's size gives it
-NARROWER = (0.15, 0.06)  # deviations from the usual diameter with which outlines are sought again
+NARROWER = (0.15, 0.06)  # allowed deviations from the usual diameter in repeated searches
 CLEARLY_LESS = 0.1  # of a picture's variance: a pose that explains so much less than another is wrong, likely or not
 SURE_NLL = 20.0  # by so much less likely
 GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance see different things
-STEP, REACH = 0.2, 2  # of `relocalise`: radii from place to place; places to each side of the blob's middle
-LOOSE = 0.15  # of the radius: error of a place that `relocalise` finds
+STEP, REACH = 0.2, 2  # of `relocalise`: step, radii, and steps to each side of the blob
+LOOSE = 0.15  # of the radius: error of a position from `relocalise`
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

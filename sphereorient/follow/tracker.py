@@ -24,19 +24,19 @@ from sphereorient.trajectory import Reason
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
 NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
 FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
-LONG_STEP = 3.0  # times the step before: after a longer one the motion before says little
+LONG_STEP = 3.0  # times the step before: a longer one changes the motion
 CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
 CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
 AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
-MOVE_SHARE = 0.3  # of the radius: how far the ball may have moved where its motion is unknown
-ASTRAY_SHARE = 0.01  # of the radius: how far a place may be from the extrapolation of three frames
+MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
+ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Expected:
     position_lab_mm: Tensor  # (3,)
     R_lab_body: Tensor  # (3, 3)
-    use: Tensor  # (C,) bool, cameras that saw the ball
+    use: Tensor  # (C,) bool, cameras that saw the sphere
     reason: tuple[Reason, ...]  # C, why the others did not
     place_precision: Tensor  # (3, 3), 1/mm^2
     rough: bool = False  # from one predecessor alone: the motion is unknown

@@ -9,7 +9,7 @@ from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 from sphereorient.motion.stencil import neighbours_there
 
-FEWEST_POINTS = 3  # points that determine a turn
+FEWEST_POINTS = 3  # points that determine a rotation
 
 
 def omega_from_orientations(

@@ -90,6 +90,6 @@ def prior_of_band(band: float, noise: float) -> Prior:
     `noise`: standard deviation of the measured value by axis, one measurement a frame.
     """
     rate = 2 * np.pi * band
-    pole = 0.75 * rate  # as learnt from turbulence-like motion: the fall begins a little before the band ends
+    pole = 0.75 * rate  # as estimated from turbulence-like motion: the fall begins a little before the band ends
     density = _DENSITY / pole * (1 + (rate / pole) ** 2) ** -ORDER  # of w of unit variance at the band
     return Prior(pole=pole, deviation=float(noise * rate / np.sqrt(density)))

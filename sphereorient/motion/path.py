@@ -37,7 +37,7 @@ class SegmentTrack:
     time: Floats  # (N,), frames, increasing
     covariance: Floats  # (N, 3, 3), of the measurements
     seen: Bools  # (N,), measured
-    used: Bools  # (N,), measured and believed
+    used: Bools  # (N,), measured and not rejected
     unknown_rate: float  # standard deviation of the constant rate from the reference's, next to no pull
     mean: Floats  # (3,), the reference's constant rate, value per frame
     rate: Floats  # (N, ORDER, 3), the reference's w, w' / pole, ...

@@ -13,9 +13,9 @@ from sphereorient.locate.blob import find_blobs
 from sphereorient.pose.fitter import CameraView
 
 SOFT, SOFT_PX = 0.06, 1.5  # radii, px: templates of pictures that are blurred by more than both are blurred as well
-FIRST_BLUR_PX = 0.625  # what is begun with of pictures that are not soft: a pixel's own width and a good lens
+FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a good lens
 CALM_PX = 1.0  # blur that is laid over pictures first, against noise
-AROUND = 1.2  # of the radius: the ball and its rim
+AROUND = 1.2  # of the radius: the sphere and its rim
 CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and scene lie
 STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
 

@@ -25,7 +25,7 @@ class FittedPoses:
     position_lab_mm: Tensor  # (L, 3) float64
     R_lab_body: Tensor  # (L, 3, 3) float64
     covariance: Tensor  # (L, 6, 6) float64, of delta (rad) and position (mm), lab
-    own_turn: Tensor  # (L, C, 3), rad: how each camera alone would turn the pose, its place held
+    own_turn: Tensor  # (L, C, 3), rad: rotation of the pose by each camera alone, position held
     own_covariance: Tensor  # (L, C, 3, 3), rad^2
     own_move: Tensor  # (L, C, 3), mm, lab: how each camera alone would move the sphere, distance by size included
     deviation: Tensor  # (L, C), robust standard deviation of the residuals over the noise expected
@@ -76,7 +76,7 @@ class Residuals:
     weight: Tensor  # (L, P), robust and inside, 0 .. 1
     deviation: Tensor  # (L,), robust standard deviation of the residuals over the noise expected
     lit: Tensor  # (L, P), grey levels from black to white paint, the frame's own light included, coverage too
-    over: Tensor  # (L, P), grey levels by which the ball is brighter than what is behind it
+    over: Tensor  # (L, P), grey levels of the sphere above the background
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,7 +85,7 @@ class PoseStart:
 
     position_lab_mm: Tensor  # (B, 3)
     R_lab_body: Tensor  # (B, 3, 3)
-    use: Tensor  # (B, C) bool, the cameras that see the ball; a pose without any stays where it is
+    use: Tensor  # (B, C) bool, the cameras that see the sphere; a pose without any stays
     place_precision: Tensor | None = None  # (B, 3, 3), 1/mm^2, of `position_lab_mm` as known beforehand
 
 
@@ -126,14 +126,14 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
     freed = solve_damped(information, pull) - step[:, None]
     shared = by_pose(_shared_scores(at, precision, mixed, pixels.tile), cameras)
     meat = (shared * seen[..., None, None]).sum(1)
-    if place_precision is not None:  # what was known before has an error of its own
+    if place_precision is not None:  # the prior position has an error of its own
         meat[:, 3:, 3:] += place_precision
     bread = inverse_damped(whole)
     own_bread = inverse_damped(information[..., :3, :3])
     edge = _edge_errors(pixels, X[:, None] - origin, cameras, radius_mm) * seen[..., None]
     lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
     covariance = bread @ meat @ bread + lured.mT @ lured
-    told = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # no picture, no knowledge: the inverse of nothing is huge
+    told = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge
     covariance = torch.where(told[:, None, None], 0.5 * (covariance + covariance.mT), bread)
     loss = by_pose(_loss(at, pixels.inside), cameras)
     return FittedPoses(

@@ -25,7 +25,7 @@ from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_ta
 Picture = NDArray[np.generic]
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
-SIZES = 1.06  # ratio of neighbouring sizes of disks for which there is a stencil
+SIZES = 1.06  # ratio of neighbouring stencil sizes
 CPU = torch.device("cpu")
 FINEST_PX = 0.4  # least blur of any picture, px: a pixel alone has 0.29
 COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
@@ -38,7 +38,7 @@ class CameraView:
     name: str
     camera: Camera
     background: Background
-    diameter_px: float  # of the ball in the middle of the volume
+    diameter_px: float  # of the sphere in the middle of the volume
     sight: LinesOfSight
 
     @classmethod
@@ -118,7 +118,7 @@ class Fitter:
     radius_mm: float
     optics: Optics
     light: Light
-    device: torch.device = CPU  # where the fits are computed; what goes in and comes out is on the CPU
+    device: torch.device = CPU  # of the fits; inputs and results are on the CPU
     widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
 
     @property

@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px ball
+MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
 ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)
 
 
@@ -20,7 +20,7 @@ class Shading:
     black: int
 
 
-FIRST = Shading(difference=4, black=2)  # no light is learnt yet
+FIRST = Shading(difference=4, black=2)  # before the light is estimated
 LATER = Shading(difference=2, black=1)
 
 
@@ -51,7 +51,7 @@ class Light:
     difference: Tensor  # (C, K), white less black paint, grey levels
     black: Tensor  # (C, K)
     noise: Tensor  # (C, 4), grey levels^2 .. 1 / grey level
-    known: bool  # False: not learnt, difference is 1 everywhere and black 0
+    known: bool  # False: difference is 1 everywhere and black 0
 
     @cached_property
     def _map(self) -> Tensor:

@@ -15,7 +15,7 @@ from sphereorient.so3.linalg import cross_first_axis
 from sphereorient.sphere.texture_table import TextureTable
 
 SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself
-RIM_NODES = 4  # look-ups along the radius where the limb is near: there the paint is squeezed together
+RIM_NODES = 4  # look-ups along the radius near the limb, where the paint is compressed
 DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of the paint is infinite on the limb
 
 

@@ -25,7 +25,7 @@ class Pixels:
     """
 
     grey: Tensor  # (L, P), grey levels
-    behind: Tensor  # (L, P), grey levels of the scene without the ball
+    behind: Tensor  # (L, P), grey levels of the scene without the sphere
     inside: Tensor  # (L, P) bool, places that lie in the picture and are not masked
     direction: Tensor  # (L, 3, P), unit lines of sight, lab
     origin: Tensor  # (L, 3, 1) or (L, 3, P), where they start, lab, mm
@@ -33,7 +33,7 @@ class Pixels:
     pitch_rad: Tensor  # (L,), angle between neighbouring lines of sight at the disk's middle
     pitch_mm: Tensor  # (L,), how far apart they start; 0 but behind a wall and in parallel light
     tile: Tensor  # (P,) int64, square tile of the disk that a place belongs to, for errors that neighbours share
-    inner: int = 0  # so many first places are well within the limb
+    inner: int = 0  # number of first places well within the limb
 
     def __len__(self) -> int:
         """Return the number of disks."""
@@ -104,7 +104,7 @@ class Stencil:
     down: NDArray[np.int64]
     tile: Tensor  # (P,) int64
     reach: int  # px
-    inner: int  # so many first places are well within the limb
+    inner: int  # number of first places well within the limb
 
 
 def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stencil:

@@ -24,8 +24,8 @@ from sphereorient.trajectory import Reason
 # Disks normalised at once. Fixed, filled up with empty disks: the last bits of sums depend on their number.
 BATCH = 32
 PRODUCT = 128  # disks in one product, at most: the scores of more leave the cache
-GROUP = 8  # neighbouring templates whose best one stands for them in the selection
-LOOKED_AT = 32  # best groups among which peaks are sought: a broad peak spans several
+GROUP = 8  # neighbouring templates, represented by their best one
+LOOKED_AT = 32  # best groups that are searched for peaks: a broad peak spans several
 TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest detail
 DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
 

@@ -15,9 +15,9 @@ from sphereorient.sphere import DiskView
 from sphereorient.sphere.texture_table import TextureTable
 
 WHITE_ORDER, BLACK_ORDER = 2, 1  # of the light's polynomials over the disk: on the paint, and without it
-STEP_RAD = 0.14  # longest step: beyond it the paint's slope says nothing any more
+STEP_RAD = 0.14  # longest step that the paint's slope predicts
 RIDGE = 1e-4  # of the diagonal: keeps the light solvable where the disk shows one paint
-GAIN_MIN = 0.1  # white less black paint, deviations: a place that is darker still turns the right way
+GAIN_MIN = 0.1  # white less black paint, deviations: darker pixels still have the right sign
 PIXEL = 0.5  # standard deviation of a pixel and its resampling, px
 
 
@@ -61,7 +61,7 @@ class Target:
     """The pixels of one disk at one level."""
 
     grey: Tensor  # (P,), in units of its deviation from the smoothest light
-    unexplained: Tensor  # (), cost where there is light only and no paint
+    unexplained: Tensor  # (), cost of light without paint
 
 
 def level_reference(level: DetailLevel, disk: Tensor) -> Target:

@@ -30,7 +30,7 @@ def local_grid(
         do = "give the radius in rad, or take lattman_grid for all rotations"
         raise SettingsError(refusal("radius_rad", expected="0 .. pi", got=f"{radius_rad}", do=do))
     unit = HALF_EDGE * step_rad
-    reach = radius_rad / unit * (1 + 1e-9)  # a shell that lies on the rim by geometry is not lost to the last bits
+    reach = radius_rad / unit * (1 + 1e-9)  # keeps a shell that is exactly on the rim
     line = torch.arange(-math.floor(reach), math.floor(reach) + 1)
     places = torch.cartesian_prod(line, line, line)
     norm2 = places.square().sum(1)
