@@ -121,9 +121,7 @@ class PathLayer(nn.Module):
     def _second_order_costs(
         self, R: Tensor, score: Tensor, time_s: Tensor, variance: Tensor, mask: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the costs of edges, the mask, and the costs of candidates and triples, with the place for no
-        candidate.
-        """
+        """Return the costs of edges, the mask, and the costs of candidates and triples, one place for no candidate."""
         cost, visited = self.cost(score), mask.any(-1, keepdim=True)
         (hit_again, hit), (miss_again, miss) = cost.presence()
         right = hit - cost.picture_log_weight(-score, mask)

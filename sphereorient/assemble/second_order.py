@@ -1,7 +1,4 @@
-"""The second-order path: the choice of candidates by the pictures and by how omega changes.
-
-The scale of the angular acceleration is estimated from the path itself, in turn with the search.
-"""
+"""The second-order path: candidates by the pictures and the change of omega; the acceleration is estimated too."""
 
 from __future__ import annotations
 
@@ -215,9 +212,7 @@ def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> S
 
 
 def _misfits(rows: CandidateRows, histories: Histories, cost: SecondOrderCost) -> tuple[Ints, Floats, Floats, Floats]:
-    """Return the frames (L,) with a prediction from the two before, and for each: misfit, rad; its variance per axis,
-    rad^2, from the errors of the orientations; its drift per unit of acceleration, s^2.
-    """
+    """Return the frames (L,) with a prediction, and misfit, rad, variance, rad^2, and drift per acceleration, s^2."""
     frame = np.flatnonzero(histories.row >= 0)
     row, begins = histories.row[frame], histories.begins[frame]
     before, here, after = row[:-2], row[1:-1], row[2:]
@@ -236,9 +231,7 @@ def _misfits(rows: CandidateRows, histories: Histories, cost: SecondOrderCost) -
 def _acceleration(
     rows: CandidateRows, searched: Sequence[tuple[CandidateRows, Histories]], cost: SecondOrderCost
 ) -> float:
-    """Return the scale of the acceleration in the histories of some parts of a movie, rad/s^2.
-    Source: textbook, expectation and maximisation of Student's t; its weights make a few wrong links harmless.
-    """
+    """Return the scale of the acceleration, rad/s^2, in some parts of a movie, by EM of Student's t (textbook)."""
     links = [_misfits(part, histories, cost)[1:] for part, histories in searched]
     off, variance, drift = (np.concatenate(each) for each in zip(*links, strict=True))
     scale, tail = float(cost.acceleration_rad_s2), float(cost.tail)

@@ -114,9 +114,7 @@ def soft_min(values: Floats, group: Ints, size: int) -> Floats:
 
 
 def rotation_between(R_from: Floats, R_to: Floats) -> tuple[Floats, Floats]:
-    """Return angle (...), rad, 0 .. pi, and lab axis (..., 3) of the shortest rotation from R_from to R_to (..., 3, 3).
-    The axis of no rotation is 0.
-    """
+    """Return angle (...), rad, 0 .. pi, and lab axis (..., 3), 0 without rotation, from R_from to R_to (..., 3, 3)."""
     turn = R_to @ np.swapaxes(R_from, -1, -2)
     twice = np.stack(
         [turn[..., 2, 1] - turn[..., 1, 2], turn[..., 0, 2] - turn[..., 2, 0], turn[..., 1, 0] - turn[..., 0, 1]], -1

@@ -203,9 +203,7 @@ def _scores(found: Sequence[Poses]) -> tuple[float, float]:
 
 
 def _times_better(found: Sequence[Poses]) -> float:
-    """Return the median ratio of the variances that the second and the best pose of a clear frame leave unexplained.
-    Blurred pictures are mostly disk, which any pose explains; only the ratio separates poses.
-    """
+    """Return the median ratio of the variances left by second and best pose; blurred pictures need the ratio."""
     rows = [(found[k].score[:2], found[k].use) for k in _clear(found) if len(found[k]) > 1]
     if not rows:
         return math.inf

@@ -47,7 +47,7 @@ class FixedCentre:
 
 
 def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Frame]], score_min: float) -> FixedCentre | None:
-    """Find the centre of a sphere that only rotates, from n x C frames; poses below `score_min` are not used.
+    """Find the centre of a sphere that only rotates, from n x C frames and their poses of at least `score_min`.
     None where no frame has a pose that all of its pictures support.
     """
     fitter = search.fitter
@@ -102,9 +102,7 @@ def mean_place(position_lab_mm: Tensor, covariance_mm2: Tensor) -> tuple[Tensor,
 
 
 def _edge(fitter: Fitter, position_lab_mm: Tensor) -> Tensor:
-    """Return the covariance (3, 3), mm^2, of errors that all frames share.
-    The modelled limb may lie EDGE_PX off to one side, or all around; with one camera the latter is a distance.
-    """
+    """Return the covariance (3, 3), mm^2, of a limb that lies EDGE_PX off in all frames, to one side or all around."""
     radius_px = torch.stack([view.radius_px(position_lab_mm, fitter.radius_mm) for view in fitter.views])
     aside = EDGE_PX * fitter.radius_mm / float(radius_px.min())
     covariance = aside**2 * torch.eye(3, dtype=torch.float64)

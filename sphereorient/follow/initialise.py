@@ -147,9 +147,7 @@ def _best_score(poses: Poses) -> float:
 
 
 def explaining_first(nll: Tensor, score: Tensor) -> Tensor:
-    """Return likelihoods nll (M,) in which poses that explain clearly less (score (M,)) come behind the others.
-    Likelihood forgives a wide scatter before it forgives worn paint or dirt.
-    """
+    """Return nll (M,) with poses of clearly lower score (M,) behind the others: likelihood forgives wide scatter."""
     behind = score < score.nan_to_num(-1.0).max() - CLEARLY_LESS
     if not bool((~behind & torch.isfinite(nll)).any()):
         return nll
@@ -170,9 +168,7 @@ def distinct_indices(R: Tensor, nll: Tensor, count: int) -> Tensor:
 
 
 def relocalise(frame: Picture, view: CameraView, proposer: Proposer, locating: LocateSettings) -> Found:
-    """Find the position about a blob where the texture map explains a disk of the usual size best.
-    The result is an outline without edges, with a wide error; None with the reason without a blob.
-    """
+    """Return the outline at which the texture map explains a usual disk best, with a wide error, or the reason."""
     difference = view.background.difference(frame)
     blobs = find_blobs(difference, view.background.noise, view.diameter_px, locating)
     if not blobs:

@@ -36,9 +36,7 @@ def no_pose(cameras: int, reason: Sequence[Reason], use: Tensor | None = None) -
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseTable(FittedPoses):
-    """Poses of N frames, padded to M each, (N, M), most likely first; `nll` is above the frame's best.
-    Unused places hold zeros and the unit rotation.
-    """
+    """Poses of N frames, padded to (N, M) with zeros and the unit rotation, likeliest first; `nll` above the best."""
 
     mask: Tensor  # (N, M) bool
     use: Tensor  # (N, C) bool

@@ -122,18 +122,14 @@ class ChunkTracker:
         self.centre = centre
 
     def batches(self, frames: range) -> list[list[int]]:
-        """Return the lengths of the chunks of each batch of an experiment's frames; chunks begin at multiples of
-        `chunk_frames`.
-        """
+        """Return the lengths of the chunks of each batch; chunks begin at multiples of `chunk_frames`."""
         length = self.settings.chunk_frames
         firsts = [frames.start, *range((frames.start // length + 1) * length, frames.stop, length)] if frames else []
         lengths = [last - first for first, last in pairwise([*firsts, frames.stop])]
         return [lengths[k : k + self.settings.chunks] for k in range(0, len(lengths), self.settings.chunks)]
 
     def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
-        """Yield the poses of each frame of one batch, in order.
-        `shots` holds the frames of each view, `batch` the lengths of the chunks, `time_s` the times of all.
-        """
+        """Yield the poses of a batch's frames: shots of each view, lengths of the chunks, times of all frames."""
         firsts = list(accumulate([0, *batch[:-1]]))
         chunks = [_Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
         found: dict[int, Poses] = {}

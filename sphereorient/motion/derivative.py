@@ -93,9 +93,7 @@ def _determinant(gauss: Tensor, step: Tensor, order: int) -> Tensor:
 
 
 def _with_exact_moments(gauss: Tensor, step: Tensor, order: int) -> Tensor:
-    """Correct symmetric weights (..., 2 h + 1) so that moments 0 .. order + 1 are those of the derivative.
-    The same as a least-squares fit of a polynomial with Gaussian weights (Savitzky-Golay, weighted).
-    """
+    """Correct weights (..., 2 h + 1) to exact moments 0 .. order + 1, as a weighted Savitzky-Golay fit."""
     m0, m2, m4 = ((gauss * step**power).sum(-1, keepdim=True) for power in (0, 2, 4))
     if order == 0:
         return gauss / m0

@@ -69,7 +69,7 @@ class Estimate:
 def estimate(
     paths: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings, known: ProcessPrior | None = None
 ) -> tuple[list[Estimate], float, ProcessPrior | None]:
-    """Estimate the process from all segments of one kind unless `known`, then smooth each; `band` in cycles per frame.
+    """Estimate the process of all segments unless `known`, then smooth each; `band` in cycles per frame.
     Return the estimates, the ratio of true errors to sigmas of the measurements, and the process.
     """
     if known is None:

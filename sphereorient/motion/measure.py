@@ -160,9 +160,7 @@ def _to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
 
 
 def _sigma_in_body(R_lab_body: Tensor, x_lab: Tensor, x_sigma: Tensor, sigma_rad: Tensor | None) -> Tensor:
-    """Return the standard deviations by axis of R^T x from those of x (lab) and of the orientation.
-    An orientation error delta adds delta x x, independent of omega, which does not use the frame's own orientation.
-    """
+    """Return the sigmas of R^T x by axis; an orientation error delta adds delta x x, independent of that of x."""
     from_x = _to_body(R_lab_body.square(), x_sigma.square())
     unit = torch.eye(3, dtype=x_lab.dtype, device=x_lab.device).expand(*x_lab.shape, 3)
     turned = torch.linalg.cross(unit, x_lab[..., None, :])  # (..., 3, 3), row j: delta along axis j crossed with x

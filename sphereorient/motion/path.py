@@ -89,9 +89,7 @@ class SegmentTrack:
         return np.concatenate([carry[:, NODES], from_mean, from_rate], axis=2), drift
 
     def chain(self, prior: Prior) -> StateSpace:
-        """Return the state space model, linear about the reference.
-        Source: Barfoot 2017, State Estimation for Robotics, sections 7.2 and 7.3: perturbations from the left.
-        """
+        """Return the state space model, linear about the reference (Barfoot 2017, sections 7.2 and 7.3)."""
         step = np.diff(self.time)
         count = len(step)
         lengths, kind = np.unique(np.round(step, 9), return_inverse=True)
@@ -281,9 +279,7 @@ def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int
 
 
 def _first_guess(time: Floats, R: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
-    """Return orientations (N, 3, 3) and omega_lab (N, 3), rad per frame, at all instants, and the frames trusted.
-    Gaps may exceed half a turn: of the rotations that fit, the one nearest to the interpolated omega is taken.
-    """
+    """Return orientations (N, 3, 3), omega_lab (N, 3), rad per frame, at all instants, and the frames trusted."""
     frames = np.flatnonzero(seen)
     if len(frames) < 2:
         return np.broadcast_to(R[frames[0]], R.shape).copy(), np.zeros((len(time), 3)), seen

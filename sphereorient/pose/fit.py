@@ -236,9 +236,7 @@ def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Te
 
 
 def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) -> Tensor:
-    """Shorten steps (B, 6) that change a picture by over 0.1 radii, beyond which the slopes do not hold.
-    Along a line of sight (to_centre (B, C, 3), mm) a step may have the same share of the distance.
-    """
+    """Shorten steps (B, 6) to 0.1 radii in the picture, or the same share of the distance along the line of sight."""
     distance = to_centre.norm(dim=-1, keepdim=True).clamp_min(radius_mm)
     move, sight = step[:, None, 3:], to_centre / distance
     along = (move * sight).sum(-1, keepdim=True)

@@ -97,9 +97,7 @@ def implicit_pose(
 
 
 def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
-    """Return the poses (B, 3, 3) and (B, 3) with the least sum of squares; steps that make a pose worse are rejected.
-    Source: Marquardt 1963, damping in units of the diagonal.
-    """
+    """Return the poses (B, 3, 3), (B, 3) with the least sum of squares (Marquardt 1963); no step makes one worse."""
     damping = torch.full_like(X[:, 0], START_DAMPING)
     still = torch.zeros(len(X), 6, dtype=X.dtype, device=X.device)
     for _ in range(iterations):

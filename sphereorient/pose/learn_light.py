@@ -27,9 +27,7 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
 
 
 def light_sums(view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the normal equations of light maps of L disks, (L, 2 K, 2 K) and (L, 2 K) float64.
-    `precision` (L, P) is weight over variance of each pixel.
-    """
+    """Return the normal equations of light maps of L disks, (L, 2 K, 2 K) and (L, 2 K); precision (L, P)."""
     basis = light_basis(view.across)
     columns = torch.cat([(view.coverage * view.paint)[:, None] * basis, view.coverage[:, None] * basis], dim=1)
     weighted = columns * precision[:, None]
@@ -47,9 +45,7 @@ def light_maps(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:
-    """Return the coefficients (4,), not negative, of the noise's variance as a polynomial in the grey level.
-    From expected grey levels and residuals (N,) where `inside` (N,) holds.
-    """
+    """Return the noise variance's coefficients (4,), not negative, in the grey level, from pixels (N,) inside."""
     model, residual = model[inside].clamp_min(0).double(), residual[inside].double()
     order = model.argsort(stable=True)
     groups = [group for group in order.tensor_split(24) if len(group) >= 50]

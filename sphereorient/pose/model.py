@@ -90,9 +90,7 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
 
 
 def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
-    """Return look-ups along the radius near the limb, and the derivative of each by the pixel, (L, n, P) each.
-    They are quantiles of the cut-off Gaussian, drawn towards its middle by what the table's own blur adds.
-    """
+    """Return look-ups near the limb, quantiles of the cut-off Gaussian, and their derivatives, (L, n, P) each."""
     share = ((torch.arange(RIM_NODES, dtype=q0.dtype, device=q0.device) + 0.5) / RIM_NODES)[:, None]
     z = torch.special.ndtri((share * coverage[:, None]).clamp(1e-6, 1 - 1e-6))
     # The limb holds a node back the more, the nearer it is.
@@ -110,9 +108,7 @@ class _LineOfSight(NamedTuple):
 def _sample(
     at: Tensor, moves: Tensor, line: _LineOfSight, R: Tensor, model: SphereModel
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean paint of some look-ups (L, P) and its derivatives by rotation and position (L, 3, P).
-    `at` (L, n, P) is the distance of each look-up from the disk's middle, radii; `moves` its derivative by the pixel's.
-    """
+    """Return the mean paint of look-ups (L, P) and derivatives (L, 3, P); `at` in radii, `moves` per pixel moved."""
     d, outward, nearest = line
     # In body components, as the texture: the derivatives are rotated back once, at the end.
     sight_b, outward_b = (R.mT @ d)[:, :, None], (R.mT @ outward)[:, :, None]

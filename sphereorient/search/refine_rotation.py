@@ -35,9 +35,7 @@ class DetailLevel:
 
 
 def detail_level(view: DiskView, paint: TextureTable, detail: float, every: int, blur: float = 0.0) -> DetailLevel:
-    """Prepare a pyramid level: `detail` is a Gaussian on the sphere, rad, and `blur` the pictures' own, radii.
-    `every`: 1: all pixels, 2: like the white fields of a chess board.
-    """
+    """Prepare a pyramid level: `detail` (rad or radii) and the pictures' `blur` (radii); `every` 2: half the pixels."""
     size = view.size_px
     normal = view.normal_view.T.float()
     place = torch.nonzero(view.inside.reshape(-1))[:, 0]

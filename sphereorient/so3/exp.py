@@ -8,9 +8,7 @@ from sphereorient.errors import check_tail
 
 
 def exp(rotvec: Tensor) -> Tensor:
-    """Return the rotations (..., 3, 3) of rotation vectors (..., 3), rad, of any length.
-    Source: Rodrigues' formula, as the paper prints it.
-    """
+    """Return the rotations (..., 3, 3) of rotation vectors (..., 3), rad, of any length, by Rodrigues' formula."""
     check_tail("rotvec", rotvec, 3)
     return axis_angle_to_rotation_matrix(rotvec)
 

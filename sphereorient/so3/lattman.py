@@ -22,9 +22,7 @@ def to_lattman(theta: Tensor) -> Tensor:
 
 
 def from_lattman(lattman: Tensor) -> Tensor:
-    """Return the Tait-Bryan angles (..., 3), rad, of Lattman angles theta_plus, theta, theta_minus.
-    Their ranges over SO(3) are 4 pi, -pi/2 .. pi/2, 2 pi.
-    """
+    """Return the Tait-Bryan angles (..., 3), rad, of Lattman's, of ranges 4 pi, -pi/2 .. pi/2, 2 pi over SO(3)."""
     check_tail("lattman", lattman, 3)
     plus, y, minus = lattman.unbind(-1)
     return torch.stack([(plus + minus) / 2, y, (plus - minus) / 2], -1)
