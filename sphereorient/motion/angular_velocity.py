@@ -117,8 +117,8 @@ def _shifted(R: Tensor, m: int) -> Tensor:
 
 def kabsch(points_a: Tensor, points_b: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return the rotation (..., 3, 3) from points_a (..., K, 3) onto points_b, any unit, by weighted least squares.
-    Both sets are centred first; points on one line leave it undetermined (not checked). Weights (..., K) are not
-    negative.
+    Both sets are centred first. It is proper also for mirror images; points on one line leave it undetermined (not
+    checked). Weights (..., K) are not negative; None: all equal.
     Source: W. Kabsch, Acta Cryst. A32, 922 (1976); the paper's R_kabsch, its increment T, docs/errata.md E8.
     """
     check_tail("points_a", points_a, 3)

@@ -37,7 +37,7 @@ class Candidates:
         return self.offset[1:] - self.offset[:-1]
 
     def padded(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return orientations (N, C, 3, 3), scores (N, C) and mask (N, C), C >= 1, padded by unit rotation, 0, False."""
+        """Return orientations (N, C, 3, 3), scores (N, C), mask (N, C), C >= 1; padded by unit rotation, 0, False."""
         counts = self.counts
         width = max(int(counts.max()) if len(counts) else 0, 1)
         place = torch.arange(width, device=counts.device)

@@ -20,8 +20,8 @@ BATCH = 32
 
 
 class TemplateSearch:
-    """Searches all of SO(3) for the views of a map (H, W) that look like a disk (paper sections III B and C).
-    size_px is the side of the disks, rounded up to an even number, as the bank is made at half of it.
+    """Searches all of SO(3) for the views of a map that look like a disk (paper sections III B and C).
+    The texture (H, W) is 0 black .. 1 white; size_px, the side of the disks, is rounded up to an even number.
     """
 
     def __init__(self, texture: Tensor, size_px: int, settings: OrientSettings) -> None:
