@@ -168,7 +168,7 @@ def distinct_indices(R: Tensor, nll: Tensor, count: int) -> Tensor:
 
 
 def relocalise(frame: Picture, view: CameraView, proposer: Proposer, locating: LocateSettings) -> Found:
-    """Return the outline at which the texture map explains a usual disk best, with a wide error, or the reason."""
+    """Return the outline of usual radius where the texture map explains the disk best, or None and the reason."""
     difference = view.background.difference(frame)
     blobs = find_blobs(difference, view.background.noise, view.diameter_px, locating)
     if not blobs:

@@ -89,7 +89,9 @@ class SegmentTrack:
         return np.concatenate([carry[:, NODES], from_mean, from_rate], axis=2), drift
 
     def chain(self, prior: Prior) -> StateSpace:
-        """Return the state space model, linear about the reference (Barfoot 2017, sections 7.2 and 7.3)."""
+        """Return the state space model, linear about the reference.
+        Source: Barfoot 2017, State Estimation for Robotics, sections 7.2 and 7.3: perturbations from the left.
+        """
         step = np.diff(self.time)
         count = len(step)
         lengths, kind = np.unique(np.round(step, 9), return_inverse=True)

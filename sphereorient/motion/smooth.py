@@ -81,8 +81,8 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     """Smooth a track, segment by segment, and take its derivatives; the result is on the CPU.
     Velocity and omega_lab are a constant plus a stationary random process, estimated from the whole track unless
     `known`, with one factor on the sigmas. There is no lag; ends are included, gaps inside a segment filled, outliers
-    rejected. A segment of one measured frame has no derivatives, of two no accelerations; so have tracks too short for
-    the estimation.
+    rejected. A segment of one measured frame has no derivatives, of two no accelerations; a track too short for the
+    estimation has no derivatives.
     Source: Gaussian-process smoother: Sarkka and Solin 2019, Applied Stochastic Differential Equations, chapter 12; on
     SO(3): Barfoot 2017, State Estimation for Robotics, chapters 7 and 8.
 
