@@ -1,4 +1,4 @@
-"""Which candidate is true: the paper's path and its two cameras; the second-order path; the same as a layer."""
+"""The choice among candidates along time: the paper's path and two cameras; the second-order path, also as a layer."""
 
 from sphereorient.assemble.differentiable import SoftTrack, expected_orientation, soft_track
 from sphereorient.assemble.layer import PathLayer

@@ -1,8 +1,7 @@
 """Beam search over the histories of a movie, forward and backward: the best one, and each candidate's probability.
 
-A history names the right candidate of each frame, or none, and the frames where the motion breaks. A state is the last
-two frames with an orientation, however far back: the next candidate is compared with the omega between them. States far
-worse than the best are dropped.
+A history names the right candidate of each frame, or none, and the breaks of the motion. A state is the last two frames
+with an orientation: the next candidate is compared with the omega between them.
 """
 
 from __future__ import annotations
@@ -32,17 +31,17 @@ from sphereorient.assemble.states import (
 BEAM_NATS = 30.0  # more than a break and a new beginning cost
 STATES_MAX = 256
 STUCK_FRAMES = 3  # a stuck candidate may be absent for this many frames, less one
-PIN_NATS = 6.0  # what following the motion must gain in every frame of a run that needs no search
+PIN_NATS = 6.0  # least gain of following the motion in every frame of a run without search
 PIN_MARGIN = 3  # frames at either end of such a run that are searched nevertheless
 NEAR_WHOLE_TURN = 1.0  # rad; nearer, two orientations do not determine the axis of the rotation between them
-REST_SHARE = 0.5  # of spheres seen for the first time: as slow as omega's changes; the others rotate at any rate
+REST_SHARE = 0.5  # prior share of new spheres with an omega as small as its changes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Histories:
     """Result of `search`, F frames and M rows."""
 
-    row: Ints  # (F,), row chosen, -1 none
+    row: Ints  # (F,), row chosen, -1 without
     begins: Bools  # (F,), the orientation of the frame begins a motion
     breaks: Bools  # (F,), it begins one although the motion before could have continued
     turn_rad: Floats  # (F, 3), from the orientation before, whole turns included; NaN where a motion begins
@@ -51,21 +50,13 @@ class Histories:
 
 
 def search(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> Histories:
-    """Find the most probable history of a movie, and the share of each candidate in all of them.
-
-    Args:
-        rows: candidates of at least one frame.
-        cost: of the path.
-        gap_frames_max: longest gap over which a motion is followed, in usual frame intervals.
-
+    """Find the most probable history of a movie, and each candidate's probability; `gap_frames_max` in frame intervals.
     Source: Viterbi 1967; Baum and others 1970 (forward-backward); pruned as in a beam search.
     """
     return _Search(rows, cost, gap_frames_max).run()
 
 
 class _Search:
-    """The search over one movie; costs in nats."""
-
     def __init__(self, rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> None:
         self.rows, self.cost = rows, cost
         self.time, self.offset = rows.time_s, rows.offset
@@ -76,7 +67,6 @@ class _Search:
         self.chain_cost, self.chain_turn, self.first_pin, self.last_pin = self._pins(gap_frames_max + 2)
 
     def run(self) -> Histories:
-        """Sweep forward, then backward."""
         states = PathStates.begin(NOT_YET, np.full(1, NOT_YET, dtype=np.int64))
         least, total = np.zeros(1), np.zeros(1)
         steps: list[BeamStep] = []
@@ -96,7 +86,7 @@ class _Search:
         return self._read(steps, totals, int(least.argmin()))
 
     def _step(self, states: PathStates, least: Floats, f: int) -> BeamStep:
-        """Return all ways from some states to frame f: begin at a candidate, go on to one, or to none."""
+        """Return all ways from some states to frame f: begin at a candidate, continue to one, or to none."""
         dt, alive = self._alive(states, f)
         fresh = (states.frame == f - 1).astype(np.int64)
         hit, miss = self.hit[fresh], self.miss[fresh]
@@ -116,11 +106,9 @@ class _Search:
         return concatenated(visits)
 
     def _stay(self, states: PathStates, alive: Ints, cost: Floats) -> BeamStep:
-        """Pass the frame without a candidate; the motion continues."""
         return BeamStep(frame=-1, states=states.take(alive), source=alive, target=np.arange(len(alive)), cost=cost)
 
     def _lose(self, source: Ints, cost: Floats) -> BeamStep:
-        """Pass the frame without a candidate and without a motion."""
         states = PathStates.begin(LOST, np.full(min(len(source), 1), -1))
         return BeamStep(frame=-1, states=states, source=source, target=np.zeros(len(source), dtype=np.int64), cost=cost)
 
@@ -138,7 +126,7 @@ class _Search:
         return self.cost.candidate(log_ratio, self.still[rows]) - self.rows.log_weight[rows]
 
     def _begin(self, source: Ints, cost: Floats, f: int) -> BeamStep:
-        """Begin a motion at each candidate: it may point anywhere, so its ratio to the uniform density is 1."""
+        """Begin a motion at each candidate: it may have any orientation, so its ratio to the uniform density is 1."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         return BeamStep(
             frame=f,
@@ -149,7 +137,7 @@ class _Search:
         )
 
     def _go_on(self, states: PathStates, source: Ints, dt: Floats, cost: Floats, f: int) -> BeamStep:
-        """Go on from states with an omega, by the rotation nearest to its prediction."""
+        """Continue states that have an omega, by the rotation nearest to its prediction."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         R, R_before = self.rows.R_lab_body[rows], self.rows.R_lab_body[states.row]
         expected = states.omega * dt[:, None]
@@ -180,7 +168,7 @@ class _Search:
         return replace(step, source=source[of_state], cost=total.ravel())
 
     def _second(self, states: PathStates, source: Ints, dt: Floats, cost: Floats, f: int) -> BeamStep:
-        """Go on from where a motion began: slowly, or by any rotation that the time allows."""
+        """Continue from the first frame of a motion: slowly, or by any rotation that the time allows."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         angle, axis = rotation_between(self.rows.R_lab_body[states.row][:, None], self.rows.R_lab_body[rows])
         zones = self.rows.zones(dt)
@@ -197,7 +185,7 @@ class _Search:
         return replace(step, source=source[of_source], cost=total)
 
     def _onward(self, f: int, states: PathStates, of_state: Ints, row: Ints, turn: Floats, around: Ints) -> BeamStep:
-        """Return one edge and one state for each way on; `merge_equal` merges states of equal key (`target`)."""
+        """Return one edge and one state for each continuation; `merge_equal` merges states of equal key (`target`)."""
         before, dt = states.row[of_state], self.time[f] - self.time[states.frame[of_state]]
         key = (before * (self.offset[f + 1] - self.offset[f]) + row - self.offset[f]) * (1 << 20) + around
         onward = PathStates(
@@ -236,14 +224,9 @@ class _Search:
         return pruned, new_least[near], new_total[near]
 
     def _pins(self, length: int) -> tuple[Floats, Floats, Bools, Ints]:
-        """Find runs of frames with one candidate each that follow the motion: no search is needed inside.
-
-        No gap bridges a run, and leaving out a frame of it gains nothing, so all good histories go through it in one
-        way. Near its ends the search goes on, because another candidate may be better there.
-
-        Returns:
-            Cost (F,) and rotation (F, 3) from the two frames before; (F,) bool, the first frame of each run inside its
-            margins; (F,), the last frame of the run, at its second frame, elsewhere -1.
+        """Find runs of frames with one candidate each that follow the motion: all good histories contain them.
+        Return, per frame, the cost and rotation from the two frames before, the first frames of runs inside their
+        margins, and the last frame of the run at its second frame, -1 elsewhere.
         """
         frames = len(self.time)
         cost, turn = np.zeros(frames), np.zeros((frames, 3))
@@ -264,14 +247,12 @@ class _Search:
         follows &= ratio - np.maximum(self.still[row] + self.log_stuck, 0.0) >= PIN_NATS
         edge = np.diff(np.concatenate([[0], follows.astype(np.int64), [0]]))
         for begin, end in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) + 1, strict=True):
-            # Frames begin .. end, both included: the first to follow is begin + 2.
             if end - begin + 1 >= max(length, 2 * PIN_MARGIN + 4):
                 first[begin + PIN_MARGIN] = True
                 last[begin + PIN_MARGIN + 1] = end - PIN_MARGIN
         return cost, turn, first, last
 
     def _jump(self, step: BeamStep, last: int) -> tuple[BeamStep, float]:
-        """Go through a pinned run, from its second frame to its last."""
         span = self.time[last] - self.time[last - 1]
         row = int(self.offset[last])
         states = PathStates(
@@ -287,7 +268,6 @@ class _Search:
         return BeamStep(frame=last, states=states, source=none, target=none, cost=np.array([cost]), best=none), cost
 
     def _read(self, steps: list[BeamStep], totals: list[Floats], end: int) -> Histories:
-        """Walk back from the end: read the best history, and sum over all of them."""
         frames = len(self.time)
         row, begins, breaks = np.full(frames, -1), np.zeros(frames, dtype=np.bool_), np.zeros(frames, dtype=np.bool_)
         turn, posterior = np.full((frames, 3), np.nan), np.zeros(len(self.still))
@@ -315,8 +295,7 @@ class _Search:
 
 def still_log_ratio(rows: CandidateRows, cost: SecondOrderCost) -> Floats:
     """Return the log density ratio (M,) of each row if a candidate of the last frames stays; -inf in the first frame.
-
-    False candidates stay: glare and dirt do. A motionless candidate thus proves little by following a motion.
+    False candidates (glare, dirt) stay, so that following the motion proves little for a candidate at rest.
     """
     best = np.full(len(rows.variance), -np.inf)
     for lag in range(1, min(STUCK_FRAMES, len(rows.time_s) - 1) + 1):
@@ -329,7 +308,6 @@ def still_log_ratio(rows: CandidateRows, cost: SecondOrderCost) -> Floats:
 
 
 def _row_pairs(offset: Ints, lag: int) -> tuple[Ints, Ints]:
-    """Return all pairs of a candidate and one `lag` frames later, as rows."""
     counts = np.diff(offset)
     before, after = counts[:-lag], counts[lag:]
     pairs = before * after

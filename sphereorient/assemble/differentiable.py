@@ -1,8 +1,4 @@
-"""From fitted candidates to one soft track: means over the candidates, by their probability on the soft path.
-
-docs/differentiable.md joins it to cameras, `pose.soft_picture` and `pose.implicit`: gradients reach from the error of a
-track to a camera, the light and the texture map.
-"""
+"""From fitted candidates to one differentiable soft track; docs/differentiable.md connects it to the cameras."""
 
 from __future__ import annotations
 
@@ -42,11 +38,11 @@ def soft_track(
         position_lab_mm: (..., N, C, 3), of the candidates.
         misfit: (..., N, C), cost of each, such as half the mean squared residual.
         mask: (..., N, C) bool, True for a candidate.
-        turn_rad: standard deviation of the rotation from one frame to the next; over a gap it grows with the frames.
+        turn_rad: standard deviation of the rotation between neighbouring frames; grows with the frames of a gap.
         temperature: of the soft path, in units of the costs.
 
     Raises:
-        ShapeError: the parts are not of the same frames and candidates.
+        ShapeError: the inputs differ in frames or candidates.
         SettingsError: `turn_rad` or the temperature is not above 0.
     """
     check_tail("R_lab_body", R_lab_body, *mask.shape, 3, 3)
@@ -69,11 +65,7 @@ def soft_track(
 
 def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
     """Return the edges (..., N - 1, C, C) of `soft_track`: half the squared rotation, in units of `turn_rad`.
-
-    Args:
-        R_lab_body: (..., N, C, 3, 3), finite everywhere.
-        mask: (..., N, C) bool; an edge into a frame comes from the last frame before it that has candidates.
-        turn_rad: as `soft_track`.
+    R_lab_body (..., N, C, 3, 3) is finite everywhere; an edge starts at the last frame with candidates in the mask.
     """
     frame = torch.arange(mask.shape[-2], device=mask.device)
     last = torch.where(mask.any(-1), frame, 0).cummax(-1).values[..., :-1]  # of the frames up to each one
@@ -84,20 +76,12 @@ def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
 
 
 def expected_orientation(R_lab_body: Tensor, marginals: Tensor) -> Tensor:
-    """Return the rotation with the least mean squared chord to the candidates, weighted by their probabilities.
-
-    Args:
-        R_lab_body: (..., N, C, 3, 3), candidates; NaN does not count.
-        marginals: (..., N, C), not negative.
-
-    Returns:
-        (..., N, 3, 3), differentiable in both; NaN where all marginals are 0. Where several rotations are equally near,
-        it is one of them, with a finite gradient.
+    """Return the rotation (..., N, 3, 3) with the least weighted mean squared chord to R_lab_body (..., N, C, 3, 3).
+    NaN does not count; marginals (..., N, C) are not negative; NaN where all are 0. The gradient is always finite.
+    Source: chordal mean, Hartley et al. 2013, Rotation averaging, 5.1; projected by `so3.nearest_rotation`.
 
     Raises:
-        ShapeError: candidates and marginals do not belong together.
-
-    Source: chordal mean, Hartley et al. 2013, Rotation averaging, 5.1; projected by `so3.nearest_rotation`.
+        ShapeError: candidates and marginals differ in shape.
     """
     check_tail("R_lab_body", R_lab_body, *marginals.shape[-1:], 3, 3)
     known = torch.where(R_lab_body.isnan(), 0.0, R_lab_body)

@@ -21,25 +21,23 @@ Values = Tensor | NDArray[np.floating]
 
 TRIPLES_AT_ONCE = 1 << 20  # whose misfits are held at once, 8 MB each array
 EVEN = 1e-9  # of a ratio of times: the expected rotation is off by less than 4e-9 rad
-LOST_RAD2 = 1e6  # variance of the place for none: a prediction with it says nothing
+LOST_RAD2 = 1e6  # variance of the place for no candidate: a prediction without information
 LEAST = {"tail": 2.0}  # bounds of parameters, as in PathSettings
 MOST = {name: 1.0 for name in PARAMETERS if name.endswith("probability") or name == "evidence_doubt"}
 MOST |= {"stuck_probability": 0.5, "follow_probability": 0.5}
 
 
 class PathLayer(nn.Module):
-    """Choose among candidate orientations along time.
-
-    The first order is the paper's: the cost of an edge is d(A, B) (2 - T_A - T_B) / dt. The second order is that of
-    `track`, `SecondOrderCost`: a candidate is compared with the rotation between the two before it, and place C, none,
-    stands for frames in which no candidate is right. Unlike in `track`, a candidate that breaks the motion is a mixture
-    and no state, rotations between frames visited are below half a turn, and omega is forgotten after none.
+    """Choose among candidate orientations along time; the parameters of the cost can be learnt.
+    Order 1 is the paper's: an edge costs d(A, B) (2 - T_A - T_B) / dt. Order 2 is that of `track`, `SecondOrderCost`,
+    with one more place C for frames without a right candidate. Unlike in `track`, a break of the motion is a mixture
+    and no state, rotations between frames visited are below half a turn, and omega is forgotten after a miss.
 
     Args:
         order: 1 or 2.
         soft: temperature of the soft path, in units of the costs; None: the cheapest path.
-        settings: AssembleSettings (order 1) or PathSettings with an acceleration (order 2), whose other cost settings
-            become parameters of the module: logarithms, or logits of probabilities. `settings` returns them as learnt.
+        settings: AssembleSettings (order 1) or PathSettings with an acceleration (order 2), whose other cost
+            settings become parameters of the module: logarithms, or logits of probabilities.
     """
 
     def __init__(
@@ -70,7 +68,7 @@ class PathLayer(nn.Module):
         return PathSettings(**{**self._settings.model_dump(), **learnt})
 
     def cost(self, like: Tensor) -> SecondOrderCost:
-        """Return the second-order cost, differentiable in the parameters, in the type and on the device of a tensor."""
+        """Return the second-order cost, differentiable in the parameters, with the dtype and device of a tensor."""
         return SecondOrderCost(**{name: self._value(name).to(like) for name in PARAMETERS})
 
     def forward(
@@ -81,21 +79,18 @@ class PathLayer(nn.Module):
         variance_rad2: Values | None = None,
         mask: Values | None = None,
     ) -> ShortestPath | SoftPath:
-        """Return the cheapest path, or the probabilities where `soft` is set; arrays may be of numpy.
+        """Return the cheapest path, or the probabilities where `soft` is set, differentiable in all but mask and times.
+        The path of order 2 has C + 1 places, the last of which means no candidate.
 
         Args:
             R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.
-            score: (..., N, C), the quality T, 0 .. 1 (order 1), or the log-likelihood of the pictures, nats (order 2).
+            score: (..., N, C), quality T, 0 .. 1 (order 1), or log-likelihood of the pictures, nats (order 2).
             time_s: (..., N), increasing; frames without candidates are skipped.
             variance_rad2: (..., N, C), of the orientations, per axis; read by order 2. None: 0.
             mask: (..., N, C) bool, True for a candidate; None: all. Order 1 drops those below `quality_min`.
 
-        Returns:
-            The path, of order 2 with C + 1 places, the last of which is none. Cost, free energy and probabilities are
-            differentiable in candidates, scores, variances and parameters.
-
         Raises:
-            ShapeError: the parts do not belong together.
+            ShapeError: the inputs differ in frames or candidates.
             SettingsError: the temperature is not above 0.
         """
         R, time = torch.as_tensor(R_lab_body), torch.as_tensor(time_s)
@@ -126,7 +121,7 @@ class PathLayer(nn.Module):
     def _second_order_costs(
         self, R: Tensor, score: Tensor, time_s: Tensor, variance: Tensor, mask: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the costs of edges, the mask, and the costs of candidates and triples, with the place for none."""
+        """Return the costs of edges, the mask, and the costs of candidates and triples, one place for no candidate."""
         cost, visited = self.cost(score), mask.any(-1, keepdim=True)
         (hit_again, hit), (miss_again, miss) = cost.presence()
         right = hit - cost.picture_log_weight(-score, mask)
@@ -149,19 +144,9 @@ class PathLayer(nn.Module):
 def triple_costs(
     cost: SecondOrderCost, R_lab_body: Tensor, variance_rad2: Tensor, time_s: Tensor, mask: Tensor
 ) -> Tensor:
-    """Return the cost that three candidates in a row are right: how badly the third follows from the first two.
-
-    The rotation between the last two frames visited, at the same omega, predicts the orientation.
-
-    Args:
-        cost: with tensors for parameters.
-        R_lab_body: (..., N, C, 3, 3), rotations.
-        variance_rad2: (..., N, C), per axis, as claimed; `LOST_RAD2`: says nothing.
-        time_s: (..., N), increasing; rotations between frames visited are below half a turn.
-        mask: (..., N, C) bool; frames without candidates are skipped.
-
-    Returns:
-        (..., N - 2, C, C, C), nats, as `soft_path` takes it.
+    """Return the cost (..., N - 2, C, C, C), nats, of three successive candidates: how badly the third follows.
+    R_lab_body is (..., N, C, 3, 3), variance_rad2 (..., N, C) per axis (`LOST_RAD2`: unknown), time_s (..., N), mask
+    (..., N, C). Frames without candidates are skipped; rotations between frames visited are below half a turn.
     """
     variance = cost.sigma_scale**2 * variance_rad2
     links, steps, width = _links_of(R_lab_body, time_s, mask), mask.shape[-2], max(mask.shape[-1], 1)
@@ -173,7 +158,6 @@ def triple_costs(
 
 
 def _chunk(cost: SecondOrderCost, links: _Links, variance: Tensor, still: Tensor, steps: slice) -> Tensor:
-    """Return the costs of entering some steps, (..., K, C, C, C)."""
     before = links.before[..., steps]
     earlier = links.before.gather(-1, before)
     dt, span = (each[..., None, None, None] for each in (links.dt_s[..., steps], links.dt_s.gather(-1, before)))
@@ -201,7 +185,7 @@ def _still(cost: SecondOrderCost, links: _Links, R_lab_body: Tensor, variance: T
 
 
 def _log_ratio(cost: SecondOrderCost, misfit: Tensor, variance: Tensor) -> Tensor:
-    """Return the log density ratio; 0, uniform, where the variance is so large that no motion is followed."""
+    """Return the log density ratio; 0 (uniform) where the variance is too large to follow a motion."""
     return torch.where(variance < VARIANCE_MAX, cost.log_ratio(misfit, variance), 0.0)
 
 
@@ -209,13 +193,13 @@ def _log_ratio(cost: SecondOrderCost, misfit: Tensor, variance: Tensor) -> Tenso
 class _Links:
     """How each step is reached from the one visited before it."""
 
-    turn: Tensor  # (..., N, C, C, 3, 3), lab, from each candidate there to each here
-    dt_s: Tensor  # (..., N), the time between, 1 where there is none before
-    before: Tensor  # (..., N) int64, the step visited before, 0 where there is none
+    turn: Tensor  # (..., N, C, C, 3, 3), lab, from each candidate before to each here
+    dt_s: Tensor  # (..., N), the time between, 1 without a step before
+    before: Tensor  # (..., N) int64, the step visited before, 0 without one
 
 
 def _links_of(R_lab_body: Tensor, time_s: Tensor, mask: Tensor) -> _Links:
-    """Return the rotations between all candidates of steps that follow each other; those into empty steps are any."""
+    """Return the rotations between all candidates of successive steps; those into empty steps are arbitrary."""
     step = torch.arange(mask.shape[-2], device=mask.device)
     held = torch.where(mask.any(-1), step, 0).cummax(-1).values
     before = torch.cat([torch.zeros_like(held[..., :1]), held[..., :-1]], -1)
@@ -235,7 +219,6 @@ def _squared_chord(expected: Tensor, found: Tensor) -> Tensor:
 
 
 def _taken(part: Tensor, step: Tensor, tail: int) -> Tensor:
-    """Return rows (..., K, *tail) of a part (..., N, *tail) at some steps (..., K)."""
     index = step[(..., *[None] * tail)]
     return part.gather(-tail - 1, index.expand(*step.shape, *part.shape[part.ndim - tail :]))
 

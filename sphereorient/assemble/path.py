@@ -1,5 +1,3 @@
-"""The paper's path of each camera: costs of links, the cheapest path, its spikes and segments."""
-
 from __future__ import annotations
 
 import math
@@ -24,10 +22,10 @@ Graph = Sequence[Tensor]  # R (N, C, 3, 3), score (N, C), mask (N, C)
 class Path:
     """Chosen orientations of one camera in N frames; xi and spike of a link stand at the frame that it enters."""
 
-    choice: Tensor  # (N,) int64, row within the frame's candidates; -1 where there is none
-    R_lab_body: Tensor  # (N, 3, 3), NaN where there is none
-    score: Tensor  # (N,), T of the choice, NaN where there is none
-    xi: Tensor  # (N,), rad/s, cost of the link that enters the frame; NaN where none does
+    choice: Tensor  # (N,) int64, row within the frame's candidates; -1 without any
+    R_lab_body: Tensor  # (N, 3, 3), NaN where choice is -1
+    score: Tensor  # (N,), T of the choice, NaN where choice is -1
+    xi: Tensor  # (N,), rad/s, cost of the link that enters the frame; NaN without a link
     spike: Tensor  # (N,) bool, that link is a spike
     segment: Tensor  # (N,) int64, -1 outside any
 
@@ -38,19 +36,13 @@ class Path:
 
 
 def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings) -> dict[str, Path]:
-    """Choose one candidate of each frame for each camera, by the least cost over the whole movie.
-
-    Frames without candidates are skipped: the cost of the link over them is divided by its time.
-
-    Args:
-        candidates: of each camera, N frames.
-        time_s: (N,), increasing.
-        settings: of the path; candidates below `quality_min` are left out.
+    """Choose one candidate of each frame for each camera, by the least cost over the whole movie; time_s (N,)
+    increases.
+    Frames without candidates of `quality_min` are skipped: the cost of the link over them is divided by its time.
+    Source: the paper's assembly of III (directed graph between direct neighbours); docs/errata.md A6.
 
     Raises:
         ShapeError: a camera has another number of frames than there are times.
-
-    Source: the paper's assembly of III (directed graph between direct neighbours); docs/errata.md A6.
     """
     for name, each in candidates.items():
         if len(each) != len(time_s):
@@ -61,7 +53,7 @@ def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, setting
 
 
 def assemble_path(candidates: Candidates, time_s: Tensor, settings: AssembleSettings) -> Path:
-    """Choose one candidate a frame for a single camera; as `assemble_paths`."""
+    """Choose one candidate per frame for a single camera; as `assemble_paths`."""
     return assemble_paths({"": candidates}, time_s, settings)[""]
 
 
@@ -72,7 +64,6 @@ def graph_of(candidates: Candidates, quality_min: float) -> Graph:
 
 
 def _path(graph: Graph, time_s: Tensor, settings: AssembleSettings) -> Path:
-    """Return the cheapest path, its links, spikes and segments."""
     R_all, score_all, mask = graph
     choice = shortest_path(edges_over_gaps(R_all, score_all, time_s, mask), mask).choice
     there = choice >= 0
@@ -99,7 +90,6 @@ def edges_over_gaps(R_lab_body: Tensor, score: Tensor, time_s: Tensor, mask: Ten
 
 def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:
     """Return cost xi (rad/s) and angle (rad) of the link that enters each frame, (N,) each, NaN without a link.
-
     R_lab_body (N, 3, 3) and score (N,), the quality T, are NaN in frames that are skipped.
     """
     frame = torch.nonzero(torch.isfinite(score))[:, 0]
@@ -113,19 +103,12 @@ def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Te
 
 
 def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
-    """Return the paper's cost from each candidate of a step to each of the next, (..., N - 1, C, C), rad/s.
-
-    It is d(A, B) (2 - T_A - T_B) / dt, rows from, columns to, in the dtype of the rotations.
-
-    Args:
-        R_lab_body: (..., N, C, 3, 3), rotations, not checked.
-        score: (..., N, C), quality T, 0 .. 1.
-        time_s: (..., N), increasing.
+    """Return the paper's cost d(A, B) (2 - T_A - T_B) / dt, rad/s, from each candidate (row) to each of the next step.
+    Shapes: R_lab_body (..., N, C, 3, 3), score T (..., N, C), increasing time_s (..., N), result (..., N - 1, C, C).
+    Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
 
     Raises:
-        ShapeError: the inputs are not of the same steps and candidates.
-
-    Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
+        ShapeError: the inputs differ in steps or candidates.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     check_tail("score", score, *R_lab_body.shape[-4:-2])
@@ -155,14 +138,7 @@ def moving(values: Tensor, window: int) -> Tensor:
 
 def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
     """Return the links (N,) bool with xi many robust deviations (MAD) above the moving median, and a large angle.
-
-    Spikes do not raise median and MAD. A multiple of the median would not do: that of a fast sphere is large.
-
-    Args:
-        xi: (N,), rad/s, cost of the link that enters each frame; NaN without a link.
-        turn: (N,), rad, angle of that link.
-        settings: window, factor, least angle.
-
+    xi (N,), rad/s, and turn (N,), rad, belong to the link that enters each frame; xi is NaN without a link.
     Source: the paper's assembly of III (spikes of xi), which gives no numbers.
     """
     windows = moving(xi, settings.spike_window_frames)
@@ -173,14 +149,8 @@ def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
 
 
 def number_segments(present: Tensor, spike: Tensor, gap_frames_max: int) -> Tensor:
-    """Number the segments, stretches of one motion: (N,) int64 from 0, -1 outside; gaps inside belong to them.
-
-    A single wrong frame has a spike into it and one out of it: it is a segment of one frame.
-
-    Args:
-        present: (N,) bool, frames with an orientation.
-        spike: (N,) bool, frames that a spike enters.
-        gap_frames_max: longest gap inside a segment, frames.
+    """Number the segments of one motion, (N,) int64 from 0, -1 outside; gaps up to `gap_frames_max` belong to them.
+    `present` (N,) marks frames with an orientation, `spike` (N,) frames that a spike enters.
     """
     frame = torch.nonzero(present)[:, 0]
     number = torch.full(present.shape, -1, dtype=torch.int64, device=present.device)
@@ -188,7 +158,6 @@ def number_segments(present: Tensor, spike: Tensor, gap_frames_max: int) -> Tens
         return number
     breaks = (frame.diff() > gap_frames_max + 1) | spike[frame[1:]]
     of_frame = torch.nn.functional.pad(breaks.cumsum(0), (1, 0))
-    # A gap takes the number of the segment that is on both sides of it.
     every = torch.arange(len(present), device=present.device)
     before = torch.searchsorted(frame, every, right=True) - 1
     after = torch.searchsorted(frame, every)

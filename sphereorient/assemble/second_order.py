@@ -1,7 +1,4 @@
-"""The second-order path: which candidate is right, by the pictures and by how omega changes.
-
-The scale of the angular acceleration is estimated from the path itself, in turn with the search.
-"""
+"""The second-order path: candidates by the pictures and the change of omega; the acceleration is estimated too."""
 
 from __future__ import annotations
 
@@ -41,7 +38,6 @@ class Hypotheses:
     mask: Tensor  # (N, C) bool, where there is a candidate
 
     def __post_init__(self) -> None:
-        """Compare the sizes of the parts."""
         check_tail("Hypotheses.R_lab_body", self.R_lab_body, 3, 3)
         for entry in fields(self):
             tail = (3, 3) if entry.name in ("R_lab_body", "covariance_rad2") else ()
@@ -53,7 +49,6 @@ class Hypotheses:
                 raise ShapeError(refusal(name, expected=sizes, got=str(tuple(part.shape)), do=do))
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.mask)
 
 
@@ -61,11 +56,11 @@ class Hypotheses:
 class Chosen:
     """The most probable history of N frames; made by `physical_path`."""
 
-    choice: Tensor  # (N,) int64, place of the candidate, -1 where none is right
-    R_lab_body: Tensor  # (N, 3, 3) float64, NaN where none is
-    covariance_rad2: Tensor  # (N, 3, 3), NaN where none is
-    probability: Tensor  # (N,) float64, of the choice among the frame's candidates and none; NaN for none
-    posterior: Tensor  # (N, C) float64, the same of each candidate, 0 where there is none
+    choice: Tensor  # (N,) int64, index of the candidate, -1 where no candidate is right
+    R_lab_body: Tensor  # (N, 3, 3) float64, NaN where choice is -1
+    covariance_rad2: Tensor  # (N, 3, 3), NaN where choice is -1
+    probability: Tensor  # (N,) float64, of the choice, NaN where it is -1
+    posterior: Tensor  # (N, C) float64, of each candidate, 0 where masked
     turn_rad: Tensor  # (N, 3), rad, lab, from the orientation before, may exceed half a turn; NaN where a motion begins
     segment: Tensor  # (N,) int64, -1 outside any; gaps inside a segment belong to it
     flags: Tensor  # (N,) int64, bits of trajectory.Flag
@@ -78,25 +73,15 @@ class Chosen:
 
 
 def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings) -> Chosen:
-    """Choose one candidate of each frame, or none, so that the history of the movie is the most probable one.
-
-    A history names the right candidate of each frame, or none, and the frames where one motion breaks off and another
-    begins. Its probability is that of `SecondOrderCost`.
-
-    Args:
-        hypotheses: N frames.
-        time_s: (N,), increasing, even or not.
-        settings: of the path.
-
-    Returns:
-        The choices with their probabilities. Flags: `AMBIGUOUS` where the choice is not sure, `RECOVERED` on the first
-        frame with an orientation after a gap or a break, `SPIKE` where a rotation does not follow from the motion.
+    """Choose one candidate of each frame, or none, for the most probable history (`SecondOrderCost`); time_s (N,)
+    increases.
+    Flags: `AMBIGUOUS` where the choice is not sure, `RECOVERED` on the first frame with an orientation after a gap or a
+    break, `SPIKE` where a rotation does not follow from the motion.
+    Source: textbook hidden Markov model of second order; unlike the paper's cost, it does not favour candidates at rest
+    (docs/errata.md A6).
 
     Raises:
-        ShapeError: not one time a frame.
-
-    Source: textbook hidden Markov model of second order; unlike the paper's cost, a prior on the change of omega does
-        not favour candidates that stand still (docs/errata.md A6).
+        ShapeError: the number of times is not N.
     """
     if tuple(time_s.shape) != (len(hypotheses),):
         do, got = "pass one time a frame", str(tuple(time_s.shape))
@@ -134,7 +119,6 @@ def _chosen(
     cost: SecondOrderCost,
     settings: PathSettings,
 ) -> Chosen:
-    """Convert the best history from rows to frames and places."""
     device, mask, empty = hypotheses.mask.device, hypotheses.mask.cpu(), _nothing(hypotheses)
     place = torch.arange(mask.shape[1]).expand_as(mask)[mask]
     row = torch.from_numpy(histories.row)
@@ -171,7 +155,6 @@ def _chosen(
 
 
 def _nothing(hypotheses: Hypotheses) -> Chosen:
-    """Return the path of frames without candidates."""
     frames, device = len(hypotheses), hypotheses.mask.device
     none = torch.full((frames,), -1, dtype=torch.int64, device=device)
     missing = torch.full((frames, 3, 3), torch.nan, dtype=torch.float64, device=device)
@@ -205,17 +188,13 @@ def _search(rows: CandidateRows, cost: SecondOrderCost, settings: PathSettings) 
 
 
 def _bounds(rows: CandidateRows) -> tuple[float, float]:
-    """Return the least and largest acceleration, rad/s^2."""
     least = FLOOR_SIGMAS * float(np.sqrt(np.median(rows.variance)))
     most = max(math.radians(CHANGE_MAX_DEG), least)
     return least / rows.frame_s**2, most / rows.frame_s**2
 
 
 def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> SecondOrderCost:
-    """Return the cost with the acceleration under which some parts of the movie show a motion most clearly.
-
-    The best candidates by the pictures alone are no guide: they may stand still.
-    """
+    """Return the cost with the acceleration under which parts of the movie show a motion most clearly."""
     frames, parts = len(rows.time_s), [rows]
     if frames > SAMPLES * SAMPLE_FRAMES:
         firsts = np.linspace(0, frames - SAMPLE_FRAMES, SAMPLES).astype(np.int64).tolist()
@@ -233,12 +212,7 @@ def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> S
 
 
 def _misfits(rows: CandidateRows, histories: Histories, cost: SecondOrderCost) -> tuple[Ints, Floats, Floats, Floats]:
-    """Compare each orientation of a history with the prediction from the two before it.
-
-    Returns:
-        Frames (L,) with a prediction; angle between orientation and prediction, rad (L,); its variance per axis by the
-        orientations' own errors, rad^2 (L,); its drift per unit of acceleration, s^2 (L,).
-    """
+    """Return the frames (L,) with a prediction, and misfit, rad, variance, rad^2, and drift per acceleration, s^2."""
     frame = np.flatnonzero(histories.row >= 0)
     row, begins = histories.row[frame], histories.begins[frame]
     before, here, after = row[:-2], row[1:-1], row[2:]
@@ -257,10 +231,7 @@ def _misfits(rows: CandidateRows, histories: Histories, cost: SecondOrderCost) -
 def _acceleration(
     rows: CandidateRows, searched: Sequence[tuple[CandidateRows, Histories]], cost: SecondOrderCost
 ) -> float:
-    """Return the scale of the acceleration in the histories of some parts of a movie, rad/s^2.
-
-    Source: textbook, expectation and maximisation of Student's t; its weights make a few wrong links harmless.
-    """
+    """Return the scale of the acceleration, rad/s^2, in some parts of a movie, by EM of Student's t (textbook)."""
     links = [_misfits(part, histories, cost)[1:] for part, histories in searched]
     off, variance, drift = (np.concatenate(each) for each in zip(*links, strict=True))
     scale, tail = float(cost.acceleration_rad_s2), float(cost.tail)

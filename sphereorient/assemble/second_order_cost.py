@@ -1,6 +1,5 @@
-"""The second-order path cost, stated once: what pictures, motion, misses and breaks cost a path, in nats.
+"""The second-order path cost in nats: pictures, motion, misses and breaks; for beam.py (numpy) and layer.py (torch).
 
-The hard path of `track` (beam.py, numpy) and the dense layer (layer.py, torch) both take their costs from here.
 Densities of orientations are ratios to the uniform density on SO(3).
 """
 
@@ -63,23 +62,20 @@ class SecondOrderCost:
     def picture_log_weight(self, nll: Tensor, mask: Tensor) -> Tensor:
         """Return the log probability (..., C) of each candidate of a frame by the pictures alone; 0 where masked."""
         claimed = torch.where(mask, -self.evidence_scale * nll, -torch.inf)
-        # A frame without candidates has no share: zeros keep the gradient clear of inf - inf.
+        # A frame without candidates: zeros keep the gradient clear of inf - inf.
         weight = torch.softmax(torch.where(mask.any(-1, keepdim=True), claimed, 0.0), -1)
         count = mask.sum(-1)[..., None].clamp_min(1)
         weight = (1 - self.evidence_doubt) * weight + self.evidence_doubt / count
         return torch.where(mask, weight, 1.0).log()
 
     def presence(self) -> tuple[list[Any], list[Any]]:
-        """Return the costs that a candidate of a frame is right, and that none is: after a miss, and after none."""
+        """Return the costs that a candidate is right, and that none is; index 1: one was right in the frame before."""
         each = self.miss_again_probability, self.miss_probability
         return [-_library(p).log1p(-p) for p in each], [-_library(p).log(p) for p in each]
 
     def log_ratio(self, misfit: Values, variance: Values) -> Values:
         """Return the log density of Student's t in three dimensions, over the uniform one.
-
-        Args:
-            misfit: (...), rad^2, squared angle to the expected rotation, or the smooth (2 sin(angle / 2))^2.
-            variance: (...), rad^2, scale per axis.
+        `misfit`, rad^2, is angle^2 or (2 sin(angle / 2))^2 to the expected rotation; `variance`, rad^2, is per axis.
         """
         lib, tail = _library(variance), self.tail
         within = lib.minimum(variance, lib.asarray(VARIANCE_MAX))
@@ -90,17 +86,9 @@ class SecondOrderCost:
     def predicted_variance(
         self, dt_s: Values, span_s: Values, before: Values, here: Values, after: Values | float
     ) -> Values:
-        """Return the variance per axis, rad^2, of an orientation about the one that the mean omega of a span predicts.
-
-        Omega's mean changes by the acceleration times the time between the midpoints of span and step; the step carries
-        on the errors of both ends of the span.
-
-        Args:
-            dt_s: (...), step from the span's end to the predicted orientation.
-            span_s: (...), time over which omega was measured.
-            before: (...), rad^2 per axis, of the span's first orientation.
-            here: (...), of its last.
-            after: (...), of the one compared with the prediction.
+        """Return the variance per axis, rad^2, of an orientation about the prediction by the mean omega of a span.
+        dt_s is the step after the span, span_s its length; before, here and after are the variances per axis, rad^2, of
+        the span's first and last orientation and of the one predicted.
         """
         ratio = dt_s / span_s
         drift = self.acceleration_rad_s2 * (span_s + dt_s) / 2 * dt_s
@@ -113,15 +101,10 @@ class SecondOrderCost:
         return result
 
     def candidate(self, log_ratio: Values, still: Values) -> Values:
-        """Return the cost of a candidate: log density where it stands if it is false, less that if it is right.
-
-        A false candidate stands anywhere; or where one stood before; or it follows the motion, so that following proves
-        no more than that this is rare. Standing still never explains better what the motion explains: otherwise noise
-        would lose a sphere at rest.
-
-        Args:
-            log_ratio: (...), by the motion.
-            still: (...), by a candidate that stayed since a frame before; -inf where there is no such frame.
+        """Return the cost of a candidate: its log density if it is false, less that if it is right.
+        A false one stands anywhere, or stays (`still`, -inf without a frame before), or follows the motion
+        (`log_ratio`). Staying never explains better what the motion explains: otherwise noise would lose a sphere at
+        rest.
         """
         lib = _library(still)
         shares = 1 - self.stuck_probability - self.follow_probability, self.stuck_probability, self.follow_probability
@@ -142,7 +125,6 @@ def _log(number: float | Tensor, like: Floats | Tensor) -> Any:
 
 
 def _log_peak(tail: float | Tensor) -> Any:
-    """Return the log of the normalisation of Student's t in three dimensions."""
     if isinstance(tail, Tensor):
         return torch.lgamma((tail + 3) / 2) - torch.lgamma(tail / 2) - 1.5 * (tail * math.pi).log()
     return math.lgamma((tail + 3) / 2) - math.lgamma(tail / 2) - 1.5 * math.log(tail * math.pi)

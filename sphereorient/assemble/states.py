@@ -33,7 +33,7 @@ class CandidateRows:
         return np.repeat(np.arange(len(self.time_s)), np.diff(self.offset))
 
     def part(self, first: int, last: int) -> CandidateRows:
-        """Return some frames in a row."""
+        """Return the frames first .. last - 1."""
         rows = slice(self.offset[first], self.offset[last])
         return CandidateRows(
             R_lab_body=self.R_lab_body[rows],
@@ -53,7 +53,7 @@ class CandidateRows:
 class PathStates:
     """Ends of histories at one frame, S of them."""
 
-    frame: Ints  # of the last orientation; LOST or NOT_YET where there is none to go on from
+    frame: Ints  # of the last orientation; LOST or NOT_YET without one to continue from
     row: Ints  # of the last orientation
     omega: Floats  # (S, 3), rad/s, mean over the span
     turn: Floats  # (S, 3), rad, over the span
@@ -92,7 +92,7 @@ def merge_equal(step: BeamStep, least: Floats) -> BeamStep:
 
 
 def concatenated(ways: list[BeamStep], *, shared_targets: bool = False) -> BeamStep:
-    """Put several ways side by side; their targets are numbered on unless they are keys that the ways share."""
+    """Put several ways side by side; renumber their targets unless they are shared keys."""
     sizes = np.cumsum([0, *(0 if shared_targets else len(way.states.row) for way in ways)])
     parts = {e.name: np.concatenate([getattr(way.states, e.name) for way in ways]) for e in fields(PathStates)}
     return BeamStep(
@@ -114,12 +114,7 @@ def soft_min(values: Floats, group: Ints, size: int) -> Floats:
 
 
 def rotation_between(R_from: Floats, R_to: Floats) -> tuple[Floats, Floats]:
-    """Return angle (...), rad, 0 .. pi, and lab axis (..., 3) of the shortest rotation; the axis of no rotation is 0.
-
-    Args:
-        R_from: (..., 3, 3), rotations.
-        R_to: (..., 3, 3), broadcasts against R_from.
-    """
+    """Return angle (...), rad, 0 .. pi, and lab axis (..., 3), 0 without rotation, from R_from to R_to (..., 3, 3)."""
     turn = R_to @ np.swapaxes(R_from, -1, -2)
     twice = np.stack(
         [turn[..., 2, 1] - turn[..., 1, 2], turn[..., 0, 2] - turn[..., 2, 0], turn[..., 1, 0] - turn[..., 0, 1]], -1

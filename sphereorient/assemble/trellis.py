@@ -19,39 +19,34 @@ class ShortestPath:
     """One candidate in each step of each movie."""
 
     choice: Tensor  # (..., N) int64, -1 in steps without candidates, and in all where no path has a finite cost
-    cost: Tensor  # (...), of the path, inf where there is none; differentiable in all costs
+    cost: Tensor  # (...), of the path, inf without a path; differentiable in all costs
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SoftPath:
     """Probabilities of the candidates, each path weighing exp(-cost / temperature); differentiable in all costs."""
 
-    free_energy: Tensor  # (...), -T log of the sum over all paths; inf where there is none, 0 without candidates
-    marginals: Tensor  # (..., N, C), sum 1 in steps with candidates, 0 in others and where there is no path
+    free_energy: Tensor  # (...), -T log of the sum over all paths; inf without a path, 0 without candidates
+    marginals: Tensor  # (..., N, C), sum 1 in steps with candidates, 0 in others and without a path
     pair_marginals: Tensor  # (..., N - 1, C, C), of edge k into step k + 1, from the step visited last; 0 into others
 
 
 def shortest_path(
     edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None = None, triple_cost: Tensor | None = None
 ) -> ShortestPath:
-    """Find the cheapest path that visits one candidate in each step.
-
+    """Find the cheapest path that visits one candidate in each step; of equal paths, the one with the lowest last
+    index.
     Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with candidates.
-    Movies with different gaps, or of different length (empty steps at the end), share a batch.
+    Source: Bellman 1957, Viterbi 1967.
 
     Args:
-        edge_cost: (..., N - 1, C, C), from row to column, any sign, inf for a wall; None: 0, with `triple_cost` only.
+        edge_cost: (..., N - 1, C, C), from row to column, inf for a wall; None: 0, with `triple_cost` only.
         mask: (..., N, C) bool, True for a candidate; costs of masked candidates do not matter.
         node_cost: (..., N, C), of a candidate by itself.
-        triple_cost: (..., N - 2, C, C, C), of three candidates in the order of time; makes the path of second order.
-
-    Returns:
-        The path; of equally cheap ones the one that ends in, and then comes from, the lowest index.
+        triple_cost: (..., N - 2, C, C, C), of three candidates in the order of time; makes the order second.
 
     Raises:
-        ShapeError: costs and mask do not belong together.
-
-    Source: Bellman 1957, Viterbi 1967.
+        ShapeError: costs and mask differ in shape.
     """
     order = _checked_order(edge_cost, mask, node_cost, triple_cost)
     if 0 in mask.shape[-2:]:
@@ -82,20 +77,12 @@ def soft_path(
     node_cost: Tensor | None = None,
     triple_cost: Tensor | None = None,
 ) -> SoftPath:
-    """Weigh all paths that visit one candidate in each step; towards temperature 0 only `shortest_path` remains.
-
-    Args:
-        edge_cost: as `shortest_path`.
-        mask: as `shortest_path`.
-        temperature: above 0, unit of the costs.
-        node_cost: as `shortest_path`.
-        triple_cost: as `shortest_path`.
+    """Weigh all paths by exp(-cost / temperature), temperature > 0; the other arguments are those of `shortest_path`.
+    Source: Baum and others 1970 (forward-backward); Mensch and Blondel 2018, Differentiable dynamic programming.
 
     Raises:
-        ShapeError: costs and mask do not belong together.
+        ShapeError: costs and mask differ in shape.
         SettingsError: the temperature is not above 0.
-
-    Source: Baum and others 1970 (forward-backward); Mensch and Blondel 2018, Differentiable dynamic programming.
     """
     order = _checked_order(edge_cost, mask, node_cost, triple_cost)
     if not 0 < temperature < torch.inf:
@@ -162,7 +149,6 @@ def _laid_out(
     edges = torch.where(real[..., 1:, None, None], edges, 0.0)
     edges = torch.where(mask[..., :-1, :, None] & mask[..., 1:, None, :], edges, torch.inf)
     if triple_cost is not None:
-        # Before the first step stands place 0 alone.
         alone = (torch.arange(mask.shape[-1], device=mask.device) == 0).expand_as(mask[..., :1, :])
         start = torch.where(alone[..., 0, :, None], start[..., None, :], torch.inf)
         triples = edges.new_zeros((*edges.shape[:-3], min(edges.shape[-3], 1), *[mask.shape[-1]] * 3))
@@ -171,7 +157,7 @@ def _laid_out(
             triples = torch.cat([triples, late], -4)
         older = torch.cat([alone, mask[..., :-2, :]], -2)[..., : edges.shape[-3], :, None, None]
         edges = torch.where(older, triples + edges[..., None, :, :], torch.inf)
-    # Finite walls: differences of infinities would be NaN. Costs are far smaller, and nothing passes a wall.
+    # Finite walls: differences of infinities would be NaN. Costs are far smaller.
     return start.clamp_max(_wall(start)), edges.clamp_max(_wall(edges))
 
 
@@ -194,7 +180,6 @@ def _walk_back(last: Tensor, origins: list[Tensor], order: int) -> Tensor:
 
 
 def _cost_along(start: Tensor, edges: Tensor, walk: Tensor, order: int) -> Tensor:
-    """Return the cost (...) of a path; its gradient is the minimum's subgradient."""
     power = edges.shape[-1] ** torch.arange(order, -1, -1, device=walk.device)
     steps = walk.shape[-1] - order
     edge = (torch.stack([walk[..., i : i + steps] for i in range(order + 1)], -1) * power).sum(-1)
@@ -211,7 +196,7 @@ def _like(edge_cost: Tensor | None, triple_cost: Tensor | None) -> Tensor:
 
 
 def _checked_order(edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None, triple_cost: Tensor | None) -> int:
-    """Refuse costs that do not belong to the mask; return the order of the path."""
+    """Raise where costs do not fit the mask; return the order of the path."""
     _like(edge_cost, triple_cost)
     *batch, steps, width = mask.shape
     for name, cost, back in (
@@ -228,14 +213,14 @@ def _checked_order(edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | N
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Visits:
-    """The M steps that a movie visits at most; one that visits fewer waits behind its end in place 0, at no cost."""
+    """The at most M steps that a movie visits; one that visits fewer waits behind its end in place 0, at no cost."""
 
     step: Tensor  # (..., M) int64, of the N steps; behind the end any
     real: Tensor  # (..., M) bool, False behind the end
     mask: Tensor  # (..., M, C) bool, candidates; behind the end place 0 alone
     rank: Tensor  # (..., N) int64, which of the M is the last one visited up to each step, 0 before the first
     visited: Tensor  # (..., N) bool
-    whole: bool  # there is no hole in any movie
+    whole: bool  # no movie has a gap
 
     def rows(self, part: Tensor, back: int) -> Tensor:
         """Return rows (..., M - back, *tail) of a part (..., N - back, *tail) whose row k belongs to step k + back."""

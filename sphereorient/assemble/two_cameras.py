@@ -1,4 +1,4 @@
-"""Two cameras, one sphere: repair of stretches where they disagree, and the weighted mean on SO(3)."""
+"""Two cameras, one sphere: repair of frames where they disagree, and the weighted mean on SO(3)."""
 
 from __future__ import annotations
 
@@ -27,40 +27,28 @@ class Fused:
     """The orientation of the sphere in N frames from all cameras."""
 
     R_lab_body: Tensor  # (N, 3, 3), NaN where no camera has one
-    sigma_rad: Tensor  # (N,), standard deviation per axis; NaN where there is nothing to measure it by
+    sigma_rad: Tensor  # (N,), standard deviation per axis; NaN where not measurable
     disagreement_rad: Tensor  # (N,), distance of the two cameras' orientations after repair; NaN with one
     segment: Tensor  # (N,) int64, -1 outside any
     spike: Tensor  # (N,) bool
     flags: Tensor  # (N,) int64, bits of trajectory.Flag
-    weight: Mapping[str, Tensor]  # (N,) of each camera, its share in the mean: their sum is 1, or 0 where none has one
+    weight: Mapping[str, Tensor]  # (N,) of each camera, its share in the mean, of sum 1; 0 without any orientation
     repaired: Mapping[str, Tensor]  # (N,) bool of each camera
-    R_lab_body_of: Mapping[str, Tensor]  # (N, 3, 3) of each camera after the repair, NaN where it has none
+    R_lab_body_of: Mapping[str, Tensor]  # (N, 3, 3) of each camera after the repair, NaN where missing
 
 
 def fuse(
     paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings
 ) -> Fused:
-    """Fuse the paths of one or two cameras, in the lab frame, into one.
-
-    Stretches where they differ by more than `repair_deg` are repaired. Then each frame is the mean of both, weighted by
-    the inverse moving variance of xi. These variances are relative; their scale comes from the differences of the
-    cameras over the whole movie, so that there is none with one camera.
-
-    Args:
-        paths: of one or two cameras, N frames.
-        candidates: of the same cameras.
-        time_s: (N,).
-        settings: of the fusion.
-
-    Returns:
-        The fused track. Frames seen by one camera carry `ONE_CAMERA`; frames of an undecided repair `AMBIGUOUS`.
+    """Fuse the paths of one or two cameras, in the lab frame, into one; `time_s` (N,).
+    Frames that differ by more than `repair_deg` are repaired. Then each frame is the mean of both, weighted by the
+    inverse moving variance of xi; their differences give the sigma, so that one camera alone has none. Flags:
+    `ONE_CAMERA`, and `AMBIGUOUS` for an undecided repair.
+    Source: the paper's two cameras; docs/errata.md A7 (which camera is right), A8 (xi contains the motion's variance).
 
     Raises:
         ExperimentError: no camera, or more than two.
-        ShapeError: paths, candidates and times are not of the same cameras and frames.
-
-    Source: the paper's two cameras; docs/errata.md A7 (which camera is right) and A8 (the variance of xi contains the
-        motion's, so that uneven motion makes the weights more equal).
+        ShapeError: paths, candidates and times differ in cameras or frames.
     """
     _check(paths, candidates, time_s)
     names = list(paths)
@@ -103,9 +91,7 @@ def fuse(
 
 def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tensor:
     """Return the moving variance (K, N) of each camera's xi (N,), above 0; only ratios between cameras have a meaning.
-
-    It is clamped to within a factor of `VARIANCE_RANGE` of the camera's median, which also stands in where fewer than
-    `LINKS_MIN` links are near.
+    It is clamped about the camera's median, which replaces it where fewer than `LINKS_MIN` links are near.
     """
     windows = [moving(each, settings.weight_window_frames) for each in xi]
     count = torch.stack([torch.isfinite(window).sum(-1) for window in windows])
@@ -113,7 +99,7 @@ def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tenso
     variance = torch.where(count >= LINKS_MIN, squares / (count - 1).clamp_min(1), torch.nan)
     typical = variance.nanmedian(-1, keepdim=True).values if variance.shape[1] else variance.new_ones(len(xi), 1)
     largest = typical.nan_to_num(0.0).max()
-    # A camera without links, or all of them at rest: no camera is preferred.
+    # All cameras at rest or without links: no camera is preferred.
     typical = torch.where(typical.isnan() | (largest == 0), torch.where(largest > 0, largest, 1.0), typical)
     typical = typical.clamp_min(typical.max() / CAMERAS_RATIO_MAX)
     within = torch.minimum(torch.maximum(variance, typical / VARIANCE_RANGE), typical * VARIANCE_RANGE)
@@ -157,10 +143,8 @@ def _apart(tracks: Sequence[Track]) -> Tensor:
 
 def _sigma(variance: Tensor, share: Tensor, apart: Tensor, calm: Tensor) -> Tensor:
     """Return the standard deviation per axis of the mean, (N,), rad.
-
     With errors of variance s^2 variance_i per axis, d^2 / (s^2 (variance_1 + variance_2)) is chi-squared with three
-    degrees of freedom. Its median gives s^2 in spite of a few wrong frames. Frames near a spike are left out where
-    there are others: the spike raises their variance, not their d.
+    degrees of freedom; its median gives s^2 robustly. Spikes raise the variance, not d: their frames are left out.
     """
     if not len(apart):
         return apart
@@ -172,7 +156,6 @@ def _sigma(variance: Tensor, share: Tensor, apart: Tensor, calm: Tensor) -> Tens
 
 
 def _check(paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor) -> None:
-    """Refuse what is not one or two cameras of the same frames."""
     if not 1 <= len(paths) <= 2:
         do = "name one or two cameras"
         raise ExperimentError(refusal("paths", expected="one or two cameras", got=str(len(paths)), do=do))
@@ -218,14 +201,10 @@ class Repair:
 
 
 def repair(tracks: tuple[Track, Track], graphs: tuple[Graph, Graph], settings: AssembleSettings) -> Repair:
-    """Repair each stretch where the cameras disagree; the better supported camera leads.
-
-    Each camera in turn is assumed right. The other then takes, in every frame, its candidate nearest to that
-    orientation, or none beyond `repair_deg`, which counts as T = 0. The assumption with the larger mean T of both
-    cameras holds. Where the two differ by less than `repair_margin`, or neither finds a candidate (T of different
-    cameras cannot be compared), the leader with the smaller largest rotation into, within and out of the stretch holds,
-    and the frames are ambiguous.
-
+    """Repair each run of frames where the cameras disagree; the better supported camera leads.
+    Each camera in turn is assumed right; the other takes its nearest candidates, none (T = 0) beyond `repair_deg`. The
+    larger mean T of both cameras decides. Within `repair_margin`, or without such candidates, the leader with the
+    smaller largest rotation holds, and the frames are ambiguous.
     Source: the paper's two cameras, which does not say which camera is right; docs/errata.md A7.
     """
     limit = math.radians(settings.repair_deg)
@@ -254,7 +233,6 @@ def repair(tracks: tuple[Track, Track], graphs: tuple[Graph, Graph], settings: A
 
 
 def _stretches(wrong: Tensor, both: Tensor, gap_frames_max: int) -> list[Tensor]:
-    """Return the runs of wrong frames, as frame numbers; a short gap of one camera does not end a run."""
     seen = torch.nonzero(both)[:, 0]
     place = torch.nonzero(wrong[seen])[:, 0]
     frame = seen[place]
@@ -264,7 +242,7 @@ def _stretches(wrong: Tensor, both: Tensor, gap_frames_max: int) -> list[Tensor]
 
 
 def _follow(leader: Track, graph: Graph, frames: Tensor, limit: float) -> Track:
-    """Return the candidates nearest to the leader's orientations in some frames; NaN without any within the limit."""
+    """Return the candidates nearest to the leader's orientations in some frames; NaN beyond the limit."""
     R_all, score_all, mask = (part[frames] for part in graph)
     distance = so3.geodesic_distance(leader.R_lab_body[frames][:, None], R_all)
     near, which = torch.where(mask, distance, torch.inf).min(-1)
@@ -277,7 +255,6 @@ def _follow(leader: Track, graph: Graph, frames: Tensor, limit: float) -> Track:
 
 
 def _merit(leader: Track, follower: Track) -> float:
-    """Return the mean T over both cameras and all frames of a stretch."""
     return float((leader.score + follower.score.nan_to_num(0.0)).mean() / 2)
 
 

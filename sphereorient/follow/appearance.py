@@ -1,4 +1,4 @@
-"""Appearance of a movie (light, blur, noise), estimated from a few of its frames before the others are measured."""
+"""Appearance of a movie (light, blur, noise), estimated from a few frames before tracking."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from sphereorient.trajectory import Reason
 
 TRIED = 6  # frames
 APART_GAIN = 1.5  # cameras that leave this many times more unexplained together than alone are followed one by one
-APART_PX = 0.4  # where lines of sight miss each other by more, light is learnt from each camera alone
+APART_PX = 0.4  # a larger distance of lines of sight: estimate light from each camera alone
 FAR_APART_PX = 1.5  # and by more than this, no pose fits all cameras
 FEWEST_BOTH = 4  # frames of two cameras from which their usual disagreement is measured
-TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees a ball, but not where the other does
+TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees the sphere elsewhere than the other
 NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses by less than this
 TELLING = 2.0  # unless wrong poses leave this many times more unexplained, picture by picture; other maps: 1.6 at most
 ENOUGH = 1400  # pixels of each disk that are used: more of them changed nothing
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
-ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the texture locates the ball
+ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the texture locates the sphere
 
 FINER = 1.25  # ratio of the blurs that are tried, from FINEST_PX on
-WIDEST = 0.3  # of the radius: wider ones leave nothing of a paint that a ball can carry
+WIDEST = 0.3  # of the radius: wider ones remove all paint
 LIGHT_ROUNDS, SOFT_ROUNDS = 2, 4
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 
@@ -51,7 +51,7 @@ class Appearance:
     score_min: float  # between right and wrong poses
     right_score: float  # typical of right poses
     usual_apart_rad: float = math.inf  # typical angle between the orientations that two cameras alone give
-    together: bool = True  # whether the cameras see one ball in one place, as they do unless they were bumped
+    together: bool = True  # whether the cameras see the sphere at one position
 
     def of(self, camera: int) -> Appearance:
         """Return the appearance in one camera."""
@@ -62,7 +62,7 @@ class Appearance:
         return replace(self, fitter=self.fitter.on(device))
 
     def search(self, proposers: Mapping[str, Proposer], locating: LocateSettings, candidates: int) -> Initialiser:
-        """Return what finds poses in frames of this appearance without history."""
+        """Return the initialiser for frames of this appearance."""
         return Initialiser(
             fitter=self.fitter,
             proposers=proposers,
@@ -82,13 +82,8 @@ class Appearance:
 def estimate_appearance(
     first: Initialiser, frames: Sequence[Sequence[Frame]], base: TextureTable, settings: RefineSettings
 ) -> Appearance:
-    """Estimate light, blur and noise of movies.
-
-    Args:
-        first: finds poses with the blur and the light that are assumed at first.
-        frames: n times C, spread over the movies.
-        base: finest table of the texture.
-        settings: blur, if given.
+    """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies.
+    `first` finds poses with an assumed blur and light; `base` is the finest table of the texture.
 
     Raises:
         ExperimentError: no frame has a pose, or none is better than wrong poses.
@@ -109,7 +104,7 @@ def estimate_appearance(
     gain, gap_px = _apart(fitter, pictures, found)
     looked = found
     if gain > APART_GAIN or gap_px > APART_PX:
-        # A pose between what the cameras see would teach a light that is nowhere.
+        # A pose between those of disagreeing cameras would give a wrong light.
         each = [search(fitter.of(k), [[frame[k]] for frame in frames]) for k in range(len(fitter.views))]
         frame, X, R, use = _seen_by_each(each)
         looked = [poses for of_camera in each for poses in of_camera]
@@ -125,7 +120,7 @@ def estimate_appearance(
     if max(best, right) < highest + NO_BETTER and _times_better(looked) < TELLING:
         raise _unexplained(best)
     if right < highest + NO_BETTER:
-        # Dirt or a rim that is hidden spoils the light that was learnt: all poses are explained worse than before.
+        # Dirt or a hidden rim spoils the estimated light: all poses are explained worse than before.
         highest = right - (best - highest)
     fitter = replace(fitter, widest_px=widest)
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
@@ -139,7 +134,7 @@ def estimate_appearance(
 
 
 def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
-    """Return the median angle between the turns of two cameras that see the ball together; infinite without any."""
+    """Return the median angle between the rotations of two cameras that see the sphere together; inf without any."""
     angles = [
         (fit.own_turn[:, k] - fit.own_turn[:, m]).norm(dim=-1)[use[:, k] & use[:, m]]
         for k, m in combinations(range(use.shape[1]), 2)
@@ -149,12 +144,9 @@ def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
 
 
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
-    """Measure on a few frames whether the cameras see one ball in one place, as they do unless one was moved.
-
-    Returns:
-        The ratio of the variance left unexplained by all cameras together to that by each alone, and the distance
-        between the lines of sight, px; both in the worst quarter of the frames, as cameras may agree in one part of
-        the volume.
+    """Measure on a few frames whether the cameras see one sphere at one position.
+    Return, for the worst quarter of frames, the unexplained variance of all cameras together over that of each alone,
+    and the distance between the lines of sight, px.
     """
     cameras = len(fitter.views)
     whole = [k for k, poses in enumerate(found) if len(poses) and bool(poses.use.all())]
@@ -184,11 +176,10 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     return float(torch.stack(gains).amax(0).quantile(0.75)), float(gap_mm.quantile(0.75) * px_mm)
 
 
-Rows = tuple[list[int], Tensor, Tensor, Tensor]  # frames, places (n, 3), rotations (n, 3, 3), cameras in use (n, C)
+Rows = tuple[list[int], Tensor, Tensor, Tensor]  # frames, positions (n, 3), rotations (n, 3, 3), cameras in use (n, C)
 
 
 def _seen_by_all(found: Sequence[Poses]) -> Rows:
-    """Return the clear poses of all cameras together."""
     chosen = _clear(found)
     X = torch.cat([found[k].position_lab_mm[:1] for k in chosen])
     R = torch.cat([found[k].R_lab_body[:1] for k in chosen])
@@ -196,7 +187,6 @@ def _seen_by_all(found: Sequence[Poses]) -> Rows:
 
 
 def _seen_by_each(each: Sequence[Sequence[Poses]]) -> Rows:
-    """Return the clear poses of each camera alone."""
     rows = [(k, camera) for camera, found in enumerate(each) for k in _clear(found)]
     X = torch.stack([each[camera][k].position_lab_mm[0] for k, camera in rows])
     R = torch.stack([each[camera][k].R_lab_body[0] for k, camera in rows])
@@ -213,10 +203,7 @@ def _scores(found: Sequence[Poses]) -> tuple[float, float]:
 
 
 def _times_better(found: Sequence[Poses]) -> float:
-    """Return the median ratio of the variances that the second and the best pose of a clear frame leave unexplained.
-
-    Blurred pictures are mostly disk, and any pose explains most of one; only the ratio separates them.
-    """
+    """Return the median ratio of the variances left by second and best pose; blurred pictures need the ratio."""
     rows = [(found[k].score[:2], found[k].use) for k in _clear(found) if len(found[k]) > 1]
     if not rows:
         return math.inf
@@ -225,7 +212,7 @@ def _times_better(found: Sequence[Poses]) -> float:
 
 
 def _nothing(found: Sequence[Poses]) -> ExperimentError:
-    """Word what was missing in all frames: the ball, or a pose that looks like it."""
+    """Return the error of a movie without the sphere, or without a pose that fits."""
     reasons = {str(why) for poses in found for why in poses.reason}
     got = f"none ({', '.join(sorted(reasons))})"
     if Reason.LOW_SCORE in reasons:
@@ -236,7 +223,7 @@ def _nothing(found: Sequence[Poses]) -> ExperimentError:
 
 
 def _unexplained(score: float) -> ExperimentError:
-    """Word that the best poses are no better than wrong ones: the pictures do not show this map."""
+    """Return the error of a movie that does not show this map."""
     do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
     got = f"poses that explain {100 * score:.0f} % of the pictures, as wrong ones do"
     return ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
@@ -251,16 +238,14 @@ def _clear(found: Sequence[Poses]) -> list[int]:
 
 
 def _clear_of(typical: float) -> float:
-    """Return the score that leaves three times as much unexplained as a typical one."""
     return 1 - 3 * (1 - typical)
 
 
 def _light_and_blur(
     fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor, *, given: bool
 ) -> tuple[Fitter, FittedPoses]:
-    """Learn light, then blur, then light again; return the fitter that knows both, and its fit.
-
-    Light that was learnt with a wrong blur favours that blur: for blurred pictures they alternate several times.
+    """Estimate light, then blur, then light again; return the fitter that has both, and its fit.
+    Light estimated with a wrong blur favours that blur: for blurred pictures they alternate several times.
     """
     diameter_px = widest_px(fitter.views)
     fitter, fit = _with_light(fitter, pixels, fit, use, LIGHT_ROUNDS)
@@ -276,7 +261,6 @@ def _light_and_blur(
 def _with_light(
     fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor, rounds: int
 ) -> tuple[Fitter, FittedPoses]:
-    """Learn the light and fit again, several times."""
     for _ in range(rounds):
         fitter = fitter.with_light_of(pixels, fit, use)
         fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
@@ -313,6 +297,5 @@ def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: Fitted
 
 
 def _blurs_tried(radius_px: float) -> tuple[float, ...]:
-    """Return the blurs that are tried, px."""
     steps = math.log(max(WIDEST * radius_px / FINEST_PX, FINER**7)) / math.log(FINER)
     return tuple(FINEST_PX * FINER**k for k in range(math.ceil(steps) + 1))

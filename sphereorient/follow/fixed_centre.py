@@ -1,4 +1,4 @@
-"""The fixed centre of a ball that turns in one place, from a few frames; all frames are then measured there."""
+"""The fixed centre of a sphere that only rotates, from a few frames; all frames are then fitted there."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from sphereorient.pose.pixels import Pixels
 ROUNDS = 10  # of robust weights
 USUAL = 2.366  # median of chi squared with three degrees of freedom
 FAR = 2.0  # usual distances at which a frame counts for half
-FOLLOWS_EVERY = 4  # pixel; how attitudes follow the place need not be known well
+FOLLOWS_EVERY = 4  # every n-th pixel; this derivative need not be precise
 ASIDE = 0.005  # of the radius: how far aside that is tried
-FIRM = 0.01  # of the place's error: how far a frame's own idea of the place may move a fit
-ITERATIONS = 3  # of the fits that tell the place: they begin where a search has arrived
+FIRM = 0.01  # of the centre's error: how far a frame may move a fit from the centre
+ITERATIONS = 3  # of the fits; they start at the result of a search
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FixedCentre:
-    """Centre of a ball in all frames; made by `find_fixed_centre`."""
+    """Centre of a sphere in all frames; made by `find_fixed_centre`."""
 
     position_lab_mm: Tensor  # (3,) float64
     covariance_mm2: Tensor  # (3, 3), of its error, which is one and the same in all frames
@@ -47,15 +47,8 @@ class FixedCentre:
 
 
 def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Frame]], score_min: float) -> FixedCentre | None:
-    """Find the centre of a ball that turns in one place.
-
-    Args:
-        search: finds poses of single frames.
-        frames: n times C, spread over the movie.
-        score_min: of poses that are used.
-
-    Returns:
-        The centre; None where no frame has a pose that all of its pictures support.
+    """Find the centre of a sphere that only rotates, from n x C frames and their poses of at least `score_min`.
+    None where no frame has a pose that all of its pictures support.
     """
     fitter = search.fitter
     with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
@@ -91,14 +84,8 @@ def _follows(fitter: Fitter, pixels: Pixels, place: Tensor, R: Tensor, use: Tens
 
 
 def mean_place(position_lab_mm: Tensor, covariance_mm2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the robust mean of positions; outliers hardly count.
-
-    Args:
-        position_lab_mm: (n, 3), independent, n >= 1.
-        covariance_mm2: (n, 3, 3), of them.
-
-    Returns:
-        The mean (3,) and its covariance (3, 3), wider where the measurements scatter more than their covariances.
+    """Return the robust mean (3,) of n >= 1 independent positions (n, 3), mm, and its covariance (3, 3).
+    It is wider where the positions scatter more than their covariances (n, 3, 3).
     """
     X, precision = position_lab_mm.double(), torch.linalg.inv(covariance_mm2.double())
     place, weight, away = X.median(0).values, X.new_ones(len(X)), X.new_zeros(len(X))
@@ -115,10 +102,7 @@ def mean_place(position_lab_mm: Tensor, covariance_mm2: Tensor) -> tuple[Tensor,
 
 
 def _edge(fitter: Fitter, position_lab_mm: Tensor) -> Tensor:
-    """Return the covariance (3, 3), mm^2, of errors that all frames share.
-
-    The modelled limb may lie EDGE_PX off to one side, or all around; with one camera the latter is a distance.
-    """
+    """Return the covariance (3, 3), mm^2, of a limb that lies EDGE_PX off in all frames, to one side or all around."""
     radius_px = torch.stack([view.radius_px(position_lab_mm, fitter.radius_mm) for view in fitter.views])
     aside = EDGE_PX * fitter.radius_mm / float(radius_px.min())
     covariance = aside**2 * torch.eye(3, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""A movie followed batch by batch, the frames of the next batch being decoded meanwhile."""
+"""Tracking batch by batch, while the frames of the next batch are decoded."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sphereorient.pose import CameraView
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Batch:
-    """Chunks of frames that are followed side by side; frames first .. last - 1, counted from the first one used."""
+    """Chunks of frames that are tracked together; frames first .. last - 1, counted from the first one used."""
 
     first: int
     last: int
@@ -40,7 +40,7 @@ class Follower:
 
     @property
     def batches(self) -> list[Batch]:
-        """The batches of the whole recording; frame numbers alone decide which frames they hold."""
+        """The batches of the whole recording; they depend on frame numbers alone."""
         lengths = self.tracker.batches(self.recording.frames)
         ends = list(accumulate(sum(batch) for batch in lengths))
         return [
@@ -78,7 +78,6 @@ def _taken(frames: Iterator[Frame], count: int) -> list[Frame]:
 
 
 def _consecutive(batches: Sequence[Batch]) -> Iterator[list[Batch]]:
-    """Split batches where frames between them are missing."""
     stretch: list[Batch] = []
     for batch in batches:
         if stretch and stretch[-1].last != batch.first:
@@ -90,7 +89,7 @@ def _consecutive(batches: Sequence[Batch]) -> Iterator[list[Batch]]:
 
 
 def sample_frames(recording: Recording, views: Sequence[CameraView], count: int) -> list[tuple[Frame, ...]]:
-    """Return `count` frames of all cameras, spread over the movies; each the first of its stretch that is readable."""
+    """Return `count` frames of all cameras, spread over the movies; each the first readable one of its stretch."""
     total = len(recording.timeline)
     spread = spread_frames(range(total), count)
     taken = []

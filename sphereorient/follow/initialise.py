@@ -23,12 +23,12 @@ from sphereorient.trajectory import Reason
 DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin
 PLACE_SHARE = 0.03  # of the radius: how far an outline's centre may be off, dark rims included
 DEPTH_SHARE = 0.08  # of the distance: how far off it may be where only one outline's size gives it
-NARROWER = (0.15, 0.06)  # deviations from the usual diameter with which outlines are sought again
+NARROWER = (0.15, 0.06)  # allowed deviations from the usual diameter in repeated searches
 CLEARLY_LESS = 0.1  # of a picture's variance: a pose that explains so much less than another is wrong, likely or not
 SURE_NLL = 20.0  # by so much less likely
 GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance see different things
-STEP, REACH = 0.2, 2  # of `relocalise`: radii from place to place; places to each side of the blob's middle
-LOOSE = 0.15  # of the radius: error of a place that `relocalise` finds
+STEP, REACH = 0.2, 2  # of `relocalise`: step, radii, and steps to each side of the blob
+LOOSE = 0.15  # of the radius: error of a position from `relocalise`
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,10 +43,9 @@ class Initialiser:
     finalists: int = 2  # poses that are fitted to all detail
 
     def poses(self, shots: Sequence[Frame]) -> Poses:
-        """Find all poses that the C pictures of one instant allow; pictures that cannot be used take no part.
-
+        """Find all poses that the C pictures of one instant allow; unusable pictures take no part.
         Black paint that hides half of a rim leaves arcs that a smaller circle fits as well: where no picture is
-        explained well, outlines nearer to the usual size are tried, and then the texture tells where the disk is.
+        explained well, outlines nearer to the usual size are tried, and the texture locates the disk.
         """
         poses = self._with_outlines(shots, self.locating)
         if not any(shot.usable for shot in shots):
@@ -87,7 +86,6 @@ class Initialiser:
         return self._search(shots, found)
 
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
-        """Propose orientations inside given outlines, and fit them."""
         fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])
         if not use.any():
@@ -110,7 +108,7 @@ class Initialiser:
         slack = torch.nan_to_num(placed.covariance_mm2[0])
         slack = slack + (PLACE_SHARE * fitter.radius_mm) ** 2 * torch.eye(3).double()
         if int(use.sum()) == 1:
-            # Arcs of a rim that is dark in part fit a smaller circle as well, with no greater residual.
+            # Arcs of a partly dark rim fit a smaller circle as well, with no greater residual.
             (seeing,) = (view for view, used in zip(views, use.tolist(), strict=True) if used)
             sight = seeing.camera.rays(seeing.camera.project(placed.position_lab_mm))
             along = placed.position_lab_mm[0] - sight.origin_lab_mm[0]
@@ -121,10 +119,10 @@ class Initialiser:
         )
 
     def _narrow(self, pictures: Sequence[Picture], place: Tensor, precision: Tensor, R: Tensor, frame: Poses) -> Poses:
-        """Fit all starts to coarse detail, then the best distinct ones to finer and finer."""
+        """Fit all starts on the coarsest level, then the best distinct ones on finer levels."""
         fitter, optics, use = self.fitter, self.fitter.optics, frame.use
         X = place.expand(len(R), 3)
-        # (level, every which pixel, iterations, poses kept): coarse detail needs few pixels, the last fit all.
+        # (level, every n-th pixel, iterations, poses kept): coarse levels need few pixels, the last fit all.
         steps = (
             (optics.coarse, 1, 4, self.finalists + 1),
             (optics.middle, 3, 3, self.finalists),
@@ -133,7 +131,7 @@ class Initialiser:
         )
         for level, every, iterations, keep in steps:
             held = None if level is optics.fine else precision.expand(len(R), 3, 3)
-            # All starts of a level use the same pixels: those about the place that the outlines give.
+            # All starts of a level use the same pixels: those about the position of the outlines.
             one = fitter.pixels([pictures], place, level).thinned(every)
             pixels = one.where(torch.arange(len(one)).repeat(len(R)))
             fit = fitter.fit(pixels, X, R, use.expand(len(R), -1), level, iterations, held)
@@ -149,15 +147,7 @@ def _best_score(poses: Poses) -> float:
 
 
 def explaining_first(nll: Tensor, score: Tensor) -> Tensor:
-    """Return likelihoods (M,) in which poses that explain clearly less of the pictures come behind the others.
-
-    Likelihood forgives a wide scatter before it forgives worn paint or dirt: of a right pose a tenth of the pixels may
-    be off by many standard deviations, of a wrong one half of them by few of larger ones.
-
-    Args:
-        nll: (M,), negative log-likelihood.
-        score: (M,), share of the pictures' variance that each pose explains.
-    """
+    """Return nll (M,) with poses of clearly lower score (M,) behind the others: likelihood forgives wide scatter."""
     behind = score < score.nan_to_num(-1.0).max() - CLEARLY_LESS
     if not bool((~behind & torch.isfinite(nll)).any()):
         return nll
@@ -178,17 +168,7 @@ def distinct_indices(R: Tensor, nll: Tensor, count: int) -> Tensor:
 
 
 def relocalise(frame: Picture, view: CameraView, proposer: Proposer, locating: LocateSettings) -> Found:
-    """Find the place about a blob where the texture map explains a disk of the usual size best.
-
-    Args:
-        frame: (H, W), grey levels.
-        view: of the camera.
-        proposer: its scores measure how well the map explains a disk.
-        locating: how blobs are found.
-
-    Returns:
-        An outline without edges, with a wide error; None with the reason without a blob.
-    """
+    """Return the outline of usual radius where the texture map explains the disk best, or None and the reason."""
     difference = view.background.difference(frame)
     blobs = find_blobs(difference, view.background.noise, view.diameter_px, locating)
     if not blobs:

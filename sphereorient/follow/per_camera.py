@@ -1,4 +1,4 @@
-"""Cameras that disagree, say after one was moved: each follows the ball alone, and the results of all are kept."""
+"""Cameras that disagree, as after one was moved: each tracks the sphere alone, and all results are kept."""
 
 from __future__ import annotations
 
@@ -18,13 +18,7 @@ from sphereorient.trajectory import Reason
 
 
 class PerCameraTracker:
-    """Follows the ball in each camera alone; the first that sees it gives the pose, the others contradict.
-
-    Args:
-        appearance: of the movies.
-        search: finds poses without history.
-        settings: lengths of chunks and batches.
-    """
+    """Tracks the sphere in each camera alone; the first that sees it gives the pose, the others contradict."""
 
     def __init__(self, appearance: Appearance, search: Initialiser, settings: RefineSettings) -> None:
         self.search = search
@@ -36,17 +30,13 @@ class PerCameraTracker:
         return self.trackers[0].batches(frames)
 
     def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
-        """Follow the chunks of one batch; see `ChunkTracker`."""
+        """Track the chunks of one batch; see `ChunkTracker`."""
         each = [tracker.track([movie], batch, time_s) for tracker, movie in zip(self.trackers, shots, strict=True)]
         yield from (cameras_disagree(poses) for poses in zip(*each, strict=True))
 
 
 def cameras_disagree(alone: Sequence[Poses]) -> Poses:
-    """Return one frame's poses of the first camera that sees the ball, with what the others alone give.
-
-    Args:
-        alone: C records, each of one camera.
-    """
+    """Return one frame's poses of the first of C cameras that sees the sphere, with the results of the others alone."""
     reasons = [poses.reason[0] for poses in alone]
     seeing = [k for k, poses in enumerate(alone) if len(poses) and bool(poses.use.any())]
     if not seeing:

@@ -1,4 +1,4 @@
-"""Fitted poses of frames: those of one frame, and those of all frames, padded, from which the path chooses."""
+"""Fitted poses of one frame, and of all frames, padded, for the path."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ class Poses(FittedPoses):
     reason: tuple[Reason, ...]  # C
 
     def __len__(self) -> int:
-        """Return the number of poses."""
         return len(self.nll)
 
 
@@ -37,17 +36,13 @@ def no_pose(cameras: int, reason: Sequence[Reason], use: Tensor | None = None) -
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseTable(FittedPoses):
-    """Poses of N frames, padded to M each, (N, M), most likely first; `nll` is above the frame's best.
-
-    Unused places hold zeros and the unit rotation.
-    """
+    """Poses of N frames, padded to (N, M) with zeros and the unit rotation, likeliest first; `nll` above the best."""
 
     mask: Tensor  # (N, M) bool
     use: Tensor  # (N, C) bool
     reason: tuple[tuple[Reason, ...], ...]  # N of C
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.mask)
 
     def rows(self, choice: Tensor) -> dict[str, Tensor]:
@@ -61,7 +56,7 @@ class PoseTable(FittedPoses):
 
 
 def pose_table(frames: Sequence[Poses], cameras: int) -> PoseTable:
-    """Put the poses of N frames, with none to several each, into arrays."""
+    """Put the poses of N frames into arrays."""
     width = max([len(poses) for poses in frames] + [1])
     mask = torch.tensor([[k < len(poses) for k in range(width)] for poses in frames]).reshape(-1, width)
     parts = blank_parts(cameras, len(frames), width)

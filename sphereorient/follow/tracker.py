@@ -1,4 +1,4 @@
-"""Poses of all frames: a full search at the first frame of a chunk, then each frame from the ones before it."""
+"""Poses of all frames: a full search at the first frame of a chunk, then each frame from those before it."""
 
 from __future__ import annotations
 
@@ -24,21 +24,19 @@ from sphereorient.trajectory import Reason
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
 NEAR_RAD = 0.006  # a first step that is longer wants another one before all pixels are looked at
 FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
-LONG_STEP = 3.0  # times the step before: after a longer one the motion before says little
+LONG_STEP = 3.0  # times the step before: a longer one changes the motion
 CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
 CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
 AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
-MOVE_SHARE = 0.3  # of the radius: how far the ball may have moved where its motion is unknown
-ASTRAY_SHARE = 0.01  # of the radius: how far a place may be from the extrapolation of three frames
+MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
+ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Expected:
-    """What a frame's predecessors predict."""
-
     position_lab_mm: Tensor  # (3,)
     R_lab_body: Tensor  # (3, 3)
-    use: Tensor  # (C,) bool, cameras that saw the ball
+    use: Tensor  # (C,) bool, cameras that saw the sphere
     reason: tuple[Reason, ...]  # C, why the others did not
     place_precision: Tensor  # (3, 3), 1/mm^2
     rough: bool = False  # from one predecessor alone: the motion is unknown
@@ -77,7 +75,7 @@ class _Chunk:
             turn = (1 + more) * turn - on * before * more * so3.log(R0 @ rows[0].R_lab_body[0].mT)
             a, b = on * (1 + more), on * before * more
             further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * rows[0].covariance[0, 3:, 3:]
-            # Not so the distances that one camera tells: they scatter by more than the ball is accelerated.
+            # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
             if float(further.diagonal().sum()) < (ASTRAY_SHARE * radius_mm) ** 2:
                 move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
         astray = (ASTRAY_SHARE * radius_mm) ** 2 * torch.eye(3, dtype=torch.float64)
@@ -108,16 +106,9 @@ class _Chunk:
 
 
 class ChunkTracker:
-    """Follows the ball through chunks of frames, each chunk by itself.
-
-    A chunk begins with a search without history. Frame numbers alone decide where chunks begin: no batch, worker or
-    restart can change a result, and a pose gone wrong is lost with its chunk.
-
-    Args:
-        appearance: of the movies.
-        search: finds poses without history.
-        settings: lengths of chunks and batches.
-        centre: of a ball that turns in one place; None: each frame gives its own.
+    """Tracks the sphere through chunks of frames, each chunk by itself from a search without history.
+    Frame numbers alone decide where chunks begin: no batch, worker or restart can change a result, and a wrong pose is
+    lost with its chunk. `centre` is that of a sphere that only rotates; None: each frame has its own position.
     """
 
     def __init__(
@@ -131,27 +122,14 @@ class ChunkTracker:
         self.centre = centre
 
     def batches(self, frames: range) -> list[list[int]]:
-        """Return the lengths of the chunks of each batch; multiples of the setting `chunk_frames` begin a chunk.
-
-        Args:
-            frames: the experiment's frame numbers.
-        """
+        """Return the lengths of the chunks of each batch; chunks begin at multiples of `chunk_frames`."""
         length = self.settings.chunk_frames
         firsts = [frames.start, *range((frames.start // length + 1) * length, frames.stop, length)] if frames else []
         lengths = [last - first for first, last in pairwise([*firsts, frames.stop])]
         return [lengths[k : k + self.settings.chunks] for k in range(0, len(lengths), self.settings.chunks)]
 
     def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
-        """Follow the chunks of one batch.
-
-        Args:
-            shots: of each view, the frames of these chunks in order.
-            batch: lengths of the chunks.
-            time_s: of the same frames.
-
-        Yields:
-            The poses of each frame, in order.
-        """
+        """Yield the poses of a batch's frames: shots of each view, lengths of the chunks, times of all frames."""
         firsts = list(accumulate([0, *batch[:-1]]))
         chunks = [_Chunk(first, first + length, time_s) for first, length in zip(firsts, batch, strict=True)]
         found: dict[int, Poses] = {}
@@ -202,8 +180,8 @@ class ChunkTracker:
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
         alone: list[FittedPoses] = []
         if not bool((good | ~within).all()):
-            # One picture without the ball spoils the joint fit: try each camera alone; of two that disagree the one
-            # nearer to the prediction counts.
+            # One picture without the sphere spoils the joint fit: try each camera; of two that disagree the nearer one
+            # counts.
             alone = [self._fitted(frames, X, R, _only(usable, k), precision) for k in range(use.shape[1])]
             supported = [self._supported(one, _only(usable, k)) for k, one in enumerate(alone)]
             astray = [
@@ -215,10 +193,10 @@ class ChunkTracker:
                 chosen = ~good & torch.isfinite(nearest) & (which == k)
                 fit, use = one.where(chosen, fit), torch.where(chosen[:, None], _only(usable, k), use)
             good = good | torch.isfinite(nearest)
-        # Another camera is judged only where this frame itself asks: results must not depend on the batch.
+        # Another camera is judged only where this frame needs it: results must not depend on the batch.
         doubtful = ~first | before.any(1)
         if bool((usable & ~use).any()):
-            # A camera that was blind may see again: that shows at the joint pose.
+            # A camera without the sphere before may see it again: test it at the joint pose.
             both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, usable, precision)
             unused = good & (usable & ~use).any(1)
             limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
@@ -247,7 +225,7 @@ class ChunkTracker:
         precision: Tensor,
         rough: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Bring rough poses (B,) bool within reach of the finest detail, through coarser ones."""
+        """Bring rough poses (B,) bool into the basin of the finest level, through coarser ones."""
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
             pixels = self.fitter.pixels(frames, X, level, self.fitter.widest_px)
             fit = self.fitter.fit(pixels.thinned(every), X, R, use, level, iterations, precision)
@@ -258,9 +236,9 @@ class ChunkTracker:
     def _fitted(
         self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor
     ) -> FittedPoses:
-        """Fit poses that are about right: to some pixels, longer where that moves them, then to all."""
+        """Fit poses that are nearly right: to some pixels, repeated where that moves them, then to all."""
         if self.centre is None:
-            # All cameras together give the place; one of two gives a distance that is known better from before.
+            # All cameras together determine the position; for one of two the distance is better known from before.
             precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
         fine, widest = self.fitter.optics.fine, self.fitter.widest_px
         pixels = self.fitter.pixels(frames, X, fine, widest)
@@ -280,11 +258,10 @@ class ChunkTracker:
         return fit
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
-        """Return where a further fit begins, (B, 3): where the last one ended, or at the fixed centre."""
+        """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
         return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
 
     def _far(self, fit: FittedPoses, use: Tensor) -> Tensor:
-        """Return which fits need another step, (B,) bool."""
         turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
         # One camera's distances scatter; a change of its picture shows in the rotation as well.
         far: Tensor = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * self.fitter.radius_mm))
@@ -335,14 +312,12 @@ class ChunkTracker:
     def _looked_at(
         self, frames: Sequence[Picture], X: Tensor, R: Tensor, use: Tensor, level: PyramidLevel, iterations: int
     ) -> FittedPoses:
-        """Fit poses to one frame, at the fixed centre where there is one."""
         X = self._from(X)
         pixels = self.fitter.pixels([frames] * len(X), X, level)
         known = None if self.centre is None else self.centre.precision.expand(len(X), 3, 3)
         return self.fitter.fit(pixels, X, R, use, level, iterations, known)
 
     def _at_centre(self, poses: Poses, frames: Sequence[Picture]) -> Poses:
-        """Fit poses again at the fixed centre."""
         R, optics = poses.R_lab_body, self.fitter.optics
         for level, iterations in ((optics.middle, 3), (optics.fine, 4)):
             fit = self._looked_at(frames, poses.position_lab_mm, R, poses.use.expand(len(R), -1), level, iterations)
@@ -369,7 +344,7 @@ class ChunkTracker:
         return poses_of(fit, fit.nll.argsort(stable=True), _only(each, main)[0], reason)
 
     def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
-        """Fit poses to all pictures, kept if that explains all: a disk without an outline may still be there."""
+        """Fit poses to all pictures, kept if that explains all: a disk without an outline may be visible."""
         X, R, optics = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics
         every = usable.expand(len(poses), -1)
         for level, iterations in ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)):
@@ -384,14 +359,13 @@ class ChunkTracker:
 
 
 def _only(usable: Tensor, camera: int) -> Tensor:
-    """Return the mask (B, C) of one usable camera."""
     only = torch.zeros_like(usable)
     only[:, camera] = usable[:, camera]
     return only
 
 
 def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> FittedPoses:
-    """Record what a camera alone gives beside poses (B,) that it did not contribute to."""
+    """Record what a camera alone gives beside poses (B,) to which it did not contribute."""
     if not bool(rows.any()):
         return fit
     own = {
@@ -406,7 +380,6 @@ def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> 
 
 
 def _reason(used: bool, contradicts: bool, shot: Frame, before: Reason) -> Reason:
-    """Return why a camera does not count: no picture, it contradicts, or it was blind before."""
     if used:
         return Reason.OK
     if contradicts:

@@ -1,5 +1,3 @@
-"""Angular velocity from orientations or markers: rotations between two frames around a third, several separations."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -11,7 +9,7 @@ from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 from sphereorient.motion.stencil import neighbours_there
 
-FEWEST_POINTS = 3  # points that determine a turn
+FEWEST_POINTS = 3  # points that determine a rotation
 
 
 def omega_from_orientations(
@@ -22,12 +20,11 @@ def omega_from_orientations(
     segment: Tensor | None = None,
     min_separations: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """Return the angular velocity in lab components, averaged over several symmetric separations.
-
-    Each separation m gives log(R[k + m] R[k - m]^T) / (2 m dt). The mean has weights m^2, optimal for white attitude
-    noise: the pairs share no frame and their variance falls as m^-2. A lost frame costs its neighbours one separation
-    each and itself none. A component that oscillates with f cycles per frame is damped by sin(2 pi f m) / (2 pi f m)
-    per separation. 2 max(m) |omega| dt must stay well below pi, which is not checked.
+    """Return omega_lab (..., N, 3), rad/s, averaged over symmetric separations, and its standard error (..., N, 3).
+    A separation m gives log(R[k + m] R[k - m]^T) / (2 m dt), weight m^2, optimal for white attitude noise. It damps f
+    cycles per frame by sin(2 pi f m) / (2 pi f m). 2 max(m) |omega| dt must stay well below pi (not checked). The error
+    comes from the scatter of the separations; NaN with fewer than two.
+    Source: the paper, section III, angular velocity from the increment T; docs/errata.md E4 and E6.
 
     Args:
         R_lab_body: (..., N, 3, 3), orientations; NaN where missing; orthogonality is not checked.
@@ -36,15 +33,9 @@ def omega_from_orientations(
         segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
         min_separations: number of separations that a frame needs, else NaN.
 
-    Returns:
-        omega_lab (..., N, 3), rad/s, and its standard error (..., N, 3) from the scatter of the separations, NaN where
-        there are fewer than two.
-
     Raises:
         ShapeError: R_lab_body does not end in (N, 3, 3).
         SettingsError: no separation, one below 1, or one given twice.
-
-    Source: the paper, section III, angular velocity from the increment T; docs/errata.md E4 and E6.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
     if R_lab_body.dim() < 3:
@@ -62,9 +53,7 @@ def omega_from_orientations(
 
 def to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
     """Return the body components R^T x (..., 3) of vectors in lab components, in the unit of x.
-
-    It serves omega and alpha alike: the derivative of R^T omega_lab is R^T alpha_lab, because omega x omega vanishes.
-
+    It also serves alpha: the derivative of R^T omega_lab is R^T alpha_lab, because omega x omega vanishes.
     Source: docs/errata.md E6.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
@@ -73,14 +62,14 @@ def to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
 
 
 def check_separations(separations: Sequence[int]) -> None:
-    """Refuse separations that are not different numbers from 1 up."""
+    """Raise SettingsError unless the separations are different numbers from 1 up."""
     if not separations or min(separations) < 1 or len(set(separations)) < len(separations):
         expected, do = "different numbers from 1 up", "give each separation once"
         raise SettingsError(refusal("separations", expected=expected, got=str(tuple(separations)), do=do))
 
 
 def usable_separations(there: Tensor, separations: Sequence[int], segment: Tensor | None) -> Tensor:
-    """Return in which frames which of S separations have both ends in the segment, (..., N, S) bool."""
+    """Return for S separations whether both ends are in the frame's segment, (..., N, S) bool."""
     half = max(separations)
     near = neighbours_there(there, segment, half)
     m = torch.as_tensor(separations, device=there.device)
@@ -101,8 +90,7 @@ def omega_stencil(usable: Tensor, separations: Sequence[int], min_separations: i
 def mean_over_separations(
     turns: Tensor, usable: Tensor, dt_s: float, separations: Sequence[int], min_separations: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the weighted mean of the angular velocities of S separations and its standard error, (..., N, 3), rad/s.
-
+    """Return the weighted mean omega of S separations and its standard error, (..., N, 3), rad/s.
     `turns` (..., N, S, 3, 3) lead from frame k - m to k + m in lab components; unit where not `usable` (..., N, S).
     """
     m = torch.as_tensor(separations, dtype=turns.dtype, device=turns.device)
@@ -123,21 +111,14 @@ def mean_over_separations(
 
 
 def _shifted(R: Tensor, m: int) -> Tensor:
-    """Return R[..., k + m, :, :] at frame k; what wraps around an end is never used."""
+    """Return R[..., k + m, :, :] at frame k; frames that wrap around an end are never used."""
     return R.roll(-m, dims=-3)
 
 
 def kabsch(points_a: Tensor, points_b: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return the rotation (..., 3, 3) from the first set of points onto the second, best in least squares.
-
-    Both sets are centred first. The result is a proper rotation also for points in a plane and for mirror images;
-    points on one line leave the rotation about it undetermined (not checked).
-
-    Args:
-        points_a: (..., K, 3), any unit.
-        points_b: (..., K, 3), same unit and frame, point by point.
-        weights: (..., K), not negative; None weighs all alike.
-
+    """Return the rotation (..., 3, 3) from points_a (..., K, 3) onto points_b, any unit, by weighted least squares.
+    Both sets are centred first. It is proper also for mirror images; points on one line leave it undetermined (not
+    checked). Weights (..., K) are not negative; None: all equal.
     Source: W. Kabsch, Acta Cryst. A32, 922 (1976); the paper's R_kabsch, its increment T, docs/errata.md E8.
     """
     check_tail("points_a", points_a, 3)
@@ -157,17 +138,8 @@ def omega_from_markers(
     segment: Tensor | None = None,
     min_separations: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """Return the angular velocity from tracked markers, in lab components, as `omega_from_orientations`.
-
-    The rotation between two frames is found from the markers seen in both. The body components stay unknown.
-
-    Args:
-        points_lab: (..., N, K, 3), markers in the lab, any unit; NaN where a marker is not seen.
-        dt_s: time between frames.
-        separations: values of m, frames, from 1 up, each once.
-        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
-        min_separations: number of separations that a frame needs, else NaN.
-
+    """Return omega_lab and its standard error as `omega_from_orientations`, from markers seen in both frames of a pair.
+    `points_lab` (..., N, K, 3), any unit, is NaN where a marker is not seen. The body components stay unknown.
     Source: the paper, section III, R_kabsch; docs/errata.md E8.
     """
     check_tail("points_lab", points_lab, 3)

@@ -1,5 +1,3 @@
-"""Derivatives by convolution with derivatives of a Gaussian."""
-
 from __future__ import annotations
 
 import math
@@ -18,26 +16,13 @@ TRUNCATE = 3.0  # holds 99.7 % of the Gaussian
 def gaussian_derivative(
     x: Tensor, dt_s: float, sigma_frames: float, order: Order, truncate: float = TRUNCATE
 ) -> Tensor:
-    """Smooth with a Gaussian and take the derivative, wherever the whole window was measured.
-
-    The kernel's discrete moments are exact, so polynomials come out exactly: constants and lines for order 0, up to
-    quadratics for order 1, up to cubics for order 2. A sine of f cycles per frame is damped by about
-    exp(-(2 pi f sigma)^2 / 2).
-
-    Args:
-        x: (..., N, D), any unit; NaN where missing.
-        dt_s: time between frames.
-        sigma_frames: width of the Gaussian.
-        order: of the derivative, 0 (only smooth), 1 or 2.
-        truncate: half width of the window in units of sigma.
-
-    Returns:
-        (..., N, D), x's unit / s^order; NaN where the window reaches a missing value or an end.
+    """Return the derivative (..., N, D) of x (..., N, D), in its unit / s^order, by a Gaussian kernel; order 0 smooths.
+    NaN where the window (`truncate` sigmas on each side) reaches a missing value or an end. Exact for polynomials up to
+    degree order + 1. A sine of f cycles per frame is damped by about exp(-(2 pi f sigma)^2 / 2).
+    Source: the paper, section III, differentiation of trajectories with a Gaussian kernel.
 
     Raises:
-        SettingsError: another order, or a width that is not positive.
-
-    Source: the paper, section III, differentiation of trajectories with a Gaussian kernel.
+        SettingsError: an order other than 0, 1, 2, or a width that is not positive.
     """
     kernel = _full_kernel(sigma_frames, order, truncate, x)
     near = windows(x.mT, kernel.shape[-1] // 2)
@@ -46,9 +31,7 @@ def gaussian_derivative(
 
 def noise_gain(sigma_frames: float, order: Order, truncate: float = TRUNCATE) -> float:
     """Return the standard deviation of white noise of standard deviation 1 after `gaussian_derivative` with dt_s = 1.
-
-    For sigma above about 1.5 frames the orders 0, 1, 2 give 0.531 sigma^-0.5, 0.376 sigma^-1.5 and 0.460 sigma^-2.5.
-    Noise that is correlated over frames gives more, up to the square root of its correlation length.
+    For sigma above 1.5 frames, orders 0, 1, 2: 0.531 sigma^-0.5, 0.376 sigma^-1.5, 0.460 sigma^-2.5.
     """
     return float(_full_kernel(sigma_frames, order, truncate, torch.empty(0, dtype=torch.float64)).norm())
 
@@ -64,21 +47,12 @@ def gap_aware_stencil(
     dtype: torch.dtype = torch.float64,
 ) -> Tensor:
     """Return the kernel of `gaussian_derivative` for every frame, (..., N, 2 h + 1), corrected for missing frames.
-
-    A neighbour is used where its mirror image is there, too, and both are in the frame's segment; the moments are
-    corrected for what remains, so polynomials still come out exactly. Towards an end the window shrinks evenly.
-
-    Args:
-        there: (..., N) bool, measured frames.
-        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
-        sigma_frames: width of the Gaussian.
-        order: of the derivative, 0, 1 or 2.
-        truncate: half width of the window in units of sigma.
-        min_share: share of the Gaussian's weight that must be there, else NaN; 1 asks for the whole window.
-        dtype: of the result.
+    A neighbour is used where its mirror image is measured and both are in the segment; polynomials stay exact. `there`
+    (..., N) marks measured frames; segment (..., N) is -1 outside any, None is one segment. NaN where less than
+    `min_share` of the Gaussian's weight is measured.
 
     Raises:
-        SettingsError: another order, or a width that is not positive.
+        SettingsError: an order other than 0, 1, 2, or a width that is not positive.
     """
     half = _half_width(sigma_frames, order, truncate)
     like = torch.empty(0, dtype=dtype, device=there.device)
@@ -102,29 +76,24 @@ def _half_width(sigma_frames: float, order: int, truncate: float) -> int:
 
 
 def _gaussian(sigma_frames: float, half: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the Gaussian and the places it is taken at, in units of sigma."""
+    """Return the Gaussian and its abscissae in units of sigma."""
     step = torch.arange(-half, half + 1, dtype=like.dtype, device=like.device)
     return torch.exp(-0.5 * (step / sigma_frames) ** 2), step
 
 
 def _full_kernel(sigma_frames: float, order: Order, truncate: float, like: Tensor) -> Tensor:
-    """Return the kernel (2 h + 1) where nothing is missing."""
     gauss, step = _gaussian(sigma_frames, _half_width(sigma_frames, order, truncate), like)
     return _with_exact_moments(gauss, step, order)
 
 
 def _determinant(gauss: Tensor, step: Tensor, order: int) -> Tensor:
-    """Return a number that is zero where the weights that are left do not determine the derivative, (...)."""
+    """Return a number (...) that is zero where the remaining weights do not determine the derivative."""
     m0, m2, m4 = ((gauss * step**power).sum(-1) for power in (0, 2, 4))
     return (m0, m2, m0 * m4 - m2**2)[order]
 
 
 def _with_exact_moments(gauss: Tensor, step: Tensor, order: int) -> Tensor:
-    """Turn symmetric weights (..., 2 h + 1) into a kernel whose moments of powers 0 .. order + 1 are the derivative's.
-
-    It is the Gaussian times the polynomial that the Gaussian's derivative has, with coefficients from the discrete
-    sums; the same as a least-squares fit of a polynomial with Gaussian weights (Savitzky-Golay, weighted).
-    """
+    """Correct weights (..., 2 h + 1) to exact moments 0 .. order + 1, as a weighted Savitzky-Golay fit."""
     m0, m2, m4 = ((gauss * step**power).sum(-1, keepdim=True) for power in (0, 2, 4))
     if order == 0:
         return gauss / m0

@@ -1,4 +1,4 @@
-"""One kind of track, positions or orientations: estimate its process, reject outliers, smooth every segment."""
+"""Positions or orientations of a track: estimate the process, reject outliers, smooth every segment."""
 
 from __future__ import annotations
 
@@ -69,16 +69,8 @@ class Estimate:
 def estimate(
     paths: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings, known: ProcessPrior | None = None
 ) -> tuple[list[Estimate], float, ProcessPrior | None]:
-    """Estimate the process from all segments of one kind, then smooth each by itself.
-
-    Args:
-        paths: one for each segment.
-        band: cycles per frame; None estimates it.
-        settings: limits.
-        known: the process of another track, or of this one; None estimates it.
-
-    Returns:
-        The estimates, the ratio of true errors to sigmas of the measurements, slow errors included, and the process.
+    """Estimate the process of all segments unless `known`, then smooth each; `band` in cycles per frame.
+    Return the estimates, the ratio of true errors to sigmas of the measurements, and the process.
     """
     if known is None:
         pieces = _pieces(paths, settings.learn_frames)
@@ -90,7 +82,7 @@ def estimate(
 
 
 def _pieces(paths: Sequence[SegmentTrack], most: int) -> list[SegmentTrack]:
-    """Return pieces of the segments for the estimation, distributed evenly where there are too many."""
+    """Return pieces of the segments for the estimation, evenly distributed where there are too many."""
     starts = [(path, k) for path in paths for k in range(0, len(path.time), PIECE)]
     total = sum(len(path.time) for path in paths)
     if total > most:
@@ -101,7 +93,6 @@ def _pieces(paths: Sequence[SegmentTrack], most: int) -> list[SegmentTrack]:
 
 
 def _learnt(pieces: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings) -> ProcessPrior:
-    """Estimate the process, reject outliers, and estimate it again without them."""
     scales = settings.least_scale, settings.most_scale
     learnt = estimate_process(pieces, scales, band)
     for _ in range(ROUNDS):
@@ -137,7 +128,7 @@ def _settled(
 
 
 def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: float) -> Bools:
-    """Return which measurements are used: outliers no longer, and those that fit again."""
+    """Return which measurements are used: outliers are dropped, and those that fit again return."""
     out = path.seen & ~path.used
     used = path.used.copy()
     if out.any():
@@ -152,7 +143,7 @@ def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: flo
 
 
 def _stand_out(mahalanobis: Floats, limit: float) -> Bools:
-    """Return the frames beyond the limit and beyond all near them; those near are judged again without them."""
+    """Return the frames beyond the limit and beyond all near them; those near are tested again without them."""
     wrong = mahalanobis > limit
     for k in range(1, min(NEAR, len(mahalanobis) - 1) + 1):
         wrong[k:] &= mahalanobis[k:] >= mahalanobis[:-k]
@@ -161,7 +152,6 @@ def _stand_out(mahalanobis: Floats, limit: float) -> Bools:
 
 
 def _wanted(pole: float) -> Floats:
-    """Return the rows that take value, rate and its change from a state."""
     view = np.eye(3)
     wanted = np.zeros((9, SIZE))
     wanted[VALUE, DELTA] = view
@@ -191,7 +181,6 @@ def _smoothed(path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings
 
 
 def _alone(path: SegmentTrack) -> Estimate:
-    """Return the measurements as they are, without derivatives."""
     unknown = np.full((len(path.time), 3), np.nan)
     covariance = np.full((len(path.time), 9, 9), np.nan)
     covariance[path.seen, VALUE, VALUE] = path.covariance[path.seen]
@@ -204,16 +193,9 @@ def _alone(path: SegmentTrack) -> Estimate:
 def estimate_process(
     paths: Sequence[SegmentTrack], scales: tuple[float, float], band: float | None, before: ProcessPrior | None = None
 ) -> ProcessPrior:
-    """Find the prior and the factor on the measurements' sigmas under which the measurements are most likely.
-
-    Args:
-        paths: segments with at least five measurements each.
-        scales: least and largest factor accepted.
-        band: cycles per frame; fixes the prior, so that only the factor is learnt. None learns both.
-        before: the estimate of the same segments with other references or rejections, as a start.
-
-    Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form, with FREE fewer
-    degrees of freedom a path.
+    """Find the prior and the factor (within `scales`) on the measurements' sigmas with the highest likelihood.
+    Paths have at least five measurements each. `band`, cycles per frame, fixes the prior; `before` is a start.
+    Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form.
     """
     sigma = float(np.median([path.sigma for path in paths]))
     if band is not None:
@@ -242,7 +224,6 @@ def estimate_process(
 
 
 def _rate_deviation(paths: Sequence[SegmentTrack]) -> float:
-    """Return a robust standard deviation of the measured rates by axis, per frame."""
     away = np.concatenate([np.abs(rates - np.median(rates, axis=0)) for rates in (path.rates() for path in paths)])
     return float(1.48 * np.median(away))
 

@@ -16,9 +16,7 @@ EVERY = 64  # states between stored covariances; the smoother computes the other
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateSpace:
     """A linear problem of N states of size D whose first three numbers are measured.
-
-    A step takes the first three numbers to `carried` times the whole state plus `drift`; what becomes of the others,
-    and the noise, depends only on the step's kind (its length), of which there are few.
+    A step takes these to `carried` times the state plus `drift`; all else depends on the step's kind (its length).
     """
 
     carried: Floats  # (N - 1, 3, D)
@@ -52,10 +50,7 @@ class Filtered:
 
 
 def run_filter(chain: StateSpace) -> Filtered:
-    """Run Kalman's filter.
-
-    Source: Kalman 1960.
-    """
+    """Run Kalman's filter (Kalman 1960)."""
     count, size = len(chain.measured), chain.start.shape[0]
     x, P, F = np.zeros(size), chain.start, np.zeros((size, size))
     states, covariances = np.empty((count, size)), np.empty((-(-count // EVERY), size, size))
@@ -95,13 +90,12 @@ def _carried(chain: StateSpace, k: int, P: Floats, F: Floats) -> Floats:
 
 
 def _updated(P: Floats, gain: Floats) -> Floats:
-    """Return the covariance after a measurement."""
     P = P - gain @ P[:3]
     return 0.5 * (P + P.T)
 
 
 def _covariances(chain: StateSpace, filtered: Filtered, first: int) -> Floats:
-    """Return the covariances of the states from a kept one to the next, once more."""
+    """Recompute the covariances of the states from a stored one to the next."""
     count = min(EVERY, len(filtered.state) - first)
     P = filtered.covariance[first // EVERY]
     F = np.zeros_like(P)
@@ -127,13 +121,7 @@ class SmoothedStates:
 
 
 def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedStates:
-    """Run backwards over a filtered chain.
-
-    Args:
-        chain: the problem.
-        filtered: its forward pass.
-        wanted: (K, D), rows whose covariance is asked for.
-
+    """Run backwards over a filtered chain; `wanted` (K, D) holds the rows whose covariance is returned.
     Source: Bierman 1973 (modified Bryson-Frazier); the distance from the others: de Jong 1988.
     """
     count, size = filtered.state.shape

@@ -1,9 +1,7 @@
-"""A smooth random rate of change and its integral: the prior of the smoother, in closed form between two instants.
+"""The prior of the smoother: a smooth random rate of change and its integral, in closed form between two instants.
 
-The rate is u = m + w: a constant m of which nothing is known, and a stationary Gaussian process w of Matern's kernel
-whose first ORDER - 1 derivatives are continuous. Its spectrum is flat up to the band and falls steeply beyond, as that
-of a heavy body in turbulence does; being stationary it keeps the derivatives at the ends of a track believable, where
-an integrated Wiener process lets them go (on the motion of the shared experiment half the error of acceleration).
+The rate is u = m + w: an unknown constant m, and a stationary Gaussian process w of Matern's kernel with ORDER - 1
+continuous derivatives. An integrated Wiener process doubles the error of acceleration on the shared experiment.
 """
 
 from __future__ import annotations
@@ -49,23 +47,19 @@ _FACTORIAL = np.array([math.factorial(k) for k in range(ORDER)], dtype=np.float6
 
 
 def grown(tau: Floats) -> Floats:
-    """Return exp(M tau), (..., ORDER, ORDER): what the state becomes by itself.
-
-    Args:
-        tau: (...), time times pole.
-    """
+    """Return exp(M tau), (..., ORDER, ORDER), the free evolution of the state over tau (...), time times pole."""
     terms = np.exp(-tau)[..., None] * tau[..., None] ** np.arange(ORDER) / _FACTORIAL
     return np.asarray(np.tensordot(terms, _POWERS, axes=1), dtype=np.float64)
 
 
 def grown_rate(tau: Floats) -> Floats:
-    """Return w after the time tau by the state at its begin, (..., ORDER): the first row of `grown`."""
+    """Return w after the time tau from the initial state, (..., ORDER): the first row of `grown`."""
     terms = np.exp(-tau)[..., None] * tau[..., None] ** np.arange(ORDER) / _FACTORIAL
     return np.asarray(terms @ _POWERS[:, 0, :], dtype=np.float64)
 
 
 def integral(tau: Floats) -> Floats:
-    """Return the integral of w over the time tau by the state at its begin, (..., ORDER), times pole."""
+    """Return the integral of w over the time tau from the initial state, (..., ORDER), times pole."""
     terms = gammainc(np.arange(1, ORDER + 1), tau[..., None])
     return np.asarray(terms @ _POWERS[:, 0, :], dtype=np.float64)
 
@@ -78,10 +72,7 @@ def nodes(step: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """What is believed of a rate before the measurements; learnt by `learn`.
-
-    Units are those of the value per unit of time, time in frames.
-    """
+    """Prior of a rate, estimated by `estimate_process`; in units of the value per frame."""
 
     pole: float  # per frame; the spectrum of w falls beyond it
     deviation: float  # standard deviation of w by axis, value per frame
@@ -95,13 +86,10 @@ class Prior:
 
 
 def prior_of_band(band: float, noise: float) -> Prior:
-    """Return the prior with which white noise is followed up to a band: there signal and noise are equally strong.
-
-    Args:
-        band: cycles per frame.
-        noise: standard deviation of the measured value by axis, one measurement a frame.
+    """Return the prior whose spectrum equals white noise at the band (cycles per frame).
+    `noise`: standard deviation of the measured value by axis, one measurement a frame.
     """
     rate = 2 * np.pi * band
-    pole = 0.75 * rate  # as learnt from turbulence-like motion: the fall begins a little before the band ends
+    pole = 0.75 * rate  # as estimated from turbulence-like motion: the fall begins a little before the band ends
     density = _DENSITY / pole * (1 + (rate / pole) ** 2) ** -ORDER  # of w of unit variance at the band
     return Prior(pole=pole, deviation=float(noise * rate / np.sqrt(density)))

@@ -1,5 +1,3 @@
-"""Velocities and accelerations of one sphere, with their noise."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -25,7 +23,6 @@ M_PER_MM = 1e-3
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
     """Velocities and accelerations of N frames, (..., N, 3), NaN where unknown.
-
     Each sigma is the standard deviation from white measurement noise; the low-pass bias is not in it.
     """
 
@@ -53,25 +50,21 @@ def measure_motion(
     position_sigma_mm: Tensor | None = None,
     orientation_sigma_rad: Tensor | None = None,
 ) -> Motion:
-    """Return velocity, acceleration, omega and alpha of every frame whose neighbours determine them.
-
-    Nothing is measured across the ends of a segment. Single lost frames are bridged; a long gap and the frames next to
-    an end give NaN. Body components need the frame's own orientation, lab components do not.
+    """Return velocity, acceleration, omega and alpha of every frame whose neighbours determine them, else NaN.
+    Nothing crosses the ends of a segment; single lost frames are bridged. Body components need the frame's orientation.
+    Source: the paper, section III; docs/errata.md E4 and E6.
 
     Args:
         position_mm: (..., N, 3), lab; NaN where missing.
         R_lab_body: (..., N, 3, 3), orientations; NaN where missing.
         segment: (..., N) int, number of the segment, -1 outside any.
-        frame_rate_hz: even.
+        frame_rate_hz: constant.
         settings: widths and limits.
         position_sigma_mm: (..., N) or (..., N, 3), of a coordinate; NaN where unknown.
-        orientation_sigma_rad: (..., N) or (..., N, 3), of a component of delta in R_true = exp([delta]x) R; NaN where
-            unknown.
+        orientation_sigma_rad: (..., N) or (..., N, 3), of delta in R_true = exp([delta]x) R; NaN where unknown.
 
     Raises:
         ShapeError: wrong last axes, or unequal numbers of frames.
-
-    Source: the paper, section III; docs/errata.md E4 and E6.
     """
     check_tail("position_mm", position_mm, 3)
     check_tail("R_lab_body", R_lab_body, 3, 3)
@@ -134,7 +127,6 @@ def _rotation(
 
 
 def _stencil(x: Tensor, segment: Tensor, sigma_frames: float, order: Order, settings: MotionSettings) -> Tensor:
-    """Return the gap-aware stencil for x (..., N, 3) with the settings' limits."""
     return gap_aware_stencil(
         x.isfinite().all(-1),
         segment,
@@ -155,7 +147,6 @@ def _by_axis(sigma: Tensor | None, like: Tensor) -> Tensor:
 
 
 def _oriented(R_lab_body: Tensor) -> Tensor:
-    """Return which frames have an orientation, (..., N)."""
     return R_lab_body.isfinite().all(-1).all(-1)
 
 
@@ -169,11 +160,7 @@ def _to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
 
 
 def _sigma_in_body(R_lab_body: Tensor, x_lab: Tensor, x_sigma: Tensor, sigma_rad: Tensor | None) -> Tensor:
-    """Return the standard deviations of R^T x from those of the lab components x and of the orientation, all by axis.
-
-    An orientation error delta rotates the result by delta x x. It is independent of omega, which does not use the
-    frame's own orientation, and small in alpha.
-    """
+    """Return the sigmas of R^T x by axis; an orientation error delta adds delta x x, independent of that of x."""
     from_x = _to_body(R_lab_body.square(), x_sigma.square())
     unit = torch.eye(3, dtype=x_lab.dtype, device=x_lab.device).expand(*x_lab.shape, 3)
     turned = torch.linalg.cross(unit, x_lab[..., None, :])  # (..., 3, 3), row j: delta along axis j crossed with x

@@ -1,7 +1,7 @@
 """Segments as chains of small deviations from a reference: positions on R^3, orientations on SO(3) for any rotation.
 
-The state of an instant is 3 (2 + ORDER) numbers: the small deviation delta from the reference, the deviation of the
-constant rate from the reference's, and the random rate w, w' / pole, w'' / pole^2, ... itself. Time is in frames.
+The state has 3 (2 + ORDER) numbers: delta from the reference, the deviation of the constant rate, and the random rate
+w, w' / pole, w'' / pole^2, ... itself. Time is in frames.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ DELTA, MEAN, RATE = slice(0, 3), slice(3, 6), slice(6, SIZE)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentTrack:
-    """One segment: what was measured, and the reference that the states are deviations from."""
+    """The measurements of one segment, and the reference of the states."""
 
     time: Floats  # (N,), frames, increasing
     covariance: Floats  # (N, 3, 3), of the measurements
     seen: Bools  # (N,), measured
-    used: Bools  # (N,), measured and believed
+    used: Bools  # (N,), measured and not rejected
     unknown_rate: float  # standard deviation of the constant rate from the reference's, next to no pull
     mean: Floats  # (3,), the reference's constant rate, value per frame
     rate: Floats  # (N, ORDER, 3), the reference's w, w' / pole, ...
@@ -50,10 +50,8 @@ class SegmentTrack:
         raise NotImplementedError
 
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
-        """Return rotations (N - 1, NODES + 1, 3, 3) and jumps (N - 1, 3) of the reference's steps.
-
-        The rotations take a deviation from the nodes of a step, and from its begin, to its end. The jumps are what
-        remains of the steps after the integral of the reference's rate.
+        """Return rotations (N - 1, NODES + 1, 3, 3) from nodes and begin of a step to its end, and jumps (N - 1, 3).
+        The jumps are the steps less the integral of the reference's rate.
         """
         raise NotImplementedError
 
@@ -75,16 +73,12 @@ class SegmentTrack:
         return self.rate * (self.pole / prior.pole) ** np.arange(ORDER)[:, None]
 
     def part(self, instants: slice) -> Self:
-        """Return some instants of the path."""
+        """Return some instants of the segment."""
         return replace(self, **{name: getattr(self, name)[instants] for name in BY_INSTANT})
 
     def steps(self, prior: Prior, weight: Floats, by_rate: Floats) -> tuple[Floats, Floats]:
         """Return the transition of a step from the state, (M, 3, SIZE), and its drift (M, 3).
-
-        Args:
-            prior: of the rate.
-            weight: (M, NODES), of the nodes of each step.
-            by_rate: (M, NODES, ORDER), the same times how the rate's state grows to them.
+        `weight` (M, NODES): of the nodes; `by_rate` (M, NODES, ORDER): the same times the growth of the rate's state.
         """
         count = len(weight)
         carry, jump = self.jumps(prior)
@@ -96,7 +90,6 @@ class SegmentTrack:
 
     def chain(self, prior: Prior) -> StateSpace:
         """Return the state space model, linear about the reference.
-
         Source: Barfoot 2017, State Estimation for Robotics, sections 7.2 and 7.3: perturbations from the left.
         """
         step = np.diff(self.time)
@@ -206,7 +199,7 @@ class RotationTrack(SegmentTrack):
 
     @classmethod
     def of(cls, time: Floats, value: Floats, covariance: Floats, seen: Bools) -> Self:
-        """Return the segment about a first estimate: measurements that follow from each other, gaps interpolated."""
+        """Return the segment about a first estimate: consistent measurements, gaps interpolated."""
         reference, omega, trusted = _first_guess(time, value, seen)
         mean = omega.mean(0)
         rate = np.zeros((len(time), ORDER, 3))
@@ -274,8 +267,7 @@ def rotvec_between(begin: Floats, end: Floats) -> Floats:
 
 
 def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int = 3) -> Floats:
-    """Return the turns (M, 3, 3) over steps (M,) by omega_lab = mean + w(t), w by its state (M, ORDER, 3) at the begin.
-
+    """Return the rotations (M, 3, 3) over steps (M,) by omega_lab = mean + w(t), from the state of w (M, ORDER, 3).
     Source: Magnus expansion of fourth order at the two Gauss nodes (Iserles and Norsett 1999).
     """
     h = step[:, None] / parts
@@ -289,11 +281,7 @@ def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int
 
 
 def _first_guess(time: Floats, R: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
-    """Return orientations (N, 3, 3) and omega_lab (N, 3), rad per frame, at all instants, and the frames trusted.
-
-    Over a gap, where more than half a turn may have passed, omega is interpolated smoothly; of the rotations that fit,
-    the one nearest to it is taken.
-    """
+    """Return orientations (N, 3, 3), omega_lab (N, 3), rad per frame, at all instants, and the frames trusted."""
     frames = np.flatnonzero(seen)
     if len(frames) < 2:
         return np.broadcast_to(R[frames[0]], R.shape).copy(), np.zeros((len(time), 3)), seen
@@ -305,7 +293,6 @@ def _first_guess(time: Floats, R: Floats, seen: Bools) -> tuple[Floats, Floats, 
     still = gone[frames].mT @ R[frames]  # constant where the turning is typical
     way = float(np.median(np.linalg.norm(steps, axis=1)))
     trusted = frames[_consistent(lambda lag: rotvec_between(still[:-lag], still[lag:]), len(frames), way)]
-    # distribute what omega leaves between two trusted frames evenly over the time between them
     at = np.interp(np.arange(len(time)), trusted, np.arange(len(trusted)))
     left = np.minimum(at.astype(int), max(len(trusted) - 2, 0))
     share = np.clip(at - left, 0.0, 1.0)
@@ -341,14 +328,8 @@ def _around(x: Floats, width: int) -> Floats:
 
 
 def _consistent(kink: Callable[[int], Floats], count: int, way: float) -> NDArray[np.int64]:
-    """Return the frames that follow from each other, by least cost; to leave out a frame has a cost, too.
-
-    Args:
-        kink: for a lag, the steps (count - lag, 3) from each frame to the one so much later, less the typical rate.
-        count: of frames.
-        way: typical length of a step; the typical rate is known to a few hundredths of it.
-
-    Source: dynamic programming over the frame before; kinks are in units of the median kink.
+    """Return the frames that follow from each other, by dynamic programming; leaving out a frame has a cost.
+    `kink` gives for a lag the steps (count - lag, 3) between frames less the typical rate; `way` is the typical step.
     """
     reach = min(LEFT_OUT + 1, count - 1)
     kinks = [np.linalg.norm(kink(lag), axis=1) / lag for lag in range(1, reach + 1)]

@@ -1,5 +1,3 @@
-"""Settings of the room motion."""
-
 from __future__ import annotations
 
 from typing import Self

@@ -64,7 +64,6 @@ class MeasuredPoses:
     segment: Tensor  # (N,) int64, number of the segment, -1 outside any
 
     def __post_init__(self) -> None:
-        """Refuse parts of other shapes."""
         check_tail("position_lab_mm", self.position_lab_mm, 3)
         for name in ("position_cov_mm2", "R_lab_body", "orientation_cov_rad2"):
             check_tail(name, getattr(self, name), 3, 3)
@@ -80,29 +79,16 @@ class MeasuredPoses:
 
 
 def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: ProcessNoise | None = None) -> Smoothed:
-    """Smooth a track, segment by segment, and take its derivatives.
-
-    Velocity and omega_lab are a constant plus a stationary random process. Its band and strength are estimated from the
-    whole track, once for positions and once for orientations, with one factor on the sigmas of the measurements. There
-    is no lag; the ends are included; gaps inside a segment are filled; outliers are left out.
-
-    A segment with one measured frame has this measurement and no derivatives; with two it has velocities, from three on
-    accelerations too. A track with too few frames for the estimation is treated
-    as if each were alone.
-
-    Args:
-        measured: N frames.
-        settings: bands, limits.
-        known: the processes as another run estimated them; None estimates them from this track.
-
-    Returns:
-        The motion, on the CPU.
+    """Smooth a track, segment by segment, and take its derivatives; the result is on the CPU.
+    Velocity and omega_lab are a constant plus a stationary random process, estimated from the whole track unless
+    `known`, with one factor on the sigmas. There is no lag; ends are included, gaps inside a segment filled, outliers
+    rejected. A segment of one measured frame has no derivatives, of two no accelerations; a track too short for the
+    estimation has no derivatives.
+    Source: Gaussian-process smoother: Sarkka and Solin 2019, Applied Stochastic Differential Equations, chapter 12; on
+    SO(3): Barfoot 2017, State Estimation for Robotics, chapters 7 and 8.
 
     Raises:
         ShapeError: times that do not increase.
-
-    Source: Gaussian-process regression as a smoother: Sarkka and Solin 2019, Applied Stochastic Differential Equations,
-    chapter 12; on SO(3): Barfoot 2017, State Estimation for Robotics, chapters 7 and 8.
     """
     names = ("time_s", "position_lab_mm", "position_cov_mm2", "R_lab_body", "orientation_cov_rad2")
     parts = (getattr(measured, name) for name in names)
@@ -144,7 +130,6 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
 
 
 def _typical_step(time_s: Floats, numbers: NDArray[np.int64]) -> float:
-    """Return the median time between frames of one segment, s."""
     within = (numbers[1:] == numbers[:-1]) & (numbers[1:] >= 0)
     steps = np.diff(time_s)[within]
     return float(np.median(steps)) if len(steps) else 1.0
@@ -156,7 +141,7 @@ def _per_frame(band_hz: float | None, frame_s: float) -> float | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Instants:
-    """Rows of one segment, and its instants: its frames, and more where the time between them is long."""
+    """Rows of one segment, and its instants: its frames, and more inside long steps."""
 
     rows: NDArray[np.int64]  # (n,), of the track
     frames: NDArray[np.int64]  # (n,), which of the instants are frames
@@ -174,18 +159,16 @@ class _Instants:
         return cls(rows=rows, frames=frames, time=instants, used=used)
 
     def spread(self, values: Floats, neutral: Floats) -> Floats:
-        """Return the values of the track at the instants, and a neutral one where nothing was measured."""
+        """Return the values of the track at the instants, a neutral one where nothing was measured."""
         out = np.broadcast_to(neutral, (len(self.time), *neutral.shape)).copy()
         out[self.used] = values[self.rows][self.used[self.frames]]
         return out
 
     def take(self, found: Estimate) -> Estimate:
-        """Return an estimate at the frames alone."""
         return Estimate(**{entry.name: getattr(found, entry.name)[self.frames] for entry in fields(Estimate)})
 
 
 def _blank(frames: int) -> dict[str, Floats]:
-    """Return the arrays of `Smoothed`, NaN."""
     square = ("position_cov_mm2", "orientation_cov_rad2", "R_lab_body")
     other = ("extrapolated", "rejected", "position_scale", "orientation_scale", "process")
     names = [entry.name for entry in fields(Smoothed) if entry.name not in other]

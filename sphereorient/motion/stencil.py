@@ -1,7 +1,7 @@
 """Weighted sums over windows of neighbouring frames, each frame with weights of its own.
 
 A stencil is a tensor of weights (..., N, 2 h + 1): entry [k, h + j] is the weight of frame k + j in the result for
-frame k. Weights of frames that are not there are zero; a frame whose result is not determined has NaN weights.
+frame k. Missing frames have weight 0; a frame whose result is not determined has NaN weights.
 """
 
 from __future__ import annotations
@@ -12,13 +12,7 @@ from torch.nn.functional import pad
 
 
 def windows(x: Tensor, half: int, fill: float = torch.nan) -> Tensor:
-    """Return the neighbours of every frame: (..., N, 2 half + 1), entry [k, half + j] is x[k + j].
-
-    Args:
-        x: (..., N), anything by frame.
-        half: number of neighbours on either side.
-        fill: value beyond the ends.
-    """
+    """Return the neighbours of every frame of x (..., N): entry [k, half + j] of (..., N, 2 half + 1) is x[k + j]."""
     if x.shape[-1] == 0:
         return x.new_empty(*x.shape, 2 * half + 1)
     return pad(x, (half, half), value=fill).unfold(-1, 2 * half + 1, 1)
@@ -26,11 +20,7 @@ def windows(x: Tensor, half: int, fill: float = torch.nan) -> Tensor:
 
 def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
     """Return which neighbours (..., N, 2 half + 1) of a frame were measured and belong to its segment.
-
-    Args:
-        there: (..., N) bool, measured frames.
-        segment: (..., N) int, number of the segment, -1 outside any; None is one segment.
-        half: number of neighbours on either side.
+    `there` (..., N) bool marks measured frames; segment (..., N) is -1 outside any, None is one segment.
     """
     near = windows(there.to(torch.int8), half, fill=0).bool()
     if segment is None:
@@ -40,7 +30,6 @@ def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor
 
 def paired(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
     """Return which neighbours of a frame can be used in pairs k - j, k + j; arguments as `neighbours_there`.
-
     The weights of pairs have one parity: no lower power of time enters the result, whichever frames are missing.
     """
     near = neighbours_there(there, segment, half)

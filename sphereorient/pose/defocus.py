@@ -1,4 +1,4 @@
-"""How blurred pictures are, before anything is known of the ball in them."""
+"""The blur of pictures, before the pose of the sphere is known."""
 
 from __future__ import annotations
 
@@ -13,32 +13,22 @@ from sphereorient.locate.blob import find_blobs
 from sphereorient.pose.fitter import CameraView
 
 SOFT, SOFT_PX = 0.06, 1.5  # radii, px: templates of pictures that are blurred by more than both are blurred as well
-FIRST_BLUR_PX = 0.625  # what is begun with of pictures that are not soft: a pixel's own width and a good lens
+FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a good lens
 CALM_PX = 1.0  # blur that is laid over pictures first, against noise
-AROUND = 1.2  # of the radius: the ball and its rim
+AROUND = 1.2  # of the radius: the sphere and its rim
 CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and scene lie
 STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
 
 
 def defocus_radii(blur_px: float, diameter_px: float) -> float:
-    """Return the blur of pictures, radii, as far as the search has to know of it: 0 for all that are not soft."""
+    """Return the blur of pictures, radii, as the search needs it: 0 unless they are defocused."""
     blur = 2 * blur_px / diameter_px
     return blur if blur > SOFT and blur_px > SOFT_PX else 0.0
 
 
 def estimate_blur_px(views: Sequence[CameraView], shots: Sequence[Sequence[Frame]], locating: LocateSettings) -> float:
-    """Return the standard deviation of the blur of the steepest edges about the ball, px; the median of all frames.
-
-    Noise makes slopes steeper, and paint without edges less steep: it is a first guess.
-
-    Args:
-        views: C of them.
-        shots: n times C frames.
-        locating: how blobs are found.
-
-    Returns:
-        The blur; 0 where no frame shows anything of the ball's size.
-
+    """Return the standard deviation of the blur, px, of the steepest edges about the sphere: median of n x C frames.
+    A first guess, biased by noise and paint without edges. 0 where no frame shows a blob of the sphere's size.
     Source: a step of height h under a Gaussian blur sigma is h / (sigma sqrt(2 pi)) steep at most.
     """
     found = [

@@ -1,4 +1,4 @@
-"""Pose to hundredths of a degree: Gauss-Newton on rotation and place, all cameras at once, light solved inside."""
+"""Pose to hundredths of a degree: Gauss-Newton on rotation and position, all cameras at once, light eliminated."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class FittedPoses:
     position_lab_mm: Tensor  # (L, 3) float64
     R_lab_body: Tensor  # (L, 3, 3) float64
     covariance: Tensor  # (L, 6, 6) float64, of delta (rad) and position (mm), lab
-    own_turn: Tensor  # (L, C, 3), rad: how each camera alone would turn the pose, its place held
+    own_turn: Tensor  # (L, C, 3), rad: rotation of the pose by each camera alone, position held
     own_covariance: Tensor  # (L, C, 3, 3), rad^2
     own_move: Tensor  # (L, C, 3), mm, lab: how each camera alone would move the sphere, distance by size included
     deviation: Tensor  # (L, C), robust standard deviation of the residuals over the noise expected
@@ -76,7 +76,7 @@ class Residuals:
     weight: Tensor  # (L, P), robust and inside, 0 .. 1
     deviation: Tensor  # (L,), robust standard deviation of the residuals over the noise expected
     lit: Tensor  # (L, P), grey levels from black to white paint, the frame's own light included, coverage too
-    over: Tensor  # (L, P), grey levels by which the ball is brighter than what is behind it
+    over: Tensor  # (L, P), grey levels of the sphere above the background
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,25 +85,15 @@ class PoseStart:
 
     position_lab_mm: Tensor  # (B, 3)
     R_lab_body: Tensor  # (B, 3, 3)
-    use: Tensor  # (B, C) bool, the cameras that see the ball; a pose without any stays where it is
+    use: Tensor  # (B, C) bool, the cameras that see the sphere; a pose without any stays
     place_precision: Tensor | None = None  # (B, 3, 3), 1/mm^2, of `position_lab_mm` as known beforehand
 
 
 def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4) -> FittedPoses:
     """Fit poses to pictures: robust Gauss-Newton, the light's coefficients eliminated in every step.
-
-    Args:
-        pixels: of B * C disks, the cameras of a pose next to each other.
-        begin: start of the B poses.
-        model: of the sphere's pictures.
-        iterations: steps, at least 1, the same for all poses, so that none depends on its neighbours in the batch.
-
-    Returns:
-        The fit, its covariance that of the robust estimate with errors shared within tiles of the picture. All but
-        the pose is as it was before the last step, which `step` holds: a fit that has arrived does not move any more.
-
-    Source: variable projection, Golub and Pereyra 1973; covariance of an M-estimate from clustered scores, Liang and
-    Zeger 1986.
+    `pixels` holds B * C disks, the cameras of a pose next to each other; `iterations` is at least 1. The covariance is
+    robust, with errors shared within tiles. All results but the pose belong to the pose before the last step.
+    Source: variable projection, Golub and Pereyra 1973; covariance from clustered scores, Liang and Zeger 1986.
     """
     use, place_precision, radius_mm = begin.use, begin.place_precision, model.radius_mm
     cameras = use.shape[1]
@@ -129,7 +119,6 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         step = _bounded(solve_damped(whole, force), X[:, None] - origin, seen, radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
-    # Where each camera would go from where the last step began, less that step.
     own = solve_damped(
         information[..., :3, :3], pull[..., :3] - (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
     )
@@ -137,14 +126,14 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
     freed = solve_damped(information, pull) - step[:, None]
     shared = by_pose(_shared_scores(at, precision, mixed, pixels.tile), cameras)
     meat = (shared * seen[..., None, None]).sum(1)
-    if place_precision is not None:  # what was known before has an error of its own
+    if place_precision is not None:  # the prior position has an error of its own
         meat[:, 3:, 3:] += place_precision
     bread = inverse_damped(whole)
     own_bread = inverse_damped(information[..., :3, :3])
     edge = _edge_errors(pixels, X[:, None] - origin, cameras, radius_mm) * seen[..., None]
     lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
     covariance = bread @ meat @ bread + lured.mT @ lured
-    told = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # no picture, no knowledge: the inverse of nothing is huge
+    told = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge
     covariance = torch.where(told[:, None, None], 0.5 * (covariance + covariance.mT), bread)
     loss = by_pose(_loss(at, pixels.inside), cameras)
     return FittedPoses(
@@ -164,22 +153,15 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
 def residuals(
     pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel, cameras: int
 ) -> Residuals:
-    """Linearise the pictures about poses, the light's coefficients at their best.
-
-    Args:
-        pixels: of B * C disks.
-        X: (B, 3), places of the centre in the lab, mm.
-        R: (B, 3, 3), R_lab_body.
-        state: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
-        model: of the sphere's pictures.
-        cameras: C.
+    """Linearise the pictures of B * C disks about poses X (B, 3), mm, R_lab_body R (B, 3, 3), the light at its best.
+    `state`: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
     """
     view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
     columns, difference, black = light_columns(view, model)
     beyond = (1.0 - view.coverage) * pixels.behind
     noise = model.light.noise.repeat(len(X), 1)
     target = pixels.grey - beyond
-    # The first weights come from the picture itself, which a bubble is part of: a second round does without it.
+    # The first weights come from the picture itself, bubbles included; a second round does without it.
     rounds = (pixels.grey, pixels.inside.to(columns.dtype)) if state is None else state
     for _ in range(1 if state is not None else 2):
         expected, weight = rounds
@@ -216,7 +198,7 @@ def residuals(
 
 
 def grey_by_pose(view: SphereView, lit: Tensor, over: Tensor) -> Tensor:
-    """Return how grey changes with delta (rad) and place (mm), (L, 6, P); `lit` and `over` as in `Residuals`."""
+    """Return the derivatives (L, 6, P) of grey by delta (rad) and position (mm); `lit`, `over` as in `Residuals`."""
     paint, limb = lit[:, None], over[:, None]
     return torch.cat(
         [paint * view.paint_by_rotation, paint * view.paint_by_position + limb * view.coverage_by_position], dim=1
@@ -229,7 +211,7 @@ def by_pose(disks: Tensor, cameras: int) -> Tensor:
 
 
 def _variance(grey: Tensor, noise: Tensor) -> Tensor:
-    """Noise expected at grey levels (L, P) by the curves (L, 4)."""
+    """Return the noise variance expected at grey levels (L, P) by the curves (L, 4)."""
     grey = grey.clamp_min(0.0)
     a, b, c, d = noise[..., None].unbind(1)
     variance: Tensor = a + grey * (b + grey * (c + grey * d))
@@ -237,15 +219,15 @@ def _variance(grey: Tensor, noise: Tensor) -> Tensor:
 
 
 def _deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
-    """Robust standard deviation of residuals over the noise expected, (L,); 1 where the noise explains them."""
-    # A quarter of the places tells as much: they are in order of distance from the middle.
+    """Return the robust standard deviation of residuals over the noise expected, (L,), at least 1."""
+    # A quarter of the places suffices: they are in order of distance from the middle.
     residual, variance, inside = residual[:, ::4], variance[:, ::4], inside[:, ::4]
     scaled = torch.where(inside, residual.abs() * variance.rsqrt(), torch.nan)
     return 1.4826 * torch.nan_to_num(scaled.nanmedian(-1).values)
 
 
 def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Eliminate the light's coefficients: information (L, 6, 6), gradient (L, 6), what the pose takes from them."""
+    """Eliminate the light's coefficients: information (L, 6, 6), gradient (L, 6), coupling to the pose."""
     light = normal[:, 6:, 6:]
     light = light + 1e-7 * torch.diag_embed(light.diagonal(dim1=-2, dim2=-1) + 1e-12)
     mixed = torch.linalg.solve(light, normal[:, 6:, :6])
@@ -254,16 +236,7 @@ def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Te
 
 
 def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) -> Tensor:
-    """Shorten steps that change a picture by over 0.1 radii, pose by pose: beyond, the slopes say nothing.
-
-    Along a line of sight the picture only grows: there a step may be as long as its share of the distance allows.
-
-    Args:
-        step: (B, 6), rad and mm.
-        to_centre: (B, C, 3), from where each camera looks to the sphere, mm.
-        seen: (B, C), 1 for the cameras in use.
-        radius_mm: of the sphere.
-    """
+    """Shorten steps (B, 6) to 0.1 radii in the picture, or the same share of the distance along the line of sight."""
     distance = to_centre.norm(dim=-1, keepdim=True).clamp_min(radius_mm)
     move, sight = step[:, None, 3:], to_centre / distance
     along = (move * sight).sum(-1, keepdim=True)
@@ -274,7 +247,7 @@ def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) ->
 
 
 def _edge_errors(pixels: Pixels, to_centre: Tensor, cameras: int, radius_mm: float) -> Tensor:
-    """Return by how much (B, C, 3), mm, an edge that is EDGE_PX off moves the sphere along each line of sight."""
+    """Return the displacement (B, C, 3), mm, along each line of sight by an edge that is EDGE_PX off."""
     distance = to_centre.norm(dim=-1, keepdim=True)
     px_mm = by_pose(pixels.pitch_mm, cameras)[..., None] + by_pose(pixels.pitch_rad, cameras)[..., None] * distance
     off: Tensor = to_centre * (EDGE_PX * px_mm / radius_mm)
@@ -282,7 +255,6 @@ def _edge_errors(pixels: Pixels, to_centre: Tensor, cameras: int, radius_mm: flo
 
 
 def _bounded_alone(freed: Tensor, to_centre: Tensor, radius_mm: float) -> Tensor:
-    """Return the moves (B, C, 3) of steps (B, C, 6) that each camera would take alone."""
     count = freed.shape[0] * freed.shape[1]
     alone = torch.ones(count, 1, dtype=freed.dtype, device=freed.device)
     step = _bounded(freed.reshape(count, 6), to_centre.reshape(count, 1, 3), alone, radius_mm)
@@ -290,7 +262,7 @@ def _bounded_alone(freed: Tensor, to_centre: Tensor, radius_mm: float) -> Tensor
 
 
 def _shared_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:
-    """Sum over tiles of the outer products of their scores, (L, 6, 6): neighbours' errors are not independent."""
+    """Sum over tiles the outer products of their scores, (L, 6, 6): errors of neighbours are not independent."""
     by_pose = at.design[:, :6] - mixed.mT.to(at.design.dtype) @ at.design[:, 6:]
     score = by_pose * (precision * at.residual)[:, None]
     tiles = score.new_zeros(*score.shape[:2], int(tile.max()) + 1 if len(tile) else 1)
@@ -302,23 +274,18 @@ def _shared_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor
 
 
 def _loss(at: Residuals, inside: Tensor) -> Tensor:
-    """Tukey's loss with its scale's own term (L,), natural units: what a wider scatter gains, it pays for."""
+    """Return Tukey's loss (L,) with the normalisation of its scale, nats."""
     share = (at.residual.square() / (TUKEY**2 * at.variance)).clamp_max(1.0)
     loss = (TUKEY**2 / 6.0) * (1.0 - (1.0 - share) ** 3) + at.deviation.clamp_min(1.0).log()[:, None]
     return (loss * inside).sum(-1).double()
 
 
 def _score(at: Residuals, inside: Tensor) -> Tensor:
-    """Share of the disk's variance that the model explains, (L,).
-
-    Every pixel of the ball counts: those that do not fit are what tells a wrong pose. A bubble counts as dark or
-    bright as paint is, however much brighter it shines.
-    """
+    """Return the share of the disk's variance that the model explains, (L,); outliers count up to a limit."""
     share = at.view.coverage * inside
     share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)
     grey = at.model + at.residual
     spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
     left = (share * torch.minimum(at.residual.square(), 4.0 * spread[:, None])).sum(-1)
     explained = 1.0 - left / spread.clamp_min(1e-9)
-    # Where no pixel is ball, nothing is explained.
     return torch.where(spread > 1e-6, explained, torch.zeros_like(explained))

@@ -1,4 +1,4 @@
-"""Refinement at three widths of detail, and what it needs of each camera."""
+"""The fit at three levels of blur, and what it needs of each camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_ta
 Picture = NDArray[np.generic]
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
-SIZES = 1.06  # ratio of neighbouring sizes of disks for which there is a stencil
+SIZES = 1.06  # ratio of neighbouring stencil sizes
 CPU = torch.device("cpu")
 FINEST_PX = 0.4  # least blur of any picture, px: a pixel alone has 0.29
 COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
@@ -38,7 +38,7 @@ class CameraView:
     name: str
     camera: Camera
     background: Background
-    diameter_px: float  # of the ball in the middle of the volume
+    diameter_px: float  # of the sphere in the middle of the volume
     sight: LinesOfSight
 
     @classmethod
@@ -48,7 +48,7 @@ class CameraView:
         return cls(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
 
     def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
-        """Half the width (...), px, of the ball's picture at places (..., 3), along the camera's own right."""
+        """Return the radius (...), px, of the sphere's picture at positions (..., 3), mm, along the camera's x."""
         right = self.camera.R_cam_lab[0] * radius_mm
         centre, rim = self.camera.project(torch.stack([position_lab_mm, position_lab_mm + right]))
         radius_px: Tensor = (rim - centre).norm(dim=-1)
@@ -56,12 +56,12 @@ class CameraView:
 
 
 def widest_px(views: Sequence[CameraView]) -> float:
-    """Return the expected diameter of the ball in the camera that sees it largest, px."""
+    """Return the expected diameter of the sphere, px, in the camera that sees it largest."""
     return max(view.diameter_px for view in views)
 
 
 def unknown_light(views: Sequence[CameraView]) -> Light:
-    """Return the light that first fits begin with: flat, with the scene's noise and a little of a sensor's."""
+    """Return the light of the first fits: flat, with the scene's noise and a little sensor noise."""
     noise = torch.tensor([[view.background.typical_noise**2, 0.02, 0.001, 0.0] for view in views])
     return Light.unknown(len(views), noise)
 
@@ -85,18 +85,12 @@ def _stencil(radius_px: float, step_px: int) -> Stencil:
 
 
 class Optics:
-    """The paint at the widths of detail that fits go through, for one blur of the pictures.
-
-    Args:
-        base: finest table of the paint.
-        blur_px: of optics, pixel and exposure together, px.
-        diameter_px: typical diameter of the disk, px.
-    """
+    """Texture tables at the levels of blur of the fits: pictures of blur `blur_px` and disks of `diameter_px`, px."""
 
     def __init__(self, base: TextureTable, blur_px: float, diameter_px: float) -> None:
         radius_px = diameter_px / 2
         self.blur_px = blur_px
-        # Each from the one before: the wider the blur, the smaller the table that it is made from.
+        # Each from the one before: a wider blur allows a smaller table.
         self.fine = level_of(base, blur_px, 0.0, radius_px)
         self.middle = level_of(self.fine.paint, blur_px, MIDDLE * radius_px, radius_px)
         self.coarse = level_of(self.middle.paint, blur_px, COARSE * radius_px, radius_px)
@@ -124,7 +118,7 @@ class Fitter:
     radius_mm: float
     optics: Optics
     light: Light
-    device: torch.device = CPU  # where the fits are computed; what goes in and comes out is on the CPU
+    device: torch.device = CPU  # of the fits; inputs and results are on the CPU
     widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
 
     @property
@@ -152,7 +146,7 @@ class Fitter:
         return replace(self, views=[self.views[camera]], light=self.light.of(camera))
 
     def largest_px(self, position_lab_mm: Tensor) -> Tensor:
-        """Radius (B,), px, of the largest disk that a ball at places (B, 3) shows in any picture."""
+        """Return the radius (B,), px, of the largest disk that a sphere at positions (B, 3) shows in any picture."""
         radii = torch.stack([view.radius_px(position_lab_mm, self.radius_mm) for view in self.views])
         return radii.nan_to_num().amax(0)
 
@@ -163,13 +157,8 @@ class Fitter:
         level: PyramidLevel,
         radius_px: float | None = None,
     ) -> Pixels:
-        """Cut the disks of B poses out of the pictures of C views.
-
-        Args:
-            pictures: B times C frames.
-            position_lab_mm: (B, 3), where the ball is, to a few pixels.
-            level: of detail.
-            radius_px: of the disks; None: that of the largest one, on which the others' last bits then depend.
+        """Cut the disks of B poses out of the pictures of C views; position_lab_mm (B, 3) is right to a few pixels.
+        Without `radius_px` the largest disk sets it, so that the last bits depend on the batch.
         """
         middles = [torch.nan_to_num(view.camera.project(position_lab_mm)).tolist() for view in self.views]
         if radius_px is None:
@@ -214,7 +203,7 @@ class Fitter:
 
 
 def base_table(texture: Tensor, diameter_px: float) -> TextureTable:
-    """Return the finest table of a map that disks of some diameter can tell, from which all others are blurred."""
+    """Return the finest table of a map that disks of some diameter resolve; all others are blurred from it."""
     return texture_table(texture, max(BASE_RAD, FINEST_PX * 2 / diameter_px))
 
 

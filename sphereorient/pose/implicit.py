@@ -1,12 +1,8 @@
 """A converged fit of poses with its derivatives, by the implicit function theorem (docs/differentiable.md).
 
-At the least sum r(pose, theta)^2 / 2 the gradient g(pose, theta) is 0, and stays 0 when theta changes: so
-d pose / d theta = -H^-1 dg/dtheta with H = dg/dpose. `implicit_pose` fits without a graph and then takes one Newton
-step -H^-1 g with H a constant: its value is close to 0, its derivative that of the theorem. theta stands for all
-tensors with gradients from which the residuals are computed.
-
-The fit of `track` cannot serve: it works in single precision and holds weights, light and slopes of the texture fixed
-in each step, so that its zero is not the zero of a function that autograd can differentiate.
+At the minimum of sum r(pose, theta)^2 / 2 the gradient g is 0, so that d pose / d theta = -H^-1 dg/dtheta with H =
+dg/dpose. `implicit_pose` fits without a graph and then takes one Newton step -H^-1 g with H constant. The fit of
+`track` cannot serve: it holds weights, light and slopes fixed, in single precision.
 """
 
 from __future__ import annotations
@@ -47,23 +43,20 @@ def implicit_pose(
     iterations: int = 30,
 ) -> ImplicitPose:
     """Fit poses by least squares and return them with gradients to all tensors in the residuals.
+    An undetermined direction stays at the start, with gradient 0.
+    Source: implicit function theorem; the Newton-step form, Look and others 2020 (Differentiable implicit layers).
 
     Args:
-        residual: (B, 3, 3) and (B, 3) to (B, M), row b of pose b alone, in standard deviations; twice differentiable in
-            the pose by torch.func (`expected_grey` is), once in the rest. Residuals that must not count are 0.
+        residual: (B, 3, 3) and (B, 3) to (B, M), row b of pose b alone, in standard deviations, 0 where not
+            counted; twice differentiable in the pose by torch.func (`expected_grey` is), once in the rest.
         R_start_lab_body: (B, 3, 3), start.
         start_lab_mm: (B, 3), start.
-        use: (B,) bool, frames to fit; the others are NaN, with gradient 0, if their residuals have finite derivatives.
+        use: (B,) bool, frames to fit; the others, of finite residual derivatives, are NaN with gradient 0.
         iterations: Levenberg-Marquardt steps, the same for all. The graph does not grow with them.
 
-    Returns:
-        The poses. An undetermined direction stays at the start, with gradient 0.
-
     Raises:
-        ShapeError: starts, `use` and residuals do not belong together.
+        ShapeError: starts, `use` and residuals differ in shape.
         SettingsError: no iterations.
-
-    Source: implicit function theorem; the Newton-step form, Look and others 2020 (Differentiable implicit layers).
     """
     use = _checked(R_start_lab_body, start_lab_mm, use, iterations)
     known = use & R_start_lab_body.isfinite().all(-1).all(-1) & start_lab_mm.isfinite().all(-1)
@@ -104,10 +97,7 @@ def implicit_pose(
 
 
 def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
-    """Return the poses (B, 3, 3) and (B, 3) with the least sum of squares; a step that makes a pose worse is not taken.
-
-    Source: Marquardt 1963, damping in units of the diagonal.
-    """
+    """Return the poses (B, 3, 3), (B, 3) with the least sum of squares (Marquardt 1963); no step makes one worse."""
     damping = torch.full_like(X[:, 0], START_DAMPING)
     still = torch.zeros(len(X), 6, dtype=X.dtype, device=X.device)
     for _ in range(iterations):
@@ -126,11 +116,7 @@ def _levenberg_marquardt(residual: Residual, R: Tensor, X: Tensor, iterations: i
 
 
 def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply small errors (B, 6), rad and mm, lab components, from the left, to poses (docs/conventions.md).
-
-    Cayley's rotation replaces the exponential: equal up to the third order, and smooth at 0, where so3.exp has no
-    second derivative.
-    """
+    """Apply small errors (B, 6), rad and mm, lab, from the left, to poses; Cayley's rotation is smooth at 0."""
     half = so3.hat(0.5 * delta[..., :3])
     scale = 2.0 / (1.0 + 0.25 * delta[..., :3].square().sum(-1))
     turned = R_lab_body + scale[..., None, None] * ((half + half @ half) @ R_lab_body)
@@ -138,10 +124,7 @@ def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[
 
 
 def _curvature(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> Tensor:
-    """Return the Hessian (B, 6, 6) of half the sum of squares of residuals (B, M) at delta (B, 6).
-
-    J^T J would be biased where residuals remain, as with a wrong texture.
-    """
+    """Return the Hessian (B, 6, 6) of half the sum of squares of residuals (B, M) at delta (B, 6); J^T J is biased."""
     gradient = torch.func.grad(lambda delta: 0.5 * residuals(delta).square().sum())
     columns: Tensor = torch.func.vmap(lambda axis: torch.func.jvp(gradient, (delta,), (axis,))[1])(_axes(delta))
     return columns.movedim(0, -1)
@@ -155,7 +138,6 @@ def _linearised(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> tuple[T
 
 
 def _axes(delta: Tensor) -> Tensor:
-    """Return one unit change each of all poses at once, (6, B, 6)."""
     return torch.eye(6, dtype=delta.dtype, device=delta.device)[:, None].expand(6, *delta.shape)
 
 
@@ -168,7 +150,6 @@ def _inverse(curvature: Tensor) -> Tensor:
 
 
 def _checked(R: Tensor, X: Tensor, use: Tensor | None, iterations: int) -> Tensor:
-    """Refuse parts of other shapes; return `use`."""
     check_tail("start_lab_mm", X, 3)
     if X.ndim != 2:
         got, do = str(tuple(X.shape)), "put all poses into one batch"

@@ -1,5 +1,3 @@
-"""Light and noise of a movie, learnt from fitted poses."""
-
 from __future__ import annotations
 
 import numpy as np
@@ -14,14 +12,7 @@ from sphereorient.pose.pixels import Pixels
 
 
 def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Light:
-    """Learn the light and the noise of a movie from fitted poses.
-
-    Args:
-        pixels: of B * C disks.
-        fit: of them.
-        use: (B, C) bool, disks to learn from.
-        model: with which the poses were fitted.
-    """
+    """Estimate the light and the noise of a movie from the fits of B * C disks, those of `use` (B, C) bool."""
     cameras = use.shape[1]
     X, R = fit.position_lab_mm, fit.R_lab_body
     at = residuals(pixels, X, R, None, model, cameras)
@@ -36,13 +27,7 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
 
 
 def light_sums(view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the normal equations of light maps of L disks, (L, 2 K, 2 K) and (L, 2 K) float64.
-
-    Args:
-        view: of the disks at their poses.
-        pixels: of the disks.
-        precision: (L, P), weight over variance of each pixel.
-    """
+    """Return the normal equations of light maps of L disks, (L, 2 K, 2 K) and (L, 2 K); precision (L, P)."""
     basis = light_basis(view.across)
     columns = torch.cat([(view.coverage * view.paint)[:, None] * basis, view.coverage[:, None] * basis], dim=1)
     weighted = columns * precision[:, None]
@@ -60,13 +45,7 @@ def light_maps(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:
-    """Return the coefficients (4,), not negative, of the noise's variance as a polynomial in the grey level.
-
-    Args:
-        model: (N,), expected grey levels.
-        residual: (N,), grey levels.
-        inside: (N,) bool, pixels that count.
-    """
+    """Return the noise variance's coefficients (4,), not negative, in the grey level, from pixels (N,) inside."""
     model, residual = model[inside].clamp_min(0).double(), residual[inside].double()
     order = model.argsort(stable=True)
     groups = [group for group in order.tensor_split(24) if len(group) >= 50]

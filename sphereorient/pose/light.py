@@ -1,4 +1,4 @@
-"""How bright white and black paint look at each place of the disk: learnt from the movie, low order, per camera."""
+"""Brightness of white and black paint over the disk: low-order maps per camera, estimated from the movie."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px ball
+MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
 ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)
 
 
@@ -20,7 +20,7 @@ class Shading:
     black: int
 
 
-FIRST = Shading(difference=4, black=2)  # no light is learnt yet
+FIRST = Shading(difference=4, black=2)  # before the light is estimated
 LATER = Shading(difference=2, black=1)
 
 
@@ -44,19 +44,18 @@ def light_basis(across: Tensor) -> Tensor:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Light:
     """Light on the disk and noise of a movie's pictures, one entry per camera; made by `learn_light`.
-
-    A pixel of the ball shows paint * difference + black, each a map over the disk; its noise has the variance
+    A pixel of the sphere shows paint * difference + black, each a map over the disk; its noise has the variance
     noise[0] + noise[1] I + noise[2] I^2 + noise[3] I^3 (read-out; photons; grain of all paint, of white paint alone).
     """
 
     difference: Tensor  # (C, K), white less black paint, grey levels
     black: Tensor  # (C, K)
     noise: Tensor  # (C, 4), grey levels^2 .. 1 / grey level
-    known: bool  # False: not learnt, difference is 1 everywhere and black 0
+    known: bool  # False: difference is 1 everywhere and black 0
 
     @cached_property
     def _map(self) -> Tensor:
-        """Difference and black over the square about the disk, (C * S * S, 2): a look-up beats 25 functions."""
+        """Return difference and black over the square about the disk, (C * S * S, 2): a look-up beats 25 functions."""
         at = (torch.arange(MAP_SIDE, dtype=torch.float32, device=self.difference.device) + 0.5) * (2.0 / MAP_SIDE) - 1.0
         y, x = torch.meshgrid(at, at, indexing="ij")
         across = torch.stack([x, y]).reshape(2, -1)

@@ -15,7 +15,7 @@ from sphereorient.so3.linalg import cross_first_axis
 from sphereorient.sphere.texture_table import TextureTable
 
 SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself
-RIM_NODES = 4  # look-ups along the radius where the limb is near: there the paint is squeezed together
+RIM_NODES = 4  # look-ups along the radius near the limb, where the paint is compressed
 DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of the paint is infinite on the limb
 
 
@@ -43,22 +43,9 @@ class SphereView:
 
 
 def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model: SphereModel) -> SphereView:
-    """Render the sphere through pixels whose aperture is a Gaussian.
-
-    A pixel near the limb sees the paint about the middle of that part of its aperture which the sphere covers, and
-    along the radius the sphere's curvature stretches the aperture over more paint: two look-ups, one standard deviation
-    to both sides of the mean of a Gaussian cut off at the limb, make both right; the table's own blur does the rest.
-    Near the limb there are four, at the quantiles of what is left of the Gaussian.
-
-    Args:
-        pixels: of L disks, float32.
-        position_lab_mm: (L, 3), centre of the sphere.
-        R_lab_body: (L, 3, 3).
-        model: radius, paint and blur; light is not used.
-
-    Returns:
-        The view. In its derivatives the spread of the look-ups is held fixed.
-
+    """Render the sphere at position_lab_mm (L, 3) and R_lab_body (L, 3, 3) through pixels with a Gaussian aperture.
+    Two look-ups per pixel, four near the limb, reproduce mean and width of the Gaussian cut off at the limb, as the
+    curvature stretches it over the paint. Derivatives hold their spread fixed. The model's light is not used.
     Source: docs/errata.md A4 (the cap and the ellipse that a perspective camera sees); mean and variance of a cut-off
     Gaussian, Johnson, Kotz and Balakrishnan 1994, section 13.10.
     """
@@ -74,7 +61,6 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
     q0 = nearest / radius_mm
     distance = to_centre[..., 0].norm(dim=1, keepdim=True)
     blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
-    # The Gaussian aperture, cut off at the limb: what share is left, where its middle lies, how wide it is.
     # Half of an aperture on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
     edge = (1.0 - 0.5 * blur * blur - q0) / blur
     coverage = torch.special.ndtr(edge)
@@ -104,21 +90,16 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
 
 
 def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
-    """Return look-ups along the radius where the limb is near, and how each moves with the pixel, (L, n, P) each.
-
-    They are quantiles of the cut-off Gaussian, drawn towards its middle by what the table's own blur adds.
-    """
+    """Return look-ups near the limb, quantiles of the cut-off Gaussian, and their derivatives, (L, n, P) each."""
     share = ((torch.arange(RIM_NODES, dtype=q0.dtype, device=q0.device) + 0.5) / RIM_NODES)[:, None]
     z = torch.special.ndtri((share * coverage[:, None]).clamp(1e-6, 1 - 1e-6))
-    # The limb holds back the more of a node the nearer to it the node is.
+    # The limb holds a node back the more, the nearer it is.
     moves = 1.0 - share * density[:, None] / (torch.exp(-0.5 * z * z) * (1.0 / math.sqrt(2.0 * math.pi)))
     middle = middle[:, None]
     return middle + middle * (q0[:, None] + blur[:, None] * z - middle), moves.clamp(0.0, 1.0)
 
 
 class _LineOfSight(NamedTuple):
-    """Lines of sight past the sphere's centre."""
-
     direction: Tensor  # (L, 3, P), unit
     outward: Tensor  # (L, 3, P), unit, from the centre to the line
     nearest: Tensor  # (L, P), distance of the centre from the line, mm
@@ -127,17 +108,9 @@ class _LineOfSight(NamedTuple):
 def _sample(
     at: Tensor, moves: Tensor, line: _LineOfSight, R: Tensor, model: SphereModel
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean paint of some look-ups (L, P) and its derivatives by rotation and place (L, 3, P).
-
-    Args:
-        at: (L, n, P), distance of each look-up from the disk's middle, radii.
-        moves: (L, n, P) or (L, 1, P), by how much it moves with the pixel.
-        line: of the pixels.
-        R: (L, 3, 3).
-        model: radius and paint.
-    """
+    """Return the mean paint of look-ups (L, P) and derivatives (L, 3, P); `at` in radii, `moves` per pixel moved."""
     d, outward, nearest = line
-    # In body components, where the paint is: the derivatives are turned back once, at the end.
+    # In body components, as the texture: the derivatives are rotated back once, at the end.
     sight_b, outward_b = (R.mT @ d)[:, :, None], (R.mT @ outward)[:, :, None]
     qt = at.clamp(0.0, math.sqrt(1.0 - DEPTH_MIN**2))
     depth = (1.0 - qt * qt).sqrt()

@@ -1,4 +1,4 @@
-"""The pixels of a ball in a frame, each with its own line of sight: what refinement compares with the model."""
+"""The pixels of a sphere in a frame, each with its own line of sight: the data of the fit."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pixels:
-    """Pixels of L disks (one camera's view of one frame each) with P places each; made here, read by refine.
-
+    """Pixels of L disks (one camera's view of one frame each) with P places each.
     Grey levels and geometry are float32: a line of sight is right to 3e-5 mm half a metre away.
     """
 
     grey: Tensor  # (L, P), grey levels
-    behind: Tensor  # (L, P), grey levels of the scene without the ball
+    behind: Tensor  # (L, P), grey levels of the scene without the sphere
     inside: Tensor  # (L, P) bool, places that lie in the picture and are not masked
     direction: Tensor  # (L, 3, P), unit lines of sight, lab
     origin: Tensor  # (L, 3, 1) or (L, 3, P), where they start, lab, mm
@@ -34,7 +33,7 @@ class Pixels:
     pitch_rad: Tensor  # (L,), angle between neighbouring lines of sight at the disk's middle
     pitch_mm: Tensor  # (L,), how far apart they start; 0 but behind a wall and in parallel light
     tile: Tensor  # (P,) int64, square tile of the disk that a place belongs to, for errors that neighbours share
-    inner: int = 0  # so many first places are well within the limb
+    inner: int = 0  # number of first places well within the limb
 
     def __len__(self) -> int:
         """Return the number of disks."""
@@ -53,7 +52,7 @@ class Pixels:
         return replace(self, **parts)
 
     def thinned(self, step: int) -> Pixels:
-        """Return every so-many-th place of all disks."""
+        """Return every `step`-th place of all disks."""
         places = torch.arange(0, self.grey.shape[1], step)
         places = places[: whole_vectors(len(places))]
         names = ("grey", "behind", "inside", "direction")
@@ -64,20 +63,14 @@ class Pixels:
 
 
 def whole_vectors(count: int) -> int:
-    """Return the largest number up to `count` that fills the processor's vectors: the rest is computed otherwise.
-
-    What is left over at the end of a batch goes through other code whose last bits differ, and a disk's numbers would
-    depend on whether it is the last one.
+    """Return the largest number up to `count` that fills the processor's vectors.
+    The remainder takes other code whose last bits differ, so that a disk would depend on its batch.
     """
     return max(count // VECTOR, 1) * VECTOR
 
 
 class LinesOfSight:
-    """The lines of sight of all pixels of a camera, once and for all frames.
-
-    Args:
-        camera: any model.
-    """
+    """The lines of sight of all pixels of a camera, computed once for all frames."""
 
     def __init__(self, camera: Camera) -> None:
         width, height = camera.image_size
@@ -93,7 +86,7 @@ class LinesOfSight:
         self.size = width, height
 
     def pitch(self, u: int, v: int) -> tuple[Tensor, Tensor]:
-        """Return by how much the line of sight differs from the next ones, right and below: angle, start (mm)."""
+        """Return the change of the line of sight to the next pixel: angle, rad, and start, mm."""
         d = self.direction
         turned = 0.5 * ((d[:, v, u + 1] - d[:, v, u]).norm() + (d[:, v + 1, u] - d[:, v, u]).norm())
         if self.one_origin:
@@ -111,7 +104,7 @@ class Stencil:
     down: NDArray[np.int64]
     tile: Tensor  # (P,) int64
     reach: int  # px
-    inner: int  # so many first places are well within the limb
+    inner: int  # number of first places well within the limb
 
 
 def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stencil:
@@ -121,7 +114,7 @@ def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stenci
     at = at[at % step_px == 0]
     down, right = (grid.reshape(-1) for grid in np.meshgrid(at, at, indexing="ij"))
     distance2 = right**2 + down**2
-    # Among equals in no order of place: every second one of a list row by row would be the disk's left half.
+    # Random order among equals: every second place of a list row by row would be the disk's left half.
     order = np.lexsort((np.random.default_rng(0).random(len(distance2)), distance2))
     order = order[: whole_vectors(int((distance2 <= radius_px**2).sum()))]
     right, down = right[order], down[order]
@@ -141,19 +134,9 @@ def cut_pixels(
     blur_px: float = 0.0,
     shown: NDArray[np.bool_] | None = None,
 ) -> Pixels:
-    """Take a disk's pixels out of a frame, as they are: no resampling, so the noise of neighbours stays independent.
-
-    Args:
-        frame: (H, W), grey levels.
-        background: (H, W), the scene without the ball.
-        sight: of the camera.
-        middle_px: (u, v), near the ball's centre.
-        stencil: of the places.
-        blur_px: standard deviation of a Gaussian laid over frame and background first; tames detail for coarse fits.
-        shown: (H, W), False where something hides the ball; None: nowhere.
-
-    Returns:
-        One disk.
+    """Return a disk's pixels about middle_px (u, v) without resampling, so that the noise of neighbours is independent.
+    `frame`, `background` and `shown` (False where something hides the sphere) are (H, W); a Gaussian of blur_px is laid
+    over the first two, for coarse fits.
     """
     width, height = sight.size
     u, v = round(middle_px[0]), round(middle_px[1])

@@ -1,5 +1,3 @@
-"""`PoseFitter`: the pose of a sphere in a picture, with covariance, without the pipeline."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -61,16 +59,9 @@ class PoseFitter(nn.Module):
         R_lab_body: ArrayLike | Tensor,
         position_lab_mm: ArrayLike | Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Fit poses.
-
-        Args:
-            pictures: (..., C, H, W), grey levels; (..., H, W) for a single camera.
-            R_lab_body: (..., 3, 3), start, to about 10 degrees.
-            position_lab_mm: (..., 3), start, to a few pixels.
-
-        Returns:
-            R_lab_body (..., 3, 3), position_lab_mm (..., 3), and the covariance (..., 6, 6) of delta (rad, lab) and
-            position (mm); float64.
+        """Return fitted R_lab_body (..., 3, 3), position_lab_mm (..., 3) and covariance (..., 6, 6), float64.
+        The covariance is of delta (rad, lab) and position (mm). Pictures (..., C, H, W) are grey levels, (..., H, W)
+        for a single camera; the start is right to about 10 degrees and a few pixels.
 
         Raises:
             ShapeError: shapes that do not fit together.

@@ -1,5 +1,3 @@
-"""The disk of the ball, cut out of a frame at a common size."""
-
 from __future__ import annotations
 
 import cv2
@@ -12,17 +10,9 @@ from sphereorient.sphere.view import disk_offsets
 def crop_disk(
     frame: NDArray[np.generic], u_px: float, v_px: float, radius_px: float, size_px: int
 ) -> NDArray[np.float32]:
-    """Resample the square about a disk, bilinear, to the canonical view's pixels.
-
-    Args:
-        frame: (H, W), grey levels; beyond its border the nearest pixel is repeated.
-        u_px: centre of the disk, column, px.
-        v_px: centre of the disk, row, px.
-        radius_px: its radius; becomes half the picture.
-        size_px: side of the picture, px.
-
-    Returns:
-        (S, S) float32, grey levels.
+    """Return the square about a disk of a frame (H, W), resampled bilinearly to (S, S) float32 grey levels.
+    u_px, v_px: column and row of the disk's centre; radius_px becomes S / 2. Beyond the border the nearest pixel
+    repeats.
     """
     offset = disk_offsets(size_px).numpy() * radius_px
     # The window first: a map over the whole frame would convert all of it to float.
@@ -41,7 +31,7 @@ def crop_disk(
 
 
 def _span(centre_px: float, radius_px: float, length: int) -> tuple[int, int]:
-    """First and last + 1 of the columns or rows that a disk's pixels lie between; at least the one nearest to it."""
+    """Return first and last + 1 of the columns or rows that hold a disk's pixels; at least the nearest one."""
     reach = int(np.ceil(radius_px)) + 2
     first = min(max(int(centre_px) - reach, 0), length - 1)
     return first, max(int(centre_px) + reach + 2, first + 1)

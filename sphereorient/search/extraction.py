@@ -13,18 +13,8 @@ BINS = 32  # of the histograms; finer ones are empty in the small moving region
 
 
 def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_share: float) -> Tensor:
-    """Stretch and clip grey values so that given shares of the disk are black (0) and white (1).
-
-    Args:
-        disks: (..., S, S), grey levels.
-        inside: (S, S) bool, pixels of the disk.
-        black_share: least share of the disk's pixels at 0; the paper's b.
-        white_share: least share of the disk's pixels at 1; the paper's w.
-
-    Returns:
-        (..., S, S) in 0 .. 1, 0.5 outside the disk and in a disk of one grey. Where one grey fills so much that no
-        stretch gives both shares, darkest to brightest become 0 .. 1.
-
+    """Stretch and clip disks (..., S, S) so that given shares (the paper's b and w) of `inside` (S, S) are 0 and 1.
+    The result is 0.5 outside the disk and in a disk of one grey. Where one grey prevents both shares, it spans 0 .. 1.
     Source: paper section III B; docs/errata.md A2 for what the forced shares cost.
     """
     values = disks[..., inside]
@@ -43,15 +33,9 @@ def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_sh
 
 
 def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the threshold that separates the two classes of a histogram best.
-
-    Args:
-        histogram: (..., B), counts of values 0 .. 1 in equal bins; any scale.
-
-    Returns:
-        The threshold (...) in 0 .. 1 (upper edge of the lower class's last bin, in the middle of a plateau), and the
-        difference of the two classes' means (...), 0 where all values lie in one bin.
-
+    """Return the threshold between the classes of histograms (..., B) of 0 .. 1, and the difference of their means,
+    (...).
+    The threshold is the middle of a plateau; the difference is 0 where all values lie in one bin.
     Source: Otsu 1979, eq. (18): the greatest variance between the classes.
     """
     bins = histogram.shape[-1]
@@ -76,22 +60,12 @@ def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Tensor:
-    """Decide each pixel of a disk between black and white paint, where three thresholds agree.
-
-    Otsu's threshold of the whole disk, and of two square regions that move over the disk (light that changes from
-    one side to the other shifts them along), each vote; a vote that is not unanimous is 0.
-
-    Args:
-        disks: (F, S, S) float32, grey levels.
-        inside: (S, S) bool, pixels of the disk.
-        settings: shares, regions.
-
-    Returns:
-        (F, S, S) float32, -1, 0 or +1; 0 outside the disk.
+    """Return the paint of grey disks (F, S, S) float32 in the mask (S, S): -1 black, +1 white, 0 undecided or outside.
+    Otsu's thresholds of the whole disk and of two moving square regions must agree.
+    Source: paper section III B.
 
     Raises:
         ShapeError: disks and mask differ in size.
-    Source: paper section III B.
     """
     if disks.shape[-2:] != inside.shape:
         raise ShapeError(
@@ -114,14 +88,14 @@ def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Te
 
 
 def _one_hot(grey: Tensor, inside: Tensor) -> Tensor:
-    """Membership of each pixel in the histogram's bins, (F, B, S, S); outside the disk in none."""
+    """Return the membership of each pixel in the histogram's bins, (F, B, S, S); 0 outside the disk."""
     bin_of = (grey * BINS).long().clamp(0, BINS - 1)
     member = grey.new_zeros(grey.shape[0], BINS, *grey.shape[1:])
     return member.scatter_(1, bin_of[:, None], 1.0) * inside
 
 
 def _moving_threshold(one_hot: Tensor, fallback: Tensor, share: float, contrast_min: float) -> Tensor:
-    """Otsu's threshold of a square region about each pixel, (F, S, S), computed on a lattice and interpolated."""
+    """Return Otsu's threshold of a square region about each pixel, (F, S, S), interpolated from a lattice."""
     size = one_hot.shape[-1]
     side = max(3, round(share * size) | 1)
     stride = max(1, side // 4)

@@ -1,5 +1,3 @@
-"""Two proposers: the second is asked where the first is in doubt."""
-
 from __future__ import annotations
 
 import math
@@ -16,13 +14,7 @@ SAME_DEG = 12.0  # proposals of the two nearer than this are one
 
 
 class FallbackProposer:
-    """Asks one proposer, and a second one where the first is in doubt; the second's answers come first there.
-
-    Args:
-        first: asked about every disk.
-        second: asked about disks for which the first has no candidate of a score of `sure`.
-        sure: score of the first.
-    """
+    """Asks one proposer, and a second one where no score reaches `sure`; the second's answers come first there."""
 
     def __init__(self, first: Proposer, second: Proposer, sure: float) -> None:
         self._first, self._second, self._sure = first, second, sure
@@ -51,7 +43,7 @@ class FallbackProposer:
 
 
 def resized(disks: Tensor, size_px: int) -> Tensor:
-    """Return disks (F, S, S) with another number of pixels across."""
+    """Return disks (F, S, S) resampled to `size_px` pixels across."""
     if disks.shape[-1] == size_px:
         return disks
     grey: Tensor = F.interpolate(
@@ -72,7 +64,7 @@ def one_of(proposals: Candidates, f: int) -> Candidates:
 
 
 def interleaved(one: Candidates, other: Candidates) -> Candidates:
-    """Return the proposals of two for one disk in turn, the first one's first, what comes twice once."""
+    """Return the proposals of two for one disk in turn, the first one's first, without duplicates."""
     counts = (len(one.score), len(other.score))
     rank = torch.cat([2 * torch.arange(counts[0]), 2 * torch.arange(counts[1]) + 1])
     order = rank.argsort(stable=True)

@@ -1,5 +1,3 @@
-"""Pictures of the ball freed of light: by how much each place differs from its neighbourhood."""
-
 from __future__ import annotations
 
 import torch
@@ -12,18 +10,13 @@ RIM_WEIGHT_MIN = 0.02  # of the outermost pixels in the comparison
 
 
 def rim_share(size_px: int) -> Tensor:
-    """Return how far the pixels of a disk's picture may be trusted not to show what is beside the ball, (S, S)."""
+    """Return the weight (S, S), 0 .. 1, of a disk's pixels by their distance from the limb."""
     from_limb: Tensor = 1 - disk_offsets(size_px).norm(dim=-1)
     return (from_limb / RIM).clamp(0, 1).float()
 
 
 class Blur:
-    """A Gaussian over the pictures of disks, in which pixels beyond the limb have no share.
-
-    Args:
-        size_px: side S of the pictures, px; the disk fills them.
-        deviation: standard deviation, radii.
-    """
+    """A Gaussian over disks that fill (S, S) pictures, without the pixels beyond the limb; `deviation` in radii."""
 
     def __init__(self, size_px: int, deviation: float) -> None:
         at = (torch.arange(size_px, dtype=torch.float64) + 0.5) * (2.0 / size_px)
@@ -37,16 +30,9 @@ class Blur:
 
 
 class LocalNormalisation:
-    """Makes pictures under any smooth light comparable: the local mean taken off, what sticks out cut off.
-
-    The same is done to templates and to pictures, so that both lose the same; all sizes in radii of the disk.
-
-    Args:
-        size_px: side S of the pictures, px; the disk fills them.
-        detail: standard deviation of the Gaussian laid over a picture first; what is finer does not count.
-        window: standard deviation of the neighbourhood.
-        clip: differences from the local mean beyond this many deviations of the disk are cut off: reflections, and
-            the contrast of well lit places over dim ones.
+    """Makes pictures under any smooth light comparable: grey less the local mean, clipped.
+    Disks fill (S, S) pictures; `detail`, the first blur, and `window`, the neighbourhood, are standard deviations in
+    radii; `clip` is in deviations of the disk (reflections, uneven light).
     """
 
     def __init__(self, size_px: int, *, detail: float, window: float, clip: float) -> None:
@@ -55,7 +41,7 @@ class LocalNormalisation:
         self._share = rim_share(size_px) / rim_share(size_px).sum()
         self._detail, self._window = Blur(size_px, detail), Blur(size_px, window)
         self._clip = clip
-        # Near the limb a small error of the outline turns far: pixels count by their foreshortening.
+        # Near the limb a small error of the outline is a large rotation: weigh pixels by foreshortening.
         depth = (1 - radius.square()).clamp_min(0).sqrt().float()
         self._root_weight = (depth * rim_share(size_px).clamp_min(RIM_WEIGHT_MIN)).reshape(-1)[self._inside]
         self._unit = self._root_weight / self._root_weight.norm()

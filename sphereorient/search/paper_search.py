@@ -15,18 +15,13 @@ from sphereorient.sphere import DirectionTable, DiskView, orthographic_view, red
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.trajectory import Reason
 
-# Disks in one product. Fixed and filled up with empty disks: a product's last bits depend on its number of rows, and
-# so a disk's score would depend on how many others came with it.
+# Disks in one product. Fixed, filled up with empty disks: the last bits of a product depend on its number of rows.
 BATCH = 32
 
 
 class PaperSearch:
     """Searches all of SO(3) for the views of a map that look like a disk (paper sections III B and C).
-
-    Args:
-        texture: (H, W), the map, 0 black .. 1 white.
-        size_px: side of the disks at real size; rounded up to an even number, as the bank is made at half of it.
-        settings: of the room.
+    The texture (H, W) is 0 black .. 1 white; size_px, the side of the disks, is rounded up to an even number.
     """
 
     def __init__(self, texture: Tensor, size_px: int, settings: OrientSettings) -> None:
@@ -47,14 +42,8 @@ class PaperSearch:
         return self._size_px
 
     def propose(self, disks: Tensor) -> Candidates:
-        """Propose the best orientation of each group that a disk allows.
-
-        Args:
-            disks: (F, S, S) float32, grey levels, cropped so that the outline touches the borders.
-
-        Returns:
-            Candidates; a disk that fits nearly everywhere gives none (`RUNAWAY`), as does one whose best T stays below
-            `score_min` (`LOW_SCORE`).
+        """Propose the best orientation of each group for disks (F, S, S) float32, whose outlines touch the borders.
+        A disk that fits nearly everywhere has no proposal (`RUNAWAY`), nor one below `score_min` (`LOW_SCORE`).
         """
         parts: list[Candidates] = []
         for first in range(0, len(disks), BATCH):
@@ -66,13 +55,13 @@ class PaperSearch:
         return Candidates.joined(parts) if parts else Candidates.none(())
 
     def _coarse_scores(self, paint: Tensor) -> Tensor:
-        """T of every coarse template, (F, K): 1/2 + sum of products / (2 pixels counted) (docs/errata.md A2)."""
+        """Return T of every coarse template, (F, K): 1/2 + sum of products / (2 pixels counted) (docs/errata.md A2)."""
         half = torch.nn.functional.avg_pool2d(paint[:, None], 2)[:, 0]
         seen = half[:, self._coarse.inside][:, self._coarse_used]
         return 0.5 + seen @ self._bank.T / (2 * seen.shape[1])
 
     def _groups(self, score: Tensor) -> list[Tensor]:
-        """Best member of each group of possible orientations, best first, for each disk: lists of grid indices."""
+        """Return the grid index of the best member of each group, best first, for each disk."""
         possible = score > score.amax(1, keepdim=True) - self._settings.score_margin
         flat = self._grid.flatten(1)
         near = 1 + 2 * math.cos(math.radians(self._settings.group_deg))  # trace of A^T B at that angle
@@ -88,7 +77,7 @@ class PaperSearch:
         return [torch.stack(pick) if pick else torch.zeros(0, dtype=torch.long) for pick in picks]
 
     def _fine_search(self, paint: Tensor, group: Tensor) -> Candidates:
-        """Climb from each group's best on the fine grid: the proposals of one disk, best first."""
+        """Refine each group's best on the fine grid; return the proposals of one disk, best first."""
         if len(group) > self._settings.groups_max:
             return Candidates.none([Reason.RUNAWAY])
         seen = paint[self._fine.inside][self._fine_used]
@@ -98,9 +87,8 @@ class PaperSearch:
         order = order[score[order] >= self._settings.score_min]
         if not len(order):
             return Candidates.none([Reason.LOW_SCORE])
-        # The float32 products back to rotations of float64.
         R = so3.nearest_rotation(torch.stack([R for R, _ in found]).double()[order])
-        # Two groups may climb to one place: keep the first of those within two fine steps.
+        # Two groups may reach one rotation: keep the first of those within two fine steps.
         gap = so3.geodesic_distance(R[:, None], R[None])
         first = ~torch.tril(gap < 2 * math.radians(self._settings.fine_step_deg), -1).any(1)
         return Candidates(
@@ -111,7 +99,7 @@ class PaperSearch:
         )
 
     def _climb(self, seen: Tensor, R_start: Tensor) -> tuple[Tensor, Tensor]:
-        """Best of the fine grid about a rotation; where it sits at the grid's edge, once more about it."""
+        """Return the best of the fine grid about a rotation; where it is at the grid's edge, once more about it."""
         normal = self._fine.normal_view[self._fine_used]
         edge = math.radians(self._settings.fine_radius_deg - self._settings.fine_step_deg)
         R, score = R_start, seen.new_zeros(())
@@ -126,6 +114,6 @@ class PaperSearch:
 
 
 def _counted(view: DiskView, disk_share: float) -> tuple[DiskView, Tensor]:
-    """A view and which of its disk's pixels are compared: those within a share of the radius, (P,) bool."""
+    """Return a view and which of its pixels are compared, (P,) bool: those within a share of the radius."""
     radius = disk_offsets(view.size_px).norm(dim=-1)
     return view, (radius <= disk_share)[view.inside]

@@ -9,17 +9,8 @@ from torch import Tensor
 
 
 def compact_groups(R: Tensor, size: int) -> Tensor:
-    """Divide rotations into groups of neighbours, all of one size.
-
-    Args:
-        R: (K, 3, 3).
-        size: of a group.
-
-    Returns:
-        (G, size) int64, indices of rotations; where `size` does not divide K, some rotations come twice.
-
-    Source: halving along the matrix component that varies most (Bentley 1975); the components' distance grows with the
-    angle, so neighbours in them are neighbours on SO(3).
+    """Divide rotations (K, 3, 3) into groups of neighbours, (G, size) int64; some come twice unless size divides K.
+    Source: halving along the matrix component that varies most (Bentley 1975).
     """
     flat = R.flatten(1)
     groups = math.ceil(len(R) / size)
@@ -37,15 +28,8 @@ def compact_groups(R: Tensor, size: int) -> Tensor:
 
 
 def best_of_groups(scores: Tensor, count: int) -> Tensor:
-    """Find the best member of each of the best groups.
-
-    Args:
-        scores: (F, M, G), those of the M members of G groups.
-        count: of groups.
-
-    Returns:
-        (F, count) int64, or of all groups where there are fewer: places in the flattened members and groups, best
-        first.
+    """Return the best members of the `count` best groups, (F, count) int64, best first, from scores (F, M, G).
+    Indices are into the flattened members and groups; all groups where there are fewer.
     """
     groups = scores.shape[2]
     group = scores.amax(1).topk(min(count, groups), dim=1).indices
@@ -54,14 +38,8 @@ def best_of_groups(scores: Tensor, count: int) -> Tensor:
 
 
 def distinct(R: Tensor, apart_rad: float) -> Tensor:
-    """Suppress non-maxima: a rotation is suppressed by any better neighbour, even a suppressed one.
-
-    Args:
-        R: (..., M, 3, 3), best first.
-        apart_rad: distance below which rotations are neighbours, rad.
-
-    Returns:
-        (..., M) bool, which are peaks; the first always is.
+    """Return which rotations (..., M, 3, 3), best first, are peaks, (..., M) bool; the first always is.
+    Non-maximum suppression: any better neighbour within apart_rad suppresses, even a suppressed one.
     """
     flat = R.flatten(-2)
     return ~torch.tril(flat @ flat.mT > 1 + 2 * math.cos(apart_rad), -1).any(-1)  # the product is the trace of A^T B

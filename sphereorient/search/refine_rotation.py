@@ -1,4 +1,4 @@
-"""From a rough orientation to the best one nearby: Gauss-Newton on grey values, the light solved inside."""
+"""From a rough orientation to the best one nearby: Gauss-Newton on grey values, the light eliminated."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from sphereorient.sphere import DiskView
 from sphereorient.sphere.texture_table import TextureTable
 
 WHITE_ORDER, BLACK_ORDER = 2, 1  # of the light's polynomials over the disk: on the paint, and without it
-STEP_RAD = 0.14  # longest step: beyond it the paint's slope says nothing any more
+STEP_RAD = 0.14  # longest step that the paint's slope predicts
 RIDGE = 1e-4  # of the diagonal: keeps the light solvable where the disk shows one paint
-GAIN_MIN = 0.1  # white less black paint, deviations: a place that is darker still turns the right way
+GAIN_MIN = 0.1  # white less black paint, deviations: darker pixels still have the right sign
 PIXEL = 0.5  # standard deviation of a pixel and its resampling, px
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DetailLevel:
-    """One width of detail, and the pixels that are looked at there; P of them."""
+    """One pyramid level and its P pixels."""
 
     blur: Blur
     paint: TextureTable
@@ -35,15 +35,7 @@ class DetailLevel:
 
 
 def detail_level(view: DiskView, paint: TextureTable, detail: float, every: int, blur: float = 0.0) -> DetailLevel:
-    """Prepare a level.
-
-    Args:
-        view: of the pictures.
-        paint: as fine as `detail` at least.
-        detail: standard deviation of the Gaussian on the sphere, rad, and on the picture, radii.
-        every: 1: all pixels, 2: like the white fields of a chess board.
-        blur: standard deviation of the pictures' own blur, radii, if any is to be reckoned with.
-    """
+    """Prepare a pyramid level: `detail` (rad or radii) and the pictures' `blur` (radii); `every` 2: half the pixels."""
     size = view.size_px
     normal = view.normal_view.T.float()
     place = torch.nonzero(view.inside.reshape(-1))[:, 0]
@@ -64,16 +56,15 @@ def detail_level(view: DiskView, paint: TextureTable, detail: float, every: int,
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Target:
-    """What a level sees of one disk; made by `level_reference`, read by `climb`."""
+    """The pixels of one disk at one level."""
 
     grey: Tensor  # (P,), in units of its deviation from the smoothest light
-    unexplained: Tensor  # (), cost where there is light only and no paint
+    unexplained: Tensor  # (), cost of light without paint
 
 
 def level_reference(level: DetailLevel, disk: Tensor) -> Target:
     """Return a level's pixels of a disk, (S, S) grey levels of any scale."""
     grey = level.blur(disk[None])[0].reshape(-1)[level.place]
-    # Whatever the camera's units: single precision has few digits.
     grey = grey - (grey * level.weight).sum() / level.weight.sum()
     grey = grey / grey.abs().amax().clamp_min(1e-12)
     rough = grey - (_solved(level.white[None], grey, level.weight) @ level.white)[0]
@@ -82,18 +73,8 @@ def level_reference(level: DetailLevel, disk: Tensor) -> Target:
 
 
 def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Turn orientations towards the best fit nearby.
-
-    Args:
-        level: of detail.
-        target: the disk at this level.
-        R_view_body: (Q, 3, 3) float32, starts.
-        steps: Gauss-Newton steps.
-
-    Returns:
-        R_view_body (Q, 3, 3), and the score (Q,): the share of the disk's deviation from smooth light that paint
-        explains, 1 at most, 0 and below where it explains nothing.
-
+    """Fit rough orientations R_view_body (Q, 3, 3) float32 by Gauss-Newton steps; return them with scores (Q,).
+    The score is the share of the disk's deviation from smooth light that paint explains, at most 1.
     Source: variable projection, Golub and Pereyra 1973; robust weights, Geman and McClure 1987.
     """
     R, weight, whites = R_view_body, level.weight.expand(len(R_view_body), -1), len(level.white)
@@ -105,7 +86,7 @@ def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, ste
         left = target.grey - (found[:, None] @ light)[:, 0]
         weight = level.weight * _trust(left)
         gain = (found[:, None, :whites] @ level.white)[:, 0].clamp_min(GAIN_MIN)
-        # Turning the body by epsilon, R exp(epsilon), changes the paint by epsilon . (slope x normal).
+        # Rotating the body by epsilon, R exp(epsilon), changes the paint by epsilon . (slope x normal).
         turned = _cross(slope, normal_body) * gain[:, None]
         turn = _solved(torch.cat([light, turned], dim=1), left, weight)[:, -3:]
         R = R @ _rotation(turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0))
@@ -122,7 +103,7 @@ def _score(level: DetailLevel, target: Target, R: Tensor, weight: Tensor) -> Ten
     light = _light_columns(level, level.paint.sample(R.mT @ level.normal)[0])
     found = _solved(light, target.grey, weight)
     cost = _cost(level, target.grey - (found[:, None] @ light)[:, 0])
-    # Paint that would have to be lit by less than nothing is the negative of a map.
+    # A negative gain is the negative of the map.
     return torch.where(found[:, 0] > 0, 1.0 - cost / target.unexplained.clamp_min(1e-12), -1.0)
 
 
@@ -132,17 +113,15 @@ def _cost(level: DetailLevel, residual: Tensor) -> Tensor:
 
 
 def _light_columns(level: DetailLevel, value: Tensor) -> Tensor:
-    """What the light's coefficients multiply, (Q, 9, P)."""
     return torch.cat([value[:, None] * level.white, level.black.expand(len(value), -1, -1)], dim=1)
 
 
 def _trust(residual: Tensor) -> Tensor:
-    """Weight of a pixel, 1 .. 0, by its residual in deviations of the picture."""
+    """Return the weight of a pixel, 1 .. 0, by its residual in deviations of the picture."""
     return 1.0 / (1.0 + residual.square()).square()
 
 
 def _solved(columns: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
-    """Weighted least squares, (Q, C) float32, of columns (Q, C, P)."""
     weighted = columns * weight.expand(len(columns), -1)[:, None]
     normal = (weighted @ columns.mT).double()
     right = (weighted @ grey[..., None]).double()
@@ -152,6 +131,5 @@ def _solved(columns: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """Return a x b of (Q, 3, P)."""
     (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=1)

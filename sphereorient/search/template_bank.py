@@ -21,27 +21,23 @@ from sphereorient.sphere import orthographic_view, perspective_view
 from sphereorient.sphere.texture_table import TextureTable, texture_table
 from sphereorient.trajectory import Reason
 
-# Disks normalised at once. Fixed and filled up with empty disks: the last bits of sums depend on how many there are,
-# and so would a disk's answer. Products of whole numbers are exact, and may be of any.
+# Disks normalised at once. Fixed, filled up with empty disks: the last bits of sums depend on their number.
 BATCH = 32
 PRODUCT = 128  # disks in one product, at most: the scores of more leave the cache
-GROUP = 8  # neighbouring templates whose best one stands for them in the selection
-LOOKED_AT = 32  # best groups among which peaks are sought: a broad peak spans several
+GROUP = 8  # neighbouring templates, represented by their best one
+LOOKED_AT = 32  # best groups that are searched for peaks: a broad peak spans several
 TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest detail
 DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
 
 
 class TemplateBank(nn.Module):
-    """Searches all of SO(3) for the views of a texture map that look like a disk, under any smooth light.
-
-    The bank covers SO(3): every rotation is within (1/2 + 1/sqrt 2) step of a template (`so3.lattman_grid`), and
-    detail finer than `detail` is removed from templates and pictures, so that the nearest template still correlates.
-    It computes on the CPU.
+    """Searches all of SO(3) on the CPU for the views of a texture map that look like a disk, under any smooth light.
+    Detail finer than `detail` is removed, so that the nearest template of the Lattman grid still correlates.
 
     Args:
         texture: (H, 2 H), the texture map, 0 black .. 1 white.
         settings: of the search; None: the defaults.
-        blur: standard deviation of the pictures' own blur, radii, where it is wider than `detail` or nearly so.
+        blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
     """
 
     def __init__(
@@ -59,7 +55,7 @@ class TemplateBank(nn.Module):
         self._rough = detail_level(self._view, paint, settings.detail, every=2, blur=blur)
         self._fine = detail_level(self._view, paint, pixel_rad, every=1, blur=blur)
         grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
-        # (GROUP, G): the members of a group lie one below the other, and their maximum is one of whole rows.
+        # (GROUP, G): each group is a column, so that its maximum is one of whole rows.
         self._grid = grid[compact_groups(grid, GROUP).T]
         self._pixels = int(self._view.inside.sum())
         self._bank = self._templates(paint)
@@ -71,17 +67,12 @@ class TemplateBank(nn.Module):
 
     @property
     def templates(self) -> Tensor:
-        """Rotations of the bank, (K, 3, 3) float32."""
+        """Return the rotations of the bank, (K, 3, 3) float32."""
         return self._grid.flatten(0, 1)
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
-        """Return the best orientations of each disk, padded.
-
-        Args:
-            disks: (..., S, S), grey levels of any scale, the outline touching the borders.
-
-        Returns:
-            R_view_body (..., K, 3, 3) and score (..., K) float64, best first; NaN beyond a disk's last candidate.
+        """Return R_view_body (..., K, 3, 3) and score (..., K) float64 of each disk, best first, padded with NaN.
+        Disks (..., S, S) are grey levels of any scale, the outline touching the borders.
 
         Raises:
             ShapeError: the disks are of another size.
@@ -103,15 +94,9 @@ class TemplateBank(nn.Module):
         return (torch._int_mm(steps, self._bank.T) / scale**2).reshape(*grey.shape[:-2], -1)
 
     def propose(self, disks: Tensor) -> Candidates:
-        """Propose the best orientations that a disk allows, at least `distinct_deg` apart.
-
-        Args:
-            disks: (F, S, S) float32, grey levels of any scale, the outline touching the borders.
-
-        Returns:
-            Candidates, best first. The score is the share of the disk's deviation from smooth light that the paint
-            explains, 0 .. 1 (the square of their correlation). A disk whose best score stays below `score_min` has
-            none (`LOW_SCORE`).
+        """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
+        The outline touches the borders. The score, 0 .. 1, is the share of the disk's deviation from smooth light that
+        the paint explains. A disk below `score_min` has no proposal (`LOW_SCORE`).
 
         Raises:
             ShapeError: the disks are of another size.
@@ -126,14 +111,8 @@ class TemplateBank(nn.Module):
         return Candidates.joined(parts)
 
     def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
-        """Compare disks with the whole bank.
-
-        Args:
-            disks: (F, S, S) float32; the scores of all are held at once, 36 kB each.
-
-        Returns:
-            Places of the best templates of the best groups, (F, M) int64 in `templates`, best first; and which of
-            them are peaks, (F, M) bool.
+        """Return the best templates of the best groups, (F, M) int64, best first, and which are peaks, (F, M) bool.
+        All scores of the disks (F, S, S) float32 are held at once, 36 kB each.
         """
         scores = torch._int_mm(self._normalised(disks), self._bank.T)
         place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
@@ -143,7 +122,6 @@ class TemplateBank(nn.Module):
         return place, peak
 
     def _normalised(self, disks: Tensor) -> Tensor:
-        """Return normalised disks, (F, P) int8."""
         filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
         return torch.cat([_steps(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
 
@@ -154,7 +132,7 @@ class TemplateBank(nn.Module):
         return torch.cat([_steps(self._normalise(self._view.picture(paint.sample(R.mT @ normal)[0]))) for R in chunks])
 
     def _refined(self, disk: Tensor, starts: Tensor) -> Candidates:
-        """Refine the peaks of one disk: its proposals, best first."""
+        """Refine the peaks of one disk; return its proposals, best first."""
         settings = self._settings
         R, score = refine_rotation(self._rough, level_reference(self._rough, disk), starts, settings.rough_steps)
         R = R[self._distinct(R, score)[: settings.finalists]]
@@ -163,7 +141,6 @@ class TemplateBank(nn.Module):
         chosen = chosen[score[chosen] >= settings.score_min]
         if not len(chosen):
             return Candidates.none([Reason.LOW_SCORE])
-        # The float32 products back to rotations of float64.
         return Candidates(
             offset=torch.tensor([0, len(chosen)]),
             R_view_body=so3.nearest_rotation(R[chosen].double()),
@@ -172,7 +149,6 @@ class TemplateBank(nn.Module):
         )
 
     def _distinct(self, R: Tensor, score: Tensor) -> Tensor:
-        """Return the indices of the rotations that are not near a better one, best first."""
         order = score.argsort(descending=True, stable=True)
         return order[distinct(R[order], math.radians(self._settings.distinct_deg))]
 
@@ -180,5 +156,5 @@ class TemplateBank(nn.Module):
 def _steps(even: Tensor) -> Tensor:
     """Quantise normalised pictures to -127 .. 127, (B, P) int8, padded to a multiple of 8 pixels."""
     scale = 127.0 / DEVIATIONS * math.sqrt(even.shape[1])
-    # One scale for all templates: as all are of length 1, products of whole numbers rank them as they are.
+    # One scale for all templates: as all have length 1, integer products rank them as they are.
     return F.pad((even * scale).round().clamp(-127, 127), (0, -even.shape[1] % 8)).to(torch.int8)

@@ -1,8 +1,4 @@
-"""Rotations and grids of rotations; knows nothing of pictures.
-
-Rotations are (..., 3, 3) matrices that act on columns; rotation vectors (..., 3) are axis times angle in rad, by the
-right-hand rule. No function checks that a matrix is a rotation; `nearest_rotation` makes one.
-"""
+"""Rotations: (..., 3, 3) matrices that act on columns, not checked; rotation vectors (..., 3), rad, right-handed."""
 
 from __future__ import annotations
 

@@ -1,5 +1,3 @@
-"""How far a rotation turns, and how far two orientations are apart."""
-
 from __future__ import annotations
 
 import torch
@@ -10,15 +8,8 @@ from sphereorient.so3.exp import vee
 
 
 def angle(R: Tensor) -> Tensor:
-    """Return the angle by which a rotation turns.
-
-    Args:
-        R: (..., 3, 3), rotations, not checked.
-
-    Returns:
-        (...), rad, 0 .. pi, with an error of a few roundings of pi everywhere; the gradient at exactly 0 and pi,
-        where there is none, is set to 0.
-
+    """Return the angle (...), rad, 0 .. pi, of rotations (..., 3, 3), accurate also near 0 and pi.
+    The gradient at exactly 0 and pi, which does not exist, is set to 0.
     Source: docs/errata.md A3; acos((Tr - 1)/2), the paper's, loses half the digits near 0 and pi.
     """
     check_tail("R", R, 3, 3)
@@ -28,15 +19,8 @@ def angle(R: Tensor) -> Tensor:
 
 
 def geodesic_distance(A: Tensor, B: Tensor) -> Tensor:
-    """Return the angle of the smallest rotation between two orientations, angle(A^T B).
-
-    Args:
-        A: (..., 3, 3), rotations, not checked.
-        B: (..., 3, 3), rotations of the same two frames; broadcasts against A.
-
-    Returns:
-        (...), rad, 0 .. pi; exactly 0 for equal inputs; gradient as `angle`.
-
+    """Return the angle (...), rad, 0 .. pi, of A^T B for rotations (..., 3, 3); exactly 0 for equal inputs.
+    Gradient as `angle`.
     Source: the paper's d(A, B), worked out by docs/errata.md A3; the cosine from Tr((A-B)(A-B)^T) = 4 (1 - cos d).
     """
     check_tail("A", A, 3, 3)

@@ -1,5 +1,3 @@
-"""Rotation vectors and rotation matrices, vectors and cross product matrices."""
-
 from __future__ import annotations
 
 import torch
@@ -10,30 +8,14 @@ from sphereorient.errors import check_tail
 
 
 def exp(rotvec: Tensor) -> Tensor:
-    """Return the rotation about an axis by an angle.
-
-    Args:
-        rotvec: (..., 3), axis times angle, rad, any length; the axis by the right-hand rule.
-
-    Returns:
-        (..., 3, 3), the rotation; its columns are the turned unit vectors, in the frame of `rotvec`.
-
-    Source: Rodrigues' formula, as the paper prints it.
-    """
+    """Return the rotations (..., 3, 3) of rotation vectors (..., 3), rad, of any length, by Rodrigues' formula."""
     check_tail("rotvec", rotvec, 3)
     return axis_angle_to_rotation_matrix(rotvec)
 
 
 def log(R: Tensor) -> Tensor:
-    """Return the rotation vector of a rotation, the shortest one.
-
-    Args:
-        R: (..., 3, 3), rotations; not checked, and a reflection gives a value without meaning.
-
-    Returns:
-        (..., 3), axis times angle, rad, of length <= pi up to rounding. A turn by exactly pi has two; one of them
-        comes, always the same. Its gradient is finite there too.
-
+    """Return the shortest rotation vectors (..., 3), rad, of rotations (..., 3, 3), not checked.
+    At exactly pi the choice between the two vectors is always the same, and the gradient is finite.
     Source: textbook; through the quaternion's largest component, so it keeps all digits at 0 and at pi.
     """
     check_tail("R", R, 3, 3)

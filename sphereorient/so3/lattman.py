@@ -22,28 +22,17 @@ def to_lattman(theta: Tensor) -> Tensor:
 
 
 def from_lattman(lattman: Tensor) -> Tensor:
-    """Return the Tait-Bryan angles (..., 3), rad, of Lattman angles theta_plus, theta, theta_minus.
-
-    Once around SO(3) is 4 pi, -pi/2 .. pi/2, 2 pi.
-    """
+    """Return the Tait-Bryan angles (..., 3), rad, of Lattman's, of ranges 4 pi, -pi/2 .. pi/2, 2 pi over SO(3)."""
     check_tail("lattman", lattman, 3)
     plus, y, minus = lattman.unbind(-1)
     return torch.stack([(plus + minus) / 2, y, (plus - minus) / 2], -1)
 
 
 def lattman_steps(theta_y: Tensor, delta: float) -> tuple[Tensor, Tensor]:
-    """Return the steps of theta_plus and theta_minus that turn by delta.
-
-    Args:
-        theta_y: (...), rad, -pi/2 .. pi/2.
-        delta: rad.
-
-    Returns:
-        (...) and (...), step of theta_plus and of theta_minus, rad; infinite at theta_y = -pi/2 and pi/2, where the
-        angle does not turn anything.
-
-    Source: d^2 = dtheta^2 + sin^2(pi/4 + theta/2) dtheta_plus^2 + sin^2(pi/4 - theta/2) dtheta_minus^2, the paper's
-        own metric; the steps that it prints are not of it (docs/errata.md E5).
+    """Return the steps of theta_plus and theta_minus, (...) rad each, that rotate by `delta` rad.
+    theta_y (...), rad, is in -pi/2 .. pi/2; at these ends, where an angle has no effect, its step is infinite.
+    Source: d^2 = dtheta^2 + sin^2(pi/4 + theta/2) dtheta_plus^2 + sin^2(pi/4 - theta/2) dtheta_minus^2, the paper's own
+    metric; the steps that it prints do not follow from it (docs/errata.md E5).
     """
     quarter = math.pi / 4
     return delta / (quarter + theta_y / 2).sin(), delta / (quarter - theta_y / 2).sin()
@@ -52,26 +41,14 @@ def lattman_steps(theta_y: Tensor, delta: float) -> tuple[Tensor, Tensor]:
 def lattman_grid(
     step_rad: float, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> Tensor:
-    """Return a grid of rotations, evenly over SO(3).
-
-    Every rotation is within (1/2 + 1/sqrt 2) step_rad of one of them: half a step to the nearest row, then half a step
-    in each of two orthogonal directions along it. Random rotations are within sqrt(3)/2 step_rad, as in a cubic lattice
-    (measured in tests/so3/test_so3_lattman.py).
-
-    Args:
-        step_rad: rad, at most pi.
-        dtype: of the result.
-        device: of the result.
-
-    Returns:
-        (K, 3, 3), row by row of theta_y from -pi/2, within it by theta_plus, then theta_minus; K is about
-        8 pi^2 / step^3: 9,119 at 12 degrees, 557,515 at 3 degrees. The last row, theta_y = pi/2, holds its rotations
-        twice: there 2 pi of theta_plus is a full turn.
+    """Return a grid of rotations (K, 3, 3), evenly over SO(3); K is about 8 pi^2 / step_rad^3, step_rad at most pi.
+    Every rotation is within (1/2 + 1/sqrt 2) step_rad of the grid; random ones within sqrt(3)/2 step_rad (measured in
+    tests/so3/test_so3_lattman.py). Rows of theta_y from -pi/2, each by theta_plus, then theta_minus. The last row,
+    theta_y = pi/2, holds its rotations twice: there 2 pi of theta_plus is a full turn.
+    Source: Lattman 1972 as in the paper, with the steps of docs/errata.md E5.
 
     Raises:
         SettingsError: the step is not in 0 .. pi.
-
-    Source: Lattman 1972 as in the paper, with the steps of docs/errata.md E5.
     """
     if not 0 < step_rad <= math.pi:
         raise SettingsError(refusal("step_rad", expected="0 .. pi", got=f"{step_rad}", do="give the step in rad"))
@@ -87,10 +64,9 @@ def lattman_grid(
 
 
 def _count(length: float, step: Tensor) -> list[int]:
-    """Return how many steps at least go around a circle, 1 or more."""
+    """Return the least number of steps around a circle, 1 or more."""
     return [int(n) for n in (length / step - ROUNDING).ceil().clamp_min(1).tolist()]
 
 
 def _circle(length: float, count: int) -> Tensor:
-    """Return (count,) evenly spaced angles, rad, the first 0."""
     return torch.arange(count, dtype=torch.float64) * (length / count)

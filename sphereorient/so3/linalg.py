@@ -1,4 +1,4 @@
-"""Small linear algebra that several rooms share: damped solutions and a cross product along axis 1."""
+"""Small linear algebra: damped solutions, and a cross product along axis 1."""
 
 from __future__ import annotations
 
@@ -7,15 +7,8 @@ from torch import Tensor
 
 
 def solve_damped(matrix: Tensor, right: Tensor, ridge: float = 1e-9) -> Tensor:
-    """Solve small symmetric positive semidefinite systems; a direction without information gets no step.
-
-    Args:
-        matrix: (..., n, n).
-        right: (..., n).
-        ridge: share of each diagonal element that is added to it.
-
-    Returns:
-        (..., n).
+    """Solve symmetric positive semidefinite systems (..., n, n), (..., n); `ridge` is a share of each diagonal element.
+    A direction without information gets no step.
     """
     solution: Tensor = torch.linalg.solve_ex(_damped(matrix, ridge), right[..., None]).result
     return solution[..., 0]

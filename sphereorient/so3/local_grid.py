@@ -1,5 +1,3 @@
-"""Rotations spread evenly around the unit rotation."""
-
 from __future__ import annotations
 
 import math
@@ -10,34 +8,21 @@ from torch import Tensor
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.so3.exp import exp
 
-# Half the cube's edge of the body-centred cubic lattice that has one point per unit of volume: its points are all
-# multiples of it by three even or three odd whole numbers, two to a cube.
+# Half the cube's edge of the body-centred cubic lattice with one point per unit of volume.
 HALF_EDGE = 2 ** (1 / 3) / 2
 
 
 def local_grid(
     step_rad: float, radius_rad: float, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> Tensor:
-    """Return rotations spread evenly over those that turn by at most an angle.
-
-    Their rotation vectors lie on a body-centred cubic lattice, the best covering of space by a lattice, with one point
-    per step_rad^3 as in a cubic lattice of this step. Covering radius c = 0.704 step_rad (cubic: 0.866): every rotation
-    by at most radius_rad - c is within c of one of them, every one by at most radius_rad within 2 c (exp brings
-    rotation vectors nowhere further apart).
-
-    Args:
-        step_rad: rad, cube root of the volume per rotation.
-        radius_rad: rad, 0 .. pi, the largest angle.
-        dtype: of the result.
-        device: of the result.
-
-    Returns:
-        (M, 3, 3), the unit rotation first, then by angle; with each rotation also its inverse.
+    """Return rotations (M, 3, 3) spread evenly up to the angle radius_rad (0 .. pi), the unit first, then by angle.
+    The rotation vectors are a body-centred cubic lattice with one point per step_rad^3, in rad; each rotation's inverse
+    is included. Covering radius c = 0.704 step_rad: every rotation by at most radius_rad - c is within c of the grid,
+    every one by at most radius_rad within 2 c.
+    Source: Conway and Sloane, Sphere Packings, Lattices and Groups, ch. 2 (covering radius sqrt(5)/4 of the edge).
 
     Raises:
         SettingsError: the step is not above 0, or the radius not in 0 .. pi.
-
-    Source: Conway and Sloane, Sphere Packings, Lattices and Groups, ch. 2 (covering radius sqrt(5)/4 of the edge).
     """
     if not step_rad > 0:
         raise SettingsError(refusal("step_rad", expected="above 0", got=f"{step_rad}", do="give the step in rad"))
@@ -45,7 +30,7 @@ def local_grid(
         do = "give the radius in rad, or take lattman_grid for all rotations"
         raise SettingsError(refusal("radius_rad", expected="0 .. pi", got=f"{radius_rad}", do=do))
     unit = HALF_EDGE * step_rad
-    reach = radius_rad / unit * (1 + 1e-9)  # a shell that lies on the rim by geometry is not lost to the last bits
+    reach = radius_rad / unit * (1 + 1e-9)  # keeps a shell that is exactly on the rim
     line = torch.arange(-math.floor(reach), math.floor(reach) + 1)
     places = torch.cartesian_prod(line, line, line)
     norm2 = places.square().sum(1)

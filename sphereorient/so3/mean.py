@@ -1,5 +1,3 @@
-"""The mean of rotations."""
-
 from __future__ import annotations
 
 import torch
@@ -13,21 +11,10 @@ STEPS = 12
 
 
 def weighted_mean(R: Tensor, weights: Tensor) -> Tensor:
-    """Return the rotation with the smallest weighted sum of squared angles to given ones (Karcher mean).
-
-    Two rotations give the point of the geodesic between them that divides it by the weights. The steps are a fixed
-    number, from the chordal mean (the rotation nearest to the weighted sum).
-
-    Args:
-        R: (..., K, 3, 3), rotations, not checked.
-        weights: (..., K), not negative, of any sum above 0; leading axes broadcast against those of R. A rotation that
-            is NaN does not count where its weight is 0.
-
-    Returns:
-        (..., 3, 3), frames of R; NaN where all weights are 0. Where the rotations are so far apart that several means
-        are equally good (two of them by pi) the result is one of them, always the same.
-
-    Source: Hartley et al. 2013, Rotation averaging, algorithm 1.
+    """Return the rotation (..., 3, 3) with the smallest weighted sum of squared angles to R (..., K, 3, 3).
+    Weights (..., K) are not negative, of any sum; NaN rotations of weight 0 do not count; NaN where all weights are 0.
+    Where several means are equally good, the choice is always the same.
+    Source: Karcher mean; Hartley et al. 2013, Rotation averaging, algorithm 1.
     """
     check_tail("R", R, *weights.shape[-1:], 3, 3)
     weights = weights.to(R)

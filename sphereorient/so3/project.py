@@ -1,5 +1,3 @@
-"""Matrices that are nearly rotations."""
-
 from __future__ import annotations
 
 import torch
@@ -9,16 +7,9 @@ from sphereorient.errors import check_tail
 
 
 def nearest_rotation(M: Tensor) -> Tensor:
-    """Return the rotation nearest to a matrix, by the sum of squared differences.
-
-    Args:
-        M: (..., 3, 3), any matrix, any unit.
-
-    Returns:
-        (..., 3, 3), orthogonal, determinant +1; NaN where M has a NaN or infinity. Where several rotations are equally
-        near (rank below 2, or a reflection with its two smallest singular values equal) one of them comes, with
-        gradient 0 in the directions that are undecided. First derivatives only.
-
+    """Return the rotation nearest to any matrix M (..., 3, 3), by the sum of squared differences; NaN if not finite.
+    Where several are equally near (rank below 2, or a reflection with equal smallest singular values) it is one of
+    them, with gradient 0 in the undetermined directions. First derivatives only.
     Source: Kabsch 1976, the paper's R_kabsch; derivative of the polar factor, textbook.
     """
     check_tail("M", M, 3, 3)
@@ -26,7 +17,6 @@ def nearest_rotation(M: Tensor) -> Tensor:
     view = torch.eye(3, dtype=M.dtype, device=M.device)
     M = torch.where(finite, M, view)
     U, S, Vh = torch.linalg.svd(M.detach())
-    # The determinant's sign goes to the smallest singular value and its direction.
     sign = torch.linalg.det(U @ Vh).sign()[..., None]
     signs = torch.cat([torch.ones_like(S[..., :2]), sign], -1)
     S, Vh = S * signs, signs[..., None] * Vh

@@ -1,5 +1,3 @@
-"""Random rotations."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -16,18 +14,8 @@ def random_rotations(
     dtype: torch.dtype = torch.float64,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Return rotations drawn uniformly from SO(3).
-
-    Args:
-        shape: their number, or leading shape; () gives one.
-        generator: source of the numbers; the same state gives the same rotations in every dtype.
-        dtype: of the result.
-        device: of the result.
-
-    Returns:
-        (*shape, 3, 3), the rotations.
-
-    Source: a quaternion of four normal numbers points anywhere on its sphere alike (Marsaglia 1972).
+    """Return rotations (*shape, 3, 3) drawn uniformly from SO(3), from the same numbers in every dtype.
+    Source: a quaternion of four normal numbers has a uniform direction (Marsaglia 1972).
     """
     leading = (shape,) if isinstance(shape, int) else tuple(shape)
     origin = generator.device if generator is not None else None

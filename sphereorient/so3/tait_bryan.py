@@ -11,16 +11,9 @@ from sphereorient.errors import check_tail
 
 
 def from_tait_bryan(theta: Tensor) -> Tensor:
-    """Return the rotation of a triplet of Tait-Bryan angles.
-
-    Args:
-        theta: (..., 3), theta_x, theta_y, theta_z, rad.
-
-    Returns:
-        (..., 3, 3), Rx(theta_x) Ry(theta_y) Rz(theta_z): with the paper R_lab_body, that is body -> lab.
-
-    Source: the paper's R(theta). In words (docs/errata.md E9): rotations about the fixed z, then y, then x; or about
-        the body's x, then its new y, then its new z.
+    """Return the rotation (..., 3, 3) of angles theta (..., 3), rad: Rx Ry Rz, the paper's R_lab_body.
+    Source: the paper's R(theta): rotations about the fixed z, then y, then x; or about the body's x, then its new y,
+    then its new z (docs/errata.md E9).
     """
     check_tail("theta", theta, 3)
     (sx, sy, sz), (cx, cy, cz) = theta.sin().unbind(-1), theta.cos().unbind(-1)
@@ -33,17 +26,10 @@ def from_tait_bryan(theta: Tensor) -> Tensor:
 
 
 def to_tait_bryan(R: Tensor) -> Tensor:
-    """Return the triplet of Tait-Bryan angles of a rotation, the one with theta_y in -pi/2 .. pi/2.
-
-    Args:
-        R: (..., 3, 3), rotations, not checked.
-
-    Returns:
-        (..., 3), theta_x, theta_y, theta_z, rad. At cos(theta_y) = 0 (below four roundings) only theta_x + theta_z
-        or theta_x - theta_z is defined: theta_z is set to 0, and its gradient. NaN for NaN.
-
+    """Return the Tait-Bryan angles (..., 3), rad, of rotations (..., 3, 3), with theta_y in -pi/2 .. pi/2; NaN for NaN.
+    At cos(theta_y) = 0 (below four roundings) only theta_x ± theta_z is defined: theta_z and its gradient are 0.
     Source: docs/errata.md E1, with other elements for theta_y and theta_x, equal for a rotation: asin loses half the
-        digits near theta_y = ± pi/2, and -R23, R33 lose all.
+    digits near theta_y = ± pi/2, and -R23, R33 lose all.
     """
     check_tail("R", R, 3, 3)
     cos_y = torch.linalg.vector_norm(R[..., 0, :2], dim=-1)
@@ -57,14 +43,8 @@ def to_tait_bryan(R: Tensor) -> Tensor:
 
 
 def second_triplet(theta: Tensor) -> Tensor:
-    """Return the other triplet of Tait-Bryan angles of the same rotation.
-
-    Args:
-        theta: (..., 3), theta_x, theta_y, theta_z, rad.
-
-    Returns:
-        (..., 3), theta_x + pi, ± pi - theta_y with the sign of theta_y, theta_z + pi, rad, not wrapped.
-
+    """Return the other angles (..., 3), rad, not wrapped, of the rotation of theta (..., 3), rad.
+    They are theta_x + pi, ± pi - theta_y with the sign of theta_y, theta_z + pi.
     Source: the paper's second triplet with sign(0) = 1, docs/errata.md E2.
     """
     check_tail("theta", theta, 3)
@@ -75,7 +55,6 @@ def second_triplet(theta: Tensor) -> Tensor:
 
 def rate_matrix_lab(theta: Tensor) -> Tensor:
     """Return H (..., 3, 3) with H dtheta/dt = omega_lab, of the angles of R_lab_body; its determinant is cos(theta_y).
-
     Source: the paper's H, which it assigns to the body (docs/errata.md E3).
     """
     check_tail("theta", theta, 3)
