@@ -11,8 +11,8 @@ from refine_examples import f64
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.follow.initialise import Poses
-from sphereorient.follow.tracker import ChunkTracker, _Lane
+from sphereorient.follow.poses import Poses
+from sphereorient.follow.tracker import ChunkTracker, _Chunk
 from sphereorient.trajectory import Reason
 
 TIMES = [0.0, 1.0, 2.5, 3.2]
@@ -40,13 +40,14 @@ def seen(time: float, change: float) -> Poses:
         deviation=torch.ones(1, 2, dtype=torch.float64),
         score=torch.ones(1, 2, dtype=torch.float64),
         nll=torch.zeros(1, dtype=torch.float64),
+        step=torch.zeros(1, 6, dtype=torch.float64),
         use=torch.tensor([True, True]),
         reason=(Reason.OK, Reason.OK),
     )
 
 
-def lane(frames: list[int], change: float, times: list[float] = TIMES) -> _Lane:
-    found = _Lane(0, len(times), times)
+def lane(frames: list[int], change: float, times: list[float] = TIMES) -> _Chunk:
+    found = _Chunk(0, len(times), times)
     for frame in frames:
         found.saw(frame, seen(times[frame], change))
     return found

@@ -17,12 +17,15 @@ from sphereorient.experiment import input_files, load_experiment
 from sphereorient.files.provenance import provenance, sha256, versions
 from sphereorient.locate import LocateSettings
 from sphereorient.methods.settings import (
+    BRANCHES,
     DEFAULT_METHOD,
-    METHODS,
+    RENAMED,
     Settings,
+    check_settings,
     load_proposer_settings,
     load_settings,
     load_synth_settings,
+    read_settings,
     settings_yaml,
     synth_settings_yaml,
 )
@@ -65,7 +68,7 @@ def test_without_a_file_all_is_as_the_rooms_say():
     assert load_settings().locate == LocateSettings()
     assert list(Settings.model_fields) == ROOMS
     assert load_synth_settings() == SynthSettings()
-    assert DEFAULT_METHOD in METHODS
+    assert DEFAULT_METHOD in BRANCHES
 
 
 def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
@@ -238,6 +241,57 @@ def test_all_settings_have_a_default_and_a_description_and_are_frozen(model):
 def test_the_committed_settings_are_accepted():
     for path in sorted((REPO / "configs").glob("*.yaml")):
         LOADERS.get(path.stem.partition("_")[0], load_settings)(path)
+
+
+@pytest.mark.parametrize(
+    ("override", "method", "near"),
+    [
+        ("orient.fine_step_deg=2", "precise", "search.step_deg"),
+        ("search.step_deg=10", "paper", "orient.coarse_step_deg"),
+        ("locate.outlier_px=2", "precise", "smooth.outlier_sigma"),
+        ("refine.blur_px=0.7", "map", "paint.blur_px"),
+    ],
+)
+def test_a_key_that_the_method_does_not_read_is_refused_with_the_nearest_one_that_it_reads(override, method, near):
+    key = override.partition("=")[0]
+    with pytest.raises(SettingsError, match=f"--set {key}: expected a key that method {method} reads") as caught:
+        read_settings(None, [override], method)
+    named = [word.strip(",") for word in str(caught.value).split() if "." in word]
+    assert any(word.split(".")[0] in BRANCHES[method] for word in named if word != f"{key}:"), str(caught.value)
+    if near.partition(".")[2].rpartition("_")[2] == key.rpartition("_")[2]:
+        assert near in str(caught.value) or "use " in str(caught.value)
+    # The same value from the Python API.
+    with pytest.raises(SettingsError, match=f"settings, {key}"):
+        check_settings(load_settings(None, [override]), method)
+
+
+def test_a_key_of_the_other_method_in_a_file_is_left_aside_at_its_default_and_else_refused(tmp_path):
+    loaded = read_settings(write(tmp_path, "orient:\n  fine_step_deg: 3.0\n"), [], "precise")
+    assert loaded.settings == Settings()
+    (remark,) = loaded.remarks
+    assert "method precise does not read orient: left aside" in remark
+    with pytest.raises(SettingsError, match=r"orient\.fine_step_deg: expected a key that method precise reads"):
+        read_settings(write(tmp_path, "orient:\n  fine_step_deg: 2.0\n"), [], "precise")
+    assert read_settings(write(tmp_path, "orient:\n  fine_step_deg: 2.0\n"), [], "paper").remarks == ()
+
+
+@pytest.mark.parametrize("method", ["precise", "paper", "map", "report"])
+def test_the_settings_of_a_method_are_accepted_by_it(method):
+    check_settings(Settings(), method)
+    for branch in BRANCHES[method]:
+        assert branch in Settings.model_fields
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
+def test_old_names_are_read_with_a_remark(tmp_path, old, new):
+    branch, _, name = old.partition(".")
+    from_file = read_settings(write(tmp_path, f"{branch}:\n  {name}: 7\n"), [], "precise")
+    from_set = read_settings(None, [f"{old}=7"], "precise")
+    assert from_file.settings == from_set.settings != Settings()
+    for loaded in (from_file, from_set):
+        assert any(f"{old} is now {new}" in remark for remark in loaded.remarks)
+    with pytest.warns(UserWarning, match=f"{old} is now {new}"):
+        load_settings(None, [f"{old}=7"])
 
 
 def two_folders(folder: Path):

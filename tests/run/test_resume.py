@@ -66,7 +66,7 @@ def test_a_run_goes_on_with_what_is_there(whole, tmp_path, request_of):
     assert any(name.startswith("poses") for name in before)
     stages: list[tuple[str, int]] = []
     tracked(request, resume=True, progress=lambda stage, done, total: stages.append((stage, done)))
-    assert "study" not in dict(stages)  # known from before
+    assert "appearance" not in dict(stages)  # known from before
     assert stages[0] == ("track", 8 * sum(name.startswith("poses") for name in before))
     assert datasets(request.out) == datasets(whole / "track.h5")
     assert not request.parts.exists()
@@ -77,7 +77,7 @@ def test_without_resume_it_starts_over(whole, tmp_path, request_of):
     halfway(whole, request)
     stages: list[str] = []
     tracked(request, progress=lambda stage, done, total: stages.append(stage))
-    assert "study" in stages
+    assert "appearance" in stages
     assert datasets(request.out) == datasets(whole / "track.h5")
 
 
