@@ -1,3 +1,5 @@
+"""Cameras from pictures of a plate, from points, and from the sphere itself."""
+
 from sphereorient.calibration.boards import see_plate
 from sphereorient.calibration.bundle import disk_centre_shift
 from sphereorient.calibration.document import load_calibration

@@ -1,3 +1,5 @@
+"""Cameras: one file per model; projection, lines of sight, triangulation."""
+
 from sphereorient.cameras.camera import Camera, Rays
 from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.io.cameras_yaml import load_cameras, load_covariance, save_cameras
