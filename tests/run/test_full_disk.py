@@ -58,6 +58,7 @@ def test_when_there_is_room_again_the_run_goes_on(tmp_path):
     assert datasets(out) == datasets(clean)
 
 
+@pytest.mark.slow
 def test_a_place_that_may_not_be_written_is_one_line(tmp_path):
     told = run(EXCERPT, "--out", tmp_path / "none" / "track.h5")
     assert told.returncode == 2

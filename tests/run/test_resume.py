@@ -81,6 +81,7 @@ def test_without_resume_it_starts_over(whole, tmp_path, request_of):
     assert datasets(request.out) == datasets(whole / "track.h5")
 
 
+@pytest.mark.slow
 def test_parts_cut_off_while_written_are_measured_again(whole, tmp_path, request_of):
     request = request_of(tmp_path)
     parts = halfway(whole, request)
@@ -90,6 +91,7 @@ def test_parts_cut_off_while_written_are_measured_again(whole, tmp_path, request
     assert datasets(request.out) == datasets(whole / "track.h5")
 
 
+@pytest.mark.slow
 def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_path, request_of):
     request = request_of(tmp_path)
     parts = halfway(whole, request)

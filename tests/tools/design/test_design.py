@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from sphereorient import cli, so3
 from sphereorient.errors import PaintError
 from sphereorient.evaluate import cramer_rao_bound
-from sphereorient.sphere import load_texture, sample_texture
+from sphereorient.sphere import Sampling, load_texture, sample_texture
 from sphereorient.synth.textures import map_directions
 from sphereorient.tools.design.gores import Gores, gores_figure, instructions
 from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture, most_similar_views
@@ -124,7 +124,9 @@ def test_the_judgement_is_that_of_the_bound_and_knows_the_view_without_paint():
     texture = patterned_texture("dots", 15.0, 1, 128)
     texture = torch.where(direction[..., 0] > 0, texture, torch.ones_like(texture))
     judged = judge_texture(texture, FEW)
-    expected = cramer_rao_bound(texture, facing(judged.direction_body).float(), diameter_px=24, supersampling=6)
+    expected = cramer_rao_bound(
+        texture, facing(judged.direction_body).float(), diameter_px=24, sampling=Sampling(supersampling=6)
+    )
     assert_close(judged.bound_rad, expected.orientation_rms_rad.double(), atol=1e-9)
     assert float(judged.direction_body[judged.worst, 0]) < -0.5 < 0.2 < float(judged.direction_body[judged.best, 0])
     assert float(judged.white.max()) > 0.97
