@@ -197,6 +197,7 @@ def world(seed: int, frames: int, sigma: float, change: float, seen_share: float
     return hypotheses, torch.where(missing, -1, place)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_deg", [0.1, 12.0])
 def test_frames_said_to_be_right_with_a_probability_are_so_at_least_that_often(sigma_deg):
     probability, right = [], []

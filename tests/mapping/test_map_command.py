@@ -207,6 +207,7 @@ def test_shares_are_of_the_sphere_not_of_the_picture():
     assert shares_seen(north, (1,))[0] == pytest.approx((1 - 0.5**0.5) / 2)
 
 
+@pytest.mark.slow
 def test_two_maps_are_compared_and_wear_is_drawn(tmp_path, monkeypatch, capsys):
     paint = random_texture("dots", 3, 96)
     Q = so3.exp(torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64))

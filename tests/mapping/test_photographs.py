@@ -69,6 +69,7 @@ def test_the_order_of_the_pictures_does_not_matter():
     assert error_deg(again, one.R_lab_body).max() < 0.5
 
 
+@pytest.mark.slow
 def test_the_same_photographs_give_the_same_bytes():
     whole = pictures(random_attitudes(8, 4))
     assert torch.equal(found_in(whole).R_lab_body, found_in(whole).R_lab_body)

@@ -109,6 +109,7 @@ def test_a_diameter_ten_per_cent_off_is_found_and_the_right_one_named(clean, tmp
     assert named == pytest.approx(18.0, rel=0.015)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [1.8, 40.0])  # cm for mm; a number of another ball
 def test_a_diameter_that_is_altogether_wrong_still_shows_the_right_one(clean, tmp_path, wrong):
     found = of(checked(clean, tmp_path, sphere={"diameter": wrong}), "size of the ball")

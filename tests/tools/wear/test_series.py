@@ -72,6 +72,7 @@ def found() -> WearSeries:
     return wear_series([learnt(k) for k in range(4)])
 
 
+@pytest.mark.slow
 def test_worn_places_are_found_where_they_were_planted_in_the_first_maps_frame():
     for k, wear in enumerate(found().wear, start=1):
         first, later = RADII_DEG[k]
@@ -108,6 +109,7 @@ def test_places_keep_their_number_from_map_to_map():
     assert (found().number[near(LATER_SPOT, 5.0)] == 2).all()
 
 
+@pytest.mark.slow
 def test_maps_of_an_unworn_ball_show_no_wear_however_noisy():
     for noise in (0.0, 0.06):
         rng = torch.Generator().manual_seed(9)
@@ -161,6 +163,7 @@ def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
     return int(stop.value.code or 0), printed.out, printed.err
 
 
+@pytest.mark.slow
 def test_the_command_tells_and_draws_a_series(tmp_path, monkeypatch, capsys):
     paths = [save_map(learnt(k), tmp_path / f"movie{k}.png") for k in range(3)]
     write_seen((~near(FIRST_SPOT, 0.0)).long() * 20, tmp_path / "movie0_seen.png")
