@@ -46,6 +46,7 @@ def check(row: dict[str, Any], frames: int = 96) -> None:
     assert row["same"]  # with what the clean run had learnt: the same bits in all blocks without the fault
 
 
+@pytest.mark.slow
 def test_a_fault_costs_its_own_frames_only():
     """The shortest movie with a block before, with and after the fault; all faults, at full length, are slow."""
     row = rows_of("--frames", "48", "--only", "black, cam1")["black, cam1"]

@@ -65,6 +65,7 @@ def test_the_paper_tracks_the_excerpt_with_the_network(tmp_path: Path) -> None:
     assert "checkpoint: default" in track.settings
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_a_checkpoint(tmp_path: Path) -> None:
     own, out = tmp_path / "own.ckpt", tmp_path / "track.h5"
     shutil.copy(DEFAULT_CHECKPOINT, own)

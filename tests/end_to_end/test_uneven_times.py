@@ -55,6 +55,7 @@ def test_jittered_and_dropped_frames_are_tracked_by_their_times(fast, tmp_path):
     assert np.abs(counted - 1).mean() > 0.2  # what frames counted as even would have done to omega
 
 
+@pytest.mark.slow
 def test_a_pause_of_the_camera_is_a_pause(fast, tmp_path):
     rows = np.concatenate([np.arange(0, 90, 4), np.arange(150, 220, 4)])
     track, some, omega = taken(fast, rows, tmp_path, "precise")

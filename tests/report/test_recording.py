@@ -96,7 +96,7 @@ def test_a_recording_holds_cameras_pictures_sphere_and_series(tmp_path):
     assert steps == [(1, 2), (2, 2)]
     verified(out)
     told = entities(out)
-    for place in ("/lab/cam1/picture", "/lab/cam2", "/lab/sphere/ball", "/lab/path", "/plots/state", "/doubts"):
+    for place in ("/lab/cam1/picture", "/lab/cam2", "/lab/sphere/ball", "/lab/path", "/plots/state", "/warnings"):
         assert place in told, place
 
 

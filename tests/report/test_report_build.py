@@ -124,6 +124,7 @@ def test_many_tracks_make_one_page_that_needs_nothing_beside_it(place, report, t
     assert [path.name for path in tmp_path.iterdir()] == ["page"]
 
 
+@pytest.mark.slow
 def test_a_report_is_replaced_by_the_next_one(place, report, tmp_path):
     out = tmp_path / "page"
     assert report(place / "a/track.h5", "--out", out, *QUICK, "--quiet")[0] == 0
@@ -133,6 +134,7 @@ def test_a_report_is_replaced_by_the_next_one(place, report, tmp_path):
     assert "one.h5" in (out / "index.html").read_text()
 
 
+@pytest.mark.slow
 def test_same_tracks_same_numbers_and_same_pictures(place, report, tmp_path):
     for name in ("first", "second"):
         assert report(place / "a/track.h5", "--out", tmp_path / name, *QUICK, "--quiet")[0] == 0
@@ -142,6 +144,7 @@ def test_same_tracks_same_numbers_and_same_pictures(place, report, tmp_path):
             assert (tmp_path / "first" / path).read_bytes() == (tmp_path / "second" / path).read_bytes(), path
 
 
+@pytest.mark.slow
 def test_settings_of_the_statistics_are_obeyed_and_shown(place, report, tmp_path):
     code, _, _ = report(
         place / "a/track.h5", "--out", tmp_path / "page", *QUICK, "--set", "statistics.min_frames=70", "-q"
