@@ -21,6 +21,7 @@ TAILS = {
     "deviation": (CAMERAS,),
     "score": (CAMERAS,),
     "nll": (),
+    "step": (6,),
 }
 
 
