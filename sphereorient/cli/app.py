@@ -11,13 +11,16 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, cast, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 
 from sphereorient import __version__
 from sphereorient.errors import OutputError, SphereOrientError, refusal
+
+if TYPE_CHECKING:
+    from sphereorient.methods.settings import Settings
 
 
 class InOrder(TyperGroup):
@@ -70,6 +73,16 @@ def check_writable(out: Path) -> None:
     if not os.access(folder, os.W_OK):
         do = "choose another --out"
         raise OutputError(refusal(name, expected="a writable folder", got=f"{folder}, which is not", do=do))
+
+
+def settings_of(path: Path | None, overrides: list[str] | None, method: str | None) -> Settings:
+    """Read the settings that a method reads, and print remarks on the others."""
+    from sphereorient.methods.settings import BRANCHES, read_settings
+
+    loaded = read_settings(path, overrides or [], method if method in BRANCHES else None)
+    for remark in loaded.remarks:
+        typer.echo(f"note: {remark}", err=True)
+    return loaded.settings
 
 
 def camera_names(text: str | None) -> list[str] | None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import ExperimentPath, app, camera_names, check_writable, progress_bar
+from sphereorient.cli.app import ExperimentPath, app, camera_names, check_writable, progress_bar, settings_of
 from sphereorient.cli.compare_maps import print_moved
 
 if TYPE_CHECKING:
@@ -46,19 +46,15 @@ def map_(
     check_picture_name(out)
     check_writable(out)
     from sphereorient.methods.map import learn_map
-    from sphereorient.methods.method import one_thread
-    from sphereorient.methods.settings import load_settings
     from sphereorient.sphere import load_texture
 
     overrides = [*(set_ or []), *(["paint.unordered=true"] if photographs else [])]
-    chosen, begun = load_settings(settings, overrides), time.perf_counter()
+    chosen, begun = settings_of(settings, overrides, "map"), time.perf_counter()
     old = None if init is None else load_texture(init)
     command = " ".join(["sphereorient", *sys.argv[1:]])
     with progress_bar(quiet) as advance:
-        with one_thread():
-            result = learn_map(
-                experiment, chosen, init=old, cameras=camera_names(cameras), progress=advance, command=command
-            )
+        names = camera_names(cameras)
+        result = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, command=command)
         advance("figure", 0, 1)
         files, compared = _write(result, old, out)
         advance("figure", 1, 1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, progress_bar
+from sphereorient.cli.app import app, check_writable, progress_bar, settings_of
 from sphereorient.errors import TrackError, refusal
 
 if TYPE_CHECKING:
@@ -32,10 +32,9 @@ def report(
     """Write statistics of tracks with error bars, figures, and a page with the findings."""
     check_writable(out)
     from sphereorient.experiment import load_experiment
-    from sphereorient.methods.settings import load_settings
     from sphereorient.report.build import write_report
 
-    chosen = load_settings(settings, set_ or []).statistics
+    chosen = settings_of(settings, set_, "report").statistics
     known = [load_experiment(path) for path in experiment or ()]
     loaded = _load(tracks)
     command = " ".join(["sphereorient", *sys.argv[1:]])

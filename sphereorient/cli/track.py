@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import app, camera_names, check_writable, progress_bar
+from sphereorient.cli.app import app, camera_names, check_writable, progress_bar, settings_of
 from sphereorient.errors import OutputError, SettingsError, refusal
 
 if TYPE_CHECKING:
@@ -64,15 +64,11 @@ def track(
     if save_learnt is not None:
         check_writable(save_learnt)
         _refuse_shared(save_learnt, many)
-    from sphereorient.methods.settings import read_settings
     from sphereorient.run import FolderStore, Request, run
     from sphereorient.run.many import tracks_of
-    from sphereorient.run.stages import METHODS, with_proposer
+    from sphereorient.run.stages import with_proposer
 
-    loaded = read_settings(settings, set_ or [], method if method in METHODS else None)
-    for remark in loaded.remarks:
-        typer.echo(f"note: {remark}", err=True)
-    chosen = with_proposer(loaded.settings, proposer)
+    chosen = with_proposer(settings_of(settings, set_, method), proposer)
     names = camera_names(cameras)
     requests = [
         Request(
