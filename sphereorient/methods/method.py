@@ -31,7 +31,7 @@ class Method:
     """The stages of a method, in the order of `run`; without a follower, `join` does all (paper)."""
 
     learn: Callable[[Job, Progress], Follower | None]
-    resume: Callable[[Job, Learnt], Follower]  # instead of learn, with what is known
+    resume: Callable[[Job, Learnt], Follower] | None  # instead of learn, with what is known; None: it learns nothing
     join: Callable[[Job, Follower | None, Iterable[list[Poses]], Progress], tuple[Trajectory, Learnt | None]]
 
 

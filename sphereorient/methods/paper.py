@@ -12,14 +12,12 @@ from torch import Tensor
 
 from sphereorient import assemble, locate, motion
 from sphereorient.cameras import Camera, R_cam_view
-from sphereorient.errors import SettingsError, refusal
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream
 from sphereorient.follow.follower import Follower
 from sphereorient.follow.poses import Poses
 from sphereorient.locate import Sightings
 from sphereorient.methods import results
-from sphereorient.methods.learnt import Learnt
 from sphereorient.methods.method import Job, Method
 from sphereorient.methods.proposers import paper_proposer
 from sphereorient.methods.settings import Settings
@@ -117,10 +115,4 @@ def in_the_lab(proposals: Candidates, camera: Camera, centre_px: Tensor) -> Cand
     return replace(proposals, R_lab_view=camera.R_cam_lab.mT @ R_cam_view(direction_cam))
 
 
-def resume(job: Job, learnt: Learnt) -> Follower:
-    """Refuse results of another run."""
-    do = "leave it out, or use method precise"
-    raise SettingsError(refusal("learnt", expected="method precise", got="method paper", do=do))
-
-
-PAPER = Method(learn=learn, resume=resume, join=track)
+PAPER = Method(learn=learn, resume=None, join=track)

@@ -95,7 +95,7 @@ class Work:
         """Estimate what is needed before tracking, unless it is known; keep it, and return the batches to follow."""
         if not self._learnt:
             known = self.job.given or self.store.known
-            if known is not None:
+            if known is not None and self.method.resume is not None:
                 self._follower = self.method.resume(self.job, known)
             else:
                 self._follower = self.method.learn(self.job, progress)
@@ -209,7 +209,7 @@ def check_method(request: Request) -> Method:
     if request.method not in METHODS:
         got, do = repr(request.method), "name one of these"
         raise SettingsError(refusal("method", expected=" or ".join(METHODS), got=got, do=do))
-    if request.learnt is not None and request.method != "precise":
+    if request.learnt is not None and METHODS[request.method].resume is None:
         do = "leave it out, or use method precise"
         raise SettingsError(refusal("learnt", expected="method precise", got=f"method {request.method}", do=do))
     check_settings(request.settings, request.method)

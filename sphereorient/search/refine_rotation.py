@@ -11,6 +11,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.pose.light import polynomials
 from sphereorient.search.normalisation import Blur, rim_share
+from sphereorient.so3.linalg import cross_first_axis
 from sphereorient.sphere import DiskView
 from sphereorient.sphere.texture_table import TextureTable
 
@@ -87,7 +88,7 @@ def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, ste
         weight = level.weight * _trust(left)
         gain = (found[:, None, :whites] @ level.white)[:, 0].clamp_min(GAIN_MIN)
         # Rotating the body by epsilon, R exp(epsilon), changes the paint by epsilon . (slope x normal).
-        turned = _cross(slope, normal_body) * gain[:, None]
+        turned = cross_first_axis(slope, normal_body) * gain[:, None]
         turn = _solved(torch.cat([light, turned], dim=1), left, weight)[:, -3:]
         R = R @ _rotation(turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0))
     return R, _score(level, target, R, weight)
@@ -128,8 +129,3 @@ def _solved(columns: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
     ridge = RIDGE * normal.diagonal(dim1=1, dim2=2).clamp_min(1e-9)
     solution: Tensor = torch.linalg.solve(normal + torch.diag_embed(ridge), right)
     return solution[..., 0].float()
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    (ax, ay, az), (bx, by, bz) = a.unbind(1), b.unbind(1)
-    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=1)
