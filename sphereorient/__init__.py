@@ -1,7 +1,5 @@
 """Six-dimensional motion of a painted sphere from high-speed movies."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

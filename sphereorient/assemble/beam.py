@@ -4,8 +4,6 @@ A history names the right candidate of each frame, or none, and the breaks of th
 with an orientation: the next candidate is compared with the omega between them.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

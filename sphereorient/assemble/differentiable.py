@@ -1,7 +1,5 @@
 """From fitted candidates to one differentiable soft track; docs/differentiable.md connects it to the cameras."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The second-order path: candidates by the pictures and the change of omega; the acceleration is estimated too."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

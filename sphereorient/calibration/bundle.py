@@ -1,7 +1,5 @@
 """Bundle adjustment: fit all cameras and plate poses together to all points, with covariances."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

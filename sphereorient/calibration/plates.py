@@ -1,7 +1,5 @@
 """Calibration from pictures of a plate or tables of points: points -> guess -> joint fit -> cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Check and repair cameras that moved after their calibration, with the tracked sphere."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

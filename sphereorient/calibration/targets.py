@@ -1,7 +1,5 @@
 """Calibration targets: dot plates, chessboards, ChArUco boards and circle grids, as `plate` of calibration.yaml."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields
 from typing import Any

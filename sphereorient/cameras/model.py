@@ -4,8 +4,6 @@ To add a model, derive a dataclass with `MODEL` and `KEYS` from `CentralCamera` 
 `CameraModel`, and add it to `MODELS` in io/cameras_yaml.py. `KEYS` define file, parameter names and checks.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ has `port_offset`, `port_thickness` (mm), `port_n_glass`, `port_n_fluid`, and `p
 `port_tilt_z` (rad, lab: normal_true = exp([delta]x) normal, offset unchanged; about the normal no effect).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar, cast

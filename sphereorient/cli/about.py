@@ -1,7 +1,5 @@
 """`sphereorient settings` and `info`."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """`sphereorient calibrate` and `check-cameras`."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The Cramér-Rao bound of any unbiased method on one picture."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

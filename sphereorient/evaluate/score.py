@@ -1,7 +1,5 @@
 """Errors of a track, or of another program's orientations, against the exact truth of a synthetic experiment."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

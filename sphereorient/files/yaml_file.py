@@ -1,7 +1,5 @@
 """Reading and writing bounded YAML files of plain values; every fault is one line with file and key."""
 
-from __future__ import annotations
-
 import difflib
 import unicodedata
 from collections.abc import Iterable, Mapping

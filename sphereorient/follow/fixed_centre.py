@@ -1,7 +1,5 @@
 """The fixed centre of a sphere that only rotates, from a few frames; all frames are then fitted there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Tracking batch by batch, while the frames of the next batch are decoded."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The pose of a single frame without history: outlines, search over all rotations, fits from coarse to fine."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Cameras that disagree, as after one was moved: each tracks the sphere alone, and all results are kept."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Fitted poses of one frame, and of all frames, padded, for the path."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Poses of all frames: a full search at the first frame of a chunk, then each frame from those before it."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

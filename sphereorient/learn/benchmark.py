@@ -1,7 +1,5 @@
 """A checkpoint on unseen maps: recall by degradation, metrics, speed, and example pictures."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass

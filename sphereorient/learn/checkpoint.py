@@ -1,7 +1,5 @@
 """The file of a trained proposer: weights and settings, without code."""
 
-from __future__ import annotations
-
 import hashlib
 import zipfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The training for Lightning: data, loss and learning rate, checkpoints, time limit."""
 
-from __future__ import annotations
-
 import csv
 import math
 from functools import partial

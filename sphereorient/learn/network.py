@@ -1,7 +1,5 @@
 """A network that predicts a density over SO(3): it correlates features of picture and rotated map."""
 
-from __future__ import annotations
-
 import math
 
 import torch

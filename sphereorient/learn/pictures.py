@@ -1,7 +1,5 @@
 """Training pictures: random textures, orientations, light and degradations, reproducible by seed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Outliers of outlines replaced by a spline, short gaps interpolated; both are flagged."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Position of the sphere in the lab: from two rays, or from one ray and the radius."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Screening of frames: unreadable, dark, saturated or repeated pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

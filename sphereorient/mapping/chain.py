@@ -1,7 +1,5 @@
 """Orientations of a movie's frames without a map: compare neighbours, chain the rotations, close loops."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Compare two texture maps of one sphere: body frame, displacements, changes; correct an old map."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

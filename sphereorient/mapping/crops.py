@@ -1,7 +1,5 @@
 """The sphere cut out of every frame, so that movies are read once."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The texture map as unknowns of a linear system: splines, smoothness penalty, solution, sharpening."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

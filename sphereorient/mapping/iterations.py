@@ -1,7 +1,5 @@
 """The iterations of mapping: orientations, light and map in turn, and then poses and map together."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

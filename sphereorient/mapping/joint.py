@@ -1,7 +1,5 @@
 """Linearise pictures about map and poses, and solve for one joint Gauss-Newton step of all."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

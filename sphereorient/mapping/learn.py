@@ -1,7 +1,5 @@
 """The texture map, orientations and light from movies or photographs: start without a map, iterate, finish."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

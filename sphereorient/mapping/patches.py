@@ -1,7 +1,5 @@
 """Find patches of one texture map in another, to hundredths of a degree."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Orientations of unordered photographs: compare all pairs over all rotations, join consistent sets."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The method of `sphereorient map`: learn the texture map from movies in which the sphere rotates."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

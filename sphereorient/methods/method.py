@@ -1,7 +1,5 @@
 """The interface between `run` and a method."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Section III of the paper, corrected, step by step: each camera alone, then their fusion."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 

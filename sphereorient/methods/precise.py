@@ -1,7 +1,5 @@
 """The precise method: appearance of the movie, pose after pose, the most likely path, its motion."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from sphereorient import assemble, motion

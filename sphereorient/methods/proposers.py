@@ -1,7 +1,5 @@
 """The choice of proposer: the only place that knows both the template searches and the trained network."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """From the stages' results to the trajectory, one function for each method."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations

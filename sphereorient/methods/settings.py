@@ -1,7 +1,5 @@
 """The settings of all rooms in one tree: defaults, files, single overrides, and the commented file."""
 
-from __future__ import annotations
-
 import difflib
 import math
 import textwrap

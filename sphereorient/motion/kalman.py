@@ -1,7 +1,5 @@
 """Kalman filter and modified Bryson-Frazier smoother: linear in time, no inverse of a covariance of states."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

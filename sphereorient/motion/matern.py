@@ -4,8 +4,6 @@ The rate is u = m + w: an unknown constant m, and a stationary Gaussian process 
 continuous derivatives. An integrated Wiener process doubles the error of acceleration on the shared experiment.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

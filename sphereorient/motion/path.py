@@ -4,8 +4,6 @@ The state has 3 (2 + ORDER) numbers: delta from the reference, the deviation of 
 w, w' / pole, w'' / pole^2, ... itself. Time is in frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self

@@ -1,7 +1,5 @@
 """Motion from the precise track: smoothed position and orientation, their derivatives, with sigmas."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Any, Self
 

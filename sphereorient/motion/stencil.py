@@ -4,8 +4,6 @@ A stencil is a tensor of weights (..., N, 2 h + 1): entry [k, h + j] is the weig
 frame k. Missing frames have weight 0; a frame whose result is not determined has NaN weights.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad

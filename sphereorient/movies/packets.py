@@ -1,7 +1,5 @@
 """The packet table of a video: frame numbers and dependencies, found without decoding."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass

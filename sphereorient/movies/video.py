@@ -1,7 +1,5 @@
 """Videos that FFmpeg decodes, with exact seeks, and nothing decoded from damaged data."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator, Sequence
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """The blur of pictures, before the pose of the sphere is known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -5,8 +5,6 @@ dg/dpose. `implicit_pose` fits without a graph and then takes one Newton step -H
 `track` cannot serve: it holds weights, light and slopes fixed, in single precision.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The measuring model: the painted sphere in the pixels of a camera, blurred, and its derivatives by the pose."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Checks of two cameras against each other: lines of sight, and size of the ball."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Checks of each movie: files, pictures, background, ball, exposure, sharpness, motion blur."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections import Counter

@@ -1,7 +1,5 @@
 """Check whether two movies are synchronised: the gap of the lines of sight at each offset in frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

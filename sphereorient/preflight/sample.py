@@ -1,7 +1,5 @@
 """The sampled frames of the check, and the ball in them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Checks of the texture map: contrast and patches, views that look alike, and its match with the pictures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A report: a folder with one page, the figures, and the tables."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The picture of a calibration: points found and expected, and the residuals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

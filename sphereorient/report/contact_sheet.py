@@ -1,7 +1,5 @@
 """The contact sheet of a movie: frames spread over it, with their numbers, times and faults."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A track as named columns: one value for each frame, the unit in the name (docs/export.md)."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The warnings of a frame as text, and the choice of the worst frames of a track with the reasons."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

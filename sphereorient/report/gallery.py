@@ -1,7 +1,5 @@
 """Pictures of single frames of a track: small ones for the page, and the contact sheet of the worst frames."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

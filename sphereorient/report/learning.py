@@ -1,7 +1,5 @@
 """Figures of a proposer's training: learning curve and examples."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Figures of texture maps: content, agreement with the pictures, displacement and change of the paint."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Files of a texture map: the picture that tracking reads, the pictures per texel, and all other results."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The movie with the measurement drawn on it, and the re-rendered sphere beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """A picture to draw on: antialiased lines, text, panels."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The measured sphere in a camera's picture: outline, axes, trail, and the re-rendered picture."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The pictures of the overlay: each camera's frame, crop, re-rendered sphere and residual."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The page of a report: one HTML file without external parts."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The figure of a check: pictures of the cameras, their agreement, the texture map, and all findings."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from pathlib import Path

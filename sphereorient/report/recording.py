@@ -1,7 +1,5 @@
 """A track as a Rerun recording: cameras, pictures, the sphere along its path, and time series (docs/export.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from itertools import pairwise

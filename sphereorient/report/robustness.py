@@ -1,7 +1,5 @@
 """Figure and table of the robustness benchmark."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Quality of every frame of a track for the page, and the stretches of bad frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any

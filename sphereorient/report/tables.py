@@ -1,7 +1,5 @@
 """The numbers of a report as tables, one row for each value with its interval; CSV and Parquet."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

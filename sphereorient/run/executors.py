@@ -1,7 +1,5 @@
 """Executors: workers that do one task at a time, processes of this machine or of a Dask cluster."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import threading

@@ -1,7 +1,5 @@
 """Many experiments, or one long movie, on many workers: the order of tasks, and the death of a worker."""
 
-from __future__ import annotations
-
 import time
 import uuid
 from collections import deque

@@ -1,7 +1,5 @@
 """The request of a run, and the fingerprint that distinguishes it from others."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field

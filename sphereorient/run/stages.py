@@ -1,7 +1,5 @@
 """One way through a run, for every command, the Python API and the workers: learn, follow, join."""
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace

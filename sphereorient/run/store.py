@@ -1,7 +1,5 @@
 """Where a run keeps its intermediate results: in memory, or in a folder beside the track, to resume from."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

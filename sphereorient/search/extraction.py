@@ -1,7 +1,5 @@
 """From grey disks to paint: -1 black, +1 white, 0 undecided (paper section III B)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F

@@ -1,7 +1,5 @@
 """The paper's template search: a coarse bank at half size, groups, a fine grid about each at real size."""
 
-from __future__ import annotations
-
 import math
 
 import torch

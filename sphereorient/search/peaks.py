@@ -1,7 +1,5 @@
 """Peaks of many scores over SO(3), found without sorting them."""
 
-from __future__ import annotations
-
 import math
 
 import torch

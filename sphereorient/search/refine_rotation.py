@@ -1,7 +1,5 @@
 """From a rough orientation to the best one nearby: Gauss-Newton on grey values, the light eliminated."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

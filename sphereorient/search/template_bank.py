@@ -1,7 +1,5 @@
 """The template bank: normalised views over all rotations, distinct peaks, a coarse-to-fine fit from each."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

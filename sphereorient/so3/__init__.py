@@ -1,7 +1,5 @@
 """Rotations: (..., 3, 3) matrices that act on columns, not checked; rotation vectors (..., 3), rad, right-handed."""
 
-from __future__ import annotations
-
 from sphereorient.so3.distance import angle, geodesic_distance
 from sphereorient.so3.exp import exp, hat, log, vee
 from sphereorient.so3.lattman import from_lattman, lattman_grid, lattman_steps, to_lattman

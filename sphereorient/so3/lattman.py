@@ -1,7 +1,5 @@
 """Lattman's angles, in which the metric of SO(3) is diagonal, and his grid over all rotations."""
 
-from __future__ import annotations
-
 import math
 
 import torch

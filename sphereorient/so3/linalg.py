@@ -1,7 +1,5 @@
 """Small linear algebra: damped solutions, and a cross product along axis 1."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

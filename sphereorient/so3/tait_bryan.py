@@ -1,7 +1,5 @@
 """The paper's angles: theta = (theta_x, theta_y, theta_z), R = Rx(theta_x) Ry(theta_y) Rz(theta_z)."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Distance between the orientations of two cameras, each measured without the other."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations

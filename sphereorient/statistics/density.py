@@ -1,7 +1,5 @@
 """Probability densities of normalised components, the stretched exponential fitted to them, and the Gaussian."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

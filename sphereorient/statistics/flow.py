@@ -1,7 +1,5 @@
 """The flow around the sphere: its scales, dimensionless numbers, and the lift of a spinning sphere."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

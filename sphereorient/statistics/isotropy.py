@@ -1,7 +1,5 @@
 """Tests of isotropy: of vectors in lab and body, and of orientations on SO(3); Euler angles; the frame of a vector."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Autocorrelations with integral times, and increments, over lags within segments."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

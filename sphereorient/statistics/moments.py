@@ -1,7 +1,5 @@
 """Table I: mean, rms, skewness and flatness of every quantity, with intervals and without the noise."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """How much of a quantity is noise: by the track's sigmas, by increments over many lags, by the kernel's width."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Calibration of probabilities: the observed frequency of outcomes against their predicted probability."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

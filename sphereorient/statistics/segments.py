@@ -1,7 +1,5 @@
 """The usable segments of one or many tracks, as flat arrays; how long segments last."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self

@@ -1,7 +1,5 @@
 """Settings of the room statistics."""
 
-from __future__ import annotations
-
 from pydantic import BaseModel, ConfigDict, Field
 
 

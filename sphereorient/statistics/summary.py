@@ -1,7 +1,5 @@
 """All statistics of the paper's section IV; a new one needs a field of `Distributions`, a call in `_distributions`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

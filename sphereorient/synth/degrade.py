@@ -1,7 +1,5 @@
 """Degradations of picture batches, without kornia augmentations: these draw from torch's global generator."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

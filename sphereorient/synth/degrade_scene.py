@@ -1,7 +1,5 @@
 """Degraded synthetic experiments on disk; truth.h5 stays exact."""
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Random crops of single spheres, for training and benchmarks of proposers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Degradations of pictures and reported inputs: names, units, five severities."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Random texture maps of three kinds, seamless on the sphere."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Write synthetic experiments in the format that `sphereorient track` reads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 # ruff: noqa: RUF009 -- stored returns a dataclass field without a default
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Datasets of a track file: axes, unit, description and type of each record field."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path

@@ -3,8 +3,6 @@
 OpenPTV's first pixel has its centre at (0.5, 0.5), ours at (0, 0). Its camera looks along its -z with y up.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Sequence

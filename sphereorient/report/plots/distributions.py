@@ -1,7 +1,5 @@
 """Figures of distributions and correlations: PDFs, increments, autocorrelations, durations of the segments."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Figures of isotropy and of what limits the measurement: orientations, noise, kernel widths, camera distances."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """The style of all figures: colours and lines, marks with intervals, legends, numbers as text, and the writer."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """A track in six dimensions against time, and its path through space with the sphere's axes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

@@ -3,8 +3,6 @@
 Sheet: x right, y up, mm, first strip at longitude -180 degrees; north up and east right, seen from outside.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Judge how precisely a texture map determines the orientation; search for a good one to paint by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

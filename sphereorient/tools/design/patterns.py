@@ -1,7 +1,5 @@
 """Black and white texture maps to paint on a ball, and their coarseness."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

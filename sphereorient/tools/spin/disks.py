@@ -1,7 +1,5 @@
 """Disks of a ball from photographs without a background picture, grey by the ball's own colour."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The spin of a ball from a few photographs: orientations from each alone, then one uniform spin."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

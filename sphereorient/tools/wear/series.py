@@ -1,7 +1,5 @@
 """Wear of a ball from a series of its texture maps: the same worn places followed from map to map."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
