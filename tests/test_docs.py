@@ -88,6 +88,7 @@ def test_parameters_and_configs_are_those_of_the_code():
     subprocess.run([sys.executable, REPO / "scripts" / "make_parameters.py", "--check"], check=True)
 
 
+@pytest.mark.slow
 def test_the_figure_of_the_conventions_is_drawn_by_its_script(tmp_path):
     out = tmp_path / "conventions.png"
     subprocess.run([sys.executable, REPO / "scripts" / "figure_conventions.py", "--out", out], check=True)

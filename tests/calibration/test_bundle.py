@@ -31,6 +31,7 @@ def triangulated_error_mm(found, true, rng):
     return float((triangulate(*rays)[0] - points).norm(dim=-1).square().mean().sqrt())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["tsai", "brown", "pinhole"])
 def test_planted_cameras_are_found_to_the_digits_without_noise(model, rng):
     rig = planted(rng, model, count=6)
@@ -50,6 +51,7 @@ def test_planted_cameras_are_found_through_noise(walls, rng):
         assert torch.allclose(fitted.rig.T_lab_plate_mm[row], rig.T_lab_plate_mm[row], atol=0.05)
 
 
+@pytest.mark.slow
 def test_outliers_are_named_and_do_no_harm(rng):
     rig = planted(rng)
     seen = views(rig, rng)
@@ -64,6 +66,7 @@ def test_outliers_are_named_and_do_no_harm(rng):
     assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, rng) < 0.03
 
 
+@pytest.mark.slow
 def test_a_camera_that_never_saw_the_surveyed_pose_is_tied_by_the_others(rng):
     rig = planted(rng)
     seen = views(rig, rng)
@@ -72,6 +75,7 @@ def test_a_camera_that_never_saw_the_surveyed_pose_is_tied_by_the_others(rng):
     assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, rng) < 0.05
 
 
+@pytest.mark.slow
 def test_a_pose_that_one_camera_saw_serves_that_camera(rng):
     rig = planted(rng)
     seen = views(rig, rng)
@@ -83,6 +87,7 @@ def test_a_pose_that_one_camera_saw_serves_that_camera(rng):
     assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, rng) < 0.05
 
 
+@pytest.mark.slow
 def test_what_a_port_is_can_be_fitted_and_the_covariance_says_how_well(rng):
     rig = planted(rng, walls=True, count=10, tilt_deg=35.0, shift_mm=25.0)
     seen = views(rig, rng)
@@ -96,6 +101,7 @@ def test_what_a_port_is_can_be_fitted_and_the_covariance_says_how_well(rng):
     assert abs(float(found.port.n_fluid) - 1.36) < 4 * sigma
 
 
+@pytest.mark.slow
 def test_a_parameter_that_nothing_determines_gets_a_huge_sigma(rng):
     rig = planted(rng, walls=True, count=5)
     fitted = adjust(problem(rig, views(rig, rng), ("port_tilt_y",)))  # cam1's normal is along y
@@ -111,6 +117,7 @@ def coverage(count, rng, walls=False):
     return torch.stack(squares)
 
 
+@pytest.mark.slow
 def test_covariances_cover_the_errors_of_some_calibrations(rng):
     squares = coverage(8, rng)
     assert 0.75 < float(squares.mean().sqrt()) < 1.25
@@ -125,6 +132,7 @@ def test_covariances_cover_the_errors_of_200_calibrations(rng):
     assert float(each.max()) < 1.15
 
 
+@pytest.mark.slow
 def test_the_residuals_tell_the_scale_of_the_covariance_not_the_sigmas_given(rng):
     rig = planted(rng, count=4)
     seen = views(rig, rng)
@@ -137,6 +145,7 @@ def test_the_residuals_tell_the_scale_of_the_covariance_not_the_sigmas_given(rng
     assert sigmas[1] == pytest.approx(sigmas[0], rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_start_does_not_matter(rng):
     rig = planted(rng, count=5)
     seen = views(rig, rng)
@@ -146,6 +155,7 @@ def test_the_start_does_not_matter(rng):
     assert abs(found[0] - found[1]) < 0.02 * sigma
 
 
+@pytest.mark.slow
 def test_residuals_are_measured_less_expected(rng):
     rig = planted(rng, count=5)
     seen = views(rig, rng)

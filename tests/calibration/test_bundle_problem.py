@@ -20,6 +20,7 @@ def by_differences(made, change, shifts, step=1e-5):
     return torch.stack(columns, dim=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["tsai", "pinhole", "brown"])
 @pytest.mark.parametrize("walls", [False, True], ids=["air", "port"])
 def test_slopes_are_those_of_central_differences(model, walls, rng):

@@ -96,6 +96,7 @@ def test_dots_cut_by_the_edge_of_the_picture_are_left_out_and_whole_ones_kept(at
     assert rms(miss) < 0.03
 
 
+@pytest.mark.slow
 def test_a_dot_that_touches_the_edge_is_measured_as_well_as_others() -> None:
     # Slides the plate in steps of a twentieth of a pixel; the leftmost column then touches the edge here and there.
     worst = []
@@ -206,6 +207,7 @@ def strong_camera() -> TsaiCamera:
     )
 
 
+@pytest.mark.slow
 def test_the_perspective_bias_is_the_centroid_of_the_disks_picture() -> None:
     scene = Scene(tilt_deg=55, about_deg=30)
     R, T = scene.R_lab_plate, torch.tensor([10.0, -5.0, 90.0], dtype=torch.float64)
@@ -270,6 +272,7 @@ def test_the_bias_is_differentiable_also_for_corners() -> None:
         disk_centre_shift(*args, T, points[:, :2], diameter)
 
 
+@pytest.mark.slow
 def test_coarse_grain_gives_no_faint_dots_beside_the_plates_own() -> None:
     # Enlarged pictures have grain as large as small dots.
     scene = Scene(tilt_deg=20, distance_mm=420)

@@ -106,6 +106,7 @@ def test_poses_are_handed_on_from_camera_to_camera(rng):
     assert missed_px(found, rig, seen) < 20
 
 
+@pytest.mark.slow
 def test_the_pose_of_a_picture_with_too_few_points_is_not_known(rng):
     rig = planted(rng)
     seen = views(rig, rng)

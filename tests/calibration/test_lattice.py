@@ -48,6 +48,7 @@ def assert_told_right(view: PlateView, scene: Scene, least: int) -> None:
     assert np.array_equal(view.diameter_mm, scene.plate.diameters(view.index))
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(
     tilt=st.floats(0, 68),
@@ -88,6 +89,7 @@ def test_x_runs_along_columns_y_along_rows_and_z_towards_the_viewer() -> None:
     assert np.allclose(at[0, 2] - at[0, 0], [0, -2 * pitch_px], atol=0.3)
 
 
+@pytest.mark.slow
 def test_missing_dots_leave_gaps_but_no_errors() -> None:
     hole = (*((i, j) for i in (-1, -2) for j in range(-4, 4)), (4, 1), (2, -3))
     scene = Scene(tilt_deg=45, about_deg=30)
@@ -131,6 +133,7 @@ def test_a_plate_without_its_fiducials_in_view_floats_and_the_true_place_is_amon
     assert_told_right(placed(view, PLATE, true[0]), scene, len(scene.whole(0.15)))
 
 
+@pytest.mark.slow
 def test_fiducials_hidden_on_a_whole_plate_are_where_dots_are_missing_and_replaced_ones_fit_nowhere() -> None:
     scene = Scene(tilt_deg=30)
     view = see_plate(scene.picture(without=PLATE.fiducials), PLATE)
@@ -159,6 +162,7 @@ def test_a_plate_with_more_dots_than_stated_is_refused(columns: int, rows: int) 
     assert "11 x 9" in view.reason or "9 x 11" in view.reason
 
 
+@pytest.mark.slow
 def test_dots_that_stick_out_on_one_side_are_refused_although_their_number_fits() -> None:
     # 11 x 9 stated, seen is a part of a 15 x 9 plate: 11 columns, but reaching to column 7.
     large = replace(PLATE, columns=15)
@@ -245,6 +249,7 @@ def test_a_missing_key_is_named() -> None:
         plate_from_entry("dots")
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize("folder", ["experiment", "tank"])
 def test_pictures_of_a_laboratory_are_told_right_to_the_last_dot(folder: str) -> None:

@@ -125,6 +125,7 @@ def redrawn(folder, name, **how):
     cv2.imwrite(str(folder / name), scene.picture(noise=1.0, **how))
 
 
+@pytest.mark.slow
 def test_a_picture_without_fiducials_is_tied_through_the_other_camera(tmp_path):
     path = write(tmp_path)
     redrawn(tmp_path, "cam2_02.png", without=HIDDEN)
@@ -139,6 +140,7 @@ def test_a_picture_without_fiducials_is_tied_through_the_other_camera(tmp_path):
     assert cube_error_mm(result.cameras, true_cameras()) < 0.01
 
 
+@pytest.mark.slow
 def test_a_floating_picture_of_a_pose_that_nobody_else_saw_is_left_out_with_the_reason(tmp_path):
     path = write(tmp_path)
     redrawn(tmp_path, "cam1_04.png", without=HIDDEN)
@@ -172,6 +174,7 @@ def test_no_fiducials_in_any_picture_of_a_camera_is_refused(tmp_path):
     refused(path, r"cam1: expected pictures of the plate, got none of 6; the first: .*larger dots")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("columns", "rows"), [(7, 7), (31, 9)])
 def test_a_grid_of_another_size_is_refused_or_does_no_harm(source, tmp_path, columns, rows):
     """Smaller than what is seen: refused. Larger: the rest may lie outside the picture, the dots are where they are."""
@@ -199,6 +202,7 @@ def test_pictures_that_are_missing_or_none_are_refused(tmp_path):
     refused(path, r"cam1_01.png: expected a picture, got a file that is no picture or too large")
 
 
+@pytest.mark.slow
 def test_poses_too_alike_are_refused_and_the_loose_parameter_is_named(tmp_path):
     entries = [{"pose": row, "cam1": "cam1_00.png", "cam2": "cam2_00.png"} for row in range(4)]
     path = write(tmp_path, {"pictures": entries})
@@ -216,6 +220,7 @@ def table_of(camera, points, noise_px=0.02, seed=0):
     return "\n".join(["x,y,z,u,v", *rows])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["tsai", "brown", "pinhole"])
 def test_cameras_come_out_of_tables_of_points(tmp_path, model):
     points = 35 * (2 * torch.rand(80, 3, generator=torch.Generator().manual_seed(4)).double() - 1)
@@ -247,12 +252,14 @@ def test_too_few_points_are_refused_with_the_table_s_name(tmp_path):
     refused(write(tmp_path, keys, drawn=False), r"cam1.csv, points")
 
 
+@pytest.mark.slow
 def test_a_wall_that_does_not_stand_before_the_camera_is_refused(tmp_path):
     ports = {name: PORT | {"normal": [0, 0, -1]} for name in ("cam1", "cam2")}
     with pytest.raises(SphereOrientError, match="port"):
         calibrate_cameras(write(tmp_path, {"ports": ports}))
 
 
+@pytest.mark.slow
 def test_a_tie_needs_a_pose_that_somebody_knows(source, result):
     document = load_calibration(source)
     views = see_pictures(document, lambda stage, done, total: None)

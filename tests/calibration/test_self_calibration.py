@@ -54,6 +54,7 @@ def bump(rng):
     return torch.deg2rad(torch.tensor(0.3)).double() * turn, 0.5 * move
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("walls", [False, True], ids=["air", "port"])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_bumped_camera_is_put_right(walls, seed):
@@ -69,6 +70,7 @@ def test_a_bumped_camera_is_put_right(walls, seed):
     assert result.frames == FRAMES
 
 
+@pytest.mark.slow
 def test_the_first_camera_stays_and_the_change_is_as_with_parameters_has_it(rng):
     calibrated = cameras()
     turn, move = bump(rng)
@@ -81,6 +83,7 @@ def test_the_first_camera_stays_and_the_change_is_as_with_parameters_has_it(rng)
     assert float((result.moved["cam2"][:3] - turn).norm()) < 0.2 * float(turn.norm())
 
 
+@pytest.mark.slow
 def test_cameras_that_stand_right_stay(rng):
     calibrated = cameras()
     result = self_calibrate(calibrated, told(calibrated, calibrated, rng))
@@ -88,6 +91,7 @@ def test_cameras_that_stand_right_stay(rng):
     assert result.gap_after_mm <= result.gap_before_mm * 1.01
 
 
+@pytest.mark.slow
 def test_what_the_sphere_does_not_determine_is_named(rng):
     """How far the second camera stands away along its own axis: its lines of sight hardly move."""
     calibrated = cameras()
@@ -100,6 +104,7 @@ def test_what_the_sphere_does_not_determine_is_named(rng):
     assert len(named) < 4
 
 
+@pytest.mark.slow
 def test_covariances_take_the_new_spread(rng):
     calibrated = cameras()
     names = ("f", *MOVED)
@@ -112,6 +117,7 @@ def test_covariances_take_the_new_spread(rng):
         assert sigmas[part] == pytest.approx(sigma)
 
 
+@pytest.mark.slow
 def test_frames_that_one_camera_missed_and_wild_ones_do_no_harm(rng):
     calibrated = cameras()
     truly = calibrated | {"cam2": bumped(calibrated["cam2"], *bump(rng))}

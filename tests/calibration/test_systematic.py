@@ -91,6 +91,7 @@ class Ball:
         return -pose  # R_found = exp(pose) R_true
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("walls", [False, True], ids=["air", "port"])
 def test_covariances_are_those_of_brute_force(walls, rng):
     rig = cameras(walls=walls)

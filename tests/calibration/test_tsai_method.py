@@ -143,6 +143,7 @@ def as_pinhole(camera: TsaiCamera) -> PinholeCamera:
     )
 
 
+@pytest.mark.slow
 def test_with_noise_errors_are_as_large_as_the_covariance_says():
     camera, points = planted(), in_space()
     squares = []

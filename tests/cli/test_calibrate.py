@@ -88,6 +88,7 @@ def track_of(calibrated, truly, contradicts=0):
     return replace(empty, cameras=says)
 
 
+@pytest.mark.slow
 def test_calibrate_writes_cameras_and_a_picture_and_prints_tables(tmp_path, monkeypatch, capsys):
     source = tables(tmp_path)
     before = {path.name for path in tmp_path.iterdir()}
@@ -100,6 +101,7 @@ def test_calibrate_writes_cameras_and_a_picture_and_prints_tables(tmp_path, monk
     assert "sphereorient calibrate" in (tmp_path / "cameras.yaml").read_text().splitlines()[0]
 
 
+@pytest.mark.slow
 def test_quiet_prints_nothing(tmp_path, monkeypatch, capsys):
     code, out, err = run(monkeypatch, capsys, "calibrate", tables(tmp_path), "-o", tmp_path / "c.yaml", "--quiet")
     assert (code, out, err) == (0, "", "")
@@ -116,6 +118,7 @@ def test_what_a_user_can_mend_is_one_line_and_nothing_is_written(tmp_path, monke
     assert [path.name for path in tmp_path.iterdir()] == ["calibration.yaml"]
 
 
+@pytest.mark.slow
 def test_a_fault_while_writing_leaves_the_old_files(tmp_path, monkeypatch, capsys):
     source = tables(tmp_path)
     (tmp_path / "cameras.yaml").write_text("old")
@@ -145,6 +148,7 @@ def test_an_output_that_would_harm_is_refused_before_any_work(tmp_path, monkeypa
     assert source.read_text() == text
 
 
+@pytest.mark.slow
 def test_refine_with_a_track_repairs_bumped_cameras(tmp_path, monkeypatch, capsys):
     calibrated = exact_cameras()
     truly = bumped(calibrated)

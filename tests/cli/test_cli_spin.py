@@ -46,6 +46,7 @@ def options(folder):
     return ("--times", folder / "times.csv", "--texture", folder / "dots.csv", "--out", folder / "spin.json")
 
 
+@pytest.mark.slow
 def test_a_spin_is_measured_and_written(flight, monkeypatch, capsys):
     code, said, err = run(
         monkeypatch, capsys, flight / "pictures", *options(flight), "--dot-radius", 7, "--omega-max", 700

@@ -142,6 +142,7 @@ THETA = (0.01, 2.0, 0.2)  # rad, px, paint: told wrong, so that residuals are le
 STEPS = (1e-5, 1e-2, 1e-4)  # of the differences; the third order they leave out is below 1e-6
 
 
+@pytest.mark.slow
 def test_gradients_to_camera_and_texel_are_those_of_the_whole_chain_run_again(scene):
     _, got = gradients(scene)
     for k, step in enumerate(STEPS):
@@ -163,11 +164,13 @@ def test_the_chain_is_what_it_should_be(scene):
     assert_close(track.marginals.sum(-1), there.double())
 
 
+@pytest.mark.slow
 def test_more_iterations_change_neither_value_nor_gradient(scene):
     for one, other in zip(gradients(scene, 30), gradients(scene, 60), strict=True):
         assert_close(one / other, torch.ones_like(one), 1e-6)
 
 
+@pytest.mark.slow
 def test_an_empty_frame_is_nan_and_spoils_no_gradient(scene):
     theta = f64(THETA).requires_grad_()
     track, picture = chain(scene, theta)

@@ -57,6 +57,7 @@ def check_excerpt(track: Trajectory, median_deg: float, proposer: Path) -> None:
     assert track.provenance["proposer_sha256"] == sha256(proposer)
 
 
+@pytest.mark.slow
 def test_the_paper_tracks_the_excerpt_with_the_network(tmp_path: Path) -> None:
     alone = load_settings(None, ["propose.when=always"])
     experiment = shortened(tmp_path / "copy", 0, 12)
@@ -105,6 +106,7 @@ def test_the_right_orientation_comes_first(network: LearnedProposer, filmed: tup
         assert own.sum() <= 1 + 1e-6
 
 
+@pytest.mark.slow
 def test_a_mirrored_map_is_no_match(
     texture: torch.Tensor, filmed: tuple[torch.Tensor, torch.Tensor], network: LearnedProposer
 ) -> None:
@@ -143,6 +145,7 @@ def test_disks_that_show_nothing_have_no_proposal(network: LearnedProposer) -> N
         network.propose(torch.zeros(1, size, size + 1))
 
 
+@pytest.mark.slow
 def test_settings_choose_who_proposes(texture: torch.Tensor) -> None:
     alone = load_settings(None, ["propose.checkpoint=default", "propose.when=always"])
     assert isinstance(precise_proposer(texture, Settings()), TemplateBank)

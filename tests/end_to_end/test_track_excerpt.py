@@ -102,6 +102,7 @@ def test_the_file_has_every_dataset_with_units_and_its_provenance(tracked):
             assert "units" in file[name].attrs, name
 
 
+@pytest.mark.slow
 def test_the_python_call_gives_the_same_bytes_as_the_command(tmp_path):
     experiment = shortened(tmp_path / "copy", 0, 5)
     assert sphereorient("track", experiment, "--method", "paper", "--out", tmp_path / "track.h5").returncode == 0
@@ -113,6 +114,7 @@ def test_the_python_call_gives_the_same_bytes_as_the_command(tmp_path):
         np.testing.assert_array_equal(again.cameras[name].candidate_orientation, camera.candidate_orientation)
 
 
+@pytest.mark.slow
 def test_one_camera_alone_tracks_the_orientation_and_says_so(tmp_path):
     out, experiment = tmp_path / "one.h5", shortened(tmp_path / "copy", 0, 12)
     run = sphereorient("track", experiment, "--method", "paper", "--out", out, "--cameras", "cam2", "--quiet")
@@ -126,12 +128,14 @@ def test_one_camera_alone_tracks_the_orientation_and_says_so(tmp_path):
     assert np.isnan(track.orientation_cov).all()  # nothing to measure it by
 
 
+@pytest.mark.slow
 def test_a_part_of_the_frames_keeps_the_experiments_clock(tmp_path):
     track = track_movies(shortened(tmp_path / "copy", 10, 18), method="paper")
     assert np.allclose(track.time, np.arange(10, 18) / 600)
     assert score_track(track, EXCERPT / "truth.h5").percentiles_deg()[3] < 5
 
 
+@pytest.mark.slow
 def test_swapped_cameras_do_not_pass_for_a_measurement(tmp_path):
     """A wrong input must not give a confident wrong output: the rays then miss each other by centimetres."""
     experiment = shortened(tmp_path / "copy", 0, 6)
@@ -144,6 +148,7 @@ def test_swapped_cameras_do_not_pass_for_a_measurement(tmp_path):
     assert score_track(track, EXCERPT / "truth.h5").percentiles_mm()[0] > 5
 
 
+@pytest.mark.slow
 def test_a_mirrored_movie_scores_worse_than_the_right_one(copy, tracked):
     """Chirality: the mirror image of a painted sphere is another sphere."""
     for name in ("cam1", "cam2"):
@@ -268,6 +273,7 @@ def test_bad_arguments_are_one_clear_line(arguments, word, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_written_is_refused_before_the_work():
     """As a user runs it: one line, exit code 2, no traceback."""
     run = sphereorient("track", EXCERPT / "experiment.yaml", "--out", "/proc/track.h5", "--quiet")
@@ -304,6 +310,7 @@ def _wait_until_it_works(pid: int) -> None:
     time.sleep(1.0)
 
 
+@pytest.mark.slow
 def test_settings_are_kept_in_the_track(copy):
     _replace(copy / "experiment.yaml", "backgrounds", "frames: [0, 3]\nbackgrounds")
     settings = load_settings(None, ["orient.fine_step_deg=4", "orient.coarse_step_deg=15"])

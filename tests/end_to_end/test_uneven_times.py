@@ -39,6 +39,7 @@ def relative_error(track: Trajectory, omega: np.ndarray) -> float:
     return float(np.sqrt(np.mean(off**2) / np.mean(omega[there] ** 2)))
 
 
+@pytest.mark.slow
 def test_jittered_and_dropped_frames_are_tracked_by_their_times(fast, tmp_path):
     """Steps of 3, 4 or 5 fast frames, and some of 8 and 12: by count omega would be wrong by a quarter and more."""
     steps = np.random.default_rng(2).choice([3, 4, 4, 5, 8, 12], 60)

@@ -96,6 +96,7 @@ def test_the_scatter_of_least_squares_is_the_bound(patches):  # oracle
         assert got == pytest.approx(float(least), rel=0.1)
 
 
+@pytest.mark.slow
 def test_finer_samples_and_wider_steps_do_not_move_the_bound(patches, attitudes, monkeypatch):
     usual, finer = (
         cramer_rao_bound(patches, attitudes[:2], diameter_px=40, sampling=Sampling(supersampling=s)).orientation_rms_rad
@@ -112,6 +113,7 @@ def test_the_bound_is_proportional_to_the_noise(patches, attitudes):
     assert_close(two.covariance, 4 * one.covariance, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_bound_falls_as_the_specified_power_of_the_diameter():
     texture = random_texture("blobs", 3)
     R = so3.random_rotations(6, generator=torch.Generator().manual_seed(6), dtype=torch.float32)
@@ -199,6 +201,7 @@ def test_what_is_no_picture_is_refused(patches):
         cramer_rao_bound(patches, torch.zeros(3), diameter_px=24)
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_the_experiments_map_has_the_specified_bound():  # docs/errata.md, The bound
     texture = load_texture(SHARED / "experiment" / "texture.png")

@@ -217,6 +217,7 @@ def test_what_a_method_refuses_is_an_outcome(tmp_path):
     assert found.lost == 12
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_and_another_run_is_left_alone(tmp_path):
     settings = BenchSettings(degradations=(), frames=12, together=0)
     (scene,) = scenes_of(settings)

@@ -82,6 +82,7 @@ def test_the_figures_are_pictures_with_something_on_them(trained):
         assert picture.std() > 10
 
 
+@pytest.mark.slow
 def test_quiet_says_nothing_and_resume_goes_on(trained, tmp_path):
     out = trained[0]
     (tmp_path / "last.ckpt").write_bytes((out / "last.ckpt").read_bytes())
@@ -130,6 +131,7 @@ def test_resuming_nothing_and_an_impossible_folder_are_one_line(config, tmp_path
     assert "file" in refused("train", config, "--out", tmp_path / "file", *LENGTH)
 
 
+@pytest.mark.slow
 def test_evaluating_gives_recall_of_each_degradation_and_level(checkpoint):
     run = CliRunner().invoke(app, ["evaluate", str(checkpoint), "--pictures", "2", "--json", "--quiet"])
     assert run.exit_code == 0, run.exception

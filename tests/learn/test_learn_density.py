@@ -137,6 +137,7 @@ def test_a_place_without_probability_is_never_right():
     assert int(first_right(tops, tops.R_view_body[:, 2], 10.0)) == 3
 
 
+@pytest.mark.slow
 def test_a_place_between_two_tops_counts_for_the_nearer_one_alone():
     """The oracle: a loop over the grid, for two bumps 25 .. 35 degrees apart on a broad hill."""
     apart = torch.rad2deg(so3.geodesic_distance(GRID[2000].double(), GRID.double()))

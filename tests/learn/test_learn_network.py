@@ -56,6 +56,7 @@ def test_a_spherical_harmonic_decays_as_the_kernel_says(degree):
     assert_close(blurs[:, 4] / blurs[:, 4].norm(), blurs[:, 0] / blurs[:, 0].norm(), atol=2e-3)
 
 
+@pytest.mark.slow
 def test_blurs_are_sums_over_the_sphere():
     """The oracle: even points of the sphere instead of cells with areas, in numpy float64."""
     texture = smooth_map(np.eye(3))

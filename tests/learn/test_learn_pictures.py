@@ -46,6 +46,7 @@ def test_the_same_numbers_give_the_same_lesson_and_others_another(data):
         assert not torch.equal(data.training_batch(epoch, step).R_view_body, first.R_view_body)
 
 
+@pytest.mark.slow
 def test_each_epoch_has_pictures_of_its_own():
     data = TrainingData(tiny())
     for epoch in (0, 2):
@@ -55,6 +56,7 @@ def test_each_epoch_has_pictures_of_its_own():
         assert torch.equal(lessons[3].disks, data.training_batch(epoch, 3).disks)
 
 
+@pytest.mark.slow
 def test_another_data_module_of_the_same_settings_gives_the_same_pictures(data):
     other = TrainingData(tiny())
     assert torch.equal(other.training_batch(1, 2).disks, data.training_batch(1, 2).disks)
@@ -99,6 +101,7 @@ def test_there_are_as_many_validation_pictures_as_the_settings_say(data):
     assert sum(lesson.disks.shape[0] * lesson.disks.shape[1] for lesson in data.validation) == SETTINGS.validation
 
 
+@pytest.mark.slow
 def test_validation_pictures_are_not_those_of_the_training(data):
     lessons = data.validation
     assert not any(

@@ -46,6 +46,7 @@ def short(tmp_path_factory) -> tuple[Trained, Path]:
     return train_proposer(tiny(**SHORT), folder), folder
 
 
+@pytest.mark.slow
 def test_training_finds_what_the_untrained_network_does_not(trained):
     rows = trained[0].rows
     assert rows[0]["step"] == 0
@@ -91,6 +92,7 @@ def test_the_same_seed_gives_the_same_weights_and_another_does_not(short, tmp_pa
 SLOW = pytest.mark.slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", [5, pytest.param(8, marks=SLOW), pytest.param(9, marks=SLOW)])
 def test_what_was_cut_off_goes_on_to_the_same_weights(short, tmp_path, cut):
     """Cut off in the second epoch, at its very end, in the third."""
@@ -123,6 +125,7 @@ def test_a_training_that_is_finished_can_be_resumed_and_stays(tmp_path):
     assert same(train_proposer(settings, tmp_path, resume=True).checkpoint, first.checkpoint)
 
 
+@pytest.mark.slow
 def test_it_goes_on_with_the_same_settings_only_but_may_be_longer(short, tmp_path):
     (tmp_path / "last.ckpt").write_bytes((short[1] / "last.ckpt").read_bytes())
     with pytest.raises(CheckpointError, match="same settings"):
@@ -157,6 +160,7 @@ def test_what_is_no_file_to_go_on_from_is_refused_and_nothing_executed(short, tm
     assert not mark.exists()
 
 
+@pytest.mark.slow
 def test_a_checkpoint_to_begin_with_gives_its_weights(short, tmp_path):
     """A learning rate of nearly nothing: the weights stay, whatever the seed."""
     start = str(short[1] / "proposer.ckpt")
@@ -174,6 +178,7 @@ def test_a_checkpoint_of_another_network_cannot_be_begun_with(short, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_fine_tuning_on_one_map_binds_the_checkpoint_to_it(short, tmp_path):
     path = tmp_path / "texture.png"
     cv2.imwrite(str(path), (255 * random_texture("dots", 4, 128)).round().numpy().astype(np.uint8))
@@ -183,6 +188,7 @@ def test_fine_tuning_on_one_map_binds_the_checkpoint_to_it(short, tmp_path):
     assert tuned.texture_sha256 == texture_sha256(load_texture(path))
 
 
+@pytest.mark.slow
 def test_training_ends_when_its_time_is_over(tmp_path):
     """Even before an epoch is done, with a checkpoint."""
     result = train_proposer(tiny(epochs=100, steps=1000, minutes=0.02), tmp_path)
@@ -191,12 +197,14 @@ def test_training_ends_when_its_time_is_over(tmp_path):
     assert (tmp_path / "proposer.ckpt").exists()
 
 
+@pytest.mark.slow
 def test_training_ends_when_validations_get_no_better(tmp_path):
     """Weights that hardly move: the second validation is not better by more than nothing, nor the third."""
     result = train_proposer(tiny(epochs=30, steps=1, learning_rate=1e-15, patience=2), tmp_path)
     assert result.rows[-1]["epoch"] <= 6
 
 
+@pytest.mark.slow
 def test_weights_that_got_worse_are_not_kept(trained, tmp_path):
     """A learning rate that throws away what was learnt: the best are those of the beginning."""
     start = trained[1] / "proposer.ckpt"
@@ -206,6 +214,7 @@ def test_weights_that_got_worse_are_not_kept(trained, tmp_path):
     assert same(result.checkpoint, load_checkpoint(start))
 
 
+@pytest.mark.slow
 def test_a_training_that_explodes_is_refused_in_one_line(tmp_path):
     start = {**state_of(untrained()), "gain": torch.tensor(300.0)}  # exp of it is infinite
     save_checkpoint(tmp_path / "start.ckpt", Checkpoint(settings=tiny(), state=start))
@@ -227,6 +236,7 @@ def test_the_learning_rate_rises_and_falls(monkeypatch):
     assert (np.diff(rates[110:]) < 0).all()
 
 
+@pytest.mark.slow
 def test_a_temperature_that_was_planted_is_found(rng):
     """Logits of half the size want half the temperature, and with it probabilities are those of the outcomes."""
     grid = untrained().grid
@@ -253,6 +263,7 @@ def test_judging_counts_right_and_wrong(rng):
     assert found.ece == pytest.approx(0.25, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_network_of_the_checkpoint_is_as_good_as_the_log_says(trained):
     """Loaded anew, on the same validation pictures."""
     from sphereorient.learn.metrics import predict_all

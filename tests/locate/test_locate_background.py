@@ -274,6 +274,7 @@ def staying(paint: Paint, blur_px: float, count: int = 24) -> np.ndarray:
     return np.stack([filmed(sight, seed=k, blur_px=blur_px) for k, sight in enumerate(sights)])
 
 
+@pytest.mark.slow
 def test_a_blurred_ball_that_never_leaves_its_place_is_not_taken_for_noise_of_the_scene():
     frames = staying(blobs, blur_px=5.0)
     empty = np.full(SHAPE, BACK, np.float32)

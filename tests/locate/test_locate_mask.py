@@ -76,6 +76,7 @@ def test_hidden_pixels_are_not_inside_a_disk():
     assert 0.2 < float(pixels.inside.float().mean()) < 0.95
 
 
+@pytest.mark.slow
 def test_a_ball_that_turns_in_its_place_is_found_past_a_mask():
     def turned(k: int) -> np.ndarray:
         return held(filmed(plant(lambda x, y: blobs(x + 0.3 * k, y - 0.2 * k), *MIDDLE), k))

@@ -56,6 +56,7 @@ def test_the_first_attitude_stays():
     torch.testing.assert_close(closed[0], R[0])
 
 
+@pytest.mark.slow
 def test_pictures_close_the_loop_that_a_planted_drift_left_open():
     R = turning(33, 12.0)  # once around, and a little more
     disks = disks_of_pictures(pictures(R))
@@ -69,6 +70,7 @@ def test_pictures_close_the_loop_that_a_planted_drift_left_open():
     assert closed.closure.drift_after_rad < 0.15 * closed.closure.drift_before_rad
 
 
+@pytest.mark.slow
 def test_a_movie_of_two_cameras_is_followed_without_a_map():
     R = turning(12, 7.0)
     chain = find_chain(disks_of_pictures(pictures(R, 2)), MapSettings())
@@ -97,6 +99,7 @@ def test_one_frame_is_refused():
     assert "2 frames" in refused(pictures(turning(1, 0.0)))
 
 
+@pytest.mark.slow
 def test_two_different_balls_are_refused():
     one, other = turning(16, 8.0), turning(16, 8.0, (1.0, -0.2, 0.4))
     both = torch.cat([pictures(one, 2)[:, :1], pictures(other, 2, seed=9)[:, 1:]], dim=1)

@@ -55,6 +55,7 @@ def test_a_planted_rotation_is_found(paint):
     assert math.degrees(found.rms_rad) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("brightness", [(1.0, 0.0), (0.6, 0.3)])
 def test_a_planted_shift_is_found_where_it_is_with_its_direction(paint, brightness):
     gain, offset = brightness
@@ -72,6 +73,7 @@ def test_a_planted_shift_is_found_where_it_is_with_its_direction(paint, brightne
     assert math.degrees(found.rms_rad) == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_worn_place_does_not_turn_the_map(paint):
     worn = turned_map(paint, TURN.mT)
     worn = torch.where(map_directions(HEIGHT)[..., 0] > 0.9, 1.0, worn)
@@ -80,6 +82,7 @@ def test_a_worn_place_does_not_turn_the_map(paint):
     assert math.degrees(float(found.length_rad.median())) < 0.05
 
 
+@pytest.mark.slow
 def test_the_shift_of_east_and_north_has_the_sign_of_the_map(paint):
     """Rolled by two columns to the right, all paint lies 360 / 128 degrees further east (at the equator)."""
     found = compare_maps(paint.roll(1, 1), paint, turned=False)
@@ -91,6 +94,7 @@ def test_the_shift_of_east_and_north_has_the_sign_of_the_map(paint):
     assert float(moved[near, 1].abs().max()) < math.radians(0.15)
 
 
+@pytest.mark.slow
 def test_what_either_map_does_not_know_is_not_told(paint):
     half = paint.clone()
     half[:, :HEIGHT] = torch.nan  # the western half
@@ -104,6 +108,7 @@ def test_what_either_map_does_not_know_is_not_told(paint):
     assert not known[longitude < 0].any()
 
 
+@pytest.mark.slow
 def test_maps_of_two_balls_and_mirrored_ones_are_refused(paint):
     other = random_texture("dots", 4, HEIGHT)
     for wrong in (other, paint.flip(1)):
@@ -122,6 +127,7 @@ def test_levels_are_fitted_past_a_new_spot(paint):
     assert offset == pytest.approx(-0.4, abs=0.05)
 
 
+@pytest.mark.slow
 def test_worn_paint_is_shown_and_moved_paint_is_not(paint):
     assert float(texture_change(paint, paint).abs().max()) < 1e-6
     moved = warped(paint, 0.4)

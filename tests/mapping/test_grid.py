@@ -48,6 +48,7 @@ def test_the_slope_of_a_look_up_is_its_derivative(rng):
     torch.testing.assert_close(value[0], sample_spline(texture, direction.detach()))
 
 
+@pytest.mark.slow
 def test_a_table_of_a_map_is_its_spline(rng):
     texture = random_texture("blobs", 1, 32)
     table = map_table(texture, 0.05)
@@ -131,6 +132,7 @@ def test_a_joint_step_is_that_of_a_brute_force_least_squares(rng, fixed, monkeyp
     torch.testing.assert_close(step.reshape(-1), solution[: 6 * instants], atol=2e-3, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_sharpening_undoes_a_blur():
     height, blur_rad = 48, 0.08
     paint = random_texture("blobs", 5, height).double()

@@ -128,6 +128,7 @@ def test_a_movie_of_one_frame_is_refused(copy, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "map.png").exists()
 
 
+@pytest.mark.slow
 def test_a_ball_that_does_not_turn_is_refused(copy, tmp_path, monkeypatch, capsys):
     rng = np.random.default_rng(0)
     for name in ("cam1", "cam2"):

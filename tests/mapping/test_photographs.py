@@ -83,6 +83,7 @@ def test_two_cameras_see_more_than_one():
     assert error_deg(chain.R_lab_body, R).max() < 5
 
 
+@pytest.mark.slow
 def test_pictures_of_other_paint_are_left_out():
     R = near_attitudes(7, 6, 25)
     whole = torch.cat([pictures(R[:5]), pictures(R[5:], seed=11), pictures(random_attitudes(1, 7), seed=12)])
@@ -91,6 +92,7 @@ def test_pictures_of_other_paint_are_left_out():
     assert error_deg(chain.R_lab_body, R[:5]).max() < 5
 
 
+@pytest.mark.slow
 def test_a_wrong_pair_does_not_join_two_sets():
     """The surest pair between the two halves is put wrong: all their other pairs contradict it."""
     R = near_attitudes(8, 8, 30)
@@ -113,6 +115,7 @@ def test_a_wrong_pair_does_not_join_two_sets():
     assert label[0] != label[4]
 
 
+@pytest.mark.slow
 def test_other_paint_is_no_evidence_and_the_same_paint_is():
     R = near_attitudes(6, 9, 20)
     whole = torch.cat([pictures(R[:3]), pictures(R[3:], seed=21)])
@@ -147,17 +150,20 @@ def test_too_few_photographs_are_refused():
     assert "3 with the ball at least, got 2" in refused(pictures(random_attitudes(2, 1)))
 
 
+@pytest.mark.slow
 def test_photographs_that_share_no_paint_are_refused():
     whole = torch.cat([pictures(random_attitudes(1, k), seed=30 + k) for k in range(5)])
     assert "3 that share a patch, got none among 5" in refused(whole)
 
 
+@pytest.mark.slow
 def test_photographs_of_two_balls_are_refused():
     R = near_attitudes(10, 13, 25)
     line = refused(torch.cat([pictures(R[:5]), pictures(R[5:], seed=31)]))
     assert "one ball, got 5 pictures and 5 others" in line
 
 
+@pytest.mark.slow
 def test_photographs_of_a_ball_that_does_not_turn_are_refused():
     assert "a ball that turns" in refused(pictures(turning(4, 0.0)))
 

@@ -37,6 +37,7 @@ def test_the_excerpt_passes_and_its_figure_lies_here(tmp_path):
     assert cv2.imread(str(tmp_path / "experiment.check.png")) is not None
 
 
+@pytest.mark.slow
 def test_a_fault_ends_with_1_and_says_what_to_do(clean, tmp_path):
     shifted = replace(clean, pictures={"cam1": clean.pictures["cam1"][3:], "cam2": clean.pictures["cam2"][:-3]})
     path = write(shifted, tmp_path / "experiment")
@@ -48,6 +49,7 @@ def test_a_fault_ends_with_1_and_says_what_to_do(clean, tmp_path):
     assert (tmp_path / "seen.png").is_file()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_read_ends_with_2_and_one_line(clean, tmp_path):
     path = write(clean, tmp_path / "experiment")
     (tmp_path / "experiment" / "cam1.npy").write_bytes(b"no movie")
@@ -64,6 +66,7 @@ def test_a_figure_that_cannot_be_written_is_refused_before_the_work(clean, tmp_p
     assert "nowhere" in run.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["one camera", "no ball", "painted"])
 def test_the_figure_is_drawn_whatever_is_missing(clean, tmp_path, case):
     keys = {}

@@ -23,6 +23,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
     return clean_example(tmp_path_factory)
 
 
+@pytest.mark.slow
 def test_without_pictures_of_the_empty_scene_it_is_learnt(clean, tmp_path):
     result = checked(clean, tmp_path, backgrounds=None)
     assert "learnt" in of(result, "background cam1").measured
@@ -30,6 +31,7 @@ def test_without_pictures_of_the_empty_scene_it_is_learnt(clean, tmp_path):
     assert of(result, "lines of sight").severity is OK
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.8, 3.0])
 def test_a_saturated_movie_is_told(clean, tmp_path, gain):
     result = checked(clean.spoilt(lambda movie: np.clip(15 + (movie - 15.0) * gain, 0, 255)), tmp_path)
@@ -45,16 +47,19 @@ def test_a_movie_wholly_white_is_a_fault_and_no_crash(clean, tmp_path):
     assert "saturated" in of(result, "pictures cam1").measured
 
 
+@pytest.mark.slow
 def test_a_dim_movie_is_told(clean, tmp_path):
     dim = clean.spoilt(lambda movie: np.rint(15 + (movie - 15.0) * 0.1))
     assert of(checked(dim, tmp_path), "exposure cam1").severity is WARNING
 
 
+@pytest.mark.slow
 def test_a_movie_out_of_focus_is_told(clean, tmp_path):
     soft = clean.spoilt(lambda movie: np.stack([cv2.GaussianBlur(one, (0, 0), 2.0) for one in movie]))
     assert of(checked(soft, tmp_path), "sharpness cam1").severity is WARNING
 
 
+@pytest.mark.slow
 def test_black_and_repeated_pictures_are_counted(clean, tmp_path):
     def spoil(movie: np.ndarray) -> np.ndarray:
         movie = movie.copy()
@@ -75,6 +80,7 @@ def test_one_camera_is_checked_alone(clean, tmp_path):
     assert result.scan is None
 
 
+@pytest.mark.slow
 def test_a_ball_of_unknown_size_is_measured_and_the_setting_named(clean, tmp_path):
     one = replace(clean, pictures={"cam1": clean.pictures["cam1"]})
     path = write(one, tmp_path, backgrounds={"cam1": "empty_cam1.png"}, sphere={"diameter": None})
@@ -96,12 +102,14 @@ def test_a_fixed_ball_is_better_off_with_pictures_without_it(clean, tmp_path):
     assert of(without, "ball cam1").severity is OK
 
 
+@pytest.mark.slow
 def test_movies_of_unequal_length_are_told(clean, tmp_path):
     result = checked(clean.spoilt(lambda movie: movie[:50], ("cam2",)), tmp_path)
     assert of(result, "frames").severity is WARNING
     assert of(result, "lines of sight").severity is OK
 
 
+@pytest.mark.slow
 def test_files_outside_the_folder_are_told(clean, tmp_path):
     path = write(clean, tmp_path / "inside", cameras="../cameras.yaml")
     (tmp_path / "cameras.yaml").write_text((tmp_path / "inside" / "cameras.yaml").read_text())

@@ -43,12 +43,14 @@ def test_a_movie_that_began_two_frames_early_is_found_and_the_start_that_mends_i
     assert of(mended, "movies in step").severity is OK
 
 
+@pytest.mark.slow
 def test_a_wrong_start_is_put_right(clean, tmp_path):
     found = of(checked(clean, tmp_path, start={"cam1": 1, "cam2": 4}), "movies in step")
     assert found.severity is FAULT
     assert "{cam1: 1, cam2: 1}" in found.advice
 
 
+@pytest.mark.slow
 def test_a_ball_at_rest_cannot_tell_the_step(clean, tmp_path):
     def rest(movie: np.ndarray) -> np.ndarray:
         return movie[:1] + np.arange(len(movie))[:, None, None] % 2  # or the pictures would be repeated ones
@@ -86,6 +88,7 @@ def test_swapped_movies_are_named(clean, tmp_path):
     assert "swap cam1 and cam2" in of(result, "one orientation").advice
 
 
+@pytest.mark.slow
 def test_a_mirrored_movie_is_named(clean, tmp_path):
     result = checked(clean.spoilt(lambda movie: movie[:, ::-1], ("cam1",)), tmp_path, sphere=PAINTED)
     found = of(result, "map in cam1")
@@ -94,6 +97,7 @@ def test_a_mirrored_movie_is_named(clean, tmp_path):
     assert of(result, "map in cam2").severity is OK
 
 
+@pytest.mark.slow
 def test_a_movie_mirrored_left_to_right_is_told_by_the_lines_of_sight(clean, tmp_path):
     result = checked(clean.spoilt(lambda movie: movie[:, :, ::-1], ("cam1",)), tmp_path)
     found = of(result, "lines of sight")
@@ -118,6 +122,7 @@ def test_a_diameter_that_is_altogether_wrong_still_shows_the_right_one(clean, tm
     assert named == pytest.approx(18.0, rel=0.015)
 
 
+@pytest.mark.slow
 def test_one_wrong_focal_length_is_laid_to_its_camera(clean, tmp_path):
     path = write(clean, tmp_path)
     document = yaml.safe_load((tmp_path / "cameras.yaml").read_text())

@@ -137,6 +137,7 @@ def test_a_map_of_one_colour_is_refused(clean, tmp_path):
         checked(replace(clean, texture=np.full_like(clean.texture, 200)), tmp_path, sphere=PAINTED)
 
 
+@pytest.mark.slow
 def test_of_a_map_of_nearly_one_colour_nothing_else_is_said(clean, tmp_path):
     faint = replace(clean, texture=(128 + clean.texture // 128).astype(np.uint8))
     result = checked(faint, tmp_path, sphere=PAINTED)
@@ -144,6 +145,7 @@ def test_of_a_map_of_nearly_one_colour_nothing_else_is_said(clean, tmp_path):
     assert not [one for one in result.findings if one.title.startswith("map in")]
 
 
+@pytest.mark.slow
 def test_a_map_in_a_mirror_does_not_fit(clean, tmp_path):
     other = replace(clean, texture=np.ascontiguousarray(clean.texture[:, ::-1]))
     found = of(checked(other, tmp_path, sphere=PAINTED), "map in cam1")
@@ -151,6 +153,7 @@ def test_a_map_in_a_mirror_does_not_fit(clean, tmp_path):
     assert "mirror the map" in found.advice
 
 
+@pytest.mark.slow
 def test_a_map_that_is_still_to_be_learnt_is_a_warning_and_the_only_one(clean, tmp_path):
     result = checked(clean, tmp_path)
     assert [one.title for one in result.findings if one.severity is not OK] == ["paint"]

@@ -237,6 +237,7 @@ def read(path):
         return facts, [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
 
 
+@pytest.mark.slow
 def test_the_movie_is_h264_that_players_show(tmp_path):
     out = tmp_path / "overlay.mp4"
     steps = []
@@ -256,6 +257,7 @@ def test_the_movie_is_h264_that_players_show(tmp_path):
     assert not np.array_equal(pictures[0], pictures[1])
 
 
+@pytest.mark.slow
 def test_a_part_of_the_track_shows_its_own_frames(tmp_path):
     """The clock does not restart: frame 12 of the experiment is row 0 of a track of frames 12 to 29."""
     with ExitStack() as opened:
@@ -337,6 +339,7 @@ def test_without_a_map_outline_and_axes_are_shown(tmp_path):
     assert page.views[0].why_unlit == "no map of the paint"
 
 
+@pytest.mark.slow
 def test_the_command_writes_movie_and_sheet(tmp_path, monkeypatch, capsys):
     true_track().save(tmp_path / "track.h5")
     out, sheet = tmp_path / "o.mp4", tmp_path / "worst.png"

@@ -88,6 +88,7 @@ def entities(path) -> str:
     return run.stdout
 
 
+@pytest.mark.slow
 def test_a_recording_holds_cameras_pictures_sphere_and_series(tmp_path):
     pytest.importorskip("rerun")
     out, steps = tmp_path / "v.rrd", []

@@ -91,6 +91,7 @@ def test_a_missing_parent_folder_is_said_before_any_work(place, report, tmp_path
     assert "an existing folder" in said
 
 
+@pytest.mark.slow
 def test_one_segment_has_a_page_and_a_line_that_says_what_is_missing(place, report, tmp_path):
     code, out, said = report(place / "one.h5", "--out", tmp_path / "page", "--quiet")
     assert code == 0
@@ -102,6 +103,7 @@ def test_one_segment_has_a_page_and_a_line_that_says_what_is_missing(place, repo
     assert "figure-densities" not in page
 
 
+@pytest.mark.slow
 def test_many_tracks_make_one_page_that_needs_nothing_beside_it(place, report, tmp_path):
     out = tmp_path / "page"
     code, told, _ = report(place / "a/track.h5", place / "b/track.h5", "--out", out, *QUICK)

@@ -31,12 +31,14 @@ def body():
     return exact_track(draw_ensemble(spec, 12))
 
 
+@pytest.mark.slow
 def test_a_flow_with_axes_is_told_from_a_body_with_axes(body):
     flow = exact_track(draw_ensemble(EnsembleSpec(segments=250, mean_frames=90.0, omega_rms=(7.0, 12.0, 8.0)), 12))
     assert "prefers directions of the lab and none of the body" in said(flow)["Isotropy of omega"].words
     assert "prefers directions of the body and none of the lab" in said(body)["Isotropy of omega"].words
 
 
+@pytest.mark.slow
 def test_rows_that_belong_to_no_frame_are_told(lab):
     good = said(lab)
     assert good["Frame of omega_lab"].grade == Grade.GOOD
@@ -48,6 +50,7 @@ def test_rows_that_belong_to_no_frame_are_told(lab):
     assert "written in lab components" in wrong["Frame of omega_body"].words
 
 
+@pytest.mark.slow
 def test_tails_are_named_by_their_kind(lab):
     found = said(lab)
     assert "heavier tails than a Gaussian" in found["Tails of alpha_lab"].words
@@ -55,6 +58,7 @@ def test_tails_are_named_by_their_kind(lab):
     assert "not distinguishable from a Gaussian" in found["Tails of velocity"].words
 
 
+@pytest.mark.slow
 def test_attitudes_that_prefer_a_direction_are_told(lab):
     assert said(lab)["Attitudes"].grade == Grade.NEUTRAL
     still = np.tile(np.eye(3), (len(lab), 1, 1))
@@ -64,6 +68,7 @@ def test_attitudes_that_prefer_a_direction_are_told(lab):
     assert found.words.startswith("not all attitudes are equally likely")
 
 
+@pytest.mark.slow
 def test_noise_and_lost_frames_and_few_segments_are_marked(lab):
     rough = filtered_track(draw_ensemble(EnsembleSpec(segments=15, mean_frames=90.0), 5), 2.0, 0.05, 5)
     found = said(replace(rough, valid=np.arange(len(rough)) % 2 == 0))
@@ -75,6 +80,7 @@ def test_noise_and_lost_frames_and_few_segments_are_marked(lab):
     assert said(lab)["Noise"].grade == Grade.GOOD
 
 
+@pytest.mark.slow
 def test_remarks_of_the_run_are_repeated_once(lab):
     part = lab.at(np.arange(5000))
     marked = replace(part, provenance={"remarks": ["cam2 is a frame late"]})

@@ -234,6 +234,7 @@ def test_a_track_without_trouble_is_shown_evenly():
     assert max(np.diff(rows)) <= 101
 
 
+@pytest.mark.slow
 def test_the_pictures_show_the_ball_within_its_outline():
     track, told = lost_excerpt(), []
     shown = gallery(track, excerpt(), count=6, progress=lambda done, total: told.append((done, total)))
@@ -257,6 +258,7 @@ def test_the_pictures_show_the_ball_within_its_outline():
             assert tile[radius < 0.85].std() > 20  # painted
 
 
+@pytest.mark.slow
 def test_the_page_holds_the_pictures_and_why_they_are_there():
     shown = gallery(lost_excerpt(), excerpt(), count=15)
     page = strip_html("excerpt", lost_excerpt(), shown)

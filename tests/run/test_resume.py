@@ -72,6 +72,7 @@ def test_a_run_goes_on_with_what_is_there(whole, tmp_path, request_of):
     assert not request.parts.exists()
 
 
+@pytest.mark.slow
 def test_without_resume_it_starts_over(whole, tmp_path, request_of):
     request = request_of(tmp_path)
     halfway(whole, request)
@@ -126,6 +127,7 @@ def test_two_runs_do_not_write_one_track(whole, tmp_path, request_of):
     assert list(parts.folder.glob("poses-*"))
 
 
+@pytest.mark.slow
 def test_what_was_learnt_measures_the_same_again(whole, tmp_path, request_of):
     again = request_of(tmp_path, learnt=whole / "learnt.h5")
     tracked(again)

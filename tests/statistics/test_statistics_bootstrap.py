@@ -38,6 +38,7 @@ def test_errors_come_from_segments_not_from_samples():
     assert found.error[0, 0] == pytest.approx(1 / np.sqrt(300), rel=0.15)
 
 
+@pytest.mark.slow
 def test_for_skewed_samples_it_holds_the_truth_more_often_than_percentiles_do():
     truth, held = np.exp(0.5), {"studentized": 0, "percentiles": 0}
     for seed in range(150):

@@ -71,6 +71,7 @@ def test_the_fit_agrees_with_a_search_on_the_exact_likelihood():
     assert float(fit.a.value) == pytest.approx(exact.x, abs=0.002)
 
 
+@pytest.mark.slow
 def test_its_intervals_hold_the_planted_width_as_often_as_they_say():
     held = 0
     for seed in range(100):

@@ -36,6 +36,7 @@ def test_equal_components_are_isotropic_in_both():
     assert verdict(EnsembleSpec(segments=200, mean_frames=120, omega_rms=(8.0, 8.0, 8.0))) == "neither"
 
 
+@pytest.mark.slow
 def test_right_size_with_correlated_unequal_segments():
     rng = np.random.default_rng(2)
     wrong = 0
@@ -97,11 +98,13 @@ def test_the_five_dimensional_matrices_are_a_representation():
     np.testing.assert_allclose(np.trace(both, axis1=1, axis2=2), np.sin(2.5 * angle) / np.sin(angle / 2), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_statistic_of_independent_attitudes_has_the_mean_of_chi_squared():
     values = [uniformity(Rotation.random(300, seed).as_matrix()).statistic for seed in range(200)]
     assert np.mean(values) == pytest.approx(34, abs=3 * np.sqrt(68 / 200))
 
 
+@pytest.mark.slow
 def test_size_on_independent_attitudes():
     share = rejected(lambda rng: (Rotation.random(100, rng).as_matrix(),), 600)
     assert 0.03 <= share <= 0.07
@@ -126,6 +129,7 @@ def test_size_on_tracks_with_the_allowance_for_correlation():
     assert 0.03 <= share <= 0.07
 
 
+@pytest.mark.slow
 def test_without_the_allowance_tracks_would_be_rejected_nearly_always():
     assert rejected(lambda rng: walks(rng)[:1], 20) > 0.9
 
@@ -150,11 +154,13 @@ def axial(rng: np.random.Generator) -> tuple[np.ndarray]:
     return (R[rng.uniform(size=1500) < (0.5 + 0.5 * R[:, 2, 2] ** 2)],)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [biased, axial])
 def test_a_slight_bias_is_found(draw):
     assert rejected(draw, 100) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["lab", "body"])
 def test_uniform_synthetic_tracks_pass_mostly(frame):
     spec = EnsembleSpec(segments=80, mean_frames=60, frame=frame)

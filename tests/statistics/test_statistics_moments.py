@@ -55,6 +55,7 @@ def test_the_same_seed_gives_the_same_intervals_and_another_one_others():
     assert (first != other).any()
 
 
+@pytest.mark.slow
 def test_intervals_of_a_skewed_mean_hold_it_as_often_as_they_say():
     rng = np.random.default_rng(4)
     held = 0
@@ -119,6 +120,7 @@ def test_noise_that_a_smoother_let_through_does_not_flatten_heavy_tails():
     np.testing.assert_allclose(found.corrected_flatness.value[:3], 6.0, rtol=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "warned"), [(0.08, False), (0.13, True)])
 def test_a_warning_comes_above_a_tenth_of_the_variance(share, warned):
     _, measured, sigma = noisy(share)

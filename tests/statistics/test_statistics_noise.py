@@ -37,6 +37,7 @@ def test_many_lags_tell_the_motions_variance_from_the_noise(true, track, quantit
     assert (found.naive[0] > 4 * found.variance.value).all()  # over one frame it is mostly noise
 
 
+@pytest.mark.slow
 def test_two_degrees_of_noise_drown_alpha_but_not_its_estimate(true):
     found = multi_lag(filtered_track(true, 2.0, NOISE_MM, 5), "alpha_lab", settings=FEW)
     np.testing.assert_allclose(np.sqrt(found.noise_variance.value), np.radians(2.0), rtol=0.04)

@@ -37,6 +37,7 @@ def test_everything_is_there_and_belongs_to_the_same_samples(whole):
     assert {name: row.frame for name, row in more.rows.items()} == {"omega_lab": "lab", "omega_body": "body"}
 
 
+@pytest.mark.slow
 def test_the_velocitys_integral_time_is_measured_and_chooses_the_segments(planted, whole):
     _, tracked = planted
     by_all = correlation(ensemble_of(tracked), "velocity", settings=FEW).integral_time_s.value[3]
@@ -47,12 +48,14 @@ def test_the_velocitys_integral_time_is_measured_and_chooses_the_segments(plante
     assert longer.ensemble.span_s.min() >= 1.5 * longer.integral_time_s
 
 
+@pytest.mark.slow
 def test_an_integral_time_that_is_given_is_not_measured(planted):
     found = summarise(planted[1], FEW.model_copy(update={"integral_time_s": 0.3}))
     assert found.integral_time_s == 0.3
     assert found.ensemble.span_s.min() >= 0.075
 
 
+@pytest.mark.slow
 def test_the_surroundings_make_the_dimensionless_numbers(whole):
     numbers = {one.formula: one.value for one in whole.comparisons}
     v, omega = (np.sqrt(np.square(whole.table[q].corrected_rms.value[:3]).mean()) for q in ("velocity", "omega_lab"))
@@ -71,6 +74,7 @@ def test_one_segment_has_numbers_and_no_intervals():
     assert np.isnan(found.integral_time_s)
 
 
+@pytest.mark.slow
 def test_a_long_record_cut_into_pieces_has_intervals_and_no_durations():
     found = summarise(track([900]), FEW.model_copy(update={"max_duration_s": 90 * STEP_S, "integral_time_s": 0.01}))
     assert found.ensemble.segments == 10
@@ -78,6 +82,7 @@ def test_a_long_record_cut_into_pieces_has_intervals_and_no_durations():
     assert np.isfinite(found.table["omega_lab"].rms.low).all()
 
 
+@pytest.mark.slow
 def test_noise_is_warned_of_by_name():
     noisy = track([80, 80])
     sigma = noisy.alpha_body_sigma.copy()
@@ -86,6 +91,7 @@ def test_noise_is_warned_of_by_name():
     assert [(one.quantity, one.component) for one in found.warnings] == [("alpha_body", "y")]
 
 
+@pytest.mark.slow
 def test_the_progress_goes_up_to_its_end(planted):
     steps = []
     summarise(planted[1], FEW, progress=lambda done, total: steps.append((done, total)))

@@ -116,6 +116,7 @@ def test_what_is_no_picture_is_refused():
         Disk(centre_px=torch.zeros(3), radius_px=torch.tensor(3.0))
 
 
+@pytest.mark.slow
 def test_the_page_is_what_the_table_says():
     run = [sys.executable, REPO / "scripts" / "figure_degradations.py", "--check"]
     subprocess.run(run, check=True)

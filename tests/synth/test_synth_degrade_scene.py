@@ -92,6 +92,7 @@ def test_without_degradations_the_files_are_those_of_synth(plain, tmp_path):
         assert np.array_equal(frames_of(path)[name], frames)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [name for name, row in DEGRADATIONS.items() if row.where in ("picture", "frame", "map", "movie")]
 )
@@ -104,6 +105,7 @@ def test_what_spoils_pictures_spoils_the_movies_and_nothing_that_is_told(name, p
         assert np.abs(frames_of(path)[camera] - frames).mean() > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, row in DEGRADATIONS.items() if row.where == "reported"])
 def test_what_is_told_wrong_changes_neither_truth_nor_movies(name, plain, tmp_path):
     path = write_degraded(tmp_path, SETTINGS, {name: 4})
@@ -115,6 +117,7 @@ def test_what_is_told_wrong_changes_neither_truth_nor_movies(name, plain, tmp_pa
     assert changed == [{"radius_error": "experiment.yaml", "texture_error": "texture.png"}.get(name, "cameras.yaml")]
 
 
+@pytest.mark.slow
 def test_several_at_once_are_the_same_for_the_same_seed_and_others_for_another(tmp_path):
     applied = {"dropped_frames": 4, "bubbles": 2, "spin": 3, "texture_error": 2, "dirt": 3, "camera_rotation": 2}
     few = SETTINGS.model_copy(update={"frames": 3})
@@ -142,6 +145,7 @@ def test_unknown_names_and_levels_are_refused_before_anything_is_written(tmp_pat
 # Pictures of a movie.
 
 
+@pytest.mark.slow
 def test_noise_comes_on_top_of_the_cameras_own(tmp_path):
     few = SETTINGS.model_copy(update={"frames": 4, "background": 80.0, "read_noise": 3.0, "shot_noise": 0.0})
     frames = frames_of(write_with_values(tmp_path, few, {"read_noise": 4.0}))
@@ -150,6 +154,7 @@ def test_noise_comes_on_top_of_the_cameras_own(tmp_path):
         assert abs(np.corrcoef(movie[0, :15].ravel(), movie[1, :15].ravel())[0, 1]) < 0.1  # new in every frame
 
 
+@pytest.mark.slow
 def test_structure_and_dirt_stand_still_and_are_in_the_picture_without_the_ball(tmp_path):
     quiet = SETTINGS.model_copy(update={"frames": 3, "read_noise": 0.0, "shot_noise": 0.0, "background": 60.0})
     for name in ("background_clutter", "dirt"):
@@ -161,6 +166,7 @@ def test_structure_and_dirt_stand_still_and_are_in_the_picture_without_the_ball(
         assert empty.std() > 5
 
 
+@pytest.mark.slow
 def test_what_passes_by_moves_and_is_not_in_the_picture_without_the_ball(plain, tmp_path):
     for name in ("occlusion", "bubbles"):
         path = write_degraded(tmp_path / name, SETTINGS, {name: 5})
@@ -171,6 +177,7 @@ def test_what_passes_by_moves_and_is_not_in_the_picture_without_the_ball(plain, 
         assert np.ptp(np.array(middles), axis=0).max() > 5  # px
 
 
+@pytest.mark.slow
 def test_occlusion_follows_the_ball_and_hides_its_share(tmp_path):
     white = SETTINGS.model_copy(
         update={"frames": 4, "black": 160.0, "white": 160.0, "ambient": 1.0, "background": 30.0}
@@ -180,6 +187,7 @@ def test_occlusion_follows_the_ball_and_hides_its_share(tmp_path):
         assert (movie - 30).sum((1, 2)) / (130 * math.pi * 20**2) == pytest.approx(0.6, abs=0.02)
 
 
+@pytest.mark.slow
 def test_saturation_clips_its_share_of_a_white_ball_with_one_gain_for_the_movie(tmp_path):
     white = {"black": 150.0, "white": 150.0, "read_noise": 0.0, "shot_noise": 0.0, "frames": 3, "ambient": 0.3}
     settings = SETTINGS.model_copy(update=white)
@@ -191,6 +199,7 @@ def test_saturation_clips_its_share_of_a_white_ball_with_one_gain_for_the_movie(
     assert all(np.ptp(ground) == 0 and ground[0, 0, 0] > 15 for ground in grounds)
 
 
+@pytest.mark.slow
 def test_dropped_frames_are_black_in_their_camera_and_all_others_stay(plain, tmp_path):
     path = write_with_values(tmp_path, SETTINGS, {"dropped_frames": 0.3})
     lost = {}
@@ -215,6 +224,7 @@ def test_the_ball_in_a_picture_is_where_and_as_large_as_it_is_seen(plain):
 # The scene.
 
 
+@pytest.mark.slow
 def test_the_ball_has_its_size_and_the_scene_stays_the_same(tmp_path):
     for diameter in (20.0, 32.0):
         settings = with_ball_size(SETTINGS.model_copy(update={"frames": 2, "black": 150.0, "white": 150.0}), diameter)
@@ -229,6 +239,7 @@ def test_the_ball_has_its_size_and_the_scene_stays_the_same(tmp_path):
         assert torch.equal(truth.at(now).position_lab_mm, base.at(now).position_lab_mm)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [5.0, 60.0])
 def test_spin_is_the_rms_turn_from_frame_to_frame_and_smears_no_more(degrees):
     settings = with_spin(SETTINGS, degrees)
@@ -251,6 +262,7 @@ def test_motion_blur_is_the_rms_turn_while_the_shutter_is_open(degrees):
     assert step_px < 1
 
 
+@pytest.mark.slow
 def test_motion_blur_smears_the_picture_of_the_ball(tmp_path):
     quiet = SETTINGS.model_copy(update={"frames": 3, "read_noise": 0.0, "shot_noise": 0.0})
     left = []
@@ -303,6 +315,7 @@ def test_patches_are_patches_seamless_and_anywhere():
     assert torch.equal(torch.stack([random_patches(torch.empty(64, 128), 0.2, again) for _ in range(3)]), many[:3])
 
 
+@pytest.mark.slow
 def test_the_given_map_differs_from_the_filmed_one_by_its_share(plain, tmp_path):
     path = write_degraded(tmp_path, SETTINGS, {"texture_error": 4})
     told, true = (load_texture(p.parent / "texture.png") for p in (path, plain))
@@ -325,6 +338,7 @@ def test_worn_paint_is_on_the_filmed_ball_only():
 # What the method is told.
 
 
+@pytest.mark.slow
 def test_the_reported_diameter_is_too_large_by_px_at_the_rim(tmp_path):
     path = write_with_values(tmp_path, SETTINGS, {"radius_error": 2.0})
     told = load_experiment(path)
@@ -333,6 +347,7 @@ def test_the_reported_diameter_is_too_large_by_px_at_the_rim(tmp_path):
     assert float(radius) == pytest.approx(22.0, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_told_principal_points_are_off_in_opposite_directions_and_lines_of_sight_miss(plain, tmp_path):
     path = write_with_values(tmp_path, SETTINGS, {"centre_error": 2.0})
     off = {name: tsai(path, name).centre_px - tsai(plain, name).centre_px for name in ("cam1", "cam2")}
@@ -348,6 +363,7 @@ def test_told_principal_points_are_off_in_opposite_directions_and_lines_of_sight
     assert (miss_mm * 40 / 18).tolist() == pytest.approx([2 * math.sqrt(2)] * 10, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_told_second_camera_is_turned_by_degrees_about_the_origin_and_moved_by_mm(plain, tmp_path):
     path = write_with_values(tmp_path, SETTINGS, {"camera_rotation": 1.5, "camera_shift": 0.3})
     true, told = tsai(plain, "cam2"), tsai(path, "cam2")

@@ -35,6 +35,7 @@ def flatness(x: np.ndarray) -> float:
     return float((x**4).mean() / (x**2).mean() ** 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("omega", "alpha"), [(4.0, 7.6), (3.5, 5.0), (3.0, 3.0)])
 def test_a_law_has_the_moments_that_were_asked_for(omega, alpha):
     rate, slope = sample(Law.of(7.8, 560.0, omega, alpha))
@@ -83,6 +84,7 @@ def test_positions_move_as_the_velocity_says():
     np.testing.assert_allclose(moved, true.velocity[one][1:-1], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_durations_are_exponential_beyond_the_shortest():
     true = draw_ensemble(EnsembleSpec(segments=1000, mean_frames=70), 7)
     frames = np.bincount(true.segment)
@@ -131,6 +133,7 @@ def test_the_smoother_recovers_a_quiet_ensemble_and_warns_of_a_loud_one():
     assert (corrected_off < off).all()
 
 
+@pytest.mark.slow
 def test_components_in_the_other_frame_are_isotropic_whatever_the_laws():
     spec = replace(EnsembleSpec(), omega_rms=(2.0, 8.0, 14.0))
     law = nominal(spec)["omega_body"]

@@ -98,6 +98,7 @@ def test_the_same_seed_is_the_same_motion_and_another_another():
         assert name == "time_s" or not torch.allclose(value, getattr(other, name))
 
 
+@pytest.mark.slow
 def test_rms_values_are_as_asked_where_the_volume_is_large():
     time_s = torch.arange(4000, dtype=torch.float64) / 100  # hundreds of correlation times
     now = motion(volume_mm=1e6).at(time_s)

@@ -52,6 +52,7 @@ def test_the_outline_of_a_clean_picture_is_that_of_the_spheres_points(name):  # 
     assert abs(area / in_air - 1) > 0.1  # the wall and the liquid matter
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LENSES)
 def test_the_limb_is_as_wide_as_a_fine_sample(name):
     # What the soft limb is for: four rays a pixel are right to a hundredth of the step. A limb as wide as directions

@@ -50,6 +50,7 @@ def measured(lens: Camera, place: Tensor, R_lab_body: Tensor, perspective: bool 
     return lens.R_cam_lab.T @ R_persp @ R_view_body
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cam1", "cam2", "oblique"])
 def test_the_axis_and_the_sense_of_a_turn_are_found_in_the_lab(name):
     lens, place = by_camera()[name]
@@ -74,6 +75,7 @@ def test_the_axis_and_the_sense_of_a_turn_are_found_in_the_lab(name):
     assert (omega_body - STEP_RAD * axis_lab).norm() > 0.5 * STEP_RAD
 
 
+@pytest.mark.slow
 def test_without_the_perspective_the_attitude_is_wrong_by_the_angle_off_the_axis():
     lens, place = by_camera()["cam1"]
     R_true = so3.random_rotations(6, generator=torch.Generator().manual_seed(9))

@@ -147,6 +147,7 @@ def test_the_pictures_of_the_empty_scene_are_its_background(written):
         assert (empty == 10).all()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_movies_and_truth_and_another_others(written, tmp_path):
     again = write_synthetic_experiment(tmp_path / "again", SETTINGS)
     other = write_synthetic_experiment(tmp_path / "other", SETTINGS.model_copy(update={"seed": 3}))
@@ -158,6 +159,7 @@ def test_the_same_seed_gives_the_same_movies_and_truth_and_another_others(writte
     assert not torch.equal(truth_of(other)["orientation"], truth_of(written)["orientation"])
 
 
+@pytest.mark.slow
 def test_progress_counts_the_frames_of_both_cameras_and_old_files_are_replaced(tmp_path):
     steps: list[int] = []
     few = SETTINGS.model_copy(update={"frames": 2, "image_size": (64, 60)})
@@ -173,6 +175,7 @@ def test_a_momentary_exposure_gives_an_experiment_that_loads(tmp_path):
     assert load_experiment(write_synthetic_experiment(tmp_path, few)).exposure_s is None
 
 
+@pytest.mark.slow
 def test_the_exposure_lies_about_the_frames_time_also_in_frame_0(tmp_path):
     noiseless = {"frames": 2, "exposure": 0.004, "exposure_samples": 2, "read_noise": 0.0, "shot_noise": 0.0}
     settings = SETTINGS.model_copy(update=noiseless)

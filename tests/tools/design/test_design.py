@@ -57,12 +57,14 @@ def test_a_direction_faces_the_camera_with_north_up_and_east_right():  # convent
     assert float((R[1] @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))[1]) < 0  # north is up: v grows downwards
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [12.0, 20.0])
 def test_rings_take_a_brush_of_their_width(width):  # oracle
     # A brush as wide as a ring just fits; the lattice of points knows widths to a degree or two.
     assert stroke_deg(bands(width)) == pytest.approx(width, abs=2.0)
 
 
+@pytest.mark.slow
 def test_the_thinner_paint_decides():
     latitude = torch.rad2deg(torch.asin(map_directions(360)[..., 2]))
     ring = (latitude.abs() < 4).float()
@@ -82,6 +84,7 @@ def test_the_border_of_caps_is_the_sum_of_their_circles():  # oracle
     assert border_length(caps) == pytest.approx(2 * math.pi * (math.sin(0.4) + math.sin(0.9)), rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(PATTERNS))
 def test_paint_of_twice_the_size_has_half_the_border_and_takes_twice_the_brush(kind):
     fine, coarse = (patterned_texture(kind, size, 3, 256) for size in (14.0, 28.0))
@@ -99,6 +102,7 @@ def test_paint_that_nobody_knows_is_refused(kind, size, got):
         patterned_texture(kind, size, 0)
 
 
+@pytest.mark.slow
 def test_the_two_faces_of_a_ball_painted_twice_alike_are_found():  # planted
     texture = patterned_texture("blobs", 25.0, 1, 128)
     twice = torch.cat([texture[:, :128], texture[:, :128]], dim=1)  # half a turn about z changes nothing
@@ -110,6 +114,7 @@ def test_the_two_faces_of_a_ball_painted_twice_alike_are_found():  # planted
     assert most_similar_views(texture, R, 20.0)[0] < 0.95
 
 
+@pytest.mark.slow
 def test_views_that_are_near_each_other_are_not_counted_as_alike():
     texture = patterned_texture("patches", 20.0, 2, 128)
     R = facing(view_directions(12))
@@ -118,6 +123,7 @@ def test_views_that_are_near_each_other_are_not_counted_as_alike():
         assert math.degrees(float(so3.geodesic_distance(two[0], two[1]))) > apart - 0.01
 
 
+@pytest.mark.slow
 def test_the_judgement_is_that_of_the_bound_and_knows_the_view_without_paint():
     # Dots on one half only: the other half's middle is white, and nothing can be said there.
     direction = map_directions(128)

@@ -44,6 +44,7 @@ def turned(spins: Spins, true, time_s):
     return torch.rad2deg(so3.geodesic_distance(spins.R_view_body(time_s), true).amax(-1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", [0.07, 0.35, 0.49])
 def test_a_planted_spin_comes_back_among_wrong_candidates_and_wrong_pictures(turns):
     omega = turns * TURN * torch.nn.functional.normalize(torch.tensor([0.2, 1.0, -0.4], dtype=torch.float64), dim=0)
@@ -71,6 +72,7 @@ def test_beyond_half_a_turn_per_picture_all_aliases_are_told_with_the_same_evide
     assert float(turned(spins, true, time_s).max()) < 3
 
 
+@pytest.mark.slow
 def test_uneven_times_leave_one_spin():
     axis = torch.nn.functional.normalize(torch.tensor([0.5, -0.3, 0.8], dtype=torch.float64), dim=0)
     gaps = torch.tensor([1.0, 1.37, 1.11, 1.9, 1.23, 1.0, 1.61, 1.43, 1.29, 1.7, 1.17], dtype=torch.float64)
@@ -93,6 +95,7 @@ def test_the_order_of_the_pictures_and_the_origin_of_time_do_not_matter():
     torch.testing.assert_close(a.omega_view_rad_s, b.omega_view_rad_s, rtol=1e-6, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_sigma_of_the_rate_is_the_scatter_over_many_draws():
     omega = 0.2 * TURN * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     time_s = STEP * torch.arange(10, dtype=torch.float64)

@@ -84,6 +84,7 @@ def test_worn_places_are_found_where_they_were_planted_in_the_first_maps_frame()
         assert float(wear.change[inside].median()) > 0.3, "black paint that is gone is brighter"
 
 
+@pytest.mark.slow
 def test_the_worn_share_grows_as_it_was_planted():
     area = texel_areas(HEIGHT) / (4 * math.pi)
     true = [float(area[planted(k)].sum()) for k in range(4)]
@@ -121,6 +122,7 @@ def test_maps_of_an_unworn_ball_show_no_wear_however_noisy():
             assert series.wear[0].scatter == pytest.approx(noise * math.sqrt(2), rel=0.15)
 
 
+@pytest.mark.slow
 def test_what_a_map_does_not_know_is_neither_worn_nor_healed():
     blind = torch.where(near(FIRST_SPOT, 25.0), torch.nan, paint())
     worn = torch.where(planted(3), 0.7, paint())
