@@ -18,7 +18,6 @@ from scipy.special import i0e, ndtri
 
 from sphereorient import so3
 from sphereorient.motion import (
-    RATE_UNITS,
     MeasuredPoses,
     MotionSettings,
     ProcessNoise,
@@ -185,25 +184,11 @@ def nominal(spec: EnsembleSpec) -> dict[str, Nominal]:
     return out
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrueTracks:
-    """Exact motion at M frames of S segments, (M, ...); made by `draw_ensemble`."""
+def draw_ensemble(spec: EnsembleSpec, seed: int) -> Trajectory:
+    """Draw segments of exponential random length, as a perfect measurement: all sigmas are zero.
 
-    spec: EnsembleSpec
-    time_s: Floats  # (M,); the other fields are (M, ...)
-    segment: Rows
-    position_mm: Floats
-    R_lab_body: Floats
-    velocity: Floats  # m/s
-    acceleration: Floats  # m/s^2
-    omega_lab: Floats  # rad/s
-    omega_body: Floats
-    alpha_lab: Floats  # rad/s^2
-    alpha_body: Floats
-
-
-def draw_ensemble(spec: EnsembleSpec, seed: int) -> TrueTracks:
-    """Draw segments of exponential random length without noise; orientations are exact to 1e-6 rad per segment."""
+    Orientations are exact to 1e-6 rad per segment.
+    """
     rng = np.random.default_rng(seed)
     extra = rng.exponential(spec.mean_frames - spec.shortest_frames, spec.segments)
     frames = spec.shortest_frames + np.floor(extra).astype(np.int64)
@@ -221,19 +206,14 @@ def draw_ensemble(spec: EnsembleSpec, seed: int) -> TrueTracks:
     to_other = R.swapaxes(1, 2) if spec.frame == "lab" else R
     seen = [np.asarray(np.einsum("nij,nj->ni", to_other, x)) for x in (omega, alpha)]
     lab, body = ((omega, alpha), seen) if spec.frame == "lab" else (seen, (omega, alpha))
-    return TrueTracks(
-        spec=spec,
-        time_s=(np.arange(len(segment)) + REST * segment) / spec.frame_rate_hz,
-        segment=segment,
-        position_mm=origin[segment] + 1000 * path,
-        R_lab_body=R,
-        velocity=velocity,
-        acceleration=acceleration,
-        omega_lab=lab[0],
-        omega_body=body[0],
-        alpha_lab=lab[1],
-        alpha_body=body[1],
-    )
+    rates = {"velocity": velocity, "acceleration": acceleration}
+    rates |= {"omega_lab": lab[0], "omega_body": body[0], "alpha_lab": lab[1], "alpha_body": body[1]}
+    parts: dict[str, Any] = rates | {f"{name}_sigma": np.zeros((len(segment), 3)) for name in rates}
+    time_s = (np.arange(len(segment)) + REST * segment) / spec.frame_rate_hz
+    blank = Trajectory.empty(time_s, frame_rate=spec.frame_rate_hz, method="precise", experiment="synthetic")
+    parts |= {"valid": np.ones(len(segment), dtype=bool), "segment": segment, "confidence": np.ones(len(segment))}
+    position = origin[segment] + 1000 * path
+    return replace(_posed(blank, position, R, 0.0, 0.0), position_smooth=position, orientation_smooth=R, **parts)
 
 
 def _rates(draws: list[Draw], since_s: Floats, segment: Rows) -> tuple[Floats, Floats]:
@@ -264,17 +244,8 @@ def _orientations(
     return R if spec.frame == "lab" else R.swapaxes(1, 2)
 
 
-def exact_track(true: TrueTracks) -> Trajectory:
-    """Return the trajectory of a perfect measurement; all sigmas are zero."""
-    blank = _measured(true, true.position_mm, true.R_lab_body, 0.0, 0.0, "precise")
-    parts: dict[str, Any] = {"position_smooth": true.position_mm, "orientation_smooth": true.R_lab_body}
-    for name in RATE_UNITS:
-        parts |= {name: getattr(true, name), f"{name}_sigma": np.zeros((len(true.time_s), 3))}
-    return replace(blank, **parts)
-
-
 def smoothed_track(
-    true: TrueTracks,
+    true: Trajectory,
     noise_deg: float,
     noise_mm: float,
     seed: int,
@@ -287,7 +258,7 @@ def smoothed_track(
     """
     track = _noisy(true, noise_deg, noise_mm, seed, "precise")
     if silent:
-        track = replace(track, position=true.position_mm, orientation=true.R_lab_body)
+        track = replace(track, position=true.position, orientation=true.orientation)
     poses = MeasuredPoses(
         time_s=torch.from_numpy(track.time),
         position_lab_mm=torch.from_numpy(track.position),
@@ -309,7 +280,7 @@ def smoothed_track(
 
 
 def filtered_track(
-    true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, settings: MotionSettings | None = None
+    true: Trajectory, noise_deg: float, noise_mm: float, seed: int, settings: MotionSettings | None = None
 ) -> Trajectory:
     """Add white noise to an ensemble and differentiate with Gaussian kernels; return the paper method's trajectory.
 
@@ -322,7 +293,7 @@ def filtered_track(
         torch.from_numpy(track.position),
         torch.from_numpy(track.orientation),
         torch.from_numpy(track.segment),
-        true.spec.frame_rate_hz,
+        true.frame_rate,
         settings or MotionSettings(),
         position_sigma_mm=sigma_mm.double(),
         orientation_sigma_rad=sigma_rad.double(),
@@ -330,27 +301,15 @@ def filtered_track(
     return replace(track, position_smooth=track.position, orientation_smooth=track.orientation, **rates_of(found))
 
 
-def _noisy(true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, method: str) -> Trajectory:
+def _noisy(true: Trajectory, noise_deg: float, noise_mm: float, seed: int, method: str) -> Trajectory:
     rng = np.random.default_rng([seed, 1])
     noise_rad = math.radians(noise_deg)
-    delta = torch.from_numpy(noise_rad * rng.standard_normal(true.position_mm.shape))
-    R = (so3.exp(delta) @ torch.from_numpy(true.R_lab_body)).numpy()
-    position = true.position_mm + noise_mm * rng.standard_normal(true.position_mm.shape)
-    return _measured(true, position, R, noise_mm, noise_rad, method)
+    delta = torch.from_numpy(noise_rad * rng.standard_normal(true.position.shape))
+    R = (so3.exp(delta) @ torch.from_numpy(true.orientation)).numpy()
+    position = true.position + noise_mm * rng.standard_normal(true.position.shape)
+    return _posed(replace(true, method=method), position, R, noise_mm, noise_rad)
 
 
-def _measured(
-    true: TrueTracks, position_mm: Floats, R: Floats, noise_mm: float, noise_rad: float, method: str
-) -> Trajectory:
-    count, unit = len(true.time_s), np.eye(3)
-    blank = Trajectory.empty(true.time_s, frame_rate=true.spec.frame_rate_hz, method=method, experiment="synthetic")
-    return replace(
-        blank,
-        valid=np.ones(count, dtype=bool),
-        position=position_mm,
-        position_cov=np.tile(noise_mm**2 * unit, (count, 1, 1)),
-        orientation=R,
-        orientation_cov=np.tile(noise_rad**2 * unit, (count, 1, 1)),
-        segment=true.segment,
-        confidence=np.ones(count),
-    )
+def _posed(track: Trajectory, position_mm: Floats, R: Floats, noise_mm: float, noise_rad: float) -> Trajectory:
+    cov_mm2, cov_rad2 = (np.tile(noise**2 * np.eye(3), (len(track), 1, 1)) for noise in (noise_mm, noise_rad))
+    return replace(track, position=position_mm, position_cov=cov_mm2, orientation=R, orientation_cov=cov_rad2)
