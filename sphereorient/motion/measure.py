@@ -11,9 +11,8 @@ from sphereorient.motion.angular_velocity import (
     to_body,
     usable_separations,
 )
-from sphereorient.motion.derivative import Order, gap_aware_stencil
 from sphereorient.motion.settings import MotionSettings
-from sphereorient.motion.stencil import apply, compose, propagated_sigma
+from sphereorient.motion.stencil import Order, apply, compose, gap_aware_stencil, propagated_sigma
 
 M_PER_MM = 1e-3
 
@@ -73,20 +72,18 @@ def measure_motion(
     dt_s = 1.0 / frame_rate_hz
     velocity, velocity_sigma = _translation(position_mm, position_sigma_mm, segment, dt_s, 1, settings)
     acceleration, acceleration_sigma = _translation(position_mm, position_sigma_mm, segment, dt_s, 2, settings)
-    (omega, omega_sigma), (alpha, alpha_sigma) = _rotation(R_lab_body, orientation_sigma_rad, segment, dt_s, settings)
+    omega, alpha = _rotation(R_lab_body, orientation_sigma_rad, segment, dt_s, settings)
+    turning = {}
+    for name, unit, (x, sigma) in (("omega", "rad_s", omega), ("alpha", "rad_s2", alpha)):
+        turning[f"{name}_lab_{unit}"], turning[f"{name}_lab_sigma_{unit}"] = x, sigma
+        turning[f"{name}_body_{unit}"] = _to_body(R_lab_body, x)
+        turning[f"{name}_body_sigma_{unit}"] = _sigma_in_body(R_lab_body, x, sigma, orientation_sigma_rad)
     return Motion(
         velocity_m_s=velocity,
         velocity_sigma_m_s=velocity_sigma,
         acceleration_m_s2=acceleration,
         acceleration_sigma_m_s2=acceleration_sigma,
-        omega_lab_rad_s=omega,
-        omega_lab_sigma_rad_s=omega_sigma,
-        omega_body_rad_s=_to_body(R_lab_body, omega),
-        omega_body_sigma_rad_s=_sigma_in_body(R_lab_body, omega, omega_sigma, orientation_sigma_rad),
-        alpha_lab_rad_s2=alpha,
-        alpha_lab_sigma_rad_s2=alpha_sigma,
-        alpha_body_rad_s2=_to_body(R_lab_body, alpha),
-        alpha_body_sigma_rad_s2=_sigma_in_body(R_lab_body, alpha, alpha_sigma, orientation_sigma_rad),
+        **turning,
     )
 
 
