@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 
 from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.so3 import geodesic_distance
+from sphereorient.statistics.bootstrap import Floats
 from sphereorient.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,8 +74,6 @@ def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dic
     These are the orientations as if each line of sight were parallel to its camera's axis, for the given cameras only.
     Source: the paper, section III, R_persp; its sign by docs/errata.md A1.
     """
-    import torch
-
     found = {}
     for name, seen in track.cameras.items():
         if name in cameras:
@@ -93,6 +91,5 @@ def _pdf(x: Floats, edges: Floats) -> Floats:
 
 def _distance(A: Floats, B: Floats) -> Floats:
     """Return the geodesic distances of the frames with both orientations."""
-    there = np.isfinite(A).all((1, 2)) & np.isfinite(B).all((1, 2))
-    half = np.linalg.norm(A[there] - B[there], axis=(1, 2)) / np.sqrt(8)
-    return np.asarray(2 * np.arcsin(np.minimum(half, 1.0)))
+    apart = geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy()
+    return np.asarray(apart[np.isfinite(apart)])

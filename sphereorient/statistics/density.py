@@ -3,15 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfcx, log_ndtr, logsumexp
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
+from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums
 from sphereorient.statistics.moments import noise_let_through
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
-
-Floats = NDArray[np.float64]
 
 ROOT3 = np.sqrt(3.0)
 WIDEST_S = 1.5  # upper limit of the fit: flatness 14,000
@@ -76,7 +73,7 @@ class StretchedFit:
 
 def fit_stretched(
     x: Floats,
-    segment: NDArray[np.int64],
+    segment: Rows,
     segments: int,
     settings: BootstrapSettings | None = None,
     noise_share: float = 0.0,
@@ -143,7 +140,7 @@ class Density:
 
     edges: Floats  # (B + 1,)
     pdf: Interval  # (B,)
-    counts: NDArray[np.int64]  # (B,)
+    counts: Rows  # (B,)
     fit: StretchedFit
 
     @property
@@ -161,7 +158,7 @@ def density(ensemble: Ensemble, quantity: str, component: int, *, settings: Boot
 
 def density_of(
     x: Floats,
-    segment: NDArray[np.int64],
+    segment: Rows,
     segments: int,
     *,
     bins: int = 61,

@@ -3,15 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
+from sphereorient.statistics.bootstrap import Floats, Interval, bootstrap, segment_sums
 from sphereorient.statistics.moments import Moments
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
 
 M_PER_MM = 1e-3
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

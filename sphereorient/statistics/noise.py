@@ -2,18 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sphereorient.errors import TrackError, refusal
-from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums, studentized
+from sphereorient.motion import gaussian_kernel, rotvec_between
+from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums, studentized
 from sphereorient.statistics.moments import WARN_SHARE, Moments, without_noise
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 SI = 1e-3  # m per mm
 RATES = {"acceleration": ("position", SI), "alpha_lab": ("orientation", 1.0)}  # source, and its unit in SI
@@ -83,8 +81,7 @@ def multi_lag(
     whole = np.stack(sums, axis=1)  # (S, L, 3, 2)
     whole = whole[(whole[..., 1] > 0).any((1, 2))]
     if len(whole) < 2 or len(lags) < 4:
-        got = f"{len(whole)} segments and {len(lags)} lags"
-        do = "pass more tracks"
+        got, do = f"{len(whole)} segments and {len(lags)} lags", "pass more tracks"
         raise TrackError(refusal("multi_lag", expected="at least two segments and four lags", got=got, do=do))
     lag_s = step_s * np.array(lags)
     found = bootstrap(whole, lambda totals: _extrapolated(totals[..., 0] / totals[..., 1], lag_s), settings)
@@ -120,13 +117,9 @@ def _second_differences(track: Trajectory, quantity: str, n: int, step_s: float)
 
 def _rotation(R: Floats, first: Rows, second: Rows) -> Floats:
     """Return the rotation vectors from rows `first` to `second`, lab, (K, 3); NaN where either is NaN."""
-    from scipy.spatial.transform import Rotation
-
     there = np.isfinite(R[first] + R[second]).all((1, 2))
     out = np.full((len(first), 3), np.nan)
-    if there.any():
-        before, after = (Rotation.from_matrix(R[rows[there]]) for rows in (first, second))
-        out[there] = (after * before.inv()).as_rotvec()
+    out[there] = rotvec_between(R[first[there]], R[second[there]])
     return out
 
 
@@ -199,11 +192,11 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
         values[there] = _rotation(track.orientation[rows], row[there], row[there + 2]) / 2  # omega
     else:
         values[place] = track.position[rows] * SI
-    order = 2 if quantity == "acceleration" else 1
+    order: Literal[1, 2] = 2 if quantity == "acceleration" else 1
     scale = _step(track) ** -(2 if quantity != "velocity" else 1)
     parts = []
     for width in widths:
-        kernel = _kernel(width, order)
+        kernel = gaussian_kernel(width, order).numpy()[::-1]  # as `np.convolve` reads it
         x2 = np.square(_convolved(values, kernel) * scale)
         s2 = _convolved(noise, np.square(np.convolve(kernel, CENTRAL) if rotating else kernel)) * scale**2
         parts.append(np.stack([np.ones_like(x2), x2, x2 * x2, s2, s2 * s2, x2 * s2], axis=-1))
@@ -225,18 +218,6 @@ def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
     number = np.full(int(lengths.sum()), -1, dtype=np.int64)
     number[place] = segment
     return rows, place, number
-
-
-def _kernel(width: float, order: int) -> Floats:
-    import torch
-
-    from sphereorient.motion import gaussian_derivative
-
-    half = max(1, int(np.ceil(3.0 * width)))
-    impulse = torch.zeros(4 * half + 1, 1, dtype=torch.float64)
-    impulse[2 * half] = 1.0
-    answer = gaussian_derivative(impulse, 1.0, width, 2 if order == 2 else 1)[:, 0].numpy()
-    return np.asarray(answer[half : 3 * half + 1], np.float64)
 
 
 def _convolved(x: Floats, kernel: Floats) -> Floats:

@@ -8,12 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import TrackError, refusal
-from sphereorient.statistics.bootstrap import FEWEST, Interval
+from sphereorient.statistics.bootstrap import FEWEST, Floats, Interval, Rows
 from sphereorient.statistics.settings import SegmentSettings
 from sphereorient.trajectory import Flag, Trajectory
-
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 UNITS = {
     "velocity": "m/s",
