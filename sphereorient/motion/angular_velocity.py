@@ -6,7 +6,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.motion.settings import check_separations
-from sphereorient.motion.stencil import neighbours_there
+from sphereorient.motion.stencil import paired
 
 FEWEST_POINTS = 3  # points that determine a rotation
 
@@ -64,9 +64,7 @@ def to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
 def usable_separations(there: Tensor, separations: Sequence[int], segment: Tensor | None) -> Tensor:
     """Return for S separations whether both ends are in the frame's segment, (..., N, S) bool."""
     half = max(separations)
-    near = neighbours_there(there, segment, half)
-    m = torch.as_tensor(separations, device=there.device)
-    return near[..., half + m] & near[..., half - m]
+    return paired(there, segment, half)[..., half + torch.as_tensor(separations, device=there.device)]
 
 
 def omega_stencil(usable: Tensor, separations: Sequence[int], min_separations: int, dtype: torch.dtype) -> Tensor:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, zip_longest
 
 import numpy as np
 import torch
@@ -41,20 +41,18 @@ def camera_distances(
     Source: the paper, section III, distance of the two cameras; the angle by docs/errata.md A3.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
-    rough = [*uncorrected, *[None] * (len(many) - len(uncorrected))]
     apart: dict[tuple[str, str], list[Floats]] = {}
-    apart_rough: dict[tuple[str, str], list[Floats]] = {}
-    for track, other in zip(many, rough, strict=True):
-        for a, b in combinations(sorted(track.cameras), 2):
-            seen = _distance(track.cameras[a].orientation, track.cameras[b].orientation)
-            apart.setdefault((a, b), []).append(seen)
-            if other is not None and a in other and b in other:
-                apart_rough.setdefault((a, b), []).append(_distance(other[a], other[b]))
-    return [_pooled(pair, parts, apart_rough.get(pair), bins) for pair, parts in apart.items()]
+    rough: dict[tuple[str, str], list[Floats]] = {}
+    for track, other in zip_longest(many, uncorrected):
+        own = {name: camera.orientation for name, camera in track.cameras.items()}
+        for pair in combinations(sorted(own), 2):
+            for parts, of in ((apart, own), (rough, other or {})):
+                if set(pair) <= set(of):
+                    parts.setdefault(pair, []).append(_distance(*(of[name] for name in pair)))
+    return [_pooled(pair, np.concatenate(parts), rough.get(pair), bins) for pair, parts in apart.items()]
 
 
-def _pooled(pair: tuple[str, str], parts: list[Floats], rough_parts: list[Floats] | None, bins: int) -> CameraDistance:
-    apart = np.concatenate(parts)
+def _pooled(pair: tuple[str, str], apart: Floats, rough_parts: list[Floats] | None, bins: int) -> CameraDistance:
     rough = None if rough_parts is None else np.concatenate(rough_parts)
     top = max([float(x.max()) for x in (apart, rough) if x is not None and len(x)], default=np.pi)
     edges = np.linspace(0.0, max(top, 1e-9), bins + 1)

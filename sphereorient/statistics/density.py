@@ -35,12 +35,10 @@ def log_stretched_exponential(x: Floats, a: Floats | float, noise_share: float =
     if noise_share > 0:
         place, weight = np.polynomial.hermite_e.hermegauss(HERMITE)
         clean = np.sqrt(1 - noise_share)
-        logs = np.stack(
-            [
-                np.log(w / np.sqrt(2 * np.pi)) + log_stretched_exponential((x - np.sqrt(noise_share) * z) / clean, a)
-                for z, w in zip(place, weight, strict=True)
-            ]
-        )
+        logs = [
+            np.log(w / np.sqrt(2 * np.pi)) + log_stretched_exponential((x - np.sqrt(noise_share) * z) / clean, a)
+            for z, w in zip(place, weight, strict=True)
+        ]
         return np.asarray(logsumexp(logs, axis=0) - np.log(clean), np.float64)
     a = np.asarray(a, np.float64)
     size = np.maximum(np.abs(x), TINY)

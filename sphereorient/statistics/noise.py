@@ -180,6 +180,8 @@ def _step(track: Trajectory) -> float:
 
 def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floats:
     """Return by segment (S, W, 3, 6): number, x^2, x^4, sigma^2, sigma^4, x^2 sigma^2."""
+    if not (track.segment >= 0).any():
+        return np.zeros((0, len(widths), 3, 6))
     rows, place, number = _grid(track)
     rotating = quantity == "alpha_lab"
     cov = (track.orientation_cov if rotating else track.position_cov * SI**2)[rows]
@@ -202,7 +204,7 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
         parts.append(np.stack([np.ones_like(x2), x2, x2 * x2, s2, s2 * s2, x2 * s2], axis=-1))
     whole = np.stack(parts, axis=1)
     known = np.isfinite(whole).all((1, 2, 3)) & (number >= 0)
-    sums = segment_sums(whole[known], number[known], int(number.max(initial=-1)) + 1)
+    sums = segment_sums(whole[known], number[known], int(number.max()) + 1)
     return sums[sums[:, 0, 0, 0] > 0]
 
 
@@ -211,9 +213,9 @@ def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
     rows = np.flatnonzero(track.segment >= 0)
     rows = rows[np.lexsort((track.time[rows], track.segment[rows]))]
     _, segment = np.unique(track.segment[rows], return_inverse=True)
-    begin = np.searchsorted(segment, np.arange(segment.max(initial=-1) + 1))
+    begin = np.searchsorted(segment, np.arange(segment.max() + 1))
     frame = np.rint((track.time[rows] - track.time[rows][begin][segment]) / _step(track)).astype(np.int64)
-    lengths = np.maximum.reduceat(frame, begin) + 2 if len(rows) else frame
+    lengths = np.maximum.reduceat(frame, begin) + 2
     place = frame + np.concatenate([[0], np.cumsum(lengths)])[:-1][segment]
     number = np.full(int(lengths.sum()), -1, dtype=np.int64)
     number[place] = segment
@@ -222,12 +224,8 @@ def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
 
 def _convolved(x: Floats, kernel: Floats) -> Floats:
     """Return each column's convolution, NaN where the kernel reaches an empty place, (K, 3)."""
-    out = np.full_like(x, np.nan)
-    half = len(kernel) // 2
-    if len(x) >= len(kernel):
-        for i in range(x.shape[1]):
-            out[half : len(x) - half, i] = np.convolve(x[:, i], kernel, mode="valid")
-    return out
+    wider = np.pad(x, ((len(kernel) // 2,) * 2, (0, 0)), constant_values=np.nan)
+    return np.stack([np.convolve(column, kernel, mode="valid") for column in wider.T], axis=1)
 
 
 def _width_statistics(totals: Floats) -> Floats:

@@ -20,6 +20,8 @@ UNITS = {
     "alpha_lab": "rad/s^2",
     "alpha_body": "rad/s^2",
 }
+COLUMNS = {"time_s": "time", "position_mm": "position_smooth", "R_lab_body": "orientation_smooth", "label": "segment"}
+COLUMNS |= {name: name for quantity in UNITS for name in (quantity, f"{quantity}_sigma")}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,16 +112,8 @@ def _pieces(track: Trajectory, number: int, settings: SegmentSettings) -> dict[s
         known = rows[np.isfinite(size[rows])]
         if len(known):
             sure &= ~(size > settings.max_sigma * np.median(size[known]))
-    parts = {
-        "time_s": track.time,
-        "position_mm": track.position_smooth,
-        "R_lab_body": track.orientation_smooth,
-        "label": track.segment,
-        **{quantity: getattr(track, quantity) for quantity in UNITS},
-        **{f"{quantity}_sigma": getattr(track, f"{quantity}_sigma") for quantity in UNITS},
-        "sure": sure,
-    }
-    return {key: values[rows] for key, values in parts.items()} | {"track": np.full(len(rows), number)}
+    parts = {key: getattr(track, name)[rows] for key, name in COLUMNS.items()}
+    return parts | {"sure": sure[rows], "track": np.full(len(rows), number)}
 
 
 def _numbered(
