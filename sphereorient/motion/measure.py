@@ -5,12 +5,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.errors import ShapeError, check_tail, refusal
-from sphereorient.motion.angular_velocity import (
-    omega_from_orientations,
-    omega_stencil,
-    to_body,
-    usable_separations,
-)
+from sphereorient.motion.angular_velocity import omega_from_orientations, omega_stencil, to_body, usable_separations
 from sphereorient.motion.settings import MotionSettings
 from sphereorient.motion.stencil import Order, apply, compose, gap_aware_stencil, propagated_sigma
 
@@ -111,14 +106,10 @@ def _rotation(
     slope = _stencil(omega, segment, settings.alpha_sigma_frames, 1, settings)
     alpha = apply(slope, omega) / dt_s
     # neighbouring omegas share orientations: their noise is not white, that of the orientations is
-    turn = omega_stencil(
-        usable_separations(_oriented(R_lab_body), separations, segment), separations, fewest, omega.dtype
-    )
-    sigma = _by_axis(sigma_rad, omega)
-    return (omega, propagated_sigma(turn, sigma) / dt_s), (
-        alpha,
-        propagated_sigma(compose(slope, turn), sigma) / dt_s**2,
-    )
+    usable = usable_separations(_oriented(R_lab_body), separations, segment)
+    turn, sigma = omega_stencil(usable, separations, fewest, omega.dtype), _by_axis(sigma_rad, omega)
+    omega_sigma = propagated_sigma(turn, sigma) / dt_s
+    return (omega, omega_sigma), (alpha, propagated_sigma(compose(slope, turn), sigma) / dt_s**2)
 
 
 def _stencil(x: Tensor, segment: Tensor, sigma_frames: float, order: Order, settings: MotionSettings) -> Tensor:

@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from sphereorient.motion.kalman import StateSpace
+from sphereorient.motion.kalman import Bools, Floats, StateSpace
 from sphereorient.motion.matern import NODES, ORDER, STATIONARY, Prior, grown, grown_rate, integral, nodes
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 SIZE = 3 * (2 + ORDER)
 UNKNOWN = 100.0  # standard deviation of the start from its reference, in sigmas of a measurement: next to no pull

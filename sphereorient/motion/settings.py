@@ -23,9 +23,7 @@ class MotionSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     velocity_sigma_frames: float = Field(
-        3.5,
-        gt=0,
-        description="width of the Gaussian for velocity, frames; 0.1 mm of white noise at 600 Hz: 0.003 m/s",
+        3.5, gt=0, description="width of the Gaussian for velocity, frames; 0.1 mm of white noise at 600 Hz: 0.003 m/s"
     )
     acceleration_sigma_frames: float = Field(
         5.0,

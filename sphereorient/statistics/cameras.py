@@ -31,9 +31,7 @@ class CameraDistance:
 
 
 def camera_distances(
-    tracks: Trajectory | Sequence[Trajectory],
-    uncorrected: Sequence[Mapping[str, Floats] | None] = (),
-    bins: int = 60,
+    tracks: Trajectory | Sequence[Trajectory], uncorrected: Sequence[Mapping[str, Floats] | None] = (), bins: int = 60
 ) -> list[CameraDistance]:
     """Return the distances for every pair of cameras, frames of all tracks together; empty for one camera.
 

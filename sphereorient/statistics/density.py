@@ -70,11 +70,7 @@ class StretchedFit:
 
 
 def fit_stretched(
-    x: Floats,
-    segment: Rows,
-    segments: int,
-    settings: BootstrapSettings | None = None,
-    noise_share: float = 0.0,
+    x: Floats, segment: Rows, segments: int, settings: BootstrapSettings | None = None, noise_share: float = 0.0
 ) -> StretchedFit:
     """Fit the stretched exponential to the motion in a component (M,), any unit, by maximum likelihood, with intervals.
 

@@ -10,7 +10,7 @@ import numpy as np
 from sphereorient.errors import TrackError
 from sphereorient.statistics import density, isotropy, lags, noise
 from sphereorient.statistics.bootstrap import FEWEST
-from sphereorient.statistics.flow import Comparison, FlowScales, Lift, comparisons, lift
+from sphereorient.statistics.flow import Comparison, Lift, Surroundings, comparisons, lift
 from sphereorient.statistics.moments import Moments, table_of_moments
 from sphereorient.statistics.segments import UNITS, Durations, Ensemble, durations, ensemble_of
 from sphereorient.statistics.settings import StatisticsSettings
@@ -22,24 +22,6 @@ WIDTHS_OF = ("velocity", "acceleration", "alpha_lab")
 STEPS = 10  # of the progress
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Surroundings:
-    """Properties of the sphere and its flow that are not in a track; None where unknown."""
-
-    diameter_mm: float | None = None
-    viscosity_m2_s: float | None = None
-    dissipation_w_kg: float | None = None
-    u_rms_m_s: float | None = None
-    integral_length_m: float | None = None
-
-    @property
-    def flow(self) -> FlowScales | None:
-        """Scales of the flow; None if viscosity or dissipation is unknown."""
-        if self.viscosity_m2_s is None or self.dissipation_w_kg is None:
-            return None
-        return FlowScales(viscosity_m2_s=self.viscosity_m2_s, dissipation_w_kg=self.dissipation_w_kg)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,17 +87,13 @@ def summarise(
     progress(2, STEPS)
     more = _distributions(many, ensemble, settings, progress) if ensemble.segments >= FEWEST else None
     progress(STEPS, STEPS)
-    compared: list[Comparison] = []
-    if around.diameter_mm is not None:
-        flow = {"u_rms_m_s": around.u_rms_m_s, "integral_length_m": around.integral_length_m}
-        compared = comparisons(table, around.diameter_mm, around.flow, **flow)
     return Summary(
         settings=settings,
         surroundings=around,
         ensemble=ensemble,
         table=table,
         warnings=noise.noise_warnings(table, ensemble.error),
-        comparisons=compared,
+        comparisons=comparisons(table, around),
         distributions=more,
     )
 

@@ -16,16 +16,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import i0e, ndtri
 
-from sphereorient import so3
-from sphereorient.motion import (
-    MeasuredPoses,
-    MotionSettings,
-    ProcessNoise,
-    SmoothSettings,
-    measure_motion,
-    rates_of,
-    smooth_motion,
-)
+from sphereorient import motion, so3
 from sphereorient.synth.motion import magnus_rotation
 from sphereorient.trajectory import Flag, Trajectory
 
@@ -142,10 +133,6 @@ class EnsembleSpec:
     alpha_flatness: float = 7.6
     frame: Literal["lab", "body"] = "lab"  # frame of independent components; in the other frame they are isotropic
 
-    def velocity_laws(self) -> list[Law]:
-        """Return the Gaussian laws of the velocity components, m/s, lab."""
-        return [Law.of(rms, slope) for rms, slope in zip(self.velocity_rms, self.acceleration_rms, strict=True)]
-
     def omega_laws(self) -> list[Law]:
         """Return the laws of the omega components, rad/s, in `frame`."""
         pairs = zip(self.omega_rms, self.alpha_rms, strict=True)
@@ -195,7 +182,8 @@ def draw_ensemble(spec: EnsembleSpec, seed: int) -> Trajectory:
     segment = np.repeat(np.arange(spec.segments), frames)
     start = np.concatenate([[0], np.cumsum(frames)[:-1]])
     since_s = (np.arange(len(segment)) - start[segment]) / spec.frame_rate_hz
-    moves = [law.draw(spec.segments, rng) for law in spec.velocity_laws()]
+    pairs = zip(spec.velocity_rms, spec.acceleration_rms, strict=True)
+    moves = [Law.of(rms, slope).draw(spec.segments, rng) for rms, slope in pairs]
     turns = [law.draw(spec.segments, rng) for law in spec.omega_laws()]
     velocity, acceleration = _rates(moves, since_s, segment)
     omega, alpha = _rates(turns, since_s, segment)
@@ -249,9 +237,9 @@ def smoothed_track(
     noise_deg: float,
     noise_mm: float,
     seed: int,
-    known: ProcessNoise | None = None,
+    known: motion.ProcessNoise | None = None,
     silent: bool = False,
-) -> tuple[Trajectory, ProcessNoise]:
+) -> tuple[Trajectory, motion.ProcessNoise]:
     """Add white noise to an ensemble and smooth it; return the precise method's trajectory and the process noise.
 
     `known` is an earlier process noise, None estimates it. `silent` smooths exact data: the bias of smoothing alone.
@@ -259,7 +247,7 @@ def smoothed_track(
     track = _noisy(true, noise_deg, noise_mm, seed, "precise")
     if silent:
         track = replace(track, position=true.position, orientation=true.orientation)
-    poses = MeasuredPoses(
+    poses = motion.MeasuredPoses(
         time_s=torch.from_numpy(track.time),
         position_lab_mm=torch.from_numpy(track.position),
         position_cov_mm2=torch.from_numpy(track.position_cov),
@@ -267,20 +255,21 @@ def smoothed_track(
         orientation_cov_rad2=torch.from_numpy(track.orientation_cov),
         segment=torch.from_numpy(track.segment),
     )
-    found = smooth_motion(poses, SmoothSettings(), known)
-    parts = {
-        "position_smooth": found.position_lab_mm,
-        "position_smooth_cov": found.position_cov_mm2,
-        "orientation_smooth": found.R_lab_body,
-        "orientation_smooth_cov": found.orientation_cov_rad2,
-    }
-    flags = np.where(found.extrapolated.numpy(), np.uint32(Flag.EXTRAPOLATED), np.uint32(0))
-    arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in parts.items()}
-    return replace(track, **arrays, **rates_of(found), flags=flags), found.process
+    found = motion.smooth_motion(poses, motion.SmoothSettings(), known)
+    smooth = replace(
+        track,
+        position_smooth=found.position_lab_mm.numpy(),
+        position_smooth_cov=found.position_cov_mm2.numpy(),
+        orientation_smooth=found.R_lab_body.numpy(),
+        orientation_smooth_cov=found.orientation_cov_rad2.numpy(),
+        **motion.rates_of(found),
+        flags=np.where(found.extrapolated.numpy(), np.uint32(Flag.EXTRAPOLATED), np.uint32(0)),
+    )
+    return smooth, found.process
 
 
 def filtered_track(
-    true: Trajectory, noise_deg: float, noise_mm: float, seed: int, settings: MotionSettings | None = None
+    true: Trajectory, noise_deg: float, noise_mm: float, seed: int, settings: motion.MotionSettings | None = None
 ) -> Trajectory:
     """Add white noise to an ensemble and differentiate with Gaussian kernels; return the paper method's trajectory.
 
@@ -289,16 +278,18 @@ def filtered_track(
     """
     track = _noisy(true, noise_deg, noise_mm, seed, "paper")
     sigma_mm, sigma_rad = (torch.full((len(track),), x) for x in (noise_mm, math.radians(noise_deg)))
-    found = measure_motion(
+    found = motion.measure_motion(
         torch.from_numpy(track.position),
         torch.from_numpy(track.orientation),
         torch.from_numpy(track.segment),
         true.frame_rate,
-        settings or MotionSettings(),
+        settings or motion.MotionSettings(),
         position_sigma_mm=sigma_mm.double(),
         orientation_sigma_rad=sigma_rad.double(),
     )
-    return replace(track, position_smooth=track.position, orientation_smooth=track.orientation, **rates_of(found))
+    return replace(
+        track, position_smooth=track.position, orientation_smooth=track.orientation, **motion.rates_of(found)
+    )
 
 
 def _noisy(true: Trajectory, noise_deg: float, noise_mm: float, seed: int, method: str) -> Trajectory:

@@ -1,6 +1,7 @@
 """Write synthetic experiments in the format that `sphereorient track` reads."""
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -28,12 +29,9 @@ PIXEL_PITCH_MM = 0.02
 
 def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
     """Return two Tsai cameras with slight distortion: cam1 looks along lab +y, cam2 along lab -z."""
+    f64 = partial(torch.tensor, dtype=torch.float64)
     focal_mm = settings.diameter_px * PIXEL_PITCH_MM * settings.distance_mm / settings.diameter_mm
     width, height = settings.image_size
-
-    def f64(value: Any) -> Tensor:
-        return torch.tensor(value, dtype=torch.float64)
-
     looks = {
         "cam1": [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
         "cam2": [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]],
@@ -54,10 +52,7 @@ def default_cameras(settings: SynthSettings) -> dict[str, Camera]:
 
 
 def write_degraded(
-    folder: Path,
-    base: SynthSettings,
-    applied: Mapping[str, int],
-    progress: Callable[[int], None] = lambda done: None,
+    folder: Path, base: SynthSettings, applied: Mapping[str, int], progress: Callable[[int], None] = lambda done: None
 ) -> Path:
     """Render as `write_synthetic_experiment` does; `applied` maps degradations to levels 1 .. 5.
 
