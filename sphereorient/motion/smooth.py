@@ -11,11 +11,10 @@ from torch import Tensor
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, ProcessNoise, estimate
 from sphereorient.motion.kalman import Bools, Floats
-from sphereorient.motion.measure import Motion
+from sphereorient.motion.measure import M_PER_MM, Motion
 from sphereorient.motion.path import RotationTrack, SegmentTrack
 from sphereorient.motion.settings import SmoothSettings
 
-M_PER_MM = 1e-3
 LONGEST_STEP = 1.5  # typical steps; longer ones are bridged by instants in between
 MOST_BETWEEN = 300  # instants that bridge one long step
 LOST_RAD = 0.5  # an orientation with a larger sigma is discarded

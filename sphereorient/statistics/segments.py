@@ -8,18 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import TrackError, refusal
+from sphereorient.motion import RATE_UNITS
 from sphereorient.statistics.bootstrap import FEWEST, Floats, Interval, Rows
 from sphereorient.statistics.settings import SegmentSettings
 from sphereorient.trajectory import Flag, Trajectory
+from sphereorient.trajectory.datasets import stored_fields
 
-UNITS = {
-    "velocity": "m/s",
-    "acceleration": "m/s^2",
-    "omega_lab": "rad/s",
-    "omega_body": "rad/s",
-    "alpha_lab": "rad/s^2",
-    "alpha_body": "rad/s^2",
-}
+UNITS = {name: spec.units for name, spec in stored_fields(Trajectory) if name in RATE_UNITS}  # of the six quantities
 COLUMNS = {"time_s": "time", "position_mm": "position_smooth", "R_lab_body": "orientation_smooth", "label": "segment"}
 COLUMNS |= {name: name for quantity in UNITS for name in (quantity, f"{quantity}_sigma")}
 

@@ -217,9 +217,7 @@ def _orientations(
     early, late = (_rates(turns, since_s + h * (0.5 + sign * math.sqrt(3) / 6), segment)[0] for sign in (-1, 1))
     # In the body frame, dR^T/dt = -[omega_body]x R^T: the same equation for the transpose.
     sign = 1.0 if spec.frame == "lab" else -1.0
-    step = magnus_rotation(
-        torch.from_numpy(sign * early), torch.from_numpy(sign * late), torch.tensor(h, dtype=torch.float64)
-    ).numpy()
+    step = magnus_rotation(torch.from_numpy(sign * early), torch.from_numpy(sign * late), h).numpy()
     R = np.empty((len(segment), 3, 3))
     start = np.concatenate([[0], np.cumsum(frames)[:-1]])
     now = R_start if spec.frame == "lab" else R_start.swapaxes(1, 2)
