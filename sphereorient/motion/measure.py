@@ -1,5 +1,4 @@
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -65,36 +64,21 @@ def measure_motion(
         do = "give all three the same frames"
         raise ShapeError(refusal("motion", expected="(..., N, 3), (..., N, 3, 3), (..., N)", got=shapes, do=do))
     dt_s = 1.0 / frame_rate_hz
-    velocity, velocity_sigma = _translation(position_mm, position_sigma_mm, segment, dt_s, 1, settings)
-    acceleration, acceleration_sigma = _translation(position_mm, position_sigma_mm, segment, dt_s, 2, settings)
-    omega, alpha = _rotation(R_lab_body, orientation_sigma_rad, segment, dt_s, settings)
-    turning = {}
-    for name, unit, (x, sigma) in (("omega", "rad_s", omega), ("alpha", "rad_s2", alpha)):
-        turning[f"{name}_lab_{unit}"], turning[f"{name}_lab_sigma_{unit}"] = x, sigma
-        turning[f"{name}_body_{unit}"] = _to_body(R_lab_body, x)
-        turning[f"{name}_body_sigma_{unit}"] = _sigma_in_body(R_lab_body, x, sigma, orientation_sigma_rad)
-    return Motion(
-        velocity_m_s=velocity,
-        velocity_sigma_m_s=velocity_sigma,
-        acceleration_m_s2=acceleration,
-        acceleration_sigma_m_s2=acceleration_sigma,
-        **turning,
+    moves: tuple[tuple[str, str, float, Order], ...] = (
+        ("velocity", "m_s", settings.velocity_sigma_frames, 1),
+        ("acceleration", "m_s2", settings.acceleration_sigma_frames, 2),
     )
-
-
-def _translation(
-    position_mm: Tensor,
-    sigma_mm: Tensor | None,
-    segment: Tensor,
-    dt_s: float,
-    order: Literal[1, 2],
-    settings: MotionSettings,
-) -> tuple[Tensor, Tensor]:
-    """Return a derivative of the position and its sigma, m/s^order."""
-    width = {1: settings.velocity_sigma_frames, 2: settings.acceleration_sigma_frames}[order]
-    stencil = _stencil(position_mm, segment, width, order, settings)
-    scale = M_PER_MM / dt_s**order
-    return apply(stencil, position_mm) * scale, propagated_sigma(stencil, _by_axis(sigma_mm, position_mm)) * scale
+    found = {}
+    for name, unit, width, order in moves:
+        stencil, scale = _stencil(position_mm, segment, width, order, settings), M_PER_MM / dt_s**order
+        sigma = propagated_sigma(stencil, _by_axis(position_sigma_mm, position_mm))
+        found[f"{name}_{unit}"], found[f"{name}_sigma_{unit}"] = apply(stencil, position_mm) * scale, sigma * scale
+    omega, alpha = _rotation(R_lab_body, orientation_sigma_rad, segment, dt_s, settings)
+    for name, unit, (x, sigma) in (("omega", "rad_s", omega), ("alpha", "rad_s2", alpha)):
+        found[f"{name}_lab_{unit}"], found[f"{name}_lab_sigma_{unit}"] = x, sigma
+        found[f"{name}_body_{unit}"] = _to_body(R_lab_body, x)
+        found[f"{name}_body_sigma_{unit}"] = _sigma_in_body(R_lab_body, x, sigma, orientation_sigma_rad)
+    return Motion(**found)
 
 
 def _rotation(
