@@ -68,7 +68,7 @@ def measure_motion(
         ("velocity", "m_s", settings.velocity_sigma_frames, 1),
         ("acceleration", "m_s2", settings.acceleration_sigma_frames, 2),
     )
-    found = {}
+    found: dict[str, Tensor] = {}
     for name, unit, width, order in moves:
         stencil, scale = _stencil(position_mm, segment, width, order, settings), M_PER_MM / dt_s**order
         sigma = propagated_sigma(stencil, _by_axis(position_sigma_mm, position_mm))

@@ -156,7 +156,8 @@ def _without_the_ball(filming: Filming, name: str) -> NDArray[np.uint8]:
     size = filming.cameras[name].image_size[::-1]
     disk = filming.disk(name, torch.zeros(3, dtype=torch.float64), np.zeros(size, np.float32))
     empty = filming.picture(np.full(size, filming.settings.background, np.float32), disk, name, None)
-    return np.clip(np.rint(empty), 0, 255).astype(np.uint8)
+    rounded: NDArray[np.uint8] = np.clip(np.rint(empty), 0, 255).astype(np.uint8)
+    return rounded
 
 
 def _write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> None:
