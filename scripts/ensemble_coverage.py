@@ -25,7 +25,7 @@ from sphereorient.statistics.density import fit_stretched
 from sphereorient.statistics.moments import moments, noise_let_through
 from sphereorient.statistics.segments import UNITS, Ensemble, ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings, SegmentSettings
-from sphereorient.synth.ensemble import EnsembleSpec, Nominal, draw_ensemble, exact_track, nominal, smoothed_track
+from sphereorient.synth.ensemble import EnsembleSpec, Nominal, draw_ensemble, nominal, smoothed_track
 from sphereorient.trajectory import Trajectory
 
 NOISE_DEG, ROUGH_DEG, NOISE_MM = 0.1, 2.0, 0.05
@@ -87,7 +87,7 @@ def repeat(work: Work) -> Result:
     track, _ = smoothed_track(true, NOISE_DEG, NOISE_MM, work.seed, work.known)
     few = BootstrapSettings(resamples=100)
     ensemble = ensemble_of(track)
-    clean = {key: value for key, value, _, _ in measure(same_frames(exact_track(true), ensemble), few)}
+    clean = {key: value for key, value, _, _ in measure(same_frames(true, ensemble), few)}
     return {
         key: (value / clean[key], low <= work.truth[key] <= high) for key, value, low, high in measure(ensemble, DRAWS)
     }

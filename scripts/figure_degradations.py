@@ -26,7 +26,7 @@ from sphereorient.cameras import Camera
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
 from sphereorient.synth import DEGRADATIONS, SynthSettings, severity, write_degraded
-from sphereorient.synth.degrade_scene import DegradedFilming, picture_of_ball
+from sphereorient.synth.degrade_scene import Filming, picture_of_ball
 from sphereorient.synth.severities import Degradation
 from sphereorient.synth.write import default_cameras
 
@@ -121,7 +121,7 @@ def grey(cell: Any, picture: NDArray[Any]) -> None:
 
 def lost(row: Degradation, level: int) -> NDArray[np.float64]:
     """Which frames of both cameras are lost, in rows of ten, a gap between the cameras."""
-    filming = DegradedFilming(BASE, {row.name: severity(row.name, level)} if level else {})
+    filming = Filming(BASE, {row.name: severity(row.name, level)} if level else {}, default_cameras(BASE))
     masks = [[k in filming.lost(name, MOVIE) for k in range(MOVIE)] for name in ("cam1", "cam2")]
     tiles = [np.kron(np.reshape(mask, (-1, 10)), np.pad(np.ones((8, 8)), 1)) for mask in masks]
     return np.vstack([tiles[0], np.full((6, 100), np.nan), tiles[1]])

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from sphereorient.statistics.isotropy import anisotropic_frame, isotropy, uniformity
 from sphereorient.statistics.segments import ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, exact_track
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
 
 Floats = NDArray[np.float64]
 Attitudes = tuple[Floats, NDArray[np.int64] | None]
@@ -39,7 +39,7 @@ def independent(rng: np.random.Generator) -> Attitudes:
 def tracked(rng: np.random.Generator) -> Attitudes:
     """Return attitudes along 120 segments with exponential durations."""
     true = draw_ensemble(EnsembleSpec(segments=120, mean_frames=90.0), int(rng.integers(2**31)))
-    return true.R_lab_body, true.segment
+    return true.orientation, true.segment
 
 
 def pretended(rng: np.random.Generator) -> Attitudes:
@@ -73,7 +73,7 @@ def told_frames(frame: str, count: int) -> Counter[str]:
     spec = EnsembleSpec(segments=200, mean_frames=90.0, frame="lab" if frame == "lab" else "body", omega_rms=UNEQUAL)
     few, told = BootstrapSettings(resamples=100), Counter[str]()
     for seed in shown(range(count), f"prefers {frame}", transient=True):
-        ensemble = ensemble_of(exact_track(draw_ensemble(spec, seed)))
+        ensemble = ensemble_of(draw_ensemble(spec, seed))
         told[anisotropic_frame(isotropy(ensemble, "omega_lab", few), isotropy(ensemble, "omega_body", few), 0.001)] += 1
     return told
 

@@ -1,12 +1,13 @@
 """Velocities and accelerations on R^3 and SO(3)."""
 
 from sphereorient.motion.angular_velocity import kabsch, omega_from_markers, omega_from_orientations, to_body
-from sphereorient.motion.derivative import gaussian_derivative, noise_gain
 from sphereorient.motion.estimate import ProcessNoise, ProcessPrior
 from sphereorient.motion.matern import Prior
 from sphereorient.motion.measure import Motion, measure_motion
+from sphereorient.motion.path import rotvec_between
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
 from sphereorient.motion.smooth import RATE_UNITS, MeasuredPoses, Smoothed, rates_of, smooth_motion
+from sphereorient.motion.stencil import gaussian_derivative, gaussian_kernel, noise_gain
 
 __all__ = [
     "RATE_UNITS",
@@ -19,12 +20,14 @@ __all__ = [
     "SmoothSettings",
     "Smoothed",
     "gaussian_derivative",
+    "gaussian_kernel",
     "kabsch",
     "measure_motion",
     "noise_gain",
     "omega_from_markers",
     "omega_from_orientations",
     "rates_of",
+    "rotvec_between",
     "smooth_motion",
     "to_body",
 ]

@@ -4,8 +4,9 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
-from sphereorient.motion.stencil import neighbours_there
+from sphereorient.errors import ShapeError, check_tail, refusal
+from sphereorient.motion.settings import check_separations
+from sphereorient.motion.stencil import paired
 
 FEWEST_POINTS = 3  # points that determine a rotation
 
@@ -43,7 +44,8 @@ def omega_from_orientations(
     there = R_lab_body.isfinite().all(-1).all(-1)
     R = torch.where(there[..., None, None], R_lab_body, torch.eye(3, dtype=R_lab_body.dtype, device=R_lab_body.device))
     usable = usable_separations(there, separations, segment)  # (..., N, S)
-    turns = torch.stack([_shifted(R, m) @ _shifted(R, -m).mT for m in separations], dim=-3)  # (..., N, S, 3, 3)
+    # frames that wrap around an end are never used
+    turns = torch.stack([R.roll(-m, -3) @ R.roll(m, -3).mT for m in separations], dim=-3)  # (..., N, S, 3, 3)
     # a turn that is not used may be half a turn, where log has no gradient
     turns = torch.where(usable[..., None, None], turns, torch.eye(3, dtype=turns.dtype, device=turns.device))
     return mean_over_separations(turns, usable, dt_s, separations, min_separations)
@@ -59,19 +61,10 @@ def to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
     return (R_lab_body.mT @ x_lab[..., None])[..., 0]
 
 
-def check_separations(separations: Sequence[int]) -> None:
-    """Raise SettingsError unless the separations are different numbers from 1 up."""
-    if not separations or min(separations) < 1 or len(set(separations)) < len(separations):
-        expected, do = "different numbers from 1 up", "give each separation once"
-        raise SettingsError(refusal("separations", expected=expected, got=str(tuple(separations)), do=do))
-
-
 def usable_separations(there: Tensor, separations: Sequence[int], segment: Tensor | None) -> Tensor:
     """Return for S separations whether both ends are in the frame's segment, (..., N, S) bool."""
     half = max(separations)
-    near = neighbours_there(there, segment, half)
-    m = torch.as_tensor(separations, device=there.device)
-    return near[..., half + m] & near[..., half - m]
+    return paired(there, segment, half)[..., half + torch.as_tensor(separations, device=there.device)]
 
 
 def omega_stencil(usable: Tensor, separations: Sequence[int], min_separations: int, dtype: torch.dtype) -> Tensor:
@@ -106,11 +99,6 @@ def mean_over_separations(
         scattered, torch.where(scattered, variance, 1).sqrt(), torch.where(enough & (count > 1), 0.0, torch.nan)
     )
     return torch.where(enough, mean, torch.nan), error
-
-
-def _shifted(R: Tensor, m: int) -> Tensor:
-    """Return R[..., k + m, :, :] at frame k; frames that wrap around an end are never used."""
-    return R.roll(-m, dims=-3)
 
 
 def kabsch(points_a: Tensor, points_b: Tensor, weights: Tensor | None = None) -> Tensor:

@@ -6,16 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from sphereorient.motion.kalman import SmoothedStates, run_filter, smooth
+from sphereorient.motion.kalman import Bools, Floats, SmoothedStates, run_filter, smooth
 from sphereorient.motion.matern import Prior, prior_of_band
 from sphereorient.motion.path import DELTA, MEAN, SIZE, SegmentTrack
 from sphereorient.motion.settings import SmoothSettings
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 ITERATIONS = 8  # of Gauss and Newton at most between two rejections; two or three do
 SETTLED = 0.03  # of a measurement's sigma: convergence is quadratic, so the next step is negligible
@@ -42,8 +38,7 @@ class ProcessPrior:
 
     def at_rate(self, ratio: float) -> ProcessPrior:
         """Return the same motion in frames that last `ratio` times as long."""
-        prior = Prior(pole=self.prior.pole * ratio, deviation=self.prior.deviation * ratio)
-        return ProcessPrior(prior=prior, scale=self.scale)
+        return replace(self, prior=Prior(pole=self.prior.pole * ratio, deviation=self.prior.deviation * ratio))
 
 
 @dataclass(frozen=True, kw_only=True)

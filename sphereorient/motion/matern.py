@@ -9,10 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
-from numpy.typing import NDArray
 from scipy.special import betaln, gammainc
 
-Floats = NDArray[np.float64]
+from sphereorient.motion.kalman import Floats
 
 ORDER = 10  # poles; on turbulence-like motion 6 loses 20 % in acceleration, 3 loses 80 %, 11 gains 1 %
 NODES = 8  # of Gauss's quadrature over a step; exact for what Taylor's series of a step can show

@@ -1,19 +1,12 @@
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from sphereorient.errors import ShapeError, check_tail, refusal
-from sphereorient.motion.angular_velocity import (
-    omega_from_orientations,
-    omega_stencil,
-    to_body,
-    usable_separations,
-)
-from sphereorient.motion.derivative import Order, gap_aware_stencil
+from sphereorient.motion.angular_velocity import omega_from_orientations, omega_stencil, to_body, usable_separations
 from sphereorient.motion.settings import MotionSettings
-from sphereorient.motion.stencil import apply, compose, propagated_sigma
+from sphereorient.motion.stencil import Order, apply, compose, gap_aware_stencil, propagated_sigma
 
 M_PER_MM = 1e-3
 
@@ -71,38 +64,21 @@ def measure_motion(
         do = "give all three the same frames"
         raise ShapeError(refusal("motion", expected="(..., N, 3), (..., N, 3, 3), (..., N)", got=shapes, do=do))
     dt_s = 1.0 / frame_rate_hz
-    velocity, velocity_sigma = _translation(position_mm, position_sigma_mm, segment, dt_s, 1, settings)
-    acceleration, acceleration_sigma = _translation(position_mm, position_sigma_mm, segment, dt_s, 2, settings)
-    (omega, omega_sigma), (alpha, alpha_sigma) = _rotation(R_lab_body, orientation_sigma_rad, segment, dt_s, settings)
-    return Motion(
-        velocity_m_s=velocity,
-        velocity_sigma_m_s=velocity_sigma,
-        acceleration_m_s2=acceleration,
-        acceleration_sigma_m_s2=acceleration_sigma,
-        omega_lab_rad_s=omega,
-        omega_lab_sigma_rad_s=omega_sigma,
-        omega_body_rad_s=_to_body(R_lab_body, omega),
-        omega_body_sigma_rad_s=_sigma_in_body(R_lab_body, omega, omega_sigma, orientation_sigma_rad),
-        alpha_lab_rad_s2=alpha,
-        alpha_lab_sigma_rad_s2=alpha_sigma,
-        alpha_body_rad_s2=_to_body(R_lab_body, alpha),
-        alpha_body_sigma_rad_s2=_sigma_in_body(R_lab_body, alpha, alpha_sigma, orientation_sigma_rad),
+    moves: tuple[tuple[str, str, float, Order], ...] = (
+        ("velocity", "m_s", settings.velocity_sigma_frames, 1),
+        ("acceleration", "m_s2", settings.acceleration_sigma_frames, 2),
     )
-
-
-def _translation(
-    position_mm: Tensor,
-    sigma_mm: Tensor | None,
-    segment: Tensor,
-    dt_s: float,
-    order: Literal[1, 2],
-    settings: MotionSettings,
-) -> tuple[Tensor, Tensor]:
-    """Return a derivative of the position and its sigma, m/s^order."""
-    width = {1: settings.velocity_sigma_frames, 2: settings.acceleration_sigma_frames}[order]
-    stencil = _stencil(position_mm, segment, width, order, settings)
-    scale = M_PER_MM / dt_s**order
-    return apply(stencil, position_mm) * scale, propagated_sigma(stencil, _by_axis(sigma_mm, position_mm)) * scale
+    found: dict[str, Tensor] = {}
+    for name, unit, width, order in moves:
+        stencil, scale = _stencil(position_mm, segment, width, order, settings), M_PER_MM / dt_s**order
+        sigma = propagated_sigma(stencil, _by_axis(position_sigma_mm, position_mm))
+        found[f"{name}_{unit}"], found[f"{name}_sigma_{unit}"] = apply(stencil, position_mm) * scale, sigma * scale
+    omega, alpha = _rotation(R_lab_body, orientation_sigma_rad, segment, dt_s, settings)
+    for name, unit, (x, sigma) in (("omega", "rad_s", omega), ("alpha", "rad_s2", alpha)):
+        found[f"{name}_lab_{unit}"], found[f"{name}_lab_sigma_{unit}"] = x, sigma
+        found[f"{name}_body_{unit}"] = _to_body(R_lab_body, x)
+        found[f"{name}_body_sigma_{unit}"] = _sigma_in_body(R_lab_body, x, sigma, orientation_sigma_rad)
+    return Motion(**found)
 
 
 def _rotation(
@@ -114,14 +90,10 @@ def _rotation(
     slope = _stencil(omega, segment, settings.alpha_sigma_frames, 1, settings)
     alpha = apply(slope, omega) / dt_s
     # neighbouring omegas share orientations: their noise is not white, that of the orientations is
-    turn = omega_stencil(
-        usable_separations(_oriented(R_lab_body), separations, segment), separations, fewest, omega.dtype
-    )
-    sigma = _by_axis(sigma_rad, omega)
-    return (omega, propagated_sigma(turn, sigma) / dt_s), (
-        alpha,
-        propagated_sigma(compose(slope, turn), sigma) / dt_s**2,
-    )
+    usable = usable_separations(_oriented(R_lab_body), separations, segment)
+    turn, sigma = omega_stencil(usable, separations, fewest, omega.dtype), _by_axis(sigma_rad, omega)
+    omega_sigma = propagated_sigma(turn, sigma) / dt_s
+    return (omega, omega_sigma), (alpha, propagated_sigma(compose(slope, turn), sigma) / dt_s**2)
 
 
 def _stencil(x: Tensor, segment: Tensor, sigma_frames: float, order: Order, settings: MotionSettings) -> Tensor:

@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from sphereorient.motion.kalman import StateSpace
+from sphereorient.motion.kalman import Bools, Floats, StateSpace
 from sphereorient.motion.matern import NODES, ORDER, STATIONARY, Prior, grown, grown_rate, integral, nodes
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 SIZE = 3 * (2 + ORDER)
 UNKNOWN = 100.0  # standard deviation of the start from its reference, in sigmas of a measurement: next to no pull
@@ -30,7 +27,7 @@ DELTA, MEAN, RATE = slice(0, 3), slice(3, 6), slice(6, SIZE)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentTrack:
-    """The measurements of one segment, and the reference of the states."""
+    """The measurements of one segment, positions in mm, lab, and the reference of the states."""
 
     time: Floats  # (N,), frames, increasing
     covariance: Floats  # (N, 3, 3), of the measurements
@@ -43,23 +40,78 @@ class SegmentTrack:
     value: Floats  # (N, 3) or (N, 3, 3), the measurements
     reference: Floats  # like value
 
-    def away(self) -> Floats:
-        """Return the measurements as deviations (N, 3) from the reference; anything where unused."""
-        raise NotImplementedError
+    @staticmethod
+    def between(begin: Floats, end: Floats) -> Floats:
+        """Return the steps (M, 3) from values (M, ...) to others."""
+        return end - begin
+
+    @staticmethod
+    def stepped(value: Floats, step: Floats) -> Floats:
+        """Return the values (M, ...) after steps (M, 3)."""
+        return value + step
+
+    @classmethod
+    def first_guess(cls, time: Floats, value: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
+        """Return values, gaps interpolated, and rates (N, 3) per frame, at all instants; the frames trusted (N,)."""
+        frames = np.flatnonzero(seen)
+        if len(frames) > 1:
+            steps = np.diff(value[frames], axis=0)
+            velocity = _typical(time, time[frames], steps)
+            gone = np.cumsum((velocity[1:] + velocity[:-1]) / 2 * np.diff(time)[:, None], axis=0)
+            still = value[frames] - np.concatenate([np.zeros((1, 3)), gone])[frames]
+            frames = frames[_consistent(cls.between, still, steps)]
+        reference = np.stack([np.interp(time, time[frames], value[frames, axis]) for axis in range(3)], axis=1)
+        velocity = np.gradient(reference, time, axis=0) if len(time) > 1 else np.zeros_like(reference)
+        return reference, velocity, np.isin(np.arange(len(time)), frames)
 
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
         """Return rotations (N - 1, NODES + 1, 3, 3) from nodes and begin of a step to its end, and jumps (N - 1, 3).
         The jumps are the steps less the integral of the reference's rate.
         """
-        raise NotImplementedError
+        step = np.diff(self.time)
+        gone = (integral(step * prior.pole)[:, None] / prior.pole @ self.scaled(prior)[:-1])[:, 0]
+        carry = np.broadcast_to(np.eye(3), (len(step), NODES + 1, 3, 3))
+        return carry, np.diff(self.reference, axis=0) - step[:, None] * self.mean - gone
+
+    @classmethod
+    def of(cls, time: Floats, value: Floats, covariance: Floats, seen: Bools) -> Self:
+        """Return the segment about a first estimate: consistent measurements, gaps interpolated."""
+        reference, velocity, trusted = cls.first_guess(time, value, seen)
+        mean = velocity.mean(0)
+        rate = np.zeros((len(time), ORDER, 3))
+        rate[:, 0] = velocity - mean
+        return cls(
+            time=time,
+            covariance=covariance,
+            seen=seen,
+            used=trusted,
+            unknown_rate=2 * float(np.sqrt((rate[:, 0] ** 2).mean())),
+            mean=mean,
+            rate=rate,
+            pole=1.0,
+            value=value,
+            reference=reference,
+        )
 
     def moved(self, state: Floats, prior: Prior) -> Self:
         """Return the path about the states (N, SIZE)."""
-        raise NotImplementedError
+        return replace(
+            self,
+            reference=self.stepped(self.reference, state[:, DELTA]),
+            mean=self.mean + state[0, MEAN],
+            rate=state[:, RATE].reshape(-1, ORDER, 3),
+            pole=prior.pole,
+        )
+
+    def away(self) -> Floats:
+        """Return the measurements as deviations (N, 3) from the reference; 0 where not measured."""
+        seen = self.seen.reshape(-1, *(1,) * (self.value.ndim - 1))
+        return self.between(self.reference, np.where(seen, self.value, self.reference))
 
     def rates(self) -> Floats:
         """Return the rates (M, 3), per frame, between neighbouring measurements."""
-        raise NotImplementedError
+        seen = np.flatnonzero(self.used)
+        return self.between(self.value[seen[:-1]], self.value[seen[1:]]) / np.diff(self.time[seen])[:, None]
 
     @property
     def sigma(self) -> float:
@@ -131,94 +183,43 @@ def _by_axis(blocks: Floats) -> Floats:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PositionTrack(SegmentTrack):
-    """Positions of one segment: value and reference (N, 3), mm, lab."""
-
-    @classmethod
-    def of(cls, time: Floats, value: Floats, covariance: Floats, seen: Bools) -> Self:
-        """Return the segment about a first estimate: the measurements, gaps interpolated linearly."""
-        frames = np.flatnonzero(seen)
-        if len(frames) > 1:
-            steps = np.diff(value[frames], axis=0)
-            velocity = _typical(time, time[frames], steps / np.diff(time[frames])[:, None])
-            gone = np.cumsum((velocity[1:] + velocity[:-1]) / 2 * np.diff(time)[:, None], axis=0)
-            still = value[frames] - np.concatenate([np.zeros((1, 3)), gone])[frames]
-            way = float(np.median(np.linalg.norm(steps, axis=1)))
-            frames = frames[_consistent(lambda lag: still[lag:] - still[:-lag], len(frames), way)]
-        trusted = np.isin(np.arange(len(time)), frames)
-        reference = np.stack([np.interp(time, time[frames], value[frames, axis]) for axis in range(3)], axis=1)
-        velocity = np.gradient(reference, time, axis=0) if len(time) > 1 else np.zeros_like(reference)
-        mean = velocity.mean(0)
-        rate = np.zeros((len(time), ORDER, 3))
-        rate[:, 0] = velocity - mean
-        return cls(
-            time=time,
-            covariance=covariance,
-            seen=seen,
-            used=trusted,
-            unknown_rate=2 * float(np.sqrt((rate[:, 0] ** 2).mean())),
-            mean=mean,
-            rate=rate,
-            pole=1.0,
-            value=value,
-            reference=reference,
-        )
-
-    def away(self) -> Floats:
-        """Return measurements minus reference."""
-        return np.where(self.seen[:, None], self.value - self.reference, 0.0)
-
-    def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
-        """Return unit rotations, and the jumps."""
-        step = np.diff(self.time)
-        gone = (integral(step * prior.pole)[:, None] / prior.pole @ self.scaled(prior)[:-1])[:, 0]
-        carry = np.broadcast_to(np.eye(3), (len(step), NODES + 1, 3, 3))
-        return carry, np.diff(self.reference, axis=0) - step[:, None] * self.mean - gone
-
-    def rates(self) -> Floats:
-        """Return velocities between neighbouring measurements."""
-        seen = np.flatnonzero(self.used)
-        return np.diff(self.value[seen], axis=0) / np.diff(self.time[seen])[:, None]
-
-    def moved(self, state: Floats, prior: Prior) -> Self:
-        """Return the path about the states."""
-        return replace(
-            self,
-            reference=self.reference + state[:, DELTA],
-            mean=self.mean + state[0, MEAN],
-            rate=state[:, RATE].reshape(-1, ORDER, 3),
-            pole=prior.pole,
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class RotationTrack(SegmentTrack):
-    """Orientations of one segment: value and reference R_lab_body (N, 3, 3), deviations delta in lab components."""
+    """Orientations of one segment: the same with R_lab_body (N, 3, 3), steps are rotation vectors, lab."""
+
+    @staticmethod
+    def between(begin: Floats, end: Floats) -> Floats:
+        """Return the rotation vectors, lab."""
+        return rotvec_between(begin, end)
+
+    @staticmethod
+    def stepped(value: Floats, step: Floats) -> Floats:
+        """Return the orientations rotated in the lab."""
+        return rotation_of(step) @ value
 
     @classmethod
-    def of(cls, time: Floats, value: Floats, covariance: Floats, seen: Bools) -> Self:
-        """Return the segment about a first estimate: consistent measurements, gaps interpolated."""
-        reference, omega, trusted = _first_guess(time, value, seen)
-        mean = omega.mean(0)
-        rate = np.zeros((len(time), ORDER, 3))
-        rate[:, 0] = omega - mean
-        return cls(
-            time=time,
-            covariance=covariance,
-            seen=seen,
-            used=trusted,
-            unknown_rate=2 * float(np.sqrt((rate[:, 0] ** 2).mean())),
-            mean=mean,
-            rate=rate,
-            pole=1.0,
-            value=value,
-            reference=reference,
-        )
-
-    def away(self) -> Floats:
-        """Return the rotation vectors from reference to measurement."""
-        value = np.where(self.seen[:, None, None], self.value, self.reference)
-        return rotvec_between(self.reference, value)
+    def first_guess(cls, time: Floats, value: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
+        """Return orientations, gaps interpolated along the typical turning, and omega_lab."""
+        frames = np.flatnonzero(seen)
+        if len(frames) < 2:
+            return np.broadcast_to(value[frames[0]], value.shape).copy(), np.zeros((len(time), 3)), seen
+        steps = rotvec_between(value[frames[:-1]], value[frames[1:]])
+        omega = _typical(time, time[frames], steps)
+        gone = np.concatenate([np.eye(3)[None], rotation_of((omega[1:] + omega[:-1]) / 2 * np.diff(time)[:, None])])
+        for k in range(1, len(time)):  # a product in order, compared over short spans only: it need not stay exact
+            gone[k] = gone[k] @ gone[k - 1]
+        still = gone[frames].mT @ value[frames]  # constant where the turning is typical
+        trusted = frames[_consistent(cls.between, still, steps)]
+        at = np.interp(np.arange(len(time)), trusted, np.arange(len(trusted)))
+        left = np.minimum(at.astype(int), max(len(trusted) - 2, 0))
+        share = np.clip(at - left, 0.0, 1.0)
+        before, after = trusted[left], trusted[np.minimum(left + 1, len(trusted) - 1)]
+        ahead = gone @ gone[before].mT @ value[before]
+        missed = rotvec_between(gone[after] @ gone[before].mT @ value[before], value[after])
+        carried = gone @ gone[after].mT @ rotation_of(missed)  # the correction grows in the frame that turns along
+        along = rotvec_between(ahead, carried @ gone[after] @ gone[before].mT @ value[before])
+        reference = rotation_of(share[:, None] * along) @ ahead
+        reference[trusted] = value[trusted]
+        return reference, omega, np.isin(np.arange(len(time)), trusted)
 
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
         """Return the reference's own rotations, exact for any angle, and the jumps."""
@@ -234,21 +235,6 @@ class RotationTrack(SegmentTrack):
         whole = propagated(self.mean, rate, pole, step)
         carry[:, NODES] = whole
         return carry, rotvec_between(whole @ self.reference[:-1], self.reference[1:])
-
-    def rates(self) -> Floats:
-        """Return angular velocities between neighbouring measurements."""
-        seen = np.flatnonzero(self.used)
-        return rotvec_between(self.value[seen[:-1]], self.value[seen[1:]]) / np.diff(self.time[seen])[:, None]
-
-    def moved(self, state: Floats, prior: Prior) -> Self:
-        """Return the path about the states."""
-        return replace(
-            self,
-            reference=rotation_of(state[:, DELTA]) @ self.reference,
-            mean=self.mean + state[0, MEAN],
-            rate=state[:, RATE].reshape(-1, ORDER, 3),
-            pole=prior.pole,
-        )
 
 
 def rotation_of(rotvec: Floats) -> Floats:
@@ -278,37 +264,11 @@ def propagated(mean: Floats, rate: Floats, pole: float, step: Floats, parts: int
     return whole
 
 
-def _first_guess(time: Floats, R: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
-    """Return orientations (N, 3, 3), omega_lab (N, 3), rad per frame, at all instants, and the frames trusted."""
-    frames = np.flatnonzero(seen)
-    if len(frames) < 2:
-        return np.broadcast_to(R[frames[0]], R.shape).copy(), np.zeros((len(time), 3)), seen
-    steps = rotvec_between(R[frames[:-1]], R[frames[1:]])
-    omega = _typical(time, time[frames], steps / np.diff(time[frames])[:, None])
-    gone = np.concatenate([np.eye(3)[None], rotation_of((omega[1:] + omega[:-1]) / 2 * np.diff(time)[:, None])])
-    for k in range(1, len(time)):  # a product in order; it need not stay exact, it is compared over short spans only
-        gone[k] = gone[k] @ gone[k - 1]
-    still = gone[frames].mT @ R[frames]  # constant where the turning is typical
-    way = float(np.median(np.linalg.norm(steps, axis=1)))
-    trusted = frames[_consistent(lambda lag: rotvec_between(still[:-lag], still[lag:]), len(frames), way)]
-    at = np.interp(np.arange(len(time)), trusted, np.arange(len(trusted)))
-    left = np.minimum(at.astype(int), max(len(trusted) - 2, 0))
-    share = np.clip(at - left, 0.0, 1.0)
-    right = np.minimum(left + 1, len(trusted) - 1)
-    ahead = gone @ gone[trusted[left]].mT @ R[trusted[left]]
-    missed = rotvec_between(gone[trusted[right]] @ gone[trusted[left]].mT @ R[trusted[left]], R[trusted[right]])
-    carried = gone @ gone[trusted[right]].mT @ rotation_of(missed)  # the correction grows in the frame that turns along
-    along = rotvec_between(ahead, carried @ gone[trusted[right]] @ gone[trusted[left]].mT @ R[trusted[left]])
-    reference = rotation_of(share[:, None] * along) @ ahead
-    reference[trusted] = R[trusted]
-    return reference, omega, np.isin(np.arange(len(time)), trusted)
-
-
-def _typical(time: Floats, seen_time: Floats, rates: Floats) -> Floats:
-    """Return rates (N, 3) at all instants from those between neighbours, robust to two wrong ones in five."""
+def _typical(time: Floats, seen_time: Floats, steps: Floats) -> Floats:
+    """Return rates (N, 3) at all instants from the steps between neighbours, robust to two wrong ones in five."""
     step = np.diff(seen_time)
     near = np.flatnonzero(step <= 1.5 * np.median(step))
-    rates, middle = rates[near], ((seen_time[:-1] + seen_time[1:]) / 2)[near]
+    rates, middle = steps[near] / step[near, None], ((seen_time[:-1] + seen_time[1:]) / 2)[near]
     if len(near) < VOTES:
         return np.broadcast_to(np.median(rates, axis=0), (len(time), 3)).copy()
     slope = np.median(_around(np.diff(rates, axis=0) / np.diff(middle)[:, None], 2 * VOTES - 2), axis=1)
@@ -325,12 +285,14 @@ def _around(x: Floats, width: int) -> Floats:
     return np.asarray(x[first[:, None] + np.arange(width)])
 
 
-def _consistent(kink: Callable[[int], Floats], count: int, way: float) -> NDArray[np.int64]:
+def _consistent(between: Callable[[Floats, Floats], Floats], still: Floats, steps: Floats) -> NDArray[np.int64]:
     """Return the frames that follow from each other, by dynamic programming; leaving out a frame has a cost.
-    `kink` gives for a lag the steps (count - lag, 3) between frames less the typical rate; `way` is the typical step.
+    `still`: measurements (n, ...) less the typical motion, `between` the steps (m, 3) from some to others.
     """
+    count = len(still)
     reach = min(LEFT_OUT + 1, count - 1)
-    kinks = [np.linalg.norm(kink(lag), axis=1) / lag for lag in range(1, reach + 1)]
+    kinks = [np.linalg.norm(between(still[:-lag], still[lag:]), axis=1) / lag for lag in range(1, reach + 1)]
+    way = float(np.median(np.linalg.norm(steps, axis=1)))  # the typical step
     typical = max(float(np.median(kinks[0])), 0.03 * way, 1e-9)
     links = [np.minimum((size / (8 * typical)) ** 2, 25.0) for size in kinks]
     price, before = np.full(count, np.inf), np.full(count, -1)

@@ -1,8 +1,16 @@
+from collections.abc import Sequence
 from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sphereorient.errors import SettingsError, refusal
+
+
+def check_separations(separations: Sequence[int], name: str = "separations") -> None:
+    """Raise SettingsError unless the separations are different numbers from 1 up."""
+    if not separations or min(separations) < 1 or len(set(separations)) < len(separations):
+        expected, do = "different numbers from 1 up", "give each separation once"
+        raise SettingsError(refusal(name, expected=expected, got=str(tuple(separations)), do=do))
 
 
 class MotionSettings(BaseModel):
@@ -15,9 +23,7 @@ class MotionSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     velocity_sigma_frames: float = Field(
-        3.5,
-        gt=0,
-        description="width of the Gaussian for velocity, frames; 0.1 mm of white noise at 600 Hz: 0.003 m/s",
+        3.5, gt=0, description="width of the Gaussian for velocity, frames; 0.1 mm of white noise at 600 Hz: 0.003 m/s"
     )
     acceleration_sigma_frames: float = Field(
         5.0,
@@ -51,13 +57,11 @@ class MotionSettings(BaseModel):
 
     @model_validator(mode="after")
     def _separations_can_be_measured(self) -> Self:
-        m = self.separations
-        if min(m) < 1 or len(set(m)) < len(m):
-            expected, do = "different numbers from 1 up", "give each separation once"
-            raise SettingsError(refusal("motion.separations", expected=expected, got=str(m), do=do))
-        if self.min_separations > len(m):
+        check_separations(self.separations, "motion.separations")
+        most = len(self.separations)
+        if self.min_separations > most:
             got, do = str(self.min_separations), "lower it or give more separations"
-            raise SettingsError(refusal("motion.min_separations", expected=f"at most {len(m)}", got=got, do=do))
+            raise SettingsError(refusal("motion.min_separations", expected=f"at most {most}", got=got, do=do))
         return self
 
 

@@ -10,39 +10,24 @@ from torch import Tensor
 
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, ProcessNoise, estimate
-from sphereorient.motion.measure import Motion
-from sphereorient.motion.path import PositionTrack, RotationTrack
+from sphereorient.motion.kalman import Bools, Floats
+from sphereorient.motion.measure import M_PER_MM, Motion
+from sphereorient.motion.path import RotationTrack, SegmentTrack
 from sphereorient.motion.settings import SmoothSettings
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-
-M_PER_MM = 1e-3
 LONGEST_STEP = 1.5  # typical steps; longer ones are bridged by instants in between
 MOST_BETWEEN = 300  # instants that bridge one long step
 LOST_RAD = 0.5  # an orientation with a larger sigma is discarded
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Smoothed:
+class Smoothed(Motion):
     """Smoothed motion of N frames, float64, NaN where it is unknown."""
 
     position_lab_mm: Tensor  # (N, 3)
     position_cov_mm2: Tensor  # (N, 3, 3)
-    velocity_m_s: Tensor  # (N, 3)
-    velocity_sigma_m_s: Tensor
-    acceleration_m_s2: Tensor
-    acceleration_sigma_m_s2: Tensor
     R_lab_body: Tensor  # (N, 3, 3)
     orientation_cov_rad2: Tensor  # (N, 3, 3), of delta in R_true = exp([delta]x) R_lab_body, lab components
-    omega_lab_rad_s: Tensor  # (N, 3)
-    omega_lab_sigma_rad_s: Tensor
-    omega_body_rad_s: Tensor
-    omega_body_sigma_rad_s: Tensor
-    alpha_lab_rad_s2: Tensor
-    alpha_lab_sigma_rad_s2: Tensor
-    alpha_body_rad_s2: Tensor
-    alpha_body_sigma_rad_s2: Tensor
     extrapolated: Tensor  # (N,) bool, frames of a segment without a measurement of their own of either kind
     rejected: Tensor  # (N,) bool, frames with a rejected measurement
     position_scale: float  # true errors of the measured positions over their sigmas, slow errors included
@@ -65,13 +50,11 @@ class MeasuredPoses:
         check_tail("position_lab_mm", self.position_lab_mm, 3)
         for name in ("position_cov_mm2", "R_lab_body", "orientation_cov_rad2"):
             check_tail(name, getattr(self, name), 3, 3)
-        leading = [
-            self.time_s.shape,
-            self.position_lab_mm.shape[:-1],
-            *(part.shape[:-2] for part in (self.position_cov_mm2, self.R_lab_body, self.orientation_cov_rad2)),
-        ]
-        if self.time_s.dim() != 1 or any(shape != self.segment.shape for shape in leading):
-            got = ", ".join(str(tuple(shape)) for shape in [*leading, self.segment.shape])
+        square = (self.position_cov_mm2, self.R_lab_body, self.orientation_cov_rad2)
+        shapes = [self.time_s.shape, self.position_lab_mm.shape[:-1], *(part.shape[:-2] for part in square)]
+        shapes.append(self.segment.shape)
+        if self.time_s.dim() != 1 or len(set(shapes)) > 1:
+            got = ", ".join(str(tuple(shape)) for shape in shapes)
             do = "give all the same frames"
             raise ShapeError(refusal("smooth_motion", expected="N frames in each", got=got, do=do))
 
@@ -99,31 +82,30 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
         raise ShapeError(refusal("time_s", expected=expected, got="others", do=do))
     seen_X = np.isfinite(X).all(1) & np.isfinite(X_cov).all((1, 2))
     seen_R = np.isfinite(R).all((1, 2)) & np.isfinite(R_cov).all((1, 2))
-    in_places = [_Instants.of(k, t[k] / frame_s, seen_X[k]) for k in rows if seen_X[k].any()]
-    in_turns = [_Instants.of(k, t[k] / frame_s, seen_R[k]) for k in rows if seen_R[k].any()]
-    unit = np.eye(3)
-    places = [PositionTrack.of(at.time, at.spread(X, np.zeros(3)), at.spread(X_cov, unit), at.used) for at in in_places]
-    turns = [RotationTrack.of(at.time, at.spread(R, unit), at.spread(R_cov, unit), at.used) for at in in_turns]
-    place, turn = (None, None) if known is None else (known.place, known.turn)
     ratio = 1.0 if known is None else frame_s / known.frame_s
-    moving, position_scale, place = estimate(
-        places, _per_frame(settings.position_band_hz, frame_s), settings, place and place.at_rate(ratio)
-    )
-    turning, orientation_scale, turn = estimate(
-        turns, _per_frame(settings.orientation_band_hz, frame_s), settings, turn and turn.at_rate(ratio)
+    kinds: tuple[tuple[Any, ...], ...] = (
+        (SegmentTrack, X, X_cov, seen_X, settings.position_band_hz, known and known.place, _put_places),
+        (RotationTrack, R, R_cov, seen_R, settings.orientation_band_hz, known and known.turn, _put_turns),
     )
     out, rejected = _blank(len(t)), np.zeros(len(t), dtype=bool)
-    for put, instants, estimates in ((_put_places, in_places, moving), (_put_turns, in_turns, turning)):
+    scales, processes = [], []
+    for kind, values, covariance, seen, band_hz, process, put in kinds:
+        instants = [_Instants.of(k, t[k] / frame_s, seen[k]) for k in rows if seen[k].any()]
+        paths = [kind.of(at.time, at.spread(values), at.spread(covariance), at.used) for at in instants]
+        band = None if band_hz is None else band_hz * frame_s
+        estimates, scale, process = estimate(paths, band, settings, process and process.at_rate(ratio))
         for at, found in zip(instants, estimates, strict=True):
             put(out, at.rows, at.take(found), frame_s)
             rejected[at.rows] |= found.rejected[at.frames]
+        scales.append(scale)
+        processes.append(process)
     return Smoothed(
         **{name: torch.from_numpy(value) for name, value in out.items()},
         extrapolated=torch.from_numpy((numbers >= 0) & ~(seen_X & seen_R)),
         rejected=torch.from_numpy(rejected),
-        position_scale=position_scale,
-        orientation_scale=orientation_scale,
-        process=ProcessNoise(place=place, turn=turn, frame_s=frame_s),
+        position_scale=scales[0],
+        orientation_scale=scales[1],
+        process=ProcessNoise(place=processes[0], turn=processes[1], frame_s=frame_s),
     )
 
 
@@ -131,10 +113,6 @@ def _typical_step(time_s: Floats, numbers: NDArray[np.int64]) -> float:
     within = (numbers[1:] == numbers[:-1]) & (numbers[1:] >= 0)
     steps = np.diff(time_s)[within]
     return float(np.median(steps)) if len(steps) else 1.0
-
-
-def _per_frame(band_hz: float | None, frame_s: float) -> float | None:
-    return None if band_hz is None else band_hz * frame_s
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -156,8 +134,9 @@ class _Instants:
         used[frames] = seen
         return cls(rows=rows, frames=frames, time=instants, used=used)
 
-    def spread(self, values: Floats, neutral: Floats) -> Floats:
-        """Return the values of the track at the instants, a neutral one where nothing was measured."""
+    def spread(self, values: Floats) -> Floats:
+        """Return the values of the track at the instants, 0 or a unit matrix where nothing was measured."""
+        neutral = np.zeros(3) if values.ndim == 2 else np.eye(3)
         out = np.broadcast_to(neutral, (len(self.time), *neutral.shape)).copy()
         out[self.used] = values[self.rows][self.used[self.frames]]
         return out
@@ -222,7 +201,7 @@ RATE_UNITS = {
 }
 
 
-def rates_of(found: Motion | Smoothed) -> dict[str, Any]:
+def rates_of(found: Motion) -> dict[str, Any]:
     """Return velocity to alpha_body and their sigmas, (N, 3) each, under the names of a track."""
     values = {name: getattr(found, f"{name}_{unit}").numpy() for name, unit in RATE_UNITS.items()}
     return values | {

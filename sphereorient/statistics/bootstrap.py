@@ -75,15 +75,16 @@ def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | 
     if len(sums) < FEWEST:
         unknown = np.full_like(value, np.nan)
         return Interval(value=value, low=unknown, high=unknown, error=unknown)
-    drawn = _by_blocks(lambda rows: at(_weights(len(flat), rows, settings) @ flat), settings.resamples, len(flat))
-    without = _by_blocks(lambda rows: at(total - flat[rows]), len(flat), len(flat) + flat.shape[1])
+    some = max(1, AT_ONCE // len(flat))
+    drawn = _by_blocks(lambda rows: at(_weights(len(flat), rows, settings) @ flat), settings.resamples, some)
+    some = max(1, AT_ONCE // (len(flat) + flat.shape[1]))
+    without = _by_blocks(lambda rows: at(total - flat[rows]), len(flat), some)
     low, high = _bca(value, drawn, without, settings.level)
     return Interval(value=value, low=low, high=high, error=np.asarray(drawn.std(0, ddof=1), np.float64))
 
 
-def _by_blocks(part: Callable[[Rows], Floats], count: int, width: int) -> Floats:
-    """Compute rows in blocks that fit into memory."""
-    size = max(1, AT_ONCE // max(width, 1))
+def _by_blocks(part: Callable[[Rows], Floats], count: int, size: int) -> Floats:
+    """Compute the rows 0 .. count - 1 in blocks that fit into memory."""
     return np.concatenate([part(np.arange(k, min(k + size, count))) for k in range(0, count, size)])
 
 
@@ -104,12 +105,9 @@ def _bca(value: Floats, drawn: Floats, without: Floats, level: float) -> tuple[F
     pull = without.mean(0) - without
     with np.errstate(all="ignore"):
         skew = np.nan_to_num((pull**3).sum(0) / (6 * (pull**2).sum(0) ** 1.5))
-    ends = []
-    for tail in ((1 - level) / 2, (1 + level) / 2):
-        z = bias + ndtri(tail)
-        share = ndtr(bias + z / (1 - skew * z))
-        ends.append(_quantiles(drawn, share))
-    return ends[0], ends[1]
+    low, high = (bias + ndtri(tail) for tail in ((1 - level) / 2, (1 + level) / 2))
+    low, high = (_quantiles(drawn, ndtr(bias + z / (1 - skew * z))) for z in (low, high))
+    return low, high
 
 
 def _quantiles(drawn: Floats, share: Floats) -> Floats:
@@ -143,7 +141,16 @@ def studentized(
 
     value = at(sums.sum(0))
     error = _error(at, sums.sum(0), np.einsum("sgk,sgl->gkl", sums, sums))
-    drawn, drawn_error = _drawn(at, sums, settings)
+    flat = sums.reshape(len(sums), -1)
+    products = (sums[..., :, None] * sums[..., None, :]).reshape(len(sums), -1)
+
+    def resampled(rows: Rows) -> Floats:
+        weights = _weights(len(sums), rows, settings)
+        totals = (weights @ flat).reshape(-1, *sums.shape[1:])
+        squares = (weights @ products).reshape(*totals.shape, -1)
+        return np.stack([at(totals), _error(at, totals, squares)], axis=1)
+
+    drawn, drawn_error = np.moveaxis(_by_blocks(resampled, settings.resamples, RESAMPLES_AT_ONCE), 1, 0)
     with np.errstate(all="ignore"):
         t = (drawn - value) / drawn_error
     t = np.where(drawn_error > 0, t, 0.0)
@@ -158,22 +165,6 @@ def studentized(
     plain = np.where(positive, np.exp(value), value)
     spread = np.where(known, np.where(positive, plain * error, error), np.nan)
     return Interval(value=plain, low=back(value - late * error), high=back(value - early * error), error=spread)
-
-
-def _drawn(at: Statistic, sums: Floats, settings: BootstrapSettings) -> tuple[Floats, Floats]:
-    """Return values and errors of the resampled ensembles, (B, G, Q) each."""
-    segments, groups, size = sums.shape
-    flat = sums.reshape(segments, -1)
-    products = (sums[..., :, None] * sums[..., None, :]).reshape(segments, -1)
-    parts = []
-    for first in range(0, settings.resamples, RESAMPLES_AT_ONCE):
-        rows = np.arange(first, min(first + RESAMPLES_AT_ONCE, settings.resamples))
-        weights = _weights(segments, rows, settings)
-        totals = (weights @ flat).reshape(-1, groups, size)
-        squares = (weights @ products).reshape(-1, groups, size, size)
-        parts.append((at(totals), _error(at, totals, squares)))
-    values, errors = zip(*parts, strict=True)
-    return np.concatenate(values), np.concatenate(errors)
 
 
 def _error(at: Statistic, totals: Floats, squares: Floats) -> Floats:

@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, zip_longest
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 
 from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.so3 import geodesic_distance
+from sphereorient.statistics.bootstrap import Floats
 from sphereorient.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,9 +31,7 @@ class CameraDistance:
 
 
 def camera_distances(
-    tracks: Trajectory | Sequence[Trajectory],
-    uncorrected: Sequence[Mapping[str, Floats] | None] = (),
-    bins: int = 60,
+    tracks: Trajectory | Sequence[Trajectory], uncorrected: Sequence[Mapping[str, Floats] | None] = (), bins: int = 60
 ) -> list[CameraDistance]:
     """Return the distances for every pair of cameras, frames of all tracks together; empty for one camera.
 
@@ -41,20 +39,18 @@ def camera_distances(
     Source: the paper, section III, distance of the two cameras; the angle by docs/errata.md A3.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
-    rough = [*uncorrected, *[None] * (len(many) - len(uncorrected))]
     apart: dict[tuple[str, str], list[Floats]] = {}
-    apart_rough: dict[tuple[str, str], list[Floats]] = {}
-    for track, other in zip(many, rough, strict=True):
-        for a, b in combinations(sorted(track.cameras), 2):
-            seen = _distance(track.cameras[a].orientation, track.cameras[b].orientation)
-            apart.setdefault((a, b), []).append(seen)
-            if other is not None and a in other and b in other:
-                apart_rough.setdefault((a, b), []).append(_distance(other[a], other[b]))
-    return [_pooled(pair, parts, apart_rough.get(pair), bins) for pair, parts in apart.items()]
+    rough: dict[tuple[str, str], list[Floats]] = {}
+    for track, other in zip_longest(many, uncorrected):
+        own = {name: camera.orientation for name, camera in track.cameras.items()}
+        for pair in combinations(sorted(own), 2):
+            for parts, of in ((apart, own), (rough, other or {})):
+                if set(pair) <= set(of):
+                    parts.setdefault(pair, []).append(_distance(*(of[name] for name in pair)))
+    return [_pooled(pair, np.concatenate(parts), rough.get(pair), bins) for pair, parts in apart.items()]
 
 
-def _pooled(pair: tuple[str, str], parts: list[Floats], rough_parts: list[Floats] | None, bins: int) -> CameraDistance:
-    apart = np.concatenate(parts)
+def _pooled(pair: tuple[str, str], apart: Floats, rough_parts: list[Floats] | None, bins: int) -> CameraDistance:
     rough = None if rough_parts is None else np.concatenate(rough_parts)
     top = max([float(x.max()) for x in (apart, rough) if x is not None and len(x)], default=np.pi)
     edges = np.linspace(0.0, max(top, 1e-9), bins + 1)
@@ -74,8 +70,6 @@ def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dic
     These are the orientations as if each line of sight were parallel to its camera's axis, for the given cameras only.
     Source: the paper, section III, R_persp; its sign by docs/errata.md A1.
     """
-    import torch
-
     found = {}
     for name, seen in track.cameras.items():
         if name in cameras:
@@ -93,6 +87,5 @@ def _pdf(x: Floats, edges: Floats) -> Floats:
 
 def _distance(A: Floats, B: Floats) -> Floats:
     """Return the geodesic distances of the frames with both orientations."""
-    there = np.isfinite(A).all((1, 2)) & np.isfinite(B).all((1, 2))
-    half = np.linalg.norm(A[there] - B[there], axis=(1, 2)) / np.sqrt(8)
-    return np.asarray(2 * np.arcsin(np.minimum(half, 1.0)))
+    apart = geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy()
+    return np.asarray(apart[np.isfinite(apart)])

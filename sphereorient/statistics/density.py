@@ -3,15 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfcx, log_ndtr, logsumexp
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
+from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums
 from sphereorient.statistics.moments import noise_let_through
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
-
-Floats = NDArray[np.float64]
 
 ROOT3 = np.sqrt(3.0)
 WIDEST_S = 1.5  # upper limit of the fit: flatness 14,000
@@ -38,12 +35,10 @@ def log_stretched_exponential(x: Floats, a: Floats | float, noise_share: float =
     if noise_share > 0:
         place, weight = np.polynomial.hermite_e.hermegauss(HERMITE)
         clean = np.sqrt(1 - noise_share)
-        logs = np.stack(
-            [
-                np.log(w / np.sqrt(2 * np.pi)) + log_stretched_exponential((x - np.sqrt(noise_share) * z) / clean, a)
-                for z, w in zip(place, weight, strict=True)
-            ]
-        )
+        logs = [
+            np.log(w / np.sqrt(2 * np.pi)) + log_stretched_exponential((x - np.sqrt(noise_share) * z) / clean, a)
+            for z, w in zip(place, weight, strict=True)
+        ]
         return np.asarray(logsumexp(logs, axis=0) - np.log(clean), np.float64)
     a = np.asarray(a, np.float64)
     size = np.maximum(np.abs(x), TINY)
@@ -75,11 +70,7 @@ class StretchedFit:
 
 
 def fit_stretched(
-    x: Floats,
-    segment: NDArray[np.int64],
-    segments: int,
-    settings: BootstrapSettings | None = None,
-    noise_share: float = 0.0,
+    x: Floats, segment: Rows, segments: int, settings: BootstrapSettings | None = None, noise_share: float = 0.0
 ) -> StretchedFit:
     """Fit the stretched exponential to the motion in a component (M,), any unit, by maximum likelihood, with intervals.
 
@@ -143,7 +134,7 @@ class Density:
 
     edges: Floats  # (B + 1,)
     pdf: Interval  # (B,)
-    counts: NDArray[np.int64]  # (B,)
+    counts: Rows  # (B,)
     fit: StretchedFit
 
     @property
@@ -161,7 +152,7 @@ def density(ensemble: Ensemble, quantity: str, component: int, *, settings: Boot
 
 def density_of(
     x: Floats,
-    segment: NDArray[np.int64],
+    segment: Rows,
     segments: int,
     *,
     bins: int = 61,

@@ -1,17 +1,16 @@
 """The flow around the sphere: its scales, dimensionless numbers, and the lift of a spinning sphere."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
+from sphereorient.statistics.bootstrap import Floats, Interval, bootstrap, segment_sums
 from sphereorient.statistics.moments import Moments
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
 
 M_PER_MM = 1e-3
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +32,24 @@ class FlowScales:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Surroundings:
+    """Properties of the sphere and its flow that are not in a track; None where unknown."""
+
+    diameter_mm: float | None = None
+    viscosity_m2_s: float | None = None
+    dissipation_w_kg: float | None = None
+    u_rms_m_s: float | None = None
+    integral_length_m: float | None = None
+
+    @property
+    def flow(self) -> FlowScales | None:
+        """Scales of the flow; None if viscosity or dissipation is unknown."""
+        if self.viscosity_m2_s is None or self.dissipation_w_kg is None:
+            return None
+        return FlowScales(viscosity_m2_s=self.viscosity_m2_s, dissipation_w_kg=self.dissipation_w_kg)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Comparison:
     """One dimensionless number, in words and symbols; made by `comparisons`."""
 
@@ -41,20 +58,15 @@ class Comparison:
     value: float
 
 
-def comparisons(
-    table: dict[str, Moments],
-    diameter_mm: float,
-    flow: FlowScales | None = None,
-    *,
-    u_rms_m_s: float | None = None,
-    integral_length_m: float | None = None,
-) -> list[Comparison]:
-    """Return the dimensionless numbers that the given inputs allow, from the moments by quantity.
+def comparisons(table: Mapping[str, Moments], around: Surroundings) -> list[Comparison]:
+    """Return the dimensionless numbers that the surroundings allow, from the moments by quantity.
 
-    Rms values are of one component; the sphere's are corrected for noise.
+    Rms values are of one component; the sphere's are corrected for noise. Without a diameter there are none.
     Source: the paper, section IV: omega_rms against u_rms / D; docs/errata.md A5.
     """
-    diameter_m = diameter_mm * M_PER_MM
+    if around.diameter_mm is None:
+        return []
+    diameter_m, u_rms_m_s = around.diameter_mm * M_PER_MM, around.u_rms_m_s
     v, a, omega, alpha = (_component_rms(table[q]) for q in ("velocity", "acceleration", "omega_lab", "alpha_lab"))
     rows = [
         ("sphere's rate of shear, rad/s", "v_rms / D", v / diameter_m),
@@ -67,9 +79,9 @@ def comparisons(
             ("rotation against the flow", "omega_rms D / u_rms", omega * diameter_m / u_rms_m_s),
             ("velocity against the flow", "v_rms / u_rms", v / u_rms_m_s),
         ]
-    if integral_length_m:
-        rows.append(("size against the integral length", "D / L", diameter_m / integral_length_m))
-    if flow:
+    if around.integral_length_m:
+        rows.append(("size against the integral length", "D / L", diameter_m / around.integral_length_m))
+    if flow := around.flow:
         acceleration = (flow.dissipation_w_kg**3 / flow.viscosity_m2_s) ** 0.25
         rows += [
             ("size against Kolmogorov's length", "D / eta", diameter_m / flow.eta_m),

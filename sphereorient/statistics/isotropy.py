@@ -4,14 +4,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums
+from sphereorient import so3
+from sphereorient.motion import rotvec_between
+from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums
 from sphereorient.statistics.lags import Pairs
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
-
-Floats = NDArray[np.float64]
 
 ALIKE = 0.3  # largest residual of a row against the rotations, relative to the row
 DRAWS = 20_000  # of the null distribution; its 5 % point is then known to 0.2 %
@@ -100,16 +100,14 @@ class FrameOfRow:
 
 def frame_of_omega(ensemble: Ensemble, omega: Floats) -> FrameOfRow:
     """Find the frame of the components of omega (M, 3), rad/s, from the rotations. Source: docs/errata.md E4, E6."""
-    from scipy.spatial.transform import Rotation
-
     first, second = Pairs(ensemble).at(1)
-    before, after = (Rotation.from_matrix(ensemble.R_lab_body[rows]) for rows in (first, second))
+    before, after = ensemble.R_lab_body[first], ensemble.R_lab_body[second]
     step_s = (ensemble.time_s[second] - ensemble.time_s[first])[:, None]
     middle = (omega[first] + omega[second]) / 2
     size = np.sqrt(np.square(middle).mean())
     lab, body = (
-        float(np.sqrt(np.square(rotation.as_rotvec() / step_s - middle).mean()) / size)
-        for rotation in (after * before.inv(), before.inv() * after)
+        float(np.sqrt(np.square(rotvec / step_s - middle).mean()) / size)
+        for rotvec in (rotvec_between(before, after), rotvec_between(after.mT, before.mT))
     )
     frame: Literal["lab", "body", "none", "both"] = "lab" if lab < ALIKE else "none"
     if body < ALIKE:
@@ -133,7 +131,7 @@ class Uniformity:
         return self.p_value >= 0.05
 
 
-def uniformity(R_lab_body: Floats, segment: NDArray[np.int64] | None = None) -> Uniformity:
+def uniformity(R_lab_body: Floats, segment: Rows | None = None) -> Uniformity:
     """Test whether rotations (M, 3, 3) are uniform on SO(3), by the first and second moments of the axes' directions.
 
     Statistic: 3 n |<R>|^2 + 5 n |<D>|^2, D of `five_dimensional`. The null distribution rotates whole segments, (M,),
@@ -185,10 +183,6 @@ def euler_densities(
     ensemble: Ensemble, bins: int = 24, settings: BootstrapSettings | None = None
 ) -> list[EulerDensity]:
     """Return PDFs of the Euler angles and of uniform rotations. Source: the paper, section II; docs/errata.md E1."""
-    import torch
-
-    from sphereorient import so3
-
     theta = so3.to_tait_bryan(torch.from_numpy(ensemble.R_lab_body)).numpy()
     out = []
     for i, name in enumerate(("theta_x", "theta_y", "theta_z")):

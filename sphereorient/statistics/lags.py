@@ -6,13 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums, studentized
+from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums, studentized
 from sphereorient.statistics.density import Density, density_of
 from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
-
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 LEAST_PAIRS = 0.02  # of the samples: longer lags have pairs in too few segments
 EVERY_LAG, MORE_LAGS = 40, 40  # the first lags, and how many sparser ones follow
@@ -84,11 +81,12 @@ def correlation(
 
 
 def _correlation_lags(pairs: Pairs, ensemble: Ensemble, longest_s: float | None) -> Rows:
-    most = pairs.longest if longest_s is None else min(pairs.longest, int(longest_s / ensemble.step_s))
     if longest_s is None:
-        length = np.sort(np.bincount(ensemble.segment))
-        reached = np.array([np.maximum(length - k, 0).sum() for k in range(most + 1)])
+        length = np.bincount(ensemble.segment)
+        reached = np.array([np.maximum(length - k, 0).sum() for k in range(pairs.longest + 1)])
         most = max(1, int(np.flatnonzero(reached >= LEAST_PAIRS * len(ensemble))[-1]))
+    else:
+        most = min(pairs.longest, int(longest_s / ensemble.step_s))
     sparse = np.geomspace(EVERY_LAG, max(most, EVERY_LAG), MORE_LAGS).round().astype(np.int64)
     lags = np.unique(np.concatenate([np.arange(EVERY_LAG), sparse]))
     return np.asarray(lags[lags <= most], np.int64)

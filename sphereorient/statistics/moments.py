@@ -4,13 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sphereorient.statistics.bootstrap import Interval, segment_sums, studentized
+from sphereorient.statistics.bootstrap import Floats, Interval, segment_sums, studentized
 from sphereorient.statistics.segments import UNITS, Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
-
-Floats = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "z", "norm")
 STATISTICS = ("mean", "rms", "skewness", "flatness", "corrected_rms", "corrected_flatness", "noise_share")

@@ -2,18 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sphereorient.errors import TrackError, refusal
-from sphereorient.statistics.bootstrap import Interval, bootstrap, segment_sums, studentized
+from sphereorient.motion import gaussian_kernel, rotvec_between
+from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums, studentized
 from sphereorient.statistics.moments import WARN_SHARE, Moments, without_noise
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 SI = 1e-3  # m per mm
 RATES = {"acceleration": ("position", SI), "alpha_lab": ("orientation", 1.0)}  # source, and its unit in SI
@@ -83,8 +81,7 @@ def multi_lag(
     whole = np.stack(sums, axis=1)  # (S, L, 3, 2)
     whole = whole[(whole[..., 1] > 0).any((1, 2))]
     if len(whole) < 2 or len(lags) < 4:
-        got = f"{len(whole)} segments and {len(lags)} lags"
-        do = "pass more tracks"
+        got, do = f"{len(whole)} segments and {len(lags)} lags", "pass more tracks"
         raise TrackError(refusal("multi_lag", expected="at least two segments and four lags", got=got, do=do))
     lag_s = step_s * np.array(lags)
     found = bootstrap(whole, lambda totals: _extrapolated(totals[..., 0] / totals[..., 1], lag_s), settings)
@@ -120,13 +117,9 @@ def _second_differences(track: Trajectory, quantity: str, n: int, step_s: float)
 
 def _rotation(R: Floats, first: Rows, second: Rows) -> Floats:
     """Return the rotation vectors from rows `first` to `second`, lab, (K, 3); NaN where either is NaN."""
-    from scipy.spatial.transform import Rotation
-
     there = np.isfinite(R[first] + R[second]).all((1, 2))
     out = np.full((len(first), 3), np.nan)
-    if there.any():
-        before, after = (Rotation.from_matrix(R[rows[there]]) for rows in (first, second))
-        out[there] = (after * before.inv()).as_rotvec()
+    out[there] = rotvec_between(R[first[there]], R[second[there]])
     return out
 
 
@@ -187,6 +180,8 @@ def _step(track: Trajectory) -> float:
 
 def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floats:
     """Return by segment (S, W, 3, 6): number, x^2, x^4, sigma^2, sigma^4, x^2 sigma^2."""
+    if not (track.segment >= 0).any():
+        return np.zeros((0, len(widths), 3, 6))
     rows, place, number = _grid(track)
     rotating = quantity == "alpha_lab"
     cov = (track.orientation_cov if rotating else track.position_cov * SI**2)[rows]
@@ -199,17 +194,17 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
         values[there] = _rotation(track.orientation[rows], row[there], row[there + 2]) / 2  # omega
     else:
         values[place] = track.position[rows] * SI
-    order = 2 if quantity == "acceleration" else 1
+    order: Literal[1, 2] = 2 if quantity == "acceleration" else 1
     scale = _step(track) ** -(2 if quantity != "velocity" else 1)
     parts = []
     for width in widths:
-        kernel = _kernel(width, order)
+        kernel = gaussian_kernel(width, order).numpy()[::-1]  # as `np.convolve` reads it
         x2 = np.square(_convolved(values, kernel) * scale)
         s2 = _convolved(noise, np.square(np.convolve(kernel, CENTRAL) if rotating else kernel)) * scale**2
         parts.append(np.stack([np.ones_like(x2), x2, x2 * x2, s2, s2 * s2, x2 * s2], axis=-1))
     whole = np.stack(parts, axis=1)
     known = np.isfinite(whole).all((1, 2, 3)) & (number >= 0)
-    sums = segment_sums(whole[known], number[known], int(number.max(initial=-1)) + 1)
+    sums = segment_sums(whole[known], number[known], int(number.max()) + 1)
     return sums[sums[:, 0, 0, 0] > 0]
 
 
@@ -218,35 +213,19 @@ def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
     rows = np.flatnonzero(track.segment >= 0)
     rows = rows[np.lexsort((track.time[rows], track.segment[rows]))]
     _, segment = np.unique(track.segment[rows], return_inverse=True)
-    begin = np.searchsorted(segment, np.arange(segment.max(initial=-1) + 1))
+    begin = np.searchsorted(segment, np.arange(segment.max() + 1))
     frame = np.rint((track.time[rows] - track.time[rows][begin][segment]) / _step(track)).astype(np.int64)
-    lengths = np.maximum.reduceat(frame, begin) + 2 if len(rows) else frame
+    lengths = np.maximum.reduceat(frame, begin) + 2
     place = frame + np.concatenate([[0], np.cumsum(lengths)])[:-1][segment]
     number = np.full(int(lengths.sum()), -1, dtype=np.int64)
     number[place] = segment
     return rows, place, number
 
 
-def _kernel(width: float, order: int) -> Floats:
-    import torch
-
-    from sphereorient.motion import gaussian_derivative
-
-    half = max(1, int(np.ceil(3.0 * width)))
-    impulse = torch.zeros(4 * half + 1, 1, dtype=torch.float64)
-    impulse[2 * half] = 1.0
-    answer = gaussian_derivative(impulse, 1.0, width, 2 if order == 2 else 1)[:, 0].numpy()
-    return np.asarray(answer[half : 3 * half + 1], np.float64)
-
-
 def _convolved(x: Floats, kernel: Floats) -> Floats:
     """Return each column's convolution, NaN where the kernel reaches an empty place, (K, 3)."""
-    out = np.full_like(x, np.nan)
-    half = len(kernel) // 2
-    if len(x) >= len(kernel):
-        for i in range(x.shape[1]):
-            out[half : len(x) - half, i] = np.convolve(x[:, i], kernel, mode="valid")
-    return out
+    wider = np.pad(x, ((len(kernel) // 2,) * 2, (0, 0)), constant_values=np.nan)
+    return np.stack([np.convolve(column, kernel, mode="valid") for column in wider.T], axis=1)
 
 
 def _width_statistics(totals: Floats) -> Floats:

@@ -4,11 +4,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sphereorient.errors import ShapeError, refusal
+from sphereorient.statistics.bootstrap import Floats, Rows
 
-Floats = NDArray[np.float64]
 Z95 = 1.959964  # normal quantile of a two-sided interval of 95 %
 
 
@@ -20,7 +20,7 @@ class Reliability:
     share: Floats  # (B,), of the outcomes that are true
     low: Floats  # (B,), of the 95 % interval of the share
     high: Floats  # (B,)
-    count: NDArray[np.int64]  # (B,), outcomes in the bin
+    count: Rows  # (B,), outcomes in the bin
     error: float  # expected calibration error: mean |share - probability| over outcomes; NaN without outcomes
     chance: float  # the error expected by scatter alone if the probabilities are perfect
 
@@ -42,10 +42,8 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
     known = np.isfinite(said)
     said, came = said[known], came[known]
     if bins < 1 or np.any((said < 0) | (said > 1 + 1e-9)):
-        expected, got = (
-            "a bin or more, probabilities in 0 .. 1",
-            f"{bins} bins, probabilities to {said.max(initial=0.0):g}",
-        )
+        expected = "a bin or more, probabilities in 0 .. 1"
+        got = f"{bins} bins, probabilities to {said.max(initial=0.0):g}"
         raise ShapeError(refusal("reliability", expected=expected, got=got, do="correct the arguments"))
     order = np.argsort(said, kind="stable")
     said, came = said[order], came[order]
@@ -68,18 +66,18 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
     )
 
 
-def _edges(said: Floats, bins: int) -> NDArray[np.int64]:
+def _edges(said: Floats, bins: int) -> Rows:
     wanted = said[np.rint(np.linspace(0, len(said), bins + 1)[1:-1]).astype(np.int64)] if len(said) >= bins else said
     inner = np.searchsorted(said, wanted, side="left")
     return np.unique(np.concatenate([[0], inner, [len(said)]])).astype(np.int64)
 
 
-def _means(values: Floats, edges: NDArray[np.int64]) -> Floats:
+def _means(values: Floats, edges: Rows) -> Floats:
     sums = np.add.reduceat(values, edges[:-1]) if len(edges) > 1 else np.zeros(0)
     return np.asarray(sums / np.diff(edges), np.float64)
 
 
-def wilson(share: Floats, count: NDArray[np.int64]) -> tuple[Floats, Floats]:
+def wilson(share: Floats, count: Rows) -> tuple[Floats, Floats]:
     """Return the ends of the 95 % interval of shares (B,) of `count` outcomes each (Wilson 1927)."""
     middle = (share + Z95**2 / (2 * count)) / (1 + Z95**2 / count)
     half = Z95 / (1 + Z95**2 / count) * np.sqrt(share * (1 - share) / count + Z95**2 / (4 * count**2))

@@ -8,21 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import TrackError, refusal
-from sphereorient.statistics.bootstrap import FEWEST, Interval
+from sphereorient.motion import RATE_UNITS
+from sphereorient.statistics.bootstrap import FEWEST, Floats, Interval, Rows
 from sphereorient.statistics.settings import SegmentSettings
 from sphereorient.trajectory import Flag, Trajectory
+from sphereorient.trajectory.datasets import stored_fields
 
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
-
-UNITS = {
-    "velocity": "m/s",
-    "acceleration": "m/s^2",
-    "omega_lab": "rad/s",
-    "omega_body": "rad/s",
-    "alpha_lab": "rad/s^2",
-    "alpha_body": "rad/s^2",
-}
+UNITS = {name: spec.units for name, spec in stored_fields(Trajectory) if name in RATE_UNITS}  # of the six quantities
+COLUMNS = {"time_s": "time", "position_mm": "position_smooth", "R_lab_body": "orientation_smooth", "label": "segment"}
+COLUMNS |= {name: name for quantity in UNITS for name in (quantity, f"{quantity}_sigma")}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,8 +52,7 @@ class Ensemble:
         """Return the ensemble of the segments marked in `kept` (S,); TrackError if fewer than two are left."""
         _refuse_few(int(kept.sum()), "the segments kept")
         rows = kept[self.segment]
-        by_row = ("time_s", "frame", "position_mm", "R_lab_body")
-        parts: dict[str, Any] = {name: getattr(self, name)[rows] for name in by_row}
+        parts = {name: getattr(self, name)[rows] for name in ("time_s", "frame", "position_mm", "R_lab_body")}
         parts |= {name: {q: x[rows] for q, x in getattr(self, name).items()} for name in ("values", "sigmas")}
         segment = (np.cumsum(kept) - 1)[self.segment[rows]]
         return replace(self, **parts, segment=segment, track=self.track[kept], span_s=self.span_s[kept])
@@ -87,61 +80,18 @@ def ensemble_of(
     if "paper" in methods and len(methods) > 1:
         got, do = ", ".join(sorted(methods)), "report each kind by itself"
         raise TrackError(refusal(name, expected="tracks of one method", got=got, do=do))
-    steps = [np.diff(t.time)[(t.segment[1:] == t.segment[:-1]) & (t.segment[1:] >= 0)] for t in many if len(t)]
-    step = np.concatenate([*steps, np.empty(0)])
-    pieces = [_pieces(track, number, settings) for number, track in enumerate(many)]
-    if not sum(len(piece["time_s"]) for piece in pieces):
+    pieces = [_usable(track, number, settings) for number, track in enumerate(many)]
+    if not any(len(piece["time_s"]) for piece in pieces):
         do = "look at the track's reasons with `sphereorient check`"
         raise TrackError(refusal(name, expected="frames with a motion", got="no valid frame", do=do))
     whole = {key: np.concatenate([piece[key] for piece in pieces]) for key in pieces[0]}
-    error: Literal["added", "removed"] = "added" if many[0].method == "paper" else "removed"
-    return _numbered(whole, float(np.median(step)) if len(step) else 1.0, error, settings, name, fewest)
-
-
-def _pieces(track: Trajectory, number: int, settings: SegmentSettings) -> dict[str, NDArray[Any]]:
-    usable = (track.segment >= 0) & np.isfinite(track.position_smooth).all(1)
-    usable &= np.isfinite(track.orientation_smooth).all((1, 2)) & np.isfinite(track.time)
-    for quantity in UNITS:
-        usable &= np.isfinite(getattr(track, quantity)).all(1)
-    if not settings.keep_extrapolated:
-        usable &= (track.flags & np.uint32(Flag.EXTRAPOLATED)) == 0
-    rows = np.flatnonzero(usable)
-    rows = rows[np.lexsort((track.time[rows], track.segment[rows]))]
-    sure = np.ones(len(track), dtype=bool)  # errors are not larger than usual, or unknown
-    for name in ("acceleration_sigma", "alpha_lab_sigma"):
-        size = np.linalg.norm(getattr(track, name), axis=1)
-        known = rows[np.isfinite(size[rows])]
-        if len(known):
-            sure &= ~(size > settings.max_sigma * np.median(size[known]))
-    parts = {
-        "time_s": track.time,
-        "position_mm": track.position_smooth,
-        "R_lab_body": track.orientation_smooth,
-        "label": track.segment,
-        **{quantity: getattr(track, quantity) for quantity in UNITS},
-        **{f"{quantity}_sigma": getattr(track, f"{quantity}_sigma") for quantity in UNITS},
-        "sure": sure,
-    }
-    return {key: values[rows] for key, values in parts.items()} | {"track": np.full(len(rows), number)}
-
-
-def _numbered(
-    whole: dict[str, NDArray[Any]],
-    step_s: float,
-    error: Literal["added", "removed"],
-    settings: SegmentSettings,
-    name: str,
-    fewest: int,
-) -> Ensemble:
     time_s = whole["time_s"]
-    first = np.ones(len(time_s), dtype=bool)
-    first[1:] = (np.diff(whole["label"]) != 0) | (np.diff(whole["track"]) != 0)
-    if settings.max_duration_s is not None:
-        first[1:] |= np.diff(_piece(time_s, first, settings.max_duration_s)) != 0
+    steps = [np.diff(t.time)[(t.segment[1:] == t.segment[:-1]) & (t.segment[1:] >= 0)] for t in many if len(t)]
+    step_s = float(np.median(np.concatenate(steps))) if sum(map(len, steps)) else 1.0
+    first = _first_rows(whole, settings.max_duration_s)
     number, begin = np.cumsum(first) - 1, np.flatnonzero(first)
     frames = np.bincount(number)
-    last = begin + frames - 1
-    span_s = time_s[last] - time_s[begin] + step_s
+    span_s = time_s[begin + frames - 1] - time_s[begin] + step_s
     least_s = settings.min_integral_times * (settings.integral_time_s or 0.0)
     kept = (frames >= settings.min_frames) & (span_s >= least_s)
     _refuse_few(int(kept.sum()), name, f"of at least {settings.min_frames} frames and {least_s:.3g} s", fewest)
@@ -160,18 +110,41 @@ def _numbered(
         R_lab_body=whole["R_lab_body"][rows],
         values={quantity: whole[quantity][rows] for quantity in UNITS},
         sigmas={quantity: whole[f"{quantity}_sigma"][rows] for quantity in UNITS},
-        error=error,
+        error="added" if many[0].method == "paper" else "removed",
     )
 
 
-def _piece(time_s: Floats, first: NDArray[np.bool_], longest_s: float) -> Rows:
-    """Return the number of each row's piece of its segment, (M,): equal pieces of at most longest_s."""
-    number, begin = np.cumsum(first) - 1, np.flatnonzero(first)
-    end = np.append(begin[1:], len(time_s)) - 1
-    span_s = time_s[end] - time_s[begin]
-    pieces = np.maximum(np.ceil(span_s / longest_s * (1 - 1e-9)), 1)
-    share = (time_s - time_s[begin][number]) / np.maximum(span_s, 1e-300)[number]
-    return np.asarray(np.minimum(np.floor(share * pieces[number]), pieces[number] - 1), np.int64)
+def _usable(track: Trajectory, number: int, settings: SegmentSettings) -> dict[str, NDArray[Any]]:
+    """Return `COLUMNS` of the usable frames, sorted; which have errors not larger than usual; the track's number."""
+    usable = (track.segment >= 0) & np.isfinite(track.orientation_smooth).all((1, 2)) & np.isfinite(track.time)
+    for name in ("position_smooth", *UNITS):
+        usable &= np.isfinite(getattr(track, name)).all(1)
+    if not settings.keep_extrapolated:
+        usable &= (track.flags & np.uint32(Flag.EXTRAPOLATED)) == 0
+    rows = np.flatnonzero(usable)
+    rows = rows[np.lexsort((track.time[rows], track.segment[rows]))]
+    sure = np.ones(len(rows), dtype=bool)
+    for name in ("acceleration_sigma", "alpha_lab_sigma"):
+        size = np.linalg.norm(getattr(track, name)[rows], axis=1)
+        known = size[np.isfinite(size)]
+        if len(known):
+            sure &= ~(size > settings.max_sigma * np.median(known))  # unknown ones stay
+    parts = {key: getattr(track, name)[rows] for key, name in COLUMNS.items()}
+    return parts | {"sure": sure, "track": np.full(len(rows), number)}
+
+
+def _first_rows(whole: dict[str, NDArray[Any]], longest_s: float | None) -> NDArray[np.bool_]:
+    """Mark the first row of each segment (M,), or of its equal pieces of at most longest_s."""
+    time_s = whole["time_s"]
+    first = np.ones(len(time_s), dtype=bool)
+    first[1:] = (np.diff(whole["label"]) != 0) | (np.diff(whole["track"]) != 0)
+    if longest_s is not None:
+        number, begin = np.cumsum(first) - 1, np.flatnonzero(first)
+        span_s = time_s[np.append(begin[1:], len(time_s)) - 1] - time_s[begin]
+        pieces = np.maximum(np.ceil(span_s / longest_s * (1 - 1e-9)), 1)
+        share = (time_s - time_s[begin][number]) / np.maximum(span_s, 1e-300)[number]
+        first[1:] |= np.diff(np.minimum(np.floor(share * pieces[number]), pieces[number] - 1)) != 0
+    return first
 
 
 def _refuse_few(count: int, name: str, which: str = "", fewest: int = FEWEST) -> None:

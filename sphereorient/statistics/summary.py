@@ -1,80 +1,45 @@
 """All statistics of the paper's section IV; a new one needs a field of `Distributions`, a call in `_distributions`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
+from typing import Any
 
 import numpy as np
 
 from sphereorient.errors import TrackError
+from sphereorient.statistics import density, isotropy, lags, noise
 from sphereorient.statistics.bootstrap import FEWEST
-from sphereorient.statistics.density import Density, density
-from sphereorient.statistics.flow import Comparison, FlowScales, Lift, comparisons, lift
-from sphereorient.statistics.isotropy import (
-    EulerDensity,
-    FrameOfRow,
-    Isotropy,
-    Uniformity,
-    euler_densities,
-    frame_of_omega,
-    isotropy,
-    uniformity,
-)
-from sphereorient.statistics.lags import Correlation, Increments, correlation, increment_density, increments
+from sphereorient.statistics.flow import Comparison, Lift, Surroundings, comparisons, lift
 from sphereorient.statistics.moments import Moments, table_of_moments
-from sphereorient.statistics.noise import (
-    RATES,
-    MultiLag,
-    NoiseWarning,
-    WidthCurve,
-    multi_lag,
-    noise_warnings,
-    width_curve,
-)
 from sphereorient.statistics.segments import UNITS, Durations, Ensemble, durations, ensemble_of
 from sphereorient.statistics.settings import StatisticsSettings
 from sphereorient.trajectory import Trajectory
 
 CORRELATED = ("velocity", "acceleration", "omega_lab", "alpha_lab")
 SHOWN_LAGS = 5  # increments with a density, from one frame to the integral time
+WIDTHS_OF = ("velocity", "acceleration", "alpha_lab")
 STEPS = 10  # of the progress
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Surroundings:
-    """Properties of the sphere and its flow that are not in a track; None where unknown."""
-
-    diameter_mm: float | None = None
-    viscosity_m2_s: float | None = None
-    dissipation_w_kg: float | None = None
-    u_rms_m_s: float | None = None
-    integral_length_m: float | None = None
-
-    @property
-    def flow(self) -> FlowScales | None:
-        """Scales of the flow; None if viscosity or dissipation is unknown."""
-        if self.viscosity_m2_s is None or self.dissipation_w_kg is None:
-            return None
-        return FlowScales(viscosity_m2_s=self.viscosity_m2_s, dissipation_w_kg=self.dissipation_w_kg)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Distributions:
     """The statistics that need two segments or more; a part of `Summary`."""
 
-    densities: Mapping[str, tuple[Density, ...]]  # by quantity: x, y, z
-    increments: Increments  # of omega_lab
-    increment_densities: Mapping[int, Density]  # by lag in frames, x component
-    correlations: Mapping[str, Correlation]  # by quantity, CORRELATED
+    densities: Mapping[str, tuple[density.Density, ...]]  # by quantity: x, y, z
+    increments: lags.Increments  # of omega_lab
+    increment_densities: Mapping[int, density.Density]  # by lag in frames, x component
+    correlations: Mapping[str, lags.Correlation]  # by quantity, CORRELATED
     durations: Durations | None  # None if all segments are pieces of one
-    angles: Sequence[EulerDensity]
-    uniformity: Uniformity
-    isotropies: Mapping[str, Isotropy]  # by quantity
-    rows: Mapping[str, FrameOfRow]  # omega_lab, omega_body: the frame of their components
+    angles: Sequence[isotropy.EulerDensity]
+    uniformity: isotropy.Uniformity
+    isotropies: Mapping[str, isotropy.Isotropy]  # by quantity
+    rows: Mapping[str, isotropy.FrameOfRow]  # omega_lab, omega_body: the frame of their components
     lift: Lift
-    multi_lag: Mapping[str, MultiLag]  # acceleration, alpha_lab; without those that cannot be fitted
-    widths: Mapping[str, WidthCurve]  # velocity, acceleration, alpha_lab
+    multi_lag: Mapping[str, noise.MultiLag]  # acceleration, alpha_lab; without those that cannot be fitted
+    widths: Mapping[str, noise.WidthCurve]  # velocity, acceleration, alpha_lab
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,7 +50,7 @@ class Summary:
     surroundings: Surroundings
     ensemble: Ensemble
     table: Mapping[str, Moments]  # Table I; without intervals for one segment
-    warnings: Sequence[NoiseWarning]
+    warnings: Sequence[noise.NoiseWarning]
     comparisons: Sequence[Comparison]
     distributions: Distributions | None  # None with fewer than two segments
 
@@ -120,28 +85,22 @@ def summarise(
         ensemble, settings = _long_enough(ensemble, settings)
     table = dict(table_of_moments(ensemble, settings))
     progress(2, STEPS)
-    more = None
-    if ensemble.segments >= FEWEST:
-        more = _distributions(many, ensemble, settings, lambda done: progress(2 + done, STEPS))
+    more = _distributions(many, ensemble, settings, progress) if ensemble.segments >= FEWEST else None
     progress(STEPS, STEPS)
-    compared: list[Comparison] = []
-    if around.diameter_mm is not None:
-        flow = {"u_rms_m_s": around.u_rms_m_s, "integral_length_m": around.integral_length_m}
-        compared = comparisons(table, around.diameter_mm, around.flow, **flow)
     return Summary(
         settings=settings,
         surroundings=around,
         ensemble=ensemble,
         table=table,
-        warnings=noise_warnings(table, ensemble.error),
-        comparisons=compared,
+        warnings=noise.noise_warnings(table, ensemble.error),
+        comparisons=comparisons(table, around),
         distributions=more,
     )
 
 
 def _long_enough(ensemble: Ensemble, settings: StatisticsSettings) -> tuple[Ensemble, StatisticsSettings]:
     """Leave out segments that are short compared with the integral time of all of them."""
-    measured = float(correlation(ensemble, "velocity", settings=settings).integral_time_s.value[3])
+    measured = float(lags.correlation(ensemble, "velocity", settings=settings).integral_time_s.value[3])
     if not measured > 0:
         return ensemble, settings
     settings = settings.model_copy(update={"integral_time_s": measured})
@@ -150,40 +109,34 @@ def _long_enough(ensemble: Ensemble, settings: StatisticsSettings) -> tuple[Ense
 
 
 def _distributions(
-    tracks: Sequence[Trajectory], ensemble: Ensemble, settings: StatisticsSettings, progress: Callable[[int], None]
+    tracks: Sequence[Trajectory], ensemble: Ensemble, settings: StatisticsSettings, progress: Progress
 ) -> Distributions:
-    densities = {
-        quantity: tuple(density(ensemble, quantity, i, settings=settings) for i in range(3)) for quantity in UNITS
-    }
-    progress(2)
-    curves = {quantity: correlation(ensemble, quantity, settings=settings) for quantity in CORRELATED}
-    progress(3)
+    steps = count(4)
+
+    def each(of: Callable[[str], Any], quantities: Iterable[str] = UNITS) -> dict[str, Any]:
+        found = {quantity: of(quantity) for quantity in quantities}
+        progress(next(steps), STEPS)
+        return found
+
+    curves = each(lambda q: lags.correlation(ensemble, q, settings=settings), CORRELATED)
     longest_s = float(curves["omega_lab"].integral_time_s.value[3])
-    steps = increments(ensemble, integral_time_s=longest_s if longest_s > 0 else None, settings=settings)
-    chosen = np.unique(np.linspace(0, len(steps.lag_frames) - 1, SHOWN_LAGS).round().astype(int))
-    lagged = {int(lag): increment_density(ensemble, int(lag), settings=settings) for lag in steps.lag_frames[chosen]}
-    progress(4)
-    angles = euler_densities(ensemble, settings=settings)
-    uniform = uniformity(ensemble.R_lab_body, ensemble.segment)
-    progress(5)
-    isotropies = {quantity: isotropy(ensemble, quantity, settings) for quantity in UNITS}
-    rows = {name: frame_of_omega(ensemble, ensemble.values[name]) for name in ("omega_lab", "omega_body")}
-    progress(6)
-    widths = {q: width_curve(tracks, q, settings=settings) for q in ("velocity", "acceleration", "alpha_lab")}
-    progress(7)
+    lagged = lags.increments(ensemble, integral_time_s=longest_s if longest_s > 0 else None, settings=settings)
+    chosen = np.unique(np.linspace(0, len(lagged.lag_frames) - 1, SHOWN_LAGS).round().astype(int))
     return Distributions(
-        densities=densities,
-        increments=steps,
-        increment_densities=lagged,
+        densities=each(lambda q: tuple(density.density(ensemble, q, i, settings=settings) for i in range(3))),
+        increments=lagged,
+        increment_densities={
+            lag: lags.increment_density(ensemble, lag, settings=settings) for lag in lagged.lag_frames[chosen].tolist()
+        },
         correlations=curves,
         durations=_durations(tracks, ensemble, settings),
-        angles=angles,
-        uniformity=uniform,
-        isotropies=isotropies,
-        rows=rows,
+        angles=isotropy.euler_densities(ensemble, settings=settings),
+        uniformity=isotropy.uniformity(ensemble.R_lab_body, ensemble.segment),
+        isotropies=each(lambda q: isotropy.isotropy(ensemble, q, settings)),
+        rows=each(lambda q: isotropy.frame_of_omega(ensemble, ensemble.values[q]), ("omega_lab", "omega_body")),
         lift=lift(ensemble, settings),
         multi_lag=_multi_lag(tracks, settings),
-        widths=widths,
+        widths=each(lambda q: noise.width_curve(tracks, q, settings=settings), WIDTHS_OF),
     )
 
 
@@ -198,11 +151,11 @@ def _durations(tracks: Sequence[Trajectory], ensemble: Ensemble, settings: Stati
     return durations(whole.span_s, min(least_s, float(whole.span_s.min())), level=settings.level)
 
 
-def _multi_lag(tracks: Sequence[Trajectory], settings: StatisticsSettings) -> dict[str, MultiLag]:
+def _multi_lag(tracks: Sequence[Trajectory], settings: StatisticsSettings) -> dict[str, noise.MultiLag]:
     found = {}
-    for quantity in RATES:
+    for quantity in noise.RATES:
         try:
-            found[quantity] = multi_lag(list(tracks), quantity, settings=settings)
+            found[quantity] = noise.multi_lag(list(tracks), quantity, settings=settings)
         except TrackError:  # too few neighbouring frames: left out, and the page says so
             continue
     return found

@@ -1,14 +1,13 @@
 """Synthetic movies with exact truth: random motion and paint, the scene of two cameras, degradations."""
 
 from sphereorient.synth.degrade import degrade
-from sphereorient.synth.degrade_scene import write_degraded
 from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track, smoothed_track
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion
 from sphereorient.synth.scene import RenderedScene, make_scene, render_frame
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import DEGRADATIONS, severity
 from sphereorient.synth.textures import random_texture
-from sphereorient.synth.write import write_synthetic_experiment
+from sphereorient.synth.write import write_degraded, write_synthetic_experiment
 
 __all__ = [
     "DEGRADATIONS",

@@ -1,10 +1,9 @@
-"""Degraded synthetic experiments on disk; truth.h5 stays exact."""
+"""What degradations change of a filmed scene: its settings, the map, the pictures, and the reported inputs."""
 
 import math
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -19,46 +18,13 @@ from sphereorient.sphere.renderer import rim_directions
 from sphereorient.synth.degrade import OPERATIONS, Disk, gain_to_clip, lost_frames
 from sphereorient.synth.scene import expose, make_scene
 from sphereorient.synth.settings import SynthSettings
-from sphereorient.synth.severities import DEGRADATIONS, degradation, severity
+from sphereorient.synth.severities import DEGRADATIONS, degradation
 from sphereorient.synth.textures import map_directions
-from sphereorient.synth.write import FilmedView, Filming, default_cameras, write_synthetic_experiment
 
 BARE = 0.5  # grey of bare patches
 WAVES, WAVE_RATES = 24, (6.0, 12.0)  # patches: waves, and rates for periods of 30 to 60 degrees
 MASK_ROWS = 128  # height of the patch map: finer than the patches' borders
 SMEAR_PX = 1.0  # largest motion between exposure samples
-
-
-def write_degraded(
-    folder: Path,
-    base: SynthSettings,
-    applied: Mapping[str, int],
-    progress: Callable[[int], None] = lambda done: None,
-) -> Path:
-    """Render a degraded experiment in `folder`, replacing old files, and return the path of experiment.yaml.
-
-    `applied` maps degradations to levels 1 .. 5; `progress` receives the number of frames rendered since the last call.
-    Reported cameras, texture map and diameter may be wrong; truth.h5 describes the filmed cameras and sphere.
-
-    Raises:
-        SettingsError: unknown name or level, or impossible scene.
-        OutputError: folder not writable.
-    """
-    values = {name: severity(name, applied[name]) for name in applied}
-    return write_with_values(folder, base, values, progress)
-
-
-def write_with_values(
-    folder: Path,
-    base: SynthSettings,
-    values: Mapping[str, float],
-    progress: Callable[[int], None] = lambda done: None,
-) -> Path:
-    """Render as `write_degraded` does, with physical values instead of levels."""
-    for name, value in values.items():
-        degradation(name).check(value)
-    settings = degraded_settings(base, values)
-    return write_synthetic_experiment(folder, settings, progress, DegradedFilming(settings, values))
 
 
 def degraded_settings(base: SynthSettings, values: Mapping[str, float]) -> SynthSettings:
@@ -145,36 +111,36 @@ def random_patches(texture: Tensor, share: float, rng: torch.Generator) -> Tenso
     return (fields <= rising.values.gather(-1, last)[..., None]).to(texture.device)
 
 
-class DegradedFilming(Filming):
+class Filming:
     """Apply degradations of map, pictures and movie, name -> physical value, each with its own random numbers."""
 
-    def __init__(self, settings: SynthSettings, values: Mapping[str, float]) -> None:
+    def __init__(self, settings: SynthSettings, values: Mapping[str, float], cameras: Mapping[str, Camera]) -> None:
         self.settings = settings
         self.values = dict(values)
-        self.cameras = default_cameras(settings)
-        self.gains: dict[str, float] = {}
-        if "saturation" in values:
-            self.gains = {name: self._gain(name, camera) for name, camera in self.cameras.items()}
+        self.cameras = cameras
+        self.gains = {name: self._gain(name) for name in cameras} if "saturation" in values else {}
 
     def paint(self, texture: Tensor) -> Tensor:
-        """Return the worn texture map."""
+        """Return the map of the filmed sphere, (H, 2 H), worn."""
         return worn(texture, self.values.get("paint_wear", 0.0), self._generator("paint_wear"))
 
     def reported_texture(self, texture: Tensor) -> Tensor:
-        """Return the texture map with exchanged patches."""
+        """Return the map to write, (H, 2 H), with exchanged patches."""
         return misdrawn(texture, self.values.get("texture_error", 0.0), self._generator("texture_error"))
 
-    def reported_cameras(self, cameras: Mapping[str, Camera]) -> Mapping[str, Camera]:
-        """Return cameras with centre_error, camera_rotation and camera_shift."""
-        return wrong_cameras(cameras, self.values)
+    def reported_diameter_mm(self) -> float:
+        """Return the diameter to write, with radius_error, mm."""
+        base = self.settings
+        return base.diameter_mm * (1 + self.values.get("radius_error", 0.0) / (base.diameter_px / 2))
 
-    def reported_diameter_mm(self, diameter_mm: float) -> float:
-        """Return the diameter with radius_error, mm."""
-        return diameter_mm * (1 + self.values.get("radius_error", 0.0) / (self.settings.diameter_px / 2))
+    def disk(self, name: str, position_lab_mm: Tensor, cover: NDArray[np.float32]) -> Disk:
+        """Return the place of the sphere at (3,) in a camera's picture; `cover` (H, W): coverage of each pixel."""
+        centre_px, radius_px = picture_of_ball(self.cameras[name], position_lab_mm, self.settings.diameter_mm / 2)
+        return Disk(centre_px=centre_px, radius_px=radius_px, cover=torch.from_numpy(cover))
 
-    def picture(self, picture: NDArray[np.float32], view: FilmedView) -> NDArray[np.float32]:
-        """Degrade a picture; frame None gets only degradations that are constant over the movie."""
-        light = self._through(torch.from_numpy(picture), view, tuple(OPERATIONS))
+    def picture(self, picture: NDArray[np.float32], disk: Disk, name: str, frame: int | None) -> NDArray[np.float32]:
+        """Degrade grey levels (H, W) before noise; frame None gets only degradations that the movie shares."""
+        light = self._through(tuple(OPERATIONS), torch.from_numpy(picture), disk, name, frame)
         return cast("NDArray[np.float32]", light.numpy())
 
     def lost(self, name: str, frames: int) -> frozenset[int]:
@@ -183,27 +149,24 @@ class DegradedFilming(Filming):
         lost = lost_frames(torch.empty(frames), share, self._generator("dropped_frames", name))
         return frozenset(lost.nonzero()[:, 0].tolist())
 
-    def _through(self, light: Tensor, view: FilmedView, names: tuple[str, ...]) -> Tensor:
-        centre_px, radius_px = picture_of_ball(view.camera, view.position_lab_mm, self.settings.diameter_mm / 2)
-        disk = Disk(centre_px=centre_px, radius_px=radius_px, cover=torch.from_numpy(view.cover))
-        for name in names:
-            row = DEGRADATIONS[name]
-            value = self.values.get(name, row.nothing)
-            if value is None or value == row.nothing or (row.where == "frame" and view.frame is None):
+    def _through(self, operations: tuple[str, ...], light: Tensor, disk: Disk, name: str, frame: int | None) -> Tensor:
+        for what in operations:
+            row = DEGRADATIONS[what]
+            value = self.values.get(what, row.nothing)
+            if value is None or value == row.nothing or (row.where == "frame" and frame is None):
                 continue
             # Static degradations use the same random numbers in every frame.
-            rng = self._generator(name, view.name, *([] if row.where != "frame" else [view.frame or 0]))
-            light = light * self.gains[view.name] if name == "saturation" else OPERATIONS[name](light, value, disk, rng)
+            rng = self._generator(what, name, *([] if row.where != "frame" else [frame or 0]))
+            light = light * self.gains[name] if what == "saturation" else OPERATIONS[what](light, value, disk, rng)
         return light
 
-    def _gain(self, name: str, camera: Camera) -> float:
+    def _gain(self, name: str) -> float:
         """Return the exposure gain that saturates a white sphere, after the operations before saturation."""
         origin = torch.zeros(1, 3, dtype=torch.float64)
         scene = make_scene(torch.ones(8, 16), self.settings)
-        picture, cover = expose(scene, camera, origin, torch.eye(3, dtype=torch.float64)[None])
-        view = FilmedView(name=name, camera=camera, frame=None, cover=cover, position_lab_mm=origin[0])
+        picture, cover = expose(scene, self.cameras[name], origin, torch.eye(3, dtype=torch.float64)[None])
         before = tuple(OPERATIONS)[: tuple(OPERATIONS).index("saturation")]
-        light = self._through(torch.from_numpy(picture), view, before)
+        light = self._through(before, torch.from_numpy(picture), self.disk(name, origin[0], cover), name, None)
         white = torch.from_numpy(cover) > 0.99
         return float(gain_to_clip(light.flatten(), white.flatten(), self.values["saturation"]))
 
@@ -223,31 +186,19 @@ def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -
 
 
 def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float]) -> Mapping[str, Camera]:
-    """Return cameras with opposite centre errors, the second also rotated and shifted."""
-    if not any(values.get(name) for name in ("centre_error", "camera_rotation", "camera_shift")):
+    """Return cameras whose principal points are off in opposite directions, along the diagonal.
+
+    The second is also rotated about the lab origin, whose pixel stays, and shifted along its own x.
+    """
+    off_px, degrees, shift_mm = (values.get(key, 0.0) for key in ("centre_error", "camera_rotation", "camera_shift"))
+    if not (off_px or degrees or shift_mm):
         return cameras
-    wrong = {name: _shifted_centre(camera, k, values) for k, (name, camera) in enumerate(cameras.items())}
-    second = list(wrong)[-1]
-    wrong[second] = _displaced(wrong[second], values)
-    return wrong
-
-
-def _shifted_centre(camera: Camera, index: int, values: Mapping[str, float]) -> Camera:
-    """Shift the principal point along the diagonal, in opposite directions for the two cameras."""
-    error_px = values.get("centre_error", 0.0)
-    if error_px == 0:
-        return camera
-    assert isinstance(camera, TsaiCamera)
-    step_px = (1 - 2 * index) * error_px / math.sqrt(2)
-    return replace(camera, centre_px=camera.centre_px + step_px)
-
-
-def _displaced(camera: Camera, values: Mapping[str, float]) -> Camera:
-    """Rotate a camera about the lab origin, whose pixel stays, and shift it along its own x."""
-    angle, shift_mm = math.radians(values.get("camera_rotation", 0.0)), values.get("camera_shift", 0.0)
-    if angle == 0 and shift_mm == 0:
-        return camera
-    assert isinstance(camera, TsaiCamera)
-    turn = so3.exp(torch.full((3,), angle / math.sqrt(3), dtype=torch.float64))
+    wrong = {}
+    for k, (name, camera) in enumerate(cameras.items()):
+        assert isinstance(camera, TsaiCamera)
+        wrong[name] = replace(camera, centre_px=camera.centre_px + (1 - 2 * k) * off_px / math.sqrt(2))
+    second = wrong[name]
+    turn = so3.exp(torch.full((3,), math.radians(degrees) / math.sqrt(3), dtype=torch.float64))
     right = torch.tensor([shift_mm, 0.0, 0.0], dtype=torch.float64)
-    return replace(camera, R_cam_lab=turn @ camera.R_cam_lab, T_cam_lab_mm=camera.T_cam_lab_mm + right)
+    wrong[name] = replace(second, R_cam_lab=turn @ second.R_cam_lab, T_cam_lab_mm=second.T_cam_lab_mm + right)
+    return wrong

@@ -16,17 +16,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import i0e, ndtri
 
-from sphereorient import so3
-from sphereorient.motion import (
-    RATE_UNITS,
-    MeasuredPoses,
-    MotionSettings,
-    ProcessNoise,
-    SmoothSettings,
-    measure_motion,
-    rates_of,
-    smooth_motion,
-)
+from sphereorient import motion, so3
 from sphereorient.synth.motion import magnus_rotation
 from sphereorient.trajectory import Flag, Trajectory
 
@@ -143,10 +133,6 @@ class EnsembleSpec:
     alpha_flatness: float = 7.6
     frame: Literal["lab", "body"] = "lab"  # frame of independent components; in the other frame they are isotropic
 
-    def velocity_laws(self) -> list[Law]:
-        """Return the Gaussian laws of the velocity components, m/s, lab."""
-        return [Law.of(rms, slope) for rms, slope in zip(self.velocity_rms, self.acceleration_rms, strict=True)]
-
     def omega_laws(self) -> list[Law]:
         """Return the laws of the omega components, rad/s, in `frame`."""
         pairs = zip(self.omega_rms, self.alpha_rms, strict=True)
@@ -185,32 +171,19 @@ def nominal(spec: EnsembleSpec) -> dict[str, Nominal]:
     return out
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrueTracks:
-    """Exact motion at M frames of S segments, (M, ...); made by `draw_ensemble`."""
+def draw_ensemble(spec: EnsembleSpec, seed: int) -> Trajectory:
+    """Draw segments of exponential random length, as a perfect measurement: all sigmas are zero.
 
-    spec: EnsembleSpec
-    time_s: Floats  # (M,); the other fields are (M, ...)
-    segment: Rows
-    position_mm: Floats
-    R_lab_body: Floats
-    velocity: Floats  # m/s
-    acceleration: Floats  # m/s^2
-    omega_lab: Floats  # rad/s
-    omega_body: Floats
-    alpha_lab: Floats  # rad/s^2
-    alpha_body: Floats
-
-
-def draw_ensemble(spec: EnsembleSpec, seed: int) -> TrueTracks:
-    """Draw segments of exponential random length without noise; orientations are exact to 1e-6 rad per segment."""
+    Orientations are exact to 1e-6 rad per segment.
+    """
     rng = np.random.default_rng(seed)
     extra = rng.exponential(spec.mean_frames - spec.shortest_frames, spec.segments)
     frames = spec.shortest_frames + np.floor(extra).astype(np.int64)
     segment = np.repeat(np.arange(spec.segments), frames)
     start = np.concatenate([[0], np.cumsum(frames)[:-1]])
     since_s = (np.arange(len(segment)) - start[segment]) / spec.frame_rate_hz
-    moves = [law.draw(spec.segments, rng) for law in spec.velocity_laws()]
+    pairs = zip(spec.velocity_rms, spec.acceleration_rms, strict=True)
+    moves = [Law.of(rms, slope).draw(spec.segments, rng) for rms, slope in pairs]
     turns = [law.draw(spec.segments, rng) for law in spec.omega_laws()]
     velocity, acceleration = _rates(moves, since_s, segment)
     omega, alpha = _rates(turns, since_s, segment)
@@ -221,19 +194,14 @@ def draw_ensemble(spec: EnsembleSpec, seed: int) -> TrueTracks:
     to_other = R.swapaxes(1, 2) if spec.frame == "lab" else R
     seen = [np.asarray(np.einsum("nij,nj->ni", to_other, x)) for x in (omega, alpha)]
     lab, body = ((omega, alpha), seen) if spec.frame == "lab" else (seen, (omega, alpha))
-    return TrueTracks(
-        spec=spec,
-        time_s=(np.arange(len(segment)) + REST * segment) / spec.frame_rate_hz,
-        segment=segment,
-        position_mm=origin[segment] + 1000 * path,
-        R_lab_body=R,
-        velocity=velocity,
-        acceleration=acceleration,
-        omega_lab=lab[0],
-        omega_body=body[0],
-        alpha_lab=lab[1],
-        alpha_body=body[1],
-    )
+    rates = {"velocity": velocity, "acceleration": acceleration}
+    rates |= {"omega_lab": lab[0], "omega_body": body[0], "alpha_lab": lab[1], "alpha_body": body[1]}
+    parts: dict[str, Any] = rates | {f"{name}_sigma": np.zeros((len(segment), 3)) for name in rates}
+    time_s = (np.arange(len(segment)) + REST * segment) / spec.frame_rate_hz
+    blank = Trajectory.empty(time_s, frame_rate=spec.frame_rate_hz, method="precise", experiment="synthetic")
+    parts |= {"valid": np.ones(len(segment), dtype=bool), "segment": segment, "confidence": np.ones(len(segment))}
+    position = origin[segment] + 1000 * path
+    return replace(_posed(blank, position, R, 0.0, 0.0), position_smooth=position, orientation_smooth=R, **parts)
 
 
 def _rates(draws: list[Draw], since_s: Floats, segment: Rows) -> tuple[Floats, Floats]:
@@ -249,9 +217,7 @@ def _orientations(
     early, late = (_rates(turns, since_s + h * (0.5 + sign * math.sqrt(3) / 6), segment)[0] for sign in (-1, 1))
     # In the body frame, dR^T/dt = -[omega_body]x R^T: the same equation for the transpose.
     sign = 1.0 if spec.frame == "lab" else -1.0
-    step = magnus_rotation(
-        torch.from_numpy(sign * early), torch.from_numpy(sign * late), torch.tensor(h, dtype=torch.float64)
-    ).numpy()
+    step = magnus_rotation(torch.from_numpy(sign * early), torch.from_numpy(sign * late), h).numpy()
     R = np.empty((len(segment), 3, 3))
     start = np.concatenate([[0], np.cumsum(frames)[:-1]])
     now = R_start if spec.frame == "lab" else R_start.swapaxes(1, 2)
@@ -264,31 +230,22 @@ def _orientations(
     return R if spec.frame == "lab" else R.swapaxes(1, 2)
 
 
-def exact_track(true: TrueTracks) -> Trajectory:
-    """Return the trajectory of a perfect measurement; all sigmas are zero."""
-    blank = _measured(true, true.position_mm, true.R_lab_body, 0.0, 0.0, "precise")
-    parts: dict[str, Any] = {"position_smooth": true.position_mm, "orientation_smooth": true.R_lab_body}
-    for name in RATE_UNITS:
-        parts |= {name: getattr(true, name), f"{name}_sigma": np.zeros((len(true.time_s), 3))}
-    return replace(blank, **parts)
-
-
 def smoothed_track(
-    true: TrueTracks,
+    true: Trajectory,
     noise_deg: float,
     noise_mm: float,
     seed: int,
-    known: ProcessNoise | None = None,
+    known: motion.ProcessNoise | None = None,
     silent: bool = False,
-) -> tuple[Trajectory, ProcessNoise]:
+) -> tuple[Trajectory, motion.ProcessNoise]:
     """Add white noise to an ensemble and smooth it; return the precise method's trajectory and the process noise.
 
     `known` is an earlier process noise, None estimates it. `silent` smooths exact data: the bias of smoothing alone.
     """
     track = _noisy(true, noise_deg, noise_mm, seed, "precise")
     if silent:
-        track = replace(track, position=true.position_mm, orientation=true.R_lab_body)
-    poses = MeasuredPoses(
+        track = replace(track, position=true.position, orientation=true.orientation)
+    poses = motion.MeasuredPoses(
         time_s=torch.from_numpy(track.time),
         position_lab_mm=torch.from_numpy(track.position),
         position_cov_mm2=torch.from_numpy(track.position_cov),
@@ -296,20 +253,21 @@ def smoothed_track(
         orientation_cov_rad2=torch.from_numpy(track.orientation_cov),
         segment=torch.from_numpy(track.segment),
     )
-    found = smooth_motion(poses, SmoothSettings(), known)
-    parts = {
-        "position_smooth": found.position_lab_mm,
-        "position_smooth_cov": found.position_cov_mm2,
-        "orientation_smooth": found.R_lab_body,
-        "orientation_smooth_cov": found.orientation_cov_rad2,
-    }
-    flags = np.where(found.extrapolated.numpy(), np.uint32(Flag.EXTRAPOLATED), np.uint32(0))
-    arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in parts.items()}
-    return replace(track, **arrays, **rates_of(found), flags=flags), found.process
+    found = motion.smooth_motion(poses, motion.SmoothSettings(), known)
+    smooth = replace(
+        track,
+        position_smooth=found.position_lab_mm.numpy(),
+        position_smooth_cov=found.position_cov_mm2.numpy(),
+        orientation_smooth=found.R_lab_body.numpy(),
+        orientation_smooth_cov=found.orientation_cov_rad2.numpy(),
+        **motion.rates_of(found),
+        flags=np.where(found.extrapolated.numpy(), np.uint32(Flag.EXTRAPOLATED), np.uint32(0)),
+    )
+    return smooth, found.process
 
 
 def filtered_track(
-    true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, settings: MotionSettings | None = None
+    true: Trajectory, noise_deg: float, noise_mm: float, seed: int, settings: motion.MotionSettings | None = None
 ) -> Trajectory:
     """Add white noise to an ensemble and differentiate with Gaussian kernels; return the paper method's trajectory.
 
@@ -318,39 +276,29 @@ def filtered_track(
     """
     track = _noisy(true, noise_deg, noise_mm, seed, "paper")
     sigma_mm, sigma_rad = (torch.full((len(track),), x) for x in (noise_mm, math.radians(noise_deg)))
-    found = measure_motion(
+    found = motion.measure_motion(
         torch.from_numpy(track.position),
         torch.from_numpy(track.orientation),
         torch.from_numpy(track.segment),
-        true.spec.frame_rate_hz,
-        settings or MotionSettings(),
+        true.frame_rate,
+        settings or motion.MotionSettings(),
         position_sigma_mm=sigma_mm.double(),
         orientation_sigma_rad=sigma_rad.double(),
     )
-    return replace(track, position_smooth=track.position, orientation_smooth=track.orientation, **rates_of(found))
+    return replace(
+        track, position_smooth=track.position, orientation_smooth=track.orientation, **motion.rates_of(found)
+    )
 
 
-def _noisy(true: TrueTracks, noise_deg: float, noise_mm: float, seed: int, method: str) -> Trajectory:
+def _noisy(true: Trajectory, noise_deg: float, noise_mm: float, seed: int, method: str) -> Trajectory:
     rng = np.random.default_rng([seed, 1])
     noise_rad = math.radians(noise_deg)
-    delta = torch.from_numpy(noise_rad * rng.standard_normal(true.position_mm.shape))
-    R = (so3.exp(delta) @ torch.from_numpy(true.R_lab_body)).numpy()
-    position = true.position_mm + noise_mm * rng.standard_normal(true.position_mm.shape)
-    return _measured(true, position, R, noise_mm, noise_rad, method)
+    delta = torch.from_numpy(noise_rad * rng.standard_normal(true.position.shape))
+    R = (so3.exp(delta) @ torch.from_numpy(true.orientation)).numpy()
+    position = true.position + noise_mm * rng.standard_normal(true.position.shape)
+    return _posed(replace(true, method=method), position, R, noise_mm, noise_rad)
 
 
-def _measured(
-    true: TrueTracks, position_mm: Floats, R: Floats, noise_mm: float, noise_rad: float, method: str
-) -> Trajectory:
-    count, unit = len(true.time_s), np.eye(3)
-    blank = Trajectory.empty(true.time_s, frame_rate=true.spec.frame_rate_hz, method=method, experiment="synthetic")
-    return replace(
-        blank,
-        valid=np.ones(count, dtype=bool),
-        position=position_mm,
-        position_cov=np.tile(noise_mm**2 * unit, (count, 1, 1)),
-        orientation=R,
-        orientation_cov=np.tile(noise_rad**2 * unit, (count, 1, 1)),
-        segment=true.segment,
-        confidence=np.ones(count),
-    )
+def _posed(track: Trajectory, position_mm: Floats, R: Floats, noise_mm: float, noise_rad: float) -> Trajectory:
+    cov_mm2, cov_rad2 = (np.tile(noise**2 * np.eye(3), (len(track), 1, 1)) for noise in (noise_mm, noise_rad))
+    return replace(track, position=position_mm, position_cov=cov_mm2, orientation=R, orientation_cov=cov_rad2)

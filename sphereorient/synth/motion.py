@@ -97,7 +97,7 @@ def _integrate(omega: _Waves, time_s: Tensor, R_start: Tensor, substeps: int = 8
     return torch.stack(out)
 
 
-def magnus_rotation(early: Tensor, late: Tensor, step_s: Tensor) -> Tensor:
+def magnus_rotation(early: Tensor, late: Tensor, step_s: Tensor | float) -> Tensor:
     """Return step rotations (..., 3, 3) from omega (..., 3), rad/s, at each step's two Gauss nodes.
 
     Source: fourth-order Magnus expansion (Iserles and Norsett 1999).

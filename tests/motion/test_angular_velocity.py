@@ -13,8 +13,7 @@ from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError
 from sphereorient.motion import omega_from_orientations, to_body
 from sphereorient.motion.angular_velocity import omega_stencil, usable_separations
-from sphereorient.motion.derivative import gaussian_derivative
-from sphereorient.motion.stencil import apply
+from sphereorient.motion.stencil import apply, gaussian_derivative
 
 DT = 1 / 600
 A = torch.tensor([3.0, -5.0, 9.0], dtype=torch.float64)  # rad/s

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sphereorient.errors import SettingsError
-from sphereorient.motion.derivative import gap_aware_stencil, gaussian_derivative, noise_gain
-from sphereorient.motion.stencil import apply
+from sphereorient.motion.stencil import apply, gap_aware_stencil, gaussian_derivative, noise_gain
 
 DT = 1 / 600
 

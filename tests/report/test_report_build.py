@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sphereorient.cli import main
-from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, exact_track, filtered_track
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 from sphereorient.trajectory import Trajectory
 
 QUICK = ["--set", "statistics.resamples=100"]
@@ -28,7 +28,7 @@ def place(tmp_path_factory) -> Path:
     (folder / "b").mkdir()
     whole.at(np.arange(half)).save(folder / "a" / "track.h5")
     whole.at(np.arange(half, len(whole))).save(folder / "b" / "track.h5")
-    exact_track(draw_ensemble(EnsembleSpec(segments=24, mean_frames=80.0), 3)).save(folder / "precise.h5")
+    draw_ensemble(EnsembleSpec(segments=24, mean_frames=80.0), 3).save(folder / "precise.h5")
     longest = np.bincount(whole.segment).argmax()
     whole.at(np.flatnonzero(whole.segment == longest)).save(folder / "one.h5")
     Trajectory.empty(np.arange(90) / 600, cameras=["cam1"], frame_rate=600.0, method="precise").save(

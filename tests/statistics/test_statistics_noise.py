@@ -10,14 +10,14 @@ from sphereorient.errors import TrackError
 from sphereorient.motion import gaussian_derivative, noise_gain
 from sphereorient.statistics.noise import multi_lag, width_curve
 from sphereorient.statistics.settings import BootstrapSettings
-from sphereorient.synth.ensemble import EnsembleSpec, TrueTracks, draw_ensemble, filtered_track
+from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 
 FEW = BootstrapSettings(resamples=200)
 NOISE_DEG, NOISE_MM = 0.1, 0.05
 
 
 @pytest.fixture(scope="module")
-def true() -> TrueTracks:
+def true():
     return draw_ensemble(EnsembleSpec(segments=200, mean_frames=150), 3)
 
 

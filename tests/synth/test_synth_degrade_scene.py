@@ -26,7 +26,7 @@ from sphereorient.synth import (
     write_synthetic_experiment,
 )
 from sphereorient.synth.degrade_scene import (
-    DegradedFilming,
+    Filming,
     degraded_settings,
     misdrawn,
     picture_of_ball,
@@ -35,7 +35,6 @@ from sphereorient.synth.degrade_scene import (
     with_motion_blur,
     with_spin,
     worn,
-    write_with_values,
     wrong_cameras,
 )
 from sphereorient.synth.textures import map_directions
@@ -138,7 +137,7 @@ def test_unknown_names_and_levels_are_refused_before_anything_is_written(tmp_pat
         with pytest.raises(SettingsError, match=message):
             write_degraded(tmp_path / "new", SETTINGS, applied)
     with pytest.raises(SettingsError, match=r"^degradation occlusion: expected 0 or more, and below 1, got 2;"):
-        write_with_values(tmp_path / "new", SETTINGS, {"occlusion": 2.0})
+        write_synthetic_experiment(tmp_path / "new", SETTINGS, values={"occlusion": 2.0})
     assert not (tmp_path / "new").exists()
 
 
@@ -148,7 +147,7 @@ def test_unknown_names_and_levels_are_refused_before_anything_is_written(tmp_pat
 @pytest.mark.slow
 def test_noise_comes_on_top_of_the_cameras_own(tmp_path):
     few = SETTINGS.model_copy(update={"frames": 4, "background": 80.0, "read_noise": 3.0, "shot_noise": 0.0})
-    frames = frames_of(write_with_values(tmp_path, few, {"read_noise": 4.0}))
+    frames = frames_of(write_synthetic_experiment(tmp_path, few, values={"read_noise": 4.0}))
     for movie in frames.values():
         assert movie[:, :15].std() == pytest.approx(math.sqrt(3**2 + 4**2 + 1 / 12), rel=0.03)
         assert abs(np.corrcoef(movie[0, :15].ravel(), movie[1, :15].ravel())[0, 1]) < 0.1  # new in every frame
@@ -183,7 +182,7 @@ def test_occlusion_follows_the_ball_and_hides_its_share(tmp_path):
         update={"frames": 4, "black": 160.0, "white": 160.0, "ambient": 1.0, "background": 30.0}
     )
     quiet = white.model_copy(update={"read_noise": 0.0, "shot_noise": 0.0})
-    for movie in frames_of(write_with_values(tmp_path, quiet, {"occlusion": 0.4})).values():
+    for movie in frames_of(write_synthetic_experiment(tmp_path, quiet, values={"occlusion": 0.4})).values():
         assert (movie - 30).sum((1, 2)) / (130 * math.pi * 20**2) == pytest.approx(0.6, abs=0.02)
 
 
@@ -191,7 +190,7 @@ def test_occlusion_follows_the_ball_and_hides_its_share(tmp_path):
 def test_saturation_clips_its_share_of_a_white_ball_with_one_gain_for_the_movie(tmp_path):
     white = {"black": 150.0, "white": 150.0, "read_noise": 0.0, "shot_noise": 0.0, "frames": 3, "ambient": 0.3}
     settings = SETTINGS.model_copy(update=white)
-    path = write_with_values(tmp_path, settings, {"saturation": 0.3})
+    path = write_synthetic_experiment(tmp_path, settings, values={"saturation": 0.3})
     for movie in frames_of(path).values():
         for frame in movie:
             assert (frame == 255).sum() / (math.pi * 19.5**2) == pytest.approx(0.3, abs=0.04)
@@ -201,7 +200,7 @@ def test_saturation_clips_its_share_of_a_white_ball_with_one_gain_for_the_movie(
 
 @pytest.mark.slow
 def test_dropped_frames_are_black_in_their_camera_and_all_others_stay(plain, tmp_path):
-    path = write_with_values(tmp_path, SETTINGS, {"dropped_frames": 0.3})
+    path = write_synthetic_experiment(tmp_path, SETTINGS, values={"dropped_frames": 0.3})
     lost = {}
     for name, frames in frames_of(plain).items():
         got = frames_of(path)[name]
@@ -327,7 +326,7 @@ def test_the_given_map_differs_from_the_filmed_one_by_its_share(plain, tmp_path)
 
 
 def test_worn_paint_is_on_the_filmed_ball_only():
-    filming = DegradedFilming(SETTINGS, {"paint_wear": 0.25})
+    filming = Filming(SETTINGS, {"paint_wear": 0.25}, default_cameras(SETTINGS))
     texture = random_texture("blobs", 6)
     assert torch.equal(filming.reported_texture(texture), texture)
     area = map_directions(512)[..., :2].norm(dim=-1)
@@ -340,7 +339,7 @@ def test_worn_paint_is_on_the_filmed_ball_only():
 
 @pytest.mark.slow
 def test_the_reported_diameter_is_too_large_by_px_at_the_rim(tmp_path):
-    path = write_with_values(tmp_path, SETTINGS, {"radius_error": 2.0})
+    path = write_synthetic_experiment(tmp_path, SETTINGS, values={"radius_error": 2.0})
     told = load_experiment(path)
     assert told.diameter_mm == pytest.approx(18.0 * (20 + 2) / 20)
     _, radius = picture_of_ball(told.cameras["cam1"], torch.zeros(3, dtype=torch.float64), told.diameter_mm / 2)
@@ -349,7 +348,7 @@ def test_the_reported_diameter_is_too_large_by_px_at_the_rim(tmp_path):
 
 @pytest.mark.slow
 def test_told_principal_points_are_off_in_opposite_directions_and_lines_of_sight_miss(plain, tmp_path):
-    path = write_with_values(tmp_path, SETTINGS, {"centre_error": 2.0})
+    path = write_synthetic_experiment(tmp_path, SETTINGS, values={"centre_error": 2.0})
     off = {name: tsai(path, name).centre_px - tsai(plain, name).centre_px for name in ("cam1", "cam2")}
     for shift in off.values():
         assert float(shift.norm()) == pytest.approx(2.0)
@@ -365,7 +364,7 @@ def test_told_principal_points_are_off_in_opposite_directions_and_lines_of_sight
 
 @pytest.mark.slow
 def test_the_told_second_camera_is_turned_by_degrees_about_the_origin_and_moved_by_mm(plain, tmp_path):
-    path = write_with_values(tmp_path, SETTINGS, {"camera_rotation": 1.5, "camera_shift": 0.3})
+    path = write_synthetic_experiment(tmp_path, SETTINGS, values={"camera_rotation": 1.5, "camera_shift": 0.3})
     true, told = tsai(plain, "cam2"), tsai(path, "cam2")
     turn = so3.log(told.R_cam_lab @ true.R_cam_lab.mT)
     assert math.degrees(float(turn.norm())) == pytest.approx(1.5)

@@ -17,7 +17,6 @@ from sphereorient.synth.ensemble import (
     EnsembleSpec,
     Law,
     draw_ensemble,
-    exact_track,
     filtered_track,
     nominal,
     smoothed_track,
@@ -69,18 +68,18 @@ def test_true_moments_are_the_nominal_ones_in_both_frames(frame):
 def test_orientations_turn_as_omega_says(frame):
     true = draw_ensemble(EnsembleSpec(segments=5, mean_frames=80, frame=frame, frame_rate_hz=6000.0), 5)
     omega, _ = omega_from_orientations(
-        torch.from_numpy(true.R_lab_body), 1 / 6000, (1,), segment=torch.from_numpy(true.segment)
+        torch.from_numpy(true.orientation), 1 / 6000, (1,), segment=torch.from_numpy(true.segment)
     )
     off = omega.numpy() - true.omega_lab
     assert np.sqrt(np.nanmean(off**2)) < 2e-3
-    np.testing.assert_allclose(np.einsum("nij,nj->ni", true.R_lab_body, true.omega_body), true.omega_lab, atol=1e-9)
-    np.testing.assert_allclose(np.einsum("nij,nj->ni", true.R_lab_body, true.alpha_body), true.alpha_lab, atol=1e-6)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", true.orientation, true.omega_body), true.omega_lab, atol=1e-9)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", true.orientation, true.alpha_body), true.alpha_lab, atol=1e-6)
 
 
 def test_positions_move_as_the_velocity_says():
     true = draw_ensemble(EnsembleSpec(segments=3), 6)
     one = true.segment == 1
-    moved = np.gradient(true.position_mm[one], 1 / 600, axis=0)[1:-1] * 1e-3
+    moved = np.gradient(true.position[one], 1 / 600, axis=0)[1:-1] * 1e-3
     np.testing.assert_allclose(moved, true.velocity[one][1:-1], atol=2e-3)
 
 
@@ -94,7 +93,7 @@ def test_durations_are_exponential_beyond_the_shortest():
 
 def test_the_same_seed_gives_the_same_ensemble():
     spec = EnsembleSpec(segments=3)
-    a, b, c = (draw_ensemble(spec, seed).R_lab_body for seed in (1, 1, 2))
+    a, b, c = (draw_ensemble(spec, seed).orientation for seed in (1, 1, 2))
     np.testing.assert_array_equal(a, b)
     assert a.shape != c.shape or (a != c).any()
 
@@ -102,15 +101,15 @@ def test_the_same_seed_gives_the_same_ensemble():
 def test_noise_has_its_size_and_the_kernels_track_its_sigmas():
     true = draw_ensemble(EnsembleSpec(segments=40), 8)
     track = filtered_track(true, 0.5, 0.02, 9)
-    turned = Rotation.from_matrix(track.orientation) * Rotation.from_matrix(true.R_lab_body).inv()
+    turned = Rotation.from_matrix(track.orientation) * Rotation.from_matrix(true.orientation).inv()
     assert np.degrees(turned.as_rotvec()).std() == pytest.approx(0.5, rel=0.02)
-    assert (track.position - true.position_mm).std() == pytest.approx(0.02, rel=0.02)
+    assert (track.position - true.position).std() == pytest.approx(0.02, rel=0.02)
     assert track.orientation_cov[0, 0, 0] == pytest.approx(math.radians(0.5) ** 2)
 
 
 def test_a_track_without_noise_has_the_ensembles_own_moments():
     true = draw_ensemble(EnsembleSpec(segments=20), 9)
-    found = moments(ensemble_of(exact_track(true)), "alpha_body", FEW)
+    found = moments(ensemble_of(true), "alpha_body", FEW)
     np.testing.assert_allclose(found.rms.value[:3], true.alpha_body.std(0))
     np.testing.assert_allclose(found.corrected_rms.value[:3], found.rms.value[:3])
 
@@ -118,7 +117,7 @@ def test_a_track_without_noise_has_the_ensembles_own_moments():
 @pytest.mark.slow
 def test_the_smoother_recovers_a_quiet_ensemble_and_warns_of_a_loud_one():
     true = draw_ensemble(EnsembleSpec(segments=30, mean_frames=100), 10)
-    clean = ensemble_of(exact_track(true))
+    clean = ensemble_of(true)
     quiet, loud = (ensemble_of(smoothed_track(true, deg, 0.05, 11)[0]) for deg in (0.1, 2.0))
     for name in clean.values:
         found = moments(quiet, name, FEW)

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sphereorient.errors import SettingsError, refusal
-from sphereorient.synth.degrade_scene import write_degraded
+from sphereorient.synth import write_degraded
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import DEGRADATIONS, LEVELS, degradation
 
