@@ -1,4 +1,4 @@
-"""`sphereorient bench`: the robustness benchmark, its scenes, and the comparison of two runs."""
+"""Synthetic movies with exact truth: `sphereorient synth`, `score`, and `bench`, the robustness benchmark."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable, progress_bar, with_options
+from sphereorient.cli.options import Quiet, TrackPath, names_in
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.outputs import put_aside
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
+    from sphereorient.evaluate import Score
     from sphereorient.evaluate.robustness import BenchSettings, Results
 
 EXIT_WORSE = 1  # a number got worse
@@ -21,7 +25,63 @@ EXIT_WORSE = 1  # a number got worse
 bench = typer.Typer(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
 
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
+
+@app.command()
+def synth(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write the experiment into.")],
+    settings: Annotated[Path | None, typer.Option(help="YAML with keys of configs/synth.yaml.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="Override one key, e.g. --set frames=60.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Render an experiment of two cameras with exact truth."""
+    check_writable(out)
+    from sphereorient.methods.settings import load_synth_settings
+    from sphereorient.synth import write_synthetic_experiment
+
+    chosen = load_synth_settings(settings, set_ or [])
+    total = 2 * chosen.frames
+    with progress_bar(quiet) as advance:
+        done = 0
+
+        def rendered(count: int) -> None:
+            nonlocal done
+            done += count
+            advance("render", done, total)
+
+        path = write_synthetic_experiment(out, chosen, rendered)
+    if not quiet:
+        typer.echo(f"Wrote {path}. Next: sphereorient track {path} --out {out / 'track.h5'}")
+
+
+@app.command()
+def score(
+    track: TrackPath,
+    truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="truth.h5 of the synthetic experiment.")],
+) -> None:
+    """Print the errors of a track against the exact truth of a synthetic experiment."""
+    from rich.console import Console
+
+    from sphereorient.evaluate import score_track
+    from sphereorient.trajectory import Trajectory
+
+    Console().print(error_table(score_track(Trajectory.load(track), truth)))
+
+
+def error_table(found: Score) -> Table:
+    """Return errors of orientation and position, and relative errors of the rates, as a table."""
+    from rich.table import Table
+
+    title = f"Errors against the exact truth, {found.valid.sum()} of {found.frames} frames valid"
+    table = Table("quantity", "median", "95 %", "largest", title=title)
+    p50, p95, _, largest = found.percentiles_deg()
+    table.add_row("orientation (degrees)", f"{p50:.3f}", f"{p95:.3f}", f"{largest:.3f}")
+    p50, p95, _, largest = found.percentiles_mm()
+    table.add_row("position (mm)", f"{p50:.4f}", f"{p95:.4f}", f"{largest:.4f}")
+    table.add_section()
+    table.add_row("quantity", "rms error / rms", "frames", "", style="bold")
+    for key in ("velocity", "omega_lab", "omega_body"):
+        table.add_row(key, f"{100 * found.relative_rms[key]:.2f} %", f"{100 * found.coverage[key]:.0f} %", "")
+    return table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +106,7 @@ class SceneOptions:
 
         tree = (FULL if self.full else BenchSettings()).model_dump()
         if self.degradations is not None:
-            tree["degradations"] = tuple(name.strip() for name in self.degradations.split(",") if name.strip())
+            tree["degradations"] = tuple(names_in(self.degradations))
         if self.levels is not None:
             if not all(part.strip().isdecimal() for part in self.levels.split(",")):
                 expected, got, do = "whole numbers between commas", repr(self.levels)[:40], "write e.g. --levels 1,3,5"
@@ -82,7 +142,7 @@ def robustness(options: RunOptions) -> None:
     from sphereorient.report.plots.style import write_figure
     from sphereorient.report.robustness import robustness_figure, write_table
 
-    trackers = trackers_of([name.strip() for name in options.methods.split(",") if name.strip()])
+    trackers = trackers_of(names_in(options.methods))
     older = None if options.baseline is None else load_results(options.baseline)
     with progress_bar(options.quiet, unit="") as advance:
         found = run_benchmark(

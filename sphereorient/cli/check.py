@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import ExperimentPath, app, check_writable, progress_bar
+from sphereorient.cli.app import app, check_writable, echo_lines, progress_bar
+from sphereorient.cli.options import ExperimentPath, Overrides, SettingsPath
 from sphereorient.files.outputs import put_aside
 
 if TYPE_CHECKING:
@@ -28,10 +29,8 @@ def check(
         Path | None,
         typer.Option("--out", "-o", help="Figure to write (.png, .pdf); EXPERIMENT.check.png here without it."),
     ] = None,
-    settings: Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set locate.diameter_px=90.")
-    ] = None,
+    settings: SettingsPath = None,
+    set_: Overrides = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and only warnings and faults.")] = False,
 ) -> None:
     """Check an experiment in seconds before tracking: findings, and what to do. Exit code 1: there is a fault."""
@@ -65,9 +64,7 @@ def _print(findings: Sequence[Finding], quiet: bool) -> None:
             continue
         mark = typer.style(f"{finding.severity:{MARK}}", fg=COLOURS[finding.severity], bold=finding.severity != "ok")
         measured = textwrap.wrap(finding.measured, width - len(margin)) or [""]
+        advice = f"do: {finding.advice}" if finding.advice else ""
         typer.echo(f"{mark}{finding.title:{TITLE}}{measured[0]}")
-        for line in measured[1:]:
-            typer.echo(margin + line)
-        if finding.advice:
-            for line in textwrap.wrap(f"do: {finding.advice}", width - len(margin), subsequent_indent="    "):
-                typer.echo(margin + line)
+        below = measured[1:] + textwrap.wrap(advice, width - len(margin), subsequent_indent="    ")
+        echo_lines(margin + line for line in below)

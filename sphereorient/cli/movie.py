@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import Advance, app, check_writable, frame_range, progress_bar
+from sphereorient.cli.app import Advance, app, check_writable, progress_bar
+from sphereorient.cli.options import Quiet, frames_of
 from sphereorient.errors import MovieError, OutputError, refusal
 from sphereorient.files.outputs import put_aside
 
@@ -25,7 +26,6 @@ Source = Annotated[
     str, typer.Argument(metavar="FILE", help="A movie, a folder of pictures, a pattern, or file.h5::dataset.")
 ]
 Flip = Annotated[str, typer.Option(help="Mirror: none, vertical (rows), horizontal (columns), both.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
 SHOWN = 12  # numbers of frames named in a line
 LINE = 100  # characters
 UNEVEN = 1e-3  # of the usual time between frames
@@ -51,7 +51,7 @@ def show_movie(
 
     with flipped(open_movie(source), flip) as opened:
         with progress_bar(quiet) as advance:
-            seen = survey(opened, count, every, lambda done, total: advance("look", done, total))
+            seen = survey(opened, count, every, lambda *at: advance("look", *at))
             advance("sheet", 0, 1)
             with put_aside(sheet) as partial:
                 contact_sheet(opened, seen, partial)
@@ -153,7 +153,7 @@ def _stem(source: str) -> str:
 
 
 def _range(text: str, opened: Movie) -> tuple[int, int]:
-    found = frame_range(text)
+    found = frames_of(text)
     first, last = (found[0] or 0, len(opened) if found[1] is None else found[1]) if found else (0, 0)
     if not 0 <= first < last <= len(opened):
         expected, do = f"A:B within 0:{len(opened)}, A below B", "correct --frames"

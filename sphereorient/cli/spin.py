@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, progress_bar
+from sphereorient.cli.app import app, check_writable, command_line, progress_bar
+from sphereorient.cli.options import Quiet
 from sphereorient.errors import OutputError, refusal
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def spin(
         float | None, typer.Option(help="Radius of the dots, degrees on the ball; else it is measured in the pictures.")
     ] = None,
     omega_max: Annotated[float, typer.Option(min=1e-3, help="Fastest spin, rad/s.")] = 2 * math.pi * 300,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Measure angular velocity and attitudes of a spinning ball from photographs (docs/photographs.md)."""
     if out.suffix.lower() != ".json":
@@ -71,7 +71,7 @@ def _numbers(found: SpinFound, photographs: Photographs) -> dict[str, Any]:
     spins, sigma = found.spins, found.spins.rate_sigma()
     rate = spins.omega_view_rad_s.norm(dim=-1)
     return {
-        "command": " ".join(["sphereorient", *sys.argv[1:]]),
+        "command": command_line(),
         "frame": "view: x right, y down, z from the camera to the ball",
         "spins": [
             {

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, progress_bar
+from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
+from sphereorient.cli.options import names_in
 from sphereorient.errors import OutputError, TextureError, refusal
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def design(
     """Judge a map before it is painted, or make one; print it on strips that wrap the ball."""
     _check(map_, make, gores, diameter_mm, stroke, diameter_px, noise, 0.0 if diameter_mm is None else diameter_mm)
     check_writable(out)
-    from sphereorient.tools.design.gores import Gores
+    from sphereorient.tools.design.gores import Gores, write_gores
     from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture
 
     strips = Gores(count=gores, diameter_mm=diameter_mm) if gores is not None and diameter_mm is not None else None
@@ -71,17 +71,10 @@ def design(
     else:
         with progress_bar(quiet or as_json, unit="maps") as advance:
             drawn, judgement, title = design_texture(
-                [name.strip() for name in kinds.split(",") if name.strip()],
-                stroke,
-                settings,
-                tries=tries,
-                seed=seed,
-                advance=lambda done, total: advance("search", done, total),
+                names_in(kinds), stroke, settings, tries=tries, seed=seed, advance=lambda *at: advance("search", *at)
             )
     files = _written(out, drawn, judgement, title, make=map_ is None)
     if strips is not None:
-        from sphereorient.tools.design.gores import write_gores
-
         files += write_gores(drawn, strips, out)
     if as_json:
         typer.echo(json.dumps({"map": title, **judgement.as_dict()}))
@@ -99,9 +92,8 @@ def _check(map_: Path | None, make: bool, gores: int | None, diameter_mm: float 
         got = "--gores alone" if diameter_mm is None else "--diameter-mm alone"
         raise TextureError(refusal("strips", expected="--gores and --diameter-mm", got=got, do="give both"))
     if not all(math.isfinite(number) for number in numbers):
-        raise TextureError(
-            refusal("texture design", expected="numbers", got="nan or infinity", do="correct the option")
-        )
+        do = "correct the option"
+        raise TextureError(refusal("texture design", expected="numbers", got="nan or infinity", do=do))
 
 
 def _loaded(path: Path) -> Tensor:
@@ -127,7 +119,7 @@ def _written(out: Path, drawn: Tensor, judgement: Judgement, title: str, *, make
         raise OutputError(refusal(f"--out {out}", expected="a folder", got=str(error.strerror), do=do)) from error
     files = [out / "judgement.json", out / "design.png"]
     with put_aside(files[0]) as aside:
-        about = {"map": title, "command": " ".join(["sphereorient", *sys.argv[1:]]), **judgement.as_dict()}
+        about = {"map": title, "command": command_line(), **judgement.as_dict()}
         aside.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     write_figure(design_figure(drawn, judgement, title), files[1])
     if make:
@@ -143,12 +135,10 @@ def _print(judgement: Judgement, title: str) -> None:
 
     told = judgement.as_dict()
     table = Table(title, "least", "middle", "most", title="judgement", title_justify="left")
-    table.add_row("white in a view, %", *(_number(told["white_share"][name], 100, 0) for name in SPREAD))
-    table.add_row(
-        "best possible error of a view, degrees", *(_number(told["bound_deg"][name], 1, 3) for name in SPREAD)
-    )
-    console = Console()
-    console.print(table)
+    white, bound = told["white_share"], told["bound_deg"]
+    table.add_row("white in a view, %", *(_number(white[name], 100, 0) for name in SPREAD))
+    table.add_row("best possible error of a view, degrees", *(_number(bound[name], 1, 3) for name in SPREAD))
+    Console().print(table)
     settings = judgement.settings
     lines = [
         f"(ball of {settings.diameter_px:g} px, noise {100 * settings.noise_share:g} % of black to white, "
@@ -158,8 +148,7 @@ def _print(judgement: Judgement, title: str) -> None:
         f"margin {judgement.margin:.2f}: {' and '.join(_place(each) for each in told['most_alike_lon_lat_deg'])}",
         f"widest brush that paints it: {judgement.stroke_deg:.0f} degrees; borders {judgement.border:.1f} radii long",
     ]
-    for line in lines:
-        typer.echo(line)
+    echo_lines(lines)
 
 
 def _number(value: float | None, times: float, digits: int) -> str:

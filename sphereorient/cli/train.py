@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable, progress_bar
+from sphereorient.cli.options import Quiet
 
 if TYPE_CHECKING:
     from sphereorient.learn.benchmark import ProposerBenchmark
@@ -27,7 +28,7 @@ def train(
         list[str] | None, typer.Option("--set", help="Override one key, e.g. --set training.minutes=30.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue from last.ckpt in the folder.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Train a network that proposes orientations (docs/proposer.md)."""
     check_writable(out)
