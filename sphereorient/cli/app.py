@@ -1,20 +1,19 @@
-"""The application of the command line, the helpers of its commands, and the end of errors."""
+"""The application of the command line, the helpers of its commands, `settings`, `info`, and the end of errors."""
 
-import inspect
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, cast, get_type_hints
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from sphereorient import __version__
 from sphereorient.errors import OutputError, SphereOrientError, refusal
+from sphereorient.files.outputs import put_aside
 
 
 class InOrder(TyperGroup):
@@ -78,16 +77,6 @@ def echo_lines(lines: Iterable[str]) -> None:
         typer.echo(line)
 
 
-def with_options(command: Callable[[Any], None]) -> Callable[..., None]:
-    """Let a command take one record: each field of the dataclass becomes an option."""
-    record = next(iter(get_type_hints(command).values()))
-    signature = inspect.signature(record, eval_str=True)
-    with_fields: Any = wraps(command)(lambda **values: command(record(**values)))
-    with_fields.__signature__ = signature
-    with_fields.__annotations__ = {name: one.annotation for name, one in signature.parameters.items()}
-    return cast(Callable[..., None], with_fields)
-
-
 Advance = Callable[[str, int, int], None]
 
 
@@ -123,6 +112,35 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
             bar.update(tasks[stage], completed=done, total=total, rate=rate)
 
         yield advance
+
+
+@app.command()
+def settings(
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write; the screen without it.")] = None,
+) -> None:
+    """Write all settings of the methods with defaults and explanations."""
+    from sphereorient.methods.settings import settings_yaml
+
+    if out is None:
+        typer.echo(settings_yaml())
+        return
+    check_writable(out)
+    with put_aside(out) as aside:
+        aside.write_text(settings_yaml(), encoding="utf-8")
+
+
+@app.command()
+def info() -> None:
+    """Print versions, threads and device."""
+    import torch
+
+    from sphereorient.files.provenance import versions
+
+    for package, number in versions().items():
+        typer.echo(f"{package:24} {number}")
+    typer.echo(f"{'threads':24} {torch.get_num_threads()} of {os.cpu_count()} cores")
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu (no GPU found)"
+    typer.echo(f"{'device':24} {device}")
 
 
 def main() -> None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, progress_bar, with_options
+from sphereorient.cli.app import app, check_writable, progress_bar
 from sphereorient.cli.options import Quiet, TrackPath, names_in
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.outputs import put_aside
@@ -84,77 +83,72 @@ def error_table(found: Score) -> Table:
     return table
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneOptions:
-    """Options that choose the scenes."""
-
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; an unfinished one goes on.")]
-    degradations: Annotated[
-        str | None, typer.Option(help="Some of docs/degradations.md, e.g. defocus,spin; all without it.")
-    ] = None
-    levels: Annotated[str | None, typer.Option(help="Severities, e.g. 1,2,3,4,5; 1,3,5 without it.")] = None
-    seeds: Annotated[int | None, typer.Option(min=1, max=100, help="Movies of each degradation and severity.")] = None
-    frames: Annotated[int | None, typer.Option(min=12, help="Of each movie.")] = None
-    full: Annotated[bool, typer.Option("--full", help="All severities, three movies of 60 frames each: hours.")] = False
-    quiet: Quiet = False
-
-    def settings(self) -> BenchSettings:
-        """Return the default settings, or those of the full run, with the changes of the options."""
-        from pydantic import ValidationError
-
-        from sphereorient.evaluate.robustness.scenes import FULL, BenchSettings
-
-        tree = (FULL if self.full else BenchSettings()).model_dump()
-        if self.degradations is not None:
-            tree["degradations"] = tuple(names_in(self.degradations))
-        if self.levels is not None:
-            if not all(part.strip().isdecimal() for part in self.levels.split(",")):
-                expected, got, do = "whole numbers between commas", repr(self.levels)[:40], "write e.g. --levels 1,3,5"
-                raise SettingsError(refusal("--levels", expected=expected, got=got, do=do))
-            tree["levels"] = tuple(int(part) for part in self.levels.split(","))
-        if self.seeds is not None:
-            tree["seeds"] = tuple(range(self.seeds))
-        if self.frames is not None:
-            tree["frames"] = self.frames
-        try:
-            return BenchSettings(**tree)
-        except ValidationError as error:
-            raise SettingsError(str(error.errors()[0]["msg"]).removeprefix("Value error, ")) from None
+RunFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; an unfinished one goes on.")]
+Degradations = Annotated[
+    str | None, typer.Option(help="Some of docs/degradations.md, e.g. defocus,spin; all without it.")
+]
+Levels = Annotated[str | None, typer.Option(help="Severities, e.g. 1,2,3,4,5; 1,3,5 without it.")]
+Seeds = Annotated[int | None, typer.Option(min=1, max=100, help="Movies of each degradation and severity.")]
+Frames = Annotated[int | None, typer.Option(min=12, help="Of each movie.")]
+Full = Annotated[bool, typer.Option("--full", help="All severities, three movies of 60 frames each: hours.")]
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunOptions(SceneOptions):
-    """Options of a run."""
+def _settings(
+    full: bool, degradations: str | None, levels: str | None, seeds: int | None, frames: int | None
+) -> BenchSettings:
+    """Return the default settings, or those of the full run, with the changes of the options."""
+    from pydantic import ValidationError
 
-    methods: Annotated[str, typer.Option(help="Methods to compare.")] = "precise,paper"
-    baseline: Annotated[Path | None, typer.Option(help="results.json of an older run to compare with.")] = None
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes.")] = 2
+    from sphereorient.evaluate.robustness.scenes import FULL, BenchSettings
+
+    if levels is not None and not all(part.strip().isdecimal() for part in levels.split(",")):
+        expected, got, do = "whole numbers between commas", repr(levels)[:40], "write e.g. --levels 1,3,5"
+        raise SettingsError(refusal("--levels", expected=expected, got=got, do=do))
+    options: dict[str, Any] = {
+        "degradations": None if degradations is None else tuple(names_in(degradations)),
+        "levels": None if levels is None else tuple(map(int, levels.split(","))),
+        "seeds": None if seeds is None else tuple(range(seeds)),
+        "frames": frames,
+    }
+    changes = {name: value for name, value in options.items() if value is not None}
+    try:
+        return BenchSettings(**(FULL if full else BenchSettings()).model_dump() | changes)
+    except ValidationError as error:
+        raise SettingsError(str(error.errors()[0]["msg"]).removeprefix("Value error, ")) from None
 
 
 @bench.command()
-@with_options
-def robustness(options: RunOptions) -> None:
+def robustness(
+    out: RunFolder,
+    degradations: Degradations = None,
+    levels: Levels = None,
+    seeds: Seeds = None,
+    frames: Frames = None,
+    full: Full = False,
+    quiet: Quiet = False,
+    methods: Annotated[str, typer.Option(help="Methods to compare.")] = "precise,paper",
+    baseline: Annotated[Path | None, typer.Option(help="results.json of an older run to compare with.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes.")] = 2,
+) -> None:
     """Measure the effect of noise, blur, dirt, wrong cameras and more on a track; the default ends in minutes."""
-    check_writable(options.out)
-    settings = options.settings()
+    check_writable(out)
+    settings = _settings(full, degradations, levels, seeds, frames)
     from sphereorient.evaluate.robustness import load_results, run_benchmark
     from sphereorient.evaluate.robustness.run import trackers_of
     from sphereorient.report.plots.style import write_figure
     from sphereorient.report.robustness import robustness_figure, write_table
 
-    trackers = trackers_of(names_in(options.methods))
-    older = None if options.baseline is None else load_results(options.baseline)
-    with progress_bar(options.quiet, unit="") as advance:
-        found = run_benchmark(
-            options.out, settings, trackers, jobs=options.jobs, progress=lambda *at: advance("scenes", *at)
-        )
-    write_table(found, options.out / "results.csv")
-    write_figure(robustness_figure(found), options.out / "robustness")
-    if not options.quiet:
+    trackers = trackers_of(names_in(methods))
+    older = None if baseline is None else load_results(baseline)
+    with progress_bar(quiet, unit="") as advance:
+        found = run_benchmark(out, settings, trackers, jobs=jobs, progress=lambda *at: advance("scenes", *at))
+    write_table(found, out / "results.csv")
+    write_figure(robustness_figure(found), out / "robustness")
+    if not quiet:
         _print(found)
-        typer.echo(f"Wrote {options.out}: results.json, results.csv, robustness.png, .pdf")
+        typer.echo(f"Wrote {out}: results.json, results.csv, robustness.png, .pdf")
     if older is not None:
-        _print_changes(found, older, options.quiet)
+        _print_changes(found, older, quiet)
 
 
 @bench.command("compare")
@@ -170,23 +164,30 @@ def compare_results(
 
 
 @bench.command("scenes")
-@with_options
-def write_scenes(options: SceneOptions) -> None:
+def write_scenes(
+    out: RunFolder,
+    degradations: Degradations = None,
+    levels: Levels = None,
+    seeds: Seeds = None,
+    frames: Frames = None,
+    full: Full = False,
+    quiet: Quiet = False,
+) -> None:
     """Render the scenes of the benchmark with their truth, for other programs (docs/robustness.md)."""
-    check_writable(options.out)
-    settings = options.settings()
+    check_writable(out)
+    settings = _settings(full, degradations, levels, seeds, frames)
     from sphereorient.evaluate.robustness import scenes_of, write_scene
 
     scenes = scenes_of(settings)
-    with progress_bar(options.quiet, unit="") as advance:
+    with progress_bar(quiet, unit="") as advance:
         for done, scene in enumerate(scenes, start=1):
-            write_scene(options.out / scene.name, scene)
+            write_scene(out / scene.name, scene)
             advance("scenes", done, len(scenes))
     index = [{"name": scene.name, "degradations": dict(scene.degradations), "seed": scene.seed} for scene in scenes]
-    with put_aside(options.out / "scenes.json") as aside:
+    with put_aside(out / "scenes.json") as aside:
         aside.write_text(json.dumps(index, indent=1) + "\n", "utf-8")
-    if not options.quiet:
-        typer.echo(f"Wrote {options.out}: {len(scenes)} scenes, each with experiment.yaml and truth.h5")
+    if not quiet:
+        typer.echo(f"Wrote {out}: {len(scenes)} scenes, each with experiment.yaml and truth.h5")
 
 
 @bench.command("score")

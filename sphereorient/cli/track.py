@@ -109,7 +109,7 @@ def _kept(requests: Sequence[Request]) -> Iterator[None]:
 def _track_side_by_side(requests: Sequence[Request], jobs: int, cluster: str | None, resume: bool, quiet: bool) -> None:
     """Track on worker processes or a cluster, and print a table of the results."""
     from sphereorient.run import run_many
-    from sphereorient.run.executors import ProcessExecutor, dask_executor
+    from sphereorient.run.many import ProcessExecutor, dask_executor
 
     executor = ProcessExecutor(jobs) if cluster is None else dask_executor(cluster, jobs if jobs > 1 else None)
     with _kept(requests), progress_bar(quiet) as advance:

@@ -1,25 +1,133 @@
-"""`sphereorient texture`: design of a ball's texture."""
+"""Tools beside tracking: `sphereorient spin`, the spin of a ball from photographs, and `texture`, the design of one."""
 
 from __future__ import annotations
 
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
-from sphereorient.cli.options import names_in
+from sphereorient.cli.options import Quiet, names_in
 from sphereorient.errors import OutputError, TextureError, refusal
+from sphereorient.files.outputs import put_aside
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from sphereorient.tools.design.judge import Judgement
+    from sphereorient.tools.spin.disks import Photographs
+    from sphereorient.tools.spin.spin import SpinFound
 
 SPREAD = ("min", "median", "max")
 HEIGHT_MAX = 1024  # of a map that is judged: finer than any picture shows
+
+
+@app.command()
+def spin(
+    photographs: Annotated[
+        list[Path], typer.Argument(metavar="PHOTOGRAPHS...", help="Pictures of one flight, or a folder of them.")
+    ],
+    times: Annotated[
+        str, typer.Option(help="Table .csv with file,t_s; or pictures a second, e.g. 400, at equal intervals.")
+    ],
+    texture: Annotated[Path, typer.Option(help="Table of dots .csv (x,y,z a line), or a texture map .png.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Result to write, .json; a figure .png goes beside it.")],
+    dot_radius: Annotated[
+        float | None, typer.Option(help="Radius of the dots, degrees on the ball; else it is measured in the pictures.")
+    ] = None,
+    omega_max: Annotated[float, typer.Option(min=1e-3, help="Fastest spin, rad/s.")] = 2 * math.pi * 300,
+    quiet: Quiet = False,
+) -> None:
+    """Measure angular velocity and attitudes of a spinning ball from photographs (docs/photographs.md)."""
+    if out.suffix.lower() != ".json":
+        do = "choose a name such as spin.json"
+        raise OutputError(refusal(f"--out {out}", expected=".json", got=out.suffix or "no ending", do=do))
+    check_writable(out)
+    from sphereorient.report.plots.style import write_figure
+    from sphereorient.tools.spin.dots import DotTable
+    from sphereorient.tools.spin.figure import spin_figure
+    from sphereorient.tools.spin.inputs import load_ball, load_photographs
+    from sphereorient.tools.spin.spin import SpinSettings, spin_of
+
+    ball = load_ball(texture, dot_radius)
+    loaded, settings = load_photographs(photographs, times), SpinSettings(omega_max_rad_s=omega_max)
+    with progress_bar(quiet, unit="photographs") as advance:
+        found = spin_of(loaded, ball, settings, advance)
+        if isinstance(ball, DotTable) and dot_radius is None:
+            ball = ball.measured(found.disks, found.R_view_body)
+            found = spin_of(loaded, ball, settings, lambda stage, *rest: advance(f"{stage}, dots measured", *rest))
+    result = _spin_document(found, loaded)
+    if isinstance(ball, DotTable):
+        result["dot_radius_deg"] = ball.radius_deg
+    with put_aside(out) as aside:
+        aside.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    drawn = ball.texture() if isinstance(ball, DotTable) else ball
+    names = [Path(name).stem for name in loaded.names]
+    write_figure(spin_figure(found, drawn, loaded.time_s, names), out.with_suffix(".png"))
+    if not quiet:
+        _print_spin(result)
+        typer.echo(f"Wrote {out}, {out.with_suffix('.png')}")
+
+
+def _spin_document(found: SpinFound, photographs: Photographs) -> dict[str, Any]:
+    """Return the result for JSON; null: not measured."""
+    spins, sigma = found.spins, found.spins.rate_sigma()
+    rate = spins.omega_view_rad_s.norm(dim=-1)
+    return {
+        "command": command_line(),
+        "frame": "view: x right, y down, z from the camera to the ball",
+        "spins": [
+            {
+                "omega_view_rad_s": spins.omega_view_rad_s[k].tolist(),
+                "omega_covariance": spins.covariance[k, 3:, 3:].tolist(),
+                "rate_rad_s": float(rate[k]),
+                "rate_sigma_rad_s": float(sigma[k]),
+                "R0_view_body": spins.R0_view_body[k].tolist(),
+                "time0_s": float(spins.time0_s[k]),
+                "evidence": float(spins.evidence[k]),
+                "distinguished": k >= found.ambiguous,
+            }
+            for k in range(len(spins))
+        ],
+        "ambiguous": found.ambiguous,
+        "mirrored_evidence": found.mirrored_evidence,
+        "photographs": [
+            {
+                "file": name,
+                "time_s": float(photographs.time_s[k]),
+                "R_view_body": found.R_view_body[k].tolist(),
+                "residual_deg": math.degrees(residual) if math.isfinite(residual) else None,
+                "score": float(found.score[k]),
+                "evidence": float(found.evidence[0, k]),
+            }
+            for k, (name, residual) in enumerate(zip(photographs.names, found.residual_rad.tolist(), strict=True))
+        ],
+    }
+
+
+def _print_spin(result: dict[str, Any]) -> None:
+    """Print each spin, and how well the photographs follow the first."""
+    for k, one in enumerate(result["spins"]):
+        omega = ", ".join(f"{each:.1f}" for each in one["omega_view_rad_s"])
+        rate, sigma = one["rate_rad_s"], one["rate_sigma_rad_s"]
+        ambiguous = result["ambiguous"] > 1 and not one["distinguished"]
+        words = "; alias that the times do not exclude" if ambiguous and k else "" if not k else "; less likely"
+        typer.echo(
+            f"omega ({omega}) rad/s, |omega| {rate:.1f} +- {sigma:.1f} rad/s = {rate / (2 * math.pi):.2f} turns/s, "
+            f"evidence {one['evidence']:.0f}{words}"
+        )
+    followed = [one["residual_deg"] for one in result["photographs"] if one["residual_deg"] is not None]
+    typer.echo(
+        f"photographs: {len(followed)} of {len(result['photographs'])} follow the spin, "
+        f"off by {sum(followed) / max(len(followed), 1):.1f}° on average"
+    )
+    typer.echo(f"mirrored texture: evidence {result['mirrored_evidence']:.0f}")
+    if "dot_radius_deg" in result:
+        typer.echo(f"dots: radius {result['dot_radius_deg']:.1f}°")
+
 
 texture_app = typer.Typer(help="Judge, make and print a texture map (docs/paint-design.md).", no_args_is_help=True)
 app.add_typer(texture_app, name="texture")
@@ -58,7 +166,9 @@ def design(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")] = False,
 ) -> None:
     """Judge a map before it is painted, or make one; print it on strips that wrap the ball."""
-    _check(map_, make, gores, diameter_mm, stroke, diameter_px, noise, 0.0 if diameter_mm is None else diameter_mm)
+    _check_design(
+        map_, make, gores, diameter_mm, stroke, diameter_px, noise, 0.0 if diameter_mm is None else diameter_mm
+    )
     check_writable(out)
     from sphereorient.tools.design.gores import Gores, write_gores
     from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture
@@ -79,11 +189,11 @@ def design(
     if as_json:
         typer.echo(json.dumps({"map": title, **judgement.as_dict()}))
     elif not quiet:
-        _print(judgement, title)
+        _print_judgement(judgement, title)
         typer.echo("Wrote " + ", ".join(str(file) for file in files))
 
 
-def _check(map_: Path | None, make: bool, gores: int | None, diameter_mm: float | None, *numbers: float) -> None:
+def _check_design(map_: Path | None, make: bool, gores: int | None, diameter_mm: float | None, *numbers: float) -> None:
     """Refuse options that contradict each other, nan and infinity."""
     if make == (map_ is not None):
         got, do = ("both", "leave one of them away") if make else ("neither", "name a map, or say --make")
@@ -107,7 +217,6 @@ def _loaded(path: Path) -> Tensor:
 
 def _written(out: Path, drawn: Tensor, judgement: Judgement, title: str, *, make: bool) -> list[Path]:
     """Write judgement and figure, and the map where it was made; return the files."""
-    from sphereorient.files.outputs import put_aside
     from sphereorient.report.map_files import write_texture
     from sphereorient.report.plots.style import write_figure
     from sphereorient.tools.design.figure import design_figure
@@ -128,7 +237,7 @@ def _written(out: Path, drawn: Tensor, judgement: Judgement, title: str, *, make
     return files
 
 
-def _print(judgement: Judgement, title: str) -> None:
+def _print_judgement(judgement: Judgement, title: str) -> None:
     """Print the judgement as a table."""
     from rich.console import Console
     from rich.table import Table
