@@ -12,7 +12,7 @@ from demo_figure import demo_figure
 from rich.console import Console
 
 from sphereorient.cli.app import progress_bar
-from sphereorient.cli.score import error_table
+from sphereorient.cli.bench import error_table
 from sphereorient.evaluate import score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.run.stages import track_movies

@@ -21,8 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.learn.density import find_modes, first_right, smoothed_target
-from sphereorient.learn.network import Correlator, PictureNetwork
+from sphereorient.learn.network import Correlator, PictureNetwork, find_modes, first_right, smoothed_target
 from sphereorient.learn.pictures import VALIDATION_SEED, RandomTextures, TrainingBatch, draw_batch, make_textures
 from sphereorient.learn.settings import NetworkSettings, PictureSettings
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture

@@ -1,46 +1,6 @@
 """The command line: parse, call, print. Heavy packages are imported inside the commands, so that help is quick."""
 
-from sphereorient.cli import (
-    about,
-    bench,
-    calibrate,
-    check,
-    compare_maps,
-    convert_cameras,
-    export,
-    map,
-    movie,
-    overlay,
-    report,
-    score,
-    spin,
-    synth,
-    texture,
-    track,
-    train,
-    view,
-)
+from sphereorient.cli import bench, cameras, inputs, map, show, tools, track, train  # noqa: F401
 from sphereorient.cli.app import app, main
 
-__all__ = [
-    "about",
-    "app",
-    "bench",
-    "calibrate",
-    "check",
-    "compare_maps",
-    "convert_cameras",
-    "export",
-    "main",
-    "map",
-    "movie",
-    "overlay",
-    "report",
-    "score",
-    "spin",
-    "synth",
-    "texture",
-    "track",
-    "train",
-    "view",
-]
+__all__ = ["app", "main"]

@@ -1,26 +1,19 @@
-"""The application of the command line, the helpers of its commands, and the end of errors."""
+"""The application of the command line, the helpers of its commands, `settings`, `info`, and the end of errors."""
 
-from __future__ import annotations
-
-import inspect
 import os
-import re
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from sphereorient import __version__
 from sphereorient.errors import OutputError, SphereOrientError, refusal
-
-if TYPE_CHECKING:
-    from sphereorient.methods.settings import Settings
+from sphereorient.files.outputs import put_aside
 
 
 class InOrder(TyperGroup):
@@ -52,8 +45,6 @@ app = typer.Typer(
 EXIT_REFUSED = 2  # an error that the user can correct
 EXIT_INTERRUPTED = 130  # Ctrl-C, as in shells
 
-ExperimentPath = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="experiment.yaml (docs/data-format.md)")]
-
 
 @app.callback(invoke_without_command=True)
 def common(
@@ -75,37 +66,15 @@ def check_writable(out: Path) -> None:
         raise OutputError(refusal(name, expected="a writable folder", got=f"{folder}, which is not", do=do))
 
 
-def settings_of(path: Path | None, overrides: list[str] | None, method: str | None) -> Settings:
-    """Read the settings that a method reads, and print remarks on the others."""
-    from sphereorient.methods.settings import BRANCHES, read_settings
-
-    loaded = read_settings(path, overrides or [], method if method in BRANCHES else None)
-    for remark in loaded.remarks:
-        typer.echo(f"note: {remark}", err=True)
-    return loaded.settings
+def command_line() -> str:
+    """Return the command as it was typed, for the provenance of results."""
+    return " ".join(["sphereorient", *sys.argv[1:]])
 
 
-def camera_names(text: str | None) -> list[str] | None:
-    """Return the names in cam1,cam2; None without a text."""
-    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
-
-
-def frame_range(text: str) -> tuple[int | None, int | None] | None:
-    """Return first and last + 1 of A:B, None for an omitted end; None for another text."""
-    found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", text.strip())
-    if not found:
-        return None
-    return (int(found[1]) if found[1] else None, int(found[2]) if found[2] else None)
-
-
-def with_options(command: Callable[[Any], None]) -> Callable[..., None]:
-    """Let a command take one record: each field of the dataclass becomes an option."""
-    record = next(iter(get_type_hints(command).values()))
-    signature = inspect.signature(record, eval_str=True)
-    with_fields: Any = wraps(command)(lambda **values: command(record(**values)))
-    with_fields.__signature__ = signature
-    with_fields.__annotations__ = {name: one.annotation for name, one in signature.parameters.items()}
-    return cast(Callable[..., None], with_fields)
+def echo_lines(lines: Iterable[str]) -> None:
+    """Print lines."""
+    for line in lines:
+        typer.echo(line)
 
 
 Advance = Callable[[str, int, int], None]
@@ -117,26 +86,19 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
     if quiet:
         yield lambda stage, done, total: None
         return
+    from rich import progress
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
-    columns: list[Any] = [
-        TextColumn("{task.description:13}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]:>14}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    ]
-    bar = Progress(*columns, console=Console(stderr=True))
+    bar = progress.Progress(
+        "{task.description:13}",
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        "{task.fields[rate]:>14}",
+        progress.TimeElapsedColumn(),
+        "left",
+        progress.TimeRemainingColumn(),
+        console=Console(stderr=True),
+    )
     tasks: dict[str, Any] = {}
     with ExitStack() as shown:
 
@@ -150,6 +112,35 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
             bar.update(tasks[stage], completed=done, total=total, rate=rate)
 
         yield advance
+
+
+@app.command()
+def settings(
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write; the screen without it.")] = None,
+) -> None:
+    """Write all settings of the methods with defaults and explanations."""
+    from sphereorient.methods.settings import settings_yaml
+
+    if out is None:
+        typer.echo(settings_yaml())
+        return
+    check_writable(out)
+    with put_aside(out) as aside:
+        aside.write_text(settings_yaml(), encoding="utf-8")
+
+
+@app.command()
+def info() -> None:
+    """Print versions, threads and device."""
+    import torch
+
+    from sphereorient.files.provenance import versions
+
+    for package, number in versions().items():
+        typer.echo(f"{package:24} {number}")
+    typer.echo(f"{'threads':24} {torch.get_num_threads()} of {os.cpu_count()} cores")
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu (no GPU found)"
+    typer.echo(f"{'device':24} {device}")
 
 
 def main() -> None:
@@ -167,16 +158,11 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         code = EXIT_INTERRUPTED
     except Exception as error:
-        code = _usage_error(error)
+        show = getattr(error, "show", None)
+        if show is None:
+            raise
+        show()  # an error of the arguments, in the parser's words
+        code = int(getattr(error, "exit_code", EXIT_REFUSED))
     if code == EXIT_INTERRUPTED:
         typer.echo("sphereorient: interrupted; no result was written.", err=True)
     sys.exit(code)
-
-
-def _usage_error(error: Exception) -> int:
-    """Print an error of the arguments in the parser's words; raise any other error again."""
-    show = getattr(error, "show", None)
-    if show is None:
-        raise error
-    show()
-    return int(getattr(error, "exit_code", EXIT_REFUSED))

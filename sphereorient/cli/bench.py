@@ -1,19 +1,22 @@
-"""`sphereorient bench`: the robustness benchmark, its scenes, and the comparison of two runs."""
+"""Synthetic movies with exact truth: `sphereorient synth`, `score`, and `bench`, the robustness benchmark."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, progress_bar, with_options
+from sphereorient.cli.app import app, check_writable, progress_bar
+from sphereorient.cli.options import Quiet, TrackPath, names_in
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.outputs import put_aside
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
+    from sphereorient.evaluate import Score
     from sphereorient.evaluate.robustness import BenchSettings, Results
 
 EXIT_WORSE = 1  # a number got worse
@@ -21,80 +24,131 @@ EXIT_WORSE = 1  # a number got worse
 bench = typer.Typer(no_args_is_help=True, help="Benchmarks on synthetic scenes with exact truth.")
 app.add_typer(bench, name="bench")
 
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
+
+@app.command()
+def synth(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write the experiment into.")],
+    settings: Annotated[Path | None, typer.Option(help="YAML with keys of configs/synth.yaml.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="Override one key, e.g. --set frames=60.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Render an experiment of two cameras with exact truth."""
+    check_writable(out)
+    from sphereorient.methods.settings import load_synth_settings
+    from sphereorient.synth import write_synthetic_experiment
+
+    chosen = load_synth_settings(settings, set_ or [])
+    total = 2 * chosen.frames
+    with progress_bar(quiet) as advance:
+        done = 0
+
+        def rendered(count: int) -> None:
+            nonlocal done
+            done += count
+            advance("render", done, total)
+
+        path = write_synthetic_experiment(out, chosen, rendered)
+    if not quiet:
+        typer.echo(f"Wrote {path}. Next: sphereorient track {path} --out {out / 'track.h5'}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneOptions:
-    """Options that choose the scenes."""
+@app.command()
+def score(
+    track: TrackPath,
+    truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="truth.h5 of the synthetic experiment.")],
+) -> None:
+    """Print the errors of a track against the exact truth of a synthetic experiment."""
+    from rich.console import Console
 
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; an unfinished one goes on.")]
-    degradations: Annotated[
-        str | None, typer.Option(help="Some of docs/degradations.md, e.g. defocus,spin; all without it.")
-    ] = None
-    levels: Annotated[str | None, typer.Option(help="Severities, e.g. 1,2,3,4,5; 1,3,5 without it.")] = None
-    seeds: Annotated[int | None, typer.Option(min=1, max=100, help="Movies of each degradation and severity.")] = None
-    frames: Annotated[int | None, typer.Option(min=12, help="Of each movie.")] = None
-    full: Annotated[bool, typer.Option("--full", help="All severities, three movies of 60 frames each: hours.")] = False
-    quiet: Quiet = False
+    from sphereorient.evaluate import score_track
+    from sphereorient.trajectory import Trajectory
 
-    def settings(self) -> BenchSettings:
-        """Return the default settings, or those of the full run, with the changes of the options."""
-        from pydantic import ValidationError
-
-        from sphereorient.evaluate.robustness.scenes import FULL, BenchSettings
-
-        tree = (FULL if self.full else BenchSettings()).model_dump()
-        if self.degradations is not None:
-            tree["degradations"] = tuple(name.strip() for name in self.degradations.split(",") if name.strip())
-        if self.levels is not None:
-            if not all(part.strip().isdecimal() for part in self.levels.split(",")):
-                expected, got, do = "whole numbers between commas", repr(self.levels)[:40], "write e.g. --levels 1,3,5"
-                raise SettingsError(refusal("--levels", expected=expected, got=got, do=do))
-            tree["levels"] = tuple(int(part) for part in self.levels.split(","))
-        if self.seeds is not None:
-            tree["seeds"] = tuple(range(self.seeds))
-        if self.frames is not None:
-            tree["frames"] = self.frames
-        try:
-            return BenchSettings(**tree)
-        except ValidationError as error:
-            raise SettingsError(str(error.errors()[0]["msg"]).removeprefix("Value error, ")) from None
+    Console().print(error_table(score_track(Trajectory.load(track), truth)))
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunOptions(SceneOptions):
-    """Options of a run."""
+def error_table(found: Score) -> Table:
+    """Return errors of orientation and position, and relative errors of the rates, as a table."""
+    from rich.table import Table
 
-    methods: Annotated[str, typer.Option(help="Methods to compare.")] = "precise,paper"
-    baseline: Annotated[Path | None, typer.Option(help="results.json of an older run to compare with.")] = None
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes.")] = 2
+    title = f"Errors against the exact truth, {found.valid.sum()} of {found.frames} frames valid"
+    table = Table("quantity", "median", "95 %", "largest", title=title)
+    p50, p95, _, largest = found.percentiles_deg()
+    table.add_row("orientation (degrees)", f"{p50:.3f}", f"{p95:.3f}", f"{largest:.3f}")
+    p50, p95, _, largest = found.percentiles_mm()
+    table.add_row("position (mm)", f"{p50:.4f}", f"{p95:.4f}", f"{largest:.4f}")
+    table.add_section()
+    table.add_row("quantity", "rms error / rms", "frames", "", style="bold")
+    for key in ("velocity", "omega_lab", "omega_body"):
+        table.add_row(key, f"{100 * found.relative_rms[key]:.2f} %", f"{100 * found.coverage[key]:.0f} %", "")
+    return table
+
+
+RunFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; an unfinished one goes on.")]
+Degradations = Annotated[
+    str | None, typer.Option(help="Some of docs/degradations.md, e.g. defocus,spin; all without it.")
+]
+Levels = Annotated[str | None, typer.Option(help="Severities, e.g. 1,2,3,4,5; 1,3,5 without it.")]
+Seeds = Annotated[int | None, typer.Option(min=1, max=100, help="Movies of each degradation and severity.")]
+Frames = Annotated[int | None, typer.Option(min=12, help="Of each movie.")]
+Full = Annotated[bool, typer.Option("--full", help="All severities, three movies of 60 frames each: hours.")]
+
+
+def _settings(
+    full: bool, degradations: str | None, levels: str | None, seeds: int | None, frames: int | None
+) -> BenchSettings:
+    """Return the default settings, or those of the full run, with the changes of the options."""
+    from pydantic import ValidationError
+
+    from sphereorient.evaluate.robustness.scenes import FULL, BenchSettings
+
+    if levels is not None and not all(part.strip().isdecimal() for part in levels.split(",")):
+        expected, got, do = "whole numbers between commas", repr(levels)[:40], "write e.g. --levels 1,3,5"
+        raise SettingsError(refusal("--levels", expected=expected, got=got, do=do))
+    options: dict[str, Any] = {
+        "degradations": None if degradations is None else tuple(names_in(degradations)),
+        "levels": None if levels is None else tuple(map(int, levels.split(","))),
+        "seeds": None if seeds is None else tuple(range(seeds)),
+        "frames": frames,
+    }
+    changes = {name: value for name, value in options.items() if value is not None}
+    try:
+        return BenchSettings(**(FULL if full else BenchSettings()).model_dump() | changes)
+    except ValidationError as error:
+        raise SettingsError(str(error.errors()[0]["msg"]).removeprefix("Value error, ")) from None
 
 
 @bench.command()
-@with_options
-def robustness(options: RunOptions) -> None:
+def robustness(
+    out: RunFolder,
+    degradations: Degradations = None,
+    levels: Levels = None,
+    seeds: Seeds = None,
+    frames: Frames = None,
+    full: Full = False,
+    quiet: Quiet = False,
+    methods: Annotated[str, typer.Option(help="Methods to compare.")] = "precise,paper",
+    baseline: Annotated[Path | None, typer.Option(help="results.json of an older run to compare with.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes.")] = 2,
+) -> None:
     """Measure the effect of noise, blur, dirt, wrong cameras and more on a track; the default ends in minutes."""
-    check_writable(options.out)
-    settings = options.settings()
+    check_writable(out)
+    settings = _settings(full, degradations, levels, seeds, frames)
     from sphereorient.evaluate.robustness import load_results, run_benchmark
     from sphereorient.evaluate.robustness.run import trackers_of
     from sphereorient.report.plots.style import write_figure
     from sphereorient.report.robustness import robustness_figure, write_table
 
-    trackers = trackers_of([name.strip() for name in options.methods.split(",") if name.strip()])
-    older = None if options.baseline is None else load_results(options.baseline)
-    with progress_bar(options.quiet, unit="") as advance:
-        found = run_benchmark(
-            options.out, settings, trackers, jobs=options.jobs, progress=lambda *at: advance("scenes", *at)
-        )
-    write_table(found, options.out / "results.csv")
-    write_figure(robustness_figure(found), options.out / "robustness")
-    if not options.quiet:
+    trackers = trackers_of(names_in(methods))
+    older = None if baseline is None else load_results(baseline)
+    with progress_bar(quiet, unit="") as advance:
+        found = run_benchmark(out, settings, trackers, jobs=jobs, progress=lambda *at: advance("scenes", *at))
+    write_table(found, out / "results.csv")
+    write_figure(robustness_figure(found), out / "robustness")
+    if not quiet:
         _print(found)
-        typer.echo(f"Wrote {options.out}: results.json, results.csv, robustness.png, .pdf")
+        typer.echo(f"Wrote {out}: results.json, results.csv, robustness.png, .pdf")
     if older is not None:
-        _print_changes(found, older, options.quiet)
+        _print_changes(found, older, quiet)
 
 
 @bench.command("compare")
@@ -110,23 +164,30 @@ def compare_results(
 
 
 @bench.command("scenes")
-@with_options
-def write_scenes(options: SceneOptions) -> None:
+def write_scenes(
+    out: RunFolder,
+    degradations: Degradations = None,
+    levels: Levels = None,
+    seeds: Seeds = None,
+    frames: Frames = None,
+    full: Full = False,
+    quiet: Quiet = False,
+) -> None:
     """Render the scenes of the benchmark with their truth, for other programs (docs/robustness.md)."""
-    check_writable(options.out)
-    settings = options.settings()
+    check_writable(out)
+    settings = _settings(full, degradations, levels, seeds, frames)
     from sphereorient.evaluate.robustness import scenes_of, write_scene
 
     scenes = scenes_of(settings)
-    with progress_bar(options.quiet, unit="") as advance:
+    with progress_bar(quiet, unit="") as advance:
         for done, scene in enumerate(scenes, start=1):
-            write_scene(options.out / scene.name, scene)
+            write_scene(out / scene.name, scene)
             advance("scenes", done, len(scenes))
     index = [{"name": scene.name, "degradations": dict(scene.degradations), "seed": scene.seed} for scene in scenes]
-    with put_aside(options.out / "scenes.json") as aside:
+    with put_aside(out / "scenes.json") as aside:
         aside.write_text(json.dumps(index, indent=1) + "\n", "utf-8")
-    if not options.quiet:
-        typer.echo(f"Wrote {options.out}: {len(scenes)} scenes, each with experiment.yaml and truth.h5")
+    if not quiet:
+        typer.echo(f"Wrote {out}: {len(scenes)} scenes, each with experiment.yaml and truth.h5")
 
 
 @bench.command("score")

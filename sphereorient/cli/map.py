@@ -1,26 +1,30 @@
-"""`sphereorient map`."""
+"""`sphereorient map` and `compare-maps`: texture maps learnt from movies, two of them, or a series."""
 
 from __future__ import annotations
 
+import json
 import math
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import ExperimentPath, app, camera_names, check_writable, progress_bar, settings_of
-from sphereorient.cli.compare_maps import print_moved
+from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
+from sphereorient.cli.options import Cameras, ExperimentPath, Overrides, Quiet, SettingsPath, cameras_of, settings_of
+from sphereorient.errors import PaintError, refusal
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from sphereorient.mapping import LearntMap
+    from sphereorient.mapping.compare import MapComparison
     from sphereorient.methods.map import MapResult
     from sphereorient.report.map_figure import MapExample
+    from sphereorient.tools.wear.series import WearSeries
 
 OFTEN = 10  # pictures from which on a texel counts as well seen
+PLACES_PRINTED = 10  # worn places that are printed; JSON has all
 
 
 @app.command("map")
@@ -30,15 +34,13 @@ def map_(
     init: Annotated[
         Path | None, typer.Option(help="An old map: gives the body frame, and the texture of what is never seen.")
     ] = None,
-    cameras: Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")] = None,
+    cameras: Cameras = None,
     photographs: Annotated[
         bool, typer.Option("--photographs", help="Pictures in any order, no movie: --set paint.unordered=true.")
     ] = False,
-    settings: Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set paint.rounds=20.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
+    settings: SettingsPath = None,
+    set_: Overrides = None,
+    quiet: Quiet = False,
 ) -> None:
     """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed."""
     from sphereorient.report.map_files import check_picture_name
@@ -51,20 +53,18 @@ def map_(
     overrides = [*(set_ or []), *(["paint.unordered=true"] if photographs else [])]
     chosen, begun = settings_of(settings, overrides, "map"), time.perf_counter()
     old = None if init is None else load_texture(init)
-    command = " ".join(["sphereorient", *sys.argv[1:]])
+    names, command = cameras_of(cameras), command_line()
     with progress_bar(quiet) as advance:
-        names = camera_names(cameras)
         result = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, command=command)
         advance("figure", 0, 1)
         files, compared = _write(result, old, out)
         advance("figure", 1, 1)
     if quiet:
         return
-    for remark in result.remarks:
-        typer.echo(f"note: {remark}")
+    echo_lines(f"note: {remark}" for remark in result.remarks)
     _print(result.learnt, compared)
     if result.comparison is not None:
-        print_moved(result.comparison, f"against {init}")
+        _print_moved(result.comparison, f"against {init}")
         typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
     typer.echo(f"time: {time.perf_counter() - begun:.0f} s")
     typer.echo("Wrote " + ", ".join(str(file) for file in files))
@@ -115,5 +115,165 @@ def _print(learnt: LearntMap, compared: list[MapExample]) -> None:
     if np.isfinite(alike).any():
         middle, low = np.nanmedian(alike), np.nanpercentile(alike, 5)
         lines.append(f"pictures against re-rendered: correlation {middle:.3f} (median), {low:.3f} (worst twentieth)")
-    for line in lines:
-        typer.echo(line)
+    echo_lines(lines)
+
+
+@app.command("compare-maps")
+def compare_maps_(
+    maps: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="NEW.png OLD.png",
+            help="Two maps; NEW_seen.png beside one marks its unknown texels. With --series: FIRST.png SECOND.png ...",
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Figure: displacements, and where the texture changed.")
+    ] = None,
+    series: Annotated[
+        bool,
+        typer.Option("--series", help="Maps in the order of their movies: compare all with the first, show the wear."),
+    ] = False,
+    same_frame: Annotated[
+        bool, typer.Option("--same-frame", help="The body frames are the same; else the rotation is estimated.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+) -> None:
+    """Compare texture maps of one ball: displacement of the texture, and wear."""
+    if out is not None:
+        check_writable(out)
+    if not series and len(maps) != 2:
+        do = "name the new map and the old one, or add --series and name the first one first"
+        raise PaintError(refusal("maps", expected="two", got=str(len(maps)), do=do))
+    (_compare_series if series else _compare_two)(maps, out, turned=not same_frame, as_json=as_json)
+    if out is not None and not as_json:
+        typer.echo(f"Wrote {out}")
+
+
+def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
+    from sphereorient.mapping.compare import CHANGED, compare_maps, texture_change, turned_map, without_changed
+    from sphereorient.report import map_figure
+    from sphereorient.report.plots.style import write_figure
+    from sphereorient.so3 import angle
+
+    after, before = (_known_map(path) for path in maps)
+    comparison = compare_maps(after, before, turned=turned)
+    R = comparison.R_other_reference
+    change = texture_change(turned_map(after, R, len(before)), before)
+    comparison = without_changed(comparison, change, CHANGED)
+    known = change[change.isfinite()]
+    changed = float((known.abs() > CHANGED).float().mean()) if len(known) else math.nan
+    if out is not None:
+        write_figure(map_figure.moved_figure(before, comparison, change), out)
+    if as_json:
+        numbers = {**_numbers(comparison), "changed_share": _or_none(changed), "R_new_old": R.tolist()}
+        typer.echo(json.dumps(numbers))
+        return
+    _print_moved(comparison, f"{maps[0]} against {maps[1]}")
+    typer.echo(f"body frames: {math.degrees(float(angle(R))):.2f}° apart; correlation {comparison.correlation:.3f}")
+    typer.echo(f"texture changed by more than {100 * CHANGED:g} % of black to white: {100 * changed:.1f} % of the map")
+
+
+def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
+    from sphereorient.report.plots.style import write_figure
+    from sphereorient.tools.wear.figure import wear_figure
+    from sphereorient.tools.wear.series import wear_series
+
+    known = [_known_map(path) for path in maps]
+    found = wear_series(known, turned)
+    stems = [path.stem for path in maps]
+    names = stems if len(set(stems)) == len(stems) else [str(path) for path in maps]
+    if out is not None:
+        write_figure(wear_figure(known[0], found, names), out)
+    if as_json:
+        typer.echo(json.dumps(_series_numbers(found, [str(path) for path in maps])))
+    else:
+        _print_series(found, names)
+
+
+def _print_series(found: WearSeries, names: list[str]) -> None:
+    """Print the wear of each map, then of each place."""
+    width = max(len(name) for name in names)
+    typer.echo(f"{'against ' + names[0]:{width + 8}}  known of the ball  worn of it  since the map before  stays worn")
+    for name, one in zip(names[1:], found.growth, strict=True):
+        typer.echo(
+            f"{name:{width + 8}}  {_percent(one.known):>17}  {_percent(one.worn):>10}  "
+            f"{_percent(one.grown, '+'):>20}  {_percent(one.stays):>10}"
+        )
+    for name, wear in zip(names[1:], found.wear, strict=True):
+        _print_moved(wear.comparison, f"{name} against {names[0]}")
+    if not found.places:
+        typer.echo("no worn place")
+    for number, place in enumerate(found.places[:PLACES_PRINTED], start=1):
+        shares = ", ".join(_percent(share, digits=2) for share in place.share)
+        typer.echo(
+            f"place {number} at longitude {place.longitude_deg:.0f}°, latitude {place.latitude_deg:.0f}°: "
+            f"{shares} of the ball"
+        )
+    if len(found.places) > PLACES_PRINTED:
+        typer.echo(f"and {len(found.places) - PLACES_PRINTED} smaller places")
+
+
+def _percent(share: float, sign: str = "", digits: int = 1) -> str:
+    return f"{100 * share:{sign}.{digits}f} %" if math.isfinite(share) else "-"
+
+
+def _series_numbers(found: WearSeries, names: list[str]) -> dict[str, object]:
+    """Return the figures of a series for JSON."""
+    rows = [
+        {
+            "map": name,
+            **{f"{what}_share": _or_none(getattr(one, what)) for what in ("known", "worn", "grown", "stays")},
+            "scatter": _or_none(wear.scatter),
+            **_numbers(wear.comparison),
+            "R_map_first": wear.comparison.R_other_reference.tolist(),
+        }
+        for name, one, wear in zip(names[1:], found.growth, found.wear, strict=True)
+    ]
+    places = [
+        {
+            "longitude_deg": place.longitude_deg,
+            "latitude_deg": place.latitude_deg,
+            "worn_share_of_ball": [_or_none(share) for share in place.share],
+        }
+        for place in found.places
+    ]
+    return {"first": names[0], "maps": rows, "places": places}
+
+
+def _print_moved(comparison: MapComparison, against: str) -> None:
+    """Print the displacement of the texture."""
+    count = len(comparison.length_rad)
+    if not count:
+        typer.echo(f"{against}: no patch could be located")
+        return
+    rms, most = math.degrees(comparison.rms_rad), math.degrees(comparison.max_rad)
+    typer.echo(f"{against}: texture displaced by {rms:.2f}° (rms of {count} patches), {most:.2f}° at most")
+
+
+def _numbers(comparison: MapComparison) -> dict[str, object]:
+    """Return the figures of a displacement for JSON."""
+    return {
+        "patches": len(comparison.length_rad),
+        "moved_rms_deg": _or_none(math.degrees(comparison.rms_rad)),
+        "moved_max_deg": _or_none(math.degrees(comparison.max_rad)),
+        "correlation": comparison.correlation,
+    }
+
+
+def _or_none(value: float) -> float | None:
+    """Return null for JSON where a figure could not be measured."""
+    return value if math.isfinite(value) else None
+
+
+def _known_map(path: Path) -> Tensor:
+    """Read a map, NaN where the counts beside it are 0."""
+    import torch
+
+    from sphereorient.report.map_files import read_seen, seen_path
+    from sphereorient.sphere import load_texture
+
+    texture, seen = load_texture(path), read_seen(seen_path(path))
+    if seen is None or seen.shape != texture.shape:
+        return texture
+    return torch.where(seen > 0, texture, torch.nan)

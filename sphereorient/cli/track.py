@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import app, camera_names, check_writable, progress_bar, settings_of
+from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
+from sphereorient.cli.options import Cameras, Overrides, Quiet, SettingsPath, cameras_of, settings_of
 from sphereorient.errors import OutputError, SettingsError, refusal
 
 if TYPE_CHECKING:
@@ -32,11 +32,9 @@ def track(
     method: Annotated[
         str, typer.Option(help="precise: refined poses with covariances; paper: Zimmermann et al. 2011, corrected.")
     ] = "precise",
-    settings: Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set search.step_deg=10.")
-    ] = None,
-    cameras: Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")] = None,
+    settings: SettingsPath = None,
+    set_: Overrides = None,
+    cameras: Cameras = None,
     device: Annotated[str, typer.Option(help="Where fits are computed: cpu, cuda, cuda:1.")] = "cpu",
     jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Worker processes on this machine.")] = 1,
     cluster: Annotated[
@@ -56,20 +54,22 @@ def track(
         str | None,
         typer.Option(help="A trained network proposes orientations: its checkpoint, or default (docs/proposer.md)."),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Track the sphere of an experiment, or of many: position and orientation of every frame."""
     many = len(experiments) > 1 or out.is_dir()
     check_writable(out / "tracks" if many else out)
     if save_learnt is not None:
         check_writable(save_learnt)
-        _refuse_shared(save_learnt, many)
+        if many:
+            name, do = f"--save-learnt {save_learnt}", "track them one by one"
+            raise SettingsError(refusal(name, expected="one experiment", got="several", do=do))
     from sphereorient.run import FolderStore, Request, run
     from sphereorient.run.many import tracks_of
     from sphereorient.run.stages import with_proposer
 
     chosen = with_proposer(settings_of(settings, set_, method), proposer)
-    names = camera_names(cameras)
+    names = cameras_of(cameras)
     requests = [
         Request(
             experiment=experiment,
@@ -80,7 +80,7 @@ def track(
             device=device,
             learnt=learnt,
             save_learnt=save_learnt,
-            command=" ".join(["sphereorient", *sys.argv[1:]]),
+            command=command_line(),
         )
         for experiment, path in zip(experiments, tracks_of(experiments, out), strict=True)
     ]
@@ -101,22 +101,15 @@ def _kept(requests: Sequence[Request]) -> Iterator[None]:
     except (KeyboardInterrupt, SystemExit):
         for request in requests:
             if request.parts.is_dir():
-                typer.echo(
-                    f"sphereorient: the finished part of {request.out} is kept; continue with --resume.", err=True
-                )
+                kept = f"the finished part of {request.out} is kept; continue with --resume."
+                typer.echo(f"sphereorient: {kept}", err=True)
         raise
-
-
-def _refuse_shared(path: Path, many: bool) -> None:
-    if many:
-        do = "track them one by one"
-        raise SettingsError(refusal(f"--save-learnt {path}", expected="one experiment", got="several", do=do))
 
 
 def _track_side_by_side(requests: Sequence[Request], jobs: int, cluster: str | None, resume: bool, quiet: bool) -> None:
     """Track on worker processes or a cluster, and print a table of the results."""
     from sphereorient.run import run_many
-    from sphereorient.run.executors import ProcessExecutor, dask_executor
+    from sphereorient.run.many import ProcessExecutor, dask_executor
 
     executor = ProcessExecutor(jobs) if cluster is None else dask_executor(cluster, jobs if jobs > 1 else None)
     with _kept(requests), progress_bar(quiet) as advance:
@@ -135,11 +128,9 @@ def _track_side_by_side(requests: Sequence[Request], jobs: int, cluster: str | N
 def _print_table(outcomes: Sequence[Outcome]) -> None:
     """Print frames, valid frames and time of each experiment."""
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    table = Table()
-    for heading in ("track", "frames", "valid", "s", "frames/s", ""):
-        table.add_column(heading, justify="left" if heading in ("track", "") else "right")
+    table = Table("track", *(Column(heading, justify="right") for heading in ("frames", "valid", "s", "frames/s")), "")
     for outcome in outcomes:
         rate = f"{outcome.frames / outcome.seconds:.1f}" if outcome.frames else ""
         counts = (str(outcome.frames), str(outcome.valid)) if outcome.error is None else ("", "")
@@ -153,11 +144,9 @@ def _print_summary(result: Trajectory, out: Path) -> None:
     from sphereorient.calibration.table import contradiction_lines
 
     summary = result.summary()
-    for remark in result.provenance.get("remarks", []):
-        typer.echo(f"note: {remark}")
+    echo_lines(f"note: {remark}" for remark in result.provenance.get("remarks", []))
     typer.echo(f"{summary['valid']} of {summary['frames']} frames valid (position and orientation measured)")
     for name, lost in summary["lost"].items():
         text = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "none"
         typer.echo(f"  {name}: frames lost: {text}")
-    for line in [*contradiction_lines(result), f"Wrote {out}"]:
-        typer.echo(line)
+    echo_lines([*contradiction_lines(result), f"Wrote {out}"])

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable, progress_bar
+from sphereorient.cli.options import Quiet
 
 if TYPE_CHECKING:
-    from sphereorient.learn.benchmark import ProposerBenchmark
+    from sphereorient.learn.metrics import ProposerBenchmark
 
 EXAMPLES = 8  # rows of the sheet
 
@@ -27,7 +28,7 @@ def train(
         list[str] | None, typer.Option("--set", help="Override one key, e.g. --set training.minutes=30.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue from last.ckpt in the folder.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Train a network that proposes orientations (docs/proposer.md)."""
     check_writable(out)
@@ -35,7 +36,7 @@ def train(
     from sphereorient.methods.settings import load_proposer_settings, proposer_settings_yaml
 
     settings = load_proposer_settings(config, set_ or [])
-    from sphereorient.learn.benchmark import make_examples
+    from sphereorient.learn.metrics import make_examples
     from sphereorient.learn.train import CHECKPOINT, prepare, train_proposer
     from sphereorient.report.learning import examples_figure, learning_curve_figure
     from sphereorient.report.plots.style import write_figure
@@ -68,8 +69,8 @@ def evaluate(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Measure the recall of a proposer's checkpoint on balls that no training sees, one degradation at a time."""
-    from sphereorient.learn.benchmark import benchmark_checkpoint
     from sphereorient.learn.checkpoint import load_checkpoint
+    from sphereorient.learn.metrics import benchmark_checkpoint
     from sphereorient.methods.settings import load_proposer_settings
 
     loaded = load_checkpoint(checkpoint)

@@ -167,7 +167,7 @@ def _worded(fault: ValidationError, model: type[BaseModel], where: str) -> str:
     place, kind, message = first["loc"], first["type"], first["msg"]
     name = ", ".join([where, ".".join(map(str, place))]) if place else where
     if kind == "extra_forbidden":
-        return refuse_unknown(place[-1], _keys(model, place[:-1]), ", ".join([where, *map(str, place[:-1])]))
+        return refuse_unknown(place[-1], known_keys(model, place[:-1]), ", ".join([where, *map(str, place[:-1])]))
     if kind == "missing":
         return refusal(name, expected="a value", got="none", do="add the key")
     expected = message.removeprefix("Value error, ").removeprefix("Input should be ")
@@ -175,7 +175,8 @@ def _worded(fault: ValidationError, model: type[BaseModel], where: str) -> str:
     return refusal(name, expected=expected, got=short(first["input"]), do="correct the value")
 
 
-def _keys(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
+def known_keys(model: type[BaseModel], place: Iterable[int | str]) -> list[str]:
+    """Return the keys of a model's part at `place`, the keys that lead there."""
     for step in place:
         if str(step) in model.model_fields:  # others are names or numbers from the file, such as a camera's
             annotation = model.model_fields[str(step)].annotation

@@ -1,1 +1,1 @@
-"""The optional learned proposer. Only training imports `train` and `module`: pytorch_lightning takes seconds."""
+"""The optional learned proposer. Only training imports `train`: pytorch_lightning takes seconds."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StrictInt
+from pydantic import BaseModel, Field, FiniteFloat, StrictInt
 from torch import Tensor
 
 from sphereorient.errors import CheckpointError, refusal
@@ -23,10 +23,8 @@ ShortText = Annotated[str, Field(max_length=500)]
 Fact = Annotated[FiniteFloat, Field(strict=True)] | StrictInt | ShortText
 
 
-class Checkpoint(BaseModel):
+class Checkpoint(BaseModel, frozen=True, extra="forbid", arbitrary_types_allowed=True):
     """A trained network; made by `train_proposer`, written by `save_checkpoint`, read by the proposer."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
 
     settings: ProposerSettings
     state: dict[str, Tensor]  # of a `Correlator`, float32

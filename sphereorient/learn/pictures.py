@@ -1,6 +1,5 @@
 """Training pictures: random textures, orientations, light and degradations, reproducible by seed."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -78,17 +77,13 @@ def draw_batch(
         negative = bool(torch.rand((), generator=rng) < 0.5) and settings.texture is None
         texture = 1 - maps.textures[k] if negative else maps.textures[k]
         R = so3.random_rotations(groups * group, generator=rng).float()
-        filmed = [film_group(texture, some, settings, rng) for some in torch.split(R, group)]
+        each = torch.split(R, group)
+        filmed = [film(texture, some, draw_values(settings, rng), rng, settings) for some in each]
         rows.append((texture, -maps.blurs[k] if negative else maps.blurs[k], torch.cat(filmed), R))
     return TrainingBatch(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
-def film_group(texture: Tensor, R_view_body: Tensor, settings: PictureSettings, rng: torch.Generator) -> Tensor:
-    """Render a map with one random draw of degradations for all pictures, (F, S, S)."""
-    return film_with(texture, R_view_body, draw_values(settings, rng), rng, settings)
-
-
-def film_with(
+def film(
     texture: Tensor, R_view_body: Tensor, values: Mapping[str, float], rng: torch.Generator, settings: PictureSettings
 ) -> Tensor:
     """Render a map with given degradations, (F, S, S)."""
@@ -111,7 +106,4 @@ def draw_values(settings: PictureSettings, rng: torch.Generator) -> dict[str, fl
 
 def value_at(name: str, level: float) -> float:
     """Return the value of a degradation at a level, interpolated in its logarithm."""
-    values = DEGRADATIONS[name].values
-    below = min(int(level), LEVELS[-1] - 1)
-    low, high = values[below - 1], values[below]
-    return float(math.exp(math.log(low) + (level - below) * (math.log(high) - math.log(low))))
+    return float(np.exp(np.interp(level, LEVELS, np.log(DEGRADATIONS[name].values))))

@@ -6,8 +6,7 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError, refusal
-from sphereorient.learn.density import find_modes
-from sphereorient.learn.network import Correlator, map_blurs
+from sphereorient.learn.network import Correlator, find_modes, map_blurs
 from sphereorient.search.candidates import Candidates
 from sphereorient.trajectory import Reason
 
@@ -31,13 +30,11 @@ def probability_of(score: Tensor) -> Tensor:
 class LearnedProposer:
     """Proposes modes of the density that a network predicts for a map (H, 2 H), 0 black .. 1 white.
 
-    At most `candidates` for each disk; `temperature` divides the logits, for calibrated probabilities.
+    At most `CANDIDATES` for each disk; `temperature` divides the logits, for calibrated probabilities.
     """
 
-    def __init__(
-        self, correlator: Correlator, texture: Tensor, *, temperature: float = 1.0, candidates: int = CANDIDATES
-    ) -> None:
-        self._network, self._candidates, self._temperature = correlator.eval(), candidates, temperature
+    def __init__(self, correlator: Correlator, texture: Tensor, *, temperature: float = 1.0) -> None:
+        self._network, self._temperature = correlator.eval(), temperature
         with torch.inference_mode():
             blurs = map_blurs(texture.float()[None], correlator.settings.nodes)[0]
             self._bank = correlator.bank(blurs)
@@ -57,20 +54,19 @@ class LearnedProposer:
             size = f"(F, {self.size_px}, {self.size_px})"
             raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
         filled = F.pad(disks.float(), (0, 0, 0, 0, 0, -len(disks) % BATCH))
-        parts = [self._modes(batch) for batch in torch.split(filled, BATCH)] if len(disks) else []
-        R = torch.cat([torch.zeros(0, self._candidates, 3, 3), *(R for R, _ in parts)])[: len(disks)]
-        score = torch.cat([torch.zeros(0, self._candidates), *(p for _, p in parts)])[: len(disks)]
+        R, score = [torch.zeros(0, CANDIDATES, 3, 3)], [torch.zeros(0, CANDIDATES)]
+        for batch in torch.split(filled, BATCH) if len(disks) else ():
+            logits = self._network.logits(self._network.seen(batch), self._bank)
+            modes = find_modes(logits, self._network.grid, CANDIDATES, self._temperature)
+            R.append(modes.R_view_body)
+            score.append(modes.probability)
+        R_view_body, probability = torch.cat(R)[: len(disks)], torch.cat(score)[: len(disks)]
         shown = (disks != disks[:, :1, :1]).flatten(1).any(1)  # not uniform
-        there = (score >= PROBABILITY_MIN) & shown[:, None]
+        there = (probability >= PROBABILITY_MIN) & shown[:, None]
         counts = there.sum(1)
         return Candidates(
             offset=F.pad(counts.cumsum(0), (1, 0)),
-            R_view_body=so3.nearest_rotation(R[there].double()),
-            score=score_of(score[there].double()),
+            R_view_body=so3.nearest_rotation(R_view_body[there].double()),
+            score=score_of(probability[there].double()),
             reason=tuple(Reason.OK if count else Reason.LOW_SCORE for count in counts.tolist()),
         )
-
-    def _modes(self, disks: Tensor) -> tuple[Tensor, Tensor]:
-        logits = self._network.logits(self._network.seen(disks), self._bank)
-        modes = find_modes(logits, self._network.grid, self._candidates, self._temperature)
-        return modes.R_view_body, modes.probability

@@ -1,16 +1,14 @@
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.synth.disks import DISK_DEGRADATIONS, DiskSettings
 from sphereorient.synth.textures import KINDS
 
 
-class NetworkSettings(BaseModel):
+class NetworkSettings(BaseModel, frozen=True, extra="forbid"):
     """Shape of the network; part of its checkpoints."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     size_px: int = Field(40, ge=16, le=80, multiple_of=4, description="side of the disks, px")
     width: int = Field(32, ge=4, le=128, description="channels of the picture's network at half size")
@@ -20,10 +18,8 @@ class NetworkSettings(BaseModel):
     nodes: int = Field(64, ge=16, le=96, description="cells of the map's features along each axis")
 
 
-class PictureSettings(BaseModel):
+class PictureSettings(BaseModel, frozen=True, extra="forbid"):
     """The pictures from which a network learns; drawn anew for each step."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     disks: DiskSettings = Field(default_factory=lambda: DiskSettings(scale=0.55), description="how they are filmed")
     kinds: tuple[str, ...] = Field(tuple(KINDS), description="of paint")
@@ -47,10 +43,8 @@ class PictureSettings(BaseModel):
         return self
 
 
-class TrainingSettings(BaseModel):
+class TrainingSettings(BaseModel, frozen=True, extra="forbid"):
     """How a network is trained."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     epochs: int = Field(200, ge=1, description="at most; each ends with a look at the validation pictures")
     steps: int = Field(150, ge=1, description="of an epoch")
@@ -66,10 +60,8 @@ class TrainingSettings(BaseModel):
     start: str | None = Field(None, description="path of a checkpoint whose weights training begins with (fine-tuning)")
 
 
-class ProposerSettings(BaseModel):
+class ProposerSettings(BaseModel, frozen=True, extra="forbid"):
     """The settings of configs/train_proposer.yaml."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     network: NetworkSettings = Field(default_factory=NetworkSettings, description="the network")
     pictures: PictureSettings = Field(default_factory=PictureSettings, description="what it learns from")

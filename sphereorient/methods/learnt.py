@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,15 @@ from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
 from sphereorient.pose import CameraView, Fitter, Light, Optics, base_table
 
 SCHEMA = "sphereorient-learnt/1"
-NUMBERS = ("blur_px", "widest_px", "score_min", "right_score", "usual_apart_rad")
+OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
+NUMBERS = ("blur_px", "widest_px", *OF_SCORES)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Learnt:
     """Everything that the precise method learns from the movies, before and after tracking; made by the pipeline."""
 
-    backgrounds: Mapping[str, Background]  # by camera, in the order of the fit
-    diameter_px: Mapping[str, float]
+    scenes: Mapping[str, CameraScene]  # by camera, in the order of the fit
     light: Light
     blur_px: float
     widest_px: float
@@ -40,48 +40,41 @@ class Learnt:
     acceleration_rad_s2: float | None = None  # that the path was chosen with
 
     @classmethod
-    def of(cls, study: Appearance) -> Learnt:
-        """Return what was learnt before the first frame was measured."""
+    def of(
+        cls, study: Appearance, process: ProcessNoise | None = None, acceleration_rad_s2: float | None = None
+    ) -> Learnt:
+        """Return what was learnt before the first frame was measured, and the motion of the finished track."""
         fitter = study.fitter
+        told = acceleration_rad_s2 is not None and np.isfinite(acceleration_rad_s2)
         return cls(
-            backgrounds={view.name: view.background for view in fitter.views},
-            diameter_px={view.name: view.diameter_px for view in fitter.views},
+            scenes={
+                view.name: CameraScene(background=view.background, diameter_px=view.diameter_px)
+                for view in fitter.views
+            },
             light=fitter.light,
             blur_px=fitter.optics.blur_px,
             widest_px=fitter.widest_px,
-            score_min=study.score_min,
-            right_score=study.right_score,
-            usual_apart_rad=study.usual_apart_rad,
-            together=study.together,
+            **{name: getattr(study, name) for name in (*OF_SCORES, "together")},
+            process=process,
+            acceleration_rad_s2=acceleration_rad_s2 if told else None,
         )
 
     def appearance(self, recording: Recording) -> Appearance:
         """Return the estimated appearance; raise TrackError for other cameras or another picture size."""
-        views = []
-        for stream in recording.streams:
-            background = self.backgrounds.get(stream.name)
-            if background is None or background.mean.shape != stream.movie.frame_shape:
-                got = ", ".join(f"{name} {one.mean.shape}" for name, one in self.backgrounds.items())
-                expected = f"what was learnt of {stream.name}, {stream.movie.frame_shape}"
-                raise TrackError(refusal("learnt", expected=expected, got=got, do="pass that of the same cameras"))
-            scene = CameraScene(background=background, diameter_px=self.diameter_px[stream.name])
-            views.append(CameraView.of(stream.name, stream.camera, scene))
-        order = list(self.backgrounds)
-        if [view.name for view in views] != order:
-            expected, got = ", ".join(order), ", ".join(view.name for view in views)
-            raise TrackError(refusal("learnt", expected=expected, got=got, do="use the same cameras"))
-        widest = max(self.diameter_px.values())
+        used = {stream.name: stream.movie.frame_shape for stream in recording.streams}
+        known = {name: scene.background.mean.shape for name, scene in self.scenes.items()}
+        if list(used.items()) != list(known.items()):
+            other = {name: shape for name, shape in used.items() if known.get(name) != shape} or used
+            expected, got = (", ".join(f"{name} {shape}" for name, shape in each.items()) for each in (other, known))
+            do = "pass that of the same cameras"
+            raise TrackError(refusal("learnt", expected=f"what was learnt of {expected}", got=got, do=do))
+        views = [CameraView.of(stream.name, stream.camera, self.scenes[stream.name]) for stream in recording.streams]
+        widest = max(scene.diameter_px for scene in self.scenes.values())
         optics = Optics(base_table(recording.texture, widest), self.blur_px, widest)
         fitter = Fitter(
             views=views, radius_mm=recording.radius_mm, optics=optics, light=self.light, widest_px=self.widest_px
         )
-        return Appearance(
-            fitter=fitter,
-            score_min=self.score_min,
-            right_score=self.right_score,
-            usual_apart_rad=self.usual_apart_rad,
-            together=self.together,
-        )
+        return Appearance(fitter=fitter, **{name: getattr(self, name) for name in (*OF_SCORES, "together")})
 
     def save(self, path: Path) -> None:
         """Write everything as HDF5, atomically; raise OutputError if the file cannot be written."""
@@ -112,10 +105,10 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
     file.attrs["together"] = learnt.together
     if learnt.acceleration_rad_s2 is not None:
         file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
-    file.attrs["cameras"] = list(learnt.backgrounds)
-    for name, background in learnt.backgrounds.items():
-        group = file.create_group(f"cameras/{name}")
-        group.attrs["full_scale"], group.attrs["diameter_px"] = background.full_scale, learnt.diameter_px[name]
+    file.attrs["cameras"] = list(learnt.scenes)
+    for name, scene in learnt.scenes.items():
+        group, background = file.create_group(f"cameras/{name}"), scene.background
+        group.attrs["full_scale"], group.attrs["diameter_px"] = background.full_scale, scene.diameter_px
         for part in ("mean", "noise", "shown"):
             if getattr(background, part) is not None:
                 group.create_dataset(part, data=getattr(background, part), track_times=False)
@@ -133,23 +126,21 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
 
 
 def _read(file: h5py.File) -> Learnt:
-    names = [str(name) for name in file.attrs["cameras"]]
-    groups: dict[str, Any] = {name: file[f"cameras/{name}"] for name in names}
-    backgrounds = {
-        name: Background(
+    scenes = {}
+    for name in map(str, file.attrs["cameras"]):
+        group: Any = file[f"cameras/{name}"]
+        background = Background(
             mean=np.asarray(group["mean"][()], np.float32),
             noise=np.asarray(group["noise"][()], np.float32),
             full_scale=float(group.attrs["full_scale"]),
             shown=np.asarray(group["shown"][()], bool) if "shown" in group else None,
         )
-        for name, group in groups.items()
-    }
+        scenes[name] = CameraScene(background=background, diameter_px=float(group.attrs["diameter_px"]))
     light = file["light"]
     parts = {part: torch.from_numpy(light[part][()]) for part in ("difference", "black", "noise")}
     acceleration = file.attrs.get("acceleration_rad_s2")
     return Learnt(
-        backgrounds=backgrounds,
-        diameter_px={name: float(group.attrs["diameter_px"]) for name, group in groups.items()},
+        scenes=scenes,
         light=Light(known=bool(light.attrs["known"]), **parts),
         together=bool(file.attrs["together"]),
         process=_process(file["process"]) if "process" in file else None,
@@ -166,9 +157,3 @@ def _process(group: h5py.Group) -> ProcessNoise:
         return ProcessPrior(prior=Prior(pole=pole, deviation=deviation), scale=scale)
 
     return ProcessNoise(place=motion("place"), turn=motion("turn"), frame_s=float(group.attrs["frame_s"]))
-
-
-def with_motion(learnt: Learnt, process: ProcessNoise, acceleration_rad_s2: float) -> Learnt:
-    """Return the same with the motion statistics of the finished track."""
-    told = acceleration_rad_s2 if np.isfinite(acceleration_rad_s2) else None
-    return replace(learnt, process=process, acceleration_rad_s2=told)

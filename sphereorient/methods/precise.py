@@ -13,7 +13,7 @@ from sphereorient.follow.per_camera import PerCameraTracker
 from sphereorient.follow.poses import Poses, joined_tables, pose_table
 from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.methods import results
-from sphereorient.methods.learnt import Learnt, with_motion
+from sphereorient.methods.learnt import Learnt
 from sphereorient.methods.method import Job, Method
 from sphereorient.methods.proposers import BlurMatchedSearch, open_views
 from sphereorient.pose.defocus import FIRST_BLUR_PX, defocus_radii, estimate_blur_px
@@ -24,21 +24,21 @@ from sphereorient.trajectory import Trajectory
 def learn(job: Job, progress: Progress) -> Follower:
     """Estimate backgrounds, blur, light and noise from frames spread over the movies."""
     recording, settings = job.recording, job.settings
-    opened = open_views(recording, settings, progress)
+    views, base, search = open_views(recording, settings, progress)
     progress("appearance", 0, 1)
-    frames = sample_frames(recording, opened.views, settings.refine.appearance_frames)
+    frames = sample_frames(recording, views, settings.refine.appearance_frames)
     # Only blurred pictures need blurred templates; sharp ones share one first guess.
-    seen_px = settings.refine.blur_px or estimate_blur_px(opened.views, frames, settings.locate)
-    blur_px = seen_px if defocus_radii(seen_px, opened.search.diameter_px) else FIRST_BLUR_PX
+    seen_px = settings.refine.blur_px or estimate_blur_px(views, frames, settings.locate)
+    blur_px = seen_px if defocus_radii(seen_px, search.diameter_px) else FIRST_BLUR_PX
     first = Initialiser(
-        fitter=first_fitter(opened.views, recording.radius_mm, opened.base, blur_px),
-        proposers=opened.search.by_camera(opened.views, blur_px),
+        fitter=first_fitter(views, recording.radius_mm, base, blur_px),
+        proposers=search.by_camera(views, blur_px),
         locating=settings.locate,
         candidates=settings.refine.candidates,
     )
-    appearance = estimate_appearance(first, frames, opened.base, settings.refine)
+    appearance = estimate_appearance(first, frames, base, settings.refine)
     progress("appearance", 1, 1)
-    return follower(job, appearance, opened.search)
+    return follower(job, appearance, search)
 
 
 def resume(job: Job, learnt: Learnt) -> Follower:
@@ -90,7 +90,7 @@ def join(
     )
     smoothed = motion.smooth_motion(poses, settings.smooth, None if given is None else given.process)
     track = results.precise_track(job.recording.experiment, clock, table, chosen, smoothed, follower.appearance)
-    return track, with_motion(Learnt.of(follower.appearance), smoothed.process, chosen.acceleration_rad_s2)
+    return track, Learnt.of(follower.appearance, smoothed.process, chosen.acceleration_rad_s2)
 
 
 PRECISE = Method(learn=learn, resume=resume, join=join)

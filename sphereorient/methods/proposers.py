@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
@@ -48,17 +47,10 @@ class BlurMatchedSearch:
         return dict.fromkeys((view.name for view in views), self.of(blur_px))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Opened:
-    """Background, texture table and proposer of the first measurement; made by `open_views`."""
-
-    views: list[CameraView]
-    base: TextureTable  # the finest
-    search: BlurMatchedSearch
-
-
-def open_views(recording: Recording, settings: Settings, progress: Progress) -> Opened:
-    """Estimate the cameras' backgrounds, and build texture table and template bank in parallel."""
+def open_views(
+    recording: Recording, settings: Settings, progress: Progress
+) -> tuple[list[CameraView], TextureTable, BlurMatchedSearch]:
+    """Estimate the cameras' backgrounds, and build the finest texture table and a template bank in parallel."""
     with ThreadPoolExecutor(2) as pool:  # decoding, sorting and products leave the interpreter free
         opening = [pool.submit(open_view, recording, stream, settings, progress) for stream in recording.streams]
         known = [known_diameter_px(recording, stream.name, settings.locate) for stream in recording.streams]
@@ -68,7 +60,7 @@ def open_views(recording: Recording, settings: Settings, progress: Progress) -> 
         sharp = pool.submit(search.of, settings.refine.blur_px or 0.0)
         views = [view.result() for view in opening]
         sharp.result()
-        return Opened(views=views, base=base.result(), search=search)
+        return views, base.result(), search
 
 
 def open_view(recording: Recording, stream: CameraStream, settings: Settings, progress: Progress) -> CameraView:

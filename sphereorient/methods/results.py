@@ -1,8 +1,8 @@
 """From the stages' results to the trajectory, one function for each method."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -25,13 +25,10 @@ from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 def paper_camera(sightings: Sightings, candidates: Candidates, path: Path) -> CameraTrack:
     """Collect the results of one camera."""
-    track = CameraTrack.empty(len(sightings))
     lost = torch.isnan(path.score)
-    reason = [
-        Reason.LOW_SCORE if reason is Reason.OK and lost[k] else reason for k, reason in enumerate(candidates.reason)
-    ]
+    reason = [Reason.LOW_SCORE if why is Reason.OK and lost[k] else why for k, why in enumerate(candidates.reason)]
     return replace(
-        track,
+        CameraTrack.empty(len(sightings)),
         centre_px=sightings.centre_px.numpy(),
         radius_px=sightings.radius_px.numpy(),
         outline_rms_px=sightings.outline_rms_px.numpy(),
@@ -215,14 +212,9 @@ def with_systematic_errors(
     position = torch.from_numpy(track.position)
     place, turn = torch.from_numpy(track.position_cov * np.nan), torch.from_numpy(track.orientation_cov * np.nan)
     saw = {name: np.array([why == Reason.OK for why in track.cameras[name].reason]) for name in cameras}
-    for some in _subsets(list(cameras)):
+    for some in chain.from_iterable(combinations(cameras, count) for count in range(1, len(cameras) + 1)):
         rows = torch.from_numpy(np.all([saw[name] == (name in some) for name in cameras], axis=0))
         if bool(rows.any()):
             left = systematic_errors({name: cameras[name] for name in some}, covariance, position[rows], radius_mm)
             place[rows], turn[rows] = left.position_mm2, left.orientation_rad2
     return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())
-
-
-def _subsets(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    for count in range(1, len(names) + 1):
-        yield from combinations(names, count)

@@ -4,17 +4,17 @@ import difflib
 import math
 import textwrap
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.errors import SettingsError, refusal
-from sphereorient.files.yaml_file import FAULTS, parse_yaml, read_yaml, short
+from sphereorient.files.yaml_file import FAULTS, known_keys, parse_yaml, read_yaml, short
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.learn.settings import ProposerSettings
 from sphereorient.locate.settings import LocateSettings
@@ -43,10 +43,8 @@ RENAMED: dict[str, str] = {
 }
 
 
-class Settings(BaseModel):
+class Settings(BaseModel, frozen=True, extra="forbid"):
     """All settings, one branch a stage; `BRANCHES` holds which a method reads."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     locate: LocateSettings = Field(default_factory=LocateSettings, description="where is the sphere (both methods)")
     propose: ProposeSettings = Field(
@@ -63,6 +61,12 @@ class Settings(BaseModel):
     statistics: StatisticsSettings = Field(default_factory=StatisticsSettings, description="numbers of a report")
 
 
+def _values(settings: Settings) -> dict[str, Any]:
+    """Return the values by key `branch.name`."""
+    return {f"{branch}.{name}": value for branch, part in settings for name, value in part}
+
+
+DEFAULTS = _values(Settings())
 # Numbers of dotted names in a key.
 DEPTHS: dict[type[BaseModel], tuple[int, ...]] = {Settings: (2,), SynthSettings: (1,), ProposerSettings: (2, 3)}
 
@@ -96,20 +100,25 @@ def read_settings(path: Path | None = None, overrides: Iterable[str] = (), metho
             file: with another value than the default).
     """
     remarks: list[str] = []
-    overrides = [_renamed(text, remarks) for text in overrides]
+    parts = [text.partition("=") for text in overrides]
+    overrides = [f"{_renamed(key.strip(), '--set', remarks)}{equals}{value}" for key, equals, value in parts]
     for text in overrides if method is not None else ():
-        key = text.partition("=")[0].strip()
-        if _known(key) and not is_read(key, str(method)):
+        key = text.partition("=")[0]
+        if key in DEFAULTS and not is_read(key, str(method)):
             raise SettingsError(_not_read(f"--set {key}", key, str(method)))
-    tree = {} if path is None else _read(path)
-    _rename(tree, path, remarks)
-    settings = _load(Settings, tree, str(path) if path else "settings", overrides)
+    tree = _read(path)
+    for branch, part in tree.items():
+        for name in list(part) if isinstance(part, dict) else ():
+            new = _renamed(f"{branch}.{name}", f"{path}:", remarks).partition(".")[2]
+            if new != name:
+                part.setdefault(new, part.pop(name))
+    settings = _load(Settings, tree, path, overrides)
     if method is not None and path is not None:
         check_settings(settings, method, str(path))
-        aside = [key for key in _keys(tree) if _known(key) and not is_read(key, method)]
+        given = [f"{branch}.{name}" for branch, part in tree.items() for name in part]
+        aside = sorted({key.partition(".")[0] for key in given if not is_read(key, method)})
         if aside:
-            branches = sorted({key.partition(".")[0] for key in aside})
-            remarks.append(f"{path}: method {method} does not read {', '.join(branches)}: left aside")
+            remarks.append(f"{path}: method {method} does not read {', '.join(aside)}: left aside")
     return Loaded(settings, tuple(remarks))
 
 
@@ -120,81 +129,43 @@ def is_read(key: str, method: str) -> bool:
 
 def check_settings(settings: Settings, method: str, source: str = "settings") -> None:
     """Raise SettingsError if a key that the method does not read differs from its default."""
-    default = Settings()
-    for branch in Settings.model_fields:
-        for name in type(getattr(settings, branch)).model_fields:
-            key = f"{branch}.{name}"
-            if is_read(key, method) or getattr(getattr(settings, branch), name) == getattr(
-                getattr(default, branch), name
-            ):
-                continue
+    for key, value in _values(settings).items():
+        if value != DEFAULTS[key] and not is_read(key, method):
             raise SettingsError(_not_read(f"{source}, {key}", key, method))
 
 
 def _not_read(name: str, key: str, method: str) -> str:
     """Return the message about a key that a method does not read, with the nearest one that it reads."""
-    known = [
-        f"{branch}.{name}"
-        for branch in BRANCHES[method]
-        for name in _known_keys(Settings, [branch])
-        if is_read(f"{branch}.{name}", method)
-    ]
+    known = {read.partition(".")[2]: read for read in reversed(DEFAULTS) if is_read(read, method)}
     leaf = key.partition(".")[2]
-    unit = [each for each in known if each.rpartition("_")[2] == leaf.rpartition("_")[2]]
-    near = next(
-        (
-            each
-            for some in (unit, known)
-            for name in difflib.get_close_matches(leaf, [each.partition(".")[2] for each in some], 1, 0.6)
-            for each in some
-            if each.endswith(f".{name}")
-        ),
-        None,
-    )
+    unit = [name for name in known if name.rpartition("_")[2] == leaf.rpartition("_")[2]]
+    near = [name for some in (unit, list(known)) for name in difflib.get_close_matches(leaf, some, 1, 0.6)]
     others = [other for other in BRANCHES if is_read(key, other)]
-    do = f"leave it out, use {near}, " if near else "leave it out, "
-    do += f"or use it with {' or '.join(others)}"
+    instead = f"use {known[near[0]]}, " if near else ""
+    do = f"leave it out, {instead}or use it with {' or '.join(others)}"
     return refusal(name, expected=f"a key that method {method} reads", got=f"one of {' and '.join(others)}", do=do)
 
 
-def _known(key: str) -> bool:
-    branch, _, name = key.partition(".")
-    return branch in Settings.model_fields and name in _known_keys(Settings, [branch])
-
-
-def _keys(tree: Mapping[str, Any]) -> list[str]:
-    return [f"{branch}.{name}" for branch, part in tree.items() if isinstance(part, dict) for name in part]
-
-
-def _renamed(text: str, remarks: list[str]) -> str:
-    key, equals, value = text.partition("=")
-    new = RENAMED.get(key.strip())
-    if new is None:
-        return text
-    remarks.append(f"--set {key.strip()} is now {new}; the old name goes with the next version")
-    return f"{new}{equals}{value}"
-
-
-def _rename(tree: dict[str, Any], path: Path | None, remarks: list[str]) -> None:
-    for old, new in RENAMED.items():
-        branch, _, name = old.partition(".")
-        part = tree.get(branch)
-        if isinstance(part, dict) and name in part:
-            part.setdefault(new.partition(".")[2], part.pop(name))
-            remarks.append(f"{path}: {old} is now {new}; the old name goes with the next version")
+def _renamed(key: str, where: str, remarks: list[str]) -> str:
+    """Return the name of a key today, with a remark if `key` is its old one."""
+    new = RENAMED.get(key, key)
+    if new != key:
+        remarks.append(f"{where} {key} is now {new}; the old name goes with the next version")
+    return new
 
 
 def load_synth_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> SynthSettings:
     """Read the settings of a synthetic experiment from a file and from overrides `key=value`; as `load_settings`."""
-    return _load(SynthSettings, {} if path is None else _read(path), str(path) if path else "settings", overrides)
+    return _load(SynthSettings, _read(path), path, overrides)
 
 
 def load_proposer_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> ProposerSettings:
     """Read the settings of a proposer's training from a file and from overrides; as `load_settings`."""
-    return _load(ProposerSettings, {} if path is None else _read(path), str(path) if path else "settings", overrides)
+    return _load(ProposerSettings, _read(path), path, overrides)
 
 
-def _load(model: type[Model], tree: dict[str, Any], source: str, overrides: Iterable[str]) -> Model:
+def _load(model: type[Model], tree: dict[str, Any], path: Path | None, overrides: Iterable[str]) -> Model:
+    source = str(path) if path else "settings"
     for text in overrides:
         _override(tree, text, DEPTHS[model])
     try:
@@ -218,17 +189,12 @@ def _not_finite(value: Any) -> str:
     return ""
 
 
-def _read(path: Path) -> dict[str, Any]:
-    tree = read_yaml(path, SettingsError)
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
-        raise SettingsError(
-            refusal(
-                f"settings {path}", expected="keys and values", got=type(tree).__name__, do="see configs/default.yaml"
-            )
-        )
-    return tree
+def _read(path: Path | None) -> dict[str, Any]:
+    tree = None if path is None else read_yaml(path, SettingsError)
+    if not isinstance(tree, dict | None):
+        got, do = type(tree).__name__, "see configs/default.yaml"
+        raise SettingsError(refusal(f"settings {path}", expected="keys and values", got=got, do=do))
+    return tree or {}
 
 
 def _override(tree: dict[str, Any], text: str, depths: tuple[int, ...]) -> None:
@@ -237,18 +203,16 @@ def _override(tree: dict[str, Any], text: str, depths: tuple[int, ...]) -> None:
     *rooms, leaf = key.strip().split(".")
     if not equals or len(rooms) + 1 not in depths:
         expected = "key=value" if depths == (1,) else "room.key=value"
-        raise SettingsError(
-            refusal(f"--set {text}", expected=expected, got=repr(text), do="give one key and its value")
-        )
+        do = "give one key and its value"
+        raise SettingsError(refusal(f"--set {text}", expected=expected, got=repr(text), do=do))
     for room in rooms:
         branch = tree.setdefault(room, {})
         tree = branch if isinstance(branch, dict) else {}
     try:
         tree[leaf] = parse_yaml(value)
     except FAULTS:
-        raise SettingsError(
-            refusal(f"--set {text}", expected="a YAML value", got=short(value), do="quote it for the shell")
-        ) from None
+        do = "quote it for the shell"
+        raise SettingsError(refusal(f"--set {text}", expected="a YAML value", got=short(value), do=do)) from None
 
 
 def _explain(error: ValidationError, source: str, model: type[BaseModel]) -> str:
@@ -259,18 +223,12 @@ def _explain(error: ValidationError, source: str, model: type[BaseModel]) -> str
     parts = [str(part) for part in first["loc"]]
     key = ".".join(parts)
     if first["type"] == "extra_forbidden":
-        known = _known_keys(model, parts[:-1])
+        known = known_keys(model, parts[:-1])
         near = difflib.get_close_matches(parts[-1], known, 1)
         do = f"did you mean {'.'.join([*parts[:-1], near[0]])}" if near else f"use one of {', '.join(known)}"
         return refusal(f"{source}, {key}", expected="a known key", got="an unknown one", do=do)
     expected = first["msg"].replace("Input should be ", "")
     return refusal(f"{source}, {key}", expected=expected, got=short(first["input"]), do="correct the value")
-
-
-def _known_keys(model: Any, parts: list[str]) -> list[str]:
-    for part in parts:
-        model = model.model_fields[part].annotation
-    return list(model.model_fields)
 
 
 def settings_yaml(settings: Settings | None = None) -> str:

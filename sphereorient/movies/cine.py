@@ -1,6 +1,6 @@
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -8,12 +8,12 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.movies.grey import COLOUR_REMARK, luma
-from sphereorient.movies.movie import Grey, Movie, mapped, refused, truncated_remark
+from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, luma, mapped, refused
 
 FILE_HEADER = struct.Struct("<2s3HiIiI3IQ")
 BITMAP_HEADER = struct.Struct("<IiiHHIIiiII")
 SETUP_START = struct.Struct("<H138x2sH")
+SETUP = struct.Struct("<756xii4xI112xi8xI")  # both flips, frame rate, rotation, bits used; zeros where it ends earlier
 BLOCK_HEADER = struct.Struct("<IHH")
 TIME_BLOCK = 1002  # a TIME64 for each image
 MAX_BLOCKS = 10_000  # tagged blocks; recorders write a handful
@@ -31,16 +31,13 @@ class _Layout:
     name: str
     bits: int  # of a pixel in the file
     dtype: type[np.uint8] | type[np.uint16]
-    grey: Callable[[Rows, int], NDArray[Any]]  # rows and width -> (H, W)
     colour: bool = False
     packed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class _Header:
-    compression: int  # 0 none, 1 JPEG, 2 raw colour filter array
-    packing: int  # 0 none, 256: 10 bit, 1024: 12 bit
-    bits: int  # stored, of a pixel
+    layout: _Layout
     width: int
     height: int
     stated: int  # images by the header
@@ -59,7 +56,7 @@ class CineMovie(Movie):
 
     def __init__(self, path: Path) -> None:
         header = self._header = _read_header(path)
-        layout = self._layout = _layout(path, header)
+        layout = header.layout
         self._top_down = header.flip_vertical != layout.packed
         content = np.memmap(path, np.uint8, "r")
         found = Counter(_prefix_and_size(content, int(offset)) for offset in header.offsets[:FIRST])
@@ -74,19 +71,18 @@ class CineMovie(Movie):
             do = "export it again; its header is damaged"
             raise refused(path, expected, f"{self._image_size} bytes", do)
         there = np.flatnonzero((header.offsets > 0) & (header.offsets <= len(content) - prefix - self._image_size))
-        count = int(there[-1]) + 1 if len(there) else 0
-        if count < 1:
-            raise refused(path, "at least one whole image", "none", COPY_AGAIN)
+        count = int(there[-1]) + 1  # one at least is whole
         used = f" ({header.real_bits} of them used)" if 0 < header.real_bits < layout.bits else ""
-        form = f".cine, {layout.name}{used}"
-        super().__init__(path, form, count, (header.height, header.width), np.dtype(layout.dtype))
+        super().__init__(
+            path, f".cine, {layout.name}{used}", count, (header.height, header.width), np.dtype(layout.dtype)
+        )
         self.times_s, remarks = _times(header, count)
-        self.remarks = (*truncated_remark(header.stated, count), *remarks, *self._pixel_remarks())
+        self.remarks = (*self._truncated(header.stated), *remarks, *self._pixel_remarks())
 
     def _pixel_remarks(self) -> Iterator[str]:
-        if self._layout.colour:
+        if self._header.layout.colour:
             yield COLOUR_REMARK
-        if self._layout.name == "packed 10 bit":
+        if self._header.layout.name == "packed 10 bit":
             yield "packed 10 bit: grey values are the recorder's codes, which are not linear in brightness"
         if self._header.flip_vertical:
             yield "its header asks for rows turned round (bFlipV), applied; if the picture stands on its head: flip"
@@ -106,7 +102,7 @@ class CineMovie(Movie):
         if size != self._image_size:
             raise self._damage(number, "an image that is cut off or of another size")
         pixels = content[offset + prefix : offset + prefix + size]
-        grey = self._layout.grey(pixels.reshape(self._header.height, self._stride), self._header.width)
+        grey = _grey(pixels.reshape(self._header.height, self._stride), self._header.width, self._header.layout)
         upright = grey if self._top_down else grey[::-1]
         if self._header.flip_horizontal:
             upright = upright[:, ::-1]
@@ -141,30 +137,25 @@ def _read_header(path: Path) -> _Header:
         if mark != b"ST":  # older than any version whose fields are known
             length = 0
         file.seek(at_setup)
-        setup = file.read(length)
+        setup = SETUP.unpack(file.read(min(length, SETUP.size)).ljust(SETUP.size, b"\0"))
         file.seek(at_table)
         offsets = np.frombuffer(file.read(8 * min(count, max(0, size - at_table) // 8)), "<i8").astype(np.int64)
-        stamps = _read_stamps(file, at_setup + length, min(at_table, size)) if length else None
+        times_s = _read_times(file, at_setup + length, min(at_table, size), trigger) if length else None
 
-    def field(offset: int, form: str) -> int:
-        there = offset + struct.calcsize(form) <= len(setup)
-        return int(struct.unpack_from(form, setup, offset)[0]) if there else 0
-
+    flip_horizontal, flip_vertical, rate, rotate_deg, real_bits = setup
     return _Header(
-        compression=compression,
-        packing=packing,
-        bits=bits,
+        layout=_layout(path, compression, packing, bits),
         width=width,
         height=height,
         stated=count,
         offsets=offsets,
         first_number=first,
-        times_s=None if stamps is None else _seconds(stamps, trigger),
-        frame_rate_hz=field(768, "<I") or int(rate_16),  # the short field stops at 65535
-        flip_horizontal=bool(field(756, "<i")),
-        flip_vertical=bool(field(760, "<i")),
-        rotate_deg=field(884, "<i"),
-        real_bits=field(896, "<I"),
+        times_s=times_s,
+        frame_rate_hz=rate or rate_16,  # the short field stops at 65535
+        flip_horizontal=bool(flip_horizontal),
+        flip_vertical=bool(flip_vertical),
+        rotate_deg=rotate_deg,
+        real_bits=real_bits,
     )
 
 
@@ -176,8 +167,8 @@ def _unpack(path: Path, file: BinaryIO, at: int, layout: struct.Struct) -> tuple
     return layout.unpack(content)
 
 
-def _read_stamps(file: BinaryIO, at: int, end: int) -> NDArray[np.uint64] | None:
-    """Return the TIME64 of each image from the tagged blocks between `at` and `end`; None without."""
+def _read_times(file: BinaryIO, at: int, end: int, trigger: int) -> NDArray[np.float64] | None:
+    """Return the times of the images, s from the trigger, in the tagged blocks between `at` and `end`; None without."""
     for _ in range(MAX_BLOCKS):
         if at + BLOCK_HEADER.size > end:
             break
@@ -186,14 +177,11 @@ def _read_stamps(file: BinaryIO, at: int, end: int) -> NDArray[np.uint64] | None
         if size < BLOCK_HEADER.size or at + size > end:
             break
         if kind == TIME_BLOCK:
-            return np.frombuffer(file.read((size - BLOCK_HEADER.size) // 8 * 8), "<u8").astype(np.uint64)
+            stamps = np.frombuffer(file.read((size - BLOCK_HEADER.size) // 8 * 8), "<u8").astype(np.uint64)
+            since = (stamps & ~FLAG_BITS) - (np.uint64(trigger) & ~FLAG_BITS)  # may wrap round; right again as signed
+            return since.view(np.int64) / 2.0**32
         at += size
     return None
-
-
-def _seconds(stamps: NDArray[np.uint64], trigger: int) -> NDArray[np.float64]:
-    since = (stamps & ~FLAG_BITS) - (np.uint64(trigger) & ~FLAG_BITS)  # may wrap round; right again as signed
-    return since.view(np.int64) / 2.0**32
 
 
 def _times(header: _Header, count: int) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
@@ -211,70 +199,42 @@ def _times(header: _Header, count: int) -> tuple[NDArray[np.float64] | None, tup
     return numbers / rate, (f"{remark}: times are by its frame rate, {rate} Hz",)
 
 
-def _layout(path: Path, header: _Header) -> _Layout:
-    if header.compression == FILTER_ARRAY:
+def _layout(path: Path, compression: int, packing: int, bits: int) -> _Layout:
+    if compression == FILTER_ARRAY:
         do = "export it from the camera's software as interpolated colour or grey"
         raise refused(path, "grey or colour pixels", "raw colours of a filter array, one a pixel", do)
-    if header.compression == JPEG:
+    if compression == JPEG:
         do = "export it uncompressed from the camera's software"
         raise refused(path, "uncompressed or packed images", "JPEG in .cine, which cannot be decoded", do)
-    layout = LAYOUTS.get((header.packing, header.bits))
-    if layout is None or header.compression != 0:
-        got = f"{header.bits} bit, compression {header.compression}, packing {header.packing}"
+    layout = LAYOUTS.get((packing, bits))
+    if layout is None or compression != 0:
+        got = f"{bits} bit, compression {compression}, packing {packing}"
         do = "export it uncompressed from the camera's software, or as grey .avi"
         raise refused(path, "8 or 16 bit grey, colour, or packed 10 or 12 bit", got, do)
     return layout
 
 
-def _sixteen(rows: Rows, width: int) -> NDArray[Any]:
-    return np.ascontiguousarray(rows[:, : 2 * width]).view("<u2")
-
-
-def _colour_8(rows: Rows, width: int) -> NDArray[Any]:
-    blue, green, red = np.moveaxis(rows[:, : 3 * width].reshape(len(rows), width, 3), 2, 0)
+def _grey(rows: Rows, width: int, layout: _Layout) -> NDArray[Any]:
+    """Return the grey values (H, W) of an image's rows."""
+    if layout.packed:  # without gaps, the most significant bits first; each pixel lies in two bytes
+        first, offset = np.divmod(layout.bits * np.arange(width), 8)
+        pair = (rows.take(first, axis=1).astype(np.uint16) << 8) | rows.take(first + 1, axis=1)
+        return (pair >> (16 - layout.bits - offset).astype(np.uint16)) & np.uint16(2**layout.bits - 1)
+    stored = np.dtype(layout.dtype).newbyteorder("<")
+    values = np.ascontiguousarray(rows[:, : width * layout.bits // 8]).view(stored)
+    if not layout.colour:
+        return values
+    blue, green, red = np.moveaxis(values.astype(layout.dtype).reshape(len(rows), width, 3), 2, 0)
     return luma(red, green, blue)
 
 
-def _colour_16(rows: Rows, width: int) -> NDArray[Any]:
-    values = _sixteen(rows, 3 * width).reshape(len(rows), width, 3)
-    blue, green, red = np.moveaxis(values.astype(np.uint16), 2, 0)
-    return luma(red, green, blue)
-
-
-def _ten_packed(rows: Rows, width: int) -> NDArray[Any]:
-    """Unpack four pixels from five bytes, the most significant bits first."""
-    b = _groups(rows, width, pixels=4, size=5)
-    first = (b[..., 0] << 2) | (b[..., 1] >> 6)
-    second = ((b[..., 1] & 0x3F) << 4) | (b[..., 2] >> 4)
-    third = ((b[..., 2] & 0x0F) << 6) | (b[..., 3] >> 2)
-    fourth = ((b[..., 3] & 0x03) << 8) | b[..., 4]
-    return np.stack([first, second, third, fourth], axis=-1).reshape(len(rows), -1)[:, :width]
-
-
-def _twelve_packed(rows: Rows, width: int) -> NDArray[Any]:
-    """Unpack two pixels from three bytes, the most significant bits first."""
-    b = _groups(rows, width, pixels=2, size=3)
-    first = (b[..., 0] << 4) | (b[..., 1] >> 4)
-    second = ((b[..., 1] & 0x0F) << 8) | b[..., 2]
-    return np.stack([first, second], axis=-1).reshape(len(rows), -1)[:, :width]
-
-
-def _groups(rows: Rows, width: int, pixels: int, size: int) -> NDArray[np.uint16]:
-    """Return (H, n, size) bytes of the groups of pixels in a row, as 16-bit numbers, the last one zero-padded."""
-    count = -(-width // pixels)
-    whole = np.zeros((len(rows), count * size), np.uint16)
-    there = min(rows.shape[1], count * size)
-    whole[:, :there] = rows[:, :there]
-    return whole.reshape(len(rows), count, size)
-
-
-_TEN = _Layout("packed 10 bit", 10, np.uint16, _ten_packed, packed=True)
-_TWELVE = _Layout("packed 12 bit", 12, np.uint16, _twelve_packed, packed=True)
+_TEN = _Layout("packed 10 bit", 10, np.uint16, packed=True)
+_TWELVE = _Layout("packed 12 bit", 12, np.uint16, packed=True)
 LAYOUTS: dict[tuple[int, int], _Layout] = {  # by biCompression and biBitCount
-    (0, 8): _Layout("8 bit", 8, np.uint8, lambda rows, width: rows[:, :width]),
-    (0, 16): _Layout("16 bit", 16, np.uint16, _sixteen),
-    (0, 24): _Layout("colour, 8 bit", 24, np.uint8, _colour_8, colour=True),
-    (0, 48): _Layout("colour, 16 bit", 48, np.uint16, _colour_16, colour=True),
+    (0, 8): _Layout("8 bit", 8, np.uint8),
+    (0, 16): _Layout("16 bit", 16, np.uint16),
+    (0, 24): _Layout("colour, 8 bit", 24, np.uint8, colour=True),
+    (0, 48): _Layout("colour, 16 bit", 48, np.uint16, colour=True),
     **{(256, bits): _TEN for bits in (10, 16)},
     **{(1024, bits): _TWELVE for bits in (12, 16)},
 }

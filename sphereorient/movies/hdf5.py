@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.files.hdf5 import DAMAGE
-from sphereorient.movies.movie import Grey, Movie, error_words, refused, truncated_remark
+from sphereorient.movies.movie import LARGEST_RATIO, Grey, Movie, error_words, refused
 
+KIND = "data set (N, H, W) of uint8 or uint16"
 SEPARATOR = "::"  # between the file and the data set in it
 TIMES = ("time", "times", "timestamps")
 MAX_OBJECTS = 10_000  # searched for the one data set
 BLOCK_BYTES = 64 << 20  # held at once, of a data set whose chunks hold many frames
-LARGEST_RATIO = 1200  # largest compression ratio of a picture of one grey value
 
 
 class Hdf5Movie(Movie):
@@ -35,7 +35,7 @@ class Hdf5Movie(Movie):
             self.times_s, remarks = _times(data, stated, count)
             form = f"HDF5, data set {data.name}" + (f", {data.compression}" if data.compression else "")
             super().__init__(path, form, count, (height, width), data.dtype.newbyteorder("="))
-        self.remarks = (*truncated_remark(stated, count), *remarks)
+        self.remarks = (*self._truncated(stated), *remarks)
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
         at_once = max(1, BLOCK_BYTES // (math.prod(self.frame_shape) * self.dtype.itemsize))
@@ -85,13 +85,11 @@ def _data_set(path: Path, file: Any, name: str) -> Any:
         names = _candidates(file)
         if len(names) != 1:
             got = ", ".join(map(_shown, names[:5])) or "none"
-            do = "name one: file.h5::group/dataset"
-            raise refused(path, "one data set (N, H, W) of uint8 or uint16", got, do)
+            raise refused(path, f"one {KIND}", got, "name one: file.h5::group/dataset")
         data = file[names[0]]
-    if not (isinstance(data, h5py.Dataset) and _is_movie(data)):
+    if not _is_movie(data):
         got = f"{data.shape} of {data.dtype}" if isinstance(data, h5py.Dataset) else "a group"
-        expected = "a data set (N, H, W) of uint8 or uint16"
-        raise refused(path, expected, got, "name another one: file.h5::group/dataset")
+        raise refused(path, f"a {KIND}", got, "name another one: file.h5::group/dataset")
     if data.external or data.is_virtual:
         got, do = "one that lies in other files", "copy the pictures into this file"
         raise refused(path, "a data set in the file itself", got, do)
@@ -126,7 +124,7 @@ def _candidates(file: Any) -> list[str]:
     def visit(name: str, thing: Any) -> bool | None:
         nonlocal seen
         seen += 1
-        if isinstance(thing, h5py.Dataset) and _is_movie(thing):
+        if _is_movie(thing):
             found.append(name)
         return True if seen > MAX_OBJECTS else None  # anything but None ends the walk
 
@@ -134,9 +132,10 @@ def _candidates(file: Any) -> list[str]:
     return found
 
 
-def _is_movie(data: Any) -> bool:
-    shape = data.shape
-    return shape is not None and len(shape) == 3 and 0 not in shape and data.dtype in (np.uint8, np.uint16)
+def _is_movie(thing: Any) -> bool:
+    if not isinstance(thing, h5py.Dataset) or thing.dtype not in (np.uint8, np.uint16):
+        return False
+    return thing.shape is not None and len(thing.shape) == 3 and 0 not in thing.shape
 
 
 def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int] | None]:
@@ -169,14 +168,15 @@ def _times(data: Any, stated: int, count: int) -> tuple[NDArray[np.float64] | No
             continue
         times = data.parent[name]
         if not isinstance(times, h5py.Dataset) or times.shape != (stated,) or times.dtype.kind not in "fiu":
-            return None, (f"its '{name}' is not used: it is not one number a frame",)
-        unit = times.attrs.get("units", "s")
-        if unit != "s":
-            return None, (f"its '{name}' is not used: in {_shown(unit)}, not in s",)
-        if times.external or times.is_virtual:
-            return None, (f"its '{name}' is not used: it lies in other files",)
-        seconds = times[:count].astype(np.float64)
-        if not (np.isfinite(seconds).all() and (np.diff(seconds) > 0).all()):
-            return None, (f"its '{name}' is not used: it does not increase",)
-        return seconds, ()
+            fault = "it is not one number a frame"
+        elif (unit := times.attrs.get("units", "s")) != "s":
+            fault = f"in {_shown(unit)}, not in s"
+        elif times.external or times.is_virtual:
+            fault = "it lies in other files"
+        else:
+            seconds = times[:count].astype(np.float64)
+            if np.isfinite(seconds).all() and (np.diff(seconds) > 0).all():
+                return seconds, ()
+            fault = "it does not increase"
+        return None, (f"its '{name}' is not used: {fault}",)
     return None, ()

@@ -1,6 +1,5 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -10,6 +9,11 @@ from sphereorient.errors import MovieError, refusal
 
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
 FRAMES_A_MAP = 64
+OTHERS = "ask for frames that the movie has"
+LARGEST_RATIO = 1200  # largest compression ratio of a picture of one grey value; no real picture exceeds it
+# Thousandths that add up to 1000: R = G = B keeps its value.
+RED, GREEN, BLUE = 299, 587, 114
+COLOUR_REMARK = "colour, made grey (0.299 R + 0.587 G + 0.114 B)"
 FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns
 
 
@@ -58,7 +62,7 @@ class Movie:
         asked = [int(index) for index in indices]
         outside = [index for index in asked if not 0 <= index < len(self)]
         if outside:
-            raise self._outside(f"0 .. {len(self) - 1}", str(outside[0]))
+            raise refused(self.path, f"frames within 0 .. {len(self) - 1}", str(outside[0]), OTHERS)
         order = sorted(set(asked))
         pictures = np.empty((len(order), *self.frame_shape), self.dtype)
         for place, picture in enumerate(self._read(order)):
@@ -68,23 +72,22 @@ class Movie:
     def _range(self, first: int, last: int | None) -> range:
         last = len(self) if last is None else last
         if not 0 <= first <= last <= len(self):
-            raise self._outside(f"0 .. {len(self)}", f"{first} .. {last}")
+            raise refused(self.path, f"frames within 0 .. {len(self)}", f"{first} .. {last}", OTHERS)
         return range(first, last)
-
-    def _outside(self, within: str, got: str) -> MovieError:
-        do = "ask for frames that the movie has"
-        return MovieError(refusal(str(self.path), expected=f"frames within {within}", got=got, do=do))
 
     def _damage(self, number: int, got: str) -> MovieError:
         do = "export the movie again, or leave the frame out with frames: in the experiment"
-        return MovieError(refusal(f"{self.path}, frame {number}", expected="a decodable picture", got=got, do=do))
+        return refused(f"{self.path}, frame {number}", "a decodable picture", got, do)
+
+    def _truncated(self, told: int) -> tuple[str, ...]:
+        """Return the remark on a movie whose header states more frames than the file holds."""
+        there = len(self)
+        return (f"truncated: its header tells of {told} frames, {there} are there",) if there < told else ()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Do nothing: no file is open."""
 
 
@@ -108,8 +111,7 @@ class FlippedMovie(Movie):
 def flipped(movie: Movie, how: str) -> Movie:
     """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both."""
     if how not in FLIPS:
-        do = "write one of these"
-        raise MovieError(refusal(f"{movie.path}, flip", expected=", ".join(FLIPS), got=f"'{how}'", do=do))
+        raise refused(f"{movie.path}, flip", ", ".join(FLIPS), f"'{how}'", "write one of these")
     return movie if how == "none" else FlippedMovie(movie, how)
 
 
@@ -129,14 +131,15 @@ def mapped(
         yield number, values
 
 
-def refused(path: Path, expected: str, got: str, do: str) -> MovieError:
-    """Return the MovieError of a movie file."""
-    return MovieError(refusal(str(path), expected=expected, got=got, do=do))
+def luma(red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any]) -> NDArray[Any]:
+    """Return the grey values of a colour picture (...), uint8 or uint16, by ITU-R BT.601; exact where R = G = B."""
+    total = RED * red.astype(np.uint32) + GREEN * green.astype(np.uint32) + BLUE * blue.astype(np.uint32)
+    return ((total + 500) // 1000).astype(red.dtype)
 
 
-def truncated_remark(told: int, there: int) -> tuple[str, ...]:
-    """Return the remark on a movie whose header states more frames than the file holds."""
-    return (f"truncated: its header tells of {told} frames, {there} are there",) if there < told else ()
+def refused(name: object, expected: str, got: str, do: str) -> MovieError:
+    """Return the MovieError about a movie file, or a thing in it."""
+    return MovieError(refusal(str(name), expected=expected, got=got, do=do))
 
 
 def error_words(error: Exception) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sphereorient.movies.movie import Grey, Movie, error_words, mapped, refused, truncated_remark
+from sphereorient.movies.movie import Grey, Movie, error_words, mapped, refused
 
 # numpy parses a header as a Python literal, and old ones as its tokens.
 DAMAGE = (OSError, ValueError, EOFError, TypeError, LookupError, SyntaxError, TokenError, RecursionError, MemoryError)
@@ -27,7 +27,7 @@ class NpyMovie(Movie):
         if count < 1:
             raise refused(path, "at least one whole frame", "a cut off file", SAVE_AGAIN)
         super().__init__(path, "numpy array", count, (shape[1], shape[2]), self._stored.newbyteorder("="))
-        self.remarks = truncated_remark(shape[0], count)
+        self.remarks = self._truncated(shape[0])
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
         shape = (len(self), *self.frame_shape)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import logging
 import lzma
 import struct
@@ -7,16 +5,13 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tifffile import TiffFile
 
-from sphereorient.movies.grey import COLOUR_REMARK, luma
-from sphereorient.movies.movie import Grey, Movie, error_words, mapped, refused, truncated_remark
-
-if TYPE_CHECKING:
-    from tifffile import TiffFile
+from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, Grey, Movie, error_words, luma, mapped, refused
 
 # What tifffile and imagecodecs raise on damaged files, depending on the place of the damage.
 DAMAGE = (
@@ -27,7 +22,6 @@ WHITE_IS_ZERO, BLACK_IS_ZERO, RGB = 0, 1, 2  # PhotometricInterpretation
 UNCOMPRESSED = 1
 ORIENTATION = 274  # tag: where row 0 and column 0 are
 STEPS = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1)}  # of rows and columns, by orientation
-LARGEST_RATIO = 1200  # largest compression ratio of a picture of one grey value
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damage is reported by our own refusals
 
@@ -55,7 +49,7 @@ class TiffMovie(Movie):
             self._offset = int(page.dataoffsets[0]) if whole > pages else None
             count = min(stated, whole) if self._offset is not None else pages
         super().__init__(path, form, count, (int(page.imagelength), int(page.imagewidth)), np.dtype(page.dtype))
-        remarks = truncated_remark(stated, count) + ((COLOUR_REMARK,) if self.colour else ())
+        remarks = self._truncated(stated) + ((COLOUR_REMARK,) if self.colour else ())
         self.remarks = remarks + (("stored with white as 0: inverted",) if self._white_is_zero else ())
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
@@ -92,8 +86,6 @@ class TiffMovie(Movie):
 
 @contextmanager
 def _opened(path: Path) -> Iterator[TiffFile]:
-    from tifffile import TiffFile
-
     try:
         file = TiffFile(path)
     except DAMAGE as error:

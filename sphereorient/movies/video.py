@@ -1,5 +1,6 @@
-"""Videos that FFmpeg decodes, with exact seeks, and nothing decoded from damaged data."""
+"""Videos that FFmpeg decodes: exact seeks, exact grey values, nothing decoded from damaged data."""
 
+import ctypes
 import zlib
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -7,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import av
+import numpy as np
 
-from sphereorient.errors import MovieError, refusal
-from sphereorient.movies.grey import COLOUR_REMARK, check_format, grey_dtype, grey_values
-from sphereorient.movies.movie import Grey, Movie, error_words, refused, truncated_remark
+from sphereorient.errors import MovieError
+from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, error_words, luma, refused
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
 
 LOSSLESS = "lossless"
+PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # pixel formats that begin so may have a grey first plane
 NOTHING = "none from the decoder"
 PACKETS_TRIED = 8  # of FFV1: if the check sums of one are right, all packets have them
 SHOWN = 8  # missing frames named in a remark
@@ -43,7 +45,8 @@ class VideoMovie(Movie):
             count = self._index.count
             super().__init__(path, form, count, (frame.height, frame.width), grey_dtype(frame.format))
             damaged = (f"damaged: reading it breaks off after {count} frames, {broken}",) if broken else ()
-            self.remarks = (*damaged, *_remarks(container, self._pixels, self._index))
+            cut_off = self._truncated(_stated_frames(container, count))
+            self.remarks = (*damaged, *cut_off, *_remarks(container, self._pixels, self._index))
 
     def _read_index(self, container: av.container.InputContainer) -> tuple[PacketIndex, str]:
         """Return the packet table, and the error that ended it, if any."""
@@ -148,7 +151,7 @@ class VideoMovie(Movie):
             return grey_values(frame)
         expected = f"pictures of one kind, {self.frame_shape} {self._pixels}"
         got, do = f"{(frame.height, frame.width)} {frame.format.name}", "split the movie where it changes"
-        return MovieError(refusal(f"{self.path}, frame {number}", expected=expected, got=got, do=do))
+        return refused(f"{self.path}, frame {number}", expected, got, do)
 
 
 def _opened(path: Path) -> av.container.InputContainer:
@@ -206,7 +209,6 @@ def _check_sums_right(packet: bytes) -> bool:
 
 def _remarks(container: av.container.InputContainer, pixels: str, index: PacketIndex) -> Iterator[str]:
     stream = container.streams.video[0]
-    yield from truncated_remark(_stated_frames(container, index.count), index.count)
     if index.missing:
         some = ", ".join(map(str, index.missing[:SHOWN])) + (" ..." if len(index.missing) > SHOWN else "")
         yield f"its time stamps leave out frames, which count as unreadable ({len(index.missing)}): {some}"
@@ -234,3 +236,50 @@ def _loss(context: av.CodecContext) -> str:
     if not context.codec.lossy:
         return LOSSLESS
     return "may be lossy" if context.codec.lossless else "lossy"
+
+
+def grey_dtype(pixel_format: av.VideoFormat) -> np.dtype[Any]:
+    """Return uint8, or uint16 for a format with more than 8 bits."""
+    return np.dtype(np.uint8 if pixel_format.components[0].bits <= 8 else np.uint16)
+
+
+def check_format(name: str, pixel_format: av.VideoFormat) -> None:
+    """Refuse pixel formats without exact grey values: no integer grey plane and no colour (MovieError)."""
+    colour = (pixel_format.is_rgb or pixel_format.has_palette) and not pixel_format.is_bit_stream
+    if not (colour or _has_grey_plane(pixel_format)):
+        do = "convert it, lossless: ffmpeg -i MOVIE -c:v ffv1 -pix_fmt gray MOVIE.mkv"
+        raise refused(name, "grey, planar YUV or RGB pixels", pixel_format.name, do)
+
+
+def grey_values(frame: av.VideoFrame) -> Grey:
+    """Return the first plane of grey and YUV frames unchanged, the luma of RGB frames; (H, W), row 0 on top."""
+    if _has_grey_plane(frame.format):
+        return _plane_0(frame)
+    # FFmpeg only interleaves the channels here: its grey formula differs from that of the other formats.
+    deep = grey_dtype(frame.format).itemsize == 2
+    interleaved = frame.reformat(format="rgb48le" if deep else "rgb24")
+    values = _plane_0(interleaved, samples=3).reshape(frame.height, frame.width, 3)
+    if deep:
+        values = values >> (16 - frame.format.components[0].bits)  # 10 and 12 bit are scaled to 16
+    return luma(*np.moveaxis(values, 2, 0))
+
+
+def _has_grey_plane(pixel_format: av.VideoFormat) -> bool:
+    """Return whether plane 0 holds only grey; in packed formats (yuyv422, ya8) it does not."""
+    grey, *others = pixel_format.components
+    alone = all(other.plane != grey.plane for other in others)
+    return alone and pixel_format.name.startswith(PLANE_0_IS_GREY) and "f32" not in pixel_format.name
+
+
+def _plane_0(frame: av.VideoFrame, samples: int = 1) -> Grey:
+    plane, height, width = frame.planes[0], frame.height, frame.width * samples
+    dtype = grey_dtype(frame.format)
+    stored = dtype.newbyteorder(">" if frame.format.is_big_endian else "<")
+    # Rows are padded to line_size, negative for pictures stored bottom-up: buffer_ptr is then the top row, the last in
+    # memory. Read by address: PyAV releases differ in where their buffer begins.
+    reach = (height - 1) * plane.line_size
+    size = abs(reach) + width * dtype.itemsize
+    memory = memoryview((ctypes.c_uint8 * size).from_address(plane.buffer_ptr + min(reach, 0))).cast("B")
+    strides = (plane.line_size, dtype.itemsize)
+    rows: Grey = np.ndarray((height, width), stored, buffer=memory, offset=max(-reach, 0), strides=strides)
+    return rows.astype(dtype, order="C")  # a copy: the memory belongs to the frame

@@ -8,7 +8,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.errors import MovieError, refusal
 from sphereorient.files.hdf5 import GuardedFile
 from sphereorient.files.outputs import put_aside
 from sphereorient.movies.movie import Grey, refused
@@ -117,7 +116,7 @@ def _checked(path: Path, frames: Iterable[Grey | None]) -> tuple[int, Grey, Iter
         raise refused(path, "frames to write", got, "pass at least one")
     if picture.ndim != 2 or picture.dtype not in PIXEL_FORMATS:
         expected, got = "frames (H, W) of uint8 or uint16", f"{picture.shape} of {picture.dtype}"
-        raise MovieError(refusal(f"{path}, frame {dead}", expected=expected, got=got, do="convert them"))
+        raise refused(f"{path}, frame {dead}", expected, got, "convert them")
     return dead, picture, _alike(path, dead, picture, chain([picture], rest))
 
 
@@ -125,5 +124,5 @@ def _alike(path: Path, number: int, first: Grey, frames: Iterable[Grey | None]) 
     for at, picture in enumerate(frames, start=number):
         if picture is not None and (picture.shape != first.shape or picture.dtype != first.dtype):
             expected, got = f"{first.shape} of {first.dtype}", f"{picture.shape} of {picture.dtype}"
-            raise MovieError(refusal(f"{path}, frame {at}", expected=expected, got=got, do="make them alike"))
+            raise refused(f"{path}, frame {at}", expected, got, "make them alike")
         yield picture

@@ -8,8 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from sphereorient.learn.benchmark import Example
-from sphereorient.learn.metrics import WITHIN_DEG
+from sphereorient.learn.metrics import WITHIN_DEG, Example
 from sphereorient.report.plots.style import ALL, GREY, SECOND, SHADE, WIDTH_IN, X, in_style, new_figure, note
 
 RIGHT, WRONG = "#1A7F37", "#B42318"  # frames of proposals; the titles have a tick too

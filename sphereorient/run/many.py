@@ -1,13 +1,17 @@
-"""Many experiments, or one long movie, on many workers: the order of tasks, and the death of a worker."""
+"""Many experiments, or one long movie, on many workers: processes here, or a Dask cluster; some of them die."""
 
+import multiprocessing
+import os
+import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import lru_cache
+from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +21,119 @@ from sphereorient.errors import SettingsError, SphereOrientError, refusal
 from sphereorient.experiment.recording import Progress, silent
 from sphereorient.follow.follower import Batch
 from sphereorient.methods.method import one_thread
-from sphereorient.run.executors import Executor
-from sphereorient.run.request import Request
 from sphereorient.run.stages import Task, Work, check_method, check_out, opened, stages
-from sphereorient.run.store import FolderStore
+from sphereorient.run.store import FolderStore, Request
 from sphereorient.trajectory import Trajectory
 
 POLL_S = 0.5  # between looks at what the workers have written
 DEATHS = 3  # of workers on one experiment without anything new being done
+
+
+class ProcessExecutor:
+    """`size` worker processes, each in a pool of its own: one that dies does not stop the others."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._workers = [_worker() for _ in range(size)]
+
+    def submit(self, worker: int, task: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Start a task on an idle worker."""
+        return self._workers[worker].submit(task, *arguments)
+
+    def renew(self, worker: int) -> None:
+        """Replace a worker that died."""
+        self._workers[worker].shutdown(wait=False, cancel_futures=True)
+        self._workers[worker] = _worker()
+
+    def close(self) -> None:
+        """Terminate the workers; finished work is in the stores."""
+        for worker in self._workers:
+            processes = list((getattr(worker, "_processes", None) or {}).values())
+            worker.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.terminate()
+
+
+def _worker() -> ProcessPoolExecutor:
+    # Spawn: forked children of a process that used torch's threads hang.
+    start = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(1, mp_context=start, initializer=_prepare)
+
+
+def _prepare() -> None:
+    """Exit when the parent process dies; a killed parent cannot signal its workers."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+class DaskExecutor:
+    """The workers of a Dask cluster (`distributed.Client`); they must see the same files under the same names.
+
+    `cluster`: closed together with the connection; None: it continues for others.
+    """
+
+    def __init__(self, client: Any, cluster: Any = None) -> None:
+        self._client, self._cluster = client, cluster
+        self._executor = client.get_executor(pure=False, retries=0)
+
+    @property
+    def size(self) -> int:
+        """Number of tasks that the cluster does in parallel, at least one."""
+        threads: dict[str, int] = self._client.nthreads()
+        return max(1, sum(threads.values()))
+
+    def submit(self, worker: int, task: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Start a task; the scheduler chooses the worker."""
+        future: Future[Any] = self._executor.submit(task, *arguments)
+        return future
+
+    def renew(self, worker: int) -> None:
+        """Do nothing: a cluster replaces its workers itself."""
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._executor.shutdown(wait=False)
+        self._client.close()
+        if self._cluster is not None:
+            self._cluster.close()
+
+
+Executor = ProcessExecutor | DaskExecutor
+
+
+def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
+    """Connect to Dask: a scheduler (tcp://host:8786), its file (.json), or `local` (workers None: one per core).
+
+    Raises:
+        SettingsError: Dask is not installed, or the scheduler does not answer.
+    """
+    try:
+        import distributed
+    except ImportError as error:
+        do = "install it with `pip install sphereorient[cluster]`"
+        raise SettingsError(refusal("--cluster", expected="the package distributed", got="none", do=do)) from error
+    join: Any = distributed.Client  # without types of its own
+    try:
+        if cluster == "local":
+            count = workers or os.cpu_count() or 1
+            local: Any = distributed.LocalCluster
+            here: Any = local(n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
+            return DaskExecutor(join(here), here)
+        if cluster.endswith(".json"):
+            return DaskExecutor(join(scheduler_file=cluster, timeout=20))
+        return DaskExecutor(join(cluster, timeout=20))
+    except (OSError, TimeoutError, ValueError) as error:
+        do = "start one (docs/long-runs.md), and name its scheduler's address"
+        got = f"'{str(error).splitlines()[0] if str(error) else type(error).__name__}'"
+        raise SettingsError(refusal(f"--cluster {cluster}", expected="a Dask scheduler", got=got, do=do)) from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +214,10 @@ def run_many(
     Raises:
         SettingsError: two requests have the same track.
     """
-    _refuse_same(requests)
+    outs = [request.track.resolve() for request in requests]
+    if twice := [str(out) for k, out in enumerate(outs) if out in outs[:k]]:
+        do = "give the experiments different names, or track them one by one"
+        raise SettingsError(refusal("--out", expected="a track for each experiment", got=f"{twice[0]} twice", do=do))
     todo = deque(range(len(requests)))
     jobs: dict[int, _Job] = {}
     busy: dict[Future[Any], tuple[int, _Job, Task]] = {}  # worker, job, task
@@ -134,14 +246,6 @@ def run_many(
         for job in jobs.values():
             job.held.close()
     return [outcomes[number] for number in range(len(requests))]
-
-
-def _refuse_same(requests: Sequence[Request]) -> None:
-    outs = [request.track.resolve() for request in requests]
-    twice = next((out for k, out in enumerate(outs) if out in outs[:k]), None)
-    if twice is not None:
-        do = "give the experiments different names, or track them one by one"
-        raise SettingsError(refusal("--out", expected="a track for each experiment", got=f"{twice} twice", do=do))
 
 
 def _next(
@@ -201,10 +305,8 @@ def _take(future: Future[Any], job: _Job, task: Task, executor: Executor, worker
 def _outcome(job: _Job) -> Outcome:
     job.held.close()
     seconds = time.monotonic() - job.began
-    if job.counts is None:
-        return Outcome(request=job.request, seconds=seconds, error=job.error)
-    frames, valid = job.counts
-    return Outcome(request=job.request, seconds=seconds, frames=frames, valid=valid)
+    frames, valid = job.counts or (0, 0)
+    return Outcome(request=job.request, seconds=seconds, frames=frames, valid=valid, error=job.error)
 
 
 def tracks_of(experiments: Sequence[Path], out: Path) -> list[Path]:

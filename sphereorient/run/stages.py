@@ -3,6 +3,7 @@
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,7 @@ from sphereorient.methods.paper import PAPER
 from sphereorient.methods.precise import PRECISE
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, check_settings, settings_yaml
-from sphereorient.run.request import Request
-from sphereorient.run.store import MemoryStore, Store
+from sphereorient.run.store import MemoryStore, Request, Store
 from sphereorient.trajectory import Trajectory
 
 METHODS: dict[str, Method] = {"precise": PRECISE, "paper": PAPER}
@@ -46,12 +46,12 @@ def run(request: Request, store: Store, *, resume: bool = False, progress: Progr
         SphereOrientError: unusable inputs, a store of another run, or a track that cannot be written (the store stays).
     """
     check_out(request)
-    with opened(request, store) as work, store.held(request, resume=resume):
+    with opened(request, store, progress) as work, store.held(request, resume=resume):
         todo = stages(store)
         tasks = next(todo)
         while True:
             try:
-                tasks = todo.send([work.do(task, progress) for task in tasks])
+                tasks = todo.send([work.do(task) for task in tasks])
             except StopIteration as end:
                 track: Trajectory = end.value
                 return track
@@ -80,67 +80,67 @@ class Work:
     method: Method
     job: Job
     store: Store
-    _follower: Follower | None = None
-    _learnt: bool = False
+    progress: Progress = silent
 
-    def do(self, task: Task, progress: Progress = silent) -> Any:
+    def do(self, task: Task) -> Any:
         """Do one task: learn returns the batches, follow the number of batches, join the track."""
         if task.stage == "learn":
-            return self.learn(progress)
-        return self.follow(task.batches, progress) if task.stage == "follow" else self.join(progress)
+            return self.batches
+        return self.follow(task.batches) if task.stage == "follow" else self.join()
 
-    def learn(self, progress: Progress) -> list[Batch]:
-        """Estimate what is needed before tracking, unless it is known; keep it, and return the batches to follow."""
-        if not self._learnt:
-            known = self.job.given or self.store.known
-            if known is not None and self.method.resume is not None:
-                self._follower = self.method.resume(self.job, known)
-            else:
-                self._follower = self.method.learn(self.job, progress)
-                if self._follower is not None:
-                    self.store.keep(Learnt.of(self._follower.appearance))
-            self._learnt = True
-        return [] if self._follower is None else self._follower.batches
+    @cached_property
+    def follower(self) -> Follower | None:
+        """What frames are measured with: known, or learnt and kept now; None: the method needs none."""
+        known = self.job.given or self.store.known
+        if known is not None and self.method.resume is not None:
+            return self.method.resume(self.job, known)
+        follower = self.method.learn(self.job, self.progress)
+        if follower is not None:
+            self.store.keep(Learnt.of(follower.appearance))
+        return follower
 
-    def follow(self, batches: Sequence[Batch], progress: Progress) -> int:
+    @property
+    def batches(self) -> list[Batch]:
+        """The batches to follow."""
+        return [] if self.follower is None else self.follower.batches
+
+    def follow(self, batches: Sequence[Batch]) -> int:
         """Measure some batches, keep their poses, and return how many batches were measured."""
-        every = self.learn(progress)
-        assert self._follower is not None  # only a follower has batches
+        assert self.follower is not None  # only a follower has batches
+        every = self.batches
         total = sum(map(len, every))
         done = total - sum(map(len, self.store.missing(every)))
-        progress("track", done, total)
-        count = 0
-        for batch, poses in self._follower.follow(batches):
+        self.progress("track", done, total)
+        for batch, poses in self.follower.follow(batches):
             self.store.write(batch, poses)
-            done, count = done + len(batch), count + 1
-            progress("track", done, total)
-        return count
+            done += len(batch)
+            self.progress("track", done, total)
+        return len(batches)
 
-    def join(self, progress: Progress) -> Trajectory:
+    def join(self) -> Trajectory:
         """Join the measured batches to a track, write it, and empty the store."""
-        batches = self.learn(progress)
-        progress("join", 0, 1)
-        measured = (self.store.read(batch) for batch in batches)
-        track, learnt = self.method.join(self.job, self._follower, measured, progress)
+        measured = (self.store.read(batch) for batch in self.batches)
+        self.progress("join", 0, 1)
+        track, learnt = self.method.join(self.job, self.follower, measured, self.progress)
         track = finished(track, self.job, self.request)
         if learnt is not None and self.request.save_learnt is not None:
             learnt.save(self.request.save_learnt)
         if self.request.out is not None:
             track.save(self.request.out)
         self.store.remove()
-        progress("join", 1, 1)
+        self.progress("join", 1, 1)
         return track
 
 
 @contextmanager
-def opened(request: Request, store: Store) -> Iterator[Work]:
+def opened(request: Request, store: Store, progress: Progress = silent) -> Iterator[Work]:
     """Open the inputs of a request; raise SphereOrientError if they are missing, unreadable or inconsistent."""
     method = check_method(request)
     given = Learnt.load(request.learnt) if isinstance(request.learnt, Path) else request.learnt
     device = torch_device(request.device)
     with open_recording(request.experiment, request.cameras) as recording, one_thread():
         job = Job(recording=recording, settings=request.settings, device=device, given=given)
-        yield Work(request=request, method=method, job=job, store=store)
+        yield Work(request=request, method=method, job=job, store=store, progress=progress)
 
 
 def track_movies(

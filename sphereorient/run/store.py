@@ -1,6 +1,7 @@
-"""Where a run keeps its intermediate results: in memory, or in a folder beside the track, to resume from."""
+"""The request of a run, and where it keeps intermediate results: in memory, or in a folder beside the track."""
 
 import fcntl
+import hashlib
 import json
 import os
 import shutil
@@ -13,16 +14,87 @@ import h5py
 import numpy as np
 import torch
 
+from sphereorient import __version__
 from sphereorient.errors import OutputError, TrackError, refusal
+from sphereorient.experiment import Experiment, input_files, load_experiment
 from sphereorient.files.hdf5 import whole_hdf5
 from sphereorient.follow.follower import Batch
 from sphereorient.follow.poses import Poses
 from sphereorient.methods.learnt import Learnt
+from sphereorient.methods.proposers import checkpoint_path
+from sphereorient.methods.settings import DEFAULT_METHOD, Settings, settings_yaml
 from sphereorient.pose.fit import POSE_PARTS
-from sphereorient.run.request import Request, differing, fingerprint
 from sphereorient.trajectory import Reason
 
 SCHEMA = "sphereorient-poses/1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """One experiment to be tracked; sent to workers."""
+
+    experiment: Path | Experiment
+    out: Path | None = None  # the track; None: it is not written
+    method: str = DEFAULT_METHOD
+    settings: Settings = field(default_factory=Settings)
+    cameras: tuple[str, ...] | None = None
+    device: str = "cpu"
+    learnt: Path | Learnt | None = None  # what another run learnt, to measure with
+    save_learnt: Path | None = None
+    command: str = "sphereorient.run"
+
+    @property
+    def track(self) -> Path:
+        """The path of the track; raise OutputError if the request has none."""
+        if self.out is None:
+            raise OutputError(refusal("out", expected="the path of a track", got="none", do="pass out="))
+        return self.out
+
+    @property
+    def parts(self) -> Path:
+        """The folder beside the track that keeps intermediate results until the track is complete."""
+        return self.track.with_name(self.track.name + ".parts")
+
+
+def fingerprint(request: Request) -> dict[str, str]:
+    """Return the identity of a run: inputs by size and time, text of experiment.yaml, settings, version."""
+    given = request.experiment
+    experiment = given if isinstance(given, Experiment) else load_experiment(given)
+    found = {
+        "version": __version__,
+        "method": request.method,
+        "settings": _digest(settings_yaml(request.settings)),
+        "cameras": "all" if request.cameras is None else ",".join(request.cameras),
+        "device": request.device,
+        "experiment": _digest(experiment.path.read_text(encoding="utf-8")),
+    }
+    return found | {
+        path.name if n == 0 else f"{path.name} ({n})": _stamp(path) for (path, n) in _files(request, experiment)
+    }
+
+
+def _files(request: Request, experiment: Experiment) -> list[tuple[Path, int]]:
+    """Return the input files, each with the number of earlier files of the same name."""
+    named = [path for paths in input_files(experiment, request.cameras).values() for path in paths]
+    named = [path for path in named if path != experiment.path]  # compared by its text
+    if isinstance(request.learnt, Path):
+        named.append(request.learnt)
+    if request.settings.propose.checkpoint is not None:
+        named.append(checkpoint_path(request.settings.propose.checkpoint))
+    names = [path.name for path in named]
+    return [(path, names[:k].count(path.name)) for k, path in enumerate(named)]
+
+
+def _stamp(path: Path) -> str:
+    try:
+        status = path.stat()
+    except OSError:
+        return "missing"
+    return f"{status.st_size} {status.st_mtime_ns}"
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @dataclass(eq=False)
@@ -64,11 +136,6 @@ class FolderStore:
 
     folder: Path
 
-    @property
-    def learnt(self) -> Path:
-        """The file of what was learnt before the first frame."""
-        return self.folder / "learnt.h5"
-
     def poses(self, batch: Batch) -> Path:
         """Return the file of the poses of one batch."""
         return self.folder / f"poses-{batch.first:08d}.h5"
@@ -88,7 +155,7 @@ class FolderStore:
             if before is None or not resume:
                 self._make(now)
                 self._lock(locks)
-            elif others := differing(before, now):
+            elif others := sorted(name for name in {*before, *now} if before.get(name) != now.get(name)):
                 do = "run without --resume to start over"
                 got = f"parts of a run with another {', '.join(others)}"
                 raise TrackError(refusal(str(self.folder), expected="parts of this run", got=got, do=do))
@@ -145,17 +212,23 @@ class FolderStore:
     def known(self) -> Learnt | None:
         """What was learnt before the first frame; None if the file is missing or damaged."""
         try:
-            return Learnt.load(self.learnt)
+            return Learnt.load(self.folder / "learnt.h5")
         except TrackError:
             return None
 
     def keep(self, learnt: Learnt) -> None:
         """Write what was learnt."""
-        learnt.save(self.learnt)
+        learnt.save(self.folder / "learnt.h5")
 
     def write(self, batch: Batch, poses: list[Poses]) -> None:
         """Write the poses of one batch."""
-        write_poses(self.poses(batch), poses)
+        with whole_hdf5(self.poses(batch), "check the space left, then run again with --resume") as file:
+            file.attrs["schema"] = SCHEMA
+            file["count"] = np.array([len(one) for one in poses])
+            file["use"] = np.stack([one.use.numpy() for one in poses])
+            file["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
+            for name in POSE_PARTS:
+                file[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
 
     def read(self, batch: Batch) -> list[Poses]:
         """Return the poses of one batch; raise TrackError and remove the file if it is damaged."""
@@ -180,19 +253,8 @@ class FolderStore:
 Store = MemoryStore | FolderStore
 
 
-def write_poses(path: Path, poses: Sequence[Poses]) -> None:
-    """Write the poses of consecutive frames atomically; raise OutputError if the file cannot be written."""
-    with whole_hdf5(path, "check the space left, then run again with --resume") as file:
-        file.attrs["schema"] = SCHEMA
-        file["count"] = np.array([len(one) for one in poses])
-        file["use"] = np.stack([one.use.numpy() for one in poses])
-        file["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
-        for name in POSE_PARTS:
-            file[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
-
-
 def read_poses(path: Path) -> list[Poses] | None:
-    """Return what `write_poses` wrote; None if the file is not whole."""
+    """Return what `FolderStore.write` wrote; None if the file is not whole."""
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("schema") != SCHEMA:

@@ -18,7 +18,7 @@ from sphereorient.errors import CheckpointError, ShapeError
 from sphereorient.evaluate import score_track
 from sphereorient.files.provenance import sha256
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
-from sphereorient.learn.pictures import film_with
+from sphereorient.learn.pictures import film
 from sphereorient.learn.proposer import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.learn.settings import PictureSettings
 from sphereorient.methods.proposers import paper_proposer, precise_proposer
@@ -46,7 +46,7 @@ def network(texture: torch.Tensor) -> LearnedProposer:
 def filmed(texture: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     rng = torch.Generator().manual_seed(3)
     R = random_rotations(48, generator=rng)
-    return film_with(texture, R.float(), {"read_noise": 6.0}, rng, PictureSettings()), R
+    return film(texture, R.float(), {"read_noise": 6.0}, rng, PictureSettings()), R
 
 
 def check_excerpt(track: Trajectory, median_deg: float, proposer: Path) -> None:

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 from sphereorient.cli import app
 from sphereorient.errors import SphereOrientError
-from sphereorient.learn.benchmark import LEVELS
 from sphereorient.learn.checkpoint import Checkpoint, save_checkpoint
+from sphereorient.learn.metrics import LEVELS
 from sphereorient.learn.settings import ProposerSettings
 from sphereorient.methods.settings import load_proposer_settings, proposer_settings_yaml
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.learn.density import find_modes, first_right, smoothed_target
+from sphereorient.learn.network import find_modes, first_right, smoothed_target
 
 GRID = so3.lattman_grid(math.radians(15.0)).float()
 SPREAD = math.radians(8.0)

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.learn.density import find_modes, first_right
 from sphereorient.learn.metrics import cross_entropy, predict
-from sphereorient.learn.network import SCALES, Correlator, map_blurs
+from sphereorient.learn.network import SCALES, Correlator, find_modes, first_right, map_blurs
 from sphereorient.learn.pictures import TrainingBatch
 from sphereorient.sphere.texture_table import octahedral_directions
 from sphereorient.synth.textures import map_directions, random_texture

@@ -13,10 +13,10 @@ from learn_examples import tiny
 
 from sphereorient.errors import SettingsError
 from sphereorient.learn import pictures as module
-from sphereorient.learn.benchmark import BENCHMARK_SEED, MAPS, clean_views
-from sphereorient.learn.module import TrainingData
+from sphereorient.learn.metrics import BENCHMARK_SEED, MAPS, clean_views
 from sphereorient.learn.pictures import VALIDATION_SEED, draw_batch, draw_values, generator_of, make_textures, value_at
 from sphereorient.learn.settings import PictureSettings, ProposerSettings
+from sphereorient.learn.train import TrainingData
 from sphereorient.synth import random_texture
 from sphereorient.synth.disks import DISK_DEGRADATIONS
 from sphereorient.synth.severities import DEGRADATIONS

@@ -15,9 +15,8 @@ from learn_examples import TINY, state_of, tiny, untrained
 from sphereorient.errors import CheckpointError, SettingsError
 from sphereorient.learn.checkpoint import Checkpoint, correlator_of, load_checkpoint, save_checkpoint, texture_sha256
 from sphereorient.learn.metrics import Predictions, fitted_temperature, metrics_of
-from sphereorient.learn.module import ProposerModule
 from sphereorient.learn.settings import ProposerSettings
-from sphereorient.learn.train import Trained, train_proposer
+from sphereorient.learn.train import ProposerModule, Trained, train_proposer
 from sphereorient.sphere import load_texture
 from sphereorient.synth import random_texture
 
@@ -267,7 +266,7 @@ def test_judging_counts_right_and_wrong(rng):
 def test_the_network_of_the_checkpoint_is_as_good_as_the_log_says(trained):
     """Loaded anew, on the same validation pictures."""
     from sphereorient.learn.metrics import predict_all
-    from sphereorient.learn.module import TrainingData
+    from sphereorient.learn.train import TrainingData
 
     loaded = load_checkpoint(trained[1] / "proposer.ckpt")
     network = correlator_of(loaded)

@@ -8,7 +8,7 @@ import pytest
 from movie_examples import pictures
 
 from sphereorient.errors import MovieError
-from sphereorient.movies.grey import check_format, grey_dtype, grey_values
+from sphereorient.movies.video import check_format, grey_dtype, grey_values
 
 
 def turned_over(frame: av.VideoFrame) -> av.VideoFrame:

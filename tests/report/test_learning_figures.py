@@ -6,7 +6,7 @@ import pytest
 import torch
 from matplotlib.colors import to_hex
 
-from sphereorient.learn.benchmark import Example
+from sphereorient.learn.metrics import Example
 from sphereorient.report.learning import RIGHT, WRONG, examples_figure, learning_curve_figure
 from sphereorient.report.plots.style import write_figure
 

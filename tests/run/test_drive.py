@@ -15,8 +15,7 @@ from run_examples import EXCERPT, SHORT, SHORT_BLOCKS, datasets, run
 from sphereorient.errors import SettingsError
 from sphereorient.methods.settings import Settings, load_settings
 from sphereorient.run import Request, run_many
-from sphereorient.run.executors import ProcessExecutor, dask_executor
-from sphereorient.run.many import tracks_of
+from sphereorient.run.many import ProcessExecutor, dask_executor, tracks_of
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,9 @@
-"""`sphereorient movie` and `convert`."""
+"""`sphereorient check`, `movie` and `convert`: what goes in, before a run."""
 
 from __future__ import annotations
 
 import re
+import shutil
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -10,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import Advance, app, check_writable, frame_range, progress_bar
+from sphereorient.cli.app import Advance, app, check_writable, echo_lines, progress_bar
+from sphereorient.cli.options import ExperimentPath, Overrides, Quiet, SettingsPath, frames_of
 from sphereorient.errors import MovieError, OutputError, refusal
 from sphereorient.files.outputs import put_aside
 
@@ -20,15 +22,66 @@ if TYPE_CHECKING:
 
     from sphereorient.movies import Grey, Movie
     from sphereorient.movies.survey import Survey
+    from sphereorient.preflight import Finding
 
 Source = Annotated[
     str, typer.Argument(metavar="FILE", help="A movie, a folder of pictures, a pattern, or file.h5::dataset.")
 ]
 Flip = Annotated[str, typer.Option(help="Mirror: none, vertical (rows), horizontal (columns), both.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
 SHOWN = 12  # numbers of frames named in a line
 LINE = 100  # characters
 UNEVEN = 1e-3  # of the usual time between frames
+EXIT_FAULT = 1  # a run fails, or its numbers are wrong
+COLOURS = {"ok": typer.colors.GREEN, "warning": typer.colors.YELLOW, "fault": typer.colors.RED}
+MARK, TITLE = 9, 25  # columns of the list
+
+
+@app.command()
+def check(
+    experiment: ExperimentPath,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Figure to write (.png, .pdf); EXPERIMENT.check.png here without it."),
+    ] = None,
+    settings: SettingsPath = None,
+    set_: Overrides = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and only warnings and faults.")] = False,
+) -> None:
+    """Check an experiment in seconds before tracking: findings, and what to do. Exit code 1: there is a fault."""
+    picture = Path(f"{experiment.stem}.check.png") if out is None else out
+    check_writable(picture)
+    from sphereorient.methods.settings import load_settings
+    from sphereorient.preflight import Severity, preflight
+    from sphereorient.report import preflight_figure
+
+    chosen = load_settings(settings, set_ or [])
+    with progress_bar(quiet) as advance:
+        result = preflight(experiment, chosen, advance)
+        advance("figure", 0, 1)
+        with put_aside(picture) as partial:
+            preflight_figure(result, partial)
+        advance("figure", 1, 1)
+    _print_findings(result.findings, quiet)
+    if not quiet:
+        counts = [sum(one.severity is severity for one in result.findings) for severity in Severity]
+        typer.echo(f"faults: {counts[2]}, warnings: {counts[1]}, without complaint: {counts[0]}. Wrote {picture}")
+    if result.severity is Severity.FAULT:
+        raise typer.Exit(EXIT_FAULT)
+
+
+def _print_findings(findings: Sequence[Finding], quiet: bool) -> None:
+    """Print a paragraph for each finding: mark, title, measurement; below it the advice."""
+    width = max(60, shutil.get_terminal_size().columns)
+    margin = " " * (MARK + TITLE)
+    for finding in findings:
+        if quiet and finding.severity == "ok":
+            continue
+        mark = typer.style(f"{finding.severity:{MARK}}", fg=COLOURS[finding.severity], bold=finding.severity != "ok")
+        measured = textwrap.wrap(finding.measured, width - len(margin)) or [""]
+        advice = f"do: {finding.advice}" if finding.advice else ""
+        typer.echo(f"{mark}{finding.title:{TITLE}}{measured[0]}")
+        below = measured[1:] + textwrap.wrap(advice, width - len(margin), subsequent_indent="    ")
+        echo_lines(margin + line for line in below)
 
 
 @app.command("movie")
@@ -51,12 +104,12 @@ def show_movie(
 
     with flipped(open_movie(source), flip) as opened:
         with progress_bar(quiet) as advance:
-            seen = survey(opened, count, every, lambda done, total: advance("look", done, total))
+            seen = survey(opened, count, every, lambda *at: advance("look", *at))
             advance("sheet", 0, 1)
             with put_aside(sheet) as partial:
                 contact_sheet(opened, seen, partial)
             advance("sheet", 1, 1)
-        for title, text in [*_facts(opened), *_findings(opened, seen), ("sheet", str(sheet))]:
+        for title, text in [*_facts(opened, seen), ("sheet", str(sheet))]:
             typer.echo(textwrap.fill(text, LINE, initial_indent=f"{title:14}", subsequent_indent=" " * 14))
 
 
@@ -85,22 +138,22 @@ def convert(
             count = write_movie(target, _pictures(opened, first, last, dead, advance), times_s, rate)
         if quiet:
             return
-        for remark in opened.remarks:
-            typer.echo(f"{source}: {remark}")
+        echo_lines(f"{source}: {remark}" for remark in opened.remarks)
         if dead:
             left = "black" if target.suffix.lower() == ".mkv" else "left out, still counted"
-            typer.echo(f"Not decodable, {left}: {_frames(len(dead))}, {_numbers(dead)}")
+            typer.echo(f"Not decodable, {left}: {_numbers(dead, ', ')}")
         typer.echo(f"Wrote {target}: {_frames(count)}" + (f", {first} .. {last - 1} of the movie" if first else ""))
         if times_s is not None and target.suffix.lower() == ".mkv":
             typer.echo(f"Wrote {times_path(target)}: their times (experiment.yaml, times:)")
 
 
-def _facts(opened: Movie) -> list[tuple[str, str]]:
-    """Return the properties of the file, as title and text."""
+def _facts(opened: Movie, seen: Survey) -> list[tuple[str, str]]:
+    """Return the properties of the file and the result of the survey, as title and text."""
     from sphereorient.movies import movie_files
 
     height, width = opened.frame_shape
     size = sum(file.stat().st_size for file in movie_files(opened.path))
+    whole = "all frames" if seen.looked == len(opened) else f"{seen.looked} of {len(opened)} frames"
     return [
         ("file", f"{opened.path}" + (f", {size / 1e6:.1f} MB" if size else "")),
         ("format", opened.format),
@@ -108,16 +161,9 @@ def _facts(opened: Movie) -> list[tuple[str, str]]:
         ("frames", str(len(opened))),
         ("times", _times(opened.times_s)),
         *(("remark", remark) for remark in opened.remarks),
+        ("looked at", f"{whole}: grey levels {seen.lowest} .. {seen.highest}"),
+        *((fault, _numbers(numbers) if numbers else "none") for fault, numbers in seen.faults.items()),
     ]
-
-
-def _findings(opened: Movie, seen: Survey) -> list[tuple[str, str]]:
-    """Return the result of the survey, as title and text."""
-    whole = "all frames" if seen.looked == len(opened) else f"{seen.looked} of {len(opened)} frames"
-    lines = [("looked at", f"{whole}: grey levels {seen.lowest} .. {seen.highest}")]
-    for fault, numbers in seen.faults.items():
-        lines.append((fault, f"{_frames(len(numbers))}: {_numbers(numbers)}" if numbers else "none"))
-    return lines
 
 
 def _times(times_s: NDArray[np.float64] | None) -> str:
@@ -142,9 +188,9 @@ def _frames(count: int) -> str:
     return "1 frame" if count == 1 else f"{count} frames"
 
 
-def _numbers(numbers: Sequence[int]) -> str:
+def _numbers(numbers: Sequence[int], after: str = ": ") -> str:
     more = f" and {len(numbers) - SHOWN} more" if len(numbers) > SHOWN else ""
-    return ", ".join(map(str, numbers[:SHOWN])) + more
+    return _frames(len(numbers)) + after + ", ".join(map(str, numbers[:SHOWN])) + more
 
 
 def _stem(source: str) -> str:
@@ -153,7 +199,7 @@ def _stem(source: str) -> str:
 
 
 def _range(text: str, opened: Movie) -> tuple[int, int]:
-    found = frame_range(text)
+    found = frames_of(text)
     first, last = (found[0] or 0, len(opened) if found[1] is None else found[1]) if found else (0, 0)
     if not 0 <= first < last <= len(opened):
         expected, do = f"A:B within 0:{len(opened)}, A below B", "correct --frames"

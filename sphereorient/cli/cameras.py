@@ -1,0 +1,177 @@
+"""`sphereorient calibrate`, `check-cameras` and `convert-cameras`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
+from sphereorient.cli.options import ExperimentPath, cameras_of
+from sphereorient.errors import CameraError, ExperimentError, OutputError, refusal
+from sphereorient.files.outputs import put_aside
+
+if TYPE_CHECKING:
+    from sphereorient.cameras import Camera
+
+OPENCV = (".yml", ".yaml", ".xml", ".json")
+MADE_BY = "X_cam = R X_lab + T, mm; made by"
+
+
+@app.command()
+def calibrate(
+    source: Annotated[
+        Path, typer.Argument(metavar="FILE", help="calibration.yaml; with --refine-with the cameras.yaml to repair.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="cameras.yaml to write; its picture goes beside it.")],
+    refine_with: Annotated[
+        Path | None, typer.Option(help="track.h5 made with these cameras: repair them by the sphere itself.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no tables.")] = False,
+) -> None:
+    """Calibrate cameras from pictures of a plate, or repair cameras that moved, from a track of both."""
+    check_writable(out)
+    check_other_yaml(out, source)
+    if refine_with is not None:
+        _repair(source, refine_with, out, quiet)
+        return
+    from sphereorient.calibration import calibrate_cameras
+    from sphereorient.cameras import save_cameras
+    from sphereorient.report import calibration_figure
+
+    with progress_bar(quiet) as advance:
+        result = calibrate_cameras(source, advance)
+    picture = out.with_suffix(".png")
+    with put_aside(picture) as partial:
+        calibration_figure(result, partial)
+        save_cameras(out, result.cameras, f"{MADE_BY} {command_line()}", result.covariance)
+    if quiet:
+        return
+    from rich.console import Console
+
+    from sphereorient.calibration.table import parameters_table, pictures_table, summary
+
+    console = Console()
+    console.print(pictures_table(result))
+    console.print(parameters_table(result))
+    echo_lines([*summary(result), f"Wrote {out} and {picture}"])
+
+
+def _repair(cameras: Path, track: Path, out: Path, quiet: bool) -> None:
+    from sphereorient.calibration import refine_with_track
+    from sphereorient.calibration.table import repair_lines
+    from sphereorient.cameras import load_cameras, save_cameras
+
+    result = refine_with_track(cameras, track)
+    save_cameras(out, load_cameras(cameras) | dict(result.cameras), f"repaired by {command_line()}")
+    if not quiet:
+        echo_lines([*repair_lines(result), f"Wrote {out}. Track again with it; a second repair is finer still."])
+
+
+@app.command("check-cameras")
+def check_cameras_command(
+    experiment: ExperimentPath,
+    track: Annotated[
+        Path | None, typer.Option(help="track.h5 of this experiment; without it the movies are tracked first.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Report how far the cameras' lines of sight to the sphere miss each other, over a movie."""
+    from sphereorient.calibration import check_cameras
+    from sphereorient.calibration.table import check_lines, contradiction_lines
+    from sphereorient.experiment import load_experiment
+    from sphereorient.run.stages import track_movies
+    from sphereorient.trajectory import Trajectory
+
+    known = load_experiment(experiment)
+    if len(known.cameras) < 2:
+        do = "name an experiment of two cameras"
+        raise ExperimentError(refusal(str(experiment), expected="two cameras or more", got="one", do=do))
+    if track is not None:
+        result = Trajectory.load(track)
+    else:
+        with progress_bar(quiet) as advance:
+            result = track_movies(known, progress=advance)
+    lines = check_lines(check_cameras(known.cameras, result)) or ["no frame in which two cameras see the sphere"]
+    echo_lines([*lines, *contradiction_lines(result)])
+
+
+def check_other_yaml(out: Path, source: Path) -> None:
+    """Refuse to write cameras over their source, or to a name that does not end in .yaml."""
+    do = "choose another --out, such as cameras.yaml"
+    if out.suffix not in (".yaml", ".yml"):
+        raise OutputError(refusal(f"--out {out}", expected="a name that ends in .yaml", got=f"'{out.name}'", do=do))
+    if out.resolve() == source.resolve():
+        raise OutputError(refusal(f"--out {out}", expected="another file than the input", got="the input", do=do))
+
+
+@app.command("convert-cameras")
+def convert_cameras(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE...", help="One file a camera: OpenCV's .yml, .yaml, .xml, .json or OpenPTV's .ori"
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="cameras.yaml to write.")],
+    names: Annotated[
+        str | None, typer.Option(help="Names of the cameras, such as cam1,cam2; otherwise those of the files.")
+    ] = None,
+    image_size: Annotated[
+        str | None, typer.Option(metavar="W,H", help="Picture size, px, for OpenCV files without it.")
+    ] = None,
+    par: Annotated[
+        Path | None, typer.Option(help="OpenPTV's ptv.par: sensor, indices, thickness of the wall. Needed for .ori.")
+    ] = None,
+) -> None:
+    """Convert cameras of OpenCV or OpenPTV to cameras.yaml. A .addpar beside its .ori is read too."""
+    check_writable(out)
+    for source in sources:
+        check_other_yaml(out, source)
+    known = _names(sources, names)
+    size = _size(image_size)
+    from sphereorient.cameras import save_cameras
+
+    cameras = {name: _load(source, size, par) for name, source in zip(known, sources, strict=True)}
+    save_cameras(out, cameras, f"{MADE_BY} {command_line()}")
+    typer.echo(f"Wrote {out}: {', '.join(cameras)}")
+
+
+def _load(source: Path, image_size: tuple[int, int] | None, par: Path | None) -> Camera:
+    from sphereorient.cameras.io.opencv import load_opencv
+    from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par
+
+    if source.suffix in OPENCV:
+        return load_opencv(source, image_size)
+    if source.suffix != ".ori":
+        expected, do = f"a file ending in {', '.join(OPENCV)} or .ori", "name a calibration file of OpenCV or OpenPTV"
+        raise CameraError(refusal(str(source), expected=expected, got=f"'{source.name}'", do=do))
+    if par is None:
+        raise CameraError(refusal("--par", expected="OpenPTV's ptv.par", got="none", do="add --par parameters/ptv.par"))
+    addpar = source.with_suffix(".addpar")
+    return load_openptv(source, load_ptv_par(par), addpar if addpar.exists() else None)
+
+
+def _names(sources: list[Path], text: str | None) -> list[str]:
+    names = cameras_of(text)
+    if names is None:
+        names = [source.name.partition(".")[0] for source in sources]
+    if len(names) != len(sources):
+        got, do = f"{len(names)} for {len(sources)} files", "name every camera once, in the order of the files"
+        raise CameraError(refusal("--names", expected="one name a file", got=got, do=do))
+    if len(set(names)) < len(names):
+        got, do = ", ".join(names), "give each camera its own name, such as --names cam1,cam2"
+        raise CameraError(refusal("--names", expected="different names", got=got, do=do))
+    return names
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    found = re.fullmatch(r"\s*(\d{1,6})\s*,\s*(\d{1,6})\s*", text)
+    if found is None:
+        got, do = f"'{text[:20]}'", "write it as 1280,1024"
+        raise CameraError(refusal("--image-size", expected="width and height in pixels", got=got, do=do))
+    return int(found[1]), int(found[2])

@@ -1,0 +1,49 @@
+"""Options that several commands have, and what their texts mean."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from sphereorient.methods.settings import Settings
+
+ExperimentPath = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="experiment.yaml (docs/data-format.md)")]
+TrackPath = Annotated[Path, typer.Argument(metavar="TRACK", help="track.h5 that `sphereorient track` wrote.")]
+Cameras = Annotated[str | None, typer.Option(help="Use these cameras only, e.g. cam1 or cam1,cam2.")]
+SettingsPath = Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set locate.diameter_px=90.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
+
+
+def settings_of(path: Path | None, overrides: list[str] | None, method: str) -> Settings:
+    """Read the settings that a method reads, and print remarks on the others."""
+    from sphereorient.methods.settings import BRANCHES, read_settings
+
+    loaded = read_settings(path, overrides or [], method if method in BRANCHES else None)
+    for remark in loaded.remarks:
+        typer.echo(f"note: {remark}", err=True)
+    return loaded.settings
+
+
+def names_in(text: str) -> list[str]:
+    """Return the names in cam1,cam2."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def cameras_of(text: str | None) -> list[str] | None:
+    """Return the names in cam1,cam2; None without a text: all."""
+    return None if text is None else names_in(text)
+
+
+def frames_of(text: str) -> tuple[int | None, int | None] | None:
+    """Return first and last + 1 of A:B, None for an omitted end; None for another text."""
+    found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", text.strip())
+    if not found:
+        return None
+    return (int(found[1]) if found[1] else None, int(found[2]) if found[2] else None)

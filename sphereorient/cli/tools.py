@@ -1,0 +1,268 @@
+"""Tools beside tracking: `sphereorient spin`, the spin of a ball from photographs, and `texture`, the design of one."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
+from sphereorient.cli.options import Quiet, names_in
+from sphereorient.errors import OutputError, TextureError, refusal
+from sphereorient.files.outputs import put_aside
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from sphereorient.tools.design.judge import Judgement
+    from sphereorient.tools.spin.disks import Photographs
+    from sphereorient.tools.spin.spin import SpinFound
+
+SPREAD = ("min", "median", "max")
+HEIGHT_MAX = 1024  # of a map that is judged: finer than any picture shows
+
+
+@app.command()
+def spin(
+    photographs: Annotated[
+        list[Path], typer.Argument(metavar="PHOTOGRAPHS...", help="Pictures of one flight, or a folder of them.")
+    ],
+    times: Annotated[
+        str, typer.Option(help="Table .csv with file,t_s; or pictures a second, e.g. 400, at equal intervals.")
+    ],
+    texture: Annotated[Path, typer.Option(help="Table of dots .csv (x,y,z a line), or a texture map .png.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Result to write, .json; a figure .png goes beside it.")],
+    dot_radius: Annotated[
+        float | None, typer.Option(help="Radius of the dots, degrees on the ball; else it is measured in the pictures.")
+    ] = None,
+    omega_max: Annotated[float, typer.Option(min=1e-3, help="Fastest spin, rad/s.")] = 2 * math.pi * 300,
+    quiet: Quiet = False,
+) -> None:
+    """Measure angular velocity and attitudes of a spinning ball from photographs (docs/photographs.md)."""
+    if out.suffix.lower() != ".json":
+        do = "choose a name such as spin.json"
+        raise OutputError(refusal(f"--out {out}", expected=".json", got=out.suffix or "no ending", do=do))
+    check_writable(out)
+    from sphereorient.report.plots.style import write_figure
+    from sphereorient.tools.spin.dots import DotTable
+    from sphereorient.tools.spin.figure import spin_figure
+    from sphereorient.tools.spin.inputs import load_ball, load_photographs
+    from sphereorient.tools.spin.spin import SpinSettings, spin_of
+
+    ball = load_ball(texture, dot_radius)
+    loaded, settings = load_photographs(photographs, times), SpinSettings(omega_max_rad_s=omega_max)
+    with progress_bar(quiet, unit="photographs") as advance:
+        found = spin_of(loaded, ball, settings, advance)
+        if isinstance(ball, DotTable) and dot_radius is None:
+            ball = ball.measured(found.disks, found.R_view_body)
+            found = spin_of(loaded, ball, settings, lambda stage, *rest: advance(f"{stage}, dots measured", *rest))
+    result = _spin_document(found, loaded)
+    if isinstance(ball, DotTable):
+        result["dot_radius_deg"] = ball.radius_deg
+    with put_aside(out) as aside:
+        aside.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    drawn = ball.texture() if isinstance(ball, DotTable) else ball
+    names = [Path(name).stem for name in loaded.names]
+    write_figure(spin_figure(found, drawn, loaded.time_s, names), out.with_suffix(".png"))
+    if not quiet:
+        _print_spin(result)
+        typer.echo(f"Wrote {out}, {out.with_suffix('.png')}")
+
+
+def _spin_document(found: SpinFound, photographs: Photographs) -> dict[str, Any]:
+    """Return the result for JSON; null: not measured."""
+    spins, sigma = found.spins, found.spins.rate_sigma()
+    rate = spins.omega_view_rad_s.norm(dim=-1)
+    return {
+        "command": command_line(),
+        "frame": "view: x right, y down, z from the camera to the ball",
+        "spins": [
+            {
+                "omega_view_rad_s": spins.omega_view_rad_s[k].tolist(),
+                "omega_covariance": spins.covariance[k, 3:, 3:].tolist(),
+                "rate_rad_s": float(rate[k]),
+                "rate_sigma_rad_s": float(sigma[k]),
+                "R0_view_body": spins.R0_view_body[k].tolist(),
+                "time0_s": float(spins.time0_s[k]),
+                "evidence": float(spins.evidence[k]),
+                "distinguished": k >= found.ambiguous,
+            }
+            for k in range(len(spins))
+        ],
+        "ambiguous": found.ambiguous,
+        "mirrored_evidence": found.mirrored_evidence,
+        "photographs": [
+            {
+                "file": name,
+                "time_s": float(photographs.time_s[k]),
+                "R_view_body": found.R_view_body[k].tolist(),
+                "residual_deg": math.degrees(residual) if math.isfinite(residual) else None,
+                "score": float(found.score[k]),
+                "evidence": float(found.evidence[0, k]),
+            }
+            for k, (name, residual) in enumerate(zip(photographs.names, found.residual_rad.tolist(), strict=True))
+        ],
+    }
+
+
+def _print_spin(result: dict[str, Any]) -> None:
+    """Print each spin, and how well the photographs follow the first."""
+    for k, one in enumerate(result["spins"]):
+        omega = ", ".join(f"{each:.1f}" for each in one["omega_view_rad_s"])
+        rate, sigma = one["rate_rad_s"], one["rate_sigma_rad_s"]
+        ambiguous = result["ambiguous"] > 1 and not one["distinguished"]
+        words = "; alias that the times do not exclude" if ambiguous and k else "" if not k else "; less likely"
+        typer.echo(
+            f"omega ({omega}) rad/s, |omega| {rate:.1f} +- {sigma:.1f} rad/s = {rate / (2 * math.pi):.2f} turns/s, "
+            f"evidence {one['evidence']:.0f}{words}"
+        )
+    followed = [one["residual_deg"] for one in result["photographs"] if one["residual_deg"] is not None]
+    typer.echo(
+        f"photographs: {len(followed)} of {len(result['photographs'])} follow the spin, "
+        f"off by {sum(followed) / max(len(followed), 1):.1f}° on average"
+    )
+    typer.echo(f"mirrored texture: evidence {result['mirrored_evidence']:.0f}")
+    if "dot_radius_deg" in result:
+        typer.echo(f"dots: radius {result['dot_radius_deg']:.1f}°")
+
+
+texture_app = typer.Typer(help="Judge, make and print a texture map (docs/paint-design.md).", no_args_is_help=True)
+app.add_typer(texture_app, name="texture")
+
+
+@texture_app.callback()
+def texture() -> None:
+    """Judge, make and print a texture map (docs/paint-design.md)."""
+
+
+@texture_app.command()
+def design(
+    map_: Annotated[
+        Path | None, typer.Argument(metavar="[MAP.png]", help="Map to judge; without it --make makes one.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for judgement, picture, map and strips.")] = Path(
+        "design"
+    ),
+    make: Annotated[
+        bool, typer.Option("--make", help="Search for a map that is easy to paint and hard to confuse.")
+    ] = False,
+    kinds: Annotated[str, typer.Option(help="With --make: kinds of texture to try.")] = "blobs,patches,dots",
+    stroke: Annotated[
+        float, typer.Option(min=2, max=40, help="With --make: least width of the brush, degrees on the ball.")
+    ] = 10.0,
+    tries: Annotated[int, typer.Option(min=1, max=1000, help="With --make: maps of each kind.")] = 24,
+    seed: Annotated[int, typer.Option(help="With --make: the same seed gives the same map.")] = 0,
+    diameter_px: Annotated[float, typer.Option(min=12, max=400, help="Diameter of the ball's picture, px.")] = 80.0,
+    noise: Annotated[
+        float, typer.Option(min=0.001, max=1, help="Noise of a pixel over the step from black to white.")
+    ] = 0.05,
+    views: Annotated[int, typer.Option(min=12, max=2000, help="Views that are judged.")] = 96,
+    gores: Annotated[int | None, typer.Option(help="Print so many strips, e.g. 12; needs --diameter-mm.")] = None,
+    diameter_mm: Annotated[float | None, typer.Option(help="Diameter of the ball, mm.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the judgement as JSON.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")] = False,
+) -> None:
+    """Judge a map before it is painted, or make one; print it on strips that wrap the ball."""
+    _check_design(
+        map_, make, gores, diameter_mm, stroke, diameter_px, noise, 0.0 if diameter_mm is None else diameter_mm
+    )
+    check_writable(out)
+    from sphereorient.tools.design.gores import Gores, write_gores
+    from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture
+
+    strips = Gores(count=gores, diameter_mm=diameter_mm) if gores is not None and diameter_mm is not None else None
+    settings = DesignSettings(diameter_px=diameter_px, noise_share=noise, views=views)
+    if map_ is not None:
+        title, drawn = map_.name, _loaded(map_)
+        judgement = judge_texture(drawn, settings)
+    else:
+        with progress_bar(quiet or as_json, unit="maps") as advance:
+            drawn, judgement, title = design_texture(
+                names_in(kinds), stroke, settings, tries=tries, seed=seed, advance=lambda *at: advance("search", *at)
+            )
+    files = _written(out, drawn, judgement, title, make=map_ is None)
+    if strips is not None:
+        files += write_gores(drawn, strips, out)
+    if as_json:
+        typer.echo(json.dumps({"map": title, **judgement.as_dict()}))
+    elif not quiet:
+        _print_judgement(judgement, title)
+        typer.echo("Wrote " + ", ".join(str(file) for file in files))
+
+
+def _check_design(map_: Path | None, make: bool, gores: int | None, diameter_mm: float | None, *numbers: float) -> None:
+    """Refuse options that contradict each other, nan and infinity."""
+    if make == (map_ is not None):
+        got, do = ("both", "leave one of them away") if make else ("neither", "name a map, or say --make")
+        raise TextureError(refusal("texture design", expected="a map to judge or --make", got=got, do=do))
+    if (gores is None) != (diameter_mm is None):
+        got = "--gores alone" if diameter_mm is None else "--diameter-mm alone"
+        raise TextureError(refusal("strips", expected="--gores and --diameter-mm", got=got, do="give both"))
+    if not all(math.isfinite(number) for number in numbers):
+        do = "correct the option"
+        raise TextureError(refusal("texture design", expected="numbers", got="nan or infinity", do=do))
+
+
+def _loaded(path: Path) -> Tensor:
+    """Read a map, averaged down where it is finer than any picture shows."""
+    from sphereorient.sphere import load_texture, reduced_texture
+
+    drawn = load_texture(path)
+    height = drawn.shape[0]
+    return drawn if height <= HEIGHT_MAX else reduced_texture(drawn, 2 * HEIGHT_MAX / math.pi)
+
+
+def _written(out: Path, drawn: Tensor, judgement: Judgement, title: str, *, make: bool) -> list[Path]:
+    """Write judgement and figure, and the map where it was made; return the files."""
+    from sphereorient.report.map_files import write_texture
+    from sphereorient.report.plots.style import write_figure
+    from sphereorient.tools.design.figure import design_figure
+
+    try:
+        out.mkdir(exist_ok=True)
+    except OSError as error:
+        do = "choose another --out"
+        raise OutputError(refusal(f"--out {out}", expected="a folder", got=str(error.strerror), do=do)) from error
+    files = [out / "judgement.json", out / "design.png"]
+    with put_aside(files[0]) as aside:
+        about = {"map": title, "command": command_line(), **judgement.as_dict()}
+        aside.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    write_figure(design_figure(drawn, judgement, title), files[1])
+    if make:
+        files.append(out / "texture.png")
+        write_texture(drawn, files[-1])
+    return files
+
+
+def _print_judgement(judgement: Judgement, title: str) -> None:
+    """Print the judgement as a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    told = judgement.as_dict()
+    table = Table(title, "least", "middle", "most", title="judgement", title_justify="left")
+    white, bound = told["white_share"], told["bound_deg"]
+    table.add_row("white in a view, %", *(_number(white[name], 100, 0) for name in SPREAD))
+    table.add_row("best possible error of a view, degrees", *(_number(bound[name], 1, 3) for name in SPREAD))
+    Console().print(table)
+    settings = judgement.settings
+    lines = [
+        f"(ball of {settings.diameter_px:g} px, noise {100 * settings.noise_share:g} % of black to white, "
+        f"{settings.views} views, position of the ball unknown)",
+        f"worst view: {_place(told['worst_view_lon_lat_deg'])}; best: {_place(told['best_view_lon_lat_deg'])}",
+        f"most similar views, {told['most_alike_apart_deg']:.0f} degrees apart: similarity {judgement.alike:.2f}, "
+        f"margin {judgement.margin:.2f}: {' and '.join(_place(each) for each in told['most_alike_lon_lat_deg'])}",
+        f"widest brush that paints it: {judgement.stroke_deg:.0f} degrees; borders {judgement.border:.1f} radii long",
+    ]
+    echo_lines(lines)
+
+
+def _number(value: float | None, times: float, digits: int) -> str:
+    return "undetermined" if value is None else f"{times * value:.{digits}f}"
+
+
+def _place(lon_lat_deg: list[float]) -> str:
+    return f"longitude {lon_lat_deg[0]:.0f}, latitude {lon_lat_deg[1]:.0f}"
