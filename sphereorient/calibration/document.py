@@ -13,12 +13,12 @@ from torch import Tensor
 
 from sphereorient.calibration.targets import CalibrationTarget, plate_from_entry
 from sphereorient.cameras import Port
-from sphereorient.cameras.checks import camera_error
+from sphereorient.cameras.checks import camera_error, check_known
 from sphereorient.cameras.io.cameras_yaml import PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
 from sphereorient.errors import CameraError
 from sphereorient.files.whole_file import TABLE_BYTES, read_whole
-from sphereorient.files.yaml_file import read_document, refuse_unknown, short, validated
+from sphereorient.files.yaml_file import read_document, short, validated
 
 SCHEMA = "sphereorient-calibration/1"
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: rounding to four digits after the point
@@ -165,9 +165,7 @@ def _check_ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) ->
         if name not in cameras:
             do = f"name one of {', '.join(cameras)}"
             raise camera_error(f"{path}, ports", "a camera with pictures", f"'{name}'", do)
-    for name in keys.fit_ports:
-        if name not in (*PORT_NUMBERS, *PORT_TILT):
-            raise CameraError(refuse_unknown(name, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports"))
+    check_known(keys.fit_ports, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports")
     if keys.fit_ports and not keys.ports:
         do = "write under `ports` where the walls are, as well as you know"
         raise camera_error(f"{path}, fit_ports", "ports to fit", "none", do)

@@ -8,7 +8,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from sphereorient.calibration.ellipse import Dots, fit_ellipses, half_box
 from sphereorient.calibration.targets import Floats
 from sphereorient.cameras.checks import camera_error
-from sphereorient.errors import CameraError, refusal
 
 _Chain = list[tuple[Floats, Floats, float]]  # centre, shape and area of a blob, one for each grey level
 
@@ -61,7 +60,7 @@ def as_grey(picture: NDArray[np.generic]) -> NDArray[np.float32]:
     """Return a grey picture (H, W), 16 x 16 px or more, as float32; CameraError for anything else or NaN."""
     if picture.ndim != 2 or min(picture.shape) < 16:
         do = "convert it to one grey picture"
-        raise CameraError(refusal("plate picture", expected="(H, W) of 16 px or more", got=f"{picture.shape}", do=do))
+        raise camera_error("plate picture", "(H, W) of 16 px or more", f"{picture.shape}", do)
     grey = picture.astype(np.float32)
     if not np.isfinite(grey).all():
         raise camera_error("plate picture", "grey values", "NaN", "export it again")

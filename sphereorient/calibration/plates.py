@@ -18,7 +18,7 @@ from sphereorient.calibration.guess import guess_from_points, guess_rig
 from sphereorient.calibration.plate_view import PlateView, placed
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.cameras.checks import camera_error
-from sphereorient.errors import CameraError, refusal
+from sphereorient.errors import CameraError
 from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 
@@ -144,7 +144,7 @@ def _check_seen(
         if not any(picture in tied for picture in of_camera):
             do = "check plate: in the file, and the pictures"
             got = f"none of {len(of_camera)}; the first: {views[of_camera[0]].reason}"
-            raise CameraError(refusal(f"{document.path}, {name}", expected="pictures of the plate", got=got, do=do))
+            raise camera_error(f"{document.path}, {name}", "pictures of the plate", got, do)
 
 
 def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView]) -> Rig:
@@ -220,7 +220,7 @@ def _check_determined(document: CalibrationDocument, fitted: Fitted) -> None:
         named = ", ".join(text for _, text in sorted(loose, reverse=True)[:3])
         do = "add pictures of the plate in other poses: tilted about both axes, nearer and farther"
         expected = "poses that determine all parameters of the cameras"
-        raise CameraError(refusal(str(document.path), expected=expected, got=f"loose: {named}", do=do))
+        raise camera_error(str(document.path), expected, f"loose: {named}", do)
 
 
 def _sigmas(camera: Camera) -> dict[str, float]:

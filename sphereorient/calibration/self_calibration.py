@@ -13,8 +13,9 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, triangulate
+from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
-from sphereorient.errors import CameraError, TrackError, refusal
+from sphereorient.errors import TrackError
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.trajectory import Reason, Trajectory
 
@@ -115,7 +116,7 @@ def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraO
     names = list(cameras)
     if len(names) < 2:
         do = "give the track of both cameras"
-        raise CameraError(refusal("cameras", expected="two or more that saw the ball", got=f"{len(names)}", do=do))
+        raise camera_error("cameras", "two or more that saw the ball", f"{len(names)}", do)
     first, repaired = names[0], dict(cameras)
     moved, sigma, held = {}, {}, [f"{first}: all (the lab frame)"]
     before, after = [], []
@@ -150,7 +151,7 @@ class _Pair:
         if int(both.sum()) < FRAMES_MIN:
             expected = f"{FRAMES_MIN} frames or more in which both cameras measure the ball's orientation"
             do = "pass a longer track, made with both cameras"
-            raise CameraError(refusal("track", expected=expected, got=f"{int(both.sum())}", do=do))
+            raise camera_error("track", expected, f"{int(both.sum())}", do)
         self.loose = loose
         self.ray = still.rays(seen.centre_px[both])
         self.centre_px = seen_loose.centre_px[both]

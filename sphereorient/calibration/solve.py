@@ -116,7 +116,7 @@ def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_
     size, least = len(names), -(-len(names) // 2)
     if len(x_lab_mm) < least:
         expected, got = f"{least} or more for {size} parameters", f"{len(x_lab_mm)}"
-        raise CameraError(refusal("points", expected=expected, got=got, do="add points, or hold some parameters"))
+        raise camera_error("points", expected, got, "add points, or hold some parameters")
     start = cast(AnyCamera, replace(cast(Any, camera), covariance=None))
 
     def expected_px(change: Tensor) -> Tensor:

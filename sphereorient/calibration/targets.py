@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.cameras.checks import camera_error
-from sphereorient.errors import CameraError, refusal
+from sphereorient.errors import CameraError
 from sphereorient.files.yaml_file import short
 
 Floats = NDArray[np.float64]
@@ -67,11 +67,11 @@ class DotPlate(CalibrationTarget):
         largest = 2 * self.pitch_mm - self.dot_diameter_mm
         if not self.dot_diameter_mm < self.pitch_mm or not self.fiducial_diameter_mm < largest:
             got = f"diameters {self.dot_diameter_mm:g} and {self.fiducial_diameter_mm:g} at pitch {self.pitch_mm:g}"
-            raise CameraError(refusal("plate", expected="dots that do not touch", got=got, do="measure the plate"))
+            raise camera_error("plate", "dots that do not touch", got, "measure the plate")
         if self.fiducial_diameter_mm < 1.15 * self.dot_diameter_mm:
             got = f"fiducials {self.fiducial_diameter_mm:g} mm, dots {self.dot_diameter_mm:g} mm"
             expected = "fiducials larger than the dots by 15 % or more"
-            raise CameraError(refusal("plate", expected=expected, got=got, do="measure the plate"))
+            raise camera_error("plate", expected, got, "measure the plate")
         marks = self.fiducials
         pairs = isinstance(marks, list | tuple) and all(isinstance(at, list | tuple) and len(at) == 2 for at in marks)
         axes = pairs and len(marks) == 3 and all(_is_whole(i) and abs(i) <= MOST for at in marks for i in at)
@@ -125,7 +125,7 @@ class Chessboard(CalibrationTarget):
         super().__post_init__()
         if min(self.columns, self.rows) < 3:
             got, do = f"{self.columns} x {self.rows}", "count the corners between squares, without the border"
-            raise CameraError(refusal("plate", expected="3 x 3 inner corners or more", got=got, do=do))
+            raise camera_error("plate", "3 x 3 inner corners or more", got, do)
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -147,7 +147,7 @@ class CharucoBoard(CalibrationTarget):
         super().__post_init__()
         if self.marker_mm >= self.pitch_mm:
             got, do = f"{self.marker_mm:g} mm in {self.pitch_mm:g} mm", "measure the board"
-            raise CameraError(refusal("plate, marker", expected="smaller than its square", got=got, do=do))
+            raise camera_error("plate, marker", "smaller than its square", got, do)
         name, do = self.dictionary, "look up the dictionary that the board was drawn with"
         if not isinstance(name, str) or not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
             raise _refused("plate, dictionary", "a name of OpenCV's, such as DICT_4X4_50", name, do)
@@ -183,7 +183,7 @@ class CircleGrid(CalibrationTarget):
         nearest = self.pitch_mm * (np.sqrt(2) if self.asymmetric else 1)
         if self.dot_diameter_mm >= nearest:
             got, do = f"{self.dot_diameter_mm:g} mm, {nearest:g} mm apart", "measure the plate"
-            raise CameraError(refusal("plate, dot_diameter", expected="circles that do not touch", got=got, do=do))
+            raise camera_error("plate, dot_diameter", "circles that do not touch", got, do)
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -220,7 +220,7 @@ def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> Calib
     if missing or unknown:
         faults = {"no": missing, "unknown": unknown}
         got = "; ".join(f"{what} {', '.join(which)}" for what, which in faults.items() if which)
-        raise CameraError(refusal(name, expected=f"the keys {', '.join(keys)}", got=got, do="correct the plate"))
+        raise camera_error(name, f"the keys {', '.join(keys)}", got, "correct the plate")
     values = {keys[key][0]: value for key, value in entry.items() if key != "type"}
     if "dots" in entry:
         if entry["dots"] not in ("dark", "bright"):
@@ -241,4 +241,4 @@ def _is_whole(value: object) -> bool:
 
 
 def _refused(name: str, expected: str, got: object, do: str = "correct the plate") -> CameraError:
-    return CameraError(refusal(name, expected=expected, got=short(got), do=do))
+    return camera_error(name, expected, short(got), do)

@@ -80,12 +80,12 @@ def calibrate_tsai(
     for name in also:
         if name not in ALSO:
             do = "leave it out: the others are fitted, and the pixel pitch is held"
-            raise CameraError(refusal("also", expected=f"some of {', '.join(ALSO)}", got=f"'{name}'", do=do))
+            raise camera_error("also", f"some of {', '.join(ALSO)}", f"'{name}'", do)
     camera = tsai_stages(x_lab_mm, uv_px, image_size, pixel_pitch_mm)
     points, pixels = checked_points(x_lab_mm, uv_px)
     if "sx" in also and _Frame.of(points).relief < FLAT:
         do = "leave out sx, or add points off the plane"
-        raise CameraError(refusal("also, sx", expected="points that fill space", got="points in one plane", do=do))
+        raise camera_error("also, sx", "points that fill space", "points in one plane", do)
     camera = fit_to_points(camera, (*FREE, *also), points, pixels)
     _check_fit(camera, points, pixels)
     return camera
@@ -180,7 +180,7 @@ def _null_vector(equations: Tensor) -> Tensor:
     _, size, right = torch.linalg.svd(equations / scale, full_matrices=n < k)
     if float(size[k - 2]) < 1e-9 * float(size[0]):
         got = "points whose directions in the picture do not determine the pose"
-        raise CameraError(refusal("points", expected="points all over the picture", got=got, do=_ADD))
+        raise camera_error("points", "points all over the picture", got, _ADD)
     solution: Tensor = right[k - 1] / scale
     return solution
 
