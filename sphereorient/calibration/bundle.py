@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.plate_view import PlateView
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
+from sphereorient.calibration.targets import PlateView
 from sphereorient.cameras import Camera, ParameterCovariance, PortCamera
 from sphereorient.cameras.checks import check_points
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, parameter_names, with_parameters

@@ -10,7 +10,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.calibration.bundle import Rig
 from sphereorient.calibration.document import CalibrationDocument
-from sphereorient.calibration.plate_view import PlateView
+from sphereorient.calibration.targets import PlateView
 from sphereorient.calibration.tsai_method import calibrate_tsai
 from sphereorient.cameras import Camera, Port, PortCamera
 from sphereorient.cameras.checks import camera_error

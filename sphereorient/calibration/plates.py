@@ -15,7 +15,7 @@ from sphereorient.calibration.boards import see_plate
 from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
 from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
 from sphereorient.calibration.guess import guess_from_points, guess_rig
-from sphereorient.calibration.plate_view import PlateView, placed
+from sphereorient.calibration.targets import PlateView, placed
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.cameras.checks import camera_error
 from sphereorient.errors import CameraError
