@@ -6,8 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sphereorient.calibration import targets
-from sphereorient.calibration.dots import as_grey, find_dots
-from sphereorient.calibration.ellipse import Dots
+from sphereorient.calibration.dots import Dots, as_grey, find_dots
 from sphereorient.calibration.lattice import index_dots
 from sphereorient.calibration.targets import Floats, Ints, PlateView, indices, quarter_turned, refused_view, seen
 from sphereorient.errors import refusal

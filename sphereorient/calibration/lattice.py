@@ -9,17 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sphereorient.calibration.ellipse import Dots
-from sphereorient.calibration.targets import (
-    DotPlate,
-    Floats,
-    Ints,
-    PlateView,
-    indices,
-    quarter_turned,
-    refused_view,
-    seen,
-)
+from sphereorient.calibration import targets
+from sphereorient.calibration.dots import Dots
+from sphereorient.calibration.targets import DotPlate, Floats, Ints, PlateView, refused_view
 from sphereorient.errors import refusal
 
 NEIGHBOURS = 24  # of each dot: at 75 degrees of tilt the next column is about the 12th nearest
@@ -244,7 +236,7 @@ def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> Plat
         return _misplaced(index, large, plate, name)
     got = f"{int(large.sum())}, which leave {len(placements)} places of its dots on the plate"
     do = "show the fiducials, or have the other camera see them at the same instant"
-    view = seen(plate, index, dots.uv_px[which], dots.sigma_px[which])
+    view = targets.seen(plate, index, dots.uv_px[which], dots.sigma_px[which])
     return view.settled(plate, placements, refusal(name, expected="3 larger dots in view", got=got, do=do))
 
 
@@ -252,7 +244,7 @@ def _placements(index: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
     """Return the placements (m, 3) of a lattice on the plate that its larger dots allow."""
     found = []
     for quarters in range(4):
-        at = quarter_turned(index, quarters)
+        at = targets.quarter_turned(index, quarters)
         for shift in _shifts(at, large, plate):
             there = at + shift
             if plate.holds(there).all() and (plate.is_fiducial(there) == large).all():
@@ -264,7 +256,7 @@ def _shifts(at: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
     if large.any():
         return np.asarray(plate.fiducials - at[large][0])
     low, high = plate.first - at.min(axis=0), plate.last - at.max(axis=0)
-    return indices(low, high)
+    return targets.indices(low, high)
 
 
 def _sizes(lattice: Lattice, plate: DotPlate) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
