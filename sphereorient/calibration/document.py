@@ -1,7 +1,8 @@
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -116,11 +117,10 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
         surveyed=_surveyed(keys, path, numbers) if keys.pictures else IN_THE_LAB,
         pictures=pictures,
         points={name: path.parent / file for name, file in keys.points.items()},
-        ports=_ports(keys, path),
+        ports={},
         fit_ports=keys.fit_ports,
     )
-    _check_ports(keys, path, document.cameras)
-    return document
+    return replace(document, ports=_ports(keys, path, document.cameras))
 
 
 def read_points(path: Path) -> NDArray[np.float64]:
@@ -140,37 +140,31 @@ def read_points(path: Path) -> NDArray[np.float64]:
 
 
 def _number(path: Path, k: int, row: dict[str, str], name: str) -> float:
-    try:
+    with suppress(ValueError):
         value = float(row.get(name) or "")
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        do = "correct the number, or leave the point out"
-        raise camera_error(f"{path}, row {k + 1}, {name}", "a number", short(row.get(name)), do)
-    return value
+        if np.isfinite(value):
+            return value
+    do = "correct the number, or leave the point out"
+    raise camera_error(f"{path}, row {k + 1}, {name}", "a number", short(row.get(name)), do)
 
 
-def _ports(keys: CalibrationKeys, path: Path) -> dict[str, Port]:
+def _ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> dict[str, Port]:
     ports = {}
     for name, entry in keys.ports.items():
+        if name not in cameras:
+            do = f"name one of {', '.join(cameras)}"
+            raise camera_error(f"{path}, ports", "a camera with pictures", f"'{name}'", do)
         try:
             ports[name] = entry.port()
         except CameraError as error:
             raise CameraError(f"{path}, ports, {name}, {error}") from None
-    return ports
-
-
-def _check_ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> None:
-    for name in keys.ports:
-        if name not in cameras:
-            do = f"name one of {', '.join(cameras)}"
-            raise camera_error(f"{path}, ports", "a camera with pictures", f"'{name}'", do)
     check_known(keys.fit_ports, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports")
     if keys.fit_ports and not keys.ports:
         do = "write under `ports` where the walls are, as well as you know"
         raise camera_error(f"{path}, fit_ports", "ports to fit", "none", do)
     if len(set(keys.fit_ports)) < len(keys.fit_ports):
         raise camera_error(f"{path}, fit_ports", "different names", ", ".join(keys.fit_ports), "name each once")
+    return ports
 
 
 def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> tuple[Picture, ...]:

@@ -1,15 +1,16 @@
 import math
 from collections.abc import Sequence
 from itertools import combinations
+from typing import Any
 
 import torch
 from rich.table import Table
+from torch import Tensor
 
 from sphereorient.calibration.plates import Calibrated
 from sphereorient.calibration.self_calibration import MOVED, OBSERVED, CameraCheck, Repaired
 from sphereorient.cameras import Camera, PortCamera
-from sphereorient.cameras.model import CameraModel
-from sphereorient.cameras.parameters import PORT_NUMBERS
+from sphereorient.cameras.parameters import PORT_NUMBERS, TRANSLATION
 from sphereorient.trajectory import Reason, Trajectory
 
 CONTRARY_SHARE = 0.5  # of the frames of both cameras; a passing reflection spoils a few, a moved camera nearly all
@@ -101,13 +102,11 @@ def contradiction_lines(track: Trajectory) -> list[str]:
 def _values(camera: Camera) -> dict[str, float]:
     """Return the fitted numbers of lens and wall, and T; of the rotation only sigmas are meaningful."""
     known = () if camera.covariance is None else camera.covariance.names
-    found: dict[str, float] = {}
-    inner = camera.camera if isinstance(camera, PortCamera) else camera
-    if isinstance(inner, CameraModel):
-        for name, (field, place) in inner.parameter_fields().items():
-            found[name] = float(getattr(inner, field)[... if place is None else place])
-    found = {name: value for name, value in found.items() if name in known}
-    found |= {f"T_{axis}": float(value) for axis, value in zip("xyz", camera.T_cam_lab_mm, strict=True)}
+    lens: Any = camera.camera if isinstance(camera, PortCamera) else camera
+    found: dict[str, Tensor] = {}
+    for name, (field, place) in lens.parameter_fields().items():
+        found[name] = getattr(lens, field)[... if place is None else place]
+    found |= dict(zip(TRANSLATION, camera.T_cam_lab_mm, strict=True))
     if isinstance(camera, PortCamera):
-        found |= {name: float(getattr(camera.port, field)) for name, field in PORT_NUMBERS.items() if name in known}
-    return found
+        found |= {name: getattr(camera.port, field) for name, field in PORT_NUMBERS.items()}
+    return {name: float(value) for name, value in found.items() if name in known or name in TRANSLATION}
