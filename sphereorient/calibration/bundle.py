@@ -236,18 +236,11 @@ def disk_centre_shift(
     around = torch.cat([centres, centres + radius[..., None, None] * circle], dim=-2)
     uv_px = camera.project(around @ R_lab_plate[..., None, :, :].mT + T_lab_plate[..., None, None, :])
     rim = uv_px[..., 1:, :] - uv_px[..., :1, :]
-    along = _slope_matrix(rim) @ rim  # d/d angle
+    # d/d angle of the trigonometric interpolant (Trefethen 2000, chapter 3).
+    order = 1j * torch.arange(RIM_POINTS // 2 + 1, device=rim.device)[:, None]
+    along = torch.fft.irfft(order * torch.fft.rfft(rim, dim=-2), n=RIM_POINTS, dim=-2)
     u, v = rim.unbind(-1)
     du, dv = along.unbind(-1)
     twice_area = (u * dv - v * du).sum(-1)
     shift = torch.stack([(u * u * dv).sum(-1), -(v * v * du).sum(-1)], dim=-1) / twice_area[..., None]
     return torch.where(is_disk[..., None], shift, torch.zeros_like(shift))
-
-
-def _slope_matrix(like: Tensor) -> Tensor:
-    """Return d/d angle (RIM_POINTS, RIM_POINTS) of the trigonometric interpolant (Trefethen 2000, eq. 3.10, even)."""
-    k = torch.arange(RIM_POINTS, device=like.device)
-    apart = (k[:, None] - k[None, :]).to(torch.float64) * (math.pi / RIM_POINTS)
-    sign = 1.0 - 2.0 * ((k[:, None] - k[None, :]) % 2)
-    slope = 0.5 * sign / torch.tan(torch.where(apart == 0, torch.ones_like(apart), apart))
-    return torch.where(apart == 0, torch.zeros_like(slope), slope).to(like)

@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, StrictInt
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, StrictInt
 from torch import Tensor
 
 from sphereorient.calibration.targets import CalibrationTarget, plate_from_entry
 from sphereorient.cameras import Port
-from sphereorient.cameras.checks import camera_error, check_known
+from sphereorient.cameras.checks import camera_error, check_known, named
 from sphereorient.cameras.io.cameras_yaml import PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
 from sphereorient.errors import CameraError
@@ -24,10 +24,8 @@ from sphereorient.files.yaml_file import read_document, short, validated
 SCHEMA = "sphereorient-calibration/1"
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: rounding to four digits after the point
 COLUMNS = ("x", "y", "z", "u", "v")  # mm, mm, mm, px, px
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Pixels = Annotated[int, Field(gt=0)]
-Triple = tuple[Number, Number, Number]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Model = Literal["tsai", "pinhole", "brown"]
 # Points of tables are lab points: a plate whose frame is the lab's.
 IN_THE_LAB = {0: (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))}
@@ -54,7 +52,7 @@ class CalibrationKeys(BaseModel):
     """Keys of calibration.yaml (docs/calibration.md)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    image_size: tuple[Pixels, Pixels]
+    image_size: tuple[PositiveInt, PositiveInt]
     pixel_pitch: tuple[Positive, Positive]
     plate: Any = None
     surveyed: SurveyedKeys | None = None
@@ -154,10 +152,8 @@ def _ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> dict[
         if name not in cameras:
             do = f"name one of {', '.join(cameras)}"
             raise camera_error(f"{path}, ports", "a camera with pictures", f"'{name}'", do)
-        try:
+        with named(f"{path}, ports, {name}"):
             ports[name] = entry.port()
-        except CameraError as error:
-            raise CameraError(f"{path}, ports, {name}, {error}") from None
     check_known(keys.fit_ports, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports")
     if keys.fit_ports and not keys.ports:
         do = "write under `ports` where the walls are, as well as you know"

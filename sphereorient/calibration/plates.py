@@ -18,7 +18,7 @@ from sphereorient.calibration.document import CalibrationDocument, Picture, load
 from sphereorient.calibration.guess import guess_from_points, guess_rig
 from sphereorient.calibration.targets import PlateView, placed
 from sphereorient.cameras import Camera, ParameterCovariance, PortCamera, TsaiCamera
-from sphereorient.cameras.checks import camera_error
+from sphereorient.cameras.checks import camera_error, named
 from sphereorient.errors import CameraError
 from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
@@ -153,10 +153,8 @@ def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView])
     cameras = {}
     for picture, view in tied.items():
         arrays = torch.from_numpy(view.points_plate_mm), torch.from_numpy(view.uv_px)
-        try:
+        with named(str(picture.path)):
             cameras[picture.camera] = guess_from_points(document, picture.camera, *arrays)
-        except CameraError as error:
-            raise CameraError(f"{picture.path}, {error}") from None
     R, T = document.surveyed[0]
     return Rig(cameras=cameras, R_lab_plate=R[None], T_lab_plate_mm=T[None])
 

@@ -1,16 +1,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.cameras.checks import camera_error, check_points
-from sphereorient.cameras.parameters import with_parameters
+from sphereorient.cameras.parameters import AnyCamera, with_parameters
 from sphereorient.errors import CameraError, ShapeError, refusal
-
-AnyCamera = TypeVar("AnyCamera", bound=Camera)
 
 DAMPING = 1e-4  # at the start, relative to the information's diagonal
 LEAST, MOST = 1e-12, 1e10  # of the damping; beyond the upper one no step helps

@@ -1,4 +1,5 @@
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -54,6 +55,15 @@ def check_points(name: str, points: Tensor, size: int) -> None:
     if not points.is_floating_point():
         do = "convert it with .double() or .float()"
         raise ShapeError(refusal(name, expected="a floating-point tensor", got=str(points.dtype), do=do))
+
+
+@contextmanager
+def named(where: str) -> Iterator[None]:
+    """Put the place before the message of a CameraError."""
+    try:
+        yield
+    except CameraError as error:
+        raise CameraError(f"{where}, {error}") from None
 
 
 def check_known(names: Iterable[str], known: Collection[str], where: str) -> None:

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera
 from sphereorient.cameras.camera import Camera, ParameterCovariance
-from sphereorient.cameras.checks import camera_error, check_known
+from sphereorient.cameras.checks import camera_error, check_known, named
 from sphereorient.cameras.ideal import PinholeCamera, TelecentricCamera
 from sphereorient.cameras.model import CameraModel, Key
 from sphereorient.cameras.parameters import parameter_names
@@ -152,10 +152,8 @@ def _build(entry: object, where: str) -> Camera:
     if not isinstance(entry["model"], str) or entry["model"] not in MODELS:
         raise CameraError(refuse_unknown(entry["model"], MODELS, f"{where}, model"))
     checked = validated(ENTRIES[entry["model"]], entry, where, CameraError)
-    try:
+    with named(where):
         return _with_port_and_covariance(_in_air(MODELS[checked.model], checked), checked)
-    except CameraError as error:
-        raise CameraError(f"{where}, {error}") from None
 
 
 def _in_air(kind: type[CameraModel], entry: CameraEntry) -> CameraModel:

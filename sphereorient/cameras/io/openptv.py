@@ -15,7 +15,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras.brown import OpenPTVCamera
 from sphereorient.cameras.camera import Camera
-from sphereorient.cameras.checks import camera_error
+from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.errors import CameraError
@@ -63,7 +63,7 @@ def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None)
         warnings.warn(f"{addpar}: scx = {scx:g} is read as x' = scx x, y' = y, OpenPTV's classic form.", stacklevel=2)
     R_cam_lab = AXES @ so3.from_tait_bryan(_tensor(angles)).mT
     shift_px = _tensor((xh / par.pixel_pitch_mm[0], -yh / par.pixel_pitch_mm[1]))
-    try:
+    with named(str(ori)):
         camera = OpenPTVCamera(
             image_size=par.image_size,
             R_cam_lab=R_cam_lab,
@@ -77,8 +77,6 @@ def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None)
             she=_tensor(she),
         )
         return PortCamera(camera=camera, port=_port(glass, par)) if par.refracts else camera
-    except CameraError as error:
-        raise CameraError(f"{ori}, {error}") from None
 
 
 def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
