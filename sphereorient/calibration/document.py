@@ -9,13 +9,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, StrictInt
+from pydantic import BaseModel, Field, FiniteFloat, PositiveInt, StrictInt
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.calibration.targets import CalibrationTarget, plate_from_entry
 from sphereorient.cameras import Port
 from sphereorient.cameras.checks import camera_error, check_known, named
-from sphereorient.cameras.io.cameras_yaml import PortEntry
+from sphereorient.cameras.io.cameras_yaml import Entry, PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
 from sphereorient.errors import CameraError
 from sphereorient.files.whole_file import TABLE_BYTES, read_whole
@@ -31,27 +32,24 @@ Model = Literal["tsai", "pinhole", "brown"]
 IN_THE_LAB = {0: (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))}
 
 
-class SurveyedKeys(BaseModel):
+class SurveyedKeys(Entry):
     """The plate's pose in the lab in one picture; it defines the lab frame."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     pose: int
     R_lab_plate: tuple[Triple, Triple, Triple]
     T_lab_plate: Triple
 
 
-class PictureKeys(BaseModel):
+class PictureKeys(BaseModel, frozen=True, extra="allow"):
     """One pose: its number, and the picture of each camera."""
 
-    model_config = ConfigDict(frozen=True, extra="allow")
     __pydantic_extra__: dict[str, str]
     pose: StrictInt
 
 
-class CalibrationKeys(BaseModel):
+class CalibrationKeys(BaseModel, frozen=True, extra="forbid"):
     """Keys of calibration.yaml (docs/calibration.md)."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     image_size: tuple[PositiveInt, PositiveInt]
     pixel_pitch: tuple[Positive, Positive]
     plate: Any = None
@@ -193,5 +191,5 @@ def _surveyed(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> di
         got = "a reflection" if off <= ROTATION_TOLERANCE else f"rows that are {off:.2g} from it"
         do = "write the plate's x, y and z axis in the lab as its columns"
         raise camera_error(f"{where}, R_lab_plate", "a rotation", got, do)
-    U, _, Vh = torch.linalg.svd(R)
-    return {numbers.index(keys.surveyed.pose): (U @ Vh, torch.tensor(keys.surveyed.T_lab_plate, dtype=torch.float64))}
+    T = torch.tensor(keys.surveyed.T_lab_plate, dtype=torch.float64)
+    return {numbers.index(keys.surveyed.pose): (so3.nearest_rotation(R), T)}

@@ -219,18 +219,17 @@ def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> Plat
         expected = f"a lattice of {LEAST_DOTS} dots or more, 3 x 3 of them whole"
         do = "look at the picture: is the plate in it, sharp, and dark or bright as stated"
         return refused_view(name, expected, got, do)
-    large, odd = _sizes(lattice, plate)
+    dot, fiducial = plate.dot_diameter_mm / plate.pitch_mm, plate.fiducial_diameter_mm / plate.pitch_mm
+    large = lattice.width > np.sqrt(dot * fiducial)
+    odd = np.abs(lattice.width / np.where(large, fiducial, dot) - 1) > WIDTH_MISS
     if odd.mean() > 0.2:
-        pitches = float(np.median(lattice.width))
-        expected = f"dots {plate.dot_diameter_mm / plate.pitch_mm:.2f} pitches wide"
-        do = "correct pitch and dot_diameter of the plate"
-        return refused_view(name, expected, f"{pitches:.2f} pitches", do)
+        expected, got = f"dots {dot:.2f} pitches wide", f"{np.median(lattice.width):.2f} pitches"
+        return refused_view(name, expected, got, "correct pitch and dot_diameter of the plate")
     which, index, large = lattice.which[~odd], lattice.index[~odd], large[~odd]
     across, up = np.ptp(index, axis=0) + 1
     if (np.sort([across, up]) > np.sort([plate.columns, plate.rows])).any():
         expected, got = f"at most {plate.columns} x {plate.rows} dots", f"a lattice of {across} x {up}"
-        do = "correct columns and rows of the plate"
-        return refused_view(name, expected, got, do)
+        return refused_view(name, expected, got, "correct columns and rows of the plate")
     placements = _placements(index, large, plate)
     if len(placements) == 0:
         return _misplaced(index, large, plate, name)
@@ -257,14 +256,6 @@ def _shifts(at: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
         return np.asarray(plate.fiducials - at[large][0])
     low, high = plate.first - at.min(axis=0), plate.last - at.max(axis=0)
     return targets.indices(low, high)
-
-
-def _sizes(lattice: Lattice, plate: DotPlate) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which dots have the size of fiducials, and which have neither size."""
-    dot, fiducial = plate.dot_diameter_mm / plate.pitch_mm, plate.fiducial_diameter_mm / plate.pitch_mm
-    large = lattice.width > np.sqrt(dot * fiducial)
-    stated = np.where(large, fiducial, dot)
-    return large, np.abs(lattice.width / stated - 1) > WIDTH_MISS
 
 
 def _misplaced(index: Ints, large: NDArray[np.bool_], plate: DotPlate, name: str) -> PlateView:

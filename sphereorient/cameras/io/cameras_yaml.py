@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import BaseModel, ConfigDict, create_model
+from pydantic import BaseModel, create_model
 from scipy.linalg import block_diag
 
 from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera
@@ -30,10 +30,8 @@ MODELS: dict[str, type[CameraModel]] = {
 }
 
 
-class Entry(BaseModel):
+class Entry(BaseModel, frozen=True, extra="forbid"):
     """A mapping of cameras.yaml; unknown keys are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class PortEntry(Entry):
@@ -181,8 +179,8 @@ def _described(camera: Camera) -> dict[str, Any]:
         inner = {key: value for key, value in _described(camera.camera).items() if key != "covariance"}
         return inner | {"port": _values(Port.KEYS, camera.port)} | _covariance_keys(camera.covariance)
     if not isinstance(camera, CameraModel) or camera.MODEL not in MODELS:
-        got, do = type(camera).__name__, "register the model in cameras/io/cameras_yaml.py"
-        raise camera_error("camera", f"a camera of model {', '.join(MODELS)}", got, do)
+        do = "register the model in cameras/io/cameras_yaml.py"
+        raise camera_error("camera", f"a camera of model {', '.join(MODELS)}", type(camera).__name__, do)
     pose = {"R": camera.R_cam_lab.detach().tolist(), "T": camera.T_cam_lab_mm.detach().tolist()}
     first: dict[str, Any] = {"model": camera.MODEL, "image_size": list(camera.image_size)}
     return first | _values(camera.KEYS, camera) | pose | _covariance_keys(camera.covariance)
