@@ -78,8 +78,8 @@ def _zhang(
     flags |= cv2.CALIB_FIX_PRINCIPAL_POINT  # hardly improves the guess, and spoils it with a weak set of poses
     none: Any = None
     _, K, _, turns, moves = cv2.calibrateCamera(points, pixels, document.image_size, guess, none, flags=flags)
-    turns, moves = (torch.from_numpy(np.stack(parts)[..., 0]) for parts in (turns, moves))
-    relative = {row: (so3.exp(turns[k]), moves[k]) for k, row in enumerate(rows)}
+    turn, move = (torch.from_numpy(np.stack(parts)[..., 0]) for parts in (turns, moves))
+    relative = {row: (so3.exp(turn[k]), move[k]) for k, row in enumerate(rows)}
     lens = torch.from_numpy(K)
     return lens[1, 1], lens[:2, 2], relative
 

@@ -59,7 +59,8 @@ class _Field:
     """Dots with their neighbours near (n, k), and metric (n, 2, 2): v^T metric v = 1 for v one pitch long."""
 
     def __init__(self, dots: Dots) -> None:
-        self.uv_px, self.tree = dots.uv_px, cKDTree(dots.uv_px)
+        self.uv_px = dots.uv_px
+        self.tree: cKDTree[None] = cKDTree(dots.uv_px)
         k = min(NEIGHBOURS, len(dots) - 1)
         near = np.asarray(self.tree.query(dots.uv_px, k=k + 1)[1], dtype=np.int64)
         # The median over neighbours removes the effect of fiducials and stray blobs.

@@ -209,7 +209,7 @@ def _check_determined(document: CalibrationDocument, fitted: Fitted) -> None:
     loose = []
     for name, camera in fitted.rig.cameras.items():
         limits = _loose_sigmas(camera)
-        for parameter, sigma in camera.covariance.sigmas.items() if camera.covariance else ():
+        for parameter, sigma in (camera.covariance.sigmas if camera.covariance else {}).items():
             share = sigma / next((limit for begin, limit in limits.items() if parameter.startswith(begin)), np.inf)
             if not share < 1:
                 loose.append((share, f"{name}.{parameter} (sigma {sigma:.3g})"))

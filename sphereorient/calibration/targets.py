@@ -186,10 +186,11 @@ class CircleGrid(CalibrationTarget):
         return np.full(len(index), self.dot_diameter_mm)
 
 
-KINDS = {"dots": DotPlate, "chessboard": Chessboard, "charuco": CharucoBoard, "circles": CircleGrid}
+Kind = type[CalibrationTarget]
+KINDS: dict[str, Kind] = {"dots": DotPlate, "chessboard": Chessboard, "charuco": CharucoBoard, "circles": CircleGrid}
 
 
-def target_keys(kind: type[CalibrationTarget]) -> dict[str, tuple[str, bool]]:
+def target_keys(kind: Kind) -> dict[str, tuple[str, bool]]:
     """Return the field of each key of calibration.yaml, and whether the key is required."""
     return {_key(one.name): (one.name, one.default is MISSING) for one in fields(kind)}
 
