@@ -1,23 +1,14 @@
-from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from sphereorient.calibration.dots import DotSettings, as_grey, find_dots
-from sphereorient.calibration.ellipse import Dots
+from sphereorient.calibration import targets
+from sphereorient.calibration.dots import Dots, as_grey, find_dots
 from sphereorient.calibration.lattice import index_dots
-from sphereorient.calibration.plate_view import PlateView, placed, quarter_turned, refused_view
-from sphereorient.calibration.targets import (
-    CalibrationTarget,
-    CharucoBoard,
-    Chessboard,
-    CircleGrid,
-    DotPlate,
-    Floats,
-    Ints,
-)
+from sphereorient.calibration.targets import Floats, Ints, PlateView, indices, quarter_turned, refused_view, seen
 from sphereorient.errors import refusal
 
 CORNER_SIGMA_PX = 0.05  # of a corner; tests measure 0.03 to 0.07 on drawn boards
@@ -26,40 +17,35 @@ WINDOW = 0.3  # half a window of the sub-pixel step, in distances to the nearest
 SHARP = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 
 
-def see_plate(
-    picture: NDArray[np.generic],
-    plate: CalibrationTarget,
-    name: str = "plate picture",
-    settings: DotSettings | None = None,
-) -> PlateView:
+def see_plate(picture: NDArray[np.generic], plate: targets.CalibrationTarget, name: str = "plate picture") -> PlateView:
     """Find `plate` in a grey picture (H, W), any number type (or CameraError); `refused` with a reason if unusable."""
-    if isinstance(plate, Chessboard):
+    if isinstance(plate, targets.Chessboard):
         return _chessboard(picture, plate, name)
-    if isinstance(plate, CharucoBoard):
+    if isinstance(plate, targets.CharucoBoard):
         return _charuco(picture, plate, name)
-    if isinstance(plate, CircleGrid):
+    if isinstance(plate, targets.CircleGrid):
         return _circles(picture, plate, name)
-    assert isinstance(plate, DotPlate)
-    return index_dots(find_dots(picture, dark=plate.dark, settings=settings), plate, name)
+    assert isinstance(plate, targets.DotPlate)
+    return index_dots(find_dots(picture, dark=plate.dark), plate, name)
 
 
-def _chessboard(picture: NDArray[np.generic], board: Chessboard, name: str) -> PlateView:
+def _chessboard(picture: NDArray[np.generic], board: targets.Chessboard, name: str) -> PlateView:
     """Find all inner corners of a chessboard; floating where the board has a rotational symmetry."""
     grey = _eight_bits(picture)
     found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=SHARP)
     if not found:
         expected = f"a chessboard with {board.columns} x {board.rows} inner corners"
         do = "show the whole board, or correct columns and rows (corners between squares are counted)"
-        return refused_view(name, expected=expected, got="none", do=do)
+        return refused_view(name, expected, "none", do)
     uv_px = _refined(grey, corners.reshape(-1, 2).astype(np.float64))
     index = _seen_from_front(_row_by_row(board.columns, board.rows), uv_px)
     turns = _turns(board.extent)
     standard = [p for p in turns if _lower_left_is_dark(grey, quarter_turned(index, int(p[0])) + p[1:], uv_px)]
-    view = _view(board, index, uv_px, np.full(len(uv_px), CORNER_SIGMA_PX))
-    return _settled(view, board, standard or turns, name)
+    view = seen(board, index, uv_px, np.full(len(uv_px), CORNER_SIGMA_PX))
+    return _placed_one_of(standard or turns, view, board, name)
 
 
-def _charuco(picture: NDArray[np.generic], board: CharucoBoard, name: str) -> PlateView:
+def _charuco(picture: NDArray[np.generic], board: targets.CharucoBoard, name: str) -> PlateView:
     """Find the corners of a ChArUco board or a part of it."""
     detector = cv2.aruco.CharucoDetector(board.opencv())
     corners, ids, _, markers = detector.detectBoard(_eight_bits(picture))
@@ -73,12 +59,12 @@ def _charuco(picture: NDArray[np.generic], board: CharucoBoard, name: str) -> Pl
         expected = f"{LEAST_CORNERS} corners or more of a {board.columns} x {board.rows} ChArUco board"
         got = f"{count} corners, {0 if markers is None else len(markers)} markers of {board.dictionary}"
         do = "show more of the board, or correct columns, rows, dictionary or legacy_pattern"
-        return refused_view(name, expected=expected, got=got, do=do)
+        return refused_view(name, expected, got, do)
     # OpenCV has refined these already, in windows that keep clear of the markers.
-    return _view(board, index, np.asarray(corners).reshape(-1, 2).astype(np.float64), np.full(count, CORNER_SIGMA_PX))
+    return seen(board, index, np.asarray(corners).reshape(-1, 2).astype(np.float64), np.full(count, CORNER_SIGMA_PX))
 
 
-def _circles(picture: NDArray[np.generic], grid: CircleGrid, name: str) -> PlateView:
+def _circles(picture: NDArray[np.generic], grid: targets.CircleGrid, name: str) -> PlateView:
     """Find and measure all circles by `find_dots`; OpenCV only orders them."""
     dots = find_dots(picture, dark=grid.dark)
     order = _circles_in_order(dots, grid)
@@ -86,28 +72,20 @@ def _circles(picture: NDArray[np.generic], grid: CircleGrid, name: str) -> Plate
         kind = "an asymmetric grid" if grid.asymmetric else "a grid"
         expected, got = f"{kind} of {grid.columns} x {grid.rows} circles", f"none among {len(dots)} dots"
         do = "show the whole grid, or correct columns, rows, asymmetric or dots of the plate"
-        return refused_view(name, expected=expected, got=got, do=do)
+        return refused_view(name, expected, got, do)
     uv_px = dots.uv_px[order]
     index = _row_by_row(grid.columns, grid.rows)
     if grid.asymmetric:  # OpenCV's own points: the top row is not shifted
         index[:, 0] = 2 * index[:, 0] + (grid.rows - 1 - index[:, 1]) % 2
     turns = _turns(grid.extent)[:1] if grid.asymmetric else _turns(grid.extent)
-    view = _view(grid, _seen_from_front(index, uv_px), uv_px, dots.sigma_px[order])
-    return _settled(view, grid, turns, name)
+    view = seen(grid, _seen_from_front(index, uv_px), uv_px, dots.sigma_px[order])
+    return _placed_one_of(turns, view, grid, name)
 
 
-def _view(plate: CalibrationTarget, index: Ints, uv_px: Floats, sigma_px: Floats) -> PlateView:
-    points, diameters = plate.points(index), plate.diameters(index)
-    return PlateView(points_plate_mm=points, uv_px=uv_px, sigma_px=sigma_px, diameter_mm=diameters, index=index)
-
-
-def _settled(view: PlateView, plate: CalibrationTarget, placements: list[Ints], name: str) -> PlateView:
-    if len(placements) == 1:
-        return placed(view, plate, placements[0])
-    expected, got = "a plate that looks the same from one side only", f"{len(placements)} possible rotations"
+def _placed_one_of(turns: list[Ints], view: PlateView, plate: targets.CalibrationTarget, name: str) -> PlateView:
+    expected, got = "a plate that looks the same from one side only", f"{len(turns)} possible rotations"
     do = "tie it through the other camera, or use a plate with marks"
-    reason = refusal(name, expected=expected, got=got, do=do)
-    return replace(view, state="floating", reason=reason, placements=np.stack(placements))
+    return view.settled(plate, np.stack(turns), refusal(name, expected=expected, got=got, do=do))
 
 
 def _eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
@@ -115,8 +93,7 @@ def _eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
     if picture.dtype == np.uint8:
         return picture.astype(np.uint8)
     low, high = np.percentile(grey, [0.1, 99.9])
-    stretched = np.clip((grey - low) * (255.0 / max(high - low, 1e-9)), 0, 255)
-    return np.asarray(stretched, dtype=np.uint8)
+    return np.asarray(np.clip((grey - low) * (255.0 / max(high - low, 1e-9)), 0, 255), dtype=np.uint8)
 
 
 def _refined(grey: NDArray[np.uint8], uv_px: Floats) -> Floats:
@@ -160,7 +137,7 @@ def _turns(extent: tuple[int, int]) -> list[Ints]:
 def _lower_left_is_dark(grey: NDArray[np.uint8], index: Ints, uv_px: Floats) -> bool:
     homography = _homography(index, uv_px)
     across, up = index.max(axis=0)
-    i, j = (part.ravel() for part in np.meshgrid(np.arange(across), np.arange(up)))
+    i, j = indices((0, 0), (across - 1, up - 1)).T
     middle = np.column_stack([i + 0.5, j + 0.5, np.ones(len(i))]) @ homography.T
     u, v = np.rint(middle[:, :2] / middle[:, 2:]).astype(int).T
     value = grey[v.clip(0, grey.shape[0] - 1), u.clip(0, grey.shape[1] - 1)].astype(np.float64)
@@ -168,7 +145,7 @@ def _lower_left_is_dark(grey: NDArray[np.uint8], index: Ints, uv_px: Floats) -> 
     return bool(value[like_corner].mean() < value[~like_corner].mean())
 
 
-def _circles_in_order(dots: Dots, grid: CircleGrid) -> Ints | None:
+def _circles_in_order(dots: Dots, grid: targets.CircleGrid) -> Ints | None:
     if len(dots) < grid.columns * grid.rows:
         return None
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if grid.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
@@ -177,8 +154,7 @@ def _circles_in_order(dots: Dots, grid: CircleGrid) -> Ints | None:
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
         found, centres = find(points, (grid.columns, grid.rows), flags, None, cv2.CirclesGridFinderParameters())
         if found:
-            away = np.linalg.norm(dots.uv_px[None] - centres.reshape(-1, 1, 2), axis=-1)
-            order = away.argmin(axis=1)
-            if len(set(order.tolist())) == len(order) and float(away.min(axis=1).max()) < 0.5:
+            away, order = cKDTree(dots.uv_px).query(centres.reshape(-1, 2))
+            if len(set(order.tolist())) == len(order) and float(away.max()) < 0.5:
                 return np.asarray(order, dtype=np.int64)
     return None

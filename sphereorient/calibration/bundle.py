@@ -4,15 +4,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.plate_view import PlateView
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
+from sphereorient.calibration.targets import PlateView
 from sphereorient.cameras import Camera, ParameterCovariance, PortCamera
 from sphereorient.cameras.checks import check_points
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, parameter_names, with_parameters
@@ -91,26 +91,18 @@ class Problem:
     def applied(self, change: Tensor) -> Rig:
         """Return the rig with a vector of changes (size,) applied."""
         shares, poses = self._split(change)
-        return Rig(
-            cameras={name: self._camera(name, share) for name, share in shares.items()},
-            R_lab_plate=so3.exp(poses[:, :3]) @ self.rig.R_lab_plate,
-            T_lab_plate_mm=self.rig.T_lab_plate_mm + poses[:, 3:],
-        )
+        R, T = self._posed(poses)
+        cameras = {name: self._camera(name, share) for name, share in shares.items()}
+        return Rig(cameras=cameras, R_lab_plate=R, T_lab_plate_mm=T)
 
     def shifts(self, rig: Rig) -> dict[str, Tensor]:
         """Return the perspective bias of each dot, (n, 2) px of every camera."""
-        return {
-            name: torch.nan_to_num(
-                disk_centre_shift(
-                    rig.cameras[name],
-                    rig.R_lab_plate[seen.pose],
-                    rig.T_lab_plate_mm[seen.pose],
-                    seen.points_plate_mm[:, None],
-                    seen.diameter_mm[:, None],
-                )[:, 0]
-            )
-            for name, seen in self.seen.items()
-        }
+        shifts = {}
+        for name, seen in self.seen.items():
+            pose = rig.R_lab_plate[seen.pose], rig.T_lab_plate_mm[seen.pose]
+            disks = seen.points_plate_mm[:, None], seen.diameter_mm[:, None]
+            shifts[name] = torch.nan_to_num(disk_centre_shift(rig.cameras[name], *pose, *disks)[:, 0])
+        return shifts
 
     def residuals(self, change: Tensor, shifts: Mapping[str, Tensor]) -> Tensor:
         """Return measured minus expected pixels over their sigmas, (2 n,), one camera after the other."""
@@ -124,20 +116,23 @@ class Problem:
     def slopes(self, change: Tensor) -> Tensor:
         """Return the derivatives of the residuals (2 n, size)."""
         shares, poses = self._split(change)
-        free, first_pose, offset, parts = self.free, self.size - POSE_PARTS * len(self.free), 0, []
+        (of_share, of_pose), parts = self.unknowns, []
         for name, seen in self.seen.items():
-            share, count = shares[name], len(shares[name])
-            block = change.new_zeros(len(seen.pose), 2, self.size)
-            units = torch.eye(count, dtype=torch.float64)
-            block[:, :, offset : offset + count] = slopes_along(partial(self._of_share, name, poses), share, units)
+            share, block = shares[name], change.new_zeros(len(seen.pose), 2, self.size)
+            units = torch.eye(len(share), dtype=torch.float64)
+            block[..., of_share[name]] = slopes_along(partial(self._expected, name, poses=poses), share, units)
             units = torch.eye(POSE_PARTS, dtype=torch.float64)[:, None].expand(-1, len(poses), -1)
             by_pose = slopes_along(partial(self._expected, name, share), poses, units)
-            for k, row in enumerate(free):
-                begin = first_pose + POSE_PARTS * k
-                block[seen.pose == row, :, begin : begin + POSE_PARTS] = by_pose[seen.pose == row]
+            for row in self.free:
+                first = int(of_pose[row, 0])
+                block[seen.pose == row, :, first : first + POSE_PARTS] = by_pose[seen.pose == row]
             parts.append((-block / seen.sigma_px[:, None, None]).flatten(0, 1))
-            offset += count
         return torch.cat(parts)
+
+    @property
+    def unknowns(self) -> tuple[dict[str, Tensor], Tensor]:
+        """Places in the vector of each camera's parameters, and of each pose's parts (P, 6)."""
+        return self._split(torch.arange(self.size))
 
     def _split(self, change: Tensor) -> tuple[dict[str, Tensor], Tensor]:
         lengths = [len(names) for names in self.names.values()]
@@ -150,13 +145,12 @@ class Problem:
         camera = self.rig.cameras[name]
         return with_parameters(camera, self.names[name], share) if self.names[name] else camera
 
-    def _of_share(self, name: str, poses: Tensor, share: Tensor) -> Tensor:
-        return self._expected(name, share, poses)
+    def _posed(self, poses: Tensor) -> tuple[Tensor, Tensor]:
+        return so3.exp(poses[:, :3]) @ self.rig.R_lab_plate, self.rig.T_lab_plate_mm + poses[:, 3:]
 
     def _expected(self, name: str, share: Tensor, poses: Tensor) -> Tensor:
         seen = self.seen[name]
-        R = (so3.exp(poses[:, :3]) @ self.rig.R_lab_plate)[seen.pose]
-        T = (self.rig.T_lab_plate_mm + poses[:, 3:])[seen.pose]
+        R, T = (part[seen.pose] for part in self._posed(poses))
         return self._camera(name, share).project((R @ seen.points_plate_mm[..., None])[..., 0] + T)
 
 
@@ -168,7 +162,7 @@ class Fitted:
     residual_px: Mapping[str, Tensor]  # (n, 2) of each camera, measured minus expected
     used: Mapping[str, Tensor]  # (n,) bool: False for outliers
     scale: float  # standard deviation of the residuals over the given sigmas
-    labels: tuple[str, ...]  # K unknowns, in the order of the covariance
+    problem: Problem  # its K labels are in the order of the covariance
     covariance: Tensor  # (K, K) float64, of cameras and poses together
 
 
@@ -191,23 +185,18 @@ def adjust(problem: Problem) -> Fitted:
     slopes = problem.slopes(change)[rows]
     scale = float((residuals[rows].square().sum() / max(len(slopes) - problem.size, 1)).sqrt())
     covariance = scale**2 * inverse_information(slopes.mT @ slopes)
-    cameras, begin = {}, 0
+    cameras, (shares, _) = {}, problem.unknowns
     for name, camera in rig.cameras.items():
-        names = problem.names[name]
-        block = covariance[begin : begin + len(names), begin : begin + len(names)]
-        begin += len(names)
-        known: Any = camera
-        cameras[name] = replace(known, covariance=ParameterCovariance(names=names, matrix=block)) if names else camera
-    parts = torch.split(residuals.view(-1, 2), lengths)
-    residual_px = {
-        name: part * seen.sigma_px[:, None] for part, (name, seen) in zip(parts, problem.seen.items(), strict=True)
-    }
+        names, known = problem.names[name], cast(Any, camera)
+        own = ParameterCovariance(names=names, matrix=covariance[shares[name]][:, shares[name]]) if names else None
+        cameras[name] = replace(known, covariance=own) if names else camera
+    parts = dict(zip(problem.seen, torch.split(residuals.view(-1, 2), lengths), strict=True))
     return Fitted(
         rig=replace(rig, cameras=cameras),
-        residual_px=residual_px,
+        residual_px={name: parts[name] * seen.sigma_px[:, None] for name, seen in problem.seen.items()},
         used=dict(zip(problem.seen, torch.split(good, lengths), strict=True)),
         scale=scale,
-        labels=tuple(problem.labels),
+        problem=problem,
         covariance=covariance,
     )
 
@@ -247,18 +236,11 @@ def disk_centre_shift(
     around = torch.cat([centres, centres + radius[..., None, None] * circle], dim=-2)
     uv_px = camera.project(around @ R_lab_plate[..., None, :, :].mT + T_lab_plate[..., None, None, :])
     rim = uv_px[..., 1:, :] - uv_px[..., :1, :]
-    along = _slope_matrix(rim) @ rim  # d/d angle
+    # d/d angle of the trigonometric interpolant (Trefethen 2000, chapter 3).
+    order = 1j * torch.arange(RIM_POINTS // 2 + 1, device=rim.device)[:, None]
+    along = torch.fft.irfft(order * torch.fft.rfft(rim, dim=-2), n=RIM_POINTS, dim=-2)
     u, v = rim.unbind(-1)
     du, dv = along.unbind(-1)
     twice_area = (u * dv - v * du).sum(-1)
     shift = torch.stack([(u * u * dv).sum(-1), -(v * v * du).sum(-1)], dim=-1) / twice_area[..., None]
     return torch.where(is_disk[..., None], shift, torch.zeros_like(shift))
-
-
-def _slope_matrix(like: Tensor) -> Tensor:
-    """Return d/d angle (RIM_POINTS, RIM_POINTS) of the trigonometric interpolant (Trefethen 2000, eq. 3.10, even)."""
-    k = torch.arange(RIM_POINTS, device=like.device)
-    apart = (k[:, None] - k[None, :]).to(torch.float64) * (math.pi / RIM_POINTS)
-    sign = 1.0 - 2.0 * ((k[:, None] - k[None, :]) % 2)
-    slope = 0.5 * sign / torch.tan(torch.where(apart == 0, torch.ones_like(apart), apart))
-    return torch.where(apart == 0, torch.zeros_like(slope), slope).to(like)

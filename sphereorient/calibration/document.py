@@ -1,59 +1,56 @@
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, StrictInt
+from pydantic import BaseModel, Field, FiniteFloat, PositiveInt, StrictInt
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.calibration.targets import CalibrationTarget, plate_from_entry
 from sphereorient.cameras import Port
-from sphereorient.cameras.checks import camera_error
-from sphereorient.cameras.io.cameras_yaml import PortEntry
+from sphereorient.cameras.checks import camera_error, check_known, named
+from sphereorient.cameras.io.cameras_yaml import Entry, PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
 from sphereorient.errors import CameraError
 from sphereorient.files.whole_file import TABLE_BYTES, read_whole
-from sphereorient.files.yaml_file import read_document, refuse_unknown, short, validated
+from sphereorient.files.yaml_file import read_document, short, validated
 
 SCHEMA = "sphereorient-calibration/1"
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: rounding to four digits after the point
 COLUMNS = ("x", "y", "z", "u", "v")  # mm, mm, mm, px, px
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Pixels = Annotated[int, Field(gt=0)]
-Triple = tuple[Number, Number, Number]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Model = Literal["tsai", "pinhole", "brown"]
 # Points of tables are lab points: a plate whose frame is the lab's.
 IN_THE_LAB = {0: (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))}
 
 
-class SurveyedKeys(BaseModel):
+class SurveyedKeys(Entry):
     """The plate's pose in the lab in one picture; it defines the lab frame."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     pose: int
     R_lab_plate: tuple[Triple, Triple, Triple]
     T_lab_plate: Triple
 
 
-class PictureKeys(BaseModel):
+class PictureKeys(BaseModel, frozen=True, extra="allow"):
     """One pose: its number, and the picture of each camera."""
 
-    model_config = ConfigDict(frozen=True, extra="allow")
     __pydantic_extra__: dict[str, str]
     pose: StrictInt
 
 
-class CalibrationKeys(BaseModel):
+class CalibrationKeys(BaseModel, frozen=True, extra="forbid"):
     """Keys of calibration.yaml (docs/calibration.md)."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-    image_size: tuple[Pixels, Pixels]
+    image_size: tuple[PositiveInt, PositiveInt]
     pixel_pitch: tuple[Positive, Positive]
     plate: Any = None
     surveyed: SurveyedKeys | None = None
@@ -116,11 +113,10 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
         surveyed=_surveyed(keys, path, numbers) if keys.pictures else IN_THE_LAB,
         pictures=pictures,
         points={name: path.parent / file for name, file in keys.points.items()},
-        ports=_ports(keys, path),
+        ports={},
         fit_ports=keys.fit_ports,
     )
-    _check_ports(keys, path, document.cameras)
-    return document
+    return replace(document, ports=_ports(keys, path, document.cameras))
 
 
 def read_points(path: Path) -> NDArray[np.float64]:
@@ -140,39 +136,29 @@ def read_points(path: Path) -> NDArray[np.float64]:
 
 
 def _number(path: Path, k: int, row: dict[str, str], name: str) -> float:
-    try:
+    with suppress(ValueError):
         value = float(row.get(name) or "")
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        do = "correct the number, or leave the point out"
-        raise camera_error(f"{path}, row {k + 1}, {name}", "a number", short(row.get(name)), do)
-    return value
+        if np.isfinite(value):
+            return value
+    do = "correct the number, or leave the point out"
+    raise camera_error(f"{path}, row {k + 1}, {name}", "a number", short(row.get(name)), do)
 
 
-def _ports(keys: CalibrationKeys, path: Path) -> dict[str, Port]:
+def _ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> dict[str, Port]:
     ports = {}
     for name, entry in keys.ports.items():
-        try:
-            ports[name] = entry.port()
-        except CameraError as error:
-            raise CameraError(f"{path}, ports, {name}, {error}") from None
-    return ports
-
-
-def _check_ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> None:
-    for name in keys.ports:
         if name not in cameras:
             do = f"name one of {', '.join(cameras)}"
             raise camera_error(f"{path}, ports", "a camera with pictures", f"'{name}'", do)
-    for name in keys.fit_ports:
-        if name not in (*PORT_NUMBERS, *PORT_TILT):
-            raise CameraError(refuse_unknown(name, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports"))
+        with named(f"{path}, ports, {name}"):
+            ports[name] = entry.port()
+    check_known(keys.fit_ports, (*PORT_NUMBERS, *PORT_TILT), f"{path}, fit_ports")
     if keys.fit_ports and not keys.ports:
         do = "write under `ports` where the walls are, as well as you know"
         raise camera_error(f"{path}, fit_ports", "ports to fit", "none", do)
     if len(set(keys.fit_ports)) < len(keys.fit_ports):
         raise camera_error(f"{path}, fit_ports", "different names", ", ".join(keys.fit_ports), "name each once")
+    return ports
 
 
 def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> tuple[Picture, ...]:
@@ -205,5 +191,5 @@ def _surveyed(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> di
         got = "a reflection" if off <= ROTATION_TOLERANCE else f"rows that are {off:.2g} from it"
         do = "write the plate's x, y and z axis in the lab as its columns"
         raise camera_error(f"{where}, R_lab_plate", "a rotation", got, do)
-    U, _, Vh = torch.linalg.svd(R)
-    return {numbers.index(keys.surveyed.pose): (U @ Vh, torch.tensor(keys.surveyed.T_lab_plate, dtype=torch.float64))}
+    T = torch.tensor(keys.surveyed.T_lab_plate, dtype=torch.float64)
+    return {numbers.index(keys.surveyed.pose): (so3.nearest_rotation(R), T)}

@@ -1,5 +1,5 @@
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -10,23 +10,16 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.calibration.bundle import Rig
 from sphereorient.calibration.document import CalibrationDocument
-from sphereorient.calibration.plate_view import PlateView
+from sphereorient.calibration.targets import PlateView
 from sphereorient.calibration.tsai_method import calibrate_tsai
-from sphereorient.cameras import Camera, Port, PortCamera
+from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera
 from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.io.cameras_yaml import MODELS
 
 POINTS_MIN = 6  # of a picture that is used
 VIEWS_MIN = 3  # of a camera: two planes do not determine the focal length
+SAME = ("image_size", "R_cam_lab", "T_cam_lab_mm", "centre_px")  # fields of all models
 Pose = tuple[Tensor, Tensor]  # R (3, 3) and T (3,), mm
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Start:
-    f_px: float  # along v
-    centre_px: tuple[float, float]
-    R_cam_lab: Tensor  # (3, 3)
-    T_cam_lab_mm: Tensor  # (3,)
 
 
 def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, PlateView]]) -> Rig:
@@ -37,40 +30,41 @@ def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, Pl
     lenses = {name: _zhang(name, seen, document) for name, seen in views.items()}
     placed, plate = _chained({name: relative for name, (_, _, relative) in lenses.items()}, document.surveyed)
     cameras: dict[str, Camera] = {}
-    for name, (f_px, centre, _) in lenses.items():
+    for name, (f_px, centre_px, _) in lenses.items():
         R, T = placed[name]
-        cameras[name] = _camera(document, name, _Start(f_px=f_px, centre_px=centre, R_cam_lab=R, T_cam_lab_mm=T))
-    R_all = torch.eye(3, dtype=torch.float64).repeat(len(document.poses), 1, 1)
-    T_all = torch.full((len(document.poses), 3), torch.nan, dtype=torch.float64)
-    for row, (R, T) in plate.items():
-        R_all[row], T_all[row] = R, T
-    return Rig(cameras=cameras, R_lab_plate=R_all, T_lab_plate_mm=T_all)
+        pose: dict[str, Any] = {"image_size": document.image_size, "R_cam_lab": R, "T_cam_lab_mm": T}
+        cameras[name] = _camera(document, name, PinholeCamera(f_px=f_px, centre_px=centre_px, **pose))
+    unknown = torch.eye(3, dtype=torch.float64), torch.full((3,), torch.nan, dtype=torch.float64)
+    R_all, T_all = zip(*(plate.get(row, unknown) for row in range(len(document.poses))), strict=True)
+    return Rig(cameras=cameras, R_lab_plate=torch.stack(R_all), T_lab_plate_mm=torch.stack(T_all))
 
 
 def guess_from_points(document: CalibrationDocument, name: str, x_lab_mm: Tensor, uv_px: Tensor) -> Camera:
     """Return a camera without distortion from lab points (n, 3), mm, and pixels (n, 2), by Tsai 1987 (CameraError)."""
     found = calibrate_tsai(x_lab_mm, uv_px, document.image_size, document.pixel_pitch_mm)
-    start = _Start(
-        f_px=float(found.f_mm) / document.pixel_pitch_mm[1],
-        centre_px=(float(found.centre_px[0]), float(found.centre_px[1])),
-        R_cam_lab=found.R_cam_lab,
-        T_cam_lab_mm=found.T_cam_lab_mm,
-    )
-    return _camera(document, name, start)
+    same: dict[str, Any] = {name: getattr(found, name) for name in SAME}
+    return _camera(document, name, PinholeCamera(f_px=found.f_mm / document.pixel_pitch_mm[1], **same))
 
 
-def _camera(document: CalibrationDocument, name: str, start: _Start) -> Camera:
-    port, kind = document.ports.get(name), MODELS[document.model]
+def _camera(document: CalibrationDocument, name: str, start: PinholeCamera) -> Camera:
+    """Return a camera of the document's model, behind its port if it has one, from a pinhole camera in the liquid."""
+    port, (pitch_u, pitch_v) = document.ports.get(name), document.pixel_pitch_mm
+    if document.model == "pinhole" and pitch_u != pitch_v:
+        got, do = f"pixel_pitch {pitch_u:g}, {pitch_v:g}", "choose model: tsai or brown"
+        raise camera_error("model: pinhole", "square pixels", got, do)
     start = start if port is None else _in_air(start, port)
-    fields: dict[str, Any] = kind.ideal_lens(start.f_px, document.pixel_pitch_mm)
-    fields |= {"centre_px": start.centre_px, "R_cam_lab": start.R_cam_lab, "T_cam_lab_mm": start.T_cam_lab_mm}
-    lens = kind(image_size=document.image_size, **fields)
+    fields: dict[str, Any] = {
+        "pinhole": {"f_px": start.f_px},
+        "tsai": {"f_mm": start.f_px * pitch_v, "pixel_pitch_mm": (pitch_u, pitch_v), "sx": 1.0, "kappa1": 0.0},
+        "brown": {"f_px": torch.stack([start.f_px * pitch_v / pitch_u, start.f_px]), "k": (0.0,) * 3, "p": (0.0, 0.0)},
+    }[document.model]
+    lens = MODELS[document.model](**fields, **{name: getattr(start, name) for name in SAME})
     return lens if port is None else PortCamera(camera=lens, port=port)
 
 
 def _zhang(
     name: str, seen: Mapping[int, PlateView], document: CalibrationDocument
-) -> tuple[float, tuple[float, float], dict[int, Pose]]:
+) -> tuple[Tensor, Tensor, dict[int, Pose]]:
     """Return focal length (px along v), centre (px) and the plate's poses in one camera's frame."""
     rows = [row for row, view in sorted(seen.items()) if len(view) >= POINTS_MIN]
     if len(rows) < VIEWS_MIN:
@@ -84,10 +78,10 @@ def _zhang(
     flags |= cv2.CALIB_FIX_PRINCIPAL_POINT  # hardly improves the guess, and spoils it with a weak set of poses
     none: Any = None
     _, K, _, turns, moves = cv2.calibrateCamera(points, pixels, document.image_size, guess, none, flags=flags)
-    relative = {}
-    for row, turn, move in zip(rows, turns, moves, strict=True):
-        relative[row] = so3.exp(torch.from_numpy(turn.reshape(3))), torch.from_numpy(move.reshape(3))
-    return float(K[1, 1]), (float(K[0, 2]), float(K[1, 2])), relative
+    turn, move = (torch.from_numpy(np.stack(parts)[..., 0]) for parts in (turns, moves))
+    relative = {row: (so3.exp(turn[k]), move[k]) for k, row in enumerate(rows)}
+    lens = torch.from_numpy(K)
+    return lens[1, 1], lens[:2, 2], relative
 
 
 def _chained(
@@ -101,8 +95,7 @@ def _chained(
         for name, poses in relative.items():
             known = [row for row in poses if row in plate]
             if name not in placed and known:
-                R_cam_plate, T_cam_plate = poses[known[0]]
-                R_lab_plate, T_lab_plate = plate[known[0]]
+                (R_cam_plate, T_cam_plate), (R_lab_plate, T_lab_plate) = poses[known[0]], plate[known[0]]
                 R = R_cam_plate @ R_lab_plate.mT
                 placed[name] = R, T_cam_plate - R @ T_lab_plate
                 grown = True
@@ -118,10 +111,9 @@ def _chained(
     return placed, plate
 
 
-def _in_air(start: _Start, port: Port) -> _Start:
+def _in_air(start: PinholeCamera, port: Port) -> PinholeCamera:
     """Return the camera in air for one in the liquid: small-angle Snell, angles times n, distance to the wall / n."""
-    R, T, normal, n = start.R_cam_lab, start.T_cam_lab_mm, port.normal_lab, float(port.n_fluid)
-    centre = -(R.mT @ T)
+    R, centre, normal, n = start.R_cam_lab, start.centre_lab_mm, port.normal_lab, float(port.n_fluid)
     height = float(centre @ normal) - float(port.offset_mm)
     true_height = height / n + float(port.thickness_mm) * (1 - 1 / float(port.n_glass))
     centre = centre + (true_height - height) * normal
@@ -132,4 +124,4 @@ def _in_air(start: _Start, port: Port) -> _Start:
     size = swing.norm()
     if float(size) > 1e-12:
         R = R @ so3.exp(swing / size * torch.asin(size.clamp_max(1.0))).mT
-    return _Start(f_px=start.f_px / n, centre_px=start.centre_px, R_cam_lab=R, T_cam_lab_mm=-(R @ centre))
+    return replace(start, f_px=start.f_px / n, R_cam_lab=R, T_cam_lab_mm=-(R @ centre))

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sphereorient.calibration.ellipse import Dots
-from sphereorient.calibration.plate_view import PlateView, placed, quarter_turned, refused_view
-from sphereorient.calibration.targets import DotPlate, Floats, Ints
+from sphereorient.calibration import targets
+from sphereorient.calibration.dots import Dots
+from sphereorient.calibration.targets import DotPlate, Floats, Ints, PlateView, refused_view
 from sphereorient.errors import refusal
 
 NEIGHBOURS = 24  # of each dot: at 75 degrees of tilt the next column is about the 12th nearest
@@ -40,7 +40,7 @@ def find_lattice(dots: Dots) -> Lattice | None:
     """
     if len(dots) < 9:
         return None
-    field = _Field.about(dots)
+    field = _Field(dots)
     best: dict[int, tuple[int, int]] = {}
     tried: set[int] = set()
     for seed in field.seeds():
@@ -55,28 +55,23 @@ def find_lattice(dots: Dots) -> Lattice | None:
     return _checked(dots, which, index)
 
 
-@dataclass(frozen=True, eq=False)
 class _Field:
-    uv_px: Floats  # (n, 2)
-    metric: Floats  # (n, 2, 2): v^T metric v = 1 for v one pitch long
-    near: Ints  # (n, k)
-    tree: cKDTree[None]
+    """Dots with their neighbours near (n, k), and metric (n, 2, 2): v^T metric v = 1 for v one pitch long."""
 
-    @classmethod
-    def about(cls, dots: Dots) -> _Field:
-        tree: cKDTree[None] = cKDTree(dots.uv_px)
+    def __init__(self, dots: Dots) -> None:
+        self.uv_px = dots.uv_px
+        self.tree: cKDTree[None] = cKDTree(dots.uv_px)
         k = min(NEIGHBOURS, len(dots) - 1)
-        near = np.asarray(tree.query(dots.uv_px, k=k + 1)[1], dtype=np.int64)
+        near = np.asarray(self.tree.query(dots.uv_px, k=k + 1)[1], dtype=np.int64)
         # The median over neighbours removes the effect of fiducials and stray blobs.
         shape = np.median(dots.shape[near[:, : min(k, 8) + 1]], axis=1)
         away = dots.uv_px[near[:, 1:]] - dots.uv_px[:, None]
         radii = np.sqrt(np.einsum("nka,nab,nkb->nk", away, shape, away))
         pitch = np.median(radii.min(axis=1))  # in radii of a dot
-        return cls(dots.uv_px, shape / pitch**2, near[:, 1:], tree)
+        self.near, self.metric = near[:, 1:], shape / pitch**2
 
     def _pitches(self, k: int, away: Floats) -> Floats:
-        length: Floats = np.sqrt(np.einsum("...a,ab,...b->...", away, self.metric[k], away))
-        return length
+        return np.asarray(np.sqrt(np.einsum("...a,ab,...b->...", away, self.metric[k], away)))
 
     def steps_from(self, k: int) -> tuple[Floats, Floats] | None:
         """Return the two steps, px, to the neighbours of dot k, if four of them form a right-angled cross."""
@@ -126,15 +121,13 @@ class _Field:
         self, k: int, at: tuple[int, int], dot_at: dict[tuple[int, int], int], guess: tuple[Floats, Floats]
     ) -> tuple[Floats, Floats]:
         # Steps to neighbours already placed follow the perspective; otherwise the parent's step is used.
-        found: list[Floats] = []
-        for axis in (0, 1):
-            seen = []
-            for sign in (1, -1):
-                m = dot_at.get((at[0] + sign * (axis == 0), at[1] + sign * (axis == 1)))
-                if m is not None:
-                    seen.append(sign * (self.uv_px[m] - self.uv_px[k]))
-            found.append(np.mean(seen, axis=0) if seen else guess[axis])
-        return found[0], found[1]
+        seen: tuple[list[Floats], list[Floats]] = ([], [])
+        for di, dj in STEPS:
+            m = dot_at.get((at[0] + di, at[1] + dj))
+            if m is not None:
+                seen[dj != 0].append((di + dj) * (self.uv_px[m] - self.uv_px[k]))
+        i, j = (np.mean(found, axis=0) if found else usual for found, usual in zip(seen, guess, strict=True))
+        return i, j
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +145,11 @@ class _Map:
         found: Any = cv2.findHomography(near, uv_px, 0)[0]
         if found is None or not np.isfinite(found).all():
             return None
-        homography = np.asarray(found, dtype=np.float64)
-        straight = cls(homography, middle, size, np.zeros((10, 2)))
+        straight = cls(np.asarray(found, dtype=np.float64), middle, size, np.zeros((10, 2)))
         if len(index) < CUBIC_FROM:
             return straight
-        terms = straight._terms(index)
-        bend = np.linalg.lstsq(terms, uv_px - straight(index), rcond=1e-9)[0]
-        return cls(homography, middle, size, np.asarray(bend, dtype=np.float64))
+        bend = np.linalg.lstsq(straight._terms(index), uv_px - straight(index), rcond=1e-9)[0]
+        return replace(straight, bend=bend)
 
     def _terms(self, index: Floats | Ints) -> Floats:
         x, y = ((index - self.middle) / self.size).T
@@ -167,14 +158,12 @@ class _Map:
     def __call__(self, index: Floats | Ints) -> Floats:
         near = (index - self.middle) / self.size
         h = np.column_stack([near, np.ones(len(near))]) @ self.homography.T
-        uv_px: Floats = h[:, :2] / h[:, 2:] + self._terms(index) @ self.bend
-        return uv_px
+        return np.asarray(h[:, :2] / h[:, 2:] + self._terms(index) @ self.bend)
 
     def nearest(self, uv_px: Floats) -> Ints:
         """Return the nearest grid indices (n, 2), by the homography: cubic terms do not extrapolate."""
         h = np.column_stack([uv_px, np.ones(len(uv_px))]) @ np.linalg.inv(self.homography).T
-        nearest: Ints = np.rint(h[:, :2] / h[:, 2:] * self.size + self.middle).astype(np.int64)
-        return nearest
+        return np.asarray(np.rint(h[:, :2] / h[:, 2:] * self.size + self.middle), dtype=np.int64)
 
     def steps(self, index: Ints) -> Floats:
         """Return (n, 2, 2) px: the steps to the next column (first column) and to the next row (second)."""
@@ -183,8 +172,7 @@ class _Map:
 
     def misses(self, index: Ints, uv_px: Floats) -> Floats:
         away = np.linalg.solve(self.steps(index), (uv_px - self(index))[..., None])[..., 0]
-        miss: Floats = np.hypot(away[:, 0], away[:, 1])
-        return miss
+        return np.asarray(np.hypot(away[:, 0], away[:, 1]))
 
 
 def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
@@ -194,12 +182,10 @@ def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
         return None
     rest = np.setdiff1d(np.arange(len(dots)), which)
     there = lattice_map.nearest(dots.uv_px[rest])
-    taken = {tuple(at) for at in index.tolist()}
-    low, high = index.min(axis=0), index.max(axis=0)
-    free = np.array([tuple(at) not in taken for at in there.tolist()], dtype=bool) if len(rest) else np.zeros(0, bool)
+    taken = (there[:, None] == index).all(axis=2).any(axis=1)
     # Fill gaps only: outside the reached area a stray blob is more likely than a dot.
-    free &= ((there >= low) & (there <= high)).all(axis=1)
-    fits = np.flatnonzero(free)
+    inside = ((there >= index.min(axis=0)) & (there <= index.max(axis=0))).all(axis=1)
+    fits = np.flatnonzero(inside & ~taken)
     fits = fits[lattice_map.misses(there[fits], dots.uv_px[rest[fits]]) < MODEL_MISS]
     which, index = np.concatenate([which, rest[fits]]), np.concatenate([index, there[fits]])
     which, index, lattice_map = _agreeing(dots, which, index)
@@ -233,71 +219,51 @@ def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture") -> Plat
         got = f"{len(dots)} dots" + ("" if lattice is None else f", {len(lattice.index)} of them in a lattice")
         expected = f"a lattice of {LEAST_DOTS} dots or more, 3 x 3 of them whole"
         do = "look at the picture: is the plate in it, sharp, and dark or bright as stated"
-        return refused_view(name, expected=expected, got=got, do=do)
-    large, odd = _sizes(lattice, plate)
+        return refused_view(name, expected, got, do)
+    dot, fiducial = plate.dot_diameter_mm / plate.pitch_mm, plate.fiducial_diameter_mm / plate.pitch_mm
+    large = lattice.width > np.sqrt(dot * fiducial)
+    odd = np.abs(lattice.width / np.where(large, fiducial, dot) - 1) > WIDTH_MISS
     if odd.mean() > 0.2:
-        pitches = float(np.median(lattice.width))
-        expected = f"dots {plate.dot_diameter_mm / plate.pitch_mm:.2f} pitches wide"
-        do = "correct pitch and dot_diameter of the plate"
-        return refused_view(name, expected=expected, got=f"{pitches:.2f} pitches", do=do)
+        expected, got = f"dots {dot:.2f} pitches wide", f"{np.median(lattice.width):.2f} pitches"
+        return refused_view(name, expected, got, "correct pitch and dot_diameter of the plate")
     which, index, large = lattice.which[~odd], lattice.index[~odd], large[~odd]
-    seen = np.ptp(index, axis=0) + 1
-    if (np.sort(seen) > np.sort([plate.columns, plate.rows])).any():
-        expected, got = f"at most {plate.columns} x {plate.rows} dots", f"a lattice of {seen[0]} x {seen[1]}"
-        do = "correct columns and rows of the plate"
-        return refused_view(name, expected=expected, got=got, do=do)
+    across, up = np.ptp(index, axis=0) + 1
+    if (np.sort([across, up]) > np.sort([plate.columns, plate.rows])).any():
+        expected, got = f"at most {plate.columns} x {plate.rows} dots", f"a lattice of {across} x {up}"
+        return refused_view(name, expected, got, "correct columns and rows of the plate")
     placements = _placements(index, large, plate)
     if len(placements) == 0:
         return _misplaced(index, large, plate, name)
     got = f"{int(large.sum())}, which leave {len(placements)} places of its dots on the plate"
     do = "show the fiducials, or have the other camera see them at the same instant"
-    view = PlateView(
-        points_plate_mm=plate.points(index),
-        uv_px=dots.uv_px[which],
-        sigma_px=dots.sigma_px[which],
-        diameter_mm=np.where(large, plate.fiducial_diameter_mm, plate.dot_diameter_mm),
-        index=index,
-        state="floating",
-        reason=refusal(name, expected="3 larger dots in view", got=got, do=do),
-        placements=placements,
-    )
-    return placed(view, plate, placements[0]) if len(placements) == 1 else view
+    view = targets.seen(plate, index, dots.uv_px[which], dots.sigma_px[which])
+    return view.settled(plate, placements, refusal(name, expected="3 larger dots in view", got=got, do=do))
 
 
 def _placements(index: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
     """Return the placements (m, 3) of a lattice on the plate that its larger dots allow."""
-    found: list[tuple[int, int, int]] = []
+    found = []
     for quarters in range(4):
-        at = quarter_turned(index, quarters)
+        at = targets.quarter_turned(index, quarters)
         for shift in _shifts(at, large, plate):
             there = at + shift
             if plate.holds(there).all() and (plate.is_fiducial(there) == large).all():
-                found.append((quarters, int(shift[0]), int(shift[1])))
+                found.append((quarters, *shift))
     return np.array(found, dtype=np.int64).reshape(-1, 3)
 
 
 def _shifts(at: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
     if large.any():
-        onto: Ints = np.array(plate.fiducials, dtype=np.int64) - at[large][0]
-        return onto
-    low, high = np.array(plate.first) - at.min(axis=0), np.array(plate.last) - at.max(axis=0)
-    i, j = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
-    return np.stack([i.ravel(), j.ravel()], axis=1).astype(np.int64)
-
-
-def _sizes(lattice: Lattice, plate: DotPlate) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which dots have the size of fiducials, and which have neither size."""
-    dot, fiducial = plate.dot_diameter_mm / plate.pitch_mm, plate.fiducial_diameter_mm / plate.pitch_mm
-    large = lattice.width > np.sqrt(dot * fiducial)
-    stated = np.where(large, fiducial, dot)
-    return large, np.abs(lattice.width / stated - 1) > WIDTH_MISS
+        return np.asarray(plate.fiducials - at[large][0])
+    low, high = plate.first - at.min(axis=0), plate.last - at.max(axis=0)
+    return targets.indices(low, high)
 
 
 def _misplaced(index: Ints, large: NDArray[np.bool_], plate: DotPlate, name: str) -> PlateView:
     if len(_placements(index * MIRROR, large, plate)):
         expected, got = "the plate from its front, z towards the camera", "its mirror image"
         do = "mirror the picture back, or correct the fiducials: x to the right of the origin, y above it"
-        return refused_view(name, expected=expected, got=got, do=do)
+        return refused_view(name, expected, got, do)
     expected = f"larger dots at the grid indices {[list(f) for f in plate.fiducials]}"
     got = f"{int(large.sum())} larger dots that fit there nowhere on {plate.columns} x {plate.rows}"
-    return refused_view(name, expected=expected, got=got, do="correct columns, rows and fiducials of the plate")
+    return refused_view(name, expected, got, "correct columns, rows and fiducials of the plate")

@@ -1,6 +1,6 @@
 """Calibration from pictures of a plate or tables of points: points -> guess -> joint fit -> cameras."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sphereorient.calibration.boards import see_plate
 from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
 from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
 from sphereorient.calibration.guess import guess_from_points, guess_rig
-from sphereorient.calibration.plate_view import PlateView, placed
-from sphereorient.cameras import Camera, ParameterCovariance
-from sphereorient.cameras.checks import camera_error
-from sphereorient.errors import CameraError, refusal
+from sphereorient.calibration.targets import PlateView, placed
+from sphereorient.cameras import Camera, ParameterCovariance, PortCamera, TsaiCamera
+from sphereorient.cameras.checks import camera_error, named
+from sphereorient.errors import CameraError
 from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 
@@ -26,9 +27,11 @@ LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a pla
 Progress = Callable[[str, int, int], None]
 SIGMA_PX = 0.05  # of points in tables; only ratios matter, because the residuals give the scale
 CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tied where one placement fits this well
-# Sigmas from which a parameter counts as undetermined: of focal length, distance, picture's width; rad
-LOOSE = {"f": 0.01, "T": 0.01, "centre": 0.02, "rotation": 0.01}
+# Sigmas from which a parameter counts as undetermined, by the begin of its name: shares of focal length, distance and
+# picture's width; mm, rad and indices. The others, of the distortion, show in these.
+LOOSE_SHARE = {"f": 0.01, "T_": 0.01, "centre": 0.02, "cx": 0.02, "cy": 0.02}
 LOOSE_PORT = {"port_offset": 5.0, "port_thickness": 5.0, "port_n_glass": 0.1, "port_n_fluid": 0.05, "port_tilt": 0.05}
+LOOSE = {"rotation": 0.01} | LOOSE_PORT
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,8 +48,7 @@ class PictureReport:
     @property
     def rms_px(self) -> float:
         """Rms distance between measured and expected points without outliers; NaN without points."""
-        missed = self.residual_px[self.used]
-        return float(np.sqrt((missed**2).sum(1).mean())) if len(missed) else float("nan")
+        return _rms_px([self])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,8 +64,12 @@ class Calibrated:
 
     def rms_px(self, camera: str) -> float:
         """Rms distance between one camera's measured and expected points."""
-        missed = [one.residual_px[one.used] for one in self.pictures if one.picture.camera == camera]
-        return float(np.sqrt((np.concatenate(missed) ** 2).sum(1).mean()))
+        return _rms_px([one for one in self.pictures if one.picture.camera == camera])
+
+
+def _rms_px(pictures: Sequence[PictureReport]) -> float:
+    missed = np.concatenate([one.residual_px[one.used] for one in pictures])
+    return float(np.sqrt((missed**2).sum(1).mean())) if len(missed) else float("nan")
 
 
 def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: Progress | None = None) -> Calibrated:
@@ -95,14 +101,9 @@ def _read_tables(document: CalibrationDocument) -> dict[Picture, PlateView]:
     views = {}
     for name, path in document.points.items():
         table = read_points(path)
-        n = len(table)
-        views[Picture(camera=name, row=0, path=path)] = PlateView(
-            points_plate_mm=table[:, :3],
-            uv_px=table[:, 3:],
-            sigma_px=np.full(n, SIGMA_PX),
-            diameter_mm=np.zeros(n),
-            index=np.stack([np.arange(n), np.zeros(n, dtype=np.int64)], axis=1),
-        )
+        corners, index = np.zeros(len(table)), np.stack([np.arange(len(table)), np.zeros(len(table), int)], axis=1)
+        view = PlateView(table[:, :3], table[:, 3:], np.full(len(table), SIGMA_PX), corners, index)
+        views[Picture(camera=name, row=0, path=path)] = view
     return views
 
 
@@ -114,8 +115,7 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
     grey = [_read_grey(picture.path, document.image_size) for picture in document.pictures]
     views = {}
     with ThreadPoolExecutor(2) as pool:
-        names = [picture.path.name for picture in document.pictures]
-        seen = pool.map(lambda one, name: see_plate(one, plate, name), grey, names)
+        seen = pool.map(lambda one, picture: see_plate(one, plate, picture.path.name), grey, document.pictures)
         progress("pictures", 0, len(grey))
         for picture, view in zip(document.pictures, seen, strict=True):
             views[picture] = view
@@ -144,7 +144,7 @@ def _check_seen(
         if not any(picture in tied for picture in of_camera):
             do = "check plate: in the file, and the pictures"
             got = f"none of {len(of_camera)}; the first: {views[of_camera[0]].reason}"
-            raise CameraError(refusal(f"{document.path}, {name}", expected="pictures of the plate", got=got, do=do))
+            raise camera_error(f"{document.path}, {name}", "pictures of the plate", got, do)
 
 
 def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView]) -> Rig:
@@ -153,10 +153,8 @@ def _first_rig(document: CalibrationDocument, tied: Mapping[Picture, PlateView])
     cameras = {}
     for picture, view in tied.items():
         arrays = torch.from_numpy(view.points_plate_mm), torch.from_numpy(view.uv_px)
-        try:
+        with named(str(picture.path)):
             cameras[picture.camera] = guess_from_points(document, picture.camera, *arrays)
-        except CameraError as error:
-            raise CameraError(f"{picture.path}, {error}") from None
     R, T = document.surveyed[0]
     return Rig(cameras=cameras, R_lab_plate=R[None], T_lab_plate_mm=T[None])
 
@@ -195,9 +193,7 @@ def tie_floating(
         candidates = [placed(view, document.plate, placement) for placement in view.placements]
         missed = [_missed(rig, picture, candidate) for candidate in candidates]
         order = np.argsort(missed)
-        apart = np.linalg.norm(view.uv_px[:, None] - view.uv_px[None], axis=-1)
-        np.fill_diagonal(apart, np.inf)
-        step = float(np.median(apart.min(1)))  # typical distance of neighbouring points
+        step = float(np.median(cKDTree(view.uv_px).query(view.uv_px, k=2)[0][:, 1]))  # to the neighbouring point
         if missed[order[0]] < CLEARLY * step and (len(order) == 1 or missed[order[1]] > 2 * CLEARLY * step):
             tied[picture] = candidates[order[0]]
     return tied
@@ -212,70 +208,45 @@ def _missed(rig: Rig, picture: Picture, view: PlateView) -> float:
 def _check_determined(document: CalibrationDocument, fitted: Fitted) -> None:
     loose = []
     for name, camera in fitted.rig.cameras.items():
-        for parameter, sigma in _sigmas(camera).items():
-            share = sigma / _loose_sigma(camera, parameter, document)
+        limits = _loose_sigmas(camera)
+        for parameter, sigma in (camera.covariance.sigmas if camera.covariance else {}).items():
+            share = sigma / next((limit for begin, limit in limits.items() if parameter.startswith(begin)), np.inf)
             if not share < 1:
                 loose.append((share, f"{name}.{parameter} (sigma {sigma:.3g})"))
     if loose:
         named = ", ".join(text for _, text in sorted(loose, reverse=True)[:3])
         do = "add pictures of the plate in other poses: tilted about both axes, nearer and farther"
         expected = "poses that determine all parameters of the cameras"
-        raise CameraError(refusal(str(document.path), expected=expected, got=f"loose: {named}", do=do))
+        raise camera_error(str(document.path), expected, f"loose: {named}", do)
 
 
-def _sigmas(camera: Camera) -> dict[str, float]:
-    return {} if camera.covariance is None else camera.covariance.sigmas
-
-
-def _loose_sigma(camera: Camera, parameter: str, document: CalibrationDocument) -> float:
-    if parameter.startswith("T_"):
-        return LOOSE["T"] * float(camera.T_cam_lab_mm.norm())
-    if parameter.startswith("rotation"):
-        return LOOSE["rotation"]
-    if parameter.startswith(("centre", "cx", "cy")):
-        return LOOSE["centre"] * document.image_size[0]
-    if parameter in ("f", "f_px", "fx", "fy"):
-        inner: Any = getattr(camera, "camera", camera)
-        value = inner.f_mm if parameter == "f" else inner.f_px
-        return LOOSE["f"] * float(torch.as_tensor(value).max())
-    for name, size in LOOSE_PORT.items():
-        if parameter.startswith(name):
-            return size
-    return float("inf")  # distortion: the other parameters show it
+def _loose_sigmas(camera: Camera) -> dict[str, float]:
+    """Return the sigmas from which parameters are undetermined, by the begin of their names."""
+    lens: Any = camera.camera if isinstance(camera, PortCamera) else camera
+    focal, width = float((lens.f_mm if isinstance(lens, TsaiCamera) else lens.f_px).max()), camera.image_size[0]
+    scale = {"f": focal, "T_": float(camera.T_cam_lab_mm.norm())}
+    return {begin: share * scale.get(begin, width) for begin, share in LOOSE_SHARE.items()} | LOOSE
 
 
 def _collected(
-    document: CalibrationDocument,
-    views: Mapping[Picture, PlateView],
-    tied: Mapping[Picture, PlateView],
-    fitted: Fitted,
+    document: CalibrationDocument, views: Mapping[Picture, PlateView], tied: Mapping[Picture, PlateView], fitted: Fitted
 ) -> Calibrated:
-    begin = dict.fromkeys(document.cameras, 0)
-    shares = {}
-    for picture in sorted(tied, key=lambda picture: picture.row):
-        first = begin[picture.camera]
-        begin[picture.camera] = first + len(tied[picture])
-        shares[picture] = slice(first, begin[picture.camera])
     reports = []
     for picture, view in views.items():
         residual, used = np.zeros((0, 2)), np.zeros(0, dtype=bool)
         reason = view.reason or f"{picture.path.name}: {len(view)} points, too few to determine the pose"
         if picture in tied:
-            share, name, reason = shares[picture], picture.camera, ""
-            residual, used = fitted.residual_px[name][share].numpy(), fitted.used[name][share].numpy()
-        report = PictureReport(
-            picture=picture,
-            pose=document.poses[picture.row],
-            view=tied.get(picture, view),
-            residual_px=residual,
-            used=used,
-            reason=reason,
-        )
+            name, view, reason = picture.camera, tied[picture], ""
+            rows = fitted.problem.seen[name].pose == picture.row
+            residual, used = fitted.residual_px[name][rows].numpy(), fitted.used[name][rows].numpy()
+        pose = document.poses[picture.row]
+        report = PictureReport(picture=picture, pose=pose, view=view, residual_px=residual, used=used, reason=reason)
         reports.append(report)
-    count = sum(len(_sigmas(camera)) for camera in fitted.rig.cameras.values())
+    count = sum(len(names) for names in fitted.problem.names.values())
+    names, matrix = tuple(fitted.problem.labels[:count]), fitted.covariance[:count, :count]
     return Calibrated(
         cameras=fitted.rig.cameras,
-        covariance=ParameterCovariance(names=fitted.labels[:count], matrix=fitted.covariance[:count, :count]),
+        covariance=ParameterCovariance(names=names, matrix=matrix),
         R_lab_plate=fitted.rig.R_lab_plate,
         T_lab_plate_mm=fitted.rig.T_lab_plate_mm,
         pictures=tuple(reports),

@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -13,8 +15,9 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, triangulate
+from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
-from sphereorient.errors import CameraError, TrackError, refusal
+from sphereorient.errors import TrackError
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.trajectory import Reason, Trajectory
 
@@ -80,13 +83,10 @@ def observations_of(track: Trajectory, cameras: Mapping[str, Camera]) -> dict[st
 
 def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[CameraCheck]:
     """Measure the distance between the lines of sight to the sphere's centre, for every pair of cameras."""
-    observed, names, checks = observations_of(track, cameras), list(cameras), []
-    for k, one in enumerate(names):
-        for other in names[k + 1 :]:
-            pair = (one, other)
-            both = torch.isfinite(observed[one].centre_px + observed[other].centre_px).all(-1)
-            if not bool(both.any()):
-                continue
+    observed, checks = observations_of(track, cameras), []
+    for pair in combinations(cameras, 2):
+        both = torch.isfinite(torch.stack([observed[name].centre_px for name in pair])).all(-1).all(0)
+        if bool(both.any()):
             pixels = {name: observed[name].centre_px[both] for name in pair}
             middle, gap = triangulate(*(cameras[name].rays(pixels[name]) for name in pair))
             missed = torch.stack([(cameras[name].project(middle) - pixels[name]).norm(dim=-1) for name in pair])
@@ -98,10 +98,9 @@ def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repai
     """Repair cameras (cameras.yaml) that moved after their calibration, with a track.h5 that was made with them.
     CameraError for unreadable cameras or too few frames that both saw; TrackError for a track of other cameras.
     """
-    cameras = load_cameras(cameras_path)
-    track = Trajectory.load(track_path)
-    used = {name: camera for name, camera in cameras.items() if name in track.cameras}
-    return self_calibrate(used or cameras, observations_of(track, used or cameras))
+    cameras, track = load_cameras(cameras_path), Trajectory.load(track_path)
+    used = {name: camera for name, camera in cameras.items() if name in track.cameras} or cameras
+    return self_calibrate(used, observations_of(track, used))
 
 
 def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraObservations]) -> Repaired:
@@ -112,17 +111,15 @@ def self_calibrate(cameras: Mapping[str, Camera], observed: Mapping[str, CameraO
     Raises:
         CameraError: one camera, or too few frames that both saw.
     """
-    names = list(cameras)
-    if len(names) < 2:
+    if len(cameras) < 2:
         do = "give the track of both cameras"
-        raise CameraError(refusal("cameras", expected="two or more that saw the ball", got=f"{len(names)}", do=do))
-    first, repaired = names[0], dict(cameras)
+        raise camera_error("cameras", "two or more that saw the ball", f"{len(cameras)}", do)
+    (first, *others), repaired = cameras, dict(cameras)
     moved, sigma, held = {}, {}, [f"{first}: all (the lab frame)"]
     before, after = [], []
-    for name in names[1:]:
+    for name in others:
         pair = _Pair(cameras[first], cameras[name], observed[first], observed[name])
-        change, spread = pair.solved()
-        moved[name], sigma[name] = change, spread
+        moved[name], sigma[name] = change, spread = pair.solved()
         repaired[name] = with_parameters(cameras[name], MOVED, change)
         held += [f"{name}.{part}" for part, loose in zip(MOVED, spread > HELD_SHARE * PRIOR, strict=True) if loose]
         before.append(pair.gaps(torch.zeros(6, dtype=torch.float64)))
@@ -150,7 +147,7 @@ class _Pair:
         if int(both.sum()) < FRAMES_MIN:
             expected = f"{FRAMES_MIN} frames or more in which both cameras measure the ball's orientation"
             do = "pass a longer track, made with both cameras"
-            raise CameraError(refusal("track", expected=expected, got=f"{int(both.sum())}", do=do))
+            raise camera_error("track", expected, f"{int(both.sum())}", do)
         self.loose = loose
         self.ray = still.rays(seen.centre_px[both])
         self.centre_px = seen_loose.centre_px[both]
@@ -174,12 +171,10 @@ class _Pair:
         """Return the motion (6,) and its sigmas from the scatter of frames at the solution."""
         at = torch.zeros(9, dtype=torch.float64)
         for _ in range(ROUNDS):
-            at = self._improved(at, *self._scatter(at[:6]))
+            known = dict(zip(("spread", "kept"), self._scatter(at[:6]), strict=True))
+            at = least_squares(partial(self._residuals, **known), partial(self._slopes, **known), at)
         slopes = self._slopes(at, *self._scatter(at[:6]))
         return at[:6], inverse_information(slopes.mT @ slopes).diagonal()[:6].sqrt()
-
-    def _improved(self, at: Tensor, spread: Tensor, kept: Tensor) -> Tensor:
-        return least_squares(lambda x: self._residuals(x, spread, kept), lambda x: self._slopes(x, spread, kept), at)
 
     def _scatter(self, change: Tensor) -> tuple[Tensor, Tensor]:
         """Return the robust spread (4,) of gap (mm) and rotations (rad), and the inlier frames (N,)."""
@@ -216,6 +211,4 @@ def _with_spread(camera: Camera, known: ParameterCovariance, spread: Tensor) -> 
         if part in known.names:
             k = known.names.index(part)
             matrix[k], matrix[:, k], matrix[k, k] = 0.0, 0.0, sigma**2
-    changed: Any = camera
-    result: Camera = replace(changed, covariance=ParameterCovariance(names=known.names, matrix=matrix))
-    return result
+    return cast(Camera, replace(cast(Any, camera), covariance=replace(known, matrix=matrix)))

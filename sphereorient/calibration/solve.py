@@ -1,16 +1,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.cameras.checks import camera_error, check_points
-from sphereorient.cameras.parameters import with_parameters
+from sphereorient.cameras.parameters import AnyCamera, with_parameters
 from sphereorient.errors import CameraError, ShapeError, refusal
-
-AnyCamera = TypeVar("AnyCamera", bound=Camera)
 
 DAMPING = 1e-4  # at the start, relative to the information's diagonal
 LEAST, MOST = 1e-12, 1e10  # of the damping; beyond the upper one no step helps
@@ -99,8 +97,7 @@ def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tenso
         loose = [name for name, share in zip(names, part.tolist(), strict=True) if share > 0.3 * float(part.max())]
         do = "add points at other depths, tilt the plate, or hold some of these parameters"
         raise camera_error("points", "a determined camera", f"no information on {', '.join(loose)}", do)
-    inverse: Tensor = (vectors / values.clamp_min(1e-14)) @ vectors.mT
-    whole: Tensor = scale[:, None] * inverse * scale
+    whole: Tensor = scale[:, None] * ((vectors / values.clamp_min(1e-14)) @ vectors.mT) * scale
     return (whole + whole.mT) / 2
 
 
@@ -115,8 +112,8 @@ def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_
     x_lab_mm, uv_px = checked_points(x_lab_mm, uv_px)
     size, least = len(names), -(-len(names) // 2)
     if len(x_lab_mm) < least:
-        expected, got = f"{least} or more for {size} parameters", f"{len(x_lab_mm)}"
-        raise CameraError(refusal("points", expected=expected, got=got, do="add points, or hold some parameters"))
+        expected, do = f"{least} or more for {size} parameters", "add points, or hold some parameters"
+        raise camera_error("points", expected, f"{len(x_lab_mm)}", do)
     start = cast(AnyCamera, replace(cast(Any, camera), covariance=None))
 
     def expected_px(change: Tensor) -> Tensor:

@@ -32,22 +32,16 @@ def systematic_errors(
     """
     known = torch.isfinite(position_lab_mm).all(-1)
     positions = position_lab_mm[known].double()
+    some = positions
     if len(positions) > DIRECT_FRAMES:
-        rows = torch.linspace(0, len(positions) - 1, DIRECT_FRAMES).round().long()
-        some = _pose_by_parameters(cameras, covariance.names, positions[rows], radius_mm)
-        basis, target = _quadratic(positions[rows], positions[rows]), some.flatten(1)
-        effect = (_quadratic(positions, positions[rows]) @ torch.linalg.lstsq(basis, target).solution).unflatten(
-            1, some.shape[1:]
-        )
-    else:
-        effect = _pose_by_parameters(cameras, covariance.names, positions, radius_mm)
-    whole = effect @ covariance.matrix @ effect.mT
-    parts = []
-    for block in (slice(3, 6), slice(0, 3)):
-        part = position_lab_mm.new_full((len(known), 3, 3), torch.nan, dtype=torch.float64)
-        part[known] = whole[:, block, block]
-        parts.append(part)
-    return Systematic(position_mm2=parts[0], orientation_rad2=parts[1])
+        some = positions[torch.linspace(0, len(positions) - 1, DIRECT_FRAMES).round().long()]
+    effect = _pose_by_parameters(cameras, covariance.names, some, radius_mm)
+    if some is not positions:
+        law = torch.linalg.lstsq(_quadratic(some, some), effect.flatten(1)).solution
+        effect = (_quadratic(positions, some) @ law).unflatten(1, effect.shape[1:])
+    whole = position_lab_mm.new_full((len(known), 6, 6), torch.nan, dtype=torch.float64)
+    whole[known] = effect @ covariance.matrix @ effect.mT
+    return Systematic(position_mm2=whole[:, 3:, 3:], orientation_rad2=whole[:, :3, :3])
 
 
 def _quadratic(positions: Tensor, usual: Tensor) -> Tensor:
@@ -79,7 +73,9 @@ def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: floa
     """Return the derivatives of cap and limb pixels by pose (N, M, 6) and parameters (N, M, P), px."""
     towards = torch.nn.functional.normalize(camera.rays(camera.project(positions)).direction_lab, dim=-1)
     R_lab_view = camera.R_cam_lab.mT @ R_cam_view(towards @ camera.R_cam_lab.mT)
-    paint, limb = (pattern @ R_lab_view.mT * radius_mm for pattern in (_cap(), _limb()))
+    cap = torch.cat([_ring(share, PER_RING, k * torch.pi / PER_RING) for k, share in enumerate(CAP_RINGS)])
+    paint, limb = (pattern @ R_lab_view.mT * radius_mm for pattern in (cap, _ring(1.0, LIMB_POINTS)))
+    count = len(cap)
     arms = torch.cat([paint, _grazed(camera, positions, limb, radius_mm)], dim=1)
     points = positions[:, None] + arms
 
@@ -92,15 +88,14 @@ def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: floa
     # A rotation delta moves a point of the surface by delta x arm; the limb stays.
     lever = torch.linalg.cross(axes.expand(*arms.shape[:2], 3, 3), arms[..., None, :].expand(*arms.shape[:2], 3, 3))
     by_turn = by_place @ lever.mT
-    by_turn[:, len(_cap()) :] = 0.0
-    whole = torch.cat([by_turn, by_place], dim=-1)
+    by_turn[:, count:] = 0.0
     outward = torch.nn.functional.normalize(camera.project(points) - camera.project(positions)[:, None], dim=-1)
-    count = len(_cap())
-    parts = []
-    for slopes in (whole, by_parameter):
+
+    def visible(slopes: Tensor) -> Tensor:
         along = (outward[:, count:, :, None] * slopes[:, count:]).sum(2)  # motion along the limb is invisible
-        parts.append(torch.cat([slopes[:, :count].flatten(1, 2), along], dim=1))
-    return parts[0], parts[1]
+        return torch.cat([slopes[:, :count].flatten(1, 2), along], dim=1)
+
+    return visible(torch.cat([by_turn, by_place], dim=-1)), visible(by_parameter)
 
 
 def _grazed(camera: Camera, positions: Tensor, arms: Tensor, radius_mm: float) -> Tensor:
@@ -114,17 +109,8 @@ def _grazed(camera: Camera, positions: Tensor, arms: Tensor, radius_mm: float) -
     return arms
 
 
-def _cap() -> Tensor:
-    """Return unit vectors (M, 3) of the visible cap in the view frame (z along the line of sight)."""
-    angle = torch.arange(PER_RING, dtype=torch.float64) * (2 * torch.pi / PER_RING)
-    rings = []
-    for k, share in enumerate(CAP_RINGS):
-        turned = angle + k * torch.pi / PER_RING
-        depth = -torch.full_like(angle, (1 - share**2) ** 0.5)
-        rings.append(torch.stack([share * turned.cos(), share * turned.sin(), depth], dim=-1))
-    return torch.cat(rings)
-
-
-def _limb() -> Tensor:
-    angle = torch.arange(LIMB_POINTS, dtype=torch.float64) * (2 * torch.pi / LIMB_POINTS)
-    return torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1)
+def _ring(share: float, count: int, turned: float = 0.0) -> Tensor:
+    """Return unit vectors (count, 3) at a share of the radius, in the view frame (z along the line of sight)."""
+    angle = torch.arange(count, dtype=torch.float64) * (2 * torch.pi / count) + turned
+    depth = -torch.full_like(angle, (1 - share**2) ** 0.5)
+    return torch.stack([share * angle.cos(), share * angle.sin(), depth], dim=-1)

@@ -1,15 +1,16 @@
 import math
 from collections.abc import Sequence
 from itertools import combinations
+from typing import Any
 
 import torch
-from rich.table import Table
+from rich.table import Column, Table
+from torch import Tensor
 
 from sphereorient.calibration.plates import Calibrated
 from sphereorient.calibration.self_calibration import MOVED, OBSERVED, CameraCheck, Repaired
 from sphereorient.cameras import Camera, PortCamera
-from sphereorient.cameras.model import CameraModel
-from sphereorient.cameras.parameters import PORT_NUMBERS
+from sphereorient.cameras.parameters import PORT_NUMBERS, TRANSLATION
 from sphereorient.trajectory import Reason, Trajectory
 
 CONTRARY_SHARE = 0.5  # of the frames of both cameras; a passing reflection spoils a few, a moved camera nearly all
@@ -17,10 +18,8 @@ CONTRARY_SHARE = 0.5  # of the frames of both cameras; a passing reflection spoi
 
 def parameters_table(result: Calibrated) -> Table:
     """Return the parameters of all cameras with their standard deviations."""
-    table = Table(title="parameters (sigma)")
-    table.add_column("parameter")
-    for camera_name in result.cameras:
-        table.add_column(camera_name, justify="right")
+    numbers = (Column(name, justify="right") for name in result.cameras)
+    table = Table("parameter", *numbers, title="parameters (sigma)")
     values = [_values(camera) for camera in result.cameras.values()]
     sigmas = [camera.covariance.sigmas if camera.covariance else {} for camera in result.cameras.values()]
     for name in dict.fromkeys(name for known in values for name in known):
@@ -33,17 +32,13 @@ def parameters_table(result: Calibrated) -> Table:
 
 def pictures_table(result: Calibrated) -> Table:
     """Return one row for each picture: points, outliers and rms, or why it was not used."""
-    table = Table(title="pictures")
-    for column in ("pose", "camera", "picture"):
-        table.add_column(column)
-    for column in ("points", "outliers", "rms px"):
-        table.add_column(column, justify="right")
-    table.add_column("not used because")
+    numbers = (Column(name, justify="right") for name in ("points", "outliers", "rms px"))
+    table = Table("pose", "camera", "picture", *numbers, "not used because", title="pictures")
     for one in sorted(result.pictures, key=lambda one: (one.pose, one.picture.camera)):
         outliers = "" if one.reason else str(int((~one.used).sum()))
         rms = "" if one.reason else f"{one.rms_px:.3f}"
-        row = (str(one.pose), one.picture.camera, one.picture.path.name, str(len(one.view)), outliers, rms, one.reason)
-        table.add_row(*row)
+        where = str(one.pose), one.picture.camera, one.picture.path.name
+        table.add_row(*where, str(len(one.view)), outliers, rms, one.reason)
     return table
 
 
@@ -101,13 +96,11 @@ def contradiction_lines(track: Trajectory) -> list[str]:
 def _values(camera: Camera) -> dict[str, float]:
     """Return the fitted numbers of lens and wall, and T; of the rotation only sigmas are meaningful."""
     known = () if camera.covariance is None else camera.covariance.names
-    found: dict[str, float] = {}
-    inner = camera.camera if isinstance(camera, PortCamera) else camera
-    if isinstance(inner, CameraModel):
-        for name, (field, place) in inner.parameter_fields().items():
-            found[name] = float(getattr(inner, field)[... if place is None else place])
-    found = {name: value for name, value in found.items() if name in known}
-    found |= {f"T_{axis}": float(value) for axis, value in zip("xyz", camera.T_cam_lab_mm, strict=True)}
+    lens: Any = camera.camera if isinstance(camera, PortCamera) else camera
+    found: dict[str, Tensor] = {}
+    for name, (field, place) in lens.parameter_fields().items():
+        found[name] = getattr(lens, field)[... if place is None else place]
+    found |= dict(zip(TRANSLATION, camera.T_cam_lab_mm, strict=True))
     if isinstance(camera, PortCamera):
-        found |= {name: float(getattr(camera.port, field)) for name, field in PORT_NUMBERS.items() if name in known}
-    return found
+        found |= {name: getattr(camera.port, field) for name, field in PORT_NUMBERS.items()}
+    return {name: float(value) for name, value in found.items() if name in known or name in TRANSLATION}

@@ -1,8 +1,8 @@
-"""Calibration targets: dot plates, chessboards, ChArUco boards and circle grids, as `plate` of calibration.yaml."""
+"""Calibration targets (dot plates, chessboards, ChArUco boards, circle grids), and the view of one in a picture."""
 
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -27,19 +27,14 @@ class CalibrationTarget:
     pitch_mm: float
 
     def __post_init__(self) -> None:
-        for name in ("columns", "rows"):
-            count = getattr(self, name)
-            if not _is_whole(count) or not 2 <= count <= MOST:
-                expected, do = f"a whole number, 2 or more, at most {MOST}", "count them on the plate"
-                raise _refused(f"plate, {name}", expected, count, do)
-        for field in fields(self):
-            length = getattr(self, field.name)
-            number = isinstance(length, int | float) and not isinstance(length, bool)
-            if field.name.endswith("_mm") and not (number and 0 < length <= LONGEST_MM):
-                expected = f"a length above zero, mm, at most {LONGEST_MM:g}"
-                raise _refused(f"plate, {_key(field.name)}", expected, length, "measure the plate")
-            if field.type == "bool" and not isinstance(length, bool):
-                raise _refused(f"plate, {_key(field.name)}", "true or false", length)
+        for one in fields(self):
+            name, value = f"plate, {_key(one.name)}", getattr(self, one.name)
+            if one.type is int and not (_is_whole(value) and 2 <= value <= MOST):
+                raise _refused(name, f"a whole number, 2 or more, at most {MOST}", value, "count them on the plate")
+            if one.type is float and not ((_is_whole(value) or isinstance(value, float)) and 0 < value <= LONGEST_MM):
+                raise _refused(name, f"a length above zero, mm, at most {LONGEST_MM:g}", value, "measure the plate")
+            if one.type is bool and not isinstance(value, bool):
+                raise _refused(name, "true or false", value)
 
     def points(self, index: Ints) -> Floats:
         """Return the points (n, 3), plate frame, mm, with grid indices (n, 2)."""
@@ -67,11 +62,11 @@ class DotPlate(CalibrationTarget):
         largest = 2 * self.pitch_mm - self.dot_diameter_mm
         if not self.dot_diameter_mm < self.pitch_mm or not self.fiducial_diameter_mm < largest:
             got = f"diameters {self.dot_diameter_mm:g} and {self.fiducial_diameter_mm:g} at pitch {self.pitch_mm:g}"
-            raise CameraError(refusal("plate", expected="dots that do not touch", got=got, do="measure the plate"))
+            raise camera_error("plate", "dots that do not touch", got, "measure the plate")
         if self.fiducial_diameter_mm < 1.15 * self.dot_diameter_mm:
             got = f"fiducials {self.fiducial_diameter_mm:g} mm, dots {self.dot_diameter_mm:g} mm"
             expected = "fiducials larger than the dots by 15 % or more"
-            raise CameraError(refusal("plate", expected=expected, got=got, do="measure the plate"))
+            raise camera_error("plate", expected, got, "measure the plate")
         marks = self.fiducials
         pairs = isinstance(marks, list | tuple) and all(isinstance(at, list | tuple) and len(at) == 2 for at in marks)
         axes = pairs and len(marks) == 3 and all(_is_whole(i) and abs(i) <= MOST for at in marks for i in at)
@@ -96,19 +91,15 @@ class DotPlate(CalibrationTarget):
     @property
     def indices(self) -> Ints:
         """(columns * rows, 2), all grid indices, row after row."""
-        (i0, j0), (i1, j1) = self.first, self.last
-        i, j = np.meshgrid(np.arange(i0, i1 + 1), np.arange(j0, j1 + 1))
-        return np.stack([i.ravel(), j.ravel()], axis=1).astype(np.int64)
+        return indices(self.first, self.last)
 
     def holds(self, index: Ints) -> NDArray[np.bool_]:
         """Return (n,), whether grid indices (n, 2) are on the plate."""
-        inside = (index >= np.array(self.first)) & (index <= np.array(self.last))
-        return np.asarray(inside.all(axis=1), dtype=np.bool_)
+        return np.asarray(((index >= self.first) & (index <= self.last)).all(axis=1))
 
     def is_fiducial(self, index: Ints) -> NDArray[np.bool_]:
         """Return (n,), whether grid indices (n, 2) are fiducials."""
-        same = (index[:, None, :] == np.array(self.fiducials)[None]).all(axis=2)
-        return np.asarray(same.any(axis=1), dtype=np.bool_)
+        return np.asarray((index[:, None] == np.array(self.fiducials)).all(axis=2).any(axis=1))
 
     def diameters(self, index: Ints) -> Floats:
         """Return the diameters (n,), mm, of the dots with grid indices (n, 2)."""
@@ -125,7 +116,7 @@ class Chessboard(CalibrationTarget):
         super().__post_init__()
         if min(self.columns, self.rows) < 3:
             got, do = f"{self.columns} x {self.rows}", "count the corners between squares, without the border"
-            raise CameraError(refusal("plate", expected="3 x 3 inner corners or more", got=got, do=do))
+            raise camera_error("plate", "3 x 3 inner corners or more", got, do)
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -147,7 +138,7 @@ class CharucoBoard(CalibrationTarget):
         super().__post_init__()
         if self.marker_mm >= self.pitch_mm:
             got, do = f"{self.marker_mm:g} mm in {self.pitch_mm:g} mm", "measure the board"
-            raise CameraError(refusal("plate, marker", expected="smaller than its square", got=got, do=do))
+            raise camera_error("plate, marker", "smaller than its square", got, do)
         name, do = self.dictionary, "look up the dictionary that the board was drawn with"
         if not isinstance(name, str) or not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
             raise _refused("plate, dictionary", "a name of OpenCV's, such as DICT_4X4_50", name, do)
@@ -183,7 +174,7 @@ class CircleGrid(CalibrationTarget):
         nearest = self.pitch_mm * (np.sqrt(2) if self.asymmetric else 1)
         if self.dot_diameter_mm >= nearest:
             got, do = f"{self.dot_diameter_mm:g} mm, {nearest:g} mm apart", "measure the plate"
-            raise CameraError(refusal("plate, dot_diameter", expected="circles that do not touch", got=got, do=do))
+            raise camera_error("plate, dot_diameter", "circles that do not touch", got, do)
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -195,15 +186,11 @@ class CircleGrid(CalibrationTarget):
         return np.full(len(index), self.dot_diameter_mm)
 
 
-KINDS: Mapping[str, type[CalibrationTarget]] = {
-    "dots": DotPlate,
-    "chessboard": Chessboard,
-    "charuco": CharucoBoard,
-    "circles": CircleGrid,
-}
+Kind = type[CalibrationTarget]
+KINDS: dict[str, Kind] = {"dots": DotPlate, "chessboard": Chessboard, "charuco": CharucoBoard, "circles": CircleGrid}
 
 
-def target_keys(kind: type[CalibrationTarget]) -> dict[str, tuple[str, bool]]:
+def target_keys(kind: Kind) -> dict[str, tuple[str, bool]]:
     """Return the field of each key of calibration.yaml, and whether the key is required."""
     return {_key(one.name): (one.name, one.default is MISSING) for one in fields(kind)}
 
@@ -212,15 +199,15 @@ def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> Calib
     """Build the target from the parsed `plate` of calibration.yaml; CameraError, naming the key, if impossible."""
     kind = entry.get("type") if isinstance(entry, Mapping) else None
     if not isinstance(kind, str) or kind not in KINDS:
-        expected = f"a mapping with `type` one of {', '.join(KINDS)}"
-        raise _refused(name, expected, kind if kind is not None else entry, "write the type of the plate")
+        expected, got = f"a mapping with `type` one of {', '.join(KINDS)}", entry if kind is None else kind
+        raise _refused(name, expected, got, "write the type of the plate")
     keys = target_keys(KINDS[kind])
     missing = [key for key, (_, needed) in keys.items() if needed and key not in entry]
     unknown = [str(key)[:40] for key in entry if key != "type" and key not in keys][:5]
     if missing or unknown:
         faults = {"no": missing, "unknown": unknown}
         got = "; ".join(f"{what} {', '.join(which)}" for what, which in faults.items() if which)
-        raise CameraError(refusal(name, expected=f"the keys {', '.join(keys)}", got=got, do="correct the plate"))
+        raise camera_error(name, f"the keys {', '.join(keys)}", got, "correct the plate")
     values = {keys[key][0]: value for key, value in entry.items() if key != "type"}
     if "dots" in entry:
         if entry["dots"] not in ("dark", "bright"):
@@ -232,6 +219,78 @@ def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> Calib
         raise CameraError(f"{name.removesuffix('plate')}{error}") from None
 
 
+@dataclass(frozen=True, eq=False)
+class PlateView:
+    """Points of the plate and their pixels in one picture.
+    `tied`: every point is identified. `floating`: each row of `placements` is a possible place on the plate;
+    `points_plate_mm` are those before any. `refused`: unusable, all arrays are empty.
+    """
+
+    points_plate_mm: Floats  # (n, 3), plate frame
+    uv_px: Floats  # (n, 2)
+    sigma_px: Floats  # (n,), standard deviation of each of u and v
+    diameter_mm: Floats  # (n,), of the dot whose centroid was measured; 0 for corners, which have no perspective bias
+    index: Ints  # (n, 2), grid indices
+    state: Literal["tied", "floating", "refused"] = "tied"
+    reason: str = ""  # one line, why the state is not `tied`
+    placements: Ints = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))  # (m, 3): see `placed`
+
+    def __post_init__(self) -> None:
+        n = len(self.index)
+        shapes = (self.points_plate_mm.shape, self.uv_px.shape, self.sigma_px.shape, self.diameter_mm.shape)
+        assert shapes == ((n, 3), (n, 2), (n,), (n,)), shapes
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def settled(self, plate: CalibrationTarget, placements: Ints, reason: str) -> "PlateView":
+        """Return the view as `tied` by the only one of its placements (m, 3), or `floating` for this reason."""
+        if len(placements) == 1:
+            return placed(self, plate, placements[0])
+        return replace(self, state="floating", reason=reason, placements=placements)
+
+
+def seen(plate: CalibrationTarget, index: Ints, uv_px: Floats, sigma_px: Floats) -> PlateView:
+    """Return the view of the points with grid indices (n, 2) at pixels (n, 2), each with a sigma (n,)."""
+    points, diameters = plate.points(index), plate.diameters(index)
+    return PlateView(points_plate_mm=points, uv_px=uv_px, sigma_px=sigma_px, diameter_mm=diameters, index=index)
+
+
+def refused_view(name: str, expected: str, got: str, do: str) -> PlateView:
+    """Return a `refused` view with the reason worded by `refusal`."""
+    none, reason = np.zeros(0), refusal(name, expected=expected, got=got, do=do)
+    empty = PlateView(np.zeros((0, 3)), np.zeros((0, 2)), none, none, np.zeros((0, 2), dtype=np.int64))
+    return replace(empty, state="refused", reason=reason)
+
+
+def quarter_turned(index: Ints, quarters: int) -> Ints:
+    """Rotate grid indices (n, 2) by quarter turns; each takes (i, j) to (-j, i)."""
+    for _ in range(quarters % 4):
+        index = np.stack([-index[:, 1], index[:, 0]], axis=1)
+    return index
+
+
+def placed(view: PlateView, plate: CalibrationTarget, placement: Ints | Sequence[int]) -> PlateView:
+    """Return a floating view as `tied` by a placement (3,): quarter turns, shift along columns, shift along rows."""
+    quarters, shift_i, shift_j = (int(p) for p in placement)
+    index = quarter_turned(view.index, quarters) + np.array([shift_i, shift_j])
+    return replace(
+        view,
+        index=index,
+        points_plate_mm=plate.points(index),
+        diameter_mm=plate.diameters(index),
+        state="tied",
+        reason="",
+        placements=np.zeros((0, 3), dtype=np.int64),
+    )
+
+
+def indices(first: Sequence[int] | Ints, last: Sequence[int] | Ints) -> Ints:
+    """Return the grid indices (n, 2) from the first to the last ones, row after row."""
+    i, j = np.meshgrid(np.arange(first[0], last[0] + 1), np.arange(first[1], last[1] + 1))
+    return np.stack([i.ravel(), j.ravel()], axis=1).astype(np.int64)
+
+
 def _key(field: str) -> str:
     return "dots" if field == "dark" else field.removesuffix("_mm")
 
@@ -241,4 +300,4 @@ def _is_whole(value: object) -> bool:
 
 
 def _refused(name: str, expected: str, got: object, do: str = "correct the plate") -> CameraError:
-    return CameraError(refusal(name, expected=expected, got=short(got), do=do))
+    return camera_error(name, expected, short(got), do)

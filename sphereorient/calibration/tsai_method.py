@@ -4,10 +4,7 @@ Distortion is radial: a pixel and its point have the same direction from the opt
 middle. Linear equations give R, T_x, T_y, then f, T_z; a search refines f, T_z, kappa1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,7 +15,7 @@ from sphereorient.cameras.checks import camera_error, check_image_size, check_po
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION
 from sphereorient.cameras.tsai import TsaiCamera
-from sphereorient.errors import CameraError, refusal
+from sphereorient.errors import CameraError
 
 FLAT = 3e-3  # relief over width below which the linear stage takes points as a plane
 LINE = 1e-6  # width over length below which points are on a line
@@ -27,6 +24,8 @@ POINTS_OF_SPACE = 7
 UNCERTAIN_F = 0.1  # sigma of f over f beyond which f and T_z cannot be separated
 MISFIT = 0.01  # rms over the picture's diagonal: no lens with one fitted kappa misses by so much
 ALSO = ("sx", "centre_u", "centre_v")
+ADD = "add points"
+Pose = tuple[Tensor, Tensor]  # R (3, 3) or its first two rows, and T (3,), mm, or T_x, T_y
 FREE = ("f", "kappa1", *ROTATION, *TRANSLATION)
 
 
@@ -54,13 +53,17 @@ def tsai_stages(
     check_positive("pixel_pitch_mm", pitch)
     centre = middle_of_picture(image_size)
     sensor_mm = (pixels - centre) * pitch
-    starts = [
-        _camera(start, image_size, pitch)
-        for pose in _aligned(points, sensor_mm)
-        if (start := _with_depth(pose, points, sensor_mm)).f_mm > 0 and start.before(points)
-    ]
+    starts = []
+    for R, T_aside in _aligned(points, sensor_mm):
+        f_mm, T = _with_depth(R, T_aside, points, sensor_mm)
+        if f_mm > 0 and bool((points @ R[2] + T[2] > 0).all()):
+            start: dict[str, Any] = {"f_mm": f_mm, "R_cam_lab": R, "T_cam_lab_mm": T, "sx": 1.0, "kappa1": 0.0}
+            starts.append(TsaiCamera(image_size=image_size, centre_px=centre, pixel_pitch_mm=pitch, **start))
+    if not starts and _Frame(points).relief < FLAT:
+        raise _parallel("none")
     if not starts:
-        raise CameraError(_no_start(points))
+        do = "check the points' order and the axes' signs (lab right-handed, u to the right, v downwards)"
+        raise camera_error("points", "points as a camera sees them", "their mirror image, or others", do)
     camera = _best(starts, points, pixels)
     _check_fit(camera, points, pixels)
     return camera
@@ -80,75 +83,54 @@ def calibrate_tsai(
     for name in also:
         if name not in ALSO:
             do = "leave it out: the others are fitted, and the pixel pitch is held"
-            raise CameraError(refusal("also", expected=f"some of {', '.join(ALSO)}", got=f"'{name}'", do=do))
+            raise camera_error("also", f"some of {', '.join(ALSO)}", f"'{name}'", do)
     camera = tsai_stages(x_lab_mm, uv_px, image_size, pixel_pitch_mm)
     points, pixels = checked_points(x_lab_mm, uv_px)
-    if "sx" in also and _Frame.of(points).relief < FLAT:
+    if "sx" in also and _Frame(points).relief < FLAT:
         do = "leave out sx, or add points off the plane"
-        raise CameraError(refusal("also, sx", expected="points that fill space", got="points in one plane", do=do))
+        raise camera_error("also, sx", "points that fill space", "points in one plane", do)
     camera = fit_to_points(camera, (*FREE, *also), points, pixels)
     _check_fit(camera, points, pixels)
     return camera
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Frame:
-    middle_lab_mm: Tensor  # (3,)
-    R_own_lab: Tensor  # (3, 3)
-    narrow: float  # width over length
-    relief: float  # height over length
+    """Middle (3,) and axes (3, 3) of points (n, 3), and their width and height over their length."""
 
-    @staticmethod
-    def of(points: Tensor) -> _Frame:
-        middle = points.mean(0)
-        _, size, axes = torch.linalg.svd(points - middle, full_matrices=False)
-        axes = axes * torch.linalg.det(axes).sign()  # right-handed
-        size = size / size[0].clamp_min(torch.finfo(size.dtype).tiny)
-        return _Frame(middle_lab_mm=middle, R_own_lab=axes, narrow=float(size[1]), relief=float(size[2]))
+    def __init__(self, points: Tensor) -> None:
+        self.middle_lab_mm = points.mean(0)
+        _, size, axes = torch.linalg.svd(points - self.middle_lab_mm, full_matrices=False)
+        self.R_own_lab = axes * torch.linalg.det(axes).sign()  # right-handed
+        _, self.narrow, self.relief = (size / size[0].clamp_min(torch.finfo(size.dtype).tiny)).tolist()
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Start:
-    """A first pose and focal length; T_z and f are 0 while unknown."""
-
-    R_cam_lab: Tensor  # (3, 3)
-    T_cam_lab_mm: Tensor  # (3,)
-    f_mm: float = 0.0
-
-    def before(self, points: Tensor) -> bool:
-        return bool((points @ self.R_cam_lab[2] + self.T_cam_lab_mm[2] > 0).all())
-
-
-def _aligned(points: Tensor, sensor_mm: Tensor) -> list[_Start]:
-    """Return the poses without T_z that put each point in the direction of its pixel."""
-    frame = _Frame.of(points)
+def _aligned(points: Tensor, sensor_mm: Tensor) -> list[Pose]:
+    """Return the poses, with T_z 0, that put each point in the direction of its pixel."""
+    frame = _Frame(points)
     if frame.narrow < LINE:
-        raise camera_error("x_lab_mm", "points in a plane or in space", "points on a line", _ADD)
+        raise camera_error("x_lab_mm", "points in a plane or in space", "points on a line", ADD)
     flat = frame.relief < FLAT
     _check_count(points, POINTS_OF_PLANE if flat else POINTS_OF_SPACE, "in one plane" if flat else "in space")
     own = (points - frame.middle_lab_mm) @ frame.R_own_lab.mT  # own axes: well scaled equations
     width = float(own.abs().max())
-    poses = _aligned_plane(own / width, sensor_mm) if flat else [_aligned_space(own / width, sensor_mm)]
     found = []
-    for R_cam_own, T_own in poses:
-        R_cam_lab = R_cam_own @ frame.R_own_lab
-        found.append(_Start(R_cam_lab=R_cam_lab, T_cam_lab_mm=T_own * width - R_cam_lab @ frame.middle_lab_mm))
+    for rows, T_xy in (_aligned_plane if flat else _aligned_space)(own / width, sensor_mm):
+        R_cam_own = torch.stack([rows[0], rows[1], torch.linalg.cross(rows[0], rows[1])])
+        R_cam_lab, T_own = R_cam_own @ frame.R_own_lab, torch.cat([T_xy, T_xy.new_zeros(1)])
+        found.append((R_cam_lab, T_own * width - R_cam_lab @ frame.middle_lab_mm))
     return found
 
 
-def _aligned_space(own: Tensor, sensor_mm: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve x_d (r_4..6 . X + T_y) = y_d (r_1..3 . X + T_x); r_7..9 is their cross product (points right-handed)."""
+def _aligned_space(own: Tensor, sensor_mm: Tensor) -> list[Pose]:
+    """Solve x_d (r_4..6 . X + T_y) = y_d (r_1..3 . X + T_x) for the first two rows of R and T_x, T_y."""
     x, y = sensor_mm[:, :1], sensor_mm[:, 1:]
     a = _null_vector(torch.cat([y * own, y, -x * own, -x], dim=-1)).reshape(2, 4)
     left, size, right = torch.linalg.svd(a[:, :3], full_matrices=False)
     rows = left @ right  # Horn: the nearest two orthonormal rows
-    T_xy = a[:, 3] / size.mean()
-    rows, T_xy = _facing(rows, T_xy, own, sensor_mm)
-    R = torch.stack([rows[0], rows[1], torch.linalg.cross(rows[0], rows[1])])
-    return R, torch.cat([T_xy, T_xy.new_zeros(1)])
+    return [_facing(rows, a[:, 3] / size.mean(), own, sensor_mm)]
 
 
-def _aligned_plane(own: Tensor, sensor_mm: Tensor) -> list[tuple[Tensor, Tensor]]:
+def _aligned_plane(own: Tensor, sensor_mm: Tensor) -> list[Pose]:
     """Solve the same for z = 0: two mirrored rotations, whose 2 x 2 corner has the larger singular value 1."""
     x, y, flat = sensor_mm[:, :1], sensor_mm[:, 1:], own[:, :2]
     a = _null_vector(torch.cat([y * flat, y, -x * flat, -x], dim=-1)).reshape(2, 3)
@@ -157,15 +139,10 @@ def _aligned_plane(own: Tensor, sensor_mm: Tensor) -> list[tuple[Tensor, Tensor]
     # The missing column makes the rows orthonormal: I - C C^T has rank one.
     values, vectors = torch.linalg.eigh(torch.eye(2, dtype=corner.dtype) - corner @ corner.mT)
     missing = vectors[:, 1] * values[1].clamp_min(0).sqrt()
-    T = torch.cat([T_xy, T_xy.new_zeros(1)])
-    poses = []
-    for sign in (1.0, -1.0):
-        rows = torch.cat([corner, sign * missing[:, None]], dim=-1)
-        poses.append((torch.stack([rows[0], rows[1], torch.linalg.cross(rows[0], rows[1])]), T))
-    return poses
+    return [(torch.cat([corner, sign * missing[:, None]], dim=-1), T_xy) for sign in (1.0, -1.0)]
 
 
-def _facing(rows: Tensor, T_xy: Tensor, own: Tensor, sensor_mm: Tensor) -> tuple[Tensor, Tensor]:
+def _facing(rows: Tensor, T_xy: Tensor, own: Tensor, sensor_mm: Tensor) -> Pose:
     """Return rows and T with the sign that puts points on the same side of the axis as their pixels (Tsai's T_y)."""
     sign = ((own @ rows.mT + T_xy) * sensor_mm).sum().sign()
     return rows * sign, T_xy * sign
@@ -180,20 +157,19 @@ def _null_vector(equations: Tensor) -> Tensor:
     _, size, right = torch.linalg.svd(equations / scale, full_matrices=n < k)
     if float(size[k - 2]) < 1e-9 * float(size[0]):
         got = "points whose directions in the picture do not determine the pose"
-        raise CameraError(refusal("points", expected="points all over the picture", got=got, do=_ADD))
+        raise camera_error("points", "points all over the picture", got, ADD)
     solution: Tensor = right[k - 1] / scale
     return solution
 
 
-def _with_depth(pose: _Start, points: Tensor, sensor_mm: Tensor) -> _Start:
-    """Solve f X_cam - x_d T_z = x_d (r_7..9 . X), and the same of y, for f and T_z; without distortion."""
-    turned = points @ pose.R_cam_lab.mT + pose.T_cam_lab_mm
+def _with_depth(R: Tensor, T: Tensor, points: Tensor, sensor_mm: Tensor) -> tuple[float, Tensor]:
+    """Solve f X_cam - x_d T_z = x_d (r_7..9 . X), and the same of y, for f and T, whose T_z is 0; no distortion."""
+    turned = points @ R.mT + T
     equations = torch.stack([turned[:, :2].reshape(-1), -sensor_mm.reshape(-1)], dim=-1)
     scale = equations.norm(dim=0).clamp_min(torch.finfo(equations.dtype).tiny)
     right = (sensor_mm * turned[:, 2:]).reshape(-1, 1)
     f_mm, T_z = (torch.linalg.lstsq(equations / scale, right, driver="gelsd").solution[:, 0] / scale).tolist()
-    T = pose.T_cam_lab_mm + pose.T_cam_lab_mm.new_tensor([0.0, 0.0, T_z])
-    return _Start(R_cam_lab=pose.R_cam_lab, T_cam_lab_mm=T, f_mm=f_mm)
+    return f_mm, T + T.new_tensor([0.0, 0.0, T_z])
 
 
 def _best(starts: Sequence[TsaiCamera], points: Tensor, pixels: Tensor) -> TsaiCamera:
@@ -209,22 +185,9 @@ def _best(starts: Sequence[TsaiCamera], points: Tensor, pixels: Tensor) -> TsaiC
     return min(fitted, key=lambda camera: rms_px(camera, points, pixels))
 
 
-def _camera(start: _Start, image_size: tuple[int, int], pitch: Tensor) -> TsaiCamera:
-    fields: dict[str, Any] = TsaiCamera.ideal_lens(start.f_mm / float(pitch[1]), pitch.tolist())
-    fields |= {"R_cam_lab": start.R_cam_lab, "T_cam_lab_mm": start.T_cam_lab_mm}
-    return TsaiCamera(image_size=image_size, centre_px=middle_of_picture(image_size), **fields)
-
-
 def _check_count(points: Tensor, least: int, where: str) -> None:
     if len(points) < least:
-        raise camera_error("points", f"{least} or more {where}", f"{len(points)}", _ADD)
-
-
-def _no_start(points: Tensor) -> str:
-    if _Frame.of(points).relief < FLAT:
-        return _parallel("none")
-    do = "check the points' order and the axes' signs (lab right-handed, u to the right, v downwards)"
-    return refusal("points", expected="points as a camera sees them", got="their mirror image, or others", do=do)
+        raise camera_error("points", f"{least} or more {where}", f"{len(points)}", ADD)
 
 
 def _check_fit(camera: TsaiCamera, points: Tensor, pixels: Tensor) -> None:
@@ -232,15 +195,12 @@ def _check_fit(camera: TsaiCamera, points: Tensor, pixels: Tensor) -> None:
     if not miss_px <= MISFIT * diagonal_px:
         got, do = f"rms {miss_px:.3g} px", "check their order, their signs and the pixel pitch"
         raise camera_error("points", f"pixels of these points, to {MISFIT * diagonal_px:.2g} px", got, do)
-    covariance = camera.covariance
-    sigma_mm = 0.0 if covariance is None else covariance.sigmas["f"]
-    if not sigma_mm <= UNCERTAIN_F * float(camera.f_mm):
-        raise CameraError(_parallel(f"{float(camera.f_mm):.3g} mm, sigma {sigma_mm:.2g}"))
+    assert camera.covariance is not None
+    f_mm, sigma_mm = float(camera.f_mm), camera.covariance.sigmas["f"]
+    if not sigma_mm <= UNCERTAIN_F * f_mm:
+        raise _parallel(f"{f_mm:.3g} mm, sigma {sigma_mm:.2g}")
 
 
-def _parallel(got: str) -> str:
+def _parallel(got: str) -> CameraError:
     do = "tilt the plate by 20 degrees or more, or add points at other depths"
-    return refusal("f", expected="points at different depths, to separate f from T_z", got=got, do=do)
-
-
-_ADD = "add points"
+    return camera_error("f", "points at different depths, to separate f from T_z", got, do)

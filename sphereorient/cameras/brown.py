@@ -1,15 +1,16 @@
+"""Cameras with Brown's polynomial distortion: OpenCV's model and OpenPTV's."""
+
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.checks import camera_error, check_points
-from sphereorient.cameras.model import CentralCamera, Key
+from sphereorient.cameras.checks import camera_error, check_points, check_positive
+from sphereorient.cameras.model import CentralCamera, Key, middle_of_picture
 
 RADIAL_STEPS = 30  # of Newton held in a bracket; at a fold, where Newton stalls, halving alone leaves 1e-9
 PLANE_STEPS = 8  # of Newton, from the radial solution: what is left is as small as the tangential part
@@ -77,11 +78,6 @@ class BrownCamera(PolynomialCamera):
         Key("p", "p", ("p1", "p2"), default=0.0),
     )
 
-    @classmethod
-    def ideal_lens(cls, f_px: float, pitch_mm: Sequence[float]) -> dict[str, Any]:
-        """Return the fields of a lens without distortion."""
-        return {"f_px": (f_px * pitch_mm[1] / pitch_mm[0], f_px), "k": (0.0,) * 3, "p": (0.0,) * 2}
-
     @property
     def focal_px(self) -> Tensor:
         """(2,), pixels per unit of slope."""
@@ -92,6 +88,61 @@ class BrownCamera(PolynomialCamera):
 
     def _pixel(self, xy: Tensor, distorted: bool) -> Tensor:
         return xy * self.f_px.to(xy) + self.centre_px.to(xy)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OpenPTVCamera(PolynomialCamera):
+    """Perspective about `centre_px`, distorted about the middle of the picture; sensor in mm, its y up.
+    k in mm^-2, mm^-4, mm^-6; p in 1/mm and in OpenPTV's order: its p1 goes with r^2 + 2 x^2, OpenCV's with r^2 + 2 y^2.
+    Source: OpenPTV: sensor shift, polynomial, affine part x' = scx x - sin(she) y, y' = cos(she) y (its classic form).
+    """
+
+    f_mm: Tensor  # (), principal distance
+    pixel_pitch_mm: Tensor  # (2,)
+    scx: Tensor  # (), scale of x
+    she: Tensor  # (), shear, rad
+
+    MODEL: ClassVar[str] = "openptv"
+    KEYS: ClassVar[tuple[Key, ...]] = (
+        Key("f", "f_mm", positive=True),
+        Key("pixel_pitch", "pixel_pitch_mm", ("pixel_pitch_u", "pixel_pitch_v"), positive=True),
+        Key("centre", "centre_px", ("centre_u", "centre_v")),
+        Key("k", "k", ("k1", "k2", "k3"), default=0.0),
+        Key("p", "p", ("p1", "p2"), default=0.0),
+        Key("scx", "scx", default=1.0, positive=True),
+        Key("she", "she", default=0.0),
+    )
+
+    def __post_init__(self) -> None:
+        check_positive("cos(she)", torch.as_tensor(self.she, dtype=torch.float64).cos())
+        super().__post_init__()
+
+    @property
+    def focal_px(self) -> Tensor:
+        """(2,), pixels per unit of slope."""
+        return self.f_mm / self.pixel_pitch_mm
+
+    @property
+    def _p_opencv(self) -> Tensor:
+        return self.p.flip(0)
+
+    def _plane(self, uv_px: Tensor, distorted: bool) -> Tensor:
+        xy_mm = (uv_px - middle_of_picture(self.image_size).to(uv_px)) * self.pixel_pitch_mm.to(uv_px)
+        xy_mm = xy_mm * xy_mm.new_tensor([1.0, -1.0])
+        if not distorted:
+            return xy_mm
+        x, y = xy_mm.unbind(-1)
+        y = y / self.she.to(y).cos()
+        x = (x + self.she.to(y).sin() * y) / self.scx.to(x)
+        return torch.stack([x, y], dim=-1)
+
+    def _pixel(self, xy: Tensor, distorted: bool) -> Tensor:
+        if distorted:
+            x, y = xy.unbind(-1)
+            she = self.she.to(x)
+            xy = torch.stack([self.scx.to(x) * x - she.sin() * y, she.cos() * y], dim=-1)
+        uv_px = xy * xy.new_tensor([1.0, -1.0]) / self.pixel_pitch_mm.to(xy)
+        return uv_px + middle_of_picture(self.image_size).to(xy)
 
 
 def bent(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
@@ -140,22 +191,12 @@ def _bent(xy: Tensor, k: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     rise = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # twice d radial / d r^2
-    moved = torch.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        dim=-1,
-    )
-    jacobian = torch.stack(
-        [
-            radial + rise * x * x + 2 * p1 * y + 6 * p2 * x,
-            rise * x * y + 2 * p1 * x + 2 * p2 * y,
-            radial + rise * y * y + 6 * p1 * y + 2 * p2 * x,
-        ],
-        dim=-1,
-    )
-    return moved, jacobian
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    xx = radial + rise * x * x + 2 * p1 * y + 6 * p2 * x
+    xy_slope = rise * x * y + 2 * p1 * x + 2 * p2 * y
+    yy = radial + rise * y * y + 6 * p1 * y + 2 * p2 * x
+    return torch.stack([u, v], dim=-1), torch.stack([xx, xy_slope, yy], dim=-1)
 
 
 def _newton(xy: Tensor, goal: Tensor, k: Tensor, p: Tensor) -> Tensor:

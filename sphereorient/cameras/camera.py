@@ -1,9 +1,17 @@
+"""What every camera gives: rays, projection and the covariance of its parameters; and the geometry of rays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
-from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.cameras.checks import camera_error, check_points
+
+ASYMMETRY = 1e-6  # of the correlation matrix: covariances written with seven digits pass
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -12,6 +20,52 @@ class Rays:
 
     origin_lab_mm: Tensor  # (..., 3), a point of the ray: the projection centre, or the refracting wall's liquid side
     direction_lab: Tensor  # (..., 3), unit length, away from the camera
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ParameterCovariance:
+    """Covariance of the small changes that `with_parameters` applies."""
+
+    names: tuple[str, ...]  # P different names, as in `parameter_names`
+    matrix: Tensor  # (P, P) float64, in the products of the parameters' units
+
+    def __post_init__(self) -> None:
+        names, matrix = tuple(self.names), torch.as_tensor(self.matrix, dtype=torch.float64).detach()
+        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "matrix", matrix)
+        if not names or len(set(names)) < len(names):
+            got, do = ", ".join(names) or "none", "name every parameter once"
+            raise camera_error("covariance, parameters", "different names", got, do)
+        expected, got = f"{len(names)} rows of {len(names)} numbers", f"shape {tuple(matrix.shape)}"
+        if tuple(matrix.shape) != (len(names), len(names)):
+            raise camera_error("covariance, matrix", expected, got, "write one row and one column for each parameter")
+        do = "calibrate again, or remove the covariance"
+        if not bool(torch.isfinite(matrix).all()) or bool((matrix.diagonal() < 0).any()):
+            raise camera_error("covariance, matrix", "finite numbers, none below zero on the diagonal", "others", do)
+        sigma = matrix.diagonal().sqrt()
+        scale = torch.where(sigma > 0, sigma, torch.ones_like(sigma))  # parameters of different units: correlations
+        correlation = matrix / (scale[:, None] * scale)
+        asymmetry = float((correlation - correlation.mT).abs().max())
+        if asymmetry > ASYMMETRY:
+            got = f"entries that differ by {asymmetry:.2g} of the sigmas' product"
+            raise camera_error("covariance, matrix", "a symmetric matrix", got, do)
+        smallest = float(torch.linalg.eigvalsh((correlation + correlation.mT) / 2)[0])
+        if smallest < -ASYMMETRY * len(matrix):
+            got = f"{smallest:.2g} among the correlations' eigenvalues"
+            raise camera_error("covariance, matrix", "no negative eigenvalue", got, do)
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviation of each parameter, in its own unit."""
+        return dict(zip(self.names, self.matrix.diagonal().sqrt().tolist(), strict=True))
+
+    def of(self, cameras: Iterable[str]) -> ParameterCovariance | None:
+        """Return the block of some cameras, for names like cam1.f; None without parameters of them."""
+        wanted = set(cameras)
+        kept = [k for k, name in enumerate(self.names) if name.partition(".")[0] in wanted]
+        if not kept:
+            return None
+        return ParameterCovariance(names=tuple(self.names[k] for k in kept), matrix=self.matrix[kept][:, kept])
 
 
 class Camera(Protocol):
@@ -47,3 +101,44 @@ class Camera(Protocol):
 
     def distort(self, uv_px: Tensor) -> Tensor:
         """Return the pixels (..., 2) that `undistort` takes to `uv_px`."""
+
+
+def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
+    """Return the middle (..., 3), lab, mm, of the shortest segment between two rays, and its length (...), mm.
+    Both are NaN, with gradient 0, for parallel rays; the rays broadcast. Source: common perpendicular (textbook).
+    """
+    for name, rays in (("rays_a", rays_a), ("rays_b", rays_b)):
+        check_points(f"{name}.origin_lab_mm", rays.origin_lab_mm, 3)
+        check_points(f"{name}.direction_lab", rays.direction_lab, 3)
+    a, b = rays_a.direction_lab, rays_b.direction_lab
+    baseline = rays_b.origin_lab_mm - rays_a.origin_lab_mm
+    normal = _cross(a, b)  # its length is the sine of the angle: no cancellation at small angles
+    sine2 = normal.square().sum(-1, keepdim=True)
+    crossing = sine2 > (16 * torch.finfo(sine2.dtype).eps) ** 2  # below it the sine is rounding only
+    sine2 = torch.where(crossing, sine2, torch.ones_like(sine2))
+    along_a = (_cross(baseline, b) * normal).sum(-1, keepdim=True) / sine2
+    along_b = (_cross(baseline, a) * normal).sum(-1, keepdim=True) / sine2
+    point = 0.5 * (rays_a.origin_lab_mm + along_a * a + rays_b.origin_lab_mm + along_b * b)
+    gap = ((baseline * normal).sum(-1, keepdim=True) / sine2.sqrt()).abs()
+    nan = torch.full_like(gap, torch.nan)
+    return torch.where(crossing, point, nan), torch.where(crossing, gap, nan)[..., 0]
+
+
+def R_cam_view(direction_cam: Tensor) -> Tensor:
+    """Return the smallest rotation (..., 3, 3) from the camera's z axis to directions (..., 3), camera frame.
+    It takes view to camera components; the last column is the unit direction. NaN, gradient 0, for the backward one.
+    Source: docs/errata.md A1 (the paper's R_persp has the axis of OpenGL's camera); Rodrigues, axis z x direction.
+    """
+    check_points("direction_cam", direction_cam, 3)
+    unit = direction_cam / direction_cam.norm(dim=-1, keepdim=True)
+    x, y, z = unit.unbind(-1)
+    defined = 1 + z > 4 * torch.finfo(z.dtype).eps
+    share = 1 / torch.where(defined, 1 + z, torch.ones_like(z))  # (1 - cos) / sin^2: exact also at direction = z
+    rows = [1 - x * x * share, -x * y * share, x, -x * y * share, 1 - y * y * share, y, -x, -y, z]
+    R = torch.stack(rows, dim=-1).reshape(*x.shape, 3, 3)
+    return torch.where(defined[..., None, None], R, torch.full_like(R, torch.nan))
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    product: Tensor = torch.linalg.cross(*torch.broadcast_tensors(a, b))  # type: ignore[no-untyped-call]
+    return product

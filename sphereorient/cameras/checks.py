@@ -1,10 +1,11 @@
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
 
 from sphereorient.errors import CameraError, ShapeError, check_tail, refusal
-from sphereorient.files.yaml_file import short
+from sphereorient.files.yaml_file import refuse_unknown, short
 
 ROTATION_TOLERANCE = 1e-5  # of |R R^T - I|: moves a point at the rim of a 1000 px picture by less than 0.01 px
 LARGEST = 1e30  # of any parameter: results must stay finite
@@ -54,6 +55,22 @@ def check_points(name: str, points: Tensor, size: int) -> None:
     if not points.is_floating_point():
         do = "convert it with .double() or .float()"
         raise ShapeError(refusal(name, expected="a floating-point tensor", got=str(points.dtype), do=do))
+
+
+@contextmanager
+def named(where: str) -> Iterator[None]:
+    """Put the place before the message of a CameraError."""
+    try:
+        yield
+    except CameraError as error:
+        raise CameraError(f"{where}, {error}") from None
+
+
+def check_known(names: Iterable[str], known: Collection[str], where: str) -> None:
+    """Refuse names that are not among the known ones (CameraError)."""
+    for name in names:
+        if name not in known:
+            raise CameraError(refuse_unknown(name, known, where))
 
 
 def camera_error(name: str, expected: str, got: str, do: str = "correct the camera") -> CameraError:

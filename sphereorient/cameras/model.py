@@ -5,17 +5,14 @@ To add a model, derive a dataclass with `MODEL` and `KEYS` from `CentralCamera` 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.camera import Rays
+from sphereorient.cameras.camera import ParameterCovariance, Rays
 from sphereorient.cameras.checks import as_parameter, check_image_size, check_points, check_positive, check_rotation
-from sphereorient.cameras.covariance import ParameterCovariance
-from sphereorient.errors import CameraError, refusal
 
 
 @dataclass(frozen=True)
@@ -72,15 +69,8 @@ class CameraModel(ABC):
     @classmethod
     def completed(cls, values: dict[str, Any]) -> dict[str, Any]:
         """Return the keys of cameras.yaml with defaults (centre: middle of picture); CameraError if impossible."""
-        return (
-            values | {"centre": middle_of_picture(values["image_size"])} if values.get("centre", 0) is None else values
-        )
-
-    @classmethod
-    def ideal_lens(cls, f_px: float, pitch_mm: Sequence[float]) -> dict[str, Any]:
-        """Return the model's own fields for a lens without distortion: f in px along v, pitch along u and v."""
-        got, do = cls.MODEL, "calibrate model tsai, pinhole or brown"
-        raise CameraError(refusal("model", expected="one that a calibration can start from", got=got, do=do))
+        middle = {"centre": middle_of_picture(values["image_size"])}
+        return values | middle if values.get("centre", 0) is None else values
 
     @abstractmethod
     def project(self, x_lab_mm: Tensor) -> Tensor:

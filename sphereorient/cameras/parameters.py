@@ -15,11 +15,10 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras.camera import Camera
-from sphereorient.cameras.checks import camera_error
+from sphereorient.cameras.checks import camera_error, check_known
 from sphereorient.cameras.model import CameraModel
 from sphereorient.cameras.port import Port, PortCamera
-from sphereorient.errors import CameraError, check_tail, refusal
-from sphereorient.files.yaml_file import refuse_unknown
+from sphereorient.errors import check_tail
 
 AnyCamera = TypeVar("AnyCamera", bound=Camera)
 ROTATION = ("rotation_x", "rotation_y", "rotation_z")
@@ -34,7 +33,7 @@ def parameter_names(camera: Camera) -> tuple[str, ...]:
         return (*parameter_names(camera.camera), *PORT_NUMBERS, *PORT_TILT)
     if not isinstance(camera, CameraModel):
         got, do = type(camera).__name__, "derive the model from CameraModel"
-        raise CameraError(refusal("camera", expected="a model that names its parameters", got=got, do=do))
+        raise camera_error("camera", "a model that names its parameters", got, do)
     return (*camera.parameter_fields(), *ROTATION, *TRANSLATION)
 
 
@@ -46,10 +45,7 @@ def with_parameters(camera: AnyCamera, names: Sequence[str], delta: Tensor) -> A
         ShapeError: `delta` has another shape.
     """
     check_tail("delta", delta, len(names))
-    known = parameter_names(camera)
-    for name in names:
-        if name not in known:
-            raise CameraError(refuse_unknown(name, known, "parameter"))
+    check_known(names, parameter_names(camera), "parameter")
     change = dict(zip(names, delta.to(torch.float64).unbind(), strict=True))
     if len(change) < len(names):
         raise camera_error("parameters", "different names", ", ".join(names), "name every parameter once")
@@ -57,10 +53,14 @@ def with_parameters(camera: AnyCamera, names: Sequence[str], delta: Tensor) -> A
 
 
 def _changed(camera: Camera, change: Mapping[str, Tensor]) -> Camera:
-    if isinstance(camera, PortCamera):
-        return replace(camera, camera=_changed(camera.camera, change), port=_changed_port(camera.port, change))
-    assert isinstance(camera, CameraModel)
     fields: dict[str, Any] = {}
+    if isinstance(camera, PortCamera):
+        wall = camera.port
+        fields = {field: getattr(wall, field) + change[name] for name, field in PORT_NUMBERS.items() if name in change}
+        if any(name in change for name in PORT_TILT):
+            fields["normal"] = so3.exp(_vector(change, PORT_TILT)) @ wall.normal
+        return replace(camera, camera=_changed(camera.camera, change), port=replace(wall, **fields))
+    assert isinstance(camera, CameraModel)
     for name, (field, place) in camera.parameter_fields().items():
         if name in change:
             value: Tensor = fields.get(field, getattr(camera, field))
@@ -72,13 +72,6 @@ def _changed(camera: Camera, change: Mapping[str, Tensor]) -> Camera:
     if any(name in change for name in TRANSLATION):
         fields["T_cam_lab_mm"] = camera.T_cam_lab_mm + _vector(change, TRANSLATION)
     return replace(camera, **fields)
-
-
-def _changed_port(port: Port, change: Mapping[str, Tensor]) -> Port:
-    fields = {field: getattr(port, field) + change[name] for name, field in PORT_NUMBERS.items() if name in change}
-    if any(name in change for name in PORT_TILT):
-        fields["normal"] = so3.exp(_vector(change, PORT_TILT)) @ port.normal
-    return replace(port, **fields)
 
 
 def _vector(change: Mapping[str, Tensor], names: tuple[str, str, str]) -> Tensor:

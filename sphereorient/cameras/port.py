@@ -4,11 +4,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.camera import Camera, Rays
+from sphereorient.cameras.camera import Camera, ParameterCovariance, Rays
 from sphereorient.cameras.checks import as_parameter, camera_error, check_points
-from sphereorient.cameras.covariance import ParameterCovariance
 from sphereorient.cameras.model import CentralCamera, Key
-from sphereorient.errors import CameraError, refusal
 
 UNIT_TOLERANCE = 1e-3  # of |normal| - 1: three digits are enough to write a normal; its length is not used
 STEPS = 12  # of Newton's method, before those that carry derivatives; 11 suffice up to 89.9 degrees of incidence
@@ -36,15 +34,13 @@ class Port:
     def __post_init__(self) -> None:
         for key in self.KEYS:
             shape = (len(key.parts),) if key.parts else ()
-            value = as_parameter(f"port, {key.field}", getattr(self, key.field), *shape)
-            object.__setattr__(self, key.field, value)
+            object.__setattr__(self, key.field, as_parameter(f"port, {key.field}", getattr(self, key.field), *shape))
         length = float(self.normal.detach().norm())
         if abs(length - 1) > UNIT_TOLERANCE:
             do = "write the wall's normal in lab axes, towards the camera"
-            raise CameraError(refusal("port, normal", expected="a vector of length 1", got=f"{length:.6g}", do=do))
-        index_do = "write the index relative to the air's"
-        least = {"thickness_mm": (0.0, "write the wall's thickness in mm"), "n_glass": (1.0, index_do)}
-        for name, (smallest, do) in (least | {"n_fluid": (1.0, index_do)}).items():
+            raise camera_error("port, normal", "a vector of length 1", f"{length:.6g}", do)
+        do = "write the index relative to the air's, or the thickness in mm"
+        for name, smallest in (("thickness_mm", 0.0), ("n_glass", 1.0), ("n_fluid", 1.0)):
             number = float(getattr(self, name).detach())
             if number < smallest:
                 raise camera_error(f"port, {name}", f"{smallest:g} or more", f"{number:.6g}", do)
@@ -52,8 +48,7 @@ class Port:
     @property
     def normal_lab(self) -> Tensor:
         """(3,), the normal with length 1 to the last digit."""
-        length: Tensor = self.normal.norm()
-        return self.normal / length
+        return self.normal / torch.linalg.vector_norm(self.normal)
 
     @property
     def air_side_mm(self) -> Tensor:
@@ -141,11 +136,11 @@ class PortCamera:
             if stands <= wall:
                 expected = f"a camera before the wall, its centre beyond normal . X = {wall:.6g} mm"
                 do = "write the normal towards the camera, and offset and thickness in mm in the lab"
-                raise CameraError(refusal("port", expected=expected, got=f"{stands:.6g} mm", do=do))
+                raise camera_error("port", expected, f"{stands:.6g} mm", do)
         if not bool((self.camera.R_cam_lab[2].detach() @ normal) < 0):
             do = "write the normal towards the camera"
             got = f"normal {[round(part, 6) for part in normal.tolist()]}, away from it"
-            raise CameraError(refusal("port", expected="a wall that the camera looks at", got=got, do=do))
+            raise camera_error("port", "a wall that the camera looks at", got, do)
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -195,7 +190,6 @@ class PortCamera:
             to_go = ((x_lab_mm - ray.origin_lab_mm) @ normal) / (ray.direction_lab @ normal)
             missed = x_lab_mm - ray.origin_lab_mm - to_go[..., None] * ray.direction_lab
             apparent = apparent + missed
-        found = missed.norm(dim=-1, keepdim=True) < 1e3 * torch.finfo(missed.dtype).eps * (
-            1 + x_lab_mm.norm(dim=-1, keepdim=True)
-        )
+        close = 1e3 * torch.finfo(missed.dtype).eps * (1 + x_lab_mm.norm(dim=-1, keepdim=True))
+        found = missed.norm(dim=-1, keepdim=True) < close
         return torch.where(inside & found, apparent, torch.full_like(apparent, torch.nan))

@@ -1,13 +1,11 @@
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.checks import check_points
+from sphereorient.cameras.checks import camera_error, check_points
 from sphereorient.cameras.model import CentralCamera, Key
-from sphereorient.errors import CameraError, refusal
 
 FOLD = -4.0 / 27.0  # below this value of kappa1 r_u^2 the cubic has no root on the branch that holds the picture
 
@@ -40,12 +38,7 @@ class TsaiCamera(CentralCamera):
         if 1.0 + 3.0 * kappa1 * r2 <= 0:  # d r_u / d r_d at the farthest corner
             expected = f"above {-1.0 / (3.0 * r2):.4g} 1/mm^2, where the picture's farthest corner folds over"
             do = "correct the camera or calibrate again"
-            raise CameraError(refusal("kappa1", expected=expected, got=f"{kappa1:.4g}", do=do))
-
-    @classmethod
-    def ideal_lens(cls, f_px: float, pitch_mm: Sequence[float]) -> dict[str, Any]:
-        """Return the fields of a lens without distortion."""
-        return {"f_mm": f_px * pitch_mm[1], "pixel_pitch_mm": tuple(pitch_mm), "sx": 1.0, "kappa1": 0.0}
+            raise camera_error("kappa1", expected, f"{kappa1:.4g}", do)
 
     @property
     def focal_px(self) -> Tensor:

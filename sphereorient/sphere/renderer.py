@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from sphereorient.cameras import Camera, Rays
-from sphereorient.cameras.telecentric import TelecentricCamera
+from sphereorient.cameras.ideal import TelecentricCamera
 from sphereorient.errors import CameraError, SettingsError, check_tail, refusal
 from sphereorient.sphere.texture import check_texture_shape, reduced_texture, sample_spline, sample_texture
 from sphereorient.sphere.view import smooth_positive, sphere_normals

@@ -14,8 +14,7 @@ from plate_drawing import PLATE, SIZE, Scene
 from scipy.integrate import dblquad
 
 from sphereorient.calibration import disk_centre_shift
-from sphereorient.calibration.dots import DotSettings, find_dots
-from sphereorient.calibration.ellipse import Dots
+from sphereorient.calibration.dots import Dots, DotSettings, find_dots
 from sphereorient.cameras import TsaiCamera
 from sphereorient.errors import CameraError, ShapeError
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from plate_drawing import PLATE, Scene
 
 from sphereorient.calibration import DotPlate, PlateView, placed, plate_from_entry, see_plate
-from sphereorient.calibration.ellipse import Dots
+from sphereorient.calibration.dots import Dots
 from sphereorient.calibration.lattice import index_dots
-from sphereorient.calibration.plate_view import quarter_turned
+from sphereorient.calibration.targets import quarter_turned
 from sphereorient.errors import CameraError
 
 

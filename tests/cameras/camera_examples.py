@@ -7,9 +7,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera
-from sphereorient.cameras.brown import BrownCamera
-from sphereorient.cameras.openptv_camera import OpenPTVCamera
-from sphereorient.cameras.telecentric import TelecentricCamera
+from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera
+from sphereorient.cameras.ideal import TelecentricCamera
 
 SIZE = (650, 480)
 ROTVEC = (0.3, -0.2, 0.5)

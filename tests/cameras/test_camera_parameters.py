@@ -10,7 +10,7 @@ from camera_examples import MODELS, behind_port, f64, tsai
 from conftest import assert_close
 from scipy.spatial.transform import Rotation
 
-from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.cameras.camera import ParameterCovariance
 from sphereorient.cameras.parameters import parameter_names, with_parameters
 from sphereorient.errors import CameraError, ShapeError
 

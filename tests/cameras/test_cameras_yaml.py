@@ -12,7 +12,7 @@ from camera_examples import MODELS, behind_port, f64, pinhole, tsai, whole_pictu
 from conftest import SHARED, assert_close
 
 from sphereorient.cameras import PinholeCamera, TsaiCamera, load_cameras, save_cameras
-from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.cameras.camera import ParameterCovariance
 from sphereorient.errors import CameraError, OutputError
 
 TSAI = """

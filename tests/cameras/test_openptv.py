@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sphereorient.cameras import PortCamera
+from sphereorient.cameras.brown import OpenPTVCamera
 from sphereorient.cameras.io.openptv import PtvPar, load_openptv, load_ptv_par, par_of, save_openptv, save_ptv_par
-from sphereorient.cameras.openptv_camera import OpenPTVCamera
 from sphereorient.errors import CameraError, OutputError
 
 # The layout that OpenPTV writes: centre, angles, matrix (which nobody reads), shift and distance, glass vector.

@@ -9,8 +9,8 @@ import torch
 from camera_examples import f64, pinhole, whole_picture
 from conftest import assert_close
 
+from sphereorient.cameras.ideal import focal_of_field
 from sphereorient.cameras.model import middle_of_picture
-from sphereorient.cameras.pinhole import focal_of_field
 from sphereorient.errors import CameraError
 
 

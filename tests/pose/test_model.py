@@ -27,7 +27,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera
-from sphereorient.cameras.telecentric import TelecentricCamera
+from sphereorient.cameras.ideal import TelecentricCamera
 from sphereorient.pose.model import SphereView, sphere_view
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
 from sphereorient.sphere import sample_texture

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sphereorient.cameras import PinholeCamera, Port, PortCamera, triangulate
-from sphereorient.cameras.telecentric import TelecentricCamera
+from sphereorient.cameras.ideal import TelecentricCamera
 from sphereorient.experiment.stream import pictures_of
 from sphereorient.locate import Background
 from sphereorient.locate.outline import Outline

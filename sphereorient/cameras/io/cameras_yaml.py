@@ -4,21 +4,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import BaseModel, ConfigDict, create_model
+from pydantic import BaseModel, create_model
 from scipy.linalg import block_diag
 
-from sphereorient.cameras.brown import BrownCamera
-from sphereorient.cameras.camera import Camera
-from sphereorient.cameras.checks import camera_error
-from sphereorient.cameras.covariance import ParameterCovariance
+from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera
+from sphereorient.cameras.camera import Camera, ParameterCovariance
+from sphereorient.cameras.checks import camera_error, check_known, named
+from sphereorient.cameras.ideal import PinholeCamera, TelecentricCamera
 from sphereorient.cameras.model import CameraModel, Key
-from sphereorient.cameras.openptv_camera import OpenPTVCamera
 from sphereorient.cameras.parameters import parameter_names
-from sphereorient.cameras.pinhole import PinholeCamera
 from sphereorient.cameras.port import Port, PortCamera
-from sphereorient.cameras.telecentric import TelecentricCamera
 from sphereorient.cameras.tsai import TsaiCamera
-from sphereorient.errors import CameraError, refusal
+from sphereorient.errors import CameraError
 from sphereorient.files.yaml_file import read_document, refuse_unknown, short, validated, write_document
 
 SCHEMA = "sphereorient-cameras/1"
@@ -33,10 +30,8 @@ MODELS: dict[str, type[CameraModel]] = {
 }
 
 
-class Entry(BaseModel):
+class Entry(BaseModel, frozen=True, extra="forbid"):
     """A mapping of cameras.yaml; unknown keys are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class PortEntry(Entry):
@@ -103,16 +98,14 @@ def load_cameras(path: Path | str) -> dict[str, Camera]:
     """
     path = Path(path)
     document = read_document(path, SCHEMA, CameraError)
-    for key in document:
-        if key not in KEYS:
-            raise CameraError(refuse_unknown(key, KEYS, str(path)))
+    check_known(document, KEYS, str(path))
     entries = document.get("cameras")
     if not isinstance(entries, dict) or not entries:
         do = "write one camera or more below 'cameras:'"
-        raise CameraError(refusal(f"{path}, cameras", expected="named cameras", got=short(entries), do=do))
+        raise camera_error(f"{path}, cameras", "named cameras", short(entries), do)
     if len(entries) > MOST:
-        got, do = f"{len(entries)}", "write those of one experiment"
-        raise CameraError(refusal(f"{path}, cameras", expected=f"at most {MOST} cameras", got=got, do=do))
+        do = "write those of one experiment"
+        raise camera_error(f"{path}, cameras", f"at most {MOST} cameras", f"{len(entries)}", do)
     return {str(name): _build(entry, f"{path}, {name}") for name, entry in entries.items()}
 
 
@@ -129,19 +122,14 @@ def load_covariance(path: Path | str, cameras: Mapping[str, Camera]) -> Paramete
         whole = validated(CovarianceEntry, entry, where, CameraError).covariance()
     except CameraError as error:
         raise CameraError(str(error) if str(error).startswith(where) else f"{path}, {error}") from None
-    for name in whole.names:
-        camera, _, parameter = name.partition(".")
-        if camera in cameras and parameter not in parameter_names(cameras[camera]):
-            known = [f"{camera}.{one}" for one in parameter_names(cameras[camera])]
-            raise CameraError(refuse_unknown(name, known, f"{where}, parameters"))
-    return whole.of(cameras)
+    own = whole.of(cameras)
+    known = [f"{name}.{parameter}" for name, camera in cameras.items() for parameter in parameter_names(camera)]
+    check_known(() if own is None else own.names, known, f"{where}, parameters")
+    return own
 
 
 def save_cameras(
-    path: Path | str,
-    cameras: Mapping[str, Camera],
-    comment: str = "",
-    covariance: ParameterCovariance | None = None,
+    path: Path | str, cameras: Mapping[str, Camera], comment: str = "", covariance: ParameterCovariance | None = None
 ) -> None:
     """Write cameras, by name, to a file that `load_cameras` reads back to the last bit; replace an old file atomically.
     `comment` stands at its top; `covariance` is that of a joint fit.
@@ -162,10 +150,8 @@ def _build(entry: object, where: str) -> Camera:
     if not isinstance(entry["model"], str) or entry["model"] not in MODELS:
         raise CameraError(refuse_unknown(entry["model"], MODELS, f"{where}, model"))
     checked = validated(ENTRIES[entry["model"]], entry, where, CameraError)
-    try:
+    with named(where):
         return _with_port_and_covariance(_in_air(MODELS[checked.model], checked), checked)
-    except CameraError as error:
-        raise CameraError(f"{where}, {error}") from None
 
 
 def _in_air(kind: type[CameraModel], entry: CameraEntry) -> CameraModel:
@@ -184,10 +170,7 @@ def _with_port_and_covariance(camera: CameraModel, entry: CameraEntry) -> Camera
     if entry.covariance is None:
         return whole
     covariance = entry.covariance.covariance()
-    known = parameter_names(whole)
-    for name in covariance.names:
-        if name not in known:
-            raise CameraError(refuse_unknown(name, known, "covariance, parameters"))
+    check_known(covariance.names, parameter_names(whole), "covariance, parameters")
     return replace(whole, covariance=covariance)
 
 
@@ -196,8 +179,8 @@ def _described(camera: Camera) -> dict[str, Any]:
         inner = {key: value for key, value in _described(camera.camera).items() if key != "covariance"}
         return inner | {"port": _values(Port.KEYS, camera.port)} | _covariance_keys(camera.covariance)
     if not isinstance(camera, CameraModel) or camera.MODEL not in MODELS:
-        got, do = type(camera).__name__, "register the model in cameras/io/cameras_yaml.py"
-        raise CameraError(refusal("camera", expected=f"a camera of model {', '.join(MODELS)}", got=got, do=do))
+        do = "register the model in cameras/io/cameras_yaml.py"
+        raise camera_error("camera", f"a camera of model {', '.join(MODELS)}", type(camera).__name__, do)
     pose = {"R": camera.R_cam_lab.detach().tolist(), "T": camera.T_cam_lab_mm.detach().tolist()}
     first: dict[str, Any] = {"model": camera.MODEL, "image_size": list(camera.image_size)}
     return first | _values(camera.KEYS, camera) | pose | _covariance_keys(camera.covariance)

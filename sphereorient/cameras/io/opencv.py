@@ -32,34 +32,22 @@ def load_opencv(path: Path | str, image_size: tuple[int, int] | None = None) -> 
     Raises:
         CameraError: no OpenCV file, a missing or impossible key, shear, or distortion beyond k1, k2, p1, p2, k3.
     """
-    path = Path(path)
-    storage = _opened(path)
+    storage = _opened(Path(path))
     try:
-        K = _required(storage, path, "camera_matrix")
-        coefficients = _coefficients(storage, path)
-        R = _rotation(storage, path)
-        T = _translation(storage, path)
-        size = _size(storage, path, image_size)
-    finally:
-        storage.release()
-    if K.shape != (3, 3):
-        raise camera_error(f"{path}, camera_matrix", "3 x 3 numbers", str(K.shape), "correct the file")
-    if K[0, 1] != 0 or K[1, 0] != 0 or not np.allclose(K[2], (0, 0, 1)):
-        expected = "fx and fy on the diagonal, cx and cy in the last column, zeros and a one elsewhere"
-        got = short(K.round(6).tolist())
-        raise camera_error(f"{path}, camera_matrix", expected, got, "calibrate without shear")
-    try:
+        K, coefficients = _camera_matrix(storage), _coefficients(storage)
         return BrownCamera(
-            image_size=size,
-            R_cam_lab=_tensor(R),
-            T_cam_lab_mm=_tensor(T),
-            centre_px=_tensor(K[:2, 2]),
-            f_px=_tensor(K[[0, 1], [0, 1]]),
-            k=_tensor(coefficients[[0, 1, 4]]),
-            p=_tensor(coefficients[[2, 3]]),
+            image_size=_size(storage, image_size),
+            R_cam_lab=_rotation(storage),
+            T_cam_lab_mm=_translation(storage),
+            centre_px=torch.from_numpy(K[:2, 2]),
+            f_px=torch.from_numpy(K[[0, 1], [0, 1]]),
+            k=torch.from_numpy(coefficients[[0, 1, 4]]),
+            p=torch.from_numpy(coefficients[[2, 3]]),
         )
     except CameraError as error:
         raise CameraError(f"{path}, {error}") from None
+    finally:
+        storage.release()
 
 
 def save_opencv(path: Path | str, camera: BrownCamera) -> None:
@@ -128,26 +116,34 @@ def _claims_few(node: cv2.FileNode) -> bool:
 
 
 def _whole(node: cv2.FileNode) -> int | None:
-    if not (node.isInt() or node.isReal()):
-        return None
-    number = float(node.real())
+    number = float(node.real()) if node.isInt() or node.isReal() else math.nan
     return int(number) if number.is_integer() else None
 
 
-def _required(storage: cv2.FileStorage, path: Path, key: str) -> Array:
+def _required(storage: cv2.FileStorage, key: str) -> Array:
     matrix = _node(storage, key)
     if matrix is not None:
         return matrix
     if key == "camera_matrix" and _node(storage, "K1") is not None:
         expected, got = "the matrix of one camera", "a stereo pair (K1, D1, ...)"
-        raise camera_error(f"{path}, {key}", expected, got, "split the stereo file into one file per camera")
+        raise camera_error(key, expected, got, "split the stereo file into one file per camera")
     do = "calibrate with OpenCV, or name the file it wrote; write five zeros where there is no distortion"
-    raise camera_error(f"{path}, {key}", "an OpenCV matrix", "none", do)
+    raise camera_error(key, "an OpenCV matrix", "none", do)
 
 
-def _coefficients(storage: cv2.FileStorage, path: Path) -> Array:
-    where = f"{path}, distortion_coefficients"
-    flat = _required(storage, path, "distortion_coefficients").reshape(-1)
+def _camera_matrix(storage: cv2.FileStorage) -> Array:
+    K = _required(storage, "camera_matrix")
+    if K.shape != (3, 3):
+        raise camera_error("camera_matrix", "3 x 3 numbers", str(K.shape), "correct the file")
+    if K[0, 1] != 0 or K[1, 0] != 0 or not np.allclose(K[2], (0, 0, 1)):
+        expected = "fx and fy on the diagonal, cx and cy in the last column, zeros and a one elsewhere"
+        raise camera_error("camera_matrix", expected, short(K.round(6).tolist()), "calibrate without shear")
+    return K
+
+
+def _coefficients(storage: cv2.FileStorage) -> Array:
+    where = "distortion_coefficients"
+    flat = _required(storage, where).reshape(-1)
     if len(flat) not in LENGTHS:
         expected = f"{', '.join(map(str, LENGTHS[:-1]))} or {LENGTHS[-1]} numbers"
         raise camera_error(where, expected, str(len(flat)), "correct the file")
@@ -157,32 +153,28 @@ def _coefficients(storage: cv2.FileStorage, path: Path) -> Array:
     return np.pad(flat, (0, 1))[:5]
 
 
-def _rotation(storage: cv2.FileStorage, path: Path) -> Array:
-    for key in ("R", "rvec"):
-        found = _node(storage, key)
-        if found is None:
-            continue
-        if found.size == 3:
-            return np.asarray(cv2.Rodrigues(found.reshape(3, 1))[0], np.float64)
-        if found.shape != (3, 3):
-            expected = "a matrix of 3 x 3 or a vector of 3 numbers"
-            raise camera_error(f"{path}, {key}", expected, str(found.shape), "correct the file")
-        return found
-    return np.eye(3)
+def _first(storage: cv2.FileStorage, keys: tuple[str, str], usual: Array) -> tuple[str, Array]:
+    """Return the first of two keys that the file has, and its matrix; without both the usual one."""
+    return next(((key, found) for key in keys if (found := _node(storage, key)) is not None), (keys[0], usual))
 
 
-def _translation(storage: cv2.FileStorage, path: Path) -> Array:
-    for key in ("T", "tvec"):
-        found = _node(storage, key)
-        if found is not None and found.size != 3:
-            raise camera_error(f"{path}, {key}", "3 numbers", str(found.shape), "correct the file")
-        if found is not None:
-            return found.reshape(3)
-    return np.zeros(3)
+def _rotation(storage: cv2.FileStorage) -> Tensor:
+    key, found = _first(storage, ("R", "rvec"), np.eye(3))
+    if found.size != 3 and found.shape != (3, 3):
+        expected = "a matrix of 3 x 3 or a vector of 3 numbers"
+        raise camera_error(key, expected, str(found.shape), "correct the file")
+    return torch.from_numpy(cv2.Rodrigues(found.reshape(3, 1))[0] if found.size == 3 else found)
 
 
-def _size(storage: cv2.FileStorage, path: Path, image_size: tuple[int, int] | None) -> tuple[int, int]:
-    where = f"{path}, image_width, image_height"
+def _translation(storage: cv2.FileStorage) -> Tensor:
+    key, found = _first(storage, ("T", "tvec"), np.zeros(3))
+    if found.size != 3:
+        raise camera_error(key, "3 numbers", str(found.shape), "correct the file")
+    return torch.from_numpy(found.reshape(3))
+
+
+def _size(storage: cv2.FileStorage, image_size: tuple[int, int] | None) -> tuple[int, int]:
+    where = "image_width, image_height"
     width, height = (_whole(storage.getNode(key)) or 0 for key in ("image_width", "image_height"))
     if width > 0 and height > 0:
         if image_size not in (None, (width, height)):
@@ -191,7 +183,3 @@ def _size(storage: cv2.FileStorage, path: Path, image_size: tuple[int, int] | No
     if image_size is None:
         raise camera_error(where, "two whole numbers", "none", "give image_size (--image-size W,H)")
     return image_size
-
-
-def _tensor(array: Array) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float64))

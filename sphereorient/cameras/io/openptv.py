@@ -6,33 +6,32 @@ OpenPTV's first pixel has its centre at (0.5, 0.5), ours at (0, 0). Its camera l
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.cameras.brown import OpenPTVCamera
 from sphereorient.cameras.camera import Camera
-from sphereorient.cameras.checks import camera_error
+from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.model import middle_of_picture
-from sphereorient.cameras.openptv_camera import OpenPTVCamera
 from sphereorient.cameras.port import Port, PortCamera
-from sphereorient.errors import CameraError, OutputError, refusal
+from sphereorient.errors import CameraError
+from sphereorient.files.outputs import put_aside
 from sphereorient.files.whole_file import TEXT_BYTES, read_whole
 from sphereorient.files.yaml_file import short
 
-ORI_PARTS = "centre, angles, matrix, xh yh cc, glass vector"
-ORI_NUMBERS = 21
-ADDPAR_PARTS = "k1 k2 k3 p1 p2 scx she"
-ADDPAR_NUMBERS = 7
-PAR_PARTS = "hp_flag allCam_flag tiff_flag imx imy pix_x pix_y chfield n1 n2 n3 d after the cameras' names"
-PAR_NUMBERS = 12
+# How many numbers each file has, and which.
+ORI = 21, "centre, angles, matrix, xh yh cc, glass vector"
+ADDPAR = 7, "k1 k2 k3 p1 p2 scx she"
+PAR = 12, "hp_flag allCam_flag tiff_flag imx imy pix_x pix_y chfield n1 n2 n3 d after the cameras' names"
 NO_ADDPAR = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]  # OpenPTV's defaults where there is no file
 AXES = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # OpenPTV's camera components to ours
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class PtvPar:
     """Content of ptv.par: the sensor, and the media between camera and liquid."""
 
@@ -57,16 +56,14 @@ def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None)
     Raises:
         CameraError: a missing, truncated or malformed file, or impossible parameters.
     """
-    ori = Path(ori)
-    v = _numbers(ori, None, ORI_NUMBERS, ORI_PARTS)
+    v = _numbers(Path(ori), None, *ORI)
     centre, angles, (xh, yh, cc), glass = v[:3], v[3:6], v[15:18], v[18:21]
-    distortion = NO_ADDPAR if addpar is None else _numbers(Path(addpar), None, ADDPAR_NUMBERS, ADDPAR_PARTS)
-    k1, k2, k3, p1, p2, scx, she = distortion
+    *k_p, scx, she = NO_ADDPAR if addpar is None else _numbers(Path(addpar), None, *ADDPAR)
     if scx != 1.0:
         warnings.warn(f"{addpar}: scx = {scx:g} is read as x' = scx x, y' = y, OpenPTV's classic form.", stacklevel=2)
     R_cam_lab = AXES @ so3.from_tait_bryan(_tensor(angles)).mT
     shift_px = _tensor((xh / par.pixel_pitch_mm[0], -yh / par.pixel_pitch_mm[1]))
-    try:
+    with named(str(ori)):
         camera = OpenPTVCamera(
             image_size=par.image_size,
             R_cam_lab=R_cam_lab,
@@ -74,14 +71,12 @@ def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None)
             centre_px=middle_of_picture(par.image_size) + shift_px,
             f_mm=_tensor(cc),
             pixel_pitch_mm=_tensor(par.pixel_pitch_mm),
-            k=_tensor((k1, k2, k3)),
-            p=_tensor((p1, p2)),
+            k=_tensor(k_p[:3]),
+            p=_tensor(k_p[3:]),
             scx=_tensor(scx),
             she=_tensor(she),
         )
         return PortCamera(camera=camera, port=_port(glass, par)) if par.refracts else camera
-    except CameraError as error:
-        raise CameraError(f"{ori}, {error}") from None
 
 
 def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
@@ -93,10 +88,9 @@ def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
     """
     inner, glass = _openptv_of(camera), _glass_vector(camera)
     dm = inner.R_cam_lab.detach().mT @ AXES
-    angles = so3.to_tait_bryan(dm)
     shift_mm = (inner.centre_px.detach() - middle_of_picture(inner.image_size)) * inner.pixel_pitch_mm.detach()
-    xh, yh = shift_mm[0], -shift_mm[1]
-    lines = [inner.centre_lab_mm.detach(), angles, *dm, torch.stack([xh, yh]), inner.f_mm.detach()[None], glass]
+    xh_yh = shift_mm * _tensor((1.0, -1.0))
+    lines = [inner.centre_lab_mm.detach(), so3.to_tait_bryan(dm), *dm, xh_yh, inner.f_mm.detach()[None], glass]
     _write(Path(ori), "".join(_row(line) for line in lines))
     parts = (inner.k, inner.p, inner.scx[None], inner.she[None])
     _write(Path(addpar), _row(torch.cat([part.detach() for part in parts])))
@@ -109,22 +103,14 @@ def load_ptv_par(path: Path | str) -> PtvPar:
     count = words[0].strip() if words else ""
     if not (count.isascii() and count.isdigit() and len(count) < 4):
         raise camera_error(str(path), "the number of cameras first", short(count[:20]), "name OpenPTV's ptv.par")
-    numbers = _numbers(path, words[1 + 2 * int(count) :], PAR_NUMBERS, PAR_PARTS)
-    imx, imy, pix_x, pix_y, chfield, n_air, n_glass, n_fluid, thickness_mm = numbers[3:]
+    imx, imy, pix_x, pix_y, chfield, *media = _numbers(path, words[1 + 2 * int(count) :], *PAR)[3:]
     if chfield != 0:
         got, do = f"chfield {chfield:g}", "make whole frames of the fields first"
-        raise CameraError(refusal(str(path), expected="whole frames (chfield 0)", got=got, do=do))
-    if min(imx, imy, pix_x, pix_y, n_air, n_glass, n_fluid) <= 0:
-        expected, do = "sizes, pixels and indices above zero", f"correct them ({PAR_PARTS})"
-        raise CameraError(refusal(str(path), expected=expected, got="zero or less", do=do))
-    return PtvPar(
-        image_size=(int(imx), int(imy)),
-        pixel_pitch_mm=(pix_x, pix_y),
-        n_air=n_air,
-        n_glass=n_glass,
-        n_fluid=n_fluid,
-        thickness_mm=thickness_mm,
-    )
+        raise camera_error(str(path), "whole frames (chfield 0)", got, do)
+    if min(imx, imy, pix_x, pix_y, *media[:3]) <= 0:
+        expected, do = "sizes, pixels and indices above zero", f"correct them ({PAR[1]})"
+        raise camera_error(str(path), expected, "zero or less", do)
+    return PtvPar((int(imx), int(imy)), (pix_x, pix_y), *media)
 
 
 def save_ptv_par(path: Path | str, par: PtvPar, names: Sequence[str]) -> None:
@@ -141,11 +127,11 @@ def par_of(camera: Camera) -> PtvPar:
     """Return the content of ptv.par for an OpenPTV camera; CameraError for another model."""
     inner = _openptv_of(camera)
     pitch_u, pitch_v = inner.pixel_pitch_mm.tolist()
-    par = PtvPar(image_size=inner.image_size, pixel_pitch_mm=(pitch_u, pitch_v))
-    if not isinstance(camera, PortCamera):
-        return par
-    port = camera.port
-    return replace(par, n_glass=port.n_glass.item(), n_fluid=port.n_fluid.item(), thickness_mm=port.thickness_mm.item())
+    media: list[float] = []
+    if isinstance(camera, PortCamera):
+        port = camera.port
+        media = [1.0, port.n_glass.item(), port.n_fluid.item(), port.thickness_mm.item()]
+    return PtvPar(inner.image_size, (pitch_u, pitch_v), *media)
 
 
 def _port(glass_mm: Sequence[float], par: PtvPar) -> Port:
@@ -153,7 +139,7 @@ def _port(glass_mm: Sequence[float], par: PtvPar) -> Port:
     distance = vector.norm()
     if float(distance) == 0:
         do = "write the wall's normal, as long as the wall's liquid side is away from the origin"
-        raise CameraError(refusal("glass vector", expected="a vector longer than 0", got="0 0 0", do=do))
+        raise camera_error("glass vector", "a vector longer than 0", "0 0 0", do)
     return Port(
         normal=vector / distance,
         offset_mm=distance,
@@ -170,7 +156,7 @@ def _glass_vector(camera: Camera) -> Tensor:
     if float(offset) <= 0:
         expected = "a wall with the lab's origin on its liquid side (OpenPTV has only the distance)"
         got, do = f"offset {float(offset):g}", "move the lab's origin into the liquid"
-        raise CameraError(refusal("port", expected=expected, got=got, do=do))
+        raise camera_error("port", expected, got, do)
     return camera.port.normal_lab.detach() * offset
 
 
@@ -178,7 +164,7 @@ def _openptv_of(camera: Camera) -> OpenPTVCamera:
     inner = camera.camera if isinstance(camera, PortCamera) else camera
     if not isinstance(inner, OpenPTVCamera):
         got, do = type(inner).__name__, "build an OpenPTVCamera; other distortions have no exact counterpart there"
-        raise CameraError(refusal("camera", expected="a camera of model openptv", got=got, do=do))
+        raise camera_error("camera", "a camera of model openptv", got, do)
     return inner
 
 
@@ -187,15 +173,15 @@ def _words(path: Path, separator: str | None = None) -> list[str]:
     try:
         return content.decode("utf-8-sig").strip().split(separator)
     except UnicodeDecodeError:
-        expected, got, do = "a text file of OpenPTV", "bytes that are no text", "name OpenPTV's file"
-        raise CameraError(refusal(str(path), expected=expected, got=got, do=do)) from None
+        got, do = "bytes that are no text", "name OpenPTV's file"
+        raise camera_error(str(path), "a text file of OpenPTV", got, do) from None
 
 
 def _numbers(path: Path, words: Sequence[str] | None, count: int, parts: str) -> list[float]:
     words = _words(path) if words is None else words
     if len(words) != count:
         do = "copy the file again, it is cut off" if len(words) < count else "name a file of this kind"
-        raise CameraError(refusal(str(path), expected=f"{count} numbers ({parts})", got=str(len(words)), do=do))
+        raise camera_error(str(path), f"{count} numbers ({parts})", str(len(words)), do)
     numbers = []
     for place, word in enumerate(words):
         try:
@@ -214,12 +200,8 @@ def _row(numbers: Tensor) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as fault:
-        do = "choose a folder that exists and may be written"
-        got = f"'{fault.strerror}'"
-        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from fault
+    with put_aside(path) as aside:
+        aside.write_text(text, encoding="utf-8")
 
 
 def _tensor(value: object) -> Tensor:
