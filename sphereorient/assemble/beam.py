@@ -37,7 +37,7 @@ REST_SHARE = 0.5  # prior share of new spheres with an omega as small as its cha
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Histories:
-    """Result of `search`, F frames and M rows."""
+    """Result of a `BeamSearch`, F frames and M rows."""
 
     row: Ints  # (F,), row chosen, -1 without
     begins: Bools  # (F,), the orientation of the frame begins a motion
@@ -47,14 +47,9 @@ class Histories:
     evidence: float  # log of how much more probable the movie is with a motion in it than without
 
 
-def search(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> Histories:
-    """Find the most probable history of a movie, and each candidate's probability; `gap_frames_max` in frame intervals.
-    Source: Viterbi 1967; Baum and others 1970 (forward-backward); pruned as in a beam search.
-    """
-    return _Search(rows, cost, gap_frames_max).run()
+class BeamSearch:
+    """Search of a movie's candidates by a cost; gaps inside a motion have at most `gap_frames_max` frame intervals."""
 
-
-class _Search:
     def __init__(self, rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> None:
         self.rows, self.cost = rows, cost
         self.time, self.offset = rows.time_s, rows.offset
@@ -65,6 +60,9 @@ class _Search:
         self.chain_cost, self.chain_turn, self.first_pin, self.last_pin = self._pins(gap_frames_max + 2)
 
     def run(self) -> Histories:
+        """Find the most probable history of the movie, and each candidate's probability.
+        Source: Viterbi 1967; Baum and others 1970 (forward-backward); pruned as in a beam search.
+        """
         states = PathStates.begin(NOT_YET, np.full(1, NOT_YET, dtype=np.int64))
         least, total = np.zeros(1), np.zeros(1)
         steps: list[BeamStep] = []
@@ -100,15 +98,13 @@ class _Search:
         if f and self.first_pin[f - 1]:
             visits = visits[1:]
         if not (self.first_pin[f] or (f and self.first_pin[f - 1])):
-            visits += [self._stay(states, every[alive], miss[alive]), self._lose(every[~alive], miss[~alive])]
+            stays, ends = np.flatnonzero(alive), np.flatnonzero(~alive)
+            here, lost = states.take(stays), PathStates.begin(LOST, np.full(min(len(ends), 1), -1))
+            visits += [
+                BeamStep(frame=f, states=here, source=stays, target=np.arange(len(stays)), cost=miss[stays]),
+                BeamStep(frame=f, states=lost, source=ends, target=np.zeros_like(ends), cost=miss[ends]),
+            ]
         return concatenated(visits)
-
-    def _stay(self, states: PathStates, alive: Ints, cost: Floats) -> BeamStep:
-        return BeamStep(frame=-1, states=states.take(alive), source=alive, target=np.arange(len(alive)), cost=cost)
-
-    def _lose(self, source: Ints, cost: Floats) -> BeamStep:
-        states = PathStates.begin(LOST, np.full(min(len(source), 1), -1))
-        return BeamStep(frame=-1, states=states, source=source, target=np.zeros(len(source), dtype=np.int64), cost=cost)
 
     def _alive(self, states: PathStates, f: int) -> tuple[Floats, Bools]:
         """Return the time since the last orientation, and whether omega still predicts the rotation over it."""
@@ -138,7 +134,7 @@ class _Search:
         """Continue states that have an omega, by the rotation nearest to its prediction."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         R, R_before = self.rows.R_lab_body[rows], self.rows.R_lab_body[states.row]
-        expected = states.omega * dt[:, None]
+        expected = states.turn / states.span[:, None] * dt[:, None]
         off, axis_off = rotation_between(rotated(R_before, expected)[:, None], R)
         variance = self.cost.predicted_variance(
             dt[:, None],
@@ -189,7 +185,6 @@ class _Search:
         onward = PathStates(
             frame=np.full(len(row), f),
             row=row,
-            omega=turn / dt[:, None],
             turn=turn,
             span=dt,
             before=self.rows.variance[before],
@@ -229,8 +224,6 @@ class _Search:
         frames = len(self.time)
         cost, turn = np.zeros(frames), np.zeros((frames, 3))
         first, last = np.zeros(frames, dtype=np.bool_), np.full(frames, -1)
-        if frames < 3:
-            return cost, turn, first, last
         single, dt = np.diff(self.offset) == 1, np.diff(self.time)
         close = (dt <= self.hole_s) & (self.rows.zones(dt) == 1)
         R, variance = self.rows.R_lab_body[self.offset[:-1]], self.rows.variance[self.offset[:-1]]
@@ -256,7 +249,6 @@ class _Search:
         states = PathStates(
             frame=np.array([last]),
             row=np.array([row]),
-            omega=self.chain_turn[None, last] / span,
             turn=self.chain_turn[None, last],
             span=np.array([span]),
             before=self.rows.variance[None, self.offset[last - 1]],
