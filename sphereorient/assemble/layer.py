@@ -164,7 +164,9 @@ def _chunk(cost: SecondOrderCost, links: _Links, variance: Tensor, still: Tensor
     before = links.before[..., steps]
     earlier = links.before.gather(-1, before)
     dt, span = (each[..., None, None, None] for each in (links.dt_s[..., steps], links.dt_s.gather(-1, before)))
-    expected = scaled_rotations(taken(links.turn, before, 4), dt / span)
+    expected, ratio = taken(links.turn, before, 4), dt / span
+    if not bool(((ratio - 1).abs() < EVEN).all()):  # rotations about the same axes, below half a turn
+        expected = so3.exp(so3.log(expected) * ratio)
     expected = expected.flatten(-2).transpose(-3, -2)  # (..., j, i, 9)
     misfit = _squared_chord(expected, links.turn[..., steps, :, :, :, :].flatten(-2)).transpose(-3, -2)
     predicted = cost.predicted_variance(
@@ -217,13 +219,6 @@ def _squared_chord(expected: Tensor, found: Tensor) -> Tensor:
     """Return (2 sin(angle / 2))^2 between rotations (..., A, 9) and (..., B, 9): like angle^2, but smooth at pi."""
     # Differences, not products: small misfits keep their digits in single precision.
     return torch.cdist(expected, found, compute_mode="donot_use_mm_for_euclid_dist").square() / 2
-
-
-def scaled_rotations(turn: Tensor, ratio: Tensor) -> Tensor:
-    """Return rotations (..., 3, 3) about the same axes by `ratio` (..., 1) times the angle, below half a turn."""
-    if bool(((ratio - 1).abs() < EVEN).all()):
-        return turn
-    return so3.exp(so3.log(turn) * ratio)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

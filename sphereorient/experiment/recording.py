@@ -11,8 +11,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment.experiment import Experiment, load_experiment, open_movies, outside_paths
-from sphereorient.experiment.given import given_mask
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.stream import CameraStream, given_mask
 from sphereorient.experiment.timeline import Rows, Timeline, timeline
 from sphereorient.sphere import load_texture
 

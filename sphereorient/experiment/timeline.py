@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,9 +60,9 @@ class Timeline:
         rows = {name: np.full(count, NONE) for name in self.rows}
         for name, row in self.rows.items():
             rows[name][place] = row
-        time_s = np.interp(np.arange(count), place, self.time_s)
-        grid = Timeline(number=self.number[0] + np.arange(count), time_s=time_s, rows=rows, remarks=self.remarks)
-        return grid, place
+        frames = np.arange(count)
+        time_s = np.interp(frames, place, self.time_s)
+        return replace(self, number=self.number[0] + frames, time_s=time_s, rows=rows), place
 
     @property
     def even(self) -> bool:
@@ -89,7 +89,7 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         expected, do = f"{last} frames as frames: says", "lower the end of frames:"
         raise MovieError(refusal(f"{experiment.path}, movies", expected=expected, got=f"{len(whole)}", do=do))
     rows = {name: row[first:last] for name, row in whole.rows.items()}
-    return Timeline(number=whole.number[first:last], time_s=whole.time_s[first:last], rows=rows, remarks=whole.remarks)
+    return replace(whole, number=whole.number[first:last], time_s=whole.time_s[first:last], rows=rows)
 
 
 def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
@@ -115,9 +115,8 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     else:
         time_s = load_times(Path(experiment.times))
         if len(time_s) != count:
-            do = "give one time for each frame of the experiment, counted after start:"
-            got = f"{len(time_s)}"
-            raise ExperimentError(refusal(experiment.times, expected=f"{count} times", got=got, do=do))
+            expected, do = f"{count} times", "give one time for each frame of the experiment, counted after start:"
+            raise ExperimentError(refusal(experiment.times, expected=expected, got=f"{len(time_s)}", do=do))
     return Timeline(number=number, time_s=np.asarray(time_s, np.float64), rows=rows, remarks=remarks)
 
 
@@ -203,17 +202,15 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
 def _paired(one: Floats, other: Floats, within_s: float) -> Rows:
     """Pair increasing times nearer than `within_s`; return (N, 2) indices in order of time, NONE without a partner."""
-    after = np.searchsorted(other, one).clip(1, max(len(other) - 1, 1))
-    low = np.clip(after - 1, 0, len(other) - 1)
-    high = np.clip(after, 0, len(other) - 1)
+    high = np.searchsorted(other, one).clip(max=len(other) - 1)
+    low = (high - 1).clip(0)
     nearest = np.where(np.abs(other[high] - one) < np.abs(other[low] - one), high, low)
-    near = np.abs(other[nearest] - one) <= within_s
+    apart = np.abs(other[nearest] - one)
+    near = apart <= within_s
     # Two times of `one` may share a nearest neighbour: the nearer one gets it.
     best = np.full(len(other), NONE)
-    for k in np.flatnonzero(near):
-        j = nearest[k]
-        if best[j] == NONE or abs(other[j] - one[k]) < abs(other[j] - one[best[j]]):
-            best[j] = k
+    nearest_last = np.flatnonzero(near)[np.argsort(apart[near], kind="stable")[::-1]]
+    best[nearest[nearest_last]] = nearest_last
     partner = np.full(len(one), NONE)
     there = best >= 0
     partner[best[there]] = np.flatnonzero(there)

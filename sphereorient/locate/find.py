@@ -5,8 +5,7 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient.locate.background import Background
-from sphereorient.locate.blob import Blob, find_blobs
-from sphereorient.locate.outline import Outline, fit_outline
+from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import Sightings
 from sphereorient.trajectory import Reason
@@ -24,10 +23,13 @@ def find_ball(
     difference = background.difference(frame)
     blobs = find_blobs(difference, background.noise, diameter_px, settings)
     best: Outline | None = None
+    likeliest = (False, 0.0)  # painted and supported ones first, then by coverage
     for blob in blobs:
         outline = fit_outline(difference, background.typical_noise, blob, diameter_px, settings, background.shown)
-        if outline is not None and (best is None or _likelier(outline, best, settings)):
-            best = outline
+        if outline is not None:
+            likely = (outline.painted and outline.coverage >= settings.coverage_min, outline.coverage)
+            if best is None or likely > likeliest:
+                best, likeliest = outline, likely
         # Usually the first blob; others are tried only if its rim is incomplete.
         if best is not None and best.painted and best.coverage >= max(settings.coverage_min, 0.5):
             break
@@ -35,12 +37,6 @@ def find_ball(
         return None, _why_not(difference, diameter_px, background, blobs, settings)
     reason = _why_unreadable(frame, difference, background, best, settings)
     return (best, Reason.OK) if reason is Reason.OK else (None, reason)
-
-
-def _likelier(one: Outline, other: Outline, settings: LocateSettings) -> bool:
-    """Compare outlines: painted and supported ones first, then by coverage."""
-    rank = [(each.painted and each.coverage >= settings.coverage_min, each.coverage) for each in (one, other)]
-    return rank[0] > rank[1]
 
 
 def _why_not(

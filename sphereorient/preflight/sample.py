@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from sphereorient.cameras import Camera
 from sphereorient.errors import MovieError, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.given import given_scene
-from sphereorient.experiment.stream import CameraStream, pictures_of, spread_frames, uniform
+from sphereorient.experiment.stream import CameraStream, given_scene, pictures_of, spread_frames, uniform
 from sphereorient.experiment.timeline import NONE
 from sphereorient.locate import (
     Background,
