@@ -94,10 +94,9 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
 def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     there = {name: len(movie) - experiment.start.get(name, 0) for name, movie in movies.items()}
-    subject = f"{experiment.path}, movies"
     if min(there.values()) <= 0:
-        got = " and ".join(f"{count} ({name})" for name, count in there.items())
-        raise MovieError(refusal(subject, expected="frames after start", got=got, do="correct start:"))
+        name, got = f"{experiment.path}, movies", " and ".join(f"{count} ({name})" for name, count in there.items())
+        raise MovieError(refusal(name, expected="frames after start", got=got, do="correct start:"))
     count = max(there.values())
     wanted = count if experiment.frames is None else min(count, experiment.frames[1])
     remarks = tuple(
@@ -136,15 +135,12 @@ def load_times(path: Path) -> Floats:
     values: list[float] = []
     for number, line in enumerate(lines, 1):
         text = line.split("#")[0].strip().rstrip(",;")
-        if not text:
-            continue
         try:
-            values.append(float(text))
+            values += [float(text)] if text else []
         except ValueError:
-            if not values and number == 1:
-                continue
-            name = f"{path}, line {number}"
-            raise ExperimentError(refusal(name, expected="a number", got=repr(text[:40]), do=do)) from None
+            if number > 1:  # the first line may be a heading
+                name, got = f"{path}, line {number}", repr(text[:40])
+                raise ExperimentError(refusal(name, expected="a number", got=got, do=do)) from None
     return _increasing(str(path), np.asarray(values, np.float64), do)
 
 
@@ -173,19 +169,15 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         stamps = _increasing(f"{movie.path}, time stamps", movie.times_s, "write frame_rate:, or times: with a file")
         # `start`: each clock begins at that picture; otherwise all stamps count from the trigger.
         clocks[name] = stamps[start:] - stamps[start] if experiment.start_given else stamps[start:]
-    usual_s = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]) if clocks else [np.nan]))
-    names = list(clocks)
-    if len(names) == 1:
-        pairs = np.arange(len(clocks[names[0]]))[:, None]
-    else:
+    usual_s, names = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]))), list(clocks)
+    pairs = np.arange(len(clocks[names[0]]))[:, None]
+    if len(names) == 2:
         pairs = _paired(clocks[names[0]], clocks[names[1]], PAIR_STEPS * usual_s)
-    taken = np.stack([np.where(row >= 0, clocks[name][row], np.nan) for name, row in zip(names, pairs.T, strict=True)])
-    rows = {
-        name: np.where(row >= 0, row + experiment.start.get(name, 0), NONE)
-        for name, row in zip(names, pairs.T, strict=True)
-    }
+    chosen = dict(zip(names, pairs.T, strict=True))
+    taken = np.stack([np.where(row >= 0, clocks[name][row], np.nan) for name, row in chosen.items()])
+    rows = {name: np.where(row >= 0, row + experiment.start.get(name, 0), NONE) for name, row in chosen.items()}
     remarks = [
-        f"{movies[name].path}: {lacking} of {taken.shape[1]} instants have no picture"
+        f"{movies[name].path}: {lacking} of {len(pairs)} instants have no picture"
         for name, lacking in zip(names, np.isnan(taken).sum(1).tolist(), strict=True)
         if lacking
     ]
