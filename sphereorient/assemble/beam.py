@@ -57,7 +57,7 @@ class BeamSearch:
         self.hole_s = (gap_frames_max + 1.5) * rows.frame_s  # half a frame for uneven times
         self.hit, self.miss = (np.array(each) for each in cost.presence())  # index: the last frame was a hit
         self.breaks, self.goes_on = -math.log(cost.break_probability), -math.log1p(-cost.break_probability)
-        self.chain_cost, self.chain_turn, self.first_pin, self.last_pin = self._pins(gap_frames_max + 2)
+        self.chain_cost, self.chain_turn, self.last_pin = self._pins(gap_frames_max + 2)
 
     def run(self) -> Histories:
         """Find the most probable history of the movie, and each candidate's probability.
@@ -74,8 +74,8 @@ class BeamSearch:
             totals.append(total)
             last = self.last_pin[f]
             if last > f:  # only one state is left: no search until the run's end
-                step, cost = self._jump(step, last)
-                least, total = least + cost, total + cost
+                step = self._jump(step, last)
+                least, total = least + step.cost, total + step.cost
                 steps.append(step)
                 totals.append(total)
             states, f = step.states, step.frame + 1
@@ -95,9 +95,9 @@ class BeamSearch:
             onward.append(self._second(states.take(single), single, dt[single], goes_on[single], f))
         visits = [self._begin(every, hit + np.where(alive, self.breaks, 0.0), f)]
         visits += [merge_equal(concatenated(onward, shared_targets=True), least)] if onward else []
-        if f and self.first_pin[f - 1]:
+        if self.last_pin[f] >= 0:
             visits = visits[1:]
-        if not (self.first_pin[f] or (f and self.first_pin[f - 1])):
+        elif self.last_pin[f + 1] < 0:
             stays, ends = np.flatnonzero(alive), np.flatnonzero(~alive)
             here, lost = states.take(stays), PathStates.begin(LOST, np.full(min(len(ends), 1), -1))
             visits += [
@@ -182,13 +182,8 @@ class BeamSearch:
         """Return one edge and one state for each continuation; `merge_equal` merges states of equal key (`target`)."""
         before, dt = states.row[of_state], self.time[f] - self.time[states.frame[of_state]]
         key = (before * (self.offset[f + 1] - self.offset[f]) + row - self.offset[f]) * (1 << 20) + around
-        onward = PathStates(
-            frame=np.full(len(row), f),
-            row=row,
-            turn=turn,
-            span=dt,
-            before=self.rows.variance[before],
-        )
+        at = np.full(len(row), f)
+        onward = PathStates(frame=at, row=row, turn=turn, span=dt, before=self.rows.variance[before])
         return BeamStep(frame=f, states=onward, source=of_state, target=key, cost=np.zeros(len(row)))
 
     def _arrive(self, step: BeamStep, least: Floats, total: Floats) -> tuple[BeamStep, Floats, Floats]:
@@ -206,8 +201,8 @@ class BeamSearch:
         place[near] = np.arange(len(near))
         kept = place[step.target] >= 0
         renumbered = np.cumsum(kept) - 1
-        pruned = BeamStep(
-            frame=step.frame,
+        pruned = replace(
+            step,
             states=step.states.take(near),
             source=step.source[kept],
             target=place[step.target[kept]],
@@ -216,14 +211,13 @@ class BeamSearch:
         )
         return pruned, new_least[near], new_total[near]
 
-    def _pins(self, length: int) -> tuple[Floats, Floats, Bools, Ints]:
+    def _pins(self, length: int) -> tuple[Floats, Floats, Ints]:
         """Find runs of frames with one candidate each that follow the motion: all good histories contain them.
-        Return, per frame, the cost and rotation from the two frames before, the first frames of runs inside their
-        margins, and the last frame of the run at its second frame, -1 elsewhere.
+        Return, per frame, the cost and rotation from the two frames before, and, with one more frame at the end, the
+        last frame of a run inside its margins at the second of these frames, -1 elsewhere.
         """
         frames = len(self.time)
-        cost, turn = np.zeros(frames), np.zeros((frames, 3))
-        first, last = np.zeros(frames, dtype=np.bool_), np.full(frames, -1)
+        cost, turn, last = np.zeros(frames), np.zeros((frames, 3)), np.full(frames + 1, -1)
         single, dt = np.diff(self.offset) == 1, np.diff(self.time)
         close = (dt <= self.hole_s) & (self.rows.zones(dt) == 1)
         R, variance = self.rows.R_lab_body[self.offset[:-1]], self.rows.variance[self.offset[:-1]]
@@ -239,23 +233,20 @@ class BeamSearch:
         edge = np.diff(np.concatenate([[0], follows.astype(np.int64), [0]]))
         for begin, end in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) + 1, strict=True):
             if end - begin + 1 >= max(length, 2 * PIN_MARGIN + 4):
-                first[begin + PIN_MARGIN] = True
                 last[begin + PIN_MARGIN + 1] = end - PIN_MARGIN
-        return cost, turn, first, last
+        return cost, turn, last
 
-    def _jump(self, step: BeamStep, last: int) -> tuple[BeamStep, float]:
-        span = self.time[last] - self.time[last - 1]
-        row = int(self.offset[last])
+    def _jump(self, step: BeamStep, last: int) -> BeamStep:
+        """Return the step to the last frame of a run, whose only state follows from the run's second frame."""
         states = PathStates(
             frame=np.array([last]),
-            row=np.array([row]),
-            turn=self.chain_turn[None, last],
-            span=np.array([span]),
-            before=self.rows.variance[None, self.offset[last - 1]],
+            row=self.offset[[last]],
+            turn=self.chain_turn[[last]],
+            span=self.time[[last]] - self.time[[last - 1]],
+            before=self.rows.variance[self.offset[[last - 1]]],
         )
-        cost = float(self.chain_cost[step.frame + 1 : last + 1].sum())
-        none = np.zeros(1, dtype=np.int64)
-        return BeamStep(frame=last, states=states, source=none, target=none, cost=np.array([cost]), best=none), cost
+        cost, none = self.chain_cost[step.frame + 1 : last + 1].sum(keepdims=True), np.zeros(1, dtype=np.int64)
+        return BeamStep(frame=last, states=states, source=none, target=none, cost=cost, best=none)
 
     def _read(self, steps: list[BeamStep], totals: list[Floats], end: int) -> Histories:
         frames = len(self.time)

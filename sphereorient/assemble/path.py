@@ -17,20 +17,33 @@ Graph = Sequence[Tensor]  # R (N, C, 3, 3), score (N, C), mask (N, C)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Path:
-    """Chosen orientations of one camera in N frames; xi and spike of a link stand at the frame that it enters."""
+class Track:
+    """Orientations of one camera in N frames, NaN where it has none."""
 
-    choice: Tensor  # (N,) int64, row within the frame's candidates; -1 without any
-    R_lab_body: Tensor  # (N, 3, 3), NaN where choice is -1
-    score: Tensor  # (N,), T of the choice, NaN where choice is -1
-    xi: Tensor  # (N,), rad/s, cost of the link that enters the frame; NaN without a link
-    spike: Tensor  # (N,) bool, that link is a spike
-    segment: Tensor  # (N,) int64, -1 outside any
+    R_lab_body: Tensor  # (N, 3, 3)
+    score: Tensor  # (N,)
 
     @property
     def present(self) -> Tensor:
         """Frames with an orientation, (N,) bool."""
-        return self.choice >= 0
+        return torch.isfinite(self.score)
+
+    def with_part(self, frames: Tensor, other: "Track") -> "Track":
+        """Return the track with some frames from another one."""
+        return Track(
+            R_lab_body=self.R_lab_body.index_copy(0, frames, other.R_lab_body),
+            score=self.score.index_copy(0, frames, other.score),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Path(Track):
+    """Chosen orientations of one camera in N frames; xi and spike of a link stand at the frame that it enters."""
+
+    choice: Tensor  # (N,) int64, row within the frame's candidates; -1 without any
+    xi: Tensor  # (N,), rad/s, cost of the link that enters the frame; NaN without a link
+    spike: Tensor  # (N,) bool, that link is a spike
+    segment: Tensor  # (N,) int64, -1 outside any
 
 
 def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings) -> dict[str, Path]:

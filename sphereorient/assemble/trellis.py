@@ -202,11 +202,7 @@ def _checked_order(edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | N
     """Raise where costs do not fit the mask; return the order of the path."""
     _like(edge_cost, triple_cost)
     *batch, steps, width = mask.shape
-    for name, cost, back in (
-        ("node_cost", node_cost, 0),
-        ("edge_cost", edge_cost, 1),
-        ("triple_cost", triple_cost, 2),
-    ):
+    for name, cost, back in (("node_cost", node_cost, 0), ("edge_cost", edge_cost, 1), ("triple_cost", triple_cost, 2)):
         expected = (*batch, max(steps - back, 0), *[width] * (back + 1))
         if cost is not None and cost.shape != expected:
             got, do = str(tuple(cost.shape)), "compute the costs of all candidates of the mask"

@@ -1,7 +1,5 @@
 """Two cameras, one sphere: repair of frames where they disagree, and the weighted mean on SO(3)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble.path import Graph, Path, find_spikes, graph_of, links, moving, number_segments
+from sphereorient.assemble.path import Graph, Path, Track, find_spikes, graph_of, links, moving, number_segments
 from sphereorient.assemble.settings import AssembleSettings
 from sphereorient.errors import ExperimentError, ShapeError, refusal
 from sphereorient.search import Candidates
@@ -52,7 +50,7 @@ def fuse(
     """
     _check(paths, candidates, time_s)
     names = list(paths)
-    tracks = [Track(R_lab_body=path.R_lab_body, score=path.score) for path in paths.values()]
+    tracks: list[Track] = list(paths.values())
     present = torch.stack([track.present for track in tracks])
     repaired, ambiguous = torch.zeros_like(present), torch.zeros_like(present[0])
     if len(tracks) == 2:
@@ -160,26 +158,6 @@ def _check(paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time
             expected, got = f"{len(time_s)} frames", f"{len(path.choice)} in the path, {frames} in the candidates"
             do = "pass what assemble_paths was given and gave"
             raise ShapeError(refusal(f"camera {name!r}", expected=expected, got=got, do=do))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Track:
-    """Orientations of one camera in N frames, NaN where it has none."""
-
-    R_lab_body: Tensor  # (N, 3, 3)
-    score: Tensor  # (N,)
-
-    @property
-    def present(self) -> Tensor:
-        """Frames with an orientation, (N,) bool."""
-        return torch.isfinite(self.score)
-
-    def with_part(self, frames: Tensor, other: Track) -> Track:
-        """Return the track with some frames from another one."""
-        return Track(
-            R_lab_body=self.R_lab_body.index_copy(0, frames, other.R_lab_body),
-            score=self.score.index_copy(0, frames, other.score),
-        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -96,11 +96,7 @@ def open_recording(
     remarks = [f"{experiment.path}: reads outside of its folder: {path}" for path in outside_paths(experiment)]
     remarks += [f"{movie.path}: {remark}" for movie in movies.values() for remark in movie.remarks]
     yield Recording(
-        experiment=experiment,
-        streams=streams,
-        timeline=frames,
-        texture=texture,
-        remarks=(*remarks, *frames.remarks),
+        experiment=experiment, streams=streams, timeline=frames, texture=texture, remarks=(*remarks, *frames.remarks)
     )
 
 

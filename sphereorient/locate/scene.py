@@ -12,9 +12,9 @@ from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import CameraStream, given_scene
 from sphereorient.locate.background import Background, measure_background, without_ball
-from sphereorient.locate.find import find_ball
 from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
+from sphereorient.locate.sightings import find_ball
 
 ROUNDS = 4  # most iterations; most movies need two
 RIM = 1.15  # of the radius: includes halo and shadow
@@ -162,7 +162,8 @@ def fixed_ball(
     scatter = np.asarray(grey.std(axis=0), np.float32)
     if shown is not None:
         scatter = np.where(shown, scatter, np.float32(0))
-    usual = float(np.median(scatter)) + 0.3 * float(np.iinfo(pictures.dtype).max) / 255
+    full_scale = float(np.iinfo(pictures.dtype).max)
+    usual = float(np.median(scatter)) + 0.3 * full_scale / 255
     moved = (cv2.medianBlur(scatter, WINDOW) > CHANGES * usual).astype(np.uint8)
     count, labels, stats, centres = cv2.connectedComponentsWithStats(moved, connectivity=8)
     if count < 2:
@@ -175,7 +176,8 @@ def fixed_ball(
     outline = fit_outline(change, 0.2 * usual, blob, guess, locating, shown)
     if outline is None or outline.coverage < locating.coverage_min:
         raise _none_fixed("no circle about what changes")
-    return outline, replace(_around(middle, scatter, outline, pictures.dtype, empty), shown=shown)
+    scene = _around(middle, scatter, outline, full_scale)
+    return outline, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
 
 
 def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
@@ -185,11 +187,7 @@ def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
 
 
 def _around(
-    middle: NDArray[np.float32],
-    scatter: NDArray[np.float32],
-    outline: Outline,
-    dtype: np.dtype[Any],
-    empty: NDArray[np.float32] | None,
+    middle: NDArray[np.float32], scatter: NDArray[np.float32], outline: Outline, full_scale: float
 ) -> Background:
     row, column = np.ogrid[: middle.shape[0], : middle.shape[1]]
     away = np.hypot(row - outline.v_px, column - outline.u_px) / outline.radius_px
@@ -197,8 +195,7 @@ def _around(
     around = ring if ring.any() else ~ball
     mean, noise = middle.astype(np.float32), np.maximum(scatter, 0.3).astype(np.float32)
     mean[ball], noise[ball] = np.median(middle[around]), np.median(noise[around])
-    full = float(np.iinfo(dtype).max)
-    return Background(mean=mean if empty is None else empty, noise=noise, full_scale=full)
+    return Background(mean=mean, noise=noise, full_scale=full_scale)
 
 
 def _none_fixed(got: str) -> ExperimentError:

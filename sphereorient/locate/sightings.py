@@ -1,6 +1,6 @@
-"""Outlines along time: outliers are replaced by a spline, short gaps interpolated; both are flagged."""
+"""The sphere in a frame, and along time: outliers are replaced by a spline, short gaps interpolated."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,10 +10,13 @@ from scipy.interpolate import PchipInterpolator, make_lsq_spline
 from torch import Tensor
 
 from sphereorient.errors import ExperimentError, ShapeError, refusal
+from sphereorient.locate.background import Background
+from sphereorient.locate.outline import Outline, find_blobs, fit_outline
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.trajectory import Flag, Reason
 
 DEGREE = 3  # of the spline
+Found = tuple[Outline | None, Reason]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,6 +59,64 @@ def size_of(sightings: Sightings, size_px: int | None) -> int:
     if size_px is not None:
         return size_px
     return max(16, round(2 * float(sightings.radius_px[sightings.placed].median())))
+
+
+def find_ball(
+    frame: NDArray[np.generic], background: Background, diameter_px: float, settings: LocateSettings
+) -> Found:
+    """Return the outline in a frame (H, W) and `OK`, or None and `NOT_FOUND`, `OUTLINE`, `DARK` or `SATURATED`.
+
+    Source: paper section III A.
+    """
+    difference = background.difference(frame)
+    blobs = find_blobs(difference, background.noise, diameter_px, settings)
+    best: Outline | None = None
+    likeliest = (False, 0.0)  # painted and supported ones first, then by coverage
+    for blob in blobs:
+        outline = fit_outline(difference, background.typical_noise, blob, diameter_px, settings, background.shown)
+        if outline is not None:
+            likely = (outline.painted and outline.coverage >= settings.coverage_min, outline.coverage)
+            if best is None or likely > likeliest:
+                best, likeliest = outline, likely
+        # Usually the first blob; others are tried only if its rim is incomplete.
+        if best is not None and best.painted and best.coverage >= max(settings.coverage_min, 0.5):
+            break
+    contrast_min = settings.contrast_min * background.full_scale / 255
+    if best is None or best.coverage < settings.coverage_min:
+        if not blobs or blobs[0].merit <= 0:
+            return None, Reason.NOT_FOUND
+        around = _square(int(blobs[0].u_px), int(blobs[0].v_px), 0.5 * diameter_px)
+        return None, Reason.DARK if np.percentile(difference[around], 90) < contrast_min else Reason.OUTLINE
+    height, width = frame.shape
+    u, v = min(max(round(best.u_px), 0), width - 1), min(max(round(best.v_px), 0), height - 1)
+    inside = _square(u, v, 0.7 * best.radius_px)
+    if np.percentile(difference[inside], 90) < contrast_min:
+        return None, Reason.DARK
+    if np.mean(frame[inside] >= background.full_scale) > settings.saturated_share:  # type: ignore[operator]
+        return None, Reason.SATURATED
+    return best, Reason.OK
+
+
+def _square(u: int, v: int, half: float) -> tuple[slice, slice]:
+    return slice(max(0, v - int(half)), v + int(half) + 1), slice(max(0, u - int(half)), u + int(half) + 1)
+
+
+def sightings_of(found: Iterable[Found]) -> Sightings:
+    """Collect the results of `find_ball` in consecutive frames."""
+    rows = list(found)
+    table = torch.full((len(rows), 5), torch.nan, dtype=torch.float64)
+    for k, (outline, _) in enumerate(rows):
+        if outline is not None:
+            values = (outline.u_px, outline.v_px, outline.radius_px, outline.rms_px, outline.coverage)
+            table[k] = torch.tensor(values, dtype=torch.float64)
+    return Sightings(
+        centre_px=table[:, :2],
+        radius_px=table[:, 2],
+        outline_rms_px=table[:, 3],
+        coverage=table[:, 4],
+        flags=torch.zeros(len(rows), dtype=torch.int64),
+        reason=tuple(reason for _, reason in rows),
+    )
 
 
 def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:

@@ -15,6 +15,7 @@ from sphereorient.experiment.stream import CameraStream, given_scene, pictures_o
 from sphereorient.experiment.timeline import NONE
 from sphereorient.locate import (
     Background,
+    Found,
     LocateSettings,
     Sightings,
     find_ball,
@@ -23,7 +24,6 @@ from sphereorient.locate import (
     sightings_of,
 )
 from sphereorient.locate.background import measure_background
-from sphereorient.locate.find import Found
 from sphereorient.locate.outline import Outline
 from sphereorient.trajectory import Reason
 
