@@ -4,11 +4,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from kornia.geometry.conversions import (
-    axis_angle_to_rotation_matrix,
-    quaternion_to_rotation_matrix,
-    rotation_matrix_to_axis_angle,
-)
+from kornia.geometry import conversions
 from torch import Tensor
 
 from sphereorient.errors import SettingsError, check_tail, refusal
@@ -21,7 +17,7 @@ HALF_EDGE = 2 ** (1 / 3) / 2  # half the cube's edge of the body-centred cubic l
 def exp(rotvec: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) of rotation vectors (..., 3), rad, of any length, by Rodrigues' formula."""
     check_tail("rotvec", rotvec, 3)
-    return axis_angle_to_rotation_matrix(rotvec)
+    return conversions.axis_angle_to_rotation_matrix(rotvec)
 
 
 def log(R: Tensor) -> Tensor:
@@ -30,7 +26,7 @@ def log(R: Tensor) -> Tensor:
     Source: textbook; through the quaternion's largest component, so it keeps all digits at 0 and at pi.
     """
     check_tail("R", R, 3, 3)
-    return rotation_matrix_to_axis_angle(R)
+    return conversions.rotation_matrix_to_axis_angle(R)
 
 
 def hat(v: Tensor) -> Tensor:
@@ -128,7 +124,7 @@ def random_rotations(
     leading = (shape,) if isinstance(shape, int) else tuple(shape)
     origin = generator.device if generator is not None else None
     quat_wxyz = torch.randn(*leading, 4, generator=generator, dtype=torch.float64, device=origin)
-    return quaternion_to_rotation_matrix(quat_wxyz).to(dtype=dtype, device=device)
+    return conversions.quaternion_to_rotation_matrix(quat_wxyz).to(dtype=dtype, device=device)
 
 
 def from_tait_bryan(theta: Tensor) -> Tensor:

@@ -280,18 +280,19 @@ def still_log_ratio(rows: CandidateRows, cost: SecondOrderCost) -> Floats:
     """
     best = np.full(len(rows.variance), -np.inf)
     for lag in range(1, min(STUCK_FRAMES, len(rows.time_s) - 1) + 1):
-        before, after = _row_pairs(rows.offset, lag)
-        dt = (rows.time_s[lag:] - rows.time_s[:-lag])[rows.frame[after] - lag]
+        frame, before, after = _row_pairs(rows.offset, lag)
+        dt = rows.time_s[frame + lag] - rows.time_s[frame]
         cosine = ((rows.R_lab_body[before] * rows.R_lab_body[after]).sum((-2, -1)) - 1) / 2
         variance = cost.rest_variance(dt, rows.variance[before], rows.variance[after])
         np.maximum.at(best, after, cost.log_ratio(np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2, variance))
     return best
 
 
-def _row_pairs(offset: Ints, lag: int) -> tuple[Ints, Ints]:
+def _row_pairs(offset: Ints, lag: int) -> tuple[Ints, Ints, Ints]:
+    """Return the frame, its row and the row `lag` frames later, of all pairs."""
     counts = np.diff(offset)
     before, after = counts[:-lag], counts[lag:]
     pairs = before * after
     frame = np.repeat(np.arange(len(pairs)), pairs)
     within = np.arange(len(frame)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
-    return offset[frame] + within // after[frame], offset[frame + lag] + within % after[frame]
+    return frame, offset[frame] + within // after[frame], offset[frame + lag] + within % after[frame]

@@ -67,8 +67,7 @@ class Timeline:
     @property
     def even(self) -> bool:
         """Whether all frames are evenly spaced."""
-        steps = np.diff(self.time_s)
-        return bool((np.abs(steps - self.frame_s) <= EVEN_STEPS * self.frame_s).all())
+        return bool((np.abs(np.diff(self.time_s) - self.frame_s) <= EVEN_STEPS * self.frame_s).all())
 
 
 def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:

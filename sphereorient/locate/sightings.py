@@ -104,11 +104,9 @@ def _square(u: int, v: int, half: float) -> tuple[slice, slice]:
 def sightings_of(found: Iterable[Found]) -> Sightings:
     """Collect the results of `find_ball` in consecutive frames."""
     rows = list(found)
-    table = torch.full((len(rows), 5), torch.nan, dtype=torch.float64)
-    for k, (outline, _) in enumerate(rows):
-        if outline is not None:
-            values = (outline.u_px, outline.v_px, outline.radius_px, outline.rms_px, outline.coverage)
-            table[k] = torch.tensor(values, dtype=torch.float64)
+    names = ("u_px", "v_px", "radius_px", "rms_px", "coverage")
+    values = [[getattr(outline, name, torch.nan) for name in names] for outline, _ in rows]
+    table = torch.tensor(values, dtype=torch.float64).reshape(-1, len(names))
     return Sightings(
         centre_px=table[:, :2],
         radius_px=table[:, 2],
