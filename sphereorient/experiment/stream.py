@@ -79,11 +79,9 @@ def pictures_of(movie: Movie, rows: NDArray[np.int64]) -> Iterator[Grey | None]:
 
 def _read(movie: Movie, numbers: Sequence[int]) -> Iterator[Grey | None]:
     """Yield pictures by number, consecutive ones in one pass."""
-    begin = 0
-    for end in range(1, len(numbers) + 1):
-        if end == len(numbers) or numbers[end] != numbers[end - 1] + 1:
-            yield from movie.readable(numbers[begin], numbers[end - 1] + 1)
-            begin = end
+    for run in np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1):
+        if len(run):
+            yield from movie.readable(int(run[0]), int(run[-1]) + 1)
 
 
 def _glares(picture: Grey) -> bool:
