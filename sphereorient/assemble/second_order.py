@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -93,7 +94,8 @@ def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings
         cost = SecondOrderCost.of(settings.model_copy(update={"acceleration_rad_s2": scale}))
         rows = _rows(known, time_s.detach().cpu().double(), frames, cost)
         chosen = _chosen(known, frames, rows, *_search(rows, cost, settings), settings)
-    return replace(chosen, **{name: part.to(device) for name, part in vars(chosen).items() if torch.is_tensor(part)})
+    moved: dict[str, Any] = {name: part.to(device) for name, part in vars(chosen).items() if torch.is_tensor(part)}
+    return replace(chosen, **moved)
 
 
 def _rows(known: Hypotheses, time_s: Tensor, frames: Tensor, cost: SecondOrderCost) -> CandidateRows:
