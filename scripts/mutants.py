@@ -37,14 +37,15 @@ class Mutant:
     """One changed formula; read from mutants.yaml."""
 
     name: str
-    room: str  # folder in sphereorient/ and in tests/
+    room: str  # folder or file in sphereorient/, folder in tests/
     first: str  # pattern of the test files that run first
     old: str  # text in the room; every place is changed
     new: str  # equal to `old`: the unchanged package, whose tests must pass
 
     def files(self) -> list[Path]:
         """Return the files of the room that hold the old text."""
-        every = sorted((REPO / "sphereorient" / self.room).rglob("*.py"))
+        room = REPO / "sphereorient" / self.room
+        every = sorted(room.rglob("*.py")) or [room.with_suffix(".py")]
         return [path.relative_to(REPO) for path in every if self.old in path.read_text()]
 
     def calls(self) -> list[list[Path]]:

@@ -1,7 +1,6 @@
 """The choice among candidates along time: the paper's path and two cameras; the second-order path, also as a layer."""
 
-from sphereorient.assemble.differentiable import SoftTrack, expected_orientation, soft_track
-from sphereorient.assemble.layer import PathLayer
+from sphereorient.assemble.layer import PathLayer, SoftTrack, expected_orientation, soft_track
 from sphereorient.assemble.path import Path, assemble_path, assemble_paths, edge_costs
 from sphereorient.assemble.second_order import Chosen, Hypotheses, physical_path
 from sphereorient.assemble.settings import AssembleSettings, PathSettings

@@ -37,7 +37,7 @@ REST_SHARE = 0.5  # prior share of new spheres with an omega as small as its cha
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Histories:
-    """Result of `search`, F frames and M rows."""
+    """Result of a `BeamSearch`, F frames and M rows."""
 
     row: Ints  # (F,), row chosen, -1 without
     begins: Bools  # (F,), the orientation of the frame begins a motion
@@ -47,14 +47,9 @@ class Histories:
     evidence: float  # log of how much more probable the movie is with a motion in it than without
 
 
-def search(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> Histories:
-    """Find the most probable history of a movie, and each candidate's probability; `gap_frames_max` in frame intervals.
-    Source: Viterbi 1967; Baum and others 1970 (forward-backward); pruned as in a beam search.
-    """
-    return _Search(rows, cost, gap_frames_max).run()
+class BeamSearch:
+    """Search of a movie's candidates by a cost; gaps inside a motion have at most `gap_frames_max` frame intervals."""
 
-
-class _Search:
     def __init__(self, rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> None:
         self.rows, self.cost = rows, cost
         self.time, self.offset = rows.time_s, rows.offset
@@ -62,9 +57,12 @@ class _Search:
         self.hole_s = (gap_frames_max + 1.5) * rows.frame_s  # half a frame for uneven times
         self.hit, self.miss = (np.array(each) for each in cost.presence())  # index: the last frame was a hit
         self.breaks, self.goes_on = -math.log(cost.break_probability), -math.log1p(-cost.break_probability)
-        self.chain_cost, self.chain_turn, self.first_pin, self.last_pin = self._pins(gap_frames_max + 2)
+        self.chain_cost, self.chain_turn, self.last_pin = self._pins(gap_frames_max + 2)
 
     def run(self) -> Histories:
+        """Find the most probable history of the movie, and each candidate's probability.
+        Source: Viterbi 1967; Baum and others 1970 (forward-backward); pruned as in a beam search.
+        """
         states = PathStates.begin(NOT_YET, np.full(1, NOT_YET, dtype=np.int64))
         least, total = np.zeros(1), np.zeros(1)
         steps: list[BeamStep] = []
@@ -76,8 +74,8 @@ class _Search:
             totals.append(total)
             last = self.last_pin[f]
             if last > f:  # only one state is left: no search until the run's end
-                step, cost = self._jump(step, last)
-                least, total = least + cost, total + cost
+                step = self._jump(step, last)
+                least, total = least + step.cost, total + step.cost
                 steps.append(step)
                 totals.append(total)
             states, f = step.states, step.frame + 1
@@ -97,18 +95,16 @@ class _Search:
             onward.append(self._second(states.take(single), single, dt[single], goes_on[single], f))
         visits = [self._begin(every, hit + np.where(alive, self.breaks, 0.0), f)]
         visits += [merge_equal(concatenated(onward, shared_targets=True), least)] if onward else []
-        if f and self.first_pin[f - 1]:
+        if self.last_pin[f] >= 0:
             visits = visits[1:]
-        if not (self.first_pin[f] or (f and self.first_pin[f - 1])):
-            visits += [self._stay(states, every[alive], miss[alive]), self._lose(every[~alive], miss[~alive])]
+        elif self.last_pin[f + 1] < 0:
+            stays, ends = np.flatnonzero(alive), np.flatnonzero(~alive)
+            here, lost = states.take(stays), PathStates.begin(LOST, np.full(min(len(ends), 1), -1))
+            visits += [
+                BeamStep(frame=f, states=here, source=stays, target=np.arange(len(stays)), cost=miss[stays]),
+                BeamStep(frame=f, states=lost, source=ends, target=np.zeros_like(ends), cost=miss[ends]),
+            ]
         return concatenated(visits)
-
-    def _stay(self, states: PathStates, alive: Ints, cost: Floats) -> BeamStep:
-        return BeamStep(frame=-1, states=states.take(alive), source=alive, target=np.arange(len(alive)), cost=cost)
-
-    def _lose(self, source: Ints, cost: Floats) -> BeamStep:
-        states = PathStates.begin(LOST, np.full(min(len(source), 1), -1))
-        return BeamStep(frame=-1, states=states, source=source, target=np.zeros(len(source), dtype=np.int64), cost=cost)
 
     def _alive(self, states: PathStates, f: int) -> tuple[Floats, Bools]:
         """Return the time since the last orientation, and whether omega still predicts the rotation over it."""
@@ -138,7 +134,7 @@ class _Search:
         """Continue states that have an omega, by the rotation nearest to its prediction."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         R, R_before = self.rows.R_lab_body[rows], self.rows.R_lab_body[states.row]
-        expected = states.omega * dt[:, None]
+        expected = states.turn / states.span[:, None] * dt[:, None]
         off, axis_off = rotation_between(rotated(R_before, expected)[:, None], R)
         variance = self.cost.predicted_variance(
             dt[:, None],
@@ -186,14 +182,8 @@ class _Search:
         """Return one edge and one state for each continuation; `merge_equal` merges states of equal key (`target`)."""
         before, dt = states.row[of_state], self.time[f] - self.time[states.frame[of_state]]
         key = (before * (self.offset[f + 1] - self.offset[f]) + row - self.offset[f]) * (1 << 20) + around
-        onward = PathStates(
-            frame=np.full(len(row), f),
-            row=row,
-            omega=turn / dt[:, None],
-            turn=turn,
-            span=dt,
-            before=self.rows.variance[before],
-        )
+        at = np.full(len(row), f)
+        onward = PathStates(frame=at, row=row, turn=turn, span=dt, before=self.rows.variance[before])
         return BeamStep(frame=f, states=onward, source=of_state, target=key, cost=np.zeros(len(row)))
 
     def _arrive(self, step: BeamStep, least: Floats, total: Floats) -> tuple[BeamStep, Floats, Floats]:
@@ -211,8 +201,8 @@ class _Search:
         place[near] = np.arange(len(near))
         kept = place[step.target] >= 0
         renumbered = np.cumsum(kept) - 1
-        pruned = BeamStep(
-            frame=step.frame,
+        pruned = replace(
+            step,
             states=step.states.take(near),
             source=step.source[kept],
             target=place[step.target[kept]],
@@ -221,16 +211,13 @@ class _Search:
         )
         return pruned, new_least[near], new_total[near]
 
-    def _pins(self, length: int) -> tuple[Floats, Floats, Bools, Ints]:
+    def _pins(self, length: int) -> tuple[Floats, Floats, Ints]:
         """Find runs of frames with one candidate each that follow the motion: all good histories contain them.
-        Return, per frame, the cost and rotation from the two frames before, the first frames of runs inside their
-        margins, and the last frame of the run at its second frame, -1 elsewhere.
+        Return, per frame, the cost and rotation from the two frames before, and, with one more frame at the end, the
+        last frame of a run inside its margins at the second of these frames, -1 elsewhere.
         """
         frames = len(self.time)
-        cost, turn = np.zeros(frames), np.zeros((frames, 3))
-        first, last = np.zeros(frames, dtype=np.bool_), np.full(frames, -1)
-        if frames < 3:
-            return cost, turn, first, last
+        cost, turn, last = np.zeros(frames), np.zeros((frames, 3)), np.full(frames + 1, -1)
         single, dt = np.diff(self.offset) == 1, np.diff(self.time)
         close = (dt <= self.hole_s) & (self.rows.zones(dt) == 1)
         R, variance = self.rows.R_lab_body[self.offset[:-1]], self.rows.variance[self.offset[:-1]]
@@ -246,24 +233,20 @@ class _Search:
         edge = np.diff(np.concatenate([[0], follows.astype(np.int64), [0]]))
         for begin, end in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) + 1, strict=True):
             if end - begin + 1 >= max(length, 2 * PIN_MARGIN + 4):
-                first[begin + PIN_MARGIN] = True
                 last[begin + PIN_MARGIN + 1] = end - PIN_MARGIN
-        return cost, turn, first, last
+        return cost, turn, last
 
-    def _jump(self, step: BeamStep, last: int) -> tuple[BeamStep, float]:
-        span = self.time[last] - self.time[last - 1]
-        row = int(self.offset[last])
+    def _jump(self, step: BeamStep, last: int) -> BeamStep:
+        """Return the step to the last frame of a run, whose only state follows from the run's second frame."""
         states = PathStates(
             frame=np.array([last]),
-            row=np.array([row]),
-            omega=self.chain_turn[None, last] / span,
-            turn=self.chain_turn[None, last],
-            span=np.array([span]),
-            before=self.rows.variance[None, self.offset[last - 1]],
+            row=self.offset[[last]],
+            turn=self.chain_turn[[last]],
+            span=self.time[[last]] - self.time[[last - 1]],
+            before=self.rows.variance[self.offset[[last - 1]]],
         )
-        cost = float(self.chain_cost[step.frame + 1 : last + 1].sum())
-        none = np.zeros(1, dtype=np.int64)
-        return BeamStep(frame=last, states=states, source=none, target=none, cost=np.array([cost]), best=none), cost
+        cost, none = self.chain_cost[step.frame + 1 : last + 1].sum(keepdims=True), np.zeros(1, dtype=np.int64)
+        return BeamStep(frame=last, states=states, source=none, target=none, cost=cost, best=none)
 
     def _read(self, steps: list[BeamStep], totals: list[Floats], end: int) -> Histories:
         frames = len(self.time)
@@ -297,18 +280,19 @@ def still_log_ratio(rows: CandidateRows, cost: SecondOrderCost) -> Floats:
     """
     best = np.full(len(rows.variance), -np.inf)
     for lag in range(1, min(STUCK_FRAMES, len(rows.time_s) - 1) + 1):
-        before, after = _row_pairs(rows.offset, lag)
-        dt = (rows.time_s[lag:] - rows.time_s[:-lag])[rows.frame[after] - lag]
+        frame, before, after = _row_pairs(rows.offset, lag)
+        dt = rows.time_s[frame + lag] - rows.time_s[frame]
         cosine = ((rows.R_lab_body[before] * rows.R_lab_body[after]).sum((-2, -1)) - 1) / 2
         variance = cost.rest_variance(dt, rows.variance[before], rows.variance[after])
         np.maximum.at(best, after, cost.log_ratio(np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2, variance))
     return best
 
 
-def _row_pairs(offset: Ints, lag: int) -> tuple[Ints, Ints]:
+def _row_pairs(offset: Ints, lag: int) -> tuple[Ints, Ints, Ints]:
+    """Return the frame, its row and the row `lag` frames later, of all pairs."""
     counts = np.diff(offset)
     before, after = counts[:-lag], counts[lag:]
     pairs = before * after
     frame = np.repeat(np.arange(len(pairs)), pairs)
     within = np.arange(len(frame)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
-    return offset[frame] + within // after[frame], offset[frame + lag] + within % after[frame]
+    return frame, offset[frame] + within // after[frame], offset[frame + lag] + within % after[frame]

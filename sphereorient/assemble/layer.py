@@ -1,4 +1,7 @@
-"""The path as a layer: candidates in, the cheapest path or all probabilities out; its parameters can be learnt."""
+"""Differentiable paths: a layer with parameters that can be learnt, and the soft track of fitted candidates.
+
+docs/differentiable.md connects the soft track to the cameras.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sphereorient import so3
-from sphereorient.assemble.path import edges_over_gaps
+from sphereorient.assemble.path import edge_costs, turns_over_gaps
 from sphereorient.assemble.second_order_cost import PARAMETERS, VARIANCE_MAX, SecondOrderCost
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
-from sphereorient.assemble.trellis import ShortestPath, SoftPath, shortest_path, soft_path
+from sphereorient.assemble.trellis import ShortestPath, SoftPath, shortest_path, soft_path, taken, visited_before
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 
 Values = Tensor | NDArray[np.floating]
@@ -111,7 +114,7 @@ class PathLayer(nn.Module):
         node: Tensor | None = None
         triple: Tensor | None = None
         if self.order == 1:
-            edge = edges_over_gaps(R, score, time, there)
+            edge = edge_costs(R, score, time, there)
         else:
             edge, there, node, triple = self._second_order_costs(R, score, time, variance, there)
         if self.soft is None:
@@ -161,14 +164,16 @@ def _chunk(cost: SecondOrderCost, links: _Links, variance: Tensor, still: Tensor
     before = links.before[..., steps]
     earlier = links.before.gather(-1, before)
     dt, span = (each[..., None, None, None] for each in (links.dt_s[..., steps], links.dt_s.gather(-1, before)))
-    expected = scaled_rotations(_taken(links.turn, before, 4), dt / span)
+    expected, ratio = taken(links.turn, before, 4), dt / span
+    if not bool(((ratio - 1).abs() < EVEN).all()):  # rotations about the same axes, below half a turn
+        expected = so3.exp(so3.log(expected) * ratio)
     expected = expected.flatten(-2).transpose(-3, -2)  # (..., j, i, 9)
     misfit = _squared_chord(expected, links.turn[..., steps, :, :, :, :].flatten(-2)).transpose(-3, -2)
     predicted = cost.predicted_variance(
         dt,
         span,
-        _taken(variance, earlier, 1)[..., :, None, None],
-        _taken(variance, before, 1)[..., None, :, None],
+        taken(variance, earlier, 1)[..., :, None, None],
+        taken(variance, before, 1)[..., None, :, None],
         variance[..., steps, None, None, :],
     )
     broken = torch.as_tensor(cost.break_probability)
@@ -178,8 +183,8 @@ def _chunk(cost: SecondOrderCost, links: _Links, variance: Tensor, still: Tensor
 
 def _still(cost: SecondOrderCost, links: _Links, R_lab_body: Tensor, variance: Tensor) -> Tensor:
     """Return the log ratio (..., N, C) of each candidate if one of the frame before stays."""
-    misfit = _squared_chord(_taken(R_lab_body, links.before, 3).flatten(-2), R_lab_body.flatten(-2))
-    here = _taken(variance, links.before, 1)[..., :, None]
+    misfit = _squared_chord(taken(R_lab_body, links.before, 3).flatten(-2), R_lab_body.flatten(-2))
+    here = taken(variance, links.before, 1)[..., :, None]
     rest = cost.rest_variance(links.dt_s[..., None, None], here, variance[..., None, :])
     return _log_ratio(cost, misfit, rest).amax(-2)
 
@@ -200,13 +205,11 @@ class _Links:
 
 def _links_of(R_lab_body: Tensor, time_s: Tensor, mask: Tensor) -> _Links:
     """Return the rotations between all candidates of successive steps; those into empty steps are arbitrary."""
-    step = torch.arange(mask.shape[-2], device=mask.device)
-    held = torch.where(mask.any(-1), step, 0).cummax(-1).values
-    before = torch.cat([torch.zeros_like(held[..., :1]), held[..., :-1]], -1)
+    before = visited_before(mask)
     dt = time_s - time_s.gather(-1, before)  # in this order: single precision cannot separate late times
     # One product of (3C, 3) and (3, 3C) a step, not C^2 small ones, which take ten times as long.
     width = mask.shape[-1]
-    after, first = R_lab_body.flatten(-3, -2), _taken(R_lab_body, before, 3).flatten(-3, -2)
+    after, first = R_lab_body.flatten(-3, -2), taken(R_lab_body, before, 3).flatten(-3, -2)
     every = (after @ first.mT).reshape(*mask.shape[:-1], width, 3, width, 3)  # (..., to, 3, from, 3)
     turn = every.permute(*range(mask.ndim - 1), -2, -4, -3, -1)
     return _Links(turn=turn, dt_s=torch.where(dt > 0, dt, 1.0).to(R_lab_body), before=before)
@@ -218,13 +221,74 @@ def _squared_chord(expected: Tensor, found: Tensor) -> Tensor:
     return torch.cdist(expected, found, compute_mode="donot_use_mm_for_euclid_dist").square() / 2
 
 
-def _taken(part: Tensor, step: Tensor, tail: int) -> Tensor:
-    index = step[(..., *[None] * tail)]
-    return part.gather(-tail - 1, index.expand(*step.shape, *part.shape[part.ndim - tail :]))
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SoftTrack:
+    """Mean poses of N frames over their candidates, NaN in frames without any; differentiable."""
+
+    R_lab_body: Tensor  # (..., N, 3, 3)
+    position_lab_mm: Tensor  # (..., N, 3)
+    marginals: Tensor  # (..., N, C), probability of each candidate
+    free_energy: Tensor  # (...), of the soft path
 
 
-def scaled_rotations(turn: Tensor, ratio: Tensor) -> Tensor:
-    """Return rotations (..., 3, 3) about the same axes by `ratio` (..., 1) times the angle, below half a turn."""
-    if bool(((ratio - 1).abs() < EVEN).all()):
-        return turn
-    return so3.exp(so3.log(turn) * ratio)
+def soft_track(
+    R_lab_body: Tensor,
+    position_lab_mm: Tensor,
+    misfit: Tensor,
+    mask: Tensor,
+    *,
+    turn_rad: float,
+    temperature: float = 1.0,
+) -> SoftTrack:
+    """Weigh candidates by their fit to the pictures and by the rotation from frame to frame; return their mean poses.
+
+    Args:
+        R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.
+        position_lab_mm: (..., N, C, 3), of the candidates.
+        misfit: (..., N, C), cost of each, such as half the mean squared residual.
+        mask: (..., N, C) bool, True for a candidate.
+        turn_rad: standard deviation of the rotation between neighbouring frames; grows with the frames of a gap.
+        temperature: of the soft path, in units of the costs.
+
+    Raises:
+        ShapeError: the inputs differ in frames or candidates.
+        SettingsError: `turn_rad` or the temperature is not above 0.
+    """
+    check_tail("R_lab_body", R_lab_body, *mask.shape, 3, 3)
+    check_tail("position_lab_mm", position_lab_mm, *mask.shape, 3)
+    check_tail("misfit", misfit, *mask.shape)
+    if not turn_rad > 0:
+        raise SettingsError(refusal("turn_rad", expected="above 0", got=f"{turn_rad:g}", do="give a typical rotation"))
+    unit = torch.eye(3, dtype=R_lab_body.dtype, device=R_lab_body.device)
+    R = torch.where(mask[..., None, None], R_lab_body, unit)  # 0 times NaN would reach the gradients
+    X = torch.where(mask[..., None], position_lab_mm, 0.0)
+    soft = soft_path(turning_costs(R, mask, turn_rad), mask, temperature, torch.where(mask, misfit, 0.0))
+    position = torch.where(mask.any(-1)[..., None], (soft.marginals[..., None] * X).sum(-2), torch.nan)
+    return SoftTrack(
+        R_lab_body=expected_orientation(R, soft.marginals),
+        position_lab_mm=position,
+        marginals=soft.marginals,
+        free_energy=soft.free_energy,
+    )
+
+
+def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
+    """Return the edges (..., N - 1, C, C) of `soft_track`: half the squared rotation, in units of `turn_rad`.
+    R_lab_body (..., N, C, 3, 3) is finite everywhere; an edge starts at the last frame with candidates in the mask.
+    """
+    frames = torch.arange(mask.shape[-2], device=mask.device) - visited_before(mask)
+    return 0.5 * (turns_over_gaps(R_lab_body, mask) / (turn_rad * frames[..., 1:, None, None])).square()
+
+
+def expected_orientation(R_lab_body: Tensor, marginals: Tensor) -> Tensor:
+    """Return the rotation (..., N, 3, 3) with the least weighted mean squared chord to R_lab_body (..., N, C, 3, 3).
+    NaN does not count; marginals (..., N, C) are not negative; NaN where all are 0. The gradient is always finite.
+    Source: chordal mean, Hartley et al. 2013, Rotation averaging, 5.1; projected by `so3.nearest_rotation`.
+
+    Raises:
+        ShapeError: candidates and marginals differ in shape.
+    """
+    check_tail("R_lab_body", R_lab_body, *marginals.shape[-1:], 3, 3)
+    known = torch.where(R_lab_body.isnan(), 0.0, R_lab_body)
+    mean = so3.nearest_rotation((marginals[..., None, None].to(known) * known).sum(-3))
+    return torch.where((marginals.sum(-1) > 0)[..., None, None], mean, torch.nan)

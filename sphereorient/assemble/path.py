@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.assemble.settings import AssembleSettings
-from sphereorient.assemble.trellis import shortest_path
+from sphereorient.assemble.trellis import shortest_path, taken, visited_before
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.search import Candidates
 
@@ -17,20 +17,33 @@ Graph = Sequence[Tensor]  # R (N, C, 3, 3), score (N, C), mask (N, C)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Path:
-    """Chosen orientations of one camera in N frames; xi and spike of a link stand at the frame that it enters."""
+class Track:
+    """Orientations of one camera in N frames, NaN where it has none."""
 
-    choice: Tensor  # (N,) int64, row within the frame's candidates; -1 without any
-    R_lab_body: Tensor  # (N, 3, 3), NaN where choice is -1
-    score: Tensor  # (N,), T of the choice, NaN where choice is -1
-    xi: Tensor  # (N,), rad/s, cost of the link that enters the frame; NaN without a link
-    spike: Tensor  # (N,) bool, that link is a spike
-    segment: Tensor  # (N,) int64, -1 outside any
+    R_lab_body: Tensor  # (N, 3, 3)
+    score: Tensor  # (N,)
 
     @property
     def present(self) -> Tensor:
         """Frames with an orientation, (N,) bool."""
-        return self.choice >= 0
+        return torch.isfinite(self.score)
+
+    def with_part(self, frames: Tensor, other: "Track") -> "Track":
+        """Return the track with some frames from another one."""
+        return Track(
+            R_lab_body=self.R_lab_body.index_copy(0, frames, other.R_lab_body),
+            score=self.score.index_copy(0, frames, other.score),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Path(Track):
+    """Chosen orientations of one camera in N frames; xi and spike of a link stand at the frame that it enters."""
+
+    choice: Tensor  # (N,) int64, row within the frame's candidates; -1 without any
+    xi: Tensor  # (N,), rad/s, cost of the link that enters the frame; NaN without a link
+    spike: Tensor  # (N,) bool, that link is a spike
+    segment: Tensor  # (N,) int64, -1 outside any
 
 
 def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings) -> dict[str, Path]:
@@ -63,7 +76,7 @@ def graph_of(candidates: Candidates, quality_min: float) -> Graph:
 
 def _path(graph: Graph, time_s: Tensor, settings: AssembleSettings) -> Path:
     R_all, score_all, mask = graph
-    choice = shortest_path(edges_over_gaps(R_all, score_all, time_s, mask), mask).choice
+    choice = shortest_path(edge_costs(R_all, score_all, time_s, mask), mask).choice
     there = choice >= 0
     R = torch.full((len(choice), 3, 3), torch.nan).to(R_all)
     score = torch.full((len(choice),), torch.nan).to(score_all)
@@ -72,18 +85,6 @@ def _path(graph: Graph, time_s: Tensor, settings: AssembleSettings) -> Path:
     spike = find_spikes(xi, turn, settings)
     segment = number_segments(there, spike, settings.gap_frames_max)
     return Path(choice=choice, R_lab_body=R, score=score, xi=xi, spike=spike, segment=segment)
-
-
-def edges_over_gaps(R_lab_body: Tensor, score: Tensor, time_s: Tensor, mask: Tensor) -> Tensor:
-    """Return `edge_costs` (..., N - 1, C, C), each from the last frame before it with candidates in the mask."""
-    frame = torch.arange(mask.shape[-2], device=mask.device)
-    last = torch.where(mask.any(-1), frame, 0).cummax(-1).values[..., :-1] if len(frame) else mask[..., 0].long()
-    pairs = []
-    for part, tail in ((R_lab_body, 3), (score, 1), (time_s.expand(mask.shape[:-1]), 0)):
-        index = last[(..., *[None] * tail)].expand(*last.shape, *part.shape[part.ndim - tail :])
-        here = part.narrow(-tail - 1, min(1, len(frame)), max(len(frame) - 1, 0))
-        pairs.append(torch.stack([part.gather(-tail - 1, index), here], -tail - 1))
-    return edge_costs(*pairs)[..., 0, :, :]
 
 
 def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,9 +101,10 @@ def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Te
     return xi, turn
 
 
-def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
+def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the paper's cost d(A, B) (2 - T_A - T_B) / dt, rad/s, from each candidate (row) to each of the next step.
     Shapes: R_lab_body (..., N, C, 3, 3), score T (..., N, C), increasing time_s (..., N), result (..., N - 1, C, C).
+    With a mask (..., N, C), each edge comes from the last step before it with candidates.
     Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
 
     Raises:
@@ -111,18 +113,26 @@ def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> Tensor:
     check_tail("R_lab_body", R_lab_body, 3, 3)
     check_tail("score", score, *R_lab_body.shape[-4:-2])
     check_tail("time_s", time_s, *score.shape[-2:-1])
-    batch, (steps, width) = score.shape[:-2], score.shape[-2:]
-    before, after = (
-        R.flatten(0, -4) for R in (R_lab_body[..., : max(steps - 1, 0), :, :, :], R_lab_body[..., 1:, :, :, :])
-    )
+    mask = torch.ones_like(score, dtype=torch.bool) if mask is None else mask
+    last, time_s = visited_before(mask)[..., 1:], time_s.expand(score.shape[:-1])
+    dt = time_s[..., 1:] - taken(time_s, last, 0)  # in this order: single precision cannot separate late times
+    turn = turns_over_gaps(R_lab_body, mask)
+    doubt = 2 - taken(score, last, 1)[..., :, None] - score[..., 1:, None, :]
+    return turn * doubt / dt.to(turn)[..., None, None]
+
+
+def turns_over_gaps(R_lab_body: Tensor, mask: Tensor) -> Tensor:
+    """Return the angles (..., N - 1, C, C), rad, between candidates (..., N, C, 3, 3) and those of the next step.
+    Each comes from the last step before it with candidates in the mask (..., N, C).
+    """
+    last, width = visited_before(mask)[..., 1:], mask.shape[-1]
+    before, after = (R.flatten(0, -4) for R in (taken(R_lab_body, last, 3), R_lab_body[..., 1:, :, :, :]))
     chunk = max(1, PAIRS_AT_ONCE // max(width, 1) ** 2)
     parts = [
         so3.geodesic_distance(a[:, :, None], b[:, None])
         for a, b in zip(torch.split(before, chunk), torch.split(after, chunk), strict=True)
     ]
-    distance = torch.cat(parts).reshape(*batch, max(steps - 1, 0), width, width)
-    doubt = 2 - score[..., : max(steps - 1, 0), :, None] - score[..., 1:, None, :]
-    return distance * doubt / time_s.diff().to(distance)[..., None, None]
+    return torch.cat(parts).reshape(*last.shape, width, width)
 
 
 def moving(values: Tensor, window: int) -> Tensor:

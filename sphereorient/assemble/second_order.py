@@ -3,12 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.assemble.beam import Histories, search
+from sphereorient.assemble.beam import BeamSearch, Histories
 from sphereorient.assemble.path import number_segments
 from sphereorient.assemble.second_order_cost import SecondOrderCost
 from sphereorient.assemble.settings import PathSettings
@@ -41,10 +42,9 @@ class Hypotheses:
             tail = (3, 3) if entry.name in ("R_lab_body", "covariance_rad2") else ()
             part, expected = getattr(self, entry.name), (*self.R_lab_body.shape[:-2], *tail)
             if self.R_lab_body.ndim != 4 or tuple(part.shape) != expected:
+                sizes, got = f"shape (N, C{', 3, 3' if tail else ''})", str(tuple(part.shape))
                 do = "give every part one row a frame and one place a candidate"
-                sizes = f"shape (N, C{', 3, 3' if tail else ''})"
-                name = f"Hypotheses.{entry.name}"
-                raise ShapeError(refusal(name, expected=sizes, got=str(tuple(part.shape)), do=do))
+                raise ShapeError(refusal(f"Hypotheses.{entry.name}", expected=sizes, got=got, do=do))
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -84,45 +84,48 @@ def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings
     if tuple(time_s.shape) != (len(hypotheses),):
         do, got = "pass one time a frame", str(tuple(time_s.shape))
         raise ShapeError(refusal("time_s", expected=f"shape ({len(hypotheses)},)", got=got, do=do))
-    frames = torch.nonzero(hypotheses.mask.any(1))[:, 0].cpu()
-    if not len(frames):
-        return _nothing(hypotheses)
-    first = SecondOrderCost.of(settings.model_copy(update={"acceleration_rad_s2": settings.acceleration_rad_s2 or 1.0}))
-    rows = _rows(hypotheses, time_s, frames, first)
-    histories, cost = _search(rows, first, settings)
-    return _chosen(hypotheses, frames, rows, histories, cost, settings)
+    device = hypotheses.mask.device
+    parts = {entry.name: getattr(hypotheses, entry.name).detach().cpu() for entry in fields(hypotheses)}
+    known = Hypotheses(**{name: part if name == "mask" else part.double() for name, part in parts.items()})
+    frames = torch.nonzero(known.mask.any(1))[:, 0]
+    chosen = _nothing(known.mask)
+    if len(frames):
+        scale = settings.acceleration_rad_s2 or 1.0
+        cost = SecondOrderCost.of(settings.model_copy(update={"acceleration_rad_s2": scale}))
+        rows = _rows(known, time_s.detach().cpu().double(), frames, cost)
+        chosen = _chosen(known, frames, rows, *_search(rows, cost, settings), settings)
+    moved: dict[str, Any] = {name: part.to(device) for name, part in vars(chosen).items() if torch.is_tensor(part)}
+    return replace(chosen, **moved)
 
 
-def _rows(hypotheses: Hypotheses, time_s: Tensor, frames: Tensor, cost: SecondOrderCost) -> CandidateRows:
+def _rows(known: Hypotheses, time_s: Tensor, frames: Tensor, cost: SecondOrderCost) -> CandidateRows:
     """Return the candidates as rows; the variance is the mean over axes: false candidates are degrees away."""
-    mask = hypotheses.mask.cpu()
-    log_weight = cost.picture_log_weight(hypotheses.nll.detach().cpu().double()[frames], mask[frames])
-    covariance = float(cost.sigma_scale) ** 2 * hypotheses.covariance_rad2.detach().cpu().double()
-    variance = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
+    mask = known.mask
+    variance = (float(cost.sigma_scale) ** 2 * known.covariance_rad2).diagonal(dim1=-2, dim2=-1).mean(-1)
     return CandidateRows(
-        R_lab_body=hypotheses.R_lab_body.detach().cpu().double()[mask].numpy(),
+        R_lab_body=known.R_lab_body[mask].numpy(),
         variance=variance[mask].clamp_min(VARIANCE_MIN).numpy(),
-        log_weight=log_weight[mask[frames]].numpy(),
+        log_weight=cost.picture_log_weight(known.nll[frames], mask[frames])[mask[frames]].numpy(),
         offset=np.concatenate([[0], mask[frames].sum(-1).cumsum(0).numpy()]),
-        time_s=time_s.detach().cpu().double()[frames].numpy(),
-        frame_s=float(time_s.detach().double().diff().median()) if len(time_s) > 1 else 1.0,
+        time_s=time_s[frames].numpy(),
+        frame_s=float(time_s.diff().median()) if len(time_s) > 1 else 1.0,
     )
 
 
 def _chosen(
-    hypotheses: Hypotheses,
+    known: Hypotheses,
     frames: Tensor,
     rows: CandidateRows,
     histories: Histories,
     cost: SecondOrderCost,
     settings: PathSettings,
 ) -> Chosen:
-    device, mask, empty = hypotheses.mask.device, hypotheses.mask.cpu(), _nothing(hypotheses)
+    mask, empty = known.mask, _nothing(known.mask)
     place = torch.arange(mask.shape[1]).expand_as(mask)[mask]
     row = torch.from_numpy(histories.row)
     seen, choice = frames[row >= 0], place[row[row >= 0]]
-    posterior = empty.posterior.cpu().masked_scatter(mask, torch.from_numpy(histories.posterior))
-    probability = empty.probability.cpu().index_put((seen,), posterior[seen, choice])
+    posterior = empty.posterior.masked_scatter(mask, torch.from_numpy(histories.posterior))
+    probability = empty.probability.index_put((seen,), posterior[seen, choice])
     into, off, variance, drift = _misfits(rows, histories, cost)
     usual = np.sqrt(variance + (cost.acceleration_rad_s2 * drift) ** 2)
     unlikely = histories.breaks.copy()
@@ -137,31 +140,28 @@ def _chosen(
         Flag.RECOVERED: recovered,
         Flag.SPIKE: spike,
     }
-    at = seen.to(device), choice.to(device)
-    turn = torch.from_numpy(histories.turn_rad).to(device)
     return Chosen(
-        choice=empty.choice.index_put(at[:1], at[1]),
-        R_lab_body=empty.R_lab_body.index_put(at[:1], hypotheses.R_lab_body.detach().double()[at]),
-        covariance_rad2=empty.covariance_rad2.index_put(at[:1], hypotheses.covariance_rad2.detach().double()[at]),
-        probability=probability.to(device),
-        posterior=posterior.to(device),
-        turn_rad=empty.turn_rad.index_put((frames.to(device),), turn),
-        segment=number_segments(present, begins | spike, len(mask)).to(device),
-        flags=torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0).to(device),
+        choice=empty.choice.index_put((seen,), choice),
+        R_lab_body=empty.R_lab_body.index_put((seen,), known.R_lab_body[seen, choice]),
+        covariance_rad2=empty.covariance_rad2.index_put((seen,), known.covariance_rad2[seen, choice]),
+        probability=probability,
+        posterior=posterior,
+        turn_rad=empty.turn_rad.index_put((frames,), torch.from_numpy(histories.turn_rad)),
+        segment=number_segments(present, begins | spike, len(mask)),
+        flags=torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0),
         acceleration_rad_s2=float(cost.acceleration_rad_s2),
     )
 
 
-def _nothing(hypotheses: Hypotheses) -> Chosen:
-    frames, device = len(hypotheses), hypotheses.mask.device
-    none = torch.full((frames,), -1, dtype=torch.int64, device=device)
-    missing = torch.full((frames, 3, 3), torch.nan, dtype=torch.float64, device=device)
+def _nothing(mask: Tensor) -> Chosen:
+    none = torch.full(mask.shape[:1], -1)
+    missing = torch.full((*mask.shape[:1], 3, 3), torch.nan, dtype=torch.float64)
     return Chosen(
         choice=none,
         R_lab_body=missing,
         covariance_rad2=missing,
         probability=missing[:, 0, 0],
-        posterior=torch.zeros(hypotheses.mask.shape, dtype=torch.float64, device=device),
+        posterior=torch.zeros(mask.shape, dtype=torch.float64),
         turn_rad=missing[:, 0],
         segment=none,
         flags=torch.zeros_like(none),
@@ -173,15 +173,15 @@ def _search(rows: CandidateRows, cost: SecondOrderCost, settings: PathSettings) 
     """Search, estimate the acceleration from the best history, and repeat until it stays; a given one is kept."""
     gap = settings.gap_frames_max
     if settings.acceleration_rad_s2 is not None:
-        return search(rows, cost, gap), cost
+        return BeamSearch(rows, cost, gap).run(), cost
     cost = _start(rows, cost, gap)
-    histories = search(rows, cost, gap)
+    histories = BeamSearch(rows, cost, gap).run()
     for _ in range(ROUNDS_MAX):
         scale = _acceleration(rows, [(rows, histories)], cost)
         if abs(math.log(scale / cost.acceleration_rad_s2)) < ROUND_ENOUGH:
             break
         cost = replace(cost, acceleration_rad_s2=scale)
-        histories = search(rows, cost, gap)
+        histories = BeamSearch(rows, cost, gap).run()
     return histories, cost
 
 
@@ -202,7 +202,7 @@ def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> S
     for change_deg in START_DEG:
         scale = float(np.clip(math.radians(change_deg) / rows.frame_s**2, least, most))
         trial = replace(cost, acceleration_rad_s2=scale)
-        searched = [(part, search(part, trial, gap_frames_max)) for part in parts]
+        searched = [(part, BeamSearch(part, trial, gap_frames_max).run()) for part in parts]
         evidence = sum(histories.evidence for _, histories in searched)
         if evidence > most_evidence:
             best, most_evidence = replace(trial, acceleration_rad_s2=_acceleration(rows, searched, trial)), evidence

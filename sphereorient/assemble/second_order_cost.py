@@ -6,7 +6,7 @@ Densities of orientations are ratios to the uniform density on SO(3).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,18 +22,6 @@ Values = TypeVar("Values", Floats, Tensor)
 
 TURNS_RAD3 = 8 * math.pi**2  # volume of SO(3) in rotation vectors' rad^3
 VARIANCE_MAX = 1.0  # rad^2; a wider density has wrapped around SO(3) and is as good as uniform
-PARAMETERS = (
-    "acceleration_rad_s2",
-    "tail",
-    "miss_probability",
-    "miss_again_probability",
-    "break_probability",
-    "stuck_probability",
-    "follow_probability",
-    "evidence_doubt",
-    "evidence_scale",
-    "sigma_scale",
-)  # the keys of `PathSettings` that the cost depends on; `PathLayer` learns them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +100,10 @@ class SecondOrderCost:
         false = lib.logaddexp(lib.logaddexp(anywhere, stuck + lib.minimum(still, log_ratio)), follow + log_ratio)
         result: Values = false - log_ratio
         return result
+
+
+# The keys of `PathSettings` that the cost depends on; `PathLayer` learns them.
+PARAMETERS = tuple(entry.name for entry in fields(SecondOrderCost))
 
 
 def _library(values: Floats | Tensor | float) -> Any:

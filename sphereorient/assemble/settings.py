@@ -12,9 +12,7 @@ class AssembleSettings(BaseModel):
         41, ge=5, description="window of the moving median of xi, frames: a few turns of the velocity"
     )
     spike_factor: float = Field(
-        6.0,
-        gt=1,
-        description="a spike is this many robust deviations (1.48 MAD) above the moving median of xi",
+        6.0, gt=1, description="a spike is this many robust deviations (1.48 MAD) above the moving median of xi"
     )
     spike_min_deg: float = Field(
         15.0,
@@ -28,9 +26,7 @@ class AssembleSettings(BaseModel):
         description="cameras that differ by more than this are repaired, one from the other; the paper's 30",
     )
     repair_margin: float = Field(
-        0.02,
-        ge=0,
-        description="difference of mean T that decides a repair; below it, continuity decides",
+        0.02, ge=0, description="difference of mean T that decides a repair; below it, continuity decides"
     )
     weight_window_frames: int = Field(
         25, ge=5, description="frames of the moving variance of xi that weighs the cameras; the paper gives no number"
@@ -43,9 +39,7 @@ class PathSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     acceleration_rad_s2: float | None = Field(
-        None,
-        gt=0,
-        description="scale of the angular acceleration per axis, rad/s^2; null estimates it from the movie",
+        None, gt=0, description="scale of the angular acceleration per axis, rad/s^2; null estimates it from the movie"
     )
     tail: float = Field(
         4.0,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,21 +27,16 @@ class CandidateRows:
     time_s: Floats  # (F,)
     frame_s: float  # usual time between frames of the movie
 
-    @property
-    def frame(self) -> Ints:
-        """Frame of each row, (M,)."""
-        return np.repeat(np.arange(len(self.time_s)), np.diff(self.offset))
-
     def part(self, first: int, last: int) -> CandidateRows:
         """Return the frames first .. last - 1."""
         rows = slice(self.offset[first], self.offset[last])
-        return CandidateRows(
+        return replace(
+            self,
             R_lab_body=self.R_lab_body[rows],
             variance=self.variance[rows],
             log_weight=self.log_weight[rows],
             offset=self.offset[first : last + 1] - self.offset[first],
             time_s=self.time_s[first:last],
-            frame_s=self.frame_s,
         )
 
     def zones(self, dt_s: Floats) -> Ints:
@@ -55,7 +50,6 @@ class PathStates:
 
     frame: Ints  # of the last orientation; LOST or NOT_YET without one to continue from
     row: Ints  # of the last orientation
-    omega: Floats  # (S, 3), rad/s, mean over the span
     turn: Floats  # (S, 3), rad, over the span
     span: Floats  # s, between the last two orientations; 0 where a motion begins
     before: Floats  # rad^2 per axis, of the last but one
@@ -63,8 +57,8 @@ class PathStates:
     @classmethod
     def begin(cls, frame: int, row: Ints) -> PathStates:
         """Return states without a motion."""
-        nothing, vectors = np.zeros(len(row)), np.zeros((len(row), 3))
-        return cls(frame=np.full(len(row), frame), row=row, omega=vectors, turn=vectors, span=nothing, before=nothing)
+        nothing, at = np.zeros(len(row)), np.full(len(row), frame)
+        return cls(frame=at, row=row, turn=np.zeros((len(row), 3)), span=nothing, before=nothing)
 
     def take(self, which: Ints) -> PathStates:
         """Return some of the states."""
@@ -88,7 +82,7 @@ def merge_equal(step: BeamStep, least: Floats) -> BeamStep:
     order = np.argsort(least[step.source] + step.cost, kind="stable")  # so that the first of equal keys is the cheapest
     _, first, target = np.unique(step.target[order], return_index=True, return_inverse=True)
     states = step.states.take(order[first])
-    return BeamStep(frame=step.frame, states=states, source=step.source[order], target=target, cost=step.cost[order])
+    return replace(step, states=states, source=step.source[order], target=target, cost=step.cost[order])
 
 
 def concatenated(ways: list[BeamStep], *, shared_targets: bool = False) -> BeamStep:

@@ -1,7 +1,5 @@
 """Two cameras, one sphere: repair of frames where they disagree, and the weighted mean on SO(3)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble.path import Graph, Path, find_spikes, graph_of, links, moving, number_segments
+from sphereorient.assemble.path import Graph, Path, Track, find_spikes, graph_of, links, moving, number_segments
 from sphereorient.assemble.settings import AssembleSettings
 from sphereorient.errors import ExperimentError, ShapeError, refusal
 from sphereorient.search import Candidates
@@ -52,7 +50,7 @@ def fuse(
     """
     _check(paths, candidates, time_s)
     names = list(paths)
-    tracks = [Track(R_lab_body=path.R_lab_body, score=path.score) for path in paths.values()]
+    tracks: list[Track] = list(paths.values())
     present = torch.stack([track.present for track in tracks])
     repaired, ambiguous = torch.zeros_like(present), torch.zeros_like(present[0])
     if len(tracks) == 2:
@@ -62,7 +60,8 @@ def fuse(
     present = torch.stack([track.present for track in tracks])
     linked = [links(track.R_lab_body, track.score, time_s) for track in tracks]
     variance = relative_variance([xi for xi, _ in linked], settings)
-    calm = torch.stack([_calm(xi, turn, settings) for xi, turn in linked]).all(0)
+    spikes = [moving(find_spikes(xi, turn, settings).to(xi), settings.weight_window_frames) for xi, turn in linked]
+    calm = torch.stack([window.nansum(-1) == 0 for window in spikes]).all(0)  # no spike raises the variance
     share = _shares(variance, present)
     R = _mean(tracks, share)
     apart = _apart(tracks)
@@ -104,12 +103,6 @@ def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tenso
     typical = typical.clamp_min(typical.max() / CAMERAS_RATIO_MAX)
     within = torch.minimum(torch.maximum(variance, typical / VARIANCE_RANGE), typical * VARIANCE_RANGE)
     return torch.where(variance.isnan(), typical, within)
-
-
-def _calm(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
-    """Return the frames (N,) bool without a spike in the window of their variance."""
-    spike = find_spikes(xi, turn, settings)
-    return moving(spike.to(xi), settings.weight_window_frames).nansum(-1) == 0
 
 
 def _shares(variance: Tensor, present: Tensor) -> Tensor:
@@ -168,30 +161,6 @@ def _check(paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Track:
-    """Orientations of one camera in N frames, NaN where it has none."""
-
-    R_lab_body: Tensor  # (N, 3, 3)
-    score: Tensor  # (N,)
-
-    @property
-    def present(self) -> Tensor:
-        """Frames with an orientation, (N,) bool."""
-        return torch.isfinite(self.score)
-
-    def part(self, frames: Tensor) -> Track:
-        """Return some frames of the track."""
-        return Track(R_lab_body=self.R_lab_body[frames], score=self.score[frames])
-
-    def with_part(self, frames: Tensor, other: Track) -> Track:
-        """Return the track with some frames from another one."""
-        return Track(
-            R_lab_body=self.R_lab_body.index_copy(0, frames, other.R_lab_body),
-            score=self.score.index_copy(0, frames, other.score),
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Repair:
     """Tracks of both cameras after the repair."""
 
@@ -208,15 +177,14 @@ def repair(tracks: tuple[Track, Track], graphs: tuple[Graph, Graph], settings: A
     Source: the paper's two cameras, which does not say which camera is right; docs/errata.md A7.
     """
     limit = math.radians(settings.repair_deg)
-    first, second = tracks
-    both = first.present & second.present
-    apart = torch.where(both, so3.geodesic_distance(first.R_lab_body, second.R_lab_body), 0.0)
-    wrong = apart > limit
+    apart = _apart(tracks)
+    both, wrong = torch.isfinite(apart), apart > limit
     agreed = torch.nonzero(both & ~wrong)[:, 0]
-    result, repaired, ambiguous = [first, second], torch.zeros_like(torch.stack([both, both])), torch.zeros_like(both)
+    result, repaired, ambiguous = list(tracks), torch.zeros_like(torch.stack([both, both])), torch.zeros_like(both)
     for frames in _stretches(wrong, both, settings.gap_frames_max):
         followers = [_follow(tracks[leader], graphs[1 - leader], frames, limit) for leader in (0, 1)]
-        merits = [_merit(tracks[leader].part(frames), followers[leader]) for leader in (0, 1)]
+        scores = [tracks[leader].score[frames] + followers[leader].score.nan_to_num(0.0) for leader in (0, 1)]
+        merits = [float(score.mean() / 2) for score in scores]
         matched = any(bool(follower.present.any()) for follower in followers)
         guess = not matched or abs(merits[0] - merits[1]) < settings.repair_margin
         if guess:
@@ -252,10 +220,6 @@ def _follow(leader: Track, graph: Graph, frames: Tensor, limit: float) -> Track:
         R_lab_body=torch.where(found[:, None, None], R_all[row, which], torch.nan),
         score=torch.where(found, score_all[row, which], torch.nan),
     )
-
-
-def _merit(leader: Track, follower: Track) -> float:
-    return float((leader.score + follower.score.nan_to_num(0.0)).mean() / 2)
 
 
 def _beside(frames: Tensor, agreed: Tensor, gap_frames_max: int) -> Tensor:

@@ -1,7 +1,6 @@
 """What goes in: the experiment, its timeline, camera streams, an opened recording."""
 
 from sphereorient.experiment.experiment import (
-    MOVIES_OWN,
     Experiment,
     ExperimentKeys,
     input_files,
@@ -12,7 +11,6 @@ from sphereorient.experiment.experiment import (
 )
 
 __all__ = [
-    "MOVIES_OWN",
     "Experiment",
     "ExperimentKeys",
     "input_files",

@@ -96,7 +96,10 @@ def load_experiment(path: Path | str) -> Experiment:
     path = Path(path)
     document = read_document(path, SCHEMA, ExperimentError)
     keys = validated(ExperimentKeys, document, str(path), ExperimentError)
-    _check_names(path, keys)
+    for key in ("masks", "backgrounds", "start", "flip"):
+        for name in getattr(keys, key):
+            if name not in keys.movies:
+                raise ExperimentError(refuse_unknown(name, keys.movies, f"{path}, {key}"))
     _check_numbers(path, keys)
     cameras_path = path.parent / keys.cameras
     known = load_cameras(cameras_path)
@@ -134,18 +137,17 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
         OutputError: file not writable.
     """
 
-    def relative(path: Path) -> str:
+    def relative(path: Path | str) -> str:
         return Path(os.path.relpath(path, experiment.folder)).as_posix()
 
-    timed, texture = experiment.times is not None, experiment.texture_path
-    table = MOVIES_OWN if experiment.times == MOVIES_OWN else relative(Path(str(experiment.times)))
+    times, texture = experiment.times, experiment.texture_path
     sphere: dict[str, Any] = {"diameter": experiment.diameter_mm}
     sphere |= {} if texture is None else {"texture": relative(texture)}
     sphere |= {"fixed": True} if experiment.fixed else {}
     document: dict[str, Any] = {
         "name": experiment.name,
-        "frame_rate": None if timed else float(experiment.frame_rate_hz),
-        "times": table if timed else None,
+        "frame_rate": float(experiment.frame_rate_hz) if times is None else None,
+        "times": times if times in (None, MOVIES_OWN) else relative(str(times)),
         "exposure": None if experiment.exposure_s is None else float(experiment.exposure_s),
         "sphere": sphere,
         "cameras": relative(experiment.cameras_path),
@@ -202,13 +204,6 @@ def outside_paths(experiment: Experiment) -> list[Path]:
     """Return the inputs outside the experiment's folder."""
     folder = Path(os.path.realpath(experiment.folder))
     return [path for path in input_files(experiment) if not Path(os.path.realpath(path)).is_relative_to(folder)]
-
-
-def _check_names(path: Path, keys: ExperimentKeys) -> None:
-    for key in ("masks", "backgrounds", "start", "flip"):
-        for name in getattr(keys, key):
-            if name not in keys.movies:
-                raise ExperimentError(refuse_unknown(name, keys.movies, f"{path}, {key}"))
 
 
 def _check_numbers(path: Path, keys: ExperimentKeys) -> None:

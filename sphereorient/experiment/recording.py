@@ -11,8 +11,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment.experiment import Experiment, load_experiment, open_movies, outside_paths
-from sphereorient.experiment.given import given_mask
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.stream import CameraStream, given_mask
 from sphereorient.experiment.timeline import Rows, Timeline, timeline
 from sphereorient.sphere import load_texture
 
@@ -97,11 +96,7 @@ def open_recording(
     remarks = [f"{experiment.path}: reads outside of its folder: {path}" for path in outside_paths(experiment)]
     remarks += [f"{movie.path}: {remark}" for movie in movies.values() for remark in movie.remarks]
     yield Recording(
-        experiment=experiment,
-        streams=streams,
-        timeline=frames,
-        texture=texture,
-        remarks=(*remarks, *frames.remarks),
+        experiment=experiment, streams=streams, timeline=frames, texture=texture, remarks=(*remarks, *frames.remarks)
     )
 
 

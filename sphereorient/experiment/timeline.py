@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,15 +60,14 @@ class Timeline:
         rows = {name: np.full(count, NONE) for name in self.rows}
         for name, row in self.rows.items():
             rows[name][place] = row
-        time_s = np.interp(np.arange(count), place, self.time_s)
-        grid = Timeline(number=self.number[0] + np.arange(count), time_s=time_s, rows=rows, remarks=self.remarks)
-        return grid, place
+        frames = np.arange(count)
+        time_s = np.interp(frames, place, self.time_s)
+        return replace(self, number=self.number[0] + frames, time_s=time_s, rows=rows), place
 
     @property
     def even(self) -> bool:
         """Whether all frames are evenly spaced."""
-        steps = np.diff(self.time_s)
-        return bool((np.abs(steps - self.frame_s) <= EVEN_STEPS * self.frame_s).all())
+        return bool((np.abs(np.diff(self.time_s) - self.frame_s) <= EVEN_STEPS * self.frame_s).all())
 
 
 def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
@@ -89,15 +88,14 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         expected, do = f"{last} frames as frames: says", "lower the end of frames:"
         raise MovieError(refusal(f"{experiment.path}, movies", expected=expected, got=f"{len(whole)}", do=do))
     rows = {name: row[first:last] for name, row in whole.rows.items()}
-    return Timeline(number=whole.number[first:last], time_s=whole.time_s[first:last], rows=rows, remarks=whole.remarks)
+    return replace(whole, number=whole.number[first:last], time_s=whole.time_s[first:last], rows=rows)
 
 
 def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     there = {name: len(movie) - experiment.start.get(name, 0) for name, movie in movies.items()}
-    subject = f"{experiment.path}, movies"
     if min(there.values()) <= 0:
-        got = " and ".join(f"{count} ({name})" for name, count in there.items())
-        raise MovieError(refusal(subject, expected="frames after start", got=got, do="correct start:"))
+        name, got = f"{experiment.path}, movies", " and ".join(f"{count} ({name})" for name, count in there.items())
+        raise MovieError(refusal(name, expected="frames after start", got=got, do="correct start:"))
     count = max(there.values())
     wanted = count if experiment.frames is None else min(count, experiment.frames[1])
     remarks = tuple(
@@ -115,9 +113,8 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     else:
         time_s = load_times(Path(experiment.times))
         if len(time_s) != count:
-            do = "give one time for each frame of the experiment, counted after start:"
-            got = f"{len(time_s)}"
-            raise ExperimentError(refusal(experiment.times, expected=f"{count} times", got=got, do=do))
+            expected, do = f"{count} times", "give one time for each frame of the experiment, counted after start:"
+            raise ExperimentError(refusal(experiment.times, expected=expected, got=f"{len(time_s)}", do=do))
     return Timeline(number=number, time_s=np.asarray(time_s, np.float64), rows=rows, remarks=remarks)
 
 
@@ -137,15 +134,12 @@ def load_times(path: Path) -> Floats:
     values: list[float] = []
     for number, line in enumerate(lines, 1):
         text = line.split("#")[0].strip().rstrip(",;")
-        if not text:
-            continue
         try:
-            values.append(float(text))
+            values += [float(text)] if text else []
         except ValueError:
-            if not values and number == 1:
-                continue
-            name = f"{path}, line {number}"
-            raise ExperimentError(refusal(name, expected="a number", got=repr(text[:40]), do=do)) from None
+            if number > 1:  # the first line may be a heading
+                name, got = f"{path}, line {number}", repr(text[:40])
+                raise ExperimentError(refusal(name, expected="a number", got=got, do=do)) from None
     return _increasing(str(path), np.asarray(values, np.float64), do)
 
 
@@ -174,19 +168,15 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         stamps = _increasing(f"{movie.path}, time stamps", movie.times_s, "write frame_rate:, or times: with a file")
         # `start`: each clock begins at that picture; otherwise all stamps count from the trigger.
         clocks[name] = stamps[start:] - stamps[start] if experiment.start_given else stamps[start:]
-    usual_s = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]) if clocks else [np.nan]))
-    names = list(clocks)
-    if len(names) == 1:
-        pairs = np.arange(len(clocks[names[0]]))[:, None]
-    else:
+    usual_s, names = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]))), list(clocks)
+    pairs = np.arange(len(clocks[names[0]]))[:, None]
+    if len(names) == 2:
         pairs = _paired(clocks[names[0]], clocks[names[1]], PAIR_STEPS * usual_s)
-    taken = np.stack([np.where(row >= 0, clocks[name][row], np.nan) for name, row in zip(names, pairs.T, strict=True)])
-    rows = {
-        name: np.where(row >= 0, row + experiment.start.get(name, 0), NONE)
-        for name, row in zip(names, pairs.T, strict=True)
-    }
+    chosen = dict(zip(names, pairs.T, strict=True))
+    taken = np.stack([np.where(row >= 0, clocks[name][row], np.nan) for name, row in chosen.items()])
+    rows = {name: np.where(row >= 0, row + experiment.start.get(name, 0), NONE) for name, row in chosen.items()}
     remarks = [
-        f"{movies[name].path}: {lacking} of {taken.shape[1]} instants have no picture"
+        f"{movies[name].path}: {lacking} of {len(pairs)} instants have no picture"
         for name, lacking in zip(names, np.isnan(taken).sum(1).tolist(), strict=True)
         if lacking
     ]
@@ -203,17 +193,15 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
 def _paired(one: Floats, other: Floats, within_s: float) -> Rows:
     """Pair increasing times nearer than `within_s`; return (N, 2) indices in order of time, NONE without a partner."""
-    after = np.searchsorted(other, one).clip(1, max(len(other) - 1, 1))
-    low = np.clip(after - 1, 0, len(other) - 1)
-    high = np.clip(after, 0, len(other) - 1)
+    high = np.searchsorted(other, one).clip(max=len(other) - 1)
+    low = (high - 1).clip(0)
     nearest = np.where(np.abs(other[high] - one) < np.abs(other[low] - one), high, low)
-    near = np.abs(other[nearest] - one) <= within_s
+    apart = np.abs(other[nearest] - one)
+    near = apart <= within_s
     # Two times of `one` may share a nearest neighbour: the nearer one gets it.
     best = np.full(len(other), NONE)
-    for k in np.flatnonzero(near):
-        j = nearest[k]
-        if best[j] == NONE or abs(other[j] - one[k]) < abs(other[j] - one[best[j]]):
-            best[j] = k
+    nearest_last = np.flatnonzero(near)[np.argsort(apart[near], kind="stable")[::-1]]
+    best[nearest[nearest_last]] = nearest_last
     partner = np.full(len(one), NONE)
     there = best >= 0
     partner[best[there]] = np.flatnonzero(there)

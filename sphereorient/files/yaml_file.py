@@ -105,11 +105,6 @@ def parse_yaml(text: str) -> Any:
     return _BoundedLoader(text).get_single_data()
 
 
-def is_one_line(text: str) -> bool:
-    """Return whether a text can stand in a message of one line."""
-    return text.isprintable() or not any(unicodedata.category(letter) in UNSEEN for letter in text)
-
-
 class _BoundedLoader(yaml.SafeLoader):
     """PyYAML's safe loader with bounds, checked before any value is built; an alias counts with its size."""
 
@@ -139,7 +134,8 @@ class _BoundedLoader(yaml.SafeLoader):
         node = super().compose_scalar_node(anchor)
         longest = MAX_NUMBER if node.tag in NUMBERS else MAX_TEXT
         self._check(len(node.value) <= longest, f"a value of more than {longest} characters", event)
-        self._check(is_one_line(node.value), "a text of several lines, or with control characters", event)
+        one_line = node.value.isprintable() or not any(unicodedata.category(letter) in UNSEEN for letter in node.value)
+        self._check(one_line, "a text of several lines, or with control characters", event)
         return node
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:

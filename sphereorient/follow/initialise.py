@@ -9,10 +9,8 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import R_cam_view
 from sphereorient.follow.poses import Poses, no_pose, poses_of
-from sphereorient.locate import Frame, LocateSettings, find_ball, find_positions, sightings_of
-from sphereorient.locate.blob import find_blobs
-from sphereorient.locate.find import Found
-from sphereorient.locate.outline import Outline
+from sphereorient.locate import Found, Frame, LocateSettings, find_ball, find_positions, sightings_of
+from sphereorient.locate.outline import Outline, find_blobs
 from sphereorient.pose.fitter import CameraView, Fitter, Picture
 from sphereorient.search.candidates import Proposer
 from sphereorient.search.crop import crop_disk

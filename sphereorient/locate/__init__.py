@@ -1,13 +1,10 @@
 """Locating the sphere: background, blob, outline, gaps, position in the lab."""
 
-from sphereorient.locate.background import Background
-from sphereorient.locate.find import Found, find_ball, sightings_of
-from sphereorient.locate.gaps import fill_gaps
+from sphereorient.locate.background import Background, Frame, screened, screened_frames
 from sphereorient.locate.position import Positions, find_positions
 from sphereorient.locate.scene import CameraScene, expected_diameter_px, find_scene, known_diameter_px, learn_background
-from sphereorient.locate.screen import Frame, screened, screened_frames
 from sphereorient.locate.settings import LocateSettings
-from sphereorient.locate.sightings import Sightings, check_seen, size_of
+from sphereorient.locate.sightings import Found, Sightings, check_seen, fill_gaps, find_ball, sightings_of, size_of
 
 __all__ = [
     "Background",

@@ -1,10 +1,11 @@
+"""The circle of the sphere in a picture: a blob of its size, then the outline near the blob."""
+
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sphereorient.locate.blob import Blob
 from sphereorient.locate.settings import LocateSettings
 
 DIRECTIONS = 72  # bins of 5 degrees for a circle's support
@@ -14,12 +15,83 @@ NOISE_STEEPNESS = 0.28  # times root noise: steepness of stabilised noise at one
 LEAST_RIM = 0.25  # least denominator of the coverage, share of all directions
 NEAR_HIDDEN_PX = 3  # edges this near to the mask do not belong to the rim
 PAINTED = 0.15  # least variance of the sphere, share of the window's largest
-BESIDE, NEAR_RIM = (
-    0.1,
-    1.1,
-)  # most foreground beside the sphere, share of the disk; radii: halo
+BESIDE, NEAR_RIM = 0.1, 1.1  # most foreground beside the sphere, share of the disk; radii: halo
 SET_ASIDE = 2  # other round objects whose rims are removed
 PROFILES = 180  # radial profiles; more sample the same pixels again
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blob:
+    """Approximate position of the sphere; made by `find_blobs`."""
+
+    u_px: float
+    v_px: float
+    merit: float  # variance inside times similarity to a disk
+
+
+def _reduce(picture: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    """Average by an integer factor, cropping right and lower borders (other ratios are 40 times slower)."""
+    height, width = (side // factor * factor for side in picture.shape)
+    if factor == 1:
+        return picture
+    return np.asarray(
+        cv2.resize(picture[:height, :width], (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+    )
+
+
+def find_blobs(
+    difference: NDArray[np.float32], noise: NDArray[np.float32], diameter_px: float, settings: LocateSettings
+) -> list[Blob]:
+    """Return at most `settings.blob_candidates` round blobs of about `diameter_px`, best first.
+
+    `difference` is |frame - background|, `noise` the background's sigma, (H, W), grey levels. The blob filter is a
+    difference of two box filters.
+
+    Source: paper section III A.
+    """
+    factor = settings.reduction
+    small = np.maximum(_reduce(difference - settings.noise_factor * noise, factor), 0)
+    # Clip near the sphere's brightness: a bright reflection must not dominate.
+    lit = small[small > 0]
+    if lit.size == 0:
+        return []
+    small = np.minimum(small, np.float32(np.percentile(lit, 95)))
+    size = diameter_px / factor
+    inner, outer = (max(3, round(size * share) | 1) for share in (0.85, 1.5))
+    area_ratio = (inner / outer) ** 2
+    mean_in = cv2.boxFilter(small, -1, (inner, inner), borderType=cv2.BORDER_CONSTANT)
+    mean_out = cv2.boxFilter(small, -1, (outer, outer), borderType=cv2.BORDER_CONSTANT)
+    ring = (mean_out - area_ratio * mean_in) / (1 - area_ratio)
+    response = mean_in - ring
+    blobs = []
+    reach = max(1, round(0.6 * size))
+    for _ in range(settings.blob_candidates):
+        row, column = np.unravel_index(int(response.argmax()), response.shape)
+        if response[row, column] <= 0:
+            break
+        u, v, merit = _judge(small, float(column), float(row), size / 2)
+        blobs.append(Blob(u_px=(u + 0.5) * factor - 0.5, v_px=(v + 0.5) * factor - 0.5, merit=merit))
+        response[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1] = 0
+    return sorted(blobs, key=lambda blob: -blob.merit)
+
+
+def _judge(small: NDArray[np.float32], u: float, v: float, radius: float) -> tuple[float, float, float]:
+    """Centre a blob on its foreground; return (u, v, merit)."""
+    merit = 0.0
+    for _ in range(2):
+        reach = int(np.ceil(1.5 * radius))
+        top, left = max(0, int(v) - reach), max(0, int(u) - reach)
+        window = small[top : int(v) + reach + 1, left : int(u) + reach + 1]
+        grid = np.indices(window.shape, dtype=np.float32)
+        rows, columns = grid[0] + top, grid[1] + left
+        inside = (rows - v) ** 2 + (columns - u) ** 2 <= (1.1 * radius) ** 2
+        weight = (window > 0) & inside
+        total, count = int(np.count_nonzero(window)), int(np.count_nonzero(weight))
+        if count == 0:
+            return u, v, 0.0
+        merit = float(window[inside].var()) * (count / total) ** 2
+        u, v = float(columns[weight].mean()), float(rows[weight].mean())
+    return u, v, merit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,19 +128,15 @@ def _edge_points(window: NDArray[np.float32], steepness: float) -> _Edges:
     return _Edges(point=point, inward=gradient[keep] / norm[keep])
 
 
-def _in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+def _in_the_clear(place: NDArray[np.float64], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which points (n, 2), window px, are away from the mask, (n,)."""
-    if clear is None:
-        return np.ones(len(place), bool)
     limit = np.array(clear.shape[::-1]) - 1
     u, v = np.rint(place).astype(np.int64).clip(0, limit).T
     return np.asarray(clear[v, u])
 
 
-def _rim_in_the_clear(circle: NDArray[np.float64], clear: NDArray[np.bool_] | None) -> float:
+def _rim_in_the_clear(circle: NDArray[np.float64], clear: NDArray[np.bool_]) -> float:
     """Return the number of directions in which the rim is away from the mask."""
-    if clear is None:
-        return DIRECTIONS
     angle = (np.arange(DIRECTIONS) + 0.5) * (2 * np.pi / DIRECTIONS)
     rim = circle[:2] + circle[2] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return max(float(_in_the_clear(rim, clear).sum()), LEAST_RIM * DIRECTIONS)
@@ -163,7 +231,7 @@ def _radial_edges(
     circle: NDArray[np.float64],
     reach: tuple[float, float],
     steepness: float,
-    clear: NDArray[np.bool_] | None,
+    clear: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return direction (n, 2), offset (n,), px, and steepness (n,) of outermost falls; inner edges may be steeper."""
     step = 0.5
@@ -218,7 +286,7 @@ def _fit_circle(
     circle: NDArray[np.float64],
     tolerance: float,
     steepness: float,
-    clear: NDArray[np.bool_] | None,
+    clear: NDArray[np.bool_],
 ) -> Outline | None:
     for reach in ((0.35 * circle[2], 0.25 * circle[2]), (0.1 * circle[2], 0.1 * circle[2])):
         outward, offset, fall = _radial_edges(window, circle, reach, steepness, clear)
@@ -249,13 +317,6 @@ def _fit_circle(
     )
 
 
-def _stabilised(window: NDArray[np.float32], noise: float, blur_px: float) -> NDArray[np.float32]:
-    """Blur and take the root (variance stabilisation for shot noise), so that dim and bright rims count alike."""
-    blurred = cv2.GaussianBlur(window, (0, 0), blur_px)
-    out: NDArray[np.float32] = np.sqrt(blurred + noise) - np.float32(np.sqrt(noise))
-    return out
-
-
 def fit_outline(
     difference: NDArray[np.float32],
     noise: float,
@@ -274,13 +335,16 @@ def fit_outline(
     reach = int(np.ceil(0.5 * diameter_px * (1 + settings.diameter_tolerance) + 8))
     left, top = max(0, int(blob.u_px) - reach), max(0, int(blob.v_px) - reach)
     around = np.s_[top : int(blob.v_px) + reach + 1, left : int(blob.u_px) + reach + 1]
-    window, clear = difference[around], None
+    window = difference[around]
+    clear = np.ones(window.shape, bool)
     if shown is not None:
         square = np.ones((2 * NEAR_HIDDEN_PX + 1,) * 2, np.uint8)
         clear = cv2.erode(shown[around].astype(np.uint8), square) > 0
     if min(window.shape) < 8:
         return None
-    window = _stabilised(window, NOISE_FLOOR * noise, settings.edge_blur_px)
+    # The root stabilises the variance of shot noise, so that dim and bright rims count alike.
+    lift = NOISE_FLOOR * noise
+    window = np.sqrt(cv2.GaussianBlur(window, (0, 0), settings.edge_blur_px) + lift) - np.float32(np.sqrt(lift))
     contrast = float(np.percentile(window, 90))
     # A step blurred by sigma has steepness contrast / (sigma sqrt(2 pi)); the floor excludes noise.
     floor = NOISE_STEEPNESS * noise**0.5

@@ -60,15 +60,13 @@ def find_positions(
         crossing, gap = triangulate(views[0].rays, views[1].rays)
         position = torch.where(placed.all(0)[:, None], crossing, alone)
     one = placed.sum(0) == 1
-    across = sum(torch.where(ok[:, None, None], view.across, 0.0) for view, ok in zip(views, placed, strict=True))
-    along = sum(torch.where((ok & one)[:, None, None], view.along, 0.0) for view, ok in zip(views, placed, strict=True))
-    flags = torch.zeros(len(position), dtype=torch.int64)
-    for seen, ok in zip(sightings.values(), placed, strict=True):
-        flags |= torch.where(ok, seen.flags, 0)
-    flags |= torch.where(one, int(Flag.ONE_CAMERA), 0)
-    return Positions(
-        position_lab_mm=position, covariance_mm2=_inverse(torch.as_tensor(across + along)), gap_mm=gap, flags=flags
-    )
+    flags = torch.where(one, int(Flag.ONE_CAMERA), 0)
+    information = torch.zeros(len(position), 3, 3, dtype=position.dtype)
+    for view, seen, ok in zip(views, sightings.values(), placed, strict=True):
+        known = view.across + torch.where(one[:, None, None], view.along, 0.0)
+        information = information + torch.where(ok[:, None, None], known, 0.0)
+        flags = flags | torch.where(ok, seen.flags, 0)
+    return Positions(position_lab_mm=position, covariance_mm2=_inverse(information), gap_mm=gap, flags=flags)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

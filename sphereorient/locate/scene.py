@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera, triangulate
 from sphereorient.errors import ExperimentError, SettingsError, refusal
-from sphereorient.experiment.given import given_scene
 from sphereorient.experiment.recording import Recording
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment.stream import CameraStream, given_scene
 from sphereorient.locate.background import Background, measure_background, without_ball
-from sphereorient.locate.blob import Blob
-from sphereorient.locate.find import find_ball
-from sphereorient.locate.outline import Outline, fit_outline
+from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
+from sphereorient.locate.sightings import find_ball
 
 ROUNDS = 4  # most iterations; most movies need two
 RIM = 1.15  # of the radius: includes halo and shadow
@@ -53,10 +51,10 @@ def find_scene(recording: Recording, stream: CameraStream, count: int, settings:
     empty = given_scene(recording.experiment, stream.name, stream.movie.frame_shape)
     diameter_px = known_diameter_px(recording, stream.name, settings)
     if recording.experiment.fixed and (empty is None or diameter_px is None):
-        fixed = fixed_ball(stream.spread(settings.background_frames), settings, empty, stream.shown)
-        diameter_px = diameter_px or 2 * fixed.outline.radius_px
+        outline, guess = fixed_ball(stream.spread(settings.background_frames), settings, empty, stream.shown)
+        diameter_px = diameter_px or 2 * outline.radius_px
         if empty is None:
-            return CameraScene(background=fixed.scene, diameter_px=diameter_px)
+            return CameraScene(background=guess, diameter_px=diameter_px)
     assert diameter_px is not None
     background = learn_background(stream.spread(count), diameter_px, settings, empty, stream.shown)
     return CameraScene(background=background, diameter_px=diameter_px)
@@ -144,21 +142,15 @@ def _covered(
     return covered
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FixedBall:
-    """Outline of a fixed sphere, and the background with a guess behind it; made by `fixed_ball`."""
-
-    outline: Outline
-    scene: Background
-
-
 def fixed_ball(
     pictures: NDArray[Any],
     locating: LocateSettings,
     empty: NDArray[np.float32] | None = None,
     shown: NDArray[np.bool_] | None = None,
-) -> FixedBall:
+) -> tuple[Outline, Background]:
     """Find a rotating sphere with a fixed centre in frames (n, H, W): only its pixels change.
+
+    Return its outline, and the background with a guess behind it.
 
     `empty` (H, W) is the scene without the sphere; `shown` (H, W) is False where something hides the sphere.
 
@@ -170,7 +162,8 @@ def fixed_ball(
     scatter = np.asarray(grey.std(axis=0), np.float32)
     if shown is not None:
         scatter = np.where(shown, scatter, np.float32(0))
-    usual = float(np.median(scatter)) + 0.3 * float(np.iinfo(pictures.dtype).max) / 255
+    full_scale = float(np.iinfo(pictures.dtype).max)
+    usual = float(np.median(scatter)) + 0.3 * full_scale / 255
     moved = (cv2.medianBlur(scatter, WINDOW) > CHANGES * usual).astype(np.uint8)
     count, labels, stats, centres = cv2.connectedComponentsWithStats(moved, connectivity=8)
     if count < 2:
@@ -183,8 +176,8 @@ def fixed_ball(
     outline = fit_outline(change, 0.2 * usual, blob, guess, locating, shown)
     if outline is None or outline.coverage < locating.coverage_min:
         raise _none_fixed("no circle about what changes")
-    scene = replace(_around(middle, scatter, outline, pictures.dtype, empty), shown=shown)
-    return FixedBall(outline=outline, scene=scene)
+    scene = _around(middle, scatter, outline, full_scale)
+    return outline, replace(scene, mean=scene.mean if empty is None else empty, shown=shown)
 
 
 def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
@@ -194,11 +187,7 @@ def _diameter(inside: NDArray[np.uint8], hidden: bool) -> float:
 
 
 def _around(
-    middle: NDArray[np.float32],
-    scatter: NDArray[np.float32],
-    outline: Outline,
-    dtype: np.dtype[Any],
-    empty: NDArray[np.float32] | None,
+    middle: NDArray[np.float32], scatter: NDArray[np.float32], outline: Outline, full_scale: float
 ) -> Background:
     row, column = np.ogrid[: middle.shape[0], : middle.shape[1]]
     away = np.hypot(row - outline.v_px, column - outline.u_px) / outline.radius_px
@@ -206,8 +195,7 @@ def _around(
     around = ring if ring.any() else ~ball
     mean, noise = middle.astype(np.float32), np.maximum(scatter, 0.3).astype(np.float32)
     mean[ball], noise[ball] = np.median(middle[around]), np.median(noise[around])
-    full = float(np.iinfo(dtype).max)
-    return Background(mean=mean if empty is None else empty, noise=noise, full_scale=full)
+    return Background(mean=mean, noise=noise, full_scale=full_scale)
 
 
 def _none_fixed(got: str) -> ExperimentError:

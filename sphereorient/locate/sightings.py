@@ -1,11 +1,22 @@
-from collections.abc import Mapping
-from dataclasses import dataclass
+"""The sphere in a frame, and along time: outliers are replaced by a spline, short gaps interpolated."""
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator, make_lsq_spline
 from torch import Tensor
 
 from sphereorient.errors import ExperimentError, ShapeError, refusal
-from sphereorient.trajectory import Reason
+from sphereorient.locate.background import Background
+from sphereorient.locate.outline import Outline, find_blobs, fit_outline
+from sphereorient.locate.settings import LocateSettings
+from sphereorient.trajectory import Flag, Reason
+
+DEGREE = 3  # of the spline
+Found = tuple[Outline | None, Reason]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,3 +59,129 @@ def size_of(sightings: Sightings, size_px: int | None) -> int:
     if size_px is not None:
         return size_px
     return max(16, round(2 * float(sightings.radius_px[sightings.placed].median())))
+
+
+def find_ball(
+    frame: NDArray[np.generic], background: Background, diameter_px: float, settings: LocateSettings
+) -> Found:
+    """Return the outline in a frame (H, W) and `OK`, or None and `NOT_FOUND`, `OUTLINE`, `DARK` or `SATURATED`.
+
+    Source: paper section III A.
+    """
+    difference = background.difference(frame)
+    blobs = find_blobs(difference, background.noise, diameter_px, settings)
+    best: Outline | None = None
+    likeliest = (False, 0.0)  # painted and supported ones first, then by coverage
+    for blob in blobs:
+        outline = fit_outline(difference, background.typical_noise, blob, diameter_px, settings, background.shown)
+        if outline is not None:
+            likely = (outline.painted and outline.coverage >= settings.coverage_min, outline.coverage)
+            if best is None or likely > likeliest:
+                best, likeliest = outline, likely
+        # Usually the first blob; others are tried only if its rim is incomplete.
+        if best is not None and best.painted and best.coverage >= max(settings.coverage_min, 0.5):
+            break
+    contrast_min = settings.contrast_min * background.full_scale / 255
+    if best is None or best.coverage < settings.coverage_min:
+        if not blobs or blobs[0].merit <= 0:
+            return None, Reason.NOT_FOUND
+        around = _square(int(blobs[0].u_px), int(blobs[0].v_px), 0.5 * diameter_px)
+        return None, Reason.DARK if np.percentile(difference[around], 90) < contrast_min else Reason.OUTLINE
+    height, width = frame.shape
+    u, v = min(max(round(best.u_px), 0), width - 1), min(max(round(best.v_px), 0), height - 1)
+    inside = _square(u, v, 0.7 * best.radius_px)
+    if np.percentile(difference[inside], 90) < contrast_min:
+        return None, Reason.DARK
+    if np.mean(frame[inside] >= background.full_scale) > settings.saturated_share:  # type: ignore[operator]
+        return None, Reason.SATURATED
+    return best, Reason.OK
+
+
+def _square(u: int, v: int, half: float) -> tuple[slice, slice]:
+    return slice(max(0, v - int(half)), v + int(half) + 1), slice(max(0, u - int(half)), u + int(half) + 1)
+
+
+def sightings_of(found: Iterable[Found]) -> Sightings:
+    """Collect the results of `find_ball` in consecutive frames."""
+    rows = list(found)
+    names = ("u_px", "v_px", "radius_px", "rms_px", "coverage")
+    values = [[getattr(outline, name, torch.nan) for name in names] for outline, _ in rows]
+    table = torch.tensor(values, dtype=torch.float64).reshape(-1, len(names))
+    return Sightings(
+        centre_px=table[:, :2],
+        radius_px=table[:, 2],
+        outline_rms_px=table[:, 3],
+        coverage=table[:, 4],
+        flags=torch.zeros(len(rows), dtype=torch.int64),
+        reason=tuple(reason for _, reason in rows),
+    )
+
+
+def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
+    """Replace outliers by a least-squares spline and fill short gaps, with flags and without rms; longer gaps stay NaN.
+
+    Source: paper section III A.
+    """
+    track = np.column_stack([sightings.centre_px.numpy(), sightings.radius_px.numpy()])
+    flags = sightings.flags.clone()
+    rms = sightings.outline_rms_px.clone()
+    for stretch in known_stretches(np.isfinite(track[:, 2]), settings.gap_frames_max):
+        known = stretch[np.isfinite(track[stretch, 2])]
+        spline, outlier = robust_spline(known, track[known], settings)
+        track[known[outlier]] = spline[outlier]
+        flags[known[outlier]] |= int(Flag.POSITION_OUTLIER_REPLACED)
+        rms[known[outlier]] = torch.nan
+        missing = np.setdiff1d(stretch, known)
+        if len(missing):
+            track[missing] = PchipInterpolator(known, track[known], axis=0)(missing)
+            flags[missing] |= int(Flag.POSITION_INTERPOLATED)
+    reason = tuple(
+        Reason.OUTLINE if flags[k] & int(Flag.POSITION_OUTLIER_REPLACED) else reason
+        for k, reason in enumerate(sightings.reason)
+    )
+    return replace(
+        sightings,
+        centre_px=torch.from_numpy(track[:, :2].copy()),
+        radius_px=torch.from_numpy(track[:, 2].copy()),
+        outline_rms_px=rms,
+        flags=flags,
+        reason=reason,
+    )
+
+
+def known_stretches(known: NDArray[np.bool_], gap_frames_max: int) -> list[NDArray[np.int64]]:
+    """Return runs of frame numbers with gaps of at most `gap_frames_max`; the ends are known frames."""
+    at = np.flatnonzero(known)
+    if not len(at):
+        return []
+    parts = np.split(at, np.flatnonzero(np.diff(at) > gap_frames_max + 1) + 1)
+    return [np.arange(part[0], part[-1] + 1) for part in parts]
+
+
+def robust_spline(
+    frame: NDArray[np.int64], value: NDArray[np.float64], settings: LocateSettings
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return a robust cubic spline (n, D) of values (n, D), px, at frames (n,), and the outliers (n,) bool."""
+    outlier = np.zeros(len(frame), bool)
+    fitted = value.copy()
+    for _ in range(5):
+        good = ~outlier
+        if good.sum() < 4 * (DEGREE + 1):  # too few to separate outliers from motion
+            return value.copy(), np.zeros(len(frame), bool)
+        fitted = _spline(frame[good], value[good], settings.spline_knot_frames)(frame)
+        deviation = np.abs(fitted - value)
+        sigma = 1.4826 * np.median(deviation[good], axis=0)
+        now = (deviation > np.maximum(settings.outlier_factor * sigma, settings.outlier_px)).any(axis=1)
+        if (now == outlier).all():
+            break
+        outlier = now
+    return fitted, outlier
+
+
+def _spline(x: NDArray[np.int64], y: NDArray[np.float64], spacing: int):  # type: ignore[no-untyped-def]
+    inner = np.arange(x[0] + spacing, x[-1] - spacing / 2, spacing, dtype=float)
+    counts = np.histogram(x, np.concatenate([[x[0]], inner, [x[-1] + 1]]))[0]
+    # Schoenberg and Whitney: each knot needs data nearby.
+    inner = inner[(counts[:-1] >= DEGREE + 1) & (counts[1:] >= DEGREE + 1)]
+    knots = np.concatenate([[x[0]] * (DEGREE + 1), inner, [x[-1]] * (DEGREE + 1)]).astype(float)
+    return make_lsq_spline(x.astype(float), y, knots, k=DEGREE)

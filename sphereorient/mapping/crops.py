@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import PaintError, refusal
-from sphereorient.experiment.given import given_scene
 from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.experiment.stream import given_scene
 from sphereorient.locate import (
     CameraScene,
     Found,
@@ -93,9 +93,8 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
         if experiment.fixed:  # what changes in the pictures is the ball
             pictures = stream.spread(4 * settings.background_frames)
             empty = given_scene(experiment, stream.name, stream.movie.frame_shape)
-            where = fixed_ball(pictures, locating, empty, stream.shown)
-            outline = where.outline
-            scene = CameraScene(background=where.scene, diameter_px=2 * outline.radius_px)
+            outline, background = fixed_ball(pictures, locating, empty, stream.shown)
+            scene = CameraScene(background=background, diameter_px=2 * outline.radius_px)
         else:
             scene = find_scene(recording, stream, settings.background_frames, locating)
         found: list[Found] = []

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.locate import Frame, LocateSettings
-from sphereorient.locate.blob import find_blobs
+from sphereorient.locate.outline import find_blobs
 from sphereorient.pose.fitter import CameraView
 
 SOFT, SOFT_PX = 0.06, 1.5  # radii, px: templates of pictures that are blurred by more than both are blurred as well

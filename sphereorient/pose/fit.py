@@ -11,7 +11,7 @@ from sphereorient import so3
 from sphereorient.pose.light import polynomials
 from sphereorient.pose.model import SphereModel, SphereView, light_columns, sphere_view
 from sphereorient.pose.pixels import Pixels
-from sphereorient.so3.linalg import inverse_damped, solve_damped
+from sphereorient.so3 import inverse_damped, solve_damped
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
 EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better

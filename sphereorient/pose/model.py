@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sphereorient.pose.light import LATER, Light, Shading, polynomials
 from sphereorient.pose.pixels import Pixels
-from sphereorient.so3.linalg import cross_first_axis
+from sphereorient.so3 import cross_first_axis
 from sphereorient.sphere.texture_table import TextureTable
 
 SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself

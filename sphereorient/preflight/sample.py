@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from sphereorient.cameras import Camera
 from sphereorient.errors import MovieError, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.experiment.given import given_scene
-from sphereorient.experiment.stream import CameraStream, pictures_of, spread_frames, uniform
+from sphereorient.experiment.stream import CameraStream, given_scene, pictures_of, spread_frames, uniform
 from sphereorient.experiment.timeline import NONE
 from sphereorient.locate import (
     Background,
+    Found,
     LocateSettings,
     Sightings,
     find_ball,
@@ -24,7 +24,6 @@ from sphereorient.locate import (
     sightings_of,
 )
 from sphereorient.locate.background import measure_background
-from sphereorient.locate.find import Found
 from sphereorient.locate.outline import Outline
 from sphereorient.trajectory import Reason
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.pose.light import polynomials
 from sphereorient.search.normalisation import Blur, rim_share
-from sphereorient.so3.linalg import cross_first_axis
+from sphereorient.so3 import cross_first_axis
 from sphereorient.sphere import DiskView
 from sphereorient.sphere.texture_table import TextureTable
 

@@ -1,13 +1,6 @@
 """The result of a measurement: the trajectory, its file, reasons and flags."""
 
-from sphereorient.trajectory.camera import CameraTrack
 from sphereorient.trajectory.reasons import Flag, Reason
-from sphereorient.trajectory.trajectory import Trajectory, quaternions_wxyz
+from sphereorient.trajectory.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 
-__all__ = [
-    "CameraTrack",
-    "Flag",
-    "Reason",
-    "Trajectory",
-    "quaternions_wxyz",
-]
+__all__ = ["CameraTrack", "Flag", "Reason", "Trajectory", "quaternions_wxyz"]

@@ -16,16 +16,8 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, ShapeError, TrackError, refusal
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
-from sphereorient.trajectory.camera import AGAIN, CameraTrack, read_camera, write_camera
-from sphereorient.trajectory.datasets import (
-    blank_datasets,
-    check_shapes,
-    inside,
-    read_datasets,
-    stored,
-    stored_fields,
-    write_datasets,
-)
+from sphereorient.trajectory import datasets
+from sphereorient.trajectory.datasets import stored, stored_fields
 from sphereorient.trajectory.reasons import Flag, Reason
 
 if TYPE_CHECKING:
@@ -34,6 +26,9 @@ if TYPE_CHECKING:
 
 SCHEMA = "sphereorient-track/1"
 TEXTS = ("method", "settings", "experiment")
+LONGEST_NAME = 100  # characters
+AGAIN = "write the track again"
+REASON = datasets.DatasetSpec("1", "why this camera has no orientation in the frame; ok where it has one")
 # Rows of `plot`: label, measured field, smoothed field.
 PLOTTED = (
     ("position (mm)", "position", "position_smooth"),
@@ -43,6 +38,49 @@ PLOTTED = (
 )
 COLOURS = {"w": "0.4", "x": "#0072b2", "y": "#d55e00", "z": "#009e73"}
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraTrack:
+    """Results of one camera in N frames; candidates of frame k are rows offset[k] .. offset[k + 1]."""
+
+    centre_px: Floats = stored("px", "projection of the sphere's centre, (u, v)", 2)
+    radius_px: Floats = stored("px", "radius of the outline")
+    outline_rms_px: Floats = stored("px", "rms distance of the edge points from the fitted outline")
+    orientation: Floats = stored("1", "R_lab_body of this camera's own best candidate", 3, 3)
+    orientation_cov: Floats = stored("rad^2", "covariance of delta, R_true = exp([delta]x) R, lab components", 3, 3)
+    score: Floats = stored("1", "agreement of the picture with the map at this orientation, 0 to 1")
+    xi: Floats = stored("rad", "the paper's measure of this camera's noise; its moving variance weighs the cameras")
+    reason: tuple[str, ...]  # N values of Reason; newer files may have unknown reasons
+    candidate_offset: NDArray[np.int64] = stored(
+        "1", "candidates of frame k are the rows offset[k] .. offset[k + 1]", dtype="int64", fill=0, rows="offsets"
+    )
+    candidate_orientation: Floats = stored("1", "R_lab_body of every candidate", 3, 3, rows="candidates")
+    candidate_score: Floats = stored("1", "score of every candidate", rows="candidates")
+
+    def __post_init__(self) -> None:
+        offset = np.asarray(self.candidate_offset)
+        if offset.size and (np.diff(offset, prepend=0) < 0).any():
+            got, do = f"{offset[:5].tolist()}", "count the candidates frame by frame"
+            raise ShapeError(refusal("CameraTrack.candidate_offset", expected="0 and increasing", got=got, do=do))
+        candidates = int(offset[-1]) if offset.size else 0
+        frames = len(self.reason)
+        datasets.check_shapes(self, {"frames": frames, "offsets": frames + 1, "candidates": candidates})
+
+    def at(self, rows: NDArray[np.int64]) -> Self:
+        """Return the frames of increasing `rows`, with their candidates."""
+        counts = np.diff(self.candidate_offset)
+        kept = np.isin(np.repeat(np.arange(len(counts)), counts), rows)
+        parts = {}
+        for name, c in stored_fields(type(self)):
+            parts[name] = getattr(self, name)[kept if c.rows == "candidates" else rows]
+        parts["candidate_offset"] = np.concatenate([[0], np.cumsum(counts[rows])])
+        return replace(self, **parts, reason=tuple(self.reason[k] for k in rows.tolist()))
+
+    @classmethod
+    def empty(cls, frames: int) -> Self:
+        """Return an empty record of `frames` frames."""
+        return cls(reason=(Reason.NOT_FOUND,) * frames, **datasets.blank_datasets(cls, frames))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,7 +135,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         frames = np.size(self.time)
-        check_shapes(self, {"frames": frames})
+        datasets.check_shapes(self, {"frames": frames})
         for name, camera in self.cameras.items():
             if len(camera.reason) != frames:
                 got, do = f"{len(camera.reason)} frames", "give every camera all frames of the track"
@@ -133,8 +171,8 @@ class Trajectory:
         `fields`: frame_rate (Hz; NaN for uneven times), method, settings (YAML), experiment, provenance (JSON types).
         """
         known: dict[str, Any] = {"frame_rate": np.nan, "provenance": {}, **dict.fromkeys(TEXTS, ""), **fields}
-        datasets: dict[str, Any] = blank_datasets(cls, len(time)) | {"time": np.asarray(time, "float64")}
-        return cls(cameras={name: CameraTrack.empty(len(time)) for name in cameras}, **datasets, **known)
+        parts: dict[str, Any] = datasets.blank_datasets(cls, len(time)) | {"time": np.asarray(time, "float64")}
+        return cls(cameras={name: CameraTrack.empty(len(time)) for name in cameras}, **parts, **known)
 
     def save(self, path: str | Path) -> None:
         """Write HDF5 of schema sphereorient-track/1, replacing an old file at the end; equal arrays give equal bytes.
@@ -151,7 +189,7 @@ class Trajectory:
             file.attrs["provenance"] = json.dumps(self.provenance, sort_keys=True)
             for name in (*TEXTS, "frame_rate"):
                 file.attrs[name] = getattr(self, name)
-            write_datasets(self, file)
+            datasets.write_datasets(self, file)
             file["flags"].attrs["bits"] = json.dumps({flag.name: flag.value for flag in Flag})
             cameras = file.create_group("cameras")
             for name in sorted(self.cameras):
@@ -278,10 +316,30 @@ def _read(file: h5py.File) -> dict[str, Any]:
         if name not in file.attrs:
             label = f"{file.filename}: attribute {name}"
             raise TrackError(refusal(label, expected="a value", got="none", do=AGAIN))
-    cameras = inside(file, "cameras")
-    return read_datasets(file, Trajectory) | {
+    cameras = datasets.inside(file, "cameras")
+    return datasets.read_datasets(file, Trajectory) | {
         "cameras": {name: read_camera(cameras, name) for name in cameras or ()},
         "frame_rate": float(file.attrs["frame_rate"]),
         "provenance": json.loads(file.attrs["provenance"]),
         **{name: str(file.attrs[name]) for name in TEXTS},
     }
+
+
+def write_camera(camera: CameraTrack, group: h5py.Group) -> None:
+    """Write the datasets of one camera."""
+    datasets.write_datasets(camera, group)
+    # fixed length: HDF5 stores variable strings outside the dataset
+    width = max([16, *map(len, camera.reason)])
+    datasets.write_dataset(group, "reason", np.array([str(r) for r in camera.reason], f"S{width}"), REASON)
+
+
+def read_camera(cameras: h5py.Group, name: str) -> CameraTrack:
+    """Read one camera from the group of all."""
+    group = datasets.inside(cameras, name)
+    if not isinstance(group, h5py.Group) or not name.isprintable() or len(name) > LONGEST_NAME:
+        label = f"{cameras.file.filename}: cameras"
+        raise TrackError(refusal(label, expected="groups with names", got=repr(name)[:60], do=AGAIN))
+    known = {str(reason): reason for reason in Reason}
+    texts = [text.decode() for text in datasets.read_dataset(group, "reason", "S").tolist()]
+    reason = tuple(known.get(text, text) for text in texts)
+    return CameraTrack(reason=reason, **datasets.read_datasets(group, CameraTrack))

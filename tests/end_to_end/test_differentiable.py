@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.assemble import SoftTrack, soft_track
-from sphereorient.assemble.differentiable import turning_costs
+from sphereorient.assemble.layer import turning_costs
 from sphereorient.cameras import PinholeCamera, Rays
 from sphereorient.cameras.parameters import with_parameters
 from sphereorient.errors import SettingsError, ShapeError

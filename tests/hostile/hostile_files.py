@@ -24,7 +24,7 @@ sys.path.append(str(REPO / "tests" / "movies"))
 from cine_writer import Cine, write_cine
 from movie_examples import encode
 
-from sphereorient.experiment.given import load_background
+from sphereorient.experiment.stream import load_background
 from sphereorient.experiment.timeline import load_times
 from sphereorient.movies import open_movie
 from sphereorient.sphere import load_texture

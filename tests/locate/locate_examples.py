@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from sphereorient.cameras import PinholeCamera
 from sphereorient.locate import Background, LocateSettings, Sightings
-from sphereorient.locate.blob import Blob
-from sphereorient.locate.outline import Outline, fit_outline
+from sphereorient.locate.outline import Blob, Outline, fit_outline
 from sphereorient.trajectory import Reason
 
 Grey = NDArray[np.float32]

@@ -11,11 +11,10 @@ import pytest
 from locate_examples import BACK, DIAMETER, SETTINGS, Paint, blobs, even_background, filmed, plant, white
 
 from sphereorient.errors import ExperimentError
-from sphereorient.experiment.given import load_background
-from sphereorient.experiment.stream import spread_frames
+from sphereorient.experiment.stream import load_background, spread_frames
 from sphereorient.locate import Background, learn_background
 from sphereorient.locate.background import measure_background, without_ball
-from sphereorient.locate.blob import find_blobs
+from sphereorient.locate.outline import find_blobs
 
 SHAPE = (150, 190)
 SIGMA = 3.0

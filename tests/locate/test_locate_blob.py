@@ -7,7 +7,7 @@ import pytest
 from locate_examples import BACK, DIAMETER, NOISE, SETTINGS, blobs, even_background, filmed, plant, white
 
 from sphereorient.locate import LocateSettings
-from sphereorient.locate.blob import find_blobs
+from sphereorient.locate.outline import find_blobs
 
 WIDE = (240, 320)  # H, W
 FLAT = np.full(WIDE, NOISE, np.float32)

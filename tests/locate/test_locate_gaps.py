@@ -13,7 +13,7 @@ from locate_examples import SETTINGS, sightings
 from torch import Tensor
 
 from sphereorient.locate import LocateSettings, fill_gaps
-from sphereorient.locate.gaps import known_stretches
+from sphereorient.locate.sightings import known_stretches
 from sphereorient.trajectory import Flag, Reason
 
 N = 120

@@ -11,7 +11,7 @@ import torch
 from locate_examples import BACK, DIAMETER, SETTINGS, SHAPE, blobs, even_background, filmed, looking_down, plant
 
 from sphereorient.errors import ExperimentError
-from sphereorient.experiment.given import load_mask
+from sphereorient.experiment.stream import load_mask
 from sphereorient.locate import find_ball
 from sphereorient.locate.scene import fixed_ball, learn_background
 from sphereorient.pose.pixels import LinesOfSight, cut_pixels, disk_stencil
@@ -84,10 +84,10 @@ def test_a_ball_that_turns_in_its_place_is_found_past_a_mask():
     frames = np.stack([turned(k) for k in range(12)])
     flicker = frames.copy()  # what moves before the ball lies under the mask too
     flicker[::2, in_the_cup()] = 30
-    found = fixed_ball(flicker, SETTINGS, None, shown())
-    assert np.hypot(found.outline.u_px - MIDDLE[0], found.outline.v_px - MIDDLE[1]) < 1.0
-    assert found.outline.radius_px == pytest.approx(DIAMETER / 2, abs=1.0)
-    np.testing.assert_array_equal(found.scene.shown, shown())
+    outline, scene = fixed_ball(flicker, SETTINGS, None, shown())
+    assert np.hypot(outline.u_px - MIDDLE[0], outline.v_px - MIDDLE[1]) < 1.0
+    assert outline.radius_px == pytest.approx(DIAMETER / 2, abs=1.0)
+    np.testing.assert_array_equal(scene.shown, shown())
 
 
 def test_masks_are_read_white_where_the_ball_is_seen(tmp_path):

@@ -23,8 +23,7 @@ from locate_examples import (
 )
 
 from sphereorient.locate import LocateSettings
-from sphereorient.locate.blob import Blob
-from sphereorient.locate.outline import fit_outline
+from sphereorient.locate.outline import Blob, fit_outline
 
 RADII = [39.0, 36.4]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch.testing import assert_close
 
-from sphereorient.so3.linalg import cross_first_axis, inverse_damped, solve_damped
+from sphereorient.so3 import cross_first_axis, inverse_damped, solve_damped
 
 
 def test_a_well_conditioned_system_is_solved_and_inverted() -> None:
