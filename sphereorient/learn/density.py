@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.search.peaks import distinct
+from sphereorient.search.candidates import distinct
 
 SEARCHED = 48  # likeliest grid points among which modes are searched
 APART_DEG = 25.0  # nearer modes are suppressed by a better one

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from sphereorient.errors import ShapeError, refusal
+from sphereorient.search.candidates import check_disks
 from sphereorient.search.settings import OrientSettings
 
 BINS = 32  # of the histograms; finer ones are empty in the small moving region
@@ -65,15 +65,7 @@ def extract_paint(disks: Tensor, inside: Tensor, settings: OrientSettings) -> Te
     Raises:
         ShapeError: disks and mask differ in size.
     """
-    if disks.shape[-2:] != inside.shape:
-        raise ShapeError(
-            refusal(
-                "disks",
-                expected=f"(F, {', '.join(map(str, inside.shape))})",
-                got=str(tuple(disks.shape)),
-                do="crop anew",
-            )
-        )
+    check_disks(disks, *inside.shape)
     grey = stretch_contrast(disks, inside, settings.black_share, settings.white_share)
     one_hot = _one_hot(grey, inside)
     threshold, _ = otsu(one_hot.sum((-2, -1)))

@@ -50,7 +50,7 @@ class PaperSearch:
             paint = extract_paint(filled, self._fine.inside, self._settings)
             groups = self._groups(self._coarse_scores(paint))
             parts += [self._fine_search(paint[f], groups[f]) for f in range(len(batch))]
-        return Candidates.joined(parts) if parts else Candidates.none(())
+        return Candidates.joined(parts)
 
     def _coarse_scores(self, paint: Tensor) -> Tensor:
         """Return T of every coarse template, (F, K): 1/2 + sum of products / (2 pixels counted) (docs/errata.md A2)."""
@@ -83,18 +83,11 @@ class PaperSearch:
         score = torch.stack([score for _, score in found]).double()
         order = score.argsort(descending=True, stable=True)
         order = order[score[order] >= self._settings.score_min]
-        if not len(order):
-            return Candidates.none([Reason.LOW_SCORE])
         R = so3.nearest_rotation(torch.stack([R for R, _ in found]).double()[order])
         # Two groups may reach one rotation: keep the first of those within two fine steps.
         gap = so3.geodesic_distance(R[:, None], R[None])
         first = ~torch.tril(gap < 2 * math.radians(self._settings.fine_step_deg), -1).any(1)
-        return Candidates(
-            offset=torch.tensor([0, int(first.sum())]),
-            R_view_body=R[first],
-            score=score[order][first],
-            reason=(Reason.OK,),
-        )
+        return Candidates.of_disk(R[first], score[order][first])
 
     def _climb(self, seen: Tensor, R_start: Tensor) -> tuple[Tensor, Tensor]:
         """Return the best of the fine grid about a rotation; where it is at the grid's edge, once more about it."""
