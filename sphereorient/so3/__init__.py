@@ -1,12 +1,17 @@
 """Rotations: (..., 3, 3) matrices that act on columns, not checked; rotation vectors (..., 3), rad, right-handed."""
 
-from sphereorient.so3.distance import angle, geodesic_distance
-from sphereorient.so3.exp import exp, hat, log, vee
-from sphereorient.so3.lattman import from_lattman, lattman_grid, lattman_steps, to_lattman
-from sphereorient.so3.local_grid import local_grid
-from sphereorient.so3.mean import weighted_mean
-from sphereorient.so3.project import nearest_rotation
-from sphereorient.so3.random import random_rotations
+from sphereorient.so3.grids import from_lattman, lattman_grid, lattman_steps, local_grid, to_lattman
+from sphereorient.so3.rotations import (
+    angle,
+    exp,
+    geodesic_distance,
+    hat,
+    log,
+    nearest_rotation,
+    random_rotations,
+    vee,
+    weighted_mean,
+)
 from sphereorient.so3.tait_bryan import (
     from_tait_bryan,
     rate_matrix_body,
