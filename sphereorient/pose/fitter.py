@@ -1,4 +1,4 @@
-"""The fit at three levels of blur, and what it needs of each camera."""
+"""The fit at three levels of blur, what it needs of each camera, and a first guess of the blur."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera
-from sphereorient.locate import Background, CameraScene
-from sphereorient.pose.fit import FittedPoses, PoseStart, refine
-from sphereorient.pose.learn_light import learn_light
-from sphereorient.pose.light import FIRST, LATER, Light, Shading
+from sphereorient.locate import Background, CameraScene, Frame, LocateSettings
+from sphereorient.locate.blob import find_blobs
+from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
+from sphereorient.pose.light import FIRST, LATER, Light
 from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
 from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
@@ -29,6 +29,12 @@ SIZES = 1.06  # ratio of neighbouring stencil sizes
 CPU = torch.device("cpu")
 FINEST_PX = 0.4  # least blur of any picture, px: a pixel alone has 0.29
 COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
+SOFT, SOFT_PX = 0.06, 1.5  # radii, px: templates of pictures that are blurred by more than both are blurred as well
+FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a good lens
+CALM_PX = 1.0  # blur that is laid over pictures first, against noise
+AROUND = 1.2  # of the radius: the sphere and its rim
+CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and scene lie
+STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,12 +82,7 @@ class PyramidLevel:
 
     def stencil(self, radius_px: float) -> Stencil:
         """Return the places of a disk of some radius."""
-        return _stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)))
-
-
-@lru_cache(maxsize=64)
-def _stencil(radius_px: float, step_px: int) -> Stencil:
-    return disk_stencil(radius_px, step_px, tile_px=max(6, step_px))
+        return disk_stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)))
 
 
 class Optics:
@@ -121,14 +122,9 @@ class Fitter:
     device: torch.device = CPU  # of the fits; inputs and results are on the CPU
     widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
 
-    @property
-    def shading(self) -> Shading:
-        """Orders of each frame's own light: high while nothing is learnt."""
-        return LATER if self.light.known else FIRST
-
     def model(self, level: PyramidLevel) -> SphereModel:
         """Return what the pictures of a level depend on."""
-        shading = self.shading if level.extra_px == 0 else LATER
+        shading = LATER if self.light.known or level.extra_px > 0 else FIRST  # high orders while nothing is learnt
         return SphereModel(
             radius_mm=self.radius_mm, paint=level.paint, blur_px=level.blur_px, light=self.light, shading=shading
         )
@@ -211,3 +207,45 @@ def first_fitter(views: Sequence[CameraView], radius_mm: float, base: TextureTab
     """Return a fitter with an assumed blur, and flat light."""
     optics = Optics(base, blur_px, widest_px(views))
     return Fitter(views=views, radius_mm=radius_mm, optics=optics, light=unknown_light(views))
+
+
+def defocus_radii(blur_px: float, diameter_px: float) -> float:
+    """Return the blur of pictures, radii, as the search needs it: 0 unless they are defocused."""
+    blur = 2 * blur_px / diameter_px
+    return blur if blur > SOFT and blur_px > SOFT_PX else 0.0
+
+
+def estimate_blur_px(views: Sequence[CameraView], shots: Sequence[Sequence[Frame]], locating: LocateSettings) -> float:
+    """Return the standard deviation of the blur, px, of the steepest edges about the sphere: median of n x C frames.
+    A first guess, biased by noise and paint without edges. 0 where no frame shows a blob of the sphere's size.
+    Source: a step of height h under a Gaussian blur sigma is h / (sigma sqrt(2 pi)) steep at most.
+    """
+    found = [
+        _steepest(shot.picture.astype(np.float32), view, locating)
+        for frame in shots
+        for view, shot in zip(views, frame, strict=True)
+        if shot.usable
+    ]
+    told = [blur for blur in found if blur is not None]
+    return float(np.median(told)) if told else 0.0
+
+
+def _steepest(picture: NDArray[np.float32], view: CameraView, locating: LocateSettings) -> float | None:
+    """Return the blur of the steepest edge about the likeliest blob, px; None without one."""
+    blobs = find_blobs(view.background.difference(picture), view.background.noise, view.diameter_px, locating)
+    if not blobs or blobs[0].merit <= 0:
+        return None
+    reach = round(AROUND * view.diameter_px / 2)
+    left, top = max(0, round(blobs[0].u_px) - reach), max(0, round(blobs[0].v_px) - reach)
+    window = picture[top : round(blobs[0].v_px) + reach + 1, left : round(blobs[0].u_px) + reach + 1]
+    return steepest_blur_px(window)
+
+
+def steepest_blur_px(picture: NDArray[np.float32]) -> float:
+    """Return the standard deviation of the blur, px, of the steepest edge between the darkest and the brightest."""
+    calm = cv2.GaussianBlur(picture, (0, 0), CALM_PX)
+    slope = np.hypot(cv2.Scharr(calm, cv2.CV_32F, 1, 0), cv2.Scharr(calm, cv2.CV_32F, 0, 1)) / 32
+    low, high = np.percentile(calm, CONTRAST)
+    steepest = float(np.percentile(slope, STEEPEST))
+    blur = float(high - low) / max(steepest * np.sqrt(2 * np.pi), 1e-9)
+    return float(np.sqrt(max(blur**2 - CALM_PX**2, 0.0)))

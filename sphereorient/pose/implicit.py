@@ -80,7 +80,10 @@ def implicit_pose(
 
     gradient = torch.func.grad(lambda delta: 0.5 * about(delta).square().sum())(still)
     with torch.no_grad():
-        inverse = _inverse(_curvature(about, still))
+        curvature = _curvature(about, still)
+        rounding = 10 * torch.finfo(curvature.dtype).eps
+        # Undetermined directions become 0.
+        inverse = torch.linalg.pinv(0.5 * (curvature + curvature.mT), atol=FLAT, rtol=rounding, hermitian=True)
     step = -(inverse @ gradient[..., None])[..., 0]
     arrived = known & (step[:, :3].norm(dim=-1) < ARRIVED_RAD) & (step[:, 3:].norm(dim=-1) < ARRIVED_MM)
     step = torch.where(arrived[:, None], step, 0.0)
@@ -137,14 +140,6 @@ def _linearised(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> tuple[T
 
 def _axes(delta: Tensor) -> Tensor:
     return torch.eye(6, dtype=delta.dtype, device=delta.device)[:, None].expand(6, *delta.shape)
-
-
-def _inverse(curvature: Tensor) -> Tensor:
-    """Invert symmetric (B, 6, 6); undetermined directions become 0."""
-    rounding = 10 * torch.finfo(curvature.dtype).eps
-    symmetric = 0.5 * (curvature + curvature.mT)
-    inverse: Tensor = torch.linalg.pinv(symmetric, atol=FLAT, rtol=rounding, hermitian=True)
-    return inverse
 
 
 def _checked(R: Tensor, X: Tensor, use: Tensor | None, iterations: int) -> Tensor:

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sphereorient.pose.light import LATER, Light, Shading, polynomials
+from sphereorient.pose.light import LATER, Light, Shading
 from sphereorient.pose.pixels import Pixels
 from sphereorient.so3.linalg import cross_first_axis
 from sphereorient.sphere.texture_table import TextureTable
+from sphereorient.sphere.view import nearest_approach
 
 SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself
 RIM_NODES = 4  # look-ups along the radius near the limb, where the paint is compressed
@@ -52,10 +53,9 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
     R = R_lab_body.to(d.dtype)
     # In double precision, once: half a metre less half a metre.
     to_centre = (position_lab_mm[:, :, None] - pixels.origin.double()).to(d.dtype)
-    along = (to_centre * d).sum(1, keepdim=True)
-    aside = to_centre - along * d  # from the line of sight's nearest point to the centre
+    aside = nearest_approach(to_centre, d, 1)
     nearest = (aside * aside).sum(1).sqrt().clamp_min(1e-6 * radius_mm)
-    outward = aside / -nearest[:, None]  # unit, from the centre to the line of sight
+    outward = aside / nearest[:, None]  # unit, from the centre to the line of sight
     q0 = nearest / radius_mm
     distance = to_centre[..., 0].norm(dim=1, keepdim=True)
     blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
@@ -124,14 +124,3 @@ def _sample(
     flat = R @ flat_b - by_sight[:, None] * d - by_outward[:, None] * outward
     shift = flat * (-1.0 / nearest)[:, None] - (radial / model.radius_mm)[:, None] * outward
     return value.mean(1), R @ cross_first_axis(slope, normal_b).mean(2), shift
-
-
-def light_columns(view: SphereView, model: SphereModel) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the light coefficients' columns, (L, K, P), and the learnt maps of difference and black, (L, P)."""
-    shading = model.shading
-    difference, black = model.light.at(view.across)
-    tints = polynomials(view.across, max(shading.difference, shading.black))
-    n_difference, n_black = ((order + 1) * (order + 2) // 2 for order in (shading.difference, shading.black))
-    lit = (view.coverage * (view.paint * difference + black))[:, None]
-    columns = torch.cat([lit * tints[:, :n_difference], view.coverage[:, None] * tints[:, :n_black]], dim=1)
-    return columns, difference, black
