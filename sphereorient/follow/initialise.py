@@ -16,7 +16,7 @@ from sphereorient.locate.find import Found
 from sphereorient.locate.outline import Outline
 from sphereorient.pose.fitter import CameraView, Fitter, Picture
 from sphereorient.search.candidates import Proposer
-from sphereorient.search.crop import crop_disk
+from sphereorient.search.normalisation import crop_disk
 from sphereorient.trajectory import Reason
 
 DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin

@@ -138,21 +138,16 @@ class ChunkTracker:
 
     def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
         """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
-        expected = {
-            chunk.first: self._in_place(chunk.expected(chunk.first + k, self.fitter.radius_mm)) for chunk in chunks
-        }
+        expected = {chunk.first: chunk.expected(chunk.first + k, self.fitter.radius_mm) for chunk in chunks}
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
+        if self.centre is not None:
+            place = {"position_lab_mm": self.centre.position_lab_mm, "place_precision": self.centre.precision}
+            ahead = {first: replace(pose, **place) for first, pose in ahead.items()}
         followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
         for chunk in chunks:
             poses = followed.get(chunk.first)
             poses = self._search(frames[chunk.first]) if poses is None else poses
             yield poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
-
-    def _in_place(self, expected: _Expected | None) -> _Expected | None:
-        """Return the prediction, at the fixed centre where there is one."""
-        if expected is None or self.centre is None:
-            return expected
-        return replace(expected, position_lab_mm=self.centre.position_lab_mm, place_precision=self.centre.precision)
 
     def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
         """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
@@ -212,13 +207,7 @@ class ChunkTracker:
         return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if good[n] else None for n in range(asked)]
 
     def _approached(
-        self,
-        frames: Sequence[Sequence[Picture]],
-        X: Tensor,
-        R: Tensor,
-        use: Tensor,
-        precision: Tensor,
-        rough: Tensor,
+        self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, rough: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Bring rough poses (B,) bool into the basin of the finest level, through coarser ones."""
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
@@ -286,7 +275,10 @@ class ChunkTracker:
             return poses
         frames, usable = [shot.picture for shot in shots], torch.tensor([shot.usable for shot in shots])
         if self.centre is not None:
-            poses = self._at_centre(poses, frames)
+            optics = self.fitter.optics
+            fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 3), (optics.fine, 4)))
+            order = explaining_first(fit.nll, fit.score[:, poses.use].mean(-1)).argsort(stable=True)
+            poses = poses_of(fit, order, poses.use, poses.reason)
         if bool((usable & ~poses.use).any()):
             poses = self._all_seeing(poses, frames, usable)
         seen = poses.use & (poses.score[0] >= self.score_min)
@@ -314,12 +306,6 @@ class ChunkTracker:
             fit = self.fitter.fit(pixels, X, R, use.expand(count, -1), level, iterations, known)
             X, R = fit.position_lab_mm, fit.R_lab_body
         return fit
-
-    def _at_centre(self, poses: Poses, frames: Sequence[Picture]) -> Poses:
-        optics = self.fitter.optics
-        fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 3), (optics.fine, 4)))
-        order = explaining_first(fit.nll, fit.score[:, poses.use].mean(-1)).argsort(stable=True)
-        return poses_of(fit, order, poses.use, poses.reason)
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
         """Fit poses to each camera's picture alone; the first that supports one counts, the others contradict."""

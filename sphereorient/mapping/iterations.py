@@ -27,7 +27,7 @@ from sphereorient.mapping.record import Iteration, attitude_change_rad, evenly_s
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curve
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
-from sphereorient.pose.light import Light
+from sphereorient.pose.model import Light
 from sphereorient.pose.pixels import Pixels
 
 FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map

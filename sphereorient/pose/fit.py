@@ -13,8 +13,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.light import Light, light_basis, polynomials
-from sphereorient.pose.model import SphereModel, SphereView, sphere_view
+from sphereorient.pose.model import Light, SphereModel, SphereView, light_basis, polynomials, sphere_view
 from sphereorient.pose.pixels import Pixels
 from sphereorient.so3.linalg import inverse_damped, solve_damped
 

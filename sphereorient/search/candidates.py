@@ -134,11 +134,7 @@ class FallbackProposer:
 
     def __init__(self, first: Proposer, second: Proposer, sure: float) -> None:
         self._first, self._second, self._sure = first, second, sure
-
-    @property
-    def size_px(self) -> int:
-        """Side of the disks, px."""
-        return self._first.size_px
+        self.size_px = first.size_px
 
     def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations for (F, S, S) float32 grey disks."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.light import polynomials
+from sphereorient.pose.model import polynomials
 from sphereorient.search.normalisation import Blur, rim_share
 from sphereorient.so3.linalg import cross_first_axis
 from sphereorient.sphere import DiskView

@@ -33,6 +33,8 @@ class TemplateBank(nn.Module):
         texture: (H, 2 H), the texture map, 0 black .. 1 white.
         settings: of the search; None: the defaults.
         blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
+
+    `size_px` is the side of the disks, `templates` (K, 3, 3) float32 are the rotations of the bank.
     """
 
     def __init__(
@@ -43,6 +45,7 @@ class TemplateBank(nn.Module):
         texture = torch.as_tensor(texture)
         self._settings = settings
         size, distance = settings.size_px, settings.distance_radii
+        self.size_px = size
         self._view = orthographic_view(size) if distance is None else perspective_view(size, distance)
         self._normalise = LocalNormalisation(size, detail=settings.detail, window=settings.window, clip=settings.clip)
         pixel_rad = 2.0 / size
@@ -52,18 +55,9 @@ class TemplateBank(nn.Module):
         grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
         # (GROUP, G): each group is a column, so that its maximum is one of whole rows.
         self._grid = grid[compact_groups(grid, GROUP).T]
+        self.templates = self._grid.flatten(0, 1)
         self._pixels = int(self._view.inside.sum())
         self._bank = self._templates(paint)
-
-    @property
-    def size_px(self) -> int:
-        """Side of the disks, px."""
-        return self._settings.size_px
-
-    @property
-    def templates(self) -> Tensor:
-        """Return the rotations of the bank, (K, 3, 3) float32."""
-        return self._grid.flatten(0, 1)
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
         """Return R_view_body (..., K, 3, 3) and score (..., K) float64 of each disk, best first, padded with NaN.
