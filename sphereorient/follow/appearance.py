@@ -99,7 +99,9 @@ def estimate_appearance(
     right = float(fit.score[use].median())
     best, highest = _scores(looked)
     if max(best, right) < highest + NO_BETTER and _times_better(looked) < TELLING:
-        raise _unexplained(best)
+        do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
+        got = f"poses that explain {100 * best:.0f} % of the pictures, as wrong ones do"
+        raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
     if right < highest + NO_BETTER:
         # Dirt or a hidden rim spoils the estimated light: all poses are explained worse than before.
         highest = right - (best - highest)
@@ -182,13 +184,6 @@ def _nothing(found: Sequence[Poses]) -> ExperimentError:
     else:
         expected, do = "the sphere in some frame", "check sphere.diameter and the cameras, or set locate.diameter_px"
     return ExperimentError(refusal("movies", expected=expected, got=got, do=do))
-
-
-def _unexplained(score: float) -> ExperimentError:
-    """Return the error of a movie that does not show this map."""
-    do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
-    got = f"poses that explain {100 * score:.0f} % of the pictures, as wrong ones do"
-    return ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
 
 
 def _clear(found: Sequence[Poses]) -> list[int]:

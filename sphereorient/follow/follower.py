@@ -122,13 +122,11 @@ def sample_frames(recording: Recording, views: Sequence[CameraView], count: int)
     spread = spread_frames(range(total), count)
     taken = []
     for first, last in zip(spread, [*spread[1:], total], strict=True):
-        frames = zip(
-            *(
-                screened_frames(stream, view.background, first, max(last, first + 1))
-                for stream, view in zip(recording.streams, views, strict=True)
-            ),
-            strict=True,
-        )
+        movies = [
+            screened_frames(stream, view.background, first, max(last, first + 1))
+            for stream, view in zip(recording.streams, views, strict=True)
+        ]
+        frames = zip(*movies, strict=True)
         best = next(frames)
         for shots in frames:
             if all(shot.usable for shot in best):

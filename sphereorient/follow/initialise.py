@@ -132,10 +132,8 @@ class Initialiser:
             sight = seeing.camera.rays(seeing.camera.project(placed.position_lab_mm))
             along = placed.position_lab_mm[0] - sight.origin_lab_mm[0]
             slack = slack + DEPTH_SHARE**2 * along[:, None] * along
-        pictures = [shot.picture for shot in shots]
-        return self._narrow(
-            pictures, placed.position_lab_mm, torch.linalg.inv(slack), R, no_pose(len(use), reason, use)
-        )
+        pictures, frame = [shot.picture for shot in shots], no_pose(len(use), reason, use)
+        return self._narrow(pictures, placed.position_lab_mm, torch.linalg.inv(slack), R, frame)
 
     def _narrow(self, pictures: Sequence[Picture], place: Tensor, precision: Tensor, R: Tensor, frame: Poses) -> Poses:
         """Fit all starts on the coarsest level, then the best distinct ones on finer levels."""

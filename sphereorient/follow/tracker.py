@@ -62,42 +62,38 @@ class _Chunk:
         if len(rows) > 1 and numbers[-2] == frame - 2:
             t0, t1, t2 = (self.time_s[k] for k in range(frame - 2, frame + 1))
             on = (t2 - t1) / (t1 - t0)  # 1 for even frames
-        if on > LONG_STEP:
-            spread = last.covariance[0, 3:, 3:]
-            return _expected(last, last.position_lab_mm[0], last.R_lab_body[0], spread, MOVE_SHARE * radius_mm, True)
-        *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
-        *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
-        *_, R0, R1 = (poses.R_lab_body[0] for poses in rows)
-        turn, move, spread = on * so3.log(R1 @ R0.mT), on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
-        if len(rows) == 3:
-            before = (t1 - t0) / (t0 - self.time_s[frame - 3])
-            # The rate changes from the middle of one step to that of the next as it did between the two before.
-            more = (t2 - t0) / (t1 - self.time_s[frame - 3])
-            turn = (1 + more) * turn - on * before * more * so3.log(R0 @ rows[0].R_lab_body[0].mT)
-            a, b = on * (1 + more), on * before * more
-            further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * rows[0].covariance[0, 3:, 3:]
-            # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
-            if float(further.diagonal().sum()) < (ASTRAY_SHARE * radius_mm) ** 2:
-                move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
-        return _expected(last, X1 + move, so3.exp(turn) @ R1, spread, ASTRAY_SHARE * radius_mm, False)
+        X, R, spread = last.position_lab_mm[0], last.R_lab_body[0], last.covariance[0, 3:, 3:]
+        rough, astray_mm = on > LONG_STEP, MOVE_SHARE * radius_mm
+        if not rough:
+            *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
+            *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
+            *_, R0, R1 = (poses.R_lab_body[0] for poses in rows)
+            turn, move, spread = on * so3.log(R1 @ R0.mT), on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
+            astray_mm = ASTRAY_SHARE * radius_mm
+            if len(rows) == 3:
+                before = (t1 - t0) / (t0 - self.time_s[frame - 3])
+                # The rate changes from the middle of one step to that of the next as it did between the two before.
+                more = (t2 - t0) / (t1 - self.time_s[frame - 3])
+                turn = (1 + more) * turn - on * before * more * so3.log(R0 @ rows[0].R_lab_body[0].mT)
+                a, b = on * (1 + more), on * before * more
+                further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * rows[0].covariance[0, 3:, 3:]
+                # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
+                if float(further.diagonal().sum()) < astray_mm**2:
+                    move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
+            X, R = X1 + move, so3.exp(turn) @ R1
+        return _Expected(
+            position_lab_mm=X,
+            R_lab_body=R,
+            use=last.use,
+            reason=last.reason,
+            place_precision=torch.linalg.inv(spread + astray_mm**2 * torch.eye(3, dtype=torch.float64)),
+            rough=rough,
+        )
 
     def saw(self, frame: int, poses: Poses) -> None:
         """Remember the best pose of a frame, if a picture supports it."""
         if len(poses) and bool(poses.use.any()):
             self.past.append((frame, poses))
-
-
-def _expected(last: Poses, X: Tensor, R: Tensor, spread: Tensor, astray_mm: float, rough: bool) -> _Expected:
-    """Predict X (3,) and R (3, 3) after `last`; `spread` (3, 3), mm^2, is of X, `astray_mm` comes on top."""
-    covariance = spread + astray_mm**2 * torch.eye(3, dtype=torch.float64)
-    return _Expected(
-        position_lab_mm=X,
-        R_lab_body=R,
-        use=last.use,
-        reason=last.reason,
-        place_precision=torch.linalg.inv(covariance),
-        rough=rough,
-    )
 
 
 class ChunkTracker:
@@ -297,7 +293,7 @@ class ChunkTracker:
     def _looked_at(
         self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Sequence[tuple[PyramidLevel, int]]
     ) -> FittedPoses:
-        """Fit poses to the pictures in use (C,), level by level with some iterations at each."""
+        """Fit M poses to the pictures in use, (C,) or (M, C), level by level with some iterations at each."""
         X, R, count = poses.position_lab_mm, poses.R_lab_body, len(poses)
         known = None if self.centre is None else self.centre.precision.expand(count, 3, 3)
         for level, iterations in steps:

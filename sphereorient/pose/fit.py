@@ -41,10 +41,6 @@ class FittedPoses:
         """Return the arrays by name."""
         return {name: getattr(self, name) for name in POSE_PARTS}
 
-    def to(self, device: torch.device) -> FittedPoses:
-        """Return the same on another device."""
-        return FittedPoses(**{name: part.to(device) for name, part in self.parts().items()})
-
     def where(self, mask: Tensor, other: FittedPoses) -> FittedPoses:
         """Return these poses where the mask (B,) holds, the others elsewhere."""
         own, others = self.parts(), other.parts()
@@ -123,18 +119,22 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         step = _bounded(solve_damped(whole, force), X[:, None] - origin, seen, radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
+    to_centre = X[:, None] - origin
     own = solve_damped(
         information[..., :3, :3], pull[..., :3] - (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
     )
     own = own - step[:, None, :3]
-    freed = solve_damped(information, pull) - step[:, None]
+    freed = (solve_damped(information, pull) - step[:, None]).flatten(0, 1)
+    alone = _bounded(freed, to_centre.flatten(0, 1)[:, None], freed.new_ones(len(freed), 1), radius_mm)
     shared = by_pose(_shared_scores(at, precision, mixed, pixels.tile), cameras)
     meat = (shared * seen[..., None, None]).sum(1)
     if place_precision is not None:  # the prior position has an error of its own
         meat[:, 3:, 3:] += place_precision
     bread = inverse_damped(whole)
     own_bread = inverse_damped(information[..., :3, :3])
-    edge = _edge_errors(pixels, X[:, None] - origin, cameras, radius_mm) * seen[..., None]
+    # An edge that is EDGE_PX off moves the sphere along each line of sight.
+    px_mm = pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * to_centre.flatten(0, 1).norm(dim=-1, keepdim=True)
+    edge = to_centre * (EDGE_PX * by_pose(px_mm, cameras) / radius_mm) * seen[..., None]
     lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
     covariance = bread @ meat @ bread + lured.mT @ lured
     told = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge
@@ -145,7 +145,7 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         R_lab_body=R,
         covariance=covariance,
         own_turn=own,
-        own_move=_bounded_alone(freed, X[:, None] - origin, radius_mm),
+        own_move=by_pose(alone[:, 3:], cameras),
         own_covariance=own_bread @ shared[..., :3, :3] @ own_bread,
         deviation=by_pose(at.deviation.double(), cameras),
         score=by_pose(_score(at, pixels.inside).double(), cameras),
@@ -249,21 +249,6 @@ def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) ->
     seen_change = torch.hypot(across, (along / distance)[..., 0]) * seen
     size = torch.maximum(step[:, :3].norm(dim=-1), seen_change.amax(1))
     return step * (0.1 / size.clamp_min(0.1))[:, None]
-
-
-def _edge_errors(pixels: Pixels, to_centre: Tensor, cameras: int, radius_mm: float) -> Tensor:
-    """Return the displacement (B, C, 3), mm, along each line of sight by an edge that is EDGE_PX off."""
-    distance = to_centre.norm(dim=-1, keepdim=True)
-    px_mm = by_pose(pixels.pitch_mm, cameras)[..., None] + by_pose(pixels.pitch_rad, cameras)[..., None] * distance
-    off: Tensor = to_centre * (EDGE_PX * px_mm / radius_mm)
-    return off
-
-
-def _bounded_alone(freed: Tensor, to_centre: Tensor, radius_mm: float) -> Tensor:
-    count = freed.shape[0] * freed.shape[1]
-    alone = torch.ones(count, 1, dtype=freed.dtype, device=freed.device)
-    step = _bounded(freed.reshape(count, 6), to_centre.reshape(count, 1, 3), alone, radius_mm)
-    return step.reshape(freed.shape)[..., 3:]
 
 
 def _shared_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, 
 from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
 
 Picture = NDArray[np.generic]
+Record = TypeVar("Record", Pixels, PoseStart, FittedPoses, Light)
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
 SIZES = 1.06  # ratio of neighbouring stencil sizes
@@ -138,7 +140,7 @@ class Fitter:
 
     def on(self, device: torch.device) -> Fitter:
         """Return a fitter that computes on another device."""
-        return replace(self, optics=self.optics.to(device), light=self.light.to(device), device=device)
+        return replace(self, optics=self.optics.to(device), light=moved_to(device, self.light), device=device)
 
     def of(self, camera: int) -> Fitter:
         """Return the fitter of one camera by itself."""
@@ -182,14 +184,17 @@ class Fitter:
         place_precision: Tensor | None = None,
     ) -> FittedPoses:
         """Refine B poses at one level; see `refine`."""
-        there = self.device
         begin = PoseStart(
-            position_lab_mm=position_lab_mm.to(there),
-            R_lab_body=R_lab_body.to(there),
-            use=use.to(there),
-            place_precision=None if place_precision is None else place_precision.to(there),
+            position_lab_mm=position_lab_mm, R_lab_body=R_lab_body, use=use, place_precision=place_precision
         )
-        return refine(pixels.to(there), begin, self.model(level), iterations).to(CPU)
+        fit = refine(moved_to(self.device, pixels), moved_to(self.device, begin), self.model(level), iterations)
+        return moved_to(CPU, fit)
+
+
+def moved_to(device: torch.device, record: Record) -> Record:
+    """Return a record with its tensors on another device."""
+    parts: dict[str, Any] = {field.name: getattr(record, field.name) for field in fields(record)}
+    return replace(record, **{name: part.to(device) for name, part in parts.items() if isinstance(part, Tensor)})
 
 
 def base_table(texture: Tensor, diameter_px: float) -> TextureTable:

@@ -78,9 +78,11 @@ def implicit_pose(
     def about(delta: Tensor) -> Tensor:
         return counted(*_moved(R, X, delta))
 
-    gradient = torch.func.grad(lambda delta: 0.5 * about(delta).square().sum())(still)
-    with torch.no_grad():
-        curvature = _curvature(about, still)
+    slope = torch.func.grad(lambda delta: 0.5 * about(delta).square().sum())
+    gradient = slope(still)
+    with torch.no_grad():  # the Hessian (B, 6, 6): J^T J is biased
+        columns = torch.func.vmap(lambda axis: torch.func.jvp(slope, (still,), (axis,))[1])(_axes(still))
+        curvature = columns.movedim(0, -1)
         rounding = 10 * torch.finfo(curvature.dtype).eps
         # Undetermined directions become 0.
         inverse = torch.linalg.pinv(0.5 * (curvature + curvature.mT), atol=FLAT, rtol=rounding, hermitian=True)
@@ -122,13 +124,6 @@ def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[
     scale = 2.0 / (1.0 + 0.25 * delta[..., :3].square().sum(-1))
     turned = R_lab_body + scale[..., None, None] * ((half + half @ half) @ R_lab_body)
     return turned, position_lab_mm + delta[..., 3:]
-
-
-def _curvature(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> Tensor:
-    """Return the Hessian (B, 6, 6) of half the sum of squares of residuals (B, M) at delta (B, 6); J^T J is biased."""
-    gradient = torch.func.grad(lambda delta: 0.5 * residuals(delta).square().sum())
-    columns: Tensor = torch.func.vmap(lambda axis: torch.func.jvp(gradient, (delta,), (axis,))[1])(_axes(delta))
-    return columns.movedim(0, -1)
 
 
 def _linearised(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> tuple[Tensor, Tensor]:

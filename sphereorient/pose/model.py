@@ -86,11 +86,6 @@ class Light:
         found = self._map.index_select(0, cell.reshape(-1)).to(across.dtype)
         return found[:, 0].reshape(cell.shape), found[:, 1].reshape(cell.shape)
 
-    def to(self, device: torch.device) -> Light:
-        """Return the same on another device."""
-        parts = {name: getattr(self, name).to(device) for name in ("difference", "black", "noise")}
-        return replace(self, **parts)
-
     def of(self, camera: int) -> Light:
         """Return the light of one camera."""
         one = slice(camera, camera + 1)

@@ -47,10 +47,6 @@ class Pixels:
         """Return some of the disks, by mask (L,) or by index."""
         return self._with(OF_DISKS, lambda part: part[chosen])
 
-    def to(self, device: torch.device) -> Pixels:
-        """Return the same on another device."""
-        return self._with((*OF_DISKS, "tile"), lambda part: part.to(device))
-
     def thinned(self, step: int) -> Pixels:
         """Return every `step`-th place of all disks."""
         places = torch.arange(0, self.grey.shape[1], step)
