@@ -137,8 +137,8 @@ class ChunkTracker:
         expected = {chunk.first: chunk.expected(chunk.first + k, self.fitter.radius_mm) for chunk in chunks}
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
         if self.centre is not None:
-            place = {"position_lab_mm": self.centre.position_lab_mm, "place_precision": self.centre.precision}
-            ahead = {first: replace(pose, **place) for first, pose in ahead.items()}
+            X, precision = self.centre.position_lab_mm, self.centre.precision
+            ahead = {n: replace(pose, position_lab_mm=X, place_precision=precision) for n, pose in ahead.items()}
         followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
         for chunk in chunks:
             poses = followed.get(chunk.first)

@@ -193,8 +193,9 @@ class Fitter:
 
 def moved_to(device: torch.device, record: Record) -> Record:
     """Return a record with its tensors on another device."""
-    parts: dict[str, Any] = {field.name: getattr(record, field.name) for field in fields(record)}
-    return replace(record, **{name: part.to(device) for name, part in parts.items() if isinstance(part, Tensor)})
+    parts = {field.name: getattr(record, field.name) for field in fields(record)}
+    moved: dict[str, Any] = {name: part.to(device) for name, part in parts.items() if isinstance(part, Tensor)}
+    return replace(record, **moved)
 
 
 def base_table(texture: Tensor, diameter_px: float) -> TextureTable:

@@ -71,7 +71,7 @@ class Candidates:
     def each(self) -> list[Candidates]:
         """Return the candidates of each disk alone."""
         counts = self.counts.tolist()
-        rows = zip(self.R_view_body.split(counts), self.score.split(counts), self.reason, strict=True)
+        rows = zip(torch.split(self.R_view_body, counts), torch.split(self.score, counts), self.reason, strict=True)
         return [Candidates.of_disk(R, score, why) for R, score, why in rows]
 
     @property
