@@ -24,8 +24,7 @@ from sphereorient.locate import screened_frames
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import base_table
-from sphereorient.pose.defocus import FIRST_BLUR_PX
-from sphereorient.pose.fitter import first_fitter, widest_px
+from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
 from sphereorient.search import TemplateBank
 
 REPO = Path(__file__).resolve().parents[1]

@@ -41,7 +41,7 @@ from sphereorient.search import (
     ProposeSettings,
     TemplateBank,
 )
-from sphereorient.search.fallback import resized
+from sphereorient.search.candidates import resized
 from sphereorient.statistics.reliability import Z95, reliability, wilson
 from sphereorient.synth import random_texture
 from sphereorient.synth.degrade_scene import misdrawn, worn

@@ -34,8 +34,7 @@ from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
-from sphereorient.pose.defocus import FIRST_BLUR_PX
-from sphereorient.pose.fitter import first_fitter, widest_px
+from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
 from sphereorient.search import TemplateBank, crop_disk, extract_paint
 from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
 

@@ -25,7 +25,7 @@ from sphereorient.cameras import PinholeCamera, R_cam_view
 from sphereorient.evaluate import Bound, cramer_rao_bound
 from sphereorient.locate import Background
 from sphereorient.pose.fitter import CameraView, Fitter, Optics, base_table
-from sphereorient.pose.light import Light
+from sphereorient.pose.model import Light
 from sphereorient.pose.pixels import LinesOfSight
 from sphereorient.sphere import Sampling, SphereRenderer, load_texture
 from sphereorient.synth import random_texture

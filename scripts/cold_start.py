@@ -27,8 +27,7 @@ from sphereorient.locate import Background, Frame
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, LinesOfSight, base_table
-from sphereorient.pose.defocus import FIRST_BLUR_PX
-from sphereorient.pose.fitter import first_fitter
+from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter
 from sphereorient.search import TemplateBank
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.write import default_cameras

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import torch
@@ -14,14 +14,12 @@ from torch import Tensor
 from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses
+from sphereorient.follow.poses import Poses, best_poses
 from sphereorient.follow.settings import RefineSettings
-from sphereorient.locate import Frame, LocateSettings
-from sphereorient.pose.defocus import defocus_radii
+from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import FINEST_PX, Fitter, Optics, Picture, level_of, widest_px
+from sphereorient.pose.fitter import FINEST_PX, Fitter, Optics, Picture, defocus_radii, level_of, widest_px
 from sphereorient.pose.pixels import Pixels
-from sphereorient.search.candidates import Proposer
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.trajectory import Reason
 
@@ -53,24 +51,6 @@ class Appearance:
     usual_apart_rad: float = math.inf  # typical angle between the orientations that two cameras alone give
     together: bool = True  # whether the cameras see the sphere at one position
 
-    def of(self, camera: int) -> Appearance:
-        """Return the appearance in one camera."""
-        return replace(self, fitter=self.fitter.of(camera))
-
-    def on(self, device: torch.device) -> Appearance:
-        """Return the same, computing fits on another device."""
-        return replace(self, fitter=self.fitter.on(device))
-
-    def search(self, proposers: Mapping[str, Proposer], locating: LocateSettings, candidates: int) -> Initialiser:
-        """Return the initialiser for frames of this appearance."""
-        return Initialiser(
-            fitter=self.fitter,
-            proposers=proposers,
-            locating=locating,
-            candidates=candidates,
-            score_min=self.clear_score,
-        )
-
     @property
     def clear_score(self) -> float:
         """Score of a typical right pose; out of reach for blurred pictures."""
@@ -93,11 +73,7 @@ def estimate_appearance(
     if defocus_radii(fitter.optics.blur_px, diameter_px):
         first = replace(first, score_min=ALWAYS)
 
-    def search(fitter: Fitter, frames: Sequence[Sequence[Frame]]) -> list[Poses]:
-        with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
-            return list(pool.map(replace(first, fitter=fitter).poses, frames))
-
-    found = search(fitter, frames)
+    found = first.all_poses(frames)
     pictures = [[shot.picture for shot in frame] for frame in frames]
     if not _clear(found):
         raise _nothing(found)
@@ -105,12 +81,17 @@ def estimate_appearance(
     looked = found
     if gain > APART_GAIN or gap_px > APART_PX:
         # A pose between those of disagreeing cameras would give a wrong light.
-        each = [search(fitter.of(k), [[frame[k]] for frame in frames]) for k in range(len(fitter.views))]
-        frame, X, R, use = _seen_by_each(each)
+        alone = [replace(first, fitter=fitter.of(k)) for k in range(len(fitter.views))]
+        each = [one.all_poses([[frame[k]] for frame in frames]) for k, one in enumerate(alone)]
         looked = [poses for of_camera in each for poses in of_camera]
+        seen = [(frame, camera) for camera, of_camera in enumerate(each) for frame in _clear(of_camera)]
+        X, R, _ = best_poses([each[camera][frame] for frame, camera in seen])
+        use = torch.nn.functional.one_hot(torch.tensor([camera for _, camera in seen]), len(each)).bool()
+        shown = [pictures[frame] for frame, _ in seen]
     else:
-        frame, X, R, use = _seen_by_all(found)
-    pixels = fitter.pixels([pictures[k] for k in frame], X, fitter.optics.fine)
+        X, R, use = best_poses([found[k] for k in _clear(found)])
+        shown = [pictures[k] for k in _clear(found)]
+    pixels = fitter.pixels(shown, X, fitter.optics.fine)
     pixels = pixels.thinned(max(1, round(pixels.grey.shape[1] / ENOUGH)))
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
     fitter, fit = _light_and_blur(fitter, base, pixels, fit, use, given=settings.blur_px is not None)
@@ -118,7 +99,9 @@ def estimate_appearance(
     right = float(fit.score[use].median())
     best, highest = _scores(looked)
     if max(best, right) < highest + NO_BETTER and _times_better(looked) < TELLING:
-        raise _unexplained(best)
+        do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
+        got = f"poses that explain {100 * best:.0f} % of the pictures, as wrong ones do"
+        raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
     if right < highest + NO_BETTER:
         # Dirt or a hidden rim spoils the estimated light: all poses are explained worse than before.
         highest = right - (best - highest)
@@ -158,12 +141,11 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     if not whole:
         return 1.0, 0.0
     tried = [whole[int(k)] for k in torch.linspace(0, len(whole) - 1, min(TRIED, len(whole))).round()]
-    start = [torch.cat([getattr(found[k], name)[:1] for k in tried]) for name in ("position_lab_mm", "R_lab_body")]
     gains, rays = [], []
     for camera, view in enumerate(fitter.views):
         only = torch.zeros(len(tried), cameras, dtype=torch.bool)
         only[:, camera] = True
-        X, R = start
+        X, R, _ = best_poses([found[k] for k in tried])
         for level, step in ((fitter.optics.middle, 3), (fitter.optics.fine, 4)):
             pixels = fitter.pixels([pictures[k] for k in tried], X, level).thinned(step)
             fit = fitter.fit(pixels, X, R, only, level, 3)
@@ -174,24 +156,6 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     gap_mm = torch.stack([triangulate(one, other)[1] for one, other in combinations(rays, 2)]).amax(0)
     px_mm = widest_px(fitter.views) / (2 * fitter.radius_mm)
     return float(torch.stack(gains).amax(0).quantile(0.75)), float(gap_mm.quantile(0.75) * px_mm)
-
-
-Rows = tuple[list[int], Tensor, Tensor, Tensor]  # frames, positions (n, 3), rotations (n, 3, 3), cameras in use (n, C)
-
-
-def _seen_by_all(found: Sequence[Poses]) -> Rows:
-    chosen = _clear(found)
-    X = torch.cat([found[k].position_lab_mm[:1] for k in chosen])
-    R = torch.cat([found[k].R_lab_body[:1] for k in chosen])
-    return chosen, X, R, torch.stack([found[k].use for k in chosen])
-
-
-def _seen_by_each(each: Sequence[Sequence[Poses]]) -> Rows:
-    rows = [(k, camera) for camera, found in enumerate(each) for k in _clear(found)]
-    X = torch.stack([each[camera][k].position_lab_mm[0] for k, camera in rows])
-    R = torch.stack([each[camera][k].R_lab_body[0] for k, camera in rows])
-    use = torch.nn.functional.one_hot(torch.tensor([camera for _, camera in rows]), len(each)).bool()
-    return [k for k, _ in rows], X, R, use
 
 
 def _scores(found: Sequence[Poses]) -> tuple[float, float]:
@@ -222,13 +186,6 @@ def _nothing(found: Sequence[Poses]) -> ExperimentError:
     return ExperimentError(refusal("movies", expected=expected, got=got, do=do))
 
 
-def _unexplained(score: float) -> ExperimentError:
-    """Return the error of a movie that does not show this map."""
-    do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
-    got = f"poses that explain {100 * score:.0f} % of the pictures, as wrong ones do"
-    return ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
-
-
 def _clear(found: Sequence[Poses]) -> list[int]:
     """Return the frames whose best pose explains the picture about as well as in the typical frame."""
     best = torch.tensor([float(poses.score[0, poses.use].min()) if len(poses) else torch.nan for poses in found])
@@ -248,20 +205,18 @@ def _light_and_blur(
     Light estimated with a wrong blur favours that blur: for blurred pictures they alternate several times.
     """
     diameter_px = widest_px(fitter.views)
-    fitter, fit = _with_light(fitter, pixels, fit, use, LIGHT_ROUNDS)
+    fitter, fit = _with_light(fitter, pixels, fit, use)
     soft = not given and defocus_radii(fitter.optics.blur_px, diameter_px) > 0
     for _ in range(SOFT_ROUNDS if soft else 1):
         if not given:
             blur_px = best_blur_px(fitter, base, pixels, fit, use)
             fitter = replace(fitter, optics=Optics(base, blur_px, diameter_px))
-        fitter, fit = _with_light(fitter, pixels, fit, use, LIGHT_ROUNDS)
+        fitter, fit = _with_light(fitter, pixels, fit, use)
     return fitter, fit
 
 
-def _with_light(
-    fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor, rounds: int
-) -> tuple[Fitter, FittedPoses]:
-    for _ in range(rounds):
+def _with_light(fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses]:
+    for _ in range(LIGHT_ROUNDS):
         fitter = fitter.with_light_of(pixels, fit, use)
         fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
     return fitter, fit
@@ -270,32 +225,24 @@ def _with_light(
 def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor) -> float:
     """Return the blur that leaves the least variance unexplained, interpolated between the tried ones."""
     radius_px = widest_px(fitter.views) / 2
-    left: dict[int, float] = {}
-    blurs = _blurs_tried(radius_px)
+    steps = math.log(max(WIDEST * radius_px / FINEST_PX, FINER**7)) / math.log(FINER)
+    blurs = [FINEST_PX * FINER**k for k in range(math.ceil(steps) + 1)]
 
+    @cache
     def unexplained(k: int) -> float:
-        if k not in left:
-            level = level_of(base, blurs[k], 0.0, radius_px)
-            tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 2)
-            # Of all pictures together: their curves differ in height by much and in shape by little.
-            left[k] = float((1.0 - tried.score)[use].clamp_min(LEAST_LEFT).log().mean())
-        return left[k]
+        level = level_of(base, blurs[k], 0.0, radius_px)
+        tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 2)
+        # Of all pictures together: their curves differ in height by much and in shape by little.
+        return float((1.0 - tried.score)[use].clamp_min(LEAST_LEFT).log().mean())
 
     # Downhill from the first guess: each table of the paint costs a tenth of a second.
-    k = min(range(len(blurs)), key=lambda k: abs(blurs[k] - fitter.optics.blur_px))
-    while True:
-        near = [n for n in (k - 1, k, k + 1) if 0 <= n < len(blurs)]
-        best = min(near, key=unexplained)
-        if best == k:
-            break
+    best, k = min(range(len(blurs)), key=lambda k: abs(blurs[k] - fitter.optics.blur_px)), -1
+    while best != k:
         k = best
+        best = min((n for n in (k - 1, k, k + 1) if 0 <= n < len(blurs)), key=unexplained)
     if k in (0, len(blurs) - 1):
         return blurs[k]
-    bend = left[k - 1] - 2 * left[k] + left[k + 1]
-    shift = 0.5 * (left[k - 1] - left[k + 1]) / bend if bend > 0 else 0.0
+    below, here, above = (unexplained(n) for n in (k - 1, k, k + 1))
+    bend = below - 2 * here + above
+    shift = 0.5 * (below - above) / bend if bend > 0 else 0.0
     return float(blurs[k] * FINER**shift)
-
-
-def _blurs_tried(radius_px: float) -> tuple[float, ...]:
-    steps = math.log(max(WIDEST * radius_px / FINEST_PX, FINER**7)) / math.log(FINER)
-    return tuple(FINEST_PX * FINER**k for k in range(math.ceil(steps) + 1))

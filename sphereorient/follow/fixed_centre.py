@@ -1,7 +1,6 @@
 """The fixed centre of a sphere that only rotates, from a few frames; all frames are then fitted there."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import torch
@@ -9,6 +8,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.poses import best_poses
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import EDGE_PX
 from sphereorient.pose.fitter import Fitter
@@ -49,14 +49,11 @@ def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Frame]], sc
     None where no frame has a pose that all of its pictures support.
     """
     fitter = search.fitter
-    with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
-        found = list(pool.map(search.poses, frames))
+    found = search.all_poses(frames)
     rows = [k for k, one in enumerate(found) if len(one) and bool((one.score[0, one.use] >= score_min).all())]
     if not rows:
         return None
-    X = torch.cat([found[k].position_lab_mm[:1] for k in rows])
-    R = torch.cat([found[k].R_lab_body[:1] for k in rows])
-    use = torch.stack([found[k].use for k in rows])
+    X, R, use = best_poses([found[k] for k in rows])
     fine = fitter.optics.fine
     pixels = fitter.pixels([[shot.picture for shot in frames[k]] for k in rows], X, fine)
     fit = fitter.fit(pixels, X, R, use, fine, ITERATIONS)

@@ -1,18 +1,62 @@
-"""Tracking batch by batch, while the frames of the next batch are decoded."""
+"""Tracking batch by batch, while the frames of the next batch are decoded; all cameras together, or each alone."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
-from itertools import accumulate, islice
+from dataclasses import dataclass, replace
+from itertools import accumulate, islice, pairwise
 
+import torch
+
+from sphereorient import so3
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import spread_frames
 from sphereorient.follow.appearance import Appearance
-from sphereorient.follow.per_camera import PerCameraTracker
-from sphereorient.follow.poses import Poses
-from sphereorient.follow.tracker import ChunkTracker
+from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.poses import Poses, no_pose
+from sphereorient.follow.settings import RefineSettings
+from sphereorient.follow.tracker import OWN, ChunkTracker
 from sphereorient.locate import Frame, screened_frames
 from sphereorient.pose import CameraView
+from sphereorient.trajectory import Reason
+
+
+class PerCameraTracker:
+    """Tracks the sphere in each camera alone; the first that sees it gives the pose, the others contradict."""
+
+    def __init__(self, appearance: Appearance, search: Initialiser, settings: RefineSettings) -> None:
+        fitter = appearance.fitter
+        alone = [replace(appearance, fitter=fitter.of(k)) for k in range(len(fitter.views))]
+        self.trackers = [ChunkTracker(one, search, settings) for one in alone]
+
+    def batches(self, frames: range) -> list[list[int]]:
+        """Return the lengths of the chunks of each batch; see `ChunkTracker`."""
+        return self.trackers[0].batches(frames)
+
+    def track(self, shots: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]) -> Iterator[Poses]:
+        """Track the chunks of one batch; see `ChunkTracker`."""
+        each = [tracker.track([movie], batch, time_s) for tracker, movie in zip(self.trackers, shots, strict=True)]
+        yield from (cameras_disagree(poses) for poses in zip(*each, strict=True))
+
+
+def cameras_disagree(alone: Sequence[Poses]) -> Poses:
+    """Return one frame's poses of the first of C cameras that sees the sphere, with the results of the others alone."""
+    reason = [poses.reason[0] for poses in alone]
+    seeing = [k for k, poses in enumerate(alone) if len(poses) and bool(poses.use.any())]
+    if not seeing:
+        return no_pose(len(alone), [Reason.LOW_SCORE if why is Reason.OK else why for why in reason])
+    main, parts = alone[seeing[0]], alone[seeing[0]].parts()
+    for name in ("own_turn", "own_move", *OWN):
+        parts[name] = parts[name].new_zeros(len(main), len(alone), *parts[name].shape[2:])
+    for k in seeing:
+        parts["own_turn"][:, k] = so3.log(alone[k].R_lab_body[:1] @ main.R_lab_body.mT)
+        parts["own_move"][:, k] = alone[k].position_lab_mm[:1] - main.position_lab_mm
+        for name in OWN:
+            own = getattr(alone[k], name)[:, 0]
+            parts[name][:, k] = own if k == seeing[0] else own[:1]
+        if k != seeing[0]:
+            reason[k] = Reason.CONTRADICTS
+    use = torch.arange(len(alone)) == seeing[0]
+    return Poses(**parts, use=use, reason=tuple(reason))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,8 +92,9 @@ class Follower:
 
     def follow(self, batches: Sequence[Batch]) -> Iterator[tuple[Batch, list[Poses]]]:
         """Yield the poses of each frame, batch by batch; consecutive batches are decoded ahead."""
-        for stretch in _consecutive(batches):
-            yield from self._follow(stretch)
+        breaks = [k for k in range(1, len(batches)) if batches[k - 1].last != batches[k].first]
+        for first, last in pairwise([0, *breaks, len(batches)] if batches else []):
+            yield from self._follow(batches[first:last])
 
     def _follow(self, batches: Sequence[Batch]) -> Iterator[tuple[Batch, list[Poses]]]:
         streams, time_s = self.recording.streams, self.recording.timeline.time_s
@@ -61,7 +106,7 @@ class Follower:
             ]
 
             def ahead(batch: Batch) -> list[Future[list[Frame]]]:
-                return [pool.submit(_taken, movie, len(batch)) for movie in movies]
+                return [pool.submit(list, islice(movie, len(batch))) for movie in movies]
 
             coming = ahead(batches[0])
             for k, batch in enumerate(batches):
@@ -71,34 +116,17 @@ class Follower:
                 yield batch, list(self.tracker.track(read, batch.lengths, times))
 
 
-def _taken(frames: Iterator[Frame], count: int) -> list[Frame]:
-    return list(islice(frames, count))
-
-
-def _consecutive(batches: Sequence[Batch]) -> Iterator[list[Batch]]:
-    stretch: list[Batch] = []
-    for batch in batches:
-        if stretch and stretch[-1].last != batch.first:
-            yield stretch
-            stretch = []
-        stretch.append(batch)
-    if stretch:
-        yield stretch
-
-
 def sample_frames(recording: Recording, views: Sequence[CameraView], count: int) -> list[tuple[Frame, ...]]:
     """Return `count` frames of all cameras, spread over the movies; each the first readable one of its stretch."""
     total = len(recording.timeline)
     spread = spread_frames(range(total), count)
     taken = []
     for first, last in zip(spread, [*spread[1:], total], strict=True):
-        frames = zip(
-            *(
-                screened_frames(stream, view.background, first, max(last, first + 1))
-                for stream, view in zip(recording.streams, views, strict=True)
-            ),
-            strict=True,
-        )
+        movies = [
+            screened_frames(stream, view.background, first, max(last, first + 1))
+            for stream, view in zip(recording.streams, views, strict=True)
+        ]
+        frames = zip(*movies, strict=True)
         best = next(frames)
         for shots in frames:
             if all(shot.usable for shot in best):

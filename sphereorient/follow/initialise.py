@@ -1,6 +1,7 @@
 """The pose of a single frame without history: outlines, search over all rotations, fits from coarse to fine."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import torch
@@ -9,11 +10,11 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import R_cam_view
 from sphereorient.follow.poses import Poses, no_pose, poses_of
-from sphereorient.locate import Found, Frame, LocateSettings, find_ball, find_positions, sightings_of
+from sphereorient.locate import Found, Frame, LocateSettings, Positions, find_ball, find_positions, sightings_of
 from sphereorient.locate.outline import Outline, find_blobs
 from sphereorient.pose.fitter import CameraView, Fitter, Picture
 from sphereorient.search.candidates import Proposer
-from sphereorient.search.crop import crop_disk
+from sphereorient.search.normalisation import crop_disk
 from sphereorient.trajectory import Reason
 
 DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin
@@ -38,6 +39,11 @@ class Initialiser:
     score_min: float = 0.0  # where no picture is explained this well, other outlines are tried
     finalists: int = 2  # poses that are fitted to all detail
 
+    def all_poses(self, frames: Sequence[Sequence[Frame]]) -> list[Poses]:
+        """Find the poses of n frames of C pictures; see `poses`."""
+        with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
+            return list(pool.map(self.poses, frames))
+
     def poses(self, shots: Sequence[Frame]) -> Poses:
         """Find all poses that the C pictures of one instant allow; unusable pictures take no part.
         Black paint that hides half of a rim leaves arcs that a smaller circle fits as well: where no picture is
@@ -53,41 +59,56 @@ class Initialiser:
             narrower = self.locating.model_copy(update={"diameter_tolerance": tolerance})
             poses = max(poses, self._with_outlines(shots, narrower), key=_best_score)
         if _best_score(poses) < self.score_min:
-            found = [
-                relocalise(shot.picture, view, self.proposers[view.name], self.locating)
-                if shot.usable
-                else (None, shot.reason)
-                for view, shot in zip(self.fitter.views, shots, strict=True)
-            ]
-            poses = max(poses, self._search(shots, found), key=_best_score)
+            poses = max(poses, self._search(shots, self._found(shots, self.relocalise)), key=_best_score)
         return poses
 
     def _with_outlines(self, shots: Sequence[Frame], locating: LocateSettings) -> Poses:
-        views = self.fitter.views
-        found = [
-            find_ball(shot.picture, view.background, view.diameter_px, locating) if shot.usable else (None, shot.reason)
-            for view, shot in zip(views, shots, strict=True)
-        ]
-        if len(found) > 1 and all(outline is not None for outline, _ in found):
-            seen = {view.name: sightings_of([one]) for view, one in zip(views, found, strict=True)}
-            cameras = {view.name: view.camera for view in views}
-            gap_mm = find_positions(seen, cameras, 2 * self.fitter.radius_mm).gap_mm[0]
-            if float(gap_mm) > GAP_SHARE * self.fitter.radius_mm:
-                # The cameras see different things: take the one whose picture is explained better.
-                alone = [
-                    [one if k == kept else (None, Reason.OUTLINE) for k, one in enumerate(found)]
-                    for kept in range(len(found))
-                ]
-                return max((self._search(shots, each) for each in alone), key=_best_score)
+        found = self._found(shots, lambda seen, view: find_ball(seen, view.background, view.diameter_px, locating))
+        both = len(found) > 1 and all(outline is not None for outline, _ in found)
+        if both and float(self._placed(found).gap_mm[0]) > GAP_SHARE * self.fitter.radius_mm:
+            # The cameras see different things: take the one whose picture is explained better.
+            alone = [
+                [one if k == kept else (None, Reason.OUTLINE) for k, one in enumerate(found)]
+                for kept in range(len(found))
+            ]
+            return max((self._search(shots, each) for each in alone), key=_best_score)
         return self._search(shots, found)
+
+    def relocalise(self, picture: Picture, view: CameraView) -> Found:
+        """Return the outline of usual radius where the texture map explains the disk best, or None and the reason."""
+        proposer = self.proposers[view.name]
+        difference = view.background.difference(picture)
+        blobs = find_blobs(difference, view.background.noise, view.diameter_px, self.locating)
+        if not blobs:
+            return None, Reason.NOT_FOUND
+        radius = view.diameter_px / 2
+        steps = [STEP * radius * k for k in range(-REACH, REACH + 1)]
+        places = [(blobs[0].u_px + right, blobs[0].v_px + down) for down in steps for right in steps]
+        disks = [torch.from_numpy(crop_disk(picture, u, v, radius, proposer.size_px)) for u, v in places]
+        proposals = proposer.propose(torch.stack(disks))
+        if not len(proposals.score):
+            return None, Reason.LOW_SCORE
+        best = int(torch.searchsorted(proposals.offset, int(proposals.score.argmax()), right=True)) - 1
+        u, v = places[best]
+        return Outline(u_px=u, v_px=v, radius_px=radius, rms_px=LOOSE * radius, coverage=0.0), Reason.OK
+
+    def _found(self, shots: Sequence[Frame], find: Callable[[Picture, CameraView], Found]) -> list[Found]:
+        return [
+            find(shot.picture, view) if shot.usable else (None, shot.reason)
+            for view, shot in zip(self.fitter.views, shots, strict=True)
+        ]
+
+    def _placed(self, found: Sequence[Found]) -> Positions:
+        seen = {view.name: sightings_of([one]) for view, one in zip(self.fitter.views, found, strict=True)}
+        cameras = {view.name: view.camera for view in self.fitter.views}
+        return find_positions(seen, cameras, 2 * self.fitter.radius_mm)
 
     def _search(self, shots: Sequence[Frame], found: Sequence[Found]) -> Poses:
         fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])
         if not use.any():
             return no_pose(len(views), reason)
-        seen = {view.name: sightings_of([one]) for view, one in zip(views, found, strict=True)}
-        placed = find_positions(seen, {view.name: view.camera for view in views}, 2 * fitter.radius_mm)
+        placed = self._placed(found)
         starts = [torch.zeros(0, 3, 3, dtype=torch.float64)]
         for view, shot, (outline, _) in zip(views, shots, found, strict=True):
             if outline is None:
@@ -109,10 +130,8 @@ class Initialiser:
             sight = seeing.camera.rays(seeing.camera.project(placed.position_lab_mm))
             along = placed.position_lab_mm[0] - sight.origin_lab_mm[0]
             slack = slack + DEPTH_SHARE**2 * along[:, None] * along
-        pictures = [shot.picture for shot in shots]
-        return self._narrow(
-            pictures, placed.position_lab_mm, torch.linalg.inv(slack), R, no_pose(len(use), reason, use)
-        )
+        pictures, frame = [shot.picture for shot in shots], no_pose(len(use), reason, use)
+        return self._narrow(pictures, placed.position_lab_mm, torch.linalg.inv(slack), R, frame)
 
     def _narrow(self, pictures: Sequence[Picture], place: Tensor, precision: Tensor, R: Tensor, frame: Poses) -> Poses:
         """Fit all starts on the coarsest level, then the best distinct ones on finer levels."""
@@ -161,21 +180,3 @@ def distinct_indices(R: Tensor, nll: Tensor, count: int) -> Tensor:
             chosen.append(k)
             left = left & ~near[k]
     return torch.tensor(chosen, dtype=torch.int64)
-
-
-def relocalise(frame: Picture, view: CameraView, proposer: Proposer, locating: LocateSettings) -> Found:
-    """Return the outline of usual radius where the texture map explains the disk best, or None and the reason."""
-    difference = view.background.difference(frame)
-    blobs = find_blobs(difference, view.background.noise, view.diameter_px, locating)
-    if not blobs:
-        return None, Reason.NOT_FOUND
-    radius = view.diameter_px / 2
-    steps = [STEP * radius * k for k in range(-REACH, REACH + 1)]
-    places = [(blobs[0].u_px + right, blobs[0].v_px + down) for down in steps for right in steps]
-    disks = [torch.from_numpy(crop_disk(frame, u, v, radius, proposer.size_px)) for u, v in places]
-    proposals = proposer.propose(torch.stack(disks))
-    if not len(proposals.score):
-        return None, Reason.LOW_SCORE
-    best = int(torch.searchsorted(proposals.offset, int(proposals.score.argmax()), right=True)) - 1
-    u, v = places[best]
-    return Outline(u_px=u, v_px=v, radius_px=radius, rms_px=LOOSE * radius, coverage=0.0), Reason.OK

@@ -1,6 +1,6 @@
 """Fitted poses of one frame, and of all frames, padded, for the path."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,6 +24,12 @@ class Poses(FittedPoses):
 def poses_of(fit: FittedPoses, chosen: Tensor, use: Tensor, reason: Sequence[Reason]) -> Poses:
     """Return some rows of a fit as the poses of one frame."""
     return Poses(**{name: part[chosen] for name, part in fit.parts().items()}, use=use, reason=tuple(reason))
+
+
+def best_poses(found: Sequence[Poses]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return positions (n, 3), rotations (n, 3, 3) and use (n, C) of the likeliest poses of n frames that have one."""
+    X, R = (torch.cat([getattr(one, name)[:1] for one in found]) for name in ("position_lab_mm", "R_lab_body"))
+    return X, R, torch.stack([one.use for one in found])
 
 
 def no_pose(cameras: int, reason: Sequence[Reason], use: Tensor | None = None) -> Poses:
@@ -53,30 +59,21 @@ class PoseTable(FittedPoses):
         return chosen
 
 
-def pose_table(frames: Sequence[Poses], cameras: int) -> PoseTable:
-    """Put the poses of N frames into arrays."""
-    width = max([len(poses) for poses in frames] + [1])
-    mask = torch.tensor([[k < len(poses) for k in range(width)] for poses in frames]).reshape(-1, width)
-    parts = blank_parts(cameras, len(frames), width)
-    if bool(mask.any()):
-        for name, whole in parts.items():
-            whole[mask] = torch.cat([getattr(poses, name) for poses in frames])
+def pose_table(batches: Iterable[Sequence[Poses]], cameras: int) -> PoseTable:
+    """Put the poses of N frames, given batch by batch, into arrays."""
+    flat: dict[str, list[Tensor]] = {name: [] for name in POSE_PARTS}
+    counts: list[int] = []
+    use: list[Tensor] = []
+    reason: list[tuple[Reason, ...]] = []
+    for frames in batches:
+        counts += [len(poses) for poses in frames]
+        use.append(torch.stack([poses.use for poses in frames]))
+        reason += [poses.reason for poses in frames]
+        for name, pieces in flat.items():
+            pieces.append(torch.cat([getattr(poses, name) for poses in frames]))
+    mask = torch.arange(max([*counts, 1])) < torch.tensor(counts)[:, None]
+    parts = blank_parts(cameras, *mask.shape)
+    for name, whole in parts.items():
+        whole[mask] = torch.cat(flat[name])
     parts["nll"] = parts["nll"] - parts["nll"][:, :1]
-    use = torch.stack([poses.use for poses in frames])
-    return PoseTable(mask=mask, **parts, use=use, reason=tuple(poses.reason for poses in frames))
-
-
-def joined_tables(tables: Sequence[PoseTable]) -> PoseTable:
-    """Return the frames of several tables, one after the other."""
-    width = max(table.mask.shape[1] for table in tables)
-    wide: dict[str, list[Tensor]] = {name: [] for name in ("mask", *POSE_PARTS)}
-    for table in tables:
-        count, more = len(table), width - table.mask.shape[1]
-        blank = blank_parts(table.use.shape[1], count, more) | {"mask": torch.zeros(count, more, dtype=torch.bool)}
-        for name, parts in wide.items():
-            parts.append(torch.cat([getattr(table, name), blank[name]], dim=1))
-    return PoseTable(
-        **{name: torch.cat(parts) for name, parts in wide.items()},
-        use=torch.cat([table.use for table in tables]),
-        reason=tuple(why for table in tables for why in table.reason),
-    )
+    return PoseTable(mask=mask, **parts, use=torch.cat(use), reason=tuple(reason))

@@ -17,12 +17,8 @@ class RefineSettings(BaseModel):
     )
     candidates: int = Field(4, ge=1, description="proposals of each camera that are fitted where nothing is known")
     chunk_frames: int = Field(
-        32,
-        ge=2,
-        description="frames between full searches; chunks begin at its multiples, each independent",
+        32, ge=2, description="frames between full searches; chunks begin at its multiples, each independent"
     )
     chunks: int = Field(
-        4,
-        ge=1,
-        description="chunks followed side by side, one batch; more suit a GPU; memory holds all frames",
+        4, ge=1, description="chunks followed side by side, one batch; more suit a GPU; memory holds all frames"
     )

@@ -1,5 +1,6 @@
 """Poses of all frames: a full search at the first frame of a chunk, then each frame from those before it."""
 
+import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,7 @@ from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import Fitter, Picture, PyramidLevel
+from sphereorient.pose.pixels import Pixels
 from sphereorient.trajectory import Reason
 
 ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
@@ -28,6 +30,7 @@ CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of differe
 AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
 MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
 ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
+OWN = ("own_covariance", "deviation", "score")  # what a camera alone gives, beside rotation and move from the pose
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,7 +40,7 @@ class _Expected:
     use: Tensor  # (C,) bool, cameras that saw the sphere
     reason: tuple[Reason, ...]  # C, why the others did not
     place_precision: Tensor  # (3, 3), 1/mm^2
-    rough: bool = False  # from one predecessor alone: the motion is unknown
+    rough: bool  # from one predecessor alone: the motion is unknown
 
 
 @dataclass(eq=False)
@@ -55,46 +58,36 @@ class _Chunk:
         numbers = [number for number, _ in self.past]
         if not rows or numbers[-1] != frame - 1:
             return None
-        reason = tuple(Reason.LOW_SCORE if why is Reason.OK else why for why in rows[-1].reason)
-        if len(rows) < 2 or numbers[-2] != frame - 2:
-            return self._beside(rows[-1], reason, radius_mm)
-        t0, t1, t2 = (self.time_s[k] for k in range(frame - 2, frame + 1))
-        on = (t2 - t1) / (t1 - t0)  # 1 for even frames
-        if on > LONG_STEP:
-            return self._beside(rows[-1], reason, radius_mm)
-        *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
-        *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
-        *_, R0, R1 = (poses.R_lab_body[0] for poses in rows)
-        turn, move, spread = on * so3.log(R1 @ R0.mT), on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
-        if len(rows) == 3:
-            before = (t1 - t0) / (t0 - self.time_s[frame - 3])
-            # The rate changes from the middle of one step to that of the next as it did between the two before.
-            more = (t2 - t0) / (t1 - self.time_s[frame - 3])
-            turn = (1 + more) * turn - on * before * more * so3.log(R0 @ rows[0].R_lab_body[0].mT)
-            a, b = on * (1 + more), on * before * more
-            further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * rows[0].covariance[0, 3:, 3:]
-            # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
-            if float(further.diagonal().sum()) < (ASTRAY_SHARE * radius_mm) ** 2:
-                move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
-        astray = (ASTRAY_SHARE * radius_mm) ** 2 * torch.eye(3, dtype=torch.float64)
+        last, on = rows[-1], math.inf
+        if len(rows) > 1 and numbers[-2] == frame - 2:
+            t0, t1, t2 = (self.time_s[k] for k in range(frame - 2, frame + 1))
+            on = (t2 - t1) / (t1 - t0)  # 1 for even frames
+        X, R, spread = last.position_lab_mm[0], last.R_lab_body[0], last.covariance[0, 3:, 3:]
+        rough, astray_mm = on > LONG_STEP, MOVE_SHARE * radius_mm
+        if not rough:
+            *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
+            *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
+            *_, R0, R1 = (poses.R_lab_body[0] for poses in rows)
+            turn, move, spread = on * so3.log(R1 @ R0.mT), on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
+            astray_mm = ASTRAY_SHARE * radius_mm
+            if len(rows) == 3:
+                before = (t1 - t0) / (t0 - self.time_s[frame - 3])
+                # The rate changes from the middle of one step to that of the next as it did between the two before.
+                more = (t2 - t0) / (t1 - self.time_s[frame - 3])
+                turn = (1 + more) * turn - on * before * more * so3.log(R0 @ rows[0].R_lab_body[0].mT)
+                a, b = on * (1 + more), on * before * more
+                further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * rows[0].covariance[0, 3:, 3:]
+                # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
+                if float(further.diagonal().sum()) < astray_mm**2:
+                    move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
+            X, R = X1 + move, so3.exp(turn) @ R1
         return _Expected(
-            position_lab_mm=X1 + move,
-            R_lab_body=so3.exp(turn) @ R1,
-            use=rows[-1].use,
-            reason=reason,
-            place_precision=torch.linalg.inv(spread + astray),
-        )
-
-    def _beside(self, last: Poses, reason: tuple[Reason, ...], radius_mm: float) -> _Expected:
-        """Predict the last pose, the motion being unknown."""
-        spread = last.covariance[0, 3:, 3:] + (MOVE_SHARE * radius_mm) ** 2 * torch.eye(3, dtype=torch.float64)
-        return _Expected(
-            position_lab_mm=last.position_lab_mm[0],
-            R_lab_body=last.R_lab_body[0],
+            position_lab_mm=X,
+            R_lab_body=R,
             use=last.use,
-            reason=reason,
-            place_precision=torch.linalg.inv(spread),
-            rough=True,
+            reason=last.reason,
+            place_precision=torch.linalg.inv(spread + astray_mm**2 * torch.eye(3, dtype=torch.float64)),
+            rough=rough,
         )
 
     def saw(self, frame: int, poses: Poses) -> None:
@@ -141,21 +134,16 @@ class ChunkTracker:
 
     def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
         """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
-        expected = {
-            chunk.first: self._in_place(chunk.expected(chunk.first + k, self.fitter.radius_mm)) for chunk in chunks
-        }
+        expected = {chunk.first: chunk.expected(chunk.first + k, self.fitter.radius_mm) for chunk in chunks}
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
+        if self.centre is not None:
+            X, precision = self.centre.position_lab_mm, self.centre.precision
+            ahead = {n: replace(pose, position_lab_mm=X, place_precision=precision) for n, pose in ahead.items()}
         followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
         for chunk in chunks:
             poses = followed.get(chunk.first)
             poses = self._search(frames[chunk.first]) if poses is None else poses
             yield poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
-
-    def _in_place(self, expected: _Expected | None) -> _Expected | None:
-        """Return the prediction, at the fixed centre where there is one."""
-        if expected is None or self.centre is None:
-            return expected
-        return replace(expected, position_lab_mm=self.centre.position_lab_mm, place_precision=self.centre.precision)
 
     def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:
         """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
@@ -215,13 +203,7 @@ class ChunkTracker:
         return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if good[n] else None for n in range(asked)]
 
     def _approached(
-        self,
-        frames: Sequence[Sequence[Picture]],
-        X: Tensor,
-        R: Tensor,
-        use: Tensor,
-        precision: Tensor,
-        rough: Tensor,
+        self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, rough: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Bring rough poses (B,) bool into the basin of the finest level, through coarser ones."""
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
@@ -240,30 +222,29 @@ class ChunkTracker:
             precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
         fine, widest = self.fitter.optics.fine, self.fitter.widest_px
         pixels = self.fitter.pixels(frames, X, fine, widest)
-        some = pixels.thinned(FIRST_EVERY)
-        fit = self.fitter.fit(some, X, R, use, fine, 1, precision)
-        far = self._far(fit, use)
+        fit, far = self._settled(pixels.thinned(FIRST_EVERY), X, R, use, precision, 2)
         if bool(far.any()):
-            more = self.fitter.fit(some, self._from(fit.position_lab_mm), fit.R_lab_body, use, fine, 2, precision)
-            fit = more.where(far, fit)
             begin = torch.where(far[:, None], self._from(fit.position_lab_mm), X)
             pixels = self.fitter.pixels(frames, begin, fine, widest)
-        fit = self.fitter.fit(pixels, self._from(fit.position_lab_mm), fit.R_lab_body, use, fine, 1, precision)
-        far = self._far(fit, use)
+        return self._settled(pixels, self._from(fit.position_lab_mm), fit.R_lab_body, use, precision, 3)[0]
+
+    def _settled(
+        self, pixels: Pixels, X: Tensor, R: Tensor, use: Tensor, precision: Tensor, more: int
+    ) -> tuple[FittedPoses, Tensor]:
+        """Take one step, and `more` from where that one was long; return also where it was, (B,) bool."""
+        fine = self.fitter.optics.fine
+        fit = self.fitter.fit(pixels, X, R, use, fine, 1, precision)
+        turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
+        # One camera's distances scatter; a change of its picture shows in the rotation as well.
+        far = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * self.fitter.radius_mm))
         if bool(far.any()):
-            more = self.fitter.fit(pixels, self._from(fit.position_lab_mm), fit.R_lab_body, use, fine, 3, precision)
-            fit = more.where(far, fit)
-        return fit
+            begin = self._from(fit.position_lab_mm)
+            fit = self.fitter.fit(pixels, begin, fit.R_lab_body, use, fine, more, precision).where(far, fit)
+        return fit, far
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
         """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
         return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
-
-    def _far(self, fit: FittedPoses, use: Tensor) -> Tensor:
-        turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
-        # One camera's distances scatter; a change of its picture shows in the rotation as well.
-        far: Tensor = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * self.fitter.radius_mm))
-        return far
 
     def _supported(self, fit: FittedPoses, use: Tensor) -> Tensor:
         """Return which poses have converged and explain all pictures in use well, (B,) bool."""
@@ -290,7 +271,10 @@ class ChunkTracker:
             return poses
         frames, usable = [shot.picture for shot in shots], torch.tensor([shot.usable for shot in shots])
         if self.centre is not None:
-            poses = self._at_centre(poses, frames)
+            optics = self.fitter.optics
+            fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 3), (optics.fine, 4)))
+            order = explaining_first(fit.nll, fit.score[:, poses.use].mean(-1)).argsort(stable=True)
+            poses = poses_of(fit, order, poses.use, poses.reason)
         if bool((usable & ~poses.use).any()):
             poses = self._all_seeing(poses, frames, usable)
         seen = poses.use & (poses.score[0] >= self.score_min)
@@ -303,31 +287,27 @@ class ChunkTracker:
         if bool((seen == poses.use).all()) or not bool(seen.any()):
             # Keep all where no camera is sure: the path decides.
             return replace(poses, use=seen, reason=tuple(reason))
-        X, R = poses.position_lab_mm, poses.R_lab_body
-        fit = self._looked_at(frames, X, R, seen.expand(len(poses), -1), self.fitter.optics.fine, 4)
+        fit = self._looked_at(frames, poses, seen, ((self.fitter.optics.fine, 4),))
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 
     def _looked_at(
-        self, frames: Sequence[Picture], X: Tensor, R: Tensor, use: Tensor, level: PyramidLevel, iterations: int
+        self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Sequence[tuple[PyramidLevel, int]]
     ) -> FittedPoses:
-        X = self._from(X)
-        pixels = self.fitter.pixels([frames] * len(X), X, level)
-        known = None if self.centre is None else self.centre.precision.expand(len(X), 3, 3)
-        return self.fitter.fit(pixels, X, R, use, level, iterations, known)
-
-    def _at_centre(self, poses: Poses, frames: Sequence[Picture]) -> Poses:
-        R, optics = poses.R_lab_body, self.fitter.optics
-        for level, iterations in ((optics.middle, 3), (optics.fine, 4)):
-            fit = self._looked_at(frames, poses.position_lab_mm, R, poses.use.expand(len(R), -1), level, iterations)
-            R = fit.R_lab_body
-        order = explaining_first(fit.nll, fit.score[:, poses.use].mean(-1)).argsort(stable=True)
-        return poses_of(fit, order, poses.use, poses.reason)
+        """Fit M poses to the pictures in use, (C,) or (M, C), level by level with some iterations at each."""
+        X, R, count = poses.position_lab_mm, poses.R_lab_body, len(poses)
+        known = None if self.centre is None else self.centre.precision.expand(count, 3, 3)
+        for level, iterations in steps:
+            X = self._from(X)
+            pixels = self.fitter.pixels([frames] * count, X, level)
+            fit = self.fitter.fit(pixels, X, R, use.expand(count, -1), level, iterations, known)
+            X, R = fit.position_lab_mm, fit.R_lab_body
+        return fit
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
         """Fit poses to each camera's picture alone; the first that supports one counts, the others contradict."""
-        X, R, fine = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics.fine
         each = seen.expand(len(poses), -1)
-        alone = [self._looked_at(frames, X, R, _only(each, k), fine, 4) for k in range(len(seen))]
+        steps = ((self.fitter.optics.fine, 4),)
+        alone = [self._looked_at(frames, poses, _only(each, k), steps) for k in range(len(seen))]
         right = [bool(seen[k]) and bool(self._supported(one, _only(each, k))[0]) for k, one in enumerate(alone)]
         if not any(right):
             return poses
@@ -343,17 +323,13 @@ class ChunkTracker:
 
     def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
         """Fit poses to all pictures, kept if that explains all: a disk without an outline may be visible."""
-        X, R, optics = poses.position_lab_mm, poses.R_lab_body, self.fitter.optics
-        every = usable.expand(len(poses), -1)
-        for level, iterations in ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)):
-            fit = self._looked_at(frames, X, R, every, level, iterations)
-            X, R = fit.position_lab_mm, fit.R_lab_body
+        optics = self.fitter.optics
+        fit = self._looked_at(frames, poses, usable, ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)))
         order = fit.nll.argsort(stable=True)
-        if not bool(self._supported(fit, every)[order[0]]):
+        if not bool(self._supported(fit, usable.expand(len(poses), -1))[order[0]]):
             return poses
-        return poses_of(
-            fit, order, usable, [Reason.OK if ok else why for ok, why in zip(usable, poses.reason, strict=True)]
-        )
+        reason = [Reason.OK if ok else why for ok, why in zip(usable, poses.reason, strict=True)]
+        return poses_of(fit, order, usable, reason)
 
 
 def _only(usable: Tensor, camera: int) -> Tensor:
@@ -369,7 +345,7 @@ def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> 
     own = {
         "own_turn": so3.log(other.R_lab_body @ fit.R_lab_body.mT),
         "own_move": other.position_lab_mm - fit.position_lab_mm,
-        **{name: getattr(other, name)[:, camera] for name in ("own_covariance", "deviation", "score")},
+        **{name: getattr(other, name)[:, camera] for name in OWN},
     }
     told = {name: getattr(fit, name).clone() for name in own}
     for name, value in own.items():

@@ -9,8 +9,8 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.learn.settings import NetworkSettings
+from sphereorient.search.candidates import distinct
 from sphereorient.search.normalisation import rim_share
-from sphereorient.search.peaks import distinct
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 from sphereorient.sphere.view import disk_offsets

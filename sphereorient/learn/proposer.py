@@ -5,9 +5,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.errors import ShapeError, refusal
 from sphereorient.learn.network import Correlator, find_modes, map_blurs
-from sphereorient.search.candidates import Candidates
+from sphereorient.search.candidates import Candidates, check_disks
 from sphereorient.trajectory import Reason
 
 # Disks at once, padded: the last bits of a product depend on its number of rows, a disk's result must not.
@@ -50,9 +49,7 @@ class LearnedProposer:
 
         A uniform disk has no proposals (`LOW_SCORE`); raise ShapeError for disks of another size.
         """
-        if disks.shape[1:] != (self.size_px, self.size_px):
-            size = f"(F, {self.size_px}, {self.size_px})"
-            raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
+        check_disks(disks, self.size_px, self.size_px)
         filled = F.pad(disks.float(), (0, 0, 0, 0, 0, -len(disks) % BATCH))
         R, score = [torch.zeros(0, CANDIDATES, 3, 3)], [torch.zeros(0, CANDIDATES)]
         for batch in torch.split(filled, BATCH) if len(disks) else ():

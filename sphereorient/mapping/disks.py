@@ -12,8 +12,7 @@ from torch.nn import functional as F
 from sphereorient.cameras import R_cam_view
 from sphereorient.mapping.crops import Crops
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.search.crop import crop_disk
-from sphereorient.search.normalisation import Blur, rim_share
+from sphereorient.search.normalisation import Blur, crop_disk, rim_share
 from sphereorient.sphere.view import perspective_view
 
 SHOWN_MIN = 0.99  # visible share of a disk's pixel below which it does not count

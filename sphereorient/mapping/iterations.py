@@ -25,11 +25,9 @@ from sphereorient.mapping.grid import (
 from sphereorient.mapping.joint import Linearisation, joint_step, linear_system, linearise
 from sphereorient.mapping.record import Iteration, attitude_change_rad, evenly_spread
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.defocus import FIRST_BLUR_PX
-from sphereorient.pose.fit import POSE_PARTS, FittedPoses
-from sphereorient.pose.fitter import CameraView, Fitter, Optics, unknown_light, widest_px
-from sphereorient.pose.learn_light import light_maps, light_sums, noise_curve
-from sphereorient.pose.light import Light
+from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curve
+from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
+from sphereorient.pose.model import Light
 from sphereorient.pose.pixels import Pixels
 
 FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map

@@ -26,9 +26,8 @@ from sphereorient.mapping.iterations import (
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.mapping.record import Iteration, LearntMap, evenly_spread
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.defocus import FIRST_BLUR_PX
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import CameraView, widest_px
+from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, widest_px
 from sphereorient.synth.textures import map_directions
 
 # Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).

@@ -25,7 +25,7 @@ from sphereorient.mapping.disks import Disks, reduced
 from sphereorient.mapping.pairs import RelativeRotations, all_rotations, refine_pairs, search_views, solve_graph
 from sphereorient.mapping.record import Closure, attitude_change_rad, rms
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.search.peaks import distinct
+from sphereorient.search.candidates import distinct
 
 STEP_DEG = 8.0  # of the grid of rotations
 TILT_DEG = 75.0  # between lines of sight in the body, beyond which two disks share too little

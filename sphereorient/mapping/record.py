@@ -7,7 +7,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.pose.fitter import CameraView
-from sphereorient.pose.light import Light
+from sphereorient.pose.model import Light
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

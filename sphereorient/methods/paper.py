@@ -89,7 +89,7 @@ def propose_orientations(
     # An interpolated position is of no use without a picture.
     readable = torch.tensor([reason not in BLIND for reason in sightings.reason])
     placed = sightings.placed & readable
-    proposals = [Candidates.none(sightings.reason[:0])]
+    proposals: list[Candidates] = []
     waiting: list[NDArray[np.float32]] = []
     done = 0
     for k, (picture, _) in enumerate(stream.pictures()):

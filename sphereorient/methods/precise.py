@@ -1,23 +1,22 @@
 """The precise method: appearance of the movie, pose after pose, the most likely path, its motion."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from sphereorient import assemble, motion
 from sphereorient.assemble import Hypotheses
 from sphereorient.experiment.recording import Progress
 from sphereorient.follow.appearance import Appearance, estimate_appearance
 from sphereorient.follow.fixed_centre import find_fixed_centre
-from sphereorient.follow.follower import Follower, sample_frames
+from sphereorient.follow.follower import Follower, PerCameraTracker, sample_frames
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.per_camera import PerCameraTracker
-from sphereorient.follow.poses import Poses, joined_tables, pose_table
+from sphereorient.follow.poses import Poses, pose_table
 from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.methods import results
 from sphereorient.methods.learnt import Learnt
 from sphereorient.methods.method import Job, Method
 from sphereorient.methods.proposers import BlurMatchedSearch, open_views
-from sphereorient.pose.defocus import FIRST_BLUR_PX, defocus_radii, estimate_blur_px
-from sphereorient.pose.fitter import first_fitter, widest_px
+from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, estimate_blur_px, first_fitter, widest_px
 from sphereorient.trajectory import Trajectory
 
 
@@ -52,16 +51,23 @@ def follower(job: Job, appearance: Appearance, search: BlurMatchedSearch) -> Fol
     """Choose how to follow frames: all cameras together, or one by one if they disagree."""
     settings, views = job.settings, appearance.fitter.views
     proposers = search.by_camera(views, appearance.fitter.optics.blur_px)
-    begin = appearance.search(proposers, settings.locate, settings.refine.candidates)
+    begin = Initialiser(
+        fitter=appearance.fitter,
+        proposers=proposers,
+        locating=settings.locate,
+        candidates=settings.refine.candidates,
+        score_min=appearance.clear_score,
+    )
+    there = replace(appearance, fitter=appearance.fitter.on(job.device))
     tracker: ChunkTracker | PerCameraTracker
     if appearance.together:
         centre = None
         if job.recording.experiment.fixed:
             frames = sample_frames(job.recording, views, settings.refine.appearance_frames)
             centre = find_fixed_centre(begin, frames, appearance.score_min)
-        tracker = ChunkTracker(appearance.on(job.device), begin, settings.refine, centre)
+        tracker = ChunkTracker(there, begin, settings.refine, centre)
     else:
-        tracker = PerCameraTracker(appearance.on(job.device), begin, settings.refine)
+        tracker = PerCameraTracker(there, begin, settings.refine)
     return Follower(recording=job.recording, appearance=appearance, tracker=tracker)
 
 
@@ -71,7 +77,7 @@ def join(
     """Choose the path through all frames' candidates and smooth it; return the track and what was learnt."""
     assert follower is not None  # `learn` and `resume` return one
     clock, given, settings = job.recording.clock, job.given, job.settings
-    table = joined_tables([pose_table(poses, len(job.recording.streams)) for poses in measured])
+    table = pose_table(measured, len(job.recording.streams))
     hypotheses = Hypotheses(
         R_lab_body=table.R_lab_body, nll=table.nll, covariance_rad2=table.covariance[..., :3, :3], mask=table.mask
     )

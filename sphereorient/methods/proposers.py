@@ -11,7 +11,7 @@ from sphereorient.experiment.stream import CameraStream
 from sphereorient.locate import find_scene, known_diameter_px
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
-from sphereorient.pose.defocus import defocus_radii
+from sphereorient.pose.fitter import defocus_radii
 from sphereorient.search import FallbackProposer, PaperSearch, Proposer, TemplateBank
 from sphereorient.search.settings import ProposeSettings
 from sphereorient.sphere.texture_table import TextureTable

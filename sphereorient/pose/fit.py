@@ -1,15 +1,19 @@
-"""Pose to hundredths of a degree: Gauss-Newton on rotation and position, all cameras at once, light eliminated."""
+"""Pose to hundredths of a degree: Gauss-Newton on rotation and position, all cameras at once, light eliminated.
+
+`learn_light` estimates the light and the noise that all frames share from their fits.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.light import polynomials
-from sphereorient.pose.model import SphereModel, SphereView, light_columns, sphere_view
+from sphereorient.pose.model import Light, SphereModel, SphereView, light_basis, polynomials, sphere_view
 from sphereorient.pose.pixels import Pixels
 from sphereorient.so3 import inverse_damped, solve_damped
 
@@ -36,10 +40,6 @@ class FittedPoses:
     def parts(self) -> dict[str, Tensor]:
         """Return the arrays by name."""
         return {name: getattr(self, name) for name in POSE_PARTS}
-
-    def to(self, device: torch.device) -> FittedPoses:
-        """Return the same on another device."""
-        return FittedPoses(**{name: part.to(device) for name, part in self.parts().items()})
 
     def where(self, mask: Tensor, other: FittedPoses) -> FittedPoses:
         """Return these poses where the mask (B,) holds, the others elsewhere."""
@@ -119,18 +119,22 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         step = _bounded(solve_damped(whole, force), X[:, None] - origin, seen, radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
+    to_centre = X[:, None] - origin
     own = solve_damped(
         information[..., :3, :3], pull[..., :3] - (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
     )
     own = own - step[:, None, :3]
-    freed = solve_damped(information, pull) - step[:, None]
+    freed = (solve_damped(information, pull) - step[:, None]).flatten(0, 1)
+    alone = _bounded(freed, to_centre.flatten(0, 1)[:, None], freed.new_ones(len(freed), 1), radius_mm)
     shared = by_pose(_shared_scores(at, precision, mixed, pixels.tile), cameras)
     meat = (shared * seen[..., None, None]).sum(1)
     if place_precision is not None:  # the prior position has an error of its own
         meat[:, 3:, 3:] += place_precision
     bread = inverse_damped(whole)
     own_bread = inverse_damped(information[..., :3, :3])
-    edge = _edge_errors(pixels, X[:, None] - origin, cameras, radius_mm) * seen[..., None]
+    # An edge that is EDGE_PX off moves the sphere along each line of sight.
+    px_mm = pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * to_centre.flatten(0, 1).norm(dim=-1, keepdim=True)
+    edge = to_centre * (EDGE_PX * by_pose(px_mm, cameras) / radius_mm) * seen[..., None]
     lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
     covariance = bread @ meat @ bread + lured.mT @ lured
     told = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge
@@ -141,7 +145,7 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         R_lab_body=R,
         covariance=covariance,
         own_turn=own,
-        own_move=_bounded_alone(freed, X[:, None] - origin, radius_mm),
+        own_move=by_pose(alone[:, 3:], cameras),
         own_covariance=own_bread @ shared[..., :3, :3] @ own_bread,
         deviation=by_pose(at.deviation.double(), cameras),
         score=by_pose(_score(at, pixels.inside).double(), cameras),
@@ -157,7 +161,11 @@ def residuals(
     `state`: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
     """
     view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
-    columns, difference, black = light_columns(view, model)
+    difference, black = model.light.at(view.across)  # as learnt
+    tints = polynomials(view.across, max(model.shading.difference, model.shading.black))
+    n, n_black = ((order + 1) * (order + 2) // 2 for order in (model.shading.difference, model.shading.black))
+    learnt = (view.coverage * (view.paint * difference + black))[:, None]
+    columns = torch.cat([learnt * tints[:, :n], view.coverage[:, None] * tints[:, :n_black]], dim=1)
     beyond = (1.0 - view.coverage) * pixels.behind
     noise = model.light.noise.repeat(len(X), 1)
     target = pixels.grey - beyond
@@ -176,11 +184,8 @@ def residuals(
         variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
         weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * pixels.inside
         rounds = grey, weight
-    shading = model.shading
-    tints = polynomials(view.across, max(shading.difference, shading.black))
-    n = (shading.difference + 1) * (shading.difference + 2) // 2
     gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
-    offset = (coefficients[:, None, n:] @ tints[:, : columns.shape[1] - n])[:, 0]
+    offset = (coefficients[:, None, n:] @ tints[:, :n_black])[:, 0]
     step, ground = difference * gain, black * gain + offset
     lit = view.coverage * step
     over = view.paint * step + ground - pixels.behind
@@ -246,21 +251,6 @@ def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) ->
     return step * (0.1 / size.clamp_min(0.1))[:, None]
 
 
-def _edge_errors(pixels: Pixels, to_centre: Tensor, cameras: int, radius_mm: float) -> Tensor:
-    """Return the displacement (B, C, 3), mm, along each line of sight by an edge that is EDGE_PX off."""
-    distance = to_centre.norm(dim=-1, keepdim=True)
-    px_mm = by_pose(pixels.pitch_mm, cameras)[..., None] + by_pose(pixels.pitch_rad, cameras)[..., None] * distance
-    off: Tensor = to_centre * (EDGE_PX * px_mm / radius_mm)
-    return off
-
-
-def _bounded_alone(freed: Tensor, to_centre: Tensor, radius_mm: float) -> Tensor:
-    count = freed.shape[0] * freed.shape[1]
-    alone = torch.ones(count, 1, dtype=freed.dtype, device=freed.device)
-    step = _bounded(freed.reshape(count, 6), to_centre.reshape(count, 1, 3), alone, radius_mm)
-    return step.reshape(freed.shape)[..., 3:]
-
-
 def _shared_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:
     """Sum over tiles the outer products of their scores, (L, 6, 6): errors of neighbours are not independent."""
     by_pose = at.design[:, :6] - mixed.mT.to(at.design.dtype) @ at.design[:, 6:]
@@ -289,3 +279,50 @@ def _score(at: Residuals, inside: Tensor) -> Tensor:
     left = (share * torch.minimum(at.residual.square(), 4.0 * spread[:, None])).sum(-1)
     explained = 1.0 - left / spread.clamp_min(1e-9)
     return torch.where(spread > 1e-6, explained, torch.zeros_like(explained))
+
+
+def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Light:
+    """Estimate the light and the noise of a movie from the fits of B * C disks, those of `use` (B, C) bool."""
+    cameras = use.shape[1]
+    X, R = fit.position_lab_mm, fit.R_lab_body
+    at = residuals(pixels, X, R, None, model, cameras)
+    at = residuals(pixels, X, R, (at.model, at.weight), model, cameras)
+    normal, right = light_sums(at.view, pixels, at.weight / at.variance * use.reshape(-1, 1))
+    difference, black = light_maps(by_pose(normal, cameras).sum(0), by_pose(right, cameras).sum(0))
+    counted = pixels.inside & use.reshape(-1, 1)
+    noise = torch.stack(
+        [noise_curve(at.model[c::cameras], at.residual[c::cameras], counted[c::cameras]) for c in range(cameras)]
+    )
+    return Light(difference=difference, black=black, noise=noise, known=True)
+
+
+def light_sums(view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normal equations of light maps of L disks, (L, 2 K, 2 K) and (L, 2 K); precision (L, P)."""
+    basis = light_basis(view.across)
+    columns = torch.cat([(view.coverage * view.paint)[:, None] * basis, view.coverage[:, None] * basis], dim=1)
+    weighted = columns * precision[:, None]
+    target = pixels.grey - (1.0 - view.coverage) * pixels.behind
+    return (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double()
+
+
+def light_maps(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
+    """Solve the summed normal equations (C, 2 K, 2 K), (C, 2 K) for the maps of difference and black, (C, K) each."""
+    # The basis is nearly dependent (x^2 + y^2 + depth^2 = 1): a ridge of 1e-5 picks the smallest coefficients.
+    ridge = 1e-5 * normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9)
+    solution = torch.linalg.solve(normal + torch.diag_embed(ridge), right).float()
+    difference, black = solution.chunk(2, dim=-1)
+    return difference, black
+
+
+def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:
+    """Return the noise variance's coefficients (4,), not negative, in the grey level, from pixels (N,) inside."""
+    model, residual = model[inside].clamp_min(0).double(), residual[inside].double()
+    order = model.argsort(stable=True)
+    groups = [group for group in order.tensor_split(24) if len(group) >= 50]
+    if len(groups) < 3:
+        return torch.tensor([float(residual.square().mean()) if len(residual) else 1.0, 0.0, 0.0, 0.0])
+    at = torch.stack([model[group].mean() for group in groups])
+    # Robust: the paint's borders leave residuals that are not noise.
+    seen = torch.stack([(1.4826 * residual[group].abs().median()).square() for group in groups]).clamp_min(0.1)
+    design = torch.stack([at**power for power in range(4)], dim=-1) / seen[:, None]
+    return torch.from_numpy(nnls(design.numpy(), np.ones(len(groups)))[0]).float()

@@ -1,34 +1,45 @@
-"""The fit at three levels of blur, and what it needs of each camera."""
+"""The fit at three levels of blur, what it needs of each camera, and a first guess of the blur; `PoseFitter`: alone."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor, nn
 
 from sphereorient.cameras import Camera
-from sphereorient.locate import Background, CameraScene
-from sphereorient.pose.fit import FittedPoses, PoseStart, refine
-from sphereorient.pose.learn_light import learn_light
-from sphereorient.pose.light import FIRST, LATER, Light, Shading
-from sphereorient.pose.model import SphereModel
+from sphereorient.errors import ShapeError, check_tail, refusal
+from sphereorient.locate import Background, CameraScene, Frame, LocateSettings
+from sphereorient.locate.outline import find_blobs
+from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
+from sphereorient.pose.model import FIRST, LATER, Light, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
 from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
 
 Picture = NDArray[np.generic]
+Record = TypeVar("Record", Pixels, PoseStart, FittedPoses, Light)
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
 SIZES = 1.06  # ratio of neighbouring stencil sizes
 CPU = torch.device("cpu")
 FINEST_PX = 0.4  # least blur of any picture, px: a pixel alone has 0.29
 COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
+SOFT, SOFT_PX = 0.06, 1.5  # radii, px: templates of pictures that are blurred by more than both are blurred as well
+FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a good lens
+CALM_PX = 1.0  # blur that is laid over pictures first, against noise
+AROUND = 1.2  # of the radius: the sphere and its rim
+CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and scene lie
+STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
+
+STEPS = (("coarse", 4), ("middle", 3), ("fine", 4))  # pyramid levels, and iterations at each
+NOISE = 1.0  # grey levels, of a background of one grey
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,12 +87,7 @@ class PyramidLevel:
 
     def stencil(self, radius_px: float) -> Stencil:
         """Return the places of a disk of some radius."""
-        return _stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)))
-
-
-@lru_cache(maxsize=64)
-def _stencil(radius_px: float, step_px: int) -> Stencil:
-    return disk_stencil(radius_px, step_px, tile_px=max(6, step_px))
+        return disk_stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)))
 
 
 class Optics:
@@ -121,14 +127,9 @@ class Fitter:
     device: torch.device = CPU  # of the fits; inputs and results are on the CPU
     widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
 
-    @property
-    def shading(self) -> Shading:
-        """Orders of each frame's own light: high while nothing is learnt."""
-        return LATER if self.light.known else FIRST
-
     def model(self, level: PyramidLevel) -> SphereModel:
         """Return what the pictures of a level depend on."""
-        shading = self.shading if level.extra_px == 0 else LATER
+        shading = LATER if self.light.known or level.extra_px > 0 else FIRST  # high orders while nothing is learnt
         return SphereModel(
             radius_mm=self.radius_mm, paint=level.paint, blur_px=level.blur_px, light=self.light, shading=shading
         )
@@ -139,7 +140,7 @@ class Fitter:
 
     def on(self, device: torch.device) -> Fitter:
         """Return a fitter that computes on another device."""
-        return replace(self, optics=self.optics.to(device), light=self.light.to(device), device=device)
+        return replace(self, optics=self.optics.to(device), light=moved_to(device, self.light), device=device)
 
     def of(self, camera: int) -> Fitter:
         """Return the fitter of one camera by itself."""
@@ -165,21 +166,12 @@ class Fitter:
             radius_px = max(1.0, float(self.largest_px(position_lab_mm).max()))
             radius_px = SIZES ** math.ceil(math.log(radius_px) / math.log(SIZES))
         stencil = level.stencil(min(radius_px, 0.5 * max(self.views[0].camera.image_size)))
-        return stacked(
-            [
-                cut_pixels(
-                    frame,
-                    view.background.mean,
-                    view.sight,
-                    tuple(middles[c][b]),
-                    stencil,
-                    level.extra_px,
-                    view.background.shown,
-                )
-                for b, frames in enumerate(pictures)
-                for c, (view, frame) in enumerate(zip(self.views, frames, strict=True))
-            ]
-        )
+        disks = []
+        for b, frames in enumerate(pictures):
+            for c, (view, frame) in enumerate(zip(self.views, frames, strict=True)):
+                scene, blur_px = view.background, level.extra_px
+                disks.append(cut_pixels(frame, scene.mean, view.sight, middles[c][b], stencil, blur_px, scene.shown))
+        return stacked(disks)
 
     def fit(
         self,
@@ -192,14 +184,18 @@ class Fitter:
         place_precision: Tensor | None = None,
     ) -> FittedPoses:
         """Refine B poses at one level; see `refine`."""
-        there = self.device
         begin = PoseStart(
-            position_lab_mm=position_lab_mm.to(there),
-            R_lab_body=R_lab_body.to(there),
-            use=use.to(there),
-            place_precision=None if place_precision is None else place_precision.to(there),
+            position_lab_mm=position_lab_mm, R_lab_body=R_lab_body, use=use, place_precision=place_precision
         )
-        return refine(pixels.to(there), begin, self.model(level), iterations).to(CPU)
+        fit = refine(moved_to(self.device, pixels), moved_to(self.device, begin), self.model(level), iterations)
+        return moved_to(CPU, fit)
+
+
+def moved_to(device: torch.device, record: Record) -> Record:
+    """Return a record with its tensors on another device."""
+    parts = {field.name: getattr(record, field.name) for field in fields(record)}
+    moved: dict[str, Any] = {name: part.to(device) for name, part in parts.items() if isinstance(part, Tensor)}
+    return replace(record, **moved)
 
 
 def base_table(texture: Tensor, diameter_px: float) -> TextureTable:
@@ -211,3 +207,124 @@ def first_fitter(views: Sequence[CameraView], radius_mm: float, base: TextureTab
     """Return a fitter with an assumed blur, and flat light."""
     optics = Optics(base, blur_px, widest_px(views))
     return Fitter(views=views, radius_mm=radius_mm, optics=optics, light=unknown_light(views))
+
+
+def defocus_radii(blur_px: float, diameter_px: float) -> float:
+    """Return the blur of pictures, radii, as the search needs it: 0 unless they are defocused."""
+    blur = 2 * blur_px / diameter_px
+    return blur if blur > SOFT and blur_px > SOFT_PX else 0.0
+
+
+def estimate_blur_px(views: Sequence[CameraView], shots: Sequence[Sequence[Frame]], locating: LocateSettings) -> float:
+    """Return the standard deviation of the blur, px, of the steepest edges about the sphere: median of n x C frames.
+    A first guess, biased by noise and paint without edges. 0 where no frame shows a blob of the sphere's size.
+    Source: a step of height h under a Gaussian blur sigma is h / (sigma sqrt(2 pi)) steep at most.
+    """
+    found = [
+        _steepest(shot.picture.astype(np.float32), view, locating)
+        for frame in shots
+        for view, shot in zip(views, frame, strict=True)
+        if shot.usable
+    ]
+    told = [blur for blur in found if blur is not None]
+    return float(np.median(told)) if told else 0.0
+
+
+def _steepest(picture: NDArray[np.float32], view: CameraView, locating: LocateSettings) -> float | None:
+    """Return the blur of the steepest edge about the likeliest blob, px; None without one."""
+    blobs = find_blobs(view.background.difference(picture), view.background.noise, view.diameter_px, locating)
+    if not blobs or blobs[0].merit <= 0:
+        return None
+    reach = round(AROUND * view.diameter_px / 2)
+    left, top = max(0, round(blobs[0].u_px) - reach), max(0, round(blobs[0].v_px) - reach)
+    window = picture[top : round(blobs[0].v_px) + reach + 1, left : round(blobs[0].u_px) + reach + 1]
+    return steepest_blur_px(window)
+
+
+def steepest_blur_px(picture: NDArray[np.float32]) -> float:
+    """Return the standard deviation of the blur, px, of the steepest edge between the darkest and the brightest."""
+    calm = cv2.GaussianBlur(picture, (0, 0), CALM_PX)
+    slope = np.hypot(cv2.Scharr(calm, cv2.CV_32F, 1, 0), cv2.Scharr(calm, cv2.CV_32F, 0, 1)) / 32
+    low, high = np.percentile(calm, CONTRAST)
+    steepest = float(np.percentile(slope, STEEPEST))
+    blur = float(high - low) / max(steepest * np.sqrt(2 * np.pi), 1e-9)
+    return float(np.sqrt(max(blur**2 - CALM_PX**2, 0.0)))
+
+
+class PoseFitter(nn.Module):
+    """Fits poses of a sphere of known texture to pictures of one or more calibrated cameras, coarse to fine.
+
+    Args:
+        cameras: one, or C of them.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white.
+        radius_mm: of the sphere.
+        diameter_px: expected diameter of the sphere's disk in the pictures.
+        blur_px: standard deviation of optics, pixel and exposure together, px.
+        background: (C, H, W), grey levels of the scene without the sphere; None: black.
+    """
+
+    def __init__(
+        self,
+        cameras: Camera | Sequence[Camera],
+        texture: Tensor | NDArray[np.generic],
+        *,
+        radius_mm: float,
+        diameter_px: float,
+        blur_px: float = 0.625,
+        background: Tensor | NDArray[np.generic] | None = None,
+    ) -> None:
+        super().__init__()
+        seen = list(cameras) if isinstance(cameras, Sequence) else [cameras]
+        self.register_buffer("texture", torch.as_tensor(texture).float())
+        views = []
+        for k, camera in enumerate(seen):
+            width, height = camera.image_size
+            mean = np.zeros((height, width), np.float32) if background is None else _grey(background[k])
+            noise = np.full(mean.shape, NOISE, np.float32)
+            scene = CameraScene(
+                background=Background(mean=mean, noise=noise, full_scale=float("inf")), diameter_px=diameter_px
+            )
+            views.append(CameraView.of(f"camera {k + 1}", camera, scene))
+        base = base_table(torch.as_tensor(texture).float().cpu(), diameter_px)
+        self.fitter = first_fitter(views, radius_mm, base, blur_px)
+
+    def forward(
+        self,
+        pictures: Tensor | NDArray[np.generic],
+        R_lab_body: ArrayLike | Tensor,
+        position_lab_mm: ArrayLike | Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return fitted R_lab_body (..., 3, 3), position_lab_mm (..., 3) and covariance (..., 6, 6), float64.
+        The covariance is of delta (rad, lab) and position (mm). Pictures (..., C, H, W) are grey levels, (..., H, W)
+        for a single camera; the start is right to about 10 degrees and a few pixels.
+
+        Raises:
+            ShapeError: shapes that do not fit together.
+        """
+        R, X = (torch.as_tensor(part, dtype=torch.float64) for part in (R_lab_body, position_lab_mm))
+        check_tail("R_lab_body", R, 3, 3)
+        check_tail("position_lab_mm", X, 3)
+        device = self.get_buffer("texture").device
+        fitter = self.fitter if device == self.fitter.device else self.fitter.on(device)
+        views = fitter.views
+        height, width = views[0].background.mean.shape
+        grey = torch.as_tensor(pictures)
+        lead = R.shape[:-2]
+        if grey.shape[-2:] != (height, width) or grey.numel() != lead.numel() * len(views) * height * width:
+            expected = f"(..., {len(views)}, {height}, {width}) with {lead.numel()} poses"
+            raise ShapeError(
+                refusal("pictures", expected=expected, got=str(tuple(grey.shape)), do="pass one picture per camera")
+            )
+        frames = [[_grey(one) for one in row] for row in grey.reshape(-1, len(views), height, width)]
+        R, X = R.reshape(-1, 3, 3), X.expand(*lead, 3).reshape(-1, 3)
+        use = torch.ones(len(R), len(views), dtype=torch.bool)
+        covariance = torch.zeros(len(R), 6, 6, dtype=torch.float64)
+        for name, iterations in STEPS if len(R) else ():
+            level = getattr(fitter.optics, name)
+            fit = fitter.fit(fitter.pixels(frames, X, level), X, R, use, level, iterations)
+            R, X, covariance = fit.R_lab_body, fit.position_lab_mm, fit.covariance
+        return R.reshape(*lead, 3, 3), X.reshape(*lead, 3), covariance.reshape(*lead, 6, 6)
+
+
+def _grey(picture: Tensor | NDArray[np.generic]) -> NDArray[np.float32]:
+    return np.asarray(torch.as_tensor(picture).detach().cpu().numpy(), np.float32)

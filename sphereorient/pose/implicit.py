@@ -78,9 +78,14 @@ def implicit_pose(
     def about(delta: Tensor) -> Tensor:
         return counted(*_moved(R, X, delta))
 
-    gradient = torch.func.grad(lambda delta: 0.5 * about(delta).square().sum())(still)
-    with torch.no_grad():
-        inverse = _inverse(_curvature(about, still))
+    slope = torch.func.grad(lambda delta: 0.5 * about(delta).square().sum())
+    gradient = slope(still)
+    with torch.no_grad():  # the Hessian (B, 6, 6): J^T J is biased
+        columns = torch.func.vmap(lambda axis: torch.func.jvp(slope, (still,), (axis,))[1])(_axes(still))
+        curvature = columns.movedim(0, -1)
+        rounding = 10 * torch.finfo(curvature.dtype).eps
+        # Undetermined directions become 0.
+        inverse = torch.linalg.pinv(0.5 * (curvature + curvature.mT), atol=FLAT, rtol=rounding, hermitian=True)
     step = -(inverse @ gradient[..., None])[..., 0]
     arrived = known & (step[:, :3].norm(dim=-1) < ARRIVED_RAD) & (step[:, 3:].norm(dim=-1) < ARRIVED_MM)
     step = torch.where(arrived[:, None], step, 0.0)
@@ -121,13 +126,6 @@ def _moved(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[
     return turned, position_lab_mm + delta[..., 3:]
 
 
-def _curvature(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> Tensor:
-    """Return the Hessian (B, 6, 6) of half the sum of squares of residuals (B, M) at delta (B, 6); J^T J is biased."""
-    gradient = torch.func.grad(lambda delta: 0.5 * residuals(delta).square().sum())
-    columns: Tensor = torch.func.vmap(lambda axis: torch.func.jvp(gradient, (delta,), (axis,))[1])(_axes(delta))
-    return columns.movedim(0, -1)
-
-
 def _linearised(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> tuple[Tensor, Tensor]:
     """Return the residuals (B, M) and their slopes (B, 6, M); row b depends on delta b alone: six jvps suffice."""
     along = torch.func.vmap(lambda axis: torch.func.jvp(residuals, (delta,), (axis,))[:2])
@@ -137,14 +135,6 @@ def _linearised(residuals: Callable[[Tensor], Tensor], delta: Tensor) -> tuple[T
 
 def _axes(delta: Tensor) -> Tensor:
     return torch.eye(6, dtype=delta.dtype, device=delta.device)[:, None].expand(6, *delta.shape)
-
-
-def _inverse(curvature: Tensor) -> Tensor:
-    """Invert symmetric (B, 6, 6); undetermined directions become 0."""
-    rounding = 10 * torch.finfo(curvature.dtype).eps
-    symmetric = 0.5 * (curvature + curvature.mT)
-    inverse: Tensor = torch.linalg.pinv(symmetric, atol=FLAT, rtol=rounding, hermitian=True)
-    return inverse
 
 
 def _checked(R: Tensor, X: Tensor, use: Tensor | None, iterations: int) -> Tensor:

@@ -1,20 +1,103 @@
-"""The measuring model: the painted sphere in the pixels of a camera, blurred, and its derivatives by the pose."""
+"""The measuring model: the painted sphere in the pixels of a camera, blurred, its derivatives by the pose, its light.
+
+Light: brightness of white and black paint over the disk, low-order maps per camera, estimated from the movie.
+"""
+
+from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from sphereorient.pose.light import LATER, Light, Shading, polynomials
 from sphereorient.pose.pixels import Pixels
 from sphereorient.so3 import cross_first_axis
 from sphereorient.sphere.texture_table import TextureTable
+from sphereorient.sphere.view import nearest_approach
 
 SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself
 RIM_NODES = 4  # look-ups along the radius near the limb, where the paint is compressed
 DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of the paint is infinite on the limb
+MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
+ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shading:
+    """Orders of the polynomials by which a frame's light may differ from the learnt one."""
+
+    difference: int
+    black: int
+
+
+FIRST = Shading(difference=4, black=2)  # before the light is estimated
+LATER = Shading(difference=2, black=1)
+
+
+def polynomials(across: Tensor, order: int) -> Tensor:
+    """Return all monomials of x and y up to an order, (..., K, P), from places (..., 2, P)."""
+    x, y = across[..., 0, :], across[..., 1, :]
+    columns = [torch.ones_like(x)]
+    last = columns
+    for _ in range(order):
+        last = [last[0] * x, *(column * y for column in last)]
+        columns = [*columns, *last]
+    return torch.stack(columns, dim=-2)
+
+
+def light_basis(across: Tensor) -> Tensor:
+    """Return the basis of light maps, (..., K, P): polynomials in the normal's components, which fit grazing lamps."""
+    depth = (1.0 - across.square().sum(-2)).clamp_min(0).sqrt()
+    return torch.cat([polynomials(across, ORDER), polynomials(across, DEPTH_ORDER) * depth[..., None, :]], dim=-2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Light:
+    """Light on the disk and noise of a movie's pictures, one entry per camera; made by `learn_light`.
+    A pixel of the sphere shows paint * difference + black, each a map over the disk; its noise has the variance
+    noise[0] + noise[1] I + noise[2] I^2 + noise[3] I^3 (read-out; photons; grain of all paint, of white paint alone).
+    """
+
+    difference: Tensor  # (C, K), white less black paint, grey levels
+    black: Tensor  # (C, K)
+    noise: Tensor  # (C, 4), grey levels^2 .. 1 / grey level
+    known: bool  # False: difference is 1 everywhere and black 0
+
+    @cached_property
+    def _map(self) -> Tensor:
+        """Return difference and black over the square about the disk, (C * S * S, 2): a look-up beats 25 functions."""
+        at = (torch.arange(MAP_SIDE, dtype=torch.float32, device=self.difference.device) + 0.5) * (2.0 / MAP_SIDE) - 1.0
+        y, x = torch.meshgrid(at, at, indexing="ij")
+        across = torch.stack([x, y]).reshape(2, -1)
+        # Cells that the limb cuts take their value on the disk.
+        across = across / across.norm(dim=0).clamp_min(1.0)
+        basis = light_basis(across)
+        return torch.stack([self.difference @ basis, self.black @ basis], dim=-1).reshape(-1, 2)
+
+    def at(self, across: Tensor) -> tuple[Tensor, Tensor]:
+        """Return difference and black, (L, P) each, at places (L, 2, P), the C cameras of a pose side by side."""
+        cameras = len(self.difference)
+        column, row = ((across + 1.0) * (0.5 * MAP_SIDE)).to(torch.int32).clamp_(0, MAP_SIDE - 1).unbind(1)
+        camera = torch.arange(len(across), device=across.device, dtype=torch.int32) % cameras
+        cell = (camera[:, None] * MAP_SIDE + row) * MAP_SIDE + column
+        found = self._map.index_select(0, cell.reshape(-1)).to(across.dtype)
+        return found[:, 0].reshape(cell.shape), found[:, 1].reshape(cell.shape)
+
+    def of(self, camera: int) -> Light:
+        """Return the light of one camera."""
+        one = slice(camera, camera + 1)
+        return replace(self, difference=self.difference[one], black=self.black[one], noise=self.noise[one])
+
+    @classmethod
+    def unknown(cls, cameras: int, noise: Tensor) -> Light:
+        """Return flat light, for the first fits."""
+        count = light_basis(torch.zeros(1, 2, 1)).shape[-2]
+        difference = torch.zeros(cameras, count)
+        difference[:, 0] = 1.0
+        return cls(difference=difference, black=torch.zeros(cameras, count), noise=noise, known=False)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,10 +135,9 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
     R = R_lab_body.to(d.dtype)
     # In double precision, once: half a metre less half a metre.
     to_centre = (position_lab_mm[:, :, None] - pixels.origin.double()).to(d.dtype)
-    along = (to_centre * d).sum(1, keepdim=True)
-    aside = to_centre - along * d  # from the line of sight's nearest point to the centre
+    aside = nearest_approach(to_centre, d, 1)
     nearest = (aside * aside).sum(1).sqrt().clamp_min(1e-6 * radius_mm)
-    outward = aside / -nearest[:, None]  # unit, from the centre to the line of sight
+    outward = aside / nearest[:, None]  # unit, from the centre to the line of sight
     q0 = nearest / radius_mm
     distance = to_centre[..., 0].norm(dim=1, keepdim=True)
     blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
@@ -69,13 +151,12 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
     variance = (1.0 - pull * (edge + pull)).clamp(SPREAD_MIN, 1.0)[:, :inner]
     spread = blur * variance.sqrt() * q[:, :inner]
     at = torch.stack([q[:, :inner] - spread, q[:, :inner] + spread], dim=1)
-    middle = _LineOfSight(d[..., :inner], outward[..., :inner], nearest[:, :inner])
-    parts = [_sample(at, variance[:, None], middle, R, model)]
+    line = d, outward, nearest
+    parts = [_sample(at, variance[:, None], [part[..., :inner] for part in line], R, model)]
     if inner < d.shape[-1]:
         outer = slice(inner, None)
         at, moves = _rim_nodes(q0[:, outer], blur, coverage[:, outer], density[:, outer], q[:, outer])
-        rim = _LineOfSight(d[..., outer], outward[..., outer], nearest[:, outer])
-        parts.append(_sample(at, moves, rim, R, model))
+        parts.append(_sample(at, moves, [part[..., outer] for part in line], R, model))
     body, turn, shift = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
     return SphereView(
         paint=body,
@@ -97,16 +178,12 @@ def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, midd
     return middle + middle * (q0[:, None] + blur[:, None] * z - middle), moves.clamp(0.0, 1.0)
 
 
-class _LineOfSight(NamedTuple):
-    direction: Tensor  # (L, 3, P), unit
-    outward: Tensor  # (L, 3, P), unit, from the centre to the line
-    nearest: Tensor  # (L, P), distance of the centre from the line, mm
-
-
 def _sample(
-    at: Tensor, moves: Tensor, line: _LineOfSight, R: Tensor, model: SphereModel
+    at: Tensor, moves: Tensor, line: Sequence[Tensor], R: Tensor, model: SphereModel
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean paint of look-ups (L, P) and derivatives (L, 3, P); `at` in radii, `moves` per pixel moved."""
+    """Return the mean paint of look-ups (L, P) and derivatives (L, 3, P); `at` in radii, `moves` per pixel moved.
+    `line`: direction and outward, unit (L, 3, P), and the distance from the centre (L, P), mm, of lines of sight.
+    """
     d, outward, nearest = line
     # In body components, as the texture: the derivatives are rotated back once, at the end.
     sight_b, outward_b = (R.mT @ d)[:, :, None], (R.mT @ outward)[:, :, None]
@@ -124,14 +201,3 @@ def _sample(
     flat = R @ flat_b - by_sight[:, None] * d - by_outward[:, None] * outward
     shift = flat * (-1.0 / nearest)[:, None] - (radial / model.radius_mm)[:, None] * outward
     return value.mean(1), R @ cross_first_axis(slope, normal_b).mean(2), shift
-
-
-def light_columns(view: SphereView, model: SphereModel) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the light coefficients' columns, (L, K, P), and the learnt maps of difference and black, (L, P)."""
-    shading = model.shading
-    difference, black = model.light.at(view.across)
-    tints = polynomials(view.across, max(shading.difference, shading.black))
-    n_difference, n_black = ((order + 1) * (order + 2) // 2 for order in (shading.difference, shading.black))
-    lit = (view.coverage * (view.paint * difference + black))[:, None]
-    columns = torch.cat([lit * tints[:, :n_difference], view.coverage[:, None] * tints[:, :n_black]], dim=1)
-    return columns, difference, black

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -15,6 +17,8 @@ from torch import Tensor
 from sphereorient.cameras import Camera
 
 VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
+ALONG_PLACES = ("grey", "behind", "inside", "direction")  # parts of `Pixels`, the places along their last axis
+OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm")  # and those with an entry for each disk
 INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
 
 
@@ -41,25 +45,19 @@ class Pixels:
 
     def where(self, chosen: Tensor) -> Pixels:
         """Return some of the disks, by mask (L,) or by index."""
-        names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad", "pitch_mm")
-        parts: dict[str, Any] = {name: getattr(self, name)[chosen] for name in names}
-        return replace(self, **parts)
-
-    def to(self, device: torch.device) -> Pixels:
-        """Return the same on another device."""
-        names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad", "pitch_mm", "tile")
-        parts: dict[str, Any] = {name: getattr(self, name).to(device) for name in names}
-        return replace(self, **parts)
+        return self._with(OF_DISKS, lambda part: part[chosen])
 
     def thinned(self, step: int) -> Pixels:
         """Return every `step`-th place of all disks."""
         places = torch.arange(0, self.grey.shape[1], step)
         places = places[: whole_vectors(len(places))]
-        names = ("grey", "behind", "inside", "direction")
-        parts: dict[str, Any] = {name: getattr(self, name)[..., places] for name in names}
-        origin = self.origin if self.origin.shape[-1] == 1 else self.origin[..., places]
-        inner = int((places < self.inner).sum())
-        return replace(self, **parts, origin=origin, tile=self.tile[places], inner=inner)
+        own = ("origin",) if self.origin.shape[-1] > 1 else ()
+        some = self._with((*ALONG_PLACES, *own, "tile"), lambda part: part[..., places])
+        return replace(some, inner=int((places < self.inner).sum()))
+
+    def _with(self, names: Iterable[str], change: Callable[[Tensor], Tensor]) -> Pixels:
+        parts: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
+        return replace(self, **parts)
 
 
 def whole_vectors(count: int) -> int:
@@ -107,8 +105,10 @@ class Stencil:
     inner: int  # number of first places well within the limb
 
 
+@lru_cache(maxsize=64)
 def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stencil:
-    """Return all places within a radius, `step_px` apart."""
+    """Return all places within a radius, `step_px` apart; tiles are no smaller than a step."""
+    tile_px = max(tile_px, step_px)
     reach = math.ceil(radius_px)
     at = np.arange(-reach, reach + 1)
     at = at[at % step_px == 0]
@@ -172,8 +172,7 @@ def cut_pixels(
 
 def stacked(parts: list[Pixels]) -> Pixels:
     """Return the disks of all parts, which share one stencil, in one record."""
-    names = ("grey", "behind", "inside", "direction", "origin", "axes", "pitch_rad", "pitch_mm")
     widest = max(part.origin.shape[-1] for part in parts)
     full = [replace(part, origin=part.origin.expand(-1, -1, widest)) for part in parts]
-    whole: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in full]) for name in names}
+    whole: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in full]) for name in OF_DISKS}
     return replace(full[0], **whole)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.trajectory import Reason
+
+SAME_DEG = 12.0  # proposals of two proposers nearer than this are one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,6 +37,12 @@ class Candidates:
             raise ShapeError(refusal("Candidates", expected=expected, got=got, do="pass one row per candidate"))
 
     @classmethod
+    def of_disk(cls, R_view_body: Tensor, score: Tensor, otherwise: Reason = Reason.LOW_SCORE) -> Self:
+        """Return the candidates of one disk, (M, 3, 3) and (M,), best first; `otherwise` is why there is none."""
+        reason = (Reason.OK if len(score) else otherwise,)
+        return cls(offset=torch.tensor([0, len(score)]), R_view_body=R_view_body, score=score, reason=reason)
+
+    @classmethod
     def none(cls, reason: Sequence[Reason]) -> Self:
         """Return disks without candidates, for these reasons."""
         return cls(
@@ -45,9 +55,10 @@ class Candidates:
     @classmethod
     def joined(cls, parts: Sequence[Candidates]) -> Self:
         """Return the disks of all parts, one after the other."""
+        parts = [cls.none(()), *parts]
         counts = torch.cat([part.counts for part in parts])
         return cls(
-            offset=torch.nn.functional.pad(counts.cumsum(0), (1, 0)),
+            offset=F.pad(counts.cumsum(0), (1, 0)),
             R_view_body=torch.cat([part.R_view_body for part in parts]),
             score=torch.cat([part.score for part in parts]),
             reason=tuple(why for part in parts for why in part.reason),
@@ -56,6 +67,12 @@ class Candidates:
     def __len__(self) -> int:
         """Return the number of disks or frames."""
         return len(self.offset) - 1
+
+    def each(self) -> list[Candidates]:
+        """Return the candidates of each disk alone."""
+        counts = self.counts.tolist()
+        rows = zip(torch.split(self.R_view_body, counts), torch.split(self.score, counts), self.reason, strict=True)
+        return [Candidates.of_disk(R, score, why) for R, score, why in rows]
 
     @property
     def counts(self) -> Tensor:
@@ -75,7 +92,7 @@ class Candidates:
         own = iter(self.reason)
         return replace(
             self,
-            offset=torch.nn.functional.pad(counts.cumsum(0), (1, 0)),
+            offset=F.pad(counts.cumsum(0), (1, 0)),
             reason=tuple(next(own) if here else why for here, why in zip(placed.tolist(), reason, strict=True)),
         )
 
@@ -103,3 +120,56 @@ class Proposer(Protocol):
 
     def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations for (F, S, S) float32 grey disks; a disk's answer depends on no other disk."""
+
+
+def check_disks(disks: Tensor, height: int, width: int) -> None:
+    """Raise ShapeError unless the disks are (F, height, width)."""
+    if disks.shape[1:] != (height, width):
+        size = f"(F, {height}, {width})"
+        raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
+
+
+class FallbackProposer:
+    """Asks one proposer, and a second one where no score reaches `sure`; the second's answers come first there."""
+
+    def __init__(self, first: Proposer, second: Proposer, sure: float) -> None:
+        self._first, self._second, self._sure = first, second, sure
+        self.size_px = first.size_px
+
+    def propose(self, disks: Tensor) -> Candidates:
+        """Propose orientations for (F, S, S) float32 grey disks."""
+        found = self._first.propose(disks).each()
+        doubt = [f for f, own in enumerate(found) if own.score[:1].sum() < self._sure]
+        if doubt:
+            more = self._second.propose(resized(disks[doubt], self._second.size_px))
+            for f, other in zip(doubt, more.each(), strict=True):
+                found[f] = interleaved(other, found[f])
+        return Candidates.joined(found)
+
+
+def resized(disks: Tensor, size_px: int) -> Tensor:
+    """Return disks (F, S, S) resampled to `size_px` pixels across."""
+    if disks.shape[-1] == size_px:
+        return disks
+    grey: Tensor = F.interpolate(
+        disks[:, None], (size_px, size_px), mode="bilinear", align_corners=False, antialias=True
+    )
+    return grey[:, 0]
+
+
+def interleaved(one: Candidates, other: Candidates) -> Candidates:
+    """Return the proposals of two for one disk in turn, the first one's first, without duplicates."""
+    rank = torch.cat([2 * torch.arange(len(one.score)), 2 * torch.arange(len(other.score)) + 1])
+    order = rank.argsort(stable=True)
+    R = torch.cat([one.R_view_body, other.R_view_body])[order]
+    score = torch.cat([one.score, other.score])[order]
+    new = distinct(R, math.radians(SAME_DEG))
+    return Candidates.of_disk(R[new], score[new], one.reason[0])
+
+
+def distinct(R: Tensor, apart_rad: float) -> Tensor:
+    """Return which rotations (..., M, 3, 3), best first, are peaks, (..., M) bool; the first always is.
+    Non-maximum suppression: any better neighbour within apart_rad suppresses, even a suppressed one.
+    """
+    flat = R.flatten(-2)
+    return ~torch.tril(flat @ flat.mT > 1 + 2 * math.cos(apart_rad), -1).any(-1)  # the product is the trace of A^T B

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.light import polynomials
+from sphereorient.pose.model import polynomials
 from sphereorient.search.normalisation import Blur, rim_share
 from sphereorient.so3 import cross_first_axis
 from sphereorient.sphere import DiskView
@@ -89,21 +89,17 @@ def refine_rotation(level: DetailLevel, target: Target, R_view_body: Tensor, ste
         turned = cross_first_axis(slope, normal_body) * gain[:, None]
         turn = _solved(torch.cat([light, turned], dim=1), left, weight)[:, -3:]
         R = R @ _rotation(turn * (STEP_RAD / turn.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0))
-    return R, _score(level, target, R, weight)
+    light = _light_columns(level, level.paint.sample(R.mT @ level.normal)[0])
+    found = _solved(light, target.grey, weight)
+    cost = _cost(level, target.grey - (found[:, None] @ light)[:, 0])
+    # A negative gain is the negative of the map.
+    return R, torch.where(found[:, 0] > 0, 1.0 - cost / target.unexplained.clamp_min(1e-12), -1.0)
 
 
 def _rotation(turn: Tensor) -> Tensor:
     """Return rotations (Q, 3, 3) by Cayley's formula: as `so3.exp` but for terms of third order, much faster."""
     H = so3.hat(turn)
     return torch.eye(3) + (H + 0.5 * H @ H) / (1.0 + 0.25 * turn.square().sum(-1))[:, None, None]
-
-
-def _score(level: DetailLevel, target: Target, R: Tensor, weight: Tensor) -> Tensor:
-    light = _light_columns(level, level.paint.sample(R.mT @ level.normal)[0])
-    found = _solved(light, target.grey, weight)
-    cost = _cost(level, target.grey - (found[:, None] @ light)[:, 0])
-    # A negative gain is the negative of the map.
-    return torch.where(found[:, 0] > 0, 1.0 - cost / target.unexplained.clamp_min(1e-12), -1.0)
 
 
 def _cost(level: DetailLevel, residual: Tensor) -> Tensor:

@@ -9,15 +9,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.errors import ShapeError, refusal
-from sphereorient.search.candidates import Candidates
+from sphereorient.search.candidates import Candidates, check_disks, distinct
 from sphereorient.search.normalisation import LocalNormalisation
-from sphereorient.search.peaks import best_of_groups, compact_groups, distinct
 from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import orthographic_view, perspective_view
 from sphereorient.sphere.texture_table import TextureTable, texture_table
-from sphereorient.trajectory import Reason
 
 # Disks normalised at once. Fixed, filled up with empty disks: the last bits of sums depend on their number.
 BATCH = 32
@@ -36,6 +33,8 @@ class TemplateBank(nn.Module):
         texture: (H, 2 H), the texture map, 0 black .. 1 white.
         settings: of the search; None: the defaults.
         blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
+
+    `size_px` is the side of the disks, `templates` (K, 3, 3) float32 are the rotations of the bank.
     """
 
     def __init__(
@@ -46,6 +45,7 @@ class TemplateBank(nn.Module):
         texture = torch.as_tensor(texture)
         self._settings = settings
         size, distance = settings.size_px, settings.distance_radii
+        self.size_px = size
         self._view = orthographic_view(size) if distance is None else perspective_view(size, distance)
         self._normalise = LocalNormalisation(size, detail=settings.detail, window=settings.window, clip=settings.clip)
         pixel_rad = 2.0 / size
@@ -55,18 +55,9 @@ class TemplateBank(nn.Module):
         grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
         # (GROUP, G): each group is a column, so that its maximum is one of whole rows.
         self._grid = grid[compact_groups(grid, GROUP).T]
+        self.templates = self._grid.flatten(0, 1)
         self._pixels = int(self._view.inside.sum())
         self._bank = self._templates(paint)
-
-    @property
-    def size_px(self) -> int:
-        """Side of the disks, px."""
-        return self._settings.size_px
-
-    @property
-    def templates(self) -> Tensor:
-        """Return the rotations of the bank, (K, 3, 3) float32."""
-        return self._grid.flatten(0, 1)
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
         """Return R_view_body (..., K, 3, 3) and score (..., K) float64 of each disk, best first, padded with NaN.
@@ -99,10 +90,8 @@ class TemplateBank(nn.Module):
         Raises:
             ShapeError: the disks are of another size.
         """
-        if disks.shape[1:] != (self.size_px, self.size_px):
-            size = f"(F, {self.size_px}, {self.size_px})"
-            raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
-        parts = [Candidates.none(())]
+        check_disks(disks, self.size_px, self.size_px)
+        parts: list[Candidates] = []
         for some in torch.split(disks, PRODUCT):
             for disk, place, peak in zip(some, *self.search(some), strict=True):
                 parts.append(self._refined(disk, self.templates[place[peak][: self._settings.peaks]]))
@@ -137,14 +126,7 @@ class TemplateBank(nn.Module):
         R, score = refine_rotation(self._fine, level_reference(self._fine, disk), R, settings.fine_steps)
         chosen = self._distinct(R, score)
         chosen = chosen[score[chosen] >= settings.score_min]
-        if not len(chosen):
-            return Candidates.none([Reason.LOW_SCORE])
-        return Candidates(
-            offset=torch.tensor([0, len(chosen)]),
-            R_view_body=so3.nearest_rotation(R[chosen].double()),
-            score=score[chosen].double(),
-            reason=(Reason.OK,),
-        )
+        return Candidates.of_disk(so3.nearest_rotation(R[chosen].double()), score[chosen].double())
 
     def _distinct(self, R: Tensor, score: Tensor) -> Tensor:
         order = score.argsort(descending=True, stable=True)
@@ -156,3 +138,32 @@ def _steps(even: Tensor) -> Tensor:
     scale = 127.0 / DEVIATIONS * math.sqrt(even.shape[1])
     # One scale for all templates: as all have length 1, integer products rank them as they are.
     return F.pad((even * scale).round().clamp(-127, 127), (0, -even.shape[1] % 8)).to(torch.int8)
+
+
+def compact_groups(R: Tensor, size: int) -> Tensor:
+    """Divide rotations (K, 3, 3) into groups of neighbours, (G, size) int64; some come twice unless size divides K.
+    Source: halving along the matrix component that varies most (Bentley 1975).
+    """
+    flat = R.flatten(1)
+    groups = math.ceil(len(R) / size)
+    index = torch.arange(groups * size) % len(R)
+
+    def halved(members: Tensor) -> list[Tensor]:
+        if len(members) <= size:
+            return [members]
+        at = flat[members]
+        order = members[at[:, int(at.var(0).argmax())].argsort(stable=True)]
+        middle = len(members) // size // 2 * size
+        return [*halved(order[:middle]), *halved(order[middle:])]
+
+    return torch.stack(halved(index))
+
+
+def best_of_groups(scores: Tensor, count: int) -> Tensor:
+    """Return the best members of the `count` best groups, (F, count) int64, best first, from scores (F, M, G).
+    Indices are into the flattened members and groups; all groups where there are fewer.
+    """
+    groups = scores.shape[2]
+    group = scores.amax(1).topk(min(count, groups), dim=1).indices
+    members = scores.gather(2, group[:, None].expand(-1, scores.shape[1], -1))
+    return members.argmax(1) * groups + group

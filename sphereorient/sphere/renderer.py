@@ -27,11 +27,6 @@ class SphereSight:
     normal: Tensor  # (..., P, 3), outward unit normals, frame of the rays
     depth2: Tensor  # (..., P), 1 - (distance of the ray from the centre, radii)^2: positive on a hit
 
-    @property
-    def distance_radii(self) -> Tensor:
-        """Distance of the rays from the centre, (..., P), radii."""
-        return (1.0 - self.depth2).clamp_min(1e-12).sqrt()
-
 
 def see_sphere(
     rays: Rays, centre: Tensor, R: Tensor, texture: Tensor, radius: float | Tensor = 1.0, *, smooth: bool = False
@@ -157,7 +152,8 @@ class SphereRenderer(nn.Module):
             to_centre = position[k, None] - beside.origin_lab_mm
             fine_mm = torch.linalg.cross(beside.direction_lab, to_centre).norm(dim=-1).detach()
             seen = see_sphere(rays, position[k], R[k].to(position), texture, radius[k, None])
-            share = ((1.0 - seen.distance_radii) * radius[k, None] / fine_mm + 0.5).clamp(0, 1)
+            distance_radii = (1.0 - seen.depth2).clamp_min(1e-12).sqrt()
+            share = ((1.0 - distance_radii) * radius[k, None] / fine_mm + 0.5).clamp(0, 1)
             fine = R.new_zeros(len(k), *reached.shape)
             fine[:, reached] = (share * (seen.paint - sampling.outside)).to(R.dtype)
             windows.append(aperture @ fine @ aperture.mT)

@@ -25,37 +25,27 @@ def load_texture(path: Path) -> Tensor:
     """
     name, do = f"texture {path}", "correct sphere.texture in the experiment"
     content = read_whole(path, PICTURE_BYTES, "a picture file", TextureError, do)
+
+    def refused(expected: str, got: str, do: str) -> TextureError:
+        return TextureError(refusal(name, expected=expected, got=got, do=do))
+
     claimed = claimed_pixels(content)
     if claimed is not None and claimed > MOST_PIXELS:
-        expected, do = (
-            f"a picture of at most {MOST_PIXELS / 1e6:.3g} million pixels",
-            "export it smaller, as 8192 x 4096",
-        )
-        raise TextureError(refusal(name, expected=expected, got=f"{claimed / 1e6:.3g} million", do=do))
+        expected = f"a picture of at most {MOST_PIXELS / 1e6:.3g} million pixels"
+        raise refused(expected, f"{claimed / 1e6:.3g} million", "export it smaller, as 8192 x 4096")
     picture = None if claimed is None else decoded_grey(content)
     if picture is None:
-        raise TextureError(
-            refusal(
-                name, expected="a PNG, TIFF or JPEG picture", got="a file that does not decode", do="export it again"
-            )
-        )
+        raise refused("a PNG, TIFF or JPEG picture", "a file that does not decode", "export it again")
     height, width = picture.shape
     if width != 2 * height or height < 8:
-        raise TextureError(
-            refusal(
-                name,
-                expected="an equirectangular map, twice as wide as high, at least 16 x 8",
-                got=f"{width} x {height}",
-                do="export the whole sphere, longitude -180..180 across and latitude 90..-90 down",
-            )
-        )
+        expected = "an equirectangular map, twice as wide as high, at least 16 x 8"
+        do = "export the whole sphere, longitude -180..180 across and latitude 90..-90 down"
+        raise refused(expected, f"{width} x {height}", do)
     white = WHITE.get(picture.dtype)
     if white is None:
-        raise TextureError(refusal(name, expected="8 or 16 bit grey", got=str(picture.dtype), do="export it as 8 bit"))
+        raise refused("8 or 16 bit grey", str(picture.dtype), "export it as 8 bit")
     if int(picture.min()) == int(picture.max()):
-        raise TextureError(
-            refusal(name, expected="a pattern of paint", got="one single grey", do="check that the map was saved")
-        )
+        raise refused("a pattern of paint", "one single grey", "check that the map was saved")
     return torch.from_numpy(picture.astype(np.float32) / white)
 
 

@@ -74,9 +74,7 @@ def sphere_normals(
     check_tail("direction", direction, 3)
     radius = torch.as_tensor(radius, dtype=direction.dtype, device=direction.device)[..., None]
     direction = direction / direction.norm(dim=-1, keepdim=True)
-    to_centre = centre - origin
-    along = (to_centre * direction).sum(-1, keepdim=True)
-    nearest = along * direction - to_centre
+    nearest = nearest_approach(centre - origin, direction)
     depth2 = radius**2 - nearest.square().sum(-1, keepdim=True)
     if corner > 0:
         depth = radius * smooth_positive(depth2 / radius**2, corner).sqrt()
@@ -88,6 +86,14 @@ def sphere_normals(
     normal = nearest - depth * direction
     normal = normal / normal.norm(dim=-1, keepdim=True).maximum(1e-12 * radius)
     return normal, (depth2 / radius**2)[..., 0]
+
+
+def nearest_approach(to_centre: Tensor, direction: Tensor, axis: int = -1) -> Tensor:
+    """Return the vectors from a sphere's centre to the nearest points of lines of sight; all have x, y, z along `axis`.
+
+    `to_centre` leads from a point of a line to the centre, `direction` is the line's unit direction.
+    """
+    return (to_centre * direction).sum(axis, keepdim=True) * direction - to_centre
 
 
 def smooth_positive(x: Tensor, width: float) -> Tensor:

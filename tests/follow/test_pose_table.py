@@ -40,7 +40,7 @@ def test_the_parts_that_are_gathered_are_all_that_a_pose_has():
 
 def test_every_pose_keeps_its_frame_and_rank():
     frames = [poses(2, 1), no_pose(CAMERAS, (Reason.NOT_FOUND,) * 2), poses(3, 3), poses(1, 4)]
-    table = pose_table(frames, CAMERAS)
+    table = pose_table([frames], CAMERAS)
     assert len(table) == 4
     assert table.mask.tolist() == [[True, True, False], [False] * 3, [True] * 3, [True, False, False]]
     for k, frame in enumerate(frames):
@@ -54,14 +54,14 @@ def test_every_pose_keeps_its_frame_and_rank():
 
 def test_nll_counts_from_the_best_of_its_frame():
     frames = [poses(2, 1), no_pose(CAMERAS, (Reason.NOT_FOUND,) * 2), poses(3, 3)]
-    nll = pose_table(frames, CAMERAS).nll
+    nll = pose_table([frames], CAMERAS).nll
     assert nll[:, 0].tolist() == [0.0, 0.0, 0.0]
     assert nll[0, :2].equal(frames[0].nll - frames[0].nll[0])
     assert nll[2].equal(frames[2].nll - frames[2].nll[0])
 
 
 def test_places_not_in_use_hold_the_unit_rotation_and_zeros():
-    table = pose_table([poses(1, 1), poses(3, 2)], CAMERAS)
+    table = pose_table([[poses(1, 1)], [poses(3, 2)]], CAMERAS)
     free = ~table.mask
     assert int(free.sum()) == 2
     assert table.R_lab_body[free].equal(torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
@@ -73,13 +73,13 @@ def test_places_not_in_use_hold_the_unit_rotation_and_zeros():
 def test_cameras_and_reasons_go_with_their_frames():
     lost = (Reason.NOT_FOUND, Reason.OUTLINE)
     frames = [poses(1, 1, (Reason.OK, Reason.OUTLINE)), no_pose(CAMERAS, lost), poses(1, 2)]
-    table = pose_table(frames, CAMERAS)
+    table = pose_table([frames], CAMERAS)
     assert table.use.tolist() == [[True, False], [False, False], [True, True]]
     assert table.reason == ((Reason.OK, Reason.OUTLINE), lost, OK)
 
 
 def test_frames_that_all_lack_a_pose_make_a_table_with_one_free_place():
-    table = pose_table([no_pose(CAMERAS, (Reason.NOT_FOUND,) * 2)] * 3, CAMERAS)
+    table = pose_table([[no_pose(CAMERAS, (Reason.NOT_FOUND,) * 2)]] * 3, CAMERAS)
     assert table.mask.shape == (3, 1)
     assert not table.mask.any()
     assert table.R_lab_body.shape == (3, 1, 3, 3)
@@ -87,14 +87,14 @@ def test_frames_that_all_lack_a_pose_make_a_table_with_one_free_place():
 
 def test_a_single_camera_has_its_own_axis():
     frame = no_pose(1, (Reason.NOT_FOUND,))
-    table = pose_table([frame], 1)
+    table = pose_table([[frame]], 1)
     assert table.own_turn.shape == (1, 1, 1, 3)
     assert table.use.shape == (1, 1)
 
 
 def test_rows_are_the_chosen_places_and_nan_where_none_is_chosen():
     frames = [poses(2, 1), poses(3, 2), poses(1, 3), no_pose(CAMERAS, (Reason.NOT_FOUND,) * 2)]
-    table = pose_table(frames, CAMERAS)
+    table = pose_table([frames], CAMERAS)
     rows = table.rows(torch.tensor([1, 2, -1, -1]))
     assert set(rows) == set(POSE_PARTS)
     for name, part in rows.items():

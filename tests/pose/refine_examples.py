@@ -14,8 +14,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import Camera, PinholeCamera, TsaiCamera
 from sphereorient.pose.fit import FittedPoses, PoseStart, refine
-from sphereorient.pose.light import LATER, Light, Shading
-from sphereorient.pose.model import SphereModel
+from sphereorient.pose.model import LATER, Light, Shading, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
 from sphereorient.sphere import Sampling, SphereRenderer
 from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table

@@ -10,7 +10,7 @@ from grey_examples import camera_disks, grey_search_of
 from orient_examples import attitudes, texture_of
 
 from sphereorient import so3
-from sphereorient.pose.defocus import defocus_radii, steepest_blur_px
+from sphereorient.pose.fitter import defocus_radii, steepest_blur_px
 from sphereorient.search import GreySearchSettings, TemplateBank
 
 WIDE = 0.2  # radii

@@ -37,7 +37,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses
 from sphereorient.pose.fitter import Optics, PyramidLevel
-from sphereorient.pose.light import FIRST
+from sphereorient.pose.model import FIRST
 from sphereorient.pose.pixels import Pixels, cut_pixels, stacked
 from sphereorient.sphere.texture_table import texture_table
 

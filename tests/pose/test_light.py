@@ -22,9 +22,8 @@ from refine_examples import (
 )
 from torch import Tensor
 
-from sphereorient.pose.learn_light import learn_light, light_maps, light_sums, noise_curve
-from sphereorient.pose.light import FIRST, Light, light_basis, polynomials
-from sphereorient.pose.model import SphereView, sphere_view
+from sphereorient.pose.fit import learn_light, light_maps, light_sums, noise_curve
+from sphereorient.pose.model import FIRST, Light, SphereView, light_basis, polynomials, sphere_view
 from sphereorient.pose.pixels import Pixels
 
 KINDS = ("patches",)

@@ -11,7 +11,7 @@ from refine_examples import BEHIND, BLUR_PX, RADIUS_MM, balls, noisy, paint_of, 
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError
-from sphereorient.pose.pose_fitter import PoseFitter
+from sphereorient.pose.fitter import PoseFitter
 
 RIG = rig_of(64.0)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.search import Candidates, FallbackProposer
-from sphereorient.search.fallback import interleaved, resized
+from sphereorient.search.candidates import interleaved, resized
 from sphereorient.trajectory import Reason
 
 

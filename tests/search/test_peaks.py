@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from sphereorient import so3
-from sphereorient.search.peaks import best_of_groups, compact_groups, distinct
+from sphereorient.search.candidates import distinct
+from sphereorient.search.template_bank import best_of_groups, compact_groups
 
 
 def turned_deg(*angles: float) -> torch.Tensor:

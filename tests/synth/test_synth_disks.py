@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import SettingsError
-from sphereorient.search.crop import crop_disk
+from sphereorient.search.normalisation import crop_disk
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.synth import disks, random_texture, render_frame, severity
 from sphereorient.synth.degrade import OPERATIONS
