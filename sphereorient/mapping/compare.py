@@ -8,11 +8,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.errors import PaintError, ShapeError, refusal
+from sphereorient.errors import PaintError, refusal
 from sphereorient.mapping.grid import texel_areas
+from sphereorient.mapping.learn import LearntMap
 from sphereorient.mapping.patches import Patches, compass, patch_shifts
-from sphereorient.mapping.record import LearntMap
-from sphereorient.sphere.texture import sample_texture, texture_coordinates
+from sphereorient.sphere.texture import check_texture_shape, sample_texture, texture_coordinates
 from sphereorient.sphere.texture_table import TextureTable, texture_table
 from sphereorient.synth.textures import map_directions
 
@@ -111,11 +111,17 @@ def fit_levels(texture: Tensor, reference: Tensor) -> tuple[float, float]:
     columns = torch.stack([x, torch.ones_like(x)], dim=1)
     weight = torch.ones_like(x)
     for _ in range(5):
-        scaled = columns * weight[:, None]
-        gain, offset = torch.linalg.solve(scaled.mT @ columns + 1e-9 * torch.eye(2).double(), scaled.mT @ y).tolist()
+        gain, offset = _weighted_fit(columns, weight, y).tolist()
         left = (y - gain * x - offset).abs()
         weight = 1 / (1 + (left / left.median().clamp_min(1e-3) / 2) ** 2)
     return gain, offset
+
+
+def _weighted_fit(columns: Tensor, weight: Tensor, values: Tensor) -> Tensor:
+    """Return the coefficients (K,) of columns (n, K) that fit values (n,) at weights (n,) best."""
+    weighted = columns * weight[:, None]
+    ridge = 1e-9 * torch.eye(columns.shape[1], dtype=columns.dtype)
+    return torch.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ values)
 
 
 def texture_change(new: Tensor, old: Tensor) -> Tensor:
@@ -159,8 +165,7 @@ def fibonacci_directions(count: int) -> Tensor:
 
 def _known(texture: Tensor) -> tuple[Tensor, Tensor]:
     """Return a map with its mean where unknown, and the mask of the known texels, (H, 2 H) float32 each."""
-    if texture.ndim != 2 or texture.shape[1] != 2 * texture.shape[0]:
-        raise ShapeError(refusal("map", expected="(H, 2 H)", got=str(tuple(texture.shape)), do="pass one map"))
+    check_texture_shape(texture)
     known = torch.isfinite(texture)
     middle = texture[known].mean() if known.any() else torch.tensor(0.5)
     return torch.where(known, texture, middle).float(), known.float()
@@ -222,31 +227,22 @@ def _refined(tables: list[TextureTable], shares: list[Tensor], place: Tensor, R:
         # grey(exp(delta) R d) = grey + slope . (delta x n) = grey + (n x slope) . delta
         turned = torch.linalg.cross(there.T.float(), slope[0].T)
         columns = torch.cat([-turned, reference[0][:, None], ones[:, None]], dim=1).double()
-        weighted = columns * weight[:, None]
-        normal = weighted.mT @ columns + 1e-9 * torch.eye(5).double()
-        step = torch.linalg.solve(normal, weighted.mT @ grey[0].double())[:3]
+        step = _weighted_fit(columns, weight, grey[0].double())[:3]
         R = so3.exp(step * (0.1 / step.norm().clamp_min(1e-12)).clamp_max(1.0)) @ R
     return so3.nearest_rotation(R)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Correction:
-    """A learnt map that corrects an old one."""
+def corrected(learnt: LearntMap, old: Tensor) -> tuple[LearntMap, MapComparison, float]:
+    """Express a learnt map in the frame of an old one (h, 2 h), used where unseen; raise PaintError on a mismatch.
 
-    learnt: LearntMap  # in the old map's body frame, with the old texture where the movies showed none
-    comparison: MapComparison  # displacement against the old map
-    kept_share: float  # of the sphere with the old map's texture
-
-
-def corrected(learnt: LearntMap, old: Tensor) -> Correction:
-    """Express a learnt map in the frame of an old one (h, 2 h), used where unseen; raise PaintError on a mismatch."""
+    Return also the displacement against the old map, and the share of the sphere with the old map's texture.
+    """
     comparison = compare_maps(learnt.texture, old)
     Q = comparison.R_other_reference
     height = max(len(old), len(learnt.texture))
     texture = turned_map(learnt.texture, Q, height)
     known = torch.isfinite(texture)
-    same = torch.eye(3, dtype=torch.float64)
-    before = old.to(texture) if len(old) == height else turned_map(old.to(texture), same, height)
+    before = old.to(texture) if len(old) == height else turned_map(old.to(texture), torch.eye(3), height)
     gain, offset = fit_levels(before, texture)
     new = replace(
         learnt,
@@ -255,8 +251,7 @@ def corrected(learnt: LearntMap, old: Tensor) -> Correction:
         sigma=torch.where(known, nearest_texels(learnt.sigma, Q, height), torch.inf),
         R_lab_body=learnt.R_lab_body @ Q,
     )
-    share = float((texel_areas(height) * ~known).sum() / texel_areas(height).sum())
-    return Correction(learnt=new, comparison=comparison, kept_share=share)
+    return new, comparison, float((texel_areas(height) * ~known).sum() / texel_areas(height).sum())
 
 
 def nearest_texels(values: Tensor, R_map_new: Tensor, height: int) -> Tensor:

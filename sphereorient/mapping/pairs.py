@@ -48,10 +48,44 @@ class RelativeRotations:
         return so3.log(self.R_ji @ (R_lab_body[self.second] @ R_lab_body[self.first].mT).mT)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Closure:
+    """The effect of closing the loops; angles in rad."""
+
+    pairs: int  # of neighbouring instants
+    loops: int  # tried
+    closed: int  # accepted and kept by the graph
+    drift_before_rad: float  # rms error of the closed loops in the chain
+    drift_after_rad: float  # and afterwards
+    moved_rad: float  # rms move of the orientations, the body frame's own turn removed
+
+    @classmethod
+    def of(cls, closed: RelativeRotations, before: Tensor, after: Tensor, *, pairs: int, loops: int) -> Closure:
+        """Compare orientations (N, 3, 3) before and after the loops `closed`."""
+        return cls(
+            pairs=pairs,
+            loops=loops,
+            closed=len(closed),
+            drift_before_rad=_rms(closed.residual(before)),
+            drift_after_rad=_rms(closed.residual(after)),
+            moved_rad=attitude_change_rad(before, after),
+        )
+
+
 def all_rotations(parts: list[RelativeRotations]) -> RelativeRotations:
     """Join several records of pairs."""
     names = RelativeRotations.__dataclass_fields__
     return RelativeRotations(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+
+
+def attitude_change_rad(before: Tensor, after: Tensor) -> float:
+    """Return the rms angle, rad, between orientations (N, 3, 3) without a common rotation of the body frame."""
+    Q = so3.nearest_rotation((before.mT @ after).sum(0))
+    return _rms(so3.log(after @ (before @ Q).mT))
+
+
+def _rms(vectors: Tensor) -> float:
+    return float(vectors.square().sum(-1).mean().sqrt()) if len(vectors) else 0.0
 
 
 def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slopes: bool) -> Sampled:
