@@ -42,9 +42,8 @@ def spin(
     from sphereorient.files.outputs import put_aside
     from sphereorient.report.plots.style import write_figure
     from sphereorient.tools.spin.dots import DotTable
-    from sphereorient.tools.spin.figure import spin_figure
     from sphereorient.tools.spin.inputs import load_ball, load_photographs
-    from sphereorient.tools.spin.spin import SpinSettings, spin_of
+    from sphereorient.tools.spin.spin import SpinSettings, spin_figure, spin_of
 
     ball = load_ball(texture, dot_radius)
     loaded, settings = load_photographs(photographs, times), SpinSettings(omega_max_rad_s=omega_max)

@@ -207,9 +207,9 @@ def _best(search: TemplateBank, disks: Tensor) -> tuple[Tensor, Tensor]:
     """Return the best proposal for each disk (n, S, S): R_view_body (n, 3, 3) and score (n,)."""
     found = search.propose(disks)
     R, score = torch.full((len(disks), 3, 3), math.nan, dtype=torch.float64), torch.zeros(len(disks)).double()
-    for k, first in enumerate(found.offset[:-1].tolist()):
-        if found.offset[k + 1] > first:
-            R[k], score[k] = found.R_view_body[first], found.score[first]
+    there = found.counts > 0
+    first = found.offset[:-1][there]
+    R[there], score[there] = found.R_view_body[first], found.score[first]
     return R, score
 
 

@@ -2,6 +2,7 @@ import csv
 import io
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,22 +50,17 @@ def load_ball(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
     """
     if path.suffix.lower() not in (".csv", ".txt"):
         return load_texture(path)
-    text = _text(path, "a table of dots")
+    text, do = _text(path, "a table of dots"), "write x,y,z of one dot a line, without a head"
     try:
         with warnings.catch_warnings(action="ignore"):  # of an empty table, which is refused below
             rows = np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2)
     except ValueError as error:
-        got, do = f"'{str(error).splitlines()[0]}'", "write x,y,z of one dot a line, without a head"
+        got = f"'{str(error).splitlines()[0]}'"
         raise PaintError(refusal(str(path), expected="a table of numbers", got=got, do=do)) from None
     if rows.size and rows.shape[1] != 3:
-        do = "write x,y,z of one dot a line, without a head"
         raise PaintError(refusal(str(path), expected="three columns", got=str(rows.shape[1]), do=do))
-    direction = torch.from_numpy(rows.reshape(-1, 3))
-    return (
-        DotTable(direction_body=direction)
-        if dot_radius_deg is None
-        else DotTable(direction_body=direction, radius_deg=dot_radius_deg)
-    )
+    table = DotTable(direction_body=torch.from_numpy(rows.reshape(-1, 3)))
+    return table if dot_radius_deg is None else replace(table, radius_deg=dot_radius_deg)
 
 
 def _times(times: str, files: Sequence[Path]) -> Tensor:
