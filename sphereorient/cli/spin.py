@@ -41,8 +41,8 @@ def spin(
     check_writable(out)
     from sphereorient.files.outputs import put_aside
     from sphereorient.report.plots.style import write_figure
+    from sphereorient.tools.spin.disks import load_ball, load_photographs
     from sphereorient.tools.spin.dots import DotTable
-    from sphereorient.tools.spin.inputs import load_ball, load_photographs
     from sphereorient.tools.spin.spin import SpinSettings, spin_figure, spin_of
 
     ball = load_ball(texture, dot_radius)
