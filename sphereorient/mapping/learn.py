@@ -188,30 +188,27 @@ def _coarse(
 def _finished(start: _Start, state: State, iterations: tuple[Iteration, ...], arrived: bool) -> LearntMap:
     """Fit the final poses, and express all in the body frame of the first orientation."""
     crops, frames, rows, chain = start.crops, start.frames, start.rows, start.chain
-    count, cameras = crops.seen.shape
     state, fit = fitted(state, POSE_ITERATIONS, crops)
     state = replace(state, R_lab_body=so3.nearest_rotation(state.R_lab_body))
     all_R = interpolated(chain.R_lab_body, rows, state.R_lab_body)
     Q = all_R[0].clone()  # R_new = R Q^T, and new directions are Q times the old
     texture, seen, sigma = _final_map(state, Q)
-    R = torch.full((count, 3, 3), torch.nan, dtype=torch.float64)
-    X = torch.full((count, 3), torch.nan, dtype=torch.float64)
-    score = torch.full((count, cameras), torch.nan, dtype=torch.float64)
-    valid, used = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
-    found = crops.seen.any(1)  # photographs without an orientation have a position all the same
-    R[frames], X[found] = so3.nearest_rotation(all_R @ Q.mT), crops.position_lab_mm[found]
-    X[frames[rows]] = state.position_lab_mm
-    score[frames[rows]] = torch.where(state.use, fit.score, torch.nan)
-    valid[frames], used[frames[rows]] = True, True
+
+    def spread(values: Tensor, at: Tensor) -> Tensor:
+        whole = torch.full((len(crops), *values.shape[1:]), torch.nan, dtype=torch.float64)
+        return whole.index_put((at,), values)
+
+    used, numbers = frames[rows], torch.arange(len(crops))
+    found = crops.frames_with_ball()  # photographs without an orientation have a position all the same
     return LearntMap(
         texture=texture,
         seen=seen,
         sigma=sigma,
-        R_lab_body=R,
-        position_lab_mm=X,
-        valid=valid,
-        fitted=used,
-        score=score,
+        R_lab_body=spread(so3.nearest_rotation(all_R @ Q.mT), frames),
+        position_lab_mm=spread(crops.position_lab_mm[found], found).index_put((used,), state.position_lab_mm),
+        valid=torch.isin(numbers, frames),
+        fitted=torch.isin(numbers, used),
+        score=spread(torch.where(state.use, fit.score, torch.nan), used),
         views=crops.views,
         light=state.fitter.light,
         blur_px=state.blur_px,
