@@ -128,7 +128,8 @@ def _weighted_fit(columns: Tensor, weight: Tensor, values: Tensor) -> Tensor:
     """Return the coefficients (K,) of columns (n, K) that fit values (n,) at weights (n,) best."""
     weighted = columns * weight[:, None]
     ridge = 1e-9 * torch.eye(columns.shape[1], dtype=columns.dtype)
-    return torch.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ values)
+    fitted: Tensor = torch.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ values)
+    return fitted
 
 
 def texture_change(new: Tensor, old: Tensor) -> Tensor:

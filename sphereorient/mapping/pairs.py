@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.mapping.disks import Disks, disk_places
+from sphereorient.so3.linalg import cross_first_axis
 
 STEP_RAD = 0.15  # longest step of a refinement
 RIDGE = 1e-3
@@ -114,9 +115,7 @@ def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slope
     gx, gy = found[:, 1] * scale[:, 0], found[:, 2] * scale[:, 0]
     D = disks.distance_radii[second, camera][:, None]
     gz = -(gx * place[:, 0] + gy * place[:, 1]) / (D.square() - 1).sqrt()
-    x, y, z = normal.unbind(1)
-    turned = torch.stack([y * gz - z * gy, z * gx - x * gz, x * gy - y * gx], dim=1)
-    return found[:, 0], R @ turned, weight
+    return found[:, 0], R @ cross_first_axis(normal, torch.stack([gx, gy, gz], dim=1)), weight
 
 
 def _first_views(disks: Disks, first: Tensor, every: int) -> list[Sampled]:
