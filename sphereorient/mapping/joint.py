@@ -119,7 +119,6 @@ def joint_step(
     by_pose, by_light, residual = (
         torch.cat([getattr(part, name) for part in parts]) for name in ("by_pose", "by_light", "residual")
     )
-
     poses = 3 * count + 3 if fixed else POSE * count  # unknowns before those of the texels
 
     def unknowns(pose: Tensor, texels: Array) -> Array:
@@ -142,7 +141,8 @@ def joint_step(
         values = (spread[:, None] @ by_pose)[:, 0] + torch.from_numpy(by_texel @ x[poses:]).reshape(residual.shape)
         force = pulled(without_light(values))
         force[poses:] += ties @ x[poses:]
-        return force + damping * x
+        force += damping * x
+        return force
 
     def preconditioned(x: Array) -> Array:
         return unknowns(solve_pose(pose_of(x)), precondition_map * x[poses:])
