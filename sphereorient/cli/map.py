@@ -176,8 +176,7 @@ def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: b
 
 def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
     from sphereorient.report.plots.style import write_figure
-    from sphereorient.tools.wear.figure import wear_figure
-    from sphereorient.tools.wear.series import wear_series
+    from sphereorient.tools.wear.series import wear_figure, wear_series
 
     known = [_known_map(path) for path in maps]
     found = wear_series(known, turned)

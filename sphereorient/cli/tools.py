@@ -47,10 +47,9 @@ def spin(
         raise OutputError(refusal(f"--out {out}", expected=".json", got=out.suffix or "no ending", do=do))
     check_writable(out)
     from sphereorient.report.plots.style import write_figure
+    from sphereorient.tools.spin.disks import load_ball, load_photographs
     from sphereorient.tools.spin.dots import DotTable
-    from sphereorient.tools.spin.figure import spin_figure
-    from sphereorient.tools.spin.inputs import load_ball, load_photographs
-    from sphereorient.tools.spin.spin import SpinSettings, spin_of
+    from sphereorient.tools.spin.spin import SpinSettings, spin_figure, spin_of
 
     ball = load_ball(texture, dot_radius)
     loaded, settings = load_photographs(photographs, times), SpinSettings(omega_max_rad_s=omega_max)

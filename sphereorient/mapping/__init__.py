@@ -1,8 +1,7 @@
 """The texture map from movies or photographs: relative rotations, loops, then orientations, light and map together."""
 
 from sphereorient.mapping.crops import take_crops
-from sphereorient.mapping.learn import fit_map
-from sphereorient.mapping.record import LearntMap
+from sphereorient.mapping.learn import LearntMap, fit_map
 from sphereorient.mapping.settings import MapSettings
 
 __all__ = ["LearntMap", "MapSettings", "fit_map", "take_crops"]

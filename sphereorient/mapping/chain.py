@@ -8,10 +8,16 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.mapping.crops import too_few
+from sphereorient.mapping.crops import evenly_spread, too_few
 from sphereorient.mapping.disks import Disks, reduced
-from sphereorient.mapping.pairs import RelativeRotations, all_rotations, refine_pairs, search_pairs, solve_graph
-from sphereorient.mapping.record import Closure, attitude_change_rad, rms
+from sphereorient.mapping.pairs import (
+    Closure,
+    RelativeRotations,
+    all_rotations,
+    refine_pairs,
+    search_pairs,
+    solve_graph,
+)
 from sphereorient.mapping.settings import MapSettings
 
 SEARCH_STEP_DEG = 8.0
@@ -105,21 +111,9 @@ def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, sett
         do = "film until the ball has shown its sides again, or use more frames"
         raise PaintError(refusal("movies", expected="patches of the ball that are seen twice", got=got, do=do))
     R, residual = solve_graph(R_lab_body, all_rotations([pairs, good]), SCALE_RAD)
-    loops = residual[len(pairs) :]
-    kept = loops.norm(dim=-1) < 3 * SCALE_RAD
-    closed = good.where(kept)
-    return PairwiseAttitudes(
-        rows=torch.arange(len(R)),
-        R_lab_body=R,
-        closure=Closure(
-            pairs=len(pairs),
-            loops=len(first),
-            closed=len(closed),
-            drift_before_rad=rms(closed.residual(R_lab_body)),
-            drift_after_rad=rms(loops[kept]),
-            moved_rad=attitude_change_rad(R_lab_body, R),
-        ),
-    )
+    closed = good.where(residual[len(pairs) :].norm(dim=-1) < 3 * SCALE_RAD)
+    closure = Closure.of(closed, R_lab_body, R, pairs=len(pairs), loops=len(first))
+    return PairwiseAttitudes(rows=torch.arange(len(R)), R_lab_body=R, closure=closure)
 
 
 def _keyframes(R_lab_body: Tensor, step_rad: float) -> Tensor:
@@ -137,12 +131,8 @@ def _candidates(disks: Disks, R_lab_body: Tensor, settings: MapSettings) -> tupl
     keys = _keyframes(R_lab_body, math.radians(settings.keyframe_deg))
     near = sight_cosines(disks, R_lab_body, keys)
     a, b = torch.triu_indices(len(keys), len(keys), offset=2)
-    wanted = near[a, b] > NEAR
-    a, b, most = a[wanted], b[wanted], settings.loop_pairs
-    if len(a) > most:
-        chosen = torch.linspace(0, len(a) - 1, most).round().long() if most else torch.zeros(0, dtype=torch.int64)
-        a, b = a[chosen], b[chosen]
-    return keys[a], keys[b]
+    chosen = evenly_spread(torch.nonzero(near[a, b] > NEAR)[:, 0], settings.loop_pairs)
+    return keys[a[chosen]], keys[b[chosen]]
 
 
 def sight_cosines(disks: Disks, R_lab_body: Tensor, rows: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Compare two texture maps of one sphere: body frame, displacements, changes; correct an old map."""
+"""Compare two texture maps of one sphere: body frame, displaced patches, changes; correct an old map."""
 
 import math
 from dataclasses import dataclass, replace
@@ -8,11 +8,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.errors import PaintError, ShapeError, refusal
+from sphereorient.errors import PaintError, refusal
 from sphereorient.mapping.grid import texel_areas
-from sphereorient.mapping.patches import Patches, compass, patch_shifts
-from sphereorient.mapping.record import LearntMap
-from sphereorient.sphere.texture import sample_texture, texture_coordinates
+from sphereorient.mapping.learn import LearntMap
+from sphereorient.sphere.texture import check_texture_shape, sample_texture, texture_coordinates
 from sphereorient.sphere.texture_table import TextureTable, texture_table
 from sphereorient.synth.textures import map_directions
 
@@ -22,7 +21,7 @@ SEARCH_PLACES, PLACES = 1200, 5000
 CHUNK = 256  # rotations tried at once
 PEAKS = 6  # best rotations that are refined
 BLURS_DEG = (5.0, 2.0, 0.8)  # of the refinement
-STEPS = 8
+STEPS = 8  # of each refinement, of rotations and of patches
 TURN_ITERATIONS = 5  # of robust weights
 KNOWN_USUAL = 0.1  # share of the sphere of which a correlation is half believed
 ALIKE_MIN = 0.55  # correlation below which two maps do not show one ball; of two balls, or mirrored: up to 0.5
@@ -34,6 +33,14 @@ RADIUS_DEG = 1.0  # within which the other map must show a grey level: displacem
 CHANGED = 0.15  # of black to white: a change that is reported
 CHANGED_SHARE = 0.01  # of a patch
 REACHES = 16  # directions of that search
+PATCH_DEG = 7.5  # radius of a patch
+PATCH_REACH_DEG = 4.0  # of the search for it
+ROUGH_DEG, FINE_DEG = 1.0, 0.5  # steps of the search, and of the places of a patch
+CONTRAST_MIN = 0.15  # deviation of the texture in a patch, of black to white
+ONE_WAY = 0.15  # share of the weaker direction below which all edges run one way: no shift along them is measured
+NEIGHBOURS, FEWEST, NEAR_DEG = 6, 3, 20.0  # compared with, needed for a decision, largest distance
+ASTRAY_DEG = 1.0  # from the neighbours' median shift, beyond which a patch was found in the wrong place
+FOUND_MIN = 0.8  # correlation below which a patch was not found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,11 +118,18 @@ def fit_levels(texture: Tensor, reference: Tensor) -> tuple[float, float]:
     columns = torch.stack([x, torch.ones_like(x)], dim=1)
     weight = torch.ones_like(x)
     for _ in range(5):
-        scaled = columns * weight[:, None]
-        gain, offset = torch.linalg.solve(scaled.mT @ columns + 1e-9 * torch.eye(2).double(), scaled.mT @ y).tolist()
+        gain, offset = _weighted_fit(columns, weight, y).tolist()
         left = (y - gain * x - offset).abs()
         weight = 1 / (1 + (left / left.median().clamp_min(1e-3) / 2) ** 2)
     return gain, offset
+
+
+def _weighted_fit(columns: Tensor, weight: Tensor, values: Tensor) -> Tensor:
+    """Return the coefficients (K,) of columns (n, K) that fit values (n,) at weights (n,) best."""
+    weighted = columns * weight[:, None]
+    ridge = 1e-9 * torch.eye(columns.shape[1], dtype=columns.dtype)
+    fitted: Tensor = torch.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ values)
+    return fitted
 
 
 def texture_change(new: Tensor, old: Tensor) -> Tensor:
@@ -159,8 +173,7 @@ def fibonacci_directions(count: int) -> Tensor:
 
 def _known(texture: Tensor) -> tuple[Tensor, Tensor]:
     """Return a map with its mean where unknown, and the mask of the known texels, (H, 2 H) float32 each."""
-    if texture.ndim != 2 or texture.shape[1] != 2 * texture.shape[0]:
-        raise ShapeError(refusal("map", expected="(H, 2 H)", got=str(tuple(texture.shape)), do="pass one map"))
+    check_texture_shape(texture)
     known = torch.isfinite(texture)
     middle = texture[known].mean() if known.any() else torch.tensor(0.5)
     return torch.where(known, texture, middle).float(), known.float()
@@ -222,31 +235,22 @@ def _refined(tables: list[TextureTable], shares: list[Tensor], place: Tensor, R:
         # grey(exp(delta) R d) = grey + slope . (delta x n) = grey + (n x slope) . delta
         turned = torch.linalg.cross(there.T.float(), slope[0].T)
         columns = torch.cat([-turned, reference[0][:, None], ones[:, None]], dim=1).double()
-        weighted = columns * weight[:, None]
-        normal = weighted.mT @ columns + 1e-9 * torch.eye(5).double()
-        step = torch.linalg.solve(normal, weighted.mT @ grey[0].double())[:3]
+        step = _weighted_fit(columns, weight, grey[0].double())[:3]
         R = so3.exp(step * (0.1 / step.norm().clamp_min(1e-12)).clamp_max(1.0)) @ R
     return so3.nearest_rotation(R)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Correction:
-    """A learnt map that corrects an old one."""
+def corrected(learnt: LearntMap, old: Tensor) -> tuple[LearntMap, MapComparison, float]:
+    """Express a learnt map in the frame of an old one (h, 2 h), used where unseen; raise PaintError on a mismatch.
 
-    learnt: LearntMap  # in the old map's body frame, with the old texture where the movies showed none
-    comparison: MapComparison  # displacement against the old map
-    kept_share: float  # of the sphere with the old map's texture
-
-
-def corrected(learnt: LearntMap, old: Tensor) -> Correction:
-    """Express a learnt map in the frame of an old one (h, 2 h), used where unseen; raise PaintError on a mismatch."""
+    Return also the displacement against the old map, and the share of the sphere with the old map's texture.
+    """
     comparison = compare_maps(learnt.texture, old)
     Q = comparison.R_other_reference
     height = max(len(old), len(learnt.texture))
     texture = turned_map(learnt.texture, Q, height)
     known = torch.isfinite(texture)
-    same = torch.eye(3, dtype=torch.float64)
-    before = old.to(texture) if len(old) == height else turned_map(old.to(texture), same, height)
+    before = old.to(texture) if len(old) == height else turned_map(old.to(texture), torch.eye(3), height)
     gain, offset = fit_levels(before, texture)
     new = replace(
         learnt,
@@ -255,8 +259,7 @@ def corrected(learnt: LearntMap, old: Tensor) -> Correction:
         sigma=torch.where(known, nearest_texels(learnt.sigma, Q, height), torch.inf),
         R_lab_body=learnt.R_lab_body @ Q,
     )
-    share = float((texel_areas(height) * ~known).sum() / texel_areas(height).sum())
-    return Correction(learnt=new, comparison=comparison, kept_share=share)
+    return new, comparison, float((texel_areas(height) * ~known).sum() / texel_areas(height).sum())
 
 
 def nearest_texels(values: Tensor, R_map_new: Tensor, height: int) -> Tensor:
@@ -266,3 +269,106 @@ def nearest_texels(values: Tensor, R_map_new: Tensor, height: int) -> Tensor:
     column = ((longitude / torch.pi + 1) * rows).long() % (2 * rows)
     row = ((0.5 - latitude / torch.pi) * rows).long().clamp(0, rows - 1)
     return values[row, column]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Patches:
+    """Round patches about directions of the reference, in tangent planes whose axes point east and north."""
+
+    direction: Tensor  # (D, 3) float64, no poles
+    R_other_reference: Tensor  # (3, 3)
+
+    def points(self, step_deg: float) -> Tensor:
+        """Return the sample places of all patches, (D, P, 3), at a spacing in degrees."""
+        return self.shifted(_offsets(step_deg), torch.zeros(len(self.direction), 2, dtype=torch.float64))
+
+    def shifted(self, offset: Tensor, shift: Tensor) -> Tensor:
+        """Return places (D, P, 3) at offsets (P, 2), rad east and north, from patches shifted by (D, 2)."""
+        d = self.direction[:, None]
+        east, north = (axis[:, None] for axis in compass(self.direction))
+        at = (offset + shift[:, None]).tan()
+        return F.normalize(d + at[..., :1] * east + at[..., 1:] * north, dim=-1)
+
+
+def _offsets(step_deg: float) -> Tensor:
+    count = math.floor(PATCH_DEG / step_deg)
+    at = torch.arange(-count, count + 1, dtype=torch.float64) * math.radians(step_deg)
+    grid = torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).reshape(-1, 2)
+    return grid[grid.norm(dim=-1) <= math.radians(PATCH_DEG) + 1e-9]
+
+
+def compass(direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the unit vectors to the east and to the north of directions (..., 3) other than the poles."""
+    x, y, z = direction.unbind(-1)
+    level = (x * x + y * y).sqrt().clamp_min(1e-12)
+    east = torch.stack([-y / level, x / level, torch.zeros_like(x)], dim=-1)
+    return east, torch.stack([-z * x / level, -z * y / level, level], dim=-1)
+
+
+def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: Patches) -> tuple[Tensor, Tensor]:
+    """Return shifts (D, 2) float64, rad east and north, of the reference's patches in another map, and (D,) found.
+
+    `rough` and `fine`: blurred tables of the other map and of the reference, for search and refinement.
+
+    Source: normalised correlation, then direct alignment with gain and offset, Lucas and Kanade 1981.
+    """
+    shift = start = _searched(rough, patches)
+    offset = _offsets(FINE_DEG)
+    reference, _ = fine[1].sample(patches.points(FINE_DEG).mT.float())
+    for _ in range(STEPS):
+        grey, by_shift = _sampled(fine[0], patches, offset, shift)
+        # Unknowns: shift, gain and offset that take the other map's grey to the reference's.
+        columns = torch.stack([-by_shift[:, 0], -by_shift[:, 1], reference, torch.ones_like(reference)], dim=1).double()
+        normal, right = columns @ columns.mT, columns @ grey.double()[..., None]
+        step = torch.linalg.solve(normal + 1e-9 * torch.eye(4).double(), right)[:, :2, 0]
+        longest = math.radians(0.5)
+        shift = shift + step * (longest / step.norm(dim=-1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0)
+    grey, by_shift = _sampled(fine[0], patches, offset, shift)
+    own = (by_shift.double() @ by_shift.double().mT) / len(offset)
+    weaker = torch.linalg.eigvalsh(own)[:, 0]
+    sure = (weaker > ONE_WAY * own.diagonal(dim1=1, dim2=2).sum(-1)) & (reference.std(1) > CONTRAST_MIN)
+    sure &= (_correlation(grey, reference) > FOUND_MIN) & (shift.norm(dim=-1) < math.radians(PATCH_REACH_DEG))
+    sure &= (shift - start).norm(dim=-1) < math.radians(ROUGH_DEG)  # else the refinement has left its peak
+    return shift, sure & ~_contradicted(patches.direction, shift, sure)
+
+
+def _contradicted(direction: Tensor, shift: Tensor, sure: Tensor) -> Tensor:
+    """Return which patches (D,) contradict their overlapping neighbours: they match another edge."""
+    east, north = compass(direction)
+    moved = shift[:, :1] * east + shift[:, 1:] * north
+    near = (direction @ direction.mT).fill_diagonal_(-1) * sure - (~sure).double()
+    cosine, which = near.topk(min(NEIGHBOURS, len(direction)), dim=1)
+    close = cosine > math.cos(math.radians(NEAR_DEG))
+    others = torch.where(close[..., None], moved[which], torch.nan)
+    apart = (moved - others.nanmedian(1).values).norm(dim=-1)
+    contradicted: Tensor = (close.sum(1) >= FEWEST) & (apart > math.radians(ASTRAY_DEG))
+    return contradicted
+
+
+def _searched(tables: list[TextureTable], patches: Patches) -> Tensor:
+    count, offset = len(patches.direction), _offsets(2 * FINE_DEG)
+    reference, _ = tables[1].sample(patches.points(2 * FINE_DEG).mT.float())
+    steps = round(PATCH_REACH_DEG / ROUGH_DEG)
+    at = torch.arange(-steps, steps + 1, dtype=torch.float64) * math.radians(ROUGH_DEG)
+    tried = torch.stack(torch.meshgrid(at, at, indexing="ij"), dim=-1).reshape(-1, 2)
+    scores = [
+        _correlation(_sampled(tables[0], patches, offset, shift.expand(count, 2))[0], reference) for shift in tried
+    ]
+    return tried[torch.stack(scores).argmax(0)]
+
+
+def _sampled(table: TextureTable, patches: Patches, offset: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    place = patches.shifted(offset, shift)
+    value, slope = table.sample((place @ patches.R_other_reference.mT).mT.float())
+    in_reference = slope.mT.double() @ patches.R_other_reference
+    flat = (patches.direction[:, None] * place).sum(-1)  # cosine of the angle from the patch's middle
+    columns = [
+        (in_reference * axis[:, None]).sum(-1) * flat / (offset[:, k] + shift[:, k, None]).cos().square()
+        for k, axis in enumerate(compass(patches.direction))
+    ]
+    return value, torch.stack(columns, dim=1).float()
+
+
+def _correlation(a: Tensor, b: Tensor) -> Tensor:
+    a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
+    return (a * b).sum(1) / ((a * a).sum(1) * (b * b).sum(1)).clamp_min(1e-12).sqrt()

@@ -133,6 +133,13 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
     )
 
 
+def evenly_spread(rows: Tensor, count: int) -> Tensor:
+    """Return at most `count` of the rows, evenly spread, ends included."""
+    if len(rows) <= count:
+        return rows
+    return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
+
+
 def _cut(picture: Picture, u_px: float, v_px: float, radius_px: float) -> Crop:
     reach = int(np.ceil(REACH * radius_px)) + 3
     top, left = max(0, round(v_px) - reach), max(0, round(u_px) - reach)

@@ -16,7 +16,6 @@ from sphereorient.search.normalisation import Blur, crop_disk, rim_share
 from sphereorient.sphere.view import perspective_view
 
 SHOWN_MIN = 0.99  # visible share of a disk's pixel below which it does not count
-FAR_RADII = 50.0  # distance of a camera that does not see the ball: any value does
 DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
 
 
@@ -76,8 +75,7 @@ def disks_of(crops: Crops, frames: Tensor, settings: MapSettings) -> Disks:
     pictures = torch.zeros(count, cameras, size, size)
     hidden = any(view.background.shown is not None for view in crops.views)
     shown = torch.ones(count, cameras, size, size) if hidden else None
-    R = torch.eye(3, dtype=torch.float64).repeat(count, cameras, 1, 1)
-    far = torch.full((count, cameras), FAR_RADII, dtype=torch.float64)
+    R, far = torch.empty(count, cameras, 3, 3).double(), torch.empty(count, cameras).double()
     X = crops.position_lab_mm[frames]
     for c, view in enumerate(crops.views):
         camera = view.camera

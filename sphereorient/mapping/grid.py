@@ -1,6 +1,8 @@
 """The texture map as unknowns of a linear system: splines, smoothness penalty, solution, sharpening."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 from torch import Tensor
 
-from sphereorient.sphere.texture import texture_coordinates
-from sphereorient.sphere.texture_table import CHUNK, FIVE, SIDE, TextureTable, octahedral_directions
+from sphereorient.sphere.texture import spline_weights, texel_coordinates, texture_coordinates
+from sphereorient.sphere.texture_table import CHUNK, FIVE, SIDE, TextureTable, octahedral_directions, tangents
 from sphereorient.synth.textures import map_directions
 
 STEP_RAD = 0.002  # step of a table's finite differences
@@ -17,15 +19,7 @@ POLE = 1e-3  # least cosine of a latitude: at the pole itself longitude is undef
 READS = 16  # texels that a look-up reads
 NOISE = 1.0e-3  # variance of the blurred map's errors over that of what sharpening may add
 SHARPENING_ITERATIONS = 200
-
-
-def _spline(place: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the four texels (..., 4) int64 about places (...), and their weights (Unser 1999, eq. 3)."""
-    below = place.floor()
-    t = place - below
-    s = 1 - t
-    weights = [s**3, 4 - 3 * t * t * (1 + s), 4 - 3 * s * s * (1 + t), t**3]
-    return below.long()[..., None] + torch.arange(-1, 3), torch.stack(weights, dim=-1) / 6
+Array = NDArray[Any]
 
 
 def _spline_slope(place: Tensor) -> Tensor:
@@ -35,15 +29,11 @@ def _spline_slope(place: Tensor) -> Tensor:
     return torch.stack(slopes, dim=-1) / 2
 
 
-def _place(longitude: Tensor, latitude: Tensor, height: int) -> tuple[Tensor, Tensor]:
-    return (longitude + math.pi) * (height / math.pi) - 0.5, (math.pi / 2 - latitude) * (height / math.pi) - 0.5
-
-
 def texel_weights(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
     """Return indices (..., 16) int64 in the flat map (H, 2 H), H >= 4, and B-spline weights (..., 16), sum 1."""
     width = 2 * height
-    column, row = _place(*texture_coordinates(direction_body), height)
-    (columns, along), (rows, across) = _spline(column), _spline(row)
+    (column, along), (row, across) = (spline_weights(at) for at in texel_coordinates(direction_body, height))
+    columns, rows = column[..., None] + torch.arange(4), row[..., None] + torch.arange(4)
     beyond = (rows < 0) | (rows >= height)  # over a pole the meridian goes on at the other side
     rows = torch.where(rows < 0, -1 - rows, torch.where(rows >= height, 2 * height - 1 - rows, rows))
     columns = (columns[..., None, :] + torch.where(beyond, height, 0)[..., None]) % width
@@ -67,8 +57,8 @@ class SplineTable(TextureTable):
         self.reads.append((place, weight))
         found = self.texture.to(direction.dtype).reshape(-1)[place].reshape(*place.shape[:-1], 4, 4)
         longitude, latitude = texture_coordinates(direction)
-        column, row = _place(longitude, latitude, height)
-        (_, along), (_, across) = _spline(column), _spline(row)
+        column, row = texel_coordinates(direction, height)
+        (_, along), (_, across) = spline_weights(column), spline_weights(row)
         by_column = ((found * _spline_slope(column)[..., None, :]).sum(-1) * across).sum(-1)
         by_row = ((found * along[..., None, :]).sum(-1) * _spline_slope(row)).sum(-1)
         level = latitude.cos().clamp_min(POLE)
@@ -86,20 +76,12 @@ def look_up(texture: Tensor, direction_body: Tensor) -> Tensor:
     return (texture.reshape(-1)[place] * weight.to(texture.dtype)).sum(-1)
 
 
-def _tangents(direction: Tensor) -> tuple[Tensor, Tensor]:
-    helper = torch.where(
-        direction[:, 2:].abs() < 0.9, direction.new_tensor([0.0, 0, 1]), direction.new_tensor([1.0, 0, 0])
-    )
-    right = torch.nn.functional.normalize(torch.linalg.cross(helper, direction), dim=-1)
-    return right, torch.linalg.cross(direction, right)
-
-
 def map_table(texture: Tensor, blur_rad: float) -> TextureTable:
     """Return the table of a map (H, 2 H) that already has the blur `blur_rad`, rad."""
     parts = []
     for some in torch.split(octahedral_directions(SIDE), CHUNK):
         slope = torch.zeros_like(some)
-        for axis in _tangents(some):
+        for axis in tangents(some):
             there, back = (look_up(texture.double(), some + sign * STEP_RAD * axis) for sign in (1, -1))
             slope += ((there - back) / (2 * STEP_RAD))[:, None] * axis
         value = look_up(texture.double(), some) - (slope * some).sum(-1)
@@ -171,27 +153,37 @@ def solve_map(
     ties = smooth * stiffness(height)
     diagonal = normal.diagonal() + ties.diagonal()
     diagonal[diagonal <= 0] = 1.0
-    x = np.zeros_like(right)
-    left = right.copy()
-    z = left / diagonal
-    p, rz = z.copy(), float(left @ z)
-    stop = 1e-12 * rz
-    for _ in range(iterations):
-        if rz <= stop:
-            break
-        q = normal @ p + ties @ p
-        alpha = rz / float(p @ q)
-        x += alpha * p
-        left -= alpha * q
-        z = left / diagonal
-        rz, before = float(left @ z), rz
-        p = z + rz / before * p
+    x = conjugate_gradients(lambda p: normal @ p + ties @ p, lambda left: left / diagonal, right, 1e-12, iterations)
     return torch.from_numpy(x.reshape(height, 2 * height))
+
+
+def conjugate_gradients(
+    apply: Callable[[Array], Array],
+    precondition: Callable[[Array], Array],
+    right: Array,
+    least: float,
+    iterations: int,
+    dot: Callable[[Array, Array], float] = np.dot,
+) -> Array:
+    """Solve apply(x) = right (T,) for x until the weighted square of the residual is `least` of the first one."""
+    x, left = np.zeros_like(right), right
+    p = z = precondition(left)
+    rz = first = float(dot(left, z))
+    for _ in range(iterations):
+        if rz <= least * first:
+            break
+        q = apply(p)
+        alpha = rz / float(dot(p, q))
+        x, left = x + alpha * p, left - alpha * q
+        z = precondition(left)
+        rz, before = float(dot(left, z)), rz
+        p = z + rz / before * p
+    return x
 
 
 def blur_matrix(direction_body: Tensor, blur_rad: float, height: int) -> csr_matrix:
     """Return the matrix (M, T) from a map's coefficients to its blurred values in directions (M, 3) float64."""
-    right, up = _tangents(direction_body)
+    right, up = tangents(direction_body)
     start = np.arange(0, len(direction_body) * READS + 1, READS)
     total = csr_matrix((len(direction_body), 2 * height * height))
     for a, share_a in zip(*FIVE, strict=True):

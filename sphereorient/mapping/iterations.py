@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.mapping.crops import Crops, pixels_of
+from sphereorient.mapping.crops import Crops, evenly_spread, pixels_of
 from sphereorient.mapping.disks import Disks
 from sphereorient.mapping.grid import (
     NormalMatrix,
@@ -23,7 +23,7 @@ from sphereorient.mapping.grid import (
     texel_sums,
 )
 from sphereorient.mapping.joint import Linearisation, joint_step, linear_system, linearise
-from sphereorient.mapping.record import Iteration, attitude_change_rad, evenly_spread
+from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curve
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
@@ -47,6 +47,15 @@ BEYOND = 0.2  # by how much the map may leave 0 .. 1 on the way
 NOISE_EVERY = 4  # pixels from which the noise is estimated
 HELD = 1e12  # 1/mm^2, precision of a position that must not move
 OUTLIER2 = 25.0  # squared residuals over the noise expected are cut off here
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Iteration:
+    """One iteration of orientations, light and map."""
+
+    moved_rad: float  # rms move of the orientations
+    misfit: float  # chi^2 per pixel, before the map is solved anew
+    blur_px: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -2,17 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
-from sphereorient.mapping.grid import READS, SplineTable, stiffness
-from sphereorient.pose.fit import grey_by_pose, residuals
+from sphereorient.mapping.grid import READS, Array, SplineTable, conjugate_gradients, stiffness
+from sphereorient.pose.fit import Residuals, grey_by_pose, residuals
 from sphereorient.pose.fitter import Fitter
-from sphereorient.pose.model import SphereView
 from sphereorient.pose.pixels import Pixels
 
 DEPTH_MIN = 0.2  # cosine of the slant below which a pixel is not used for the map
@@ -21,23 +20,19 @@ DAMPING = 1e-5  # of the diagonal: the body frame is free, the step along it zer
 RIDGE = 1e-7
 LONGEST_SHARE = 0.1  # typical length of a turn, rad, and of a move, radii
 STEPS = 60  # of conjugate gradients
-Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Linearisation:
+class Linearisation(Residuals):
     """L disks of P pixels, each linearised about one pose and the map."""
 
-    view: SphereView
     reads: list[tuple[Tensor, Tensor]]  # of the inner and the outer pixels: texels and weights, (L, n * P', 16) each
     inner: int  # number of first pixels that `reads[0]` is of
-    depth: Tensor  # (L, P), cosine of the slant
-    step: Tensor  # (L, P), grey levels from black to white texture, the frame's own light and coverage included
-    residual: Tensor  # (L, P), grey levels
-    weight: Tensor  # (L, P), robust, 0 .. 1
-    variance: Tensor  # (L, P), grey levels^2
-    by_pose: Tensor  # (L, 6, P), grey levels per rad (delta) and per mm
-    by_light: Tensor  # (L, K, P), by the coefficients of a frame's own light
+
+    @cached_property
+    def depth(self) -> Tensor:
+        """Cosine of the slant, (L, P)."""
+        return (1 - self.view.across.square().sum(1)).clamp_min(0).sqrt()
 
     @property
     def precision(self) -> Tensor:
@@ -47,7 +42,7 @@ class Linearisation:
 
     def by_texel(self, height: int) -> csr_matrix:
         """Return the derivative by the texels times the root of the precision, (L * P, T) float32."""
-        factor = self.step * self.precision.sqrt() * (self.depth > DEPTH_MIN)
+        factor = self.lit * self.precision.sqrt() * (self.depth > DEPTH_MIN)
         places, values, counts = [], [], []
         for k, (place, share) in enumerate(self.reads):
             own = factor[:, : self.inner] if k == 0 else factor[:, self.inner :]
@@ -75,20 +70,7 @@ def linearise(
     table = SplineTable(texture, 0.0)
     model = replace(fitter.model(fitter.optics.fine), paint=table, blur_px=blur_px)
     at = residuals(pixels, position_lab_mm, R_lab_body, None, model, len(fitter.views))
-    depth = (1 - at.view.across.square().sum(1)).clamp_min(0).sqrt()
-    return Linearisation(
-        view=at.view,
-        reads=table.reads,
-        inner=pixels.inner,
-        depth=depth,
-        step=at.lit,
-        residual=at.residual,
-        weight=at.weight,
-        variance=at.variance,
-        # Near the limb the map is not learnt; it must not move the pose there.
-        by_pose=grey_by_pose(at.view, at.lit * (depth > DEPTH_MIN), at.over),
-        by_light=at.design[:, POSE:],
-    )
+    return Linearisation(**vars(at), reads=table.reads, inner=pixels.inner)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,14 +87,16 @@ def linear_system(at: Linearisation, height: int) -> LinearSystem:
     """Return the linear system of a linearisation; `height` is the map's H."""
     root = at.precision.sqrt()
     # Orthonormal rows: the frame's own light is projected out along them.
-    rows = (at.by_light * root[:, None]).double()
+    rows = (at.design[:, POSE:] * root[:, None]).double()
     size = rows.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
     rows = rows / size
     gram = rows @ rows.mT + RIDGE * torch.eye(rows.shape[1], dtype=rows.dtype)
     basis = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows, upper=False).float()
+    # Near the limb the map is not learnt; it must not move the pose there.
+    by_pose = grey_by_pose(at.view, at.lit * (at.depth > DEPTH_MIN), at.over)
     return LinearSystem(
         by_texel=at.by_texel(height),
-        by_pose=at.by_pose * root[:, None],
+        by_pose=by_pose * root[:, None],
         by_light=basis,
         residual=at.residual * root,
     )
@@ -135,51 +119,50 @@ def joint_step(
     by_pose, by_light, residual = (
         torch.cat([getattr(part, name) for part in parts]) for name in ("by_pose", "by_light", "residual")
     )
+    poses = 3 * count + 3 if fixed else POSE * count  # unknowns before those of the texels
+
+    def unknowns(pose: Tensor, texels: Array) -> Array:
+        return np.concatenate([pose.reshape(-1).numpy(), texels])
+
+    def pose_of(x: Array) -> Tensor:
+        return torch.from_numpy(x[:poses]).reshape((-1,) if fixed else (count, POSE))
 
     def without_light(values: Tensor) -> Tensor:
         along = by_light @ values[..., None]
         left: Tensor = values - (by_light.mT @ along)[..., 0]
         return left
 
-    def pulled(values: Tensor) -> tuple[Tensor, Array]:
+    def pulled(values: Tensor) -> Array:
         pose = (by_pose @ values[..., None])[..., 0].reshape(count, cameras, POSE).sum(1)
-        return _shared(pose, fixed), back @ values.reshape(-1).numpy()
+        return unknowns(_shared(pose, fixed), back @ values.reshape(-1).numpy())
 
-    def applied(pose: Tensor, texels: Array) -> tuple[Tensor, Array]:
-        spread = _spread(pose, count, fixed).repeat_interleave(cameras, 0)
-        values = (spread[:, None] @ by_pose)[:, 0] + torch.from_numpy(by_texel @ texels).reshape(residual.shape)
-        on_pose, on_map = pulled(without_light(values))
-        return on_pose + damp_pose * pose, on_map + ties @ texels + damp_map * texels
+    def applied(x: Array) -> Array:
+        spread = _spread(pose_of(x), count, fixed).repeat_interleave(cameras, 0)
+        values = (spread[:, None] @ by_pose)[:, 0] + torch.from_numpy(by_texel @ x[poses:]).reshape(residual.shape)
+        force = pulled(without_light(values))
+        force[poses:] += ties @ x[poses:]
+        force += damping * x
+        return force
+
+    def preconditioned(x: Array) -> Array:
+        return unknowns(solve_pose(pose_of(x)), precondition_map * x[poses:])
+
+    def dot(a: Array, b: Array) -> float:
+        on_pose = (pose_of(a).double() * pose_of(b).double()).sum()
+        return float(on_pose) + float(a[poses:].astype(np.float64) @ b[poses:])
 
     lit = by_pose - (by_pose @ by_light.mT) @ by_light
     blocks = (lit @ lit.mT).reshape(count, cameras, POSE, POSE).sum(1)
     size = torch.tensor([LONGEST_SHARE] * 3 + [LONGEST_SHARE * radius_mm] * 3)
     damp = DAMPING * blocks.diagonal(dim1=1, dim2=2) + 1.0 / size.square()
-    damp_pose = _shared(damp, fixed)
-    damp_map = np.float32(1e-3 * smooth) + np.zeros(1, np.float32)
+    damp_map = np.full(ties.shape[0], 1e-3 * smooth, np.float32)
+    damping = unknowns(_shared(damp, fixed), damp_map)
     precondition_map = 1.0 / (np.asarray(by_texel.power(2).sum(0)).ravel() + ties.diagonal() + damp_map)
     solve_pose = _inverse_blocks(blocks, damp, fixed)
-    r_pose, r_map = pulled(without_light(residual))
-    r_map = r_map - ties @ texture.reshape(-1).float().numpy()
-    pose, texels = torch.zeros_like(r_pose), np.zeros_like(r_map)
-    z_pose, z_map = solve_pose(r_pose), precondition_map * r_map
-    p_pose, p_map = z_pose.clone(), z_map.copy()
-    rz = first = _dot(r_pose, z_pose, r_map, z_map)
-    for _ in range(STEPS):
-        if rz <= 1e-8 * first:
-            break
-        q_pose, q_map = applied(p_pose, p_map)
-        alpha = rz / _dot(p_pose, q_pose, p_map, q_map)
-        pose, texels = pose + alpha * p_pose, texels + alpha * p_map
-        r_pose, r_map = r_pose - alpha * q_pose, r_map - alpha * q_map
-        z_pose, z_map = solve_pose(r_pose), precondition_map * r_map
-        rz, before = _dot(r_pose, z_pose, r_map, z_map), rz
-        p_pose, p_map = z_pose + rz / before * p_pose, z_map + rz / before * p_map
-    return _spread(pose, count, fixed).double()
-
-
-def _dot(a_pose: Tensor, b_pose: Tensor, a_map: Array, b_map: Array) -> float:
-    return float((a_pose.double() * b_pose.double()).sum()) + float(a_map.astype(np.float64) @ b_map)
+    right = pulled(without_light(residual))
+    right[poses:] -= ties @ texture.reshape(-1).float().numpy()
+    step = conjugate_gradients(applied, preconditioned, right, 1e-8, STEPS, dot)
+    return _spread(pose_of(step), count, fixed).double()
 
 
 def _shared(pose: Tensor, fixed: bool) -> Tensor:

@@ -1,6 +1,7 @@
 """The texture map, orientations and light from movies or photographs: start without a map, iterate, finish."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -9,12 +10,13 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.experiment.recording import Progress
 from sphereorient.mapping.chain import PairwiseAttitudes, find_chain
-from sphereorient.mapping.crops import Crops
+from sphereorient.mapping.crops import Crops, evenly_spread
 from sphereorient.mapping.disks import Disks, disks_of
-from sphereorient.mapping.grid import look_up, sharpened
+from sphereorient.mapping.grid import look_up, sharpened, texel_areas
 from sphereorient.mapping.iterations import (
     LIGHT_ITERATIONS,
     ROW,
+    Iteration,
     State,
     first_map,
     first_state,
@@ -23,11 +25,12 @@ from sphereorient.mapping.iterations import (
     map_height,
     map_weight,
 )
+from sphereorient.mapping.pairs import Closure
 from sphereorient.mapping.photographs import find_photographs, finer_settings
-from sphereorient.mapping.record import Iteration, LearntMap, evenly_spread
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, widest_px
+from sphereorient.pose.model import Light
 from sphereorient.synth.textures import map_directions
 
 # Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).
@@ -43,6 +46,35 @@ PIXELS_A_TEXEL = 3.0
 # Blur (radii) and number of the first iterations of photographs. Errors: 0.8 degrees before, 0.06 after, 0.05 at the
 # end (12 pictures of 200 px); without them 0.09 after twice as many others.
 COARSE, COARSE_ITERATIONS = 0.015, 5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LearntMap:
+    """A texture map learnt from movies or photographs; the body frame is the lab at the first known orientation.
+
+    Through a mirror it is mirrored, which one camera or parallel ones cannot detect: set `flip:` in the experiment.
+    """
+
+    texture: Tensor  # (H, 2 H) float32, 0 black .. 1 white; NaN where never seen
+    seen: Tensor  # (H, 2 H) int64, pictures that show each texel
+    sigma: Tensor  # (H, 2 H) float32, standard deviation of the texture by noise alone; infinite where never seen
+    R_lab_body: Tensor  # (N, 3, 3) float64, NaN where the sphere was not found
+    position_lab_mm: Tensor  # (N, 3) float64, NaN likewise
+    valid: Tensor  # (N,) bool, frames with an orientation
+    fitted: Tensor  # (N,) bool, frames that the map was fitted to; the others follow them
+    score: Tensor  # (N, C), share of each picture's variance that the map explains; NaN where not fitted
+    views: Sequence[CameraView]  # with the scenes without the ball
+    light: Light
+    blur_px: float  # estimated with the map
+    closure: Closure
+    rounds: tuple[Iteration, ...]
+    arrived: bool  # whether the last iteration moved orientations by less than the setting `arrived_deg`
+
+    @property
+    def seen_share(self) -> float:
+        """Return the share of the sphere that was seen at all."""
+        areas = texel_areas(len(self.texture))
+        return float((areas * (self.seen > 0)).sum() / areas.sum())
 
 
 def fit_map(crops: Crops, settings: MapSettings, progress: Progress) -> LearntMap:
@@ -155,30 +187,27 @@ def _coarse(
 def _finished(start: _Start, state: State, iterations: tuple[Iteration, ...], arrived: bool) -> LearntMap:
     """Fit the final poses, and express all in the body frame of the first orientation."""
     crops, frames, rows, chain = start.crops, start.frames, start.rows, start.chain
-    count, cameras = crops.seen.shape
     state, fit = fitted(state, POSE_ITERATIONS, crops)
     state = replace(state, R_lab_body=so3.nearest_rotation(state.R_lab_body))
     all_R = interpolated(chain.R_lab_body, rows, state.R_lab_body)
     Q = all_R[0].clone()  # R_new = R Q^T, and new directions are Q times the old
     texture, seen, sigma = _final_map(state, Q)
-    R = torch.full((count, 3, 3), torch.nan, dtype=torch.float64)
-    X = torch.full((count, 3), torch.nan, dtype=torch.float64)
-    score = torch.full((count, cameras), torch.nan, dtype=torch.float64)
-    valid, used = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
-    found = crops.seen.any(1)  # photographs without an orientation have a position all the same
-    R[frames], X[found] = so3.nearest_rotation(all_R @ Q.mT), crops.position_lab_mm[found]
-    X[frames[rows]] = state.position_lab_mm
-    score[frames[rows]] = torch.where(state.use, fit.score, torch.nan)
-    valid[frames], used[frames[rows]] = True, True
+
+    def spread(values: Tensor, at: Tensor) -> Tensor:
+        whole = torch.full((len(crops), *values.shape[1:]), torch.nan, dtype=torch.float64)
+        return whole.index_put((at,), values)
+
+    used, numbers = frames[rows], torch.arange(len(crops))
+    found = crops.frames_with_ball()  # photographs without an orientation have a position all the same
     return LearntMap(
         texture=texture,
         seen=seen,
         sigma=sigma,
-        R_lab_body=R,
-        position_lab_mm=X,
-        valid=valid,
-        fitted=used,
-        score=score,
+        R_lab_body=spread(so3.nearest_rotation(all_R @ Q.mT), frames),
+        position_lab_mm=spread(crops.position_lab_mm[found], found).index_put((used,), state.position_lab_mm),
+        valid=torch.isin(numbers, frames),
+        fitted=torch.isin(numbers, used),
+        score=spread(torch.where(state.use, fit.score, torch.nan), used),
         views=crops.views,
         light=state.fitter.light,
         blur_px=state.blur_px,

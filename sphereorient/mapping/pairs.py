@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.mapping.disks import Disks, disk_places
+from sphereorient.so3 import cross_first_axis
 
 STEP_RAD = 0.15  # longest step of a refinement
 RIDGE = 1e-3
@@ -48,10 +49,44 @@ class RelativeRotations:
         return so3.log(self.R_ji @ (R_lab_body[self.second] @ R_lab_body[self.first].mT).mT)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Closure:
+    """The effect of closing the loops; angles in rad."""
+
+    pairs: int  # of neighbouring instants
+    loops: int  # tried
+    closed: int  # accepted and kept by the graph
+    drift_before_rad: float  # rms error of the closed loops in the chain
+    drift_after_rad: float  # and afterwards
+    moved_rad: float  # rms move of the orientations, the body frame's own turn removed
+
+    @classmethod
+    def of(cls, closed: RelativeRotations, before: Tensor, after: Tensor, *, pairs: int, loops: int) -> Closure:
+        """Compare orientations (N, 3, 3) before and after the loops `closed`."""
+        return cls(
+            pairs=pairs,
+            loops=loops,
+            closed=len(closed),
+            drift_before_rad=_rms(closed.residual(before)),
+            drift_after_rad=_rms(closed.residual(after)),
+            moved_rad=attitude_change_rad(before, after),
+        )
+
+
 def all_rotations(parts: list[RelativeRotations]) -> RelativeRotations:
     """Join several records of pairs."""
     names = RelativeRotations.__dataclass_fields__
     return RelativeRotations(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+
+
+def attitude_change_rad(before: Tensor, after: Tensor) -> float:
+    """Return the rms angle, rad, between orientations (N, 3, 3) without a common rotation of the body frame."""
+    Q = so3.nearest_rotation((before.mT @ after).sum(0))
+    return _rms(so3.log(after @ (before @ Q).mT))
+
+
+def _rms(vectors: Tensor) -> float:
+    return float(vectors.square().sum(-1).mean().sqrt()) if len(vectors) else 0.0
 
 
 def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slopes: bool) -> Sampled:
@@ -80,9 +115,7 @@ def _warped(disks: Disks, second: Tensor, camera: int, normal_lab: Tensor, slope
     gx, gy = found[:, 1] * scale[:, 0], found[:, 2] * scale[:, 0]
     D = disks.distance_radii[second, camera][:, None]
     gz = -(gx * place[:, 0] + gy * place[:, 1]) / (D.square() - 1).sqrt()
-    x, y, z = normal.unbind(1)
-    turned = torch.stack([y * gz - z * gy, z * gx - x * gz, x * gy - y * gx], dim=1)
-    return found[:, 0], R @ turned, weight
+    return found[:, 0], R @ cross_first_axis(normal, torch.stack([gx, gy, gz], dim=1)), weight
 
 
 def _first_views(disks: Disks, first: Tensor, every: int) -> list[Sampled]:

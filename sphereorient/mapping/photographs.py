@@ -22,8 +22,14 @@ from sphereorient.mapping.chain import (
     sight_cosines,
 )
 from sphereorient.mapping.disks import Disks, reduced
-from sphereorient.mapping.pairs import RelativeRotations, all_rotations, refine_pairs, search_views, solve_graph
-from sphereorient.mapping.record import Closure, attitude_change_rad, rms
+from sphereorient.mapping.pairs import (
+    Closure,
+    RelativeRotations,
+    all_rotations,
+    refine_pairs,
+    search_views,
+    solve_graph,
+)
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.search.candidates import distinct
 
@@ -97,18 +103,8 @@ def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> Pairw
     place = torch.full((len(R),), -1).index_put((rows,), torch.arange(len(rows)))
     own = replace(pairs, first=place[pairs.first], second=place[pairs.second])
     check_turned(after, settings)
-    return PairwiseAttitudes(
-        rows=rows,
-        R_lab_body=after,
-        closure=Closure(
-            pairs=len(rows) - 1,
-            loops=len(disks) * (len(disks) - 1) // 2,
-            closed=len(own),
-            drift_before_rad=rms(own.residual(before)),
-            drift_after_rad=rms(own.residual(after)),
-            moved_rad=attitude_change_rad(before, after),
-        ),
-    )
+    closure = Closure.of(own, before, after, pairs=len(rows) - 1, loops=len(disks) * (len(disks) - 1) // 2)
+    return PairwiseAttitudes(rows=rows, R_lab_body=after, closure=closure)
 
 
 def measured_evidence(disks: Disks, settings: MapSettings) -> Evidence:

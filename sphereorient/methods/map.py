@@ -70,8 +70,7 @@ def learn_map(
         crops = take_crops(recording, settings.paint, settings.locate, progress)
         learnt = fit_map(crops, settings.paint, progress)
         if old is not None:
-            correction = corrected(learnt, old)
-            learnt, comparison, kept_share = correction.learnt, correction.comparison, correction.kept_share
+            learnt, comparison, kept_share = corrected(learnt, old)
         opened = recording.experiment
         origin = provenance(input_files(opened, list(recording.cameras)), opened.folder, command)
         return MapResult(

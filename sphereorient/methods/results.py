@@ -16,7 +16,7 @@ from sphereorient.experiment import Experiment
 from sphereorient.follow import Appearance
 from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
-from sphereorient.mapping.record import LearntMap
+from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, rates_of
 from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance

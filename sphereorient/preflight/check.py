@@ -12,8 +12,8 @@ from sphereorient.experiment.recording import Progress, open_recording, silent
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.settings import Settings
-from sphereorient.preflight import cameras, movies, offset, texture_map
-from sphereorient.preflight.finding import Finding, Severity, fault, warning, worst
+from sphereorient.preflight import cameras, movies, texture_map
+from sphereorient.preflight.finding import FAULT, Finding, Severity, judged, warning, worst
 from sphereorient.preflight.sample import MovieSample, sample_more, sample_movie
 from sphereorient.search import TemplateBank
 from sphereorient.sphere import load_texture
@@ -27,7 +27,7 @@ class Preflight:
     timeline: Timeline
     samples: tuple[MovieSample, ...]
     closer: tuple[tuple[MovieSample, ...], ...]  # consecutive frames: by stretch, then by camera
-    scan: offset.OffsetScan | None  # None with one camera
+    scan: cameras.OffsetScan | None  # None with one camera
     texture: Tensor | None  # (H, 2 H)
     measures: texture_map.TextureMeasures | None
     similar: texture_map.ViewPair | None
@@ -94,7 +94,7 @@ def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Findi
         yield movies.ball(sample)
     if seen.scan is not None:
         yield cameras.lines_of_sight(seen.samples, seen.scan.in_step_px if seen.scan.shift else None)
-        yield offset.in_step(seen.scan, seen.experiment.start)
+        yield cameras.in_step(seen.scan, seen.experiment.start)
     if seen.scan is not None and seen.experiment.diameter_mm is not None:
         yield cameras.ball_size(seen.samples, seen.experiment.diameter_mm)
     else:
@@ -113,13 +113,13 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
     radii = [float(sample.sightings.radius_px.nanmedian()) for sample in seen.samples]
     default = seen.samples[0].diameter_px / 2
     yield (paint := texture_map.contrast(seen.measures, min((r for r in radii if not math.isnan(r)), default=default)))
-    if paint.severity is Severity.FAULT:  # other checks of a map of one colour mean nothing
+    if paint.severity is FAULT:  # other checks of a map of one colour mean nothing
         return
     yield (similar := texture_map.look_alikes(seen.similar))
     yield from (texture_map.map_fits(match, seen.matches) for match in seen.matches)
     # Unsynchronised movies or ambiguous views would be reported as camera errors.
     in_step = seen.scan is None or seen.scan.shift == 0
-    if len(seen.matches) == 2 and in_step and similar.severity is not Severity.FAULT:
+    if len(seen.matches) == 2 and in_step and similar.severity is not FAULT:
         yield texture_map.one_orientation(seen.matches)
 
 
@@ -133,21 +133,21 @@ def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[st
                 sizes[name] = expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
             except SettingsError as error:
                 advice = "check sphere.diameter and the lengths in cameras.yaml: all are mm"
-                findings.append(fault(f"expected size {name}", str(error), advice))
+                findings.append(judged(f"expected size {name}", str(error), (True, FAULT, advice)))
     return sizes, findings
 
 
 def _offsets(
     samples: Sequence[MovieSample], settings: Settings, pool: ThreadPoolExecutor
-) -> tuple[tuple[tuple[MovieSample, ...], ...], offset.OffsetScan | None]:
+) -> tuple[tuple[tuple[MovieSample, ...], ...], cameras.OffsetScan | None]:
     """Sample the stretches with most motion, and scan the offset between two movies."""
     if len(samples) != 2:
         return (), None
     parts = [
         [pool.submit(sample_more, sample, frames, settings.locate) for sample in samples]
-        for frames in offset.liveliest_stretches(samples)
+        for frames in cameras.liveliest_stretches(samples)
     ]
     closer = tuple(tuple(one.result() for one in part) for part in parts)
     centres = [(first.sightings.centre_px, second.sightings.centre_px) for first, second in closer]
     names, views = [one.name for one in samples], [one.camera for one in samples]
-    return closer, offset.scan_offsets(names, views, centres)
+    return closer, cameras.scan_offsets(names, views, centres)

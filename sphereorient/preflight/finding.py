@@ -11,6 +11,9 @@ class Severity(StrEnum):
     FAULT = "fault"  # the run fails, or its numbers are wrong
 
 
+OK, WARNING, FAULT = Severity
+
+
 @dataclass(frozen=True, kw_only=True)
 class Finding:
     """The result of one check; made by this room, read by the command line and the figure."""
@@ -21,19 +24,16 @@ class Finding:
     advice: str = ""  # what to do, as an imperative; empty if nothing
 
 
-def ok(title: str, measured: str) -> Finding:
-    """Return a finding without a complaint."""
-    return Finding(title=title, severity=Severity.OK, measured=measured)
+def judged(title: str, measured: str, *complaints: tuple[bool, Severity, str]) -> Finding:
+    """Return a finding with the first complaint that holds; each is whether it holds, how bad it is, and the advice."""
+    held = (complaint[1:] for complaint in complaints if complaint[0])
+    severity, advice = next(held, (OK, ""))
+    return Finding(title=title, severity=severity, measured=measured, advice=advice)
 
 
 def warning(title: str, measured: str, advice: str) -> Finding:
     """Return a warning."""
-    return Finding(title=title, severity=Severity.WARNING, measured=measured, advice=advice)
-
-
-def fault(title: str, measured: str, advice: str) -> Finding:
-    """Return a fault."""
-    return Finding(title=title, severity=Severity.FAULT, measured=measured, advice=advice)
+    return judged(title, measured, (True, WARNING, advice))
 
 
 def worst(findings: Sequence[Finding]) -> Severity:

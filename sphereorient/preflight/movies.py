@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sphereorient.experiment import Experiment, outside_paths
 from sphereorient.experiment.timeline import NONE, Timeline
 from sphereorient.locate.outline import Outline
-from sphereorient.preflight.finding import Finding, fault, ok, warning
+from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.trajectory import Reason
 
@@ -45,10 +45,8 @@ def frames(experiment: Experiment, timeline: Timeline) -> Finding:
     if count > 1:
         pace = f"{1 / timeline.frame_s:.6g} Hz" if timeline.even else f"uneven, usually {1 / timeline.frame_s:.6g} Hz"
         measured += f"; {timeline.time_s[-1] - timeline.time_s[0] + timeline.frame_s:.4g} s, {pace}"
-    if not timeline.remarks:
-        return ok("frames", measured)
     advice = "check start: and frames: if the cameras began and ended together"
-    return warning("frames", "; ".join([measured, *timeline.remarks]), advice)
+    return judged("frames", "; ".join([measured, *timeline.remarks]), (bool(timeline.remarks), WARNING, advice))
 
 
 def outside(experiment: Experiment) -> list[Finding]:
@@ -63,12 +61,11 @@ def outside(experiment: Experiment) -> list[Finding]:
 def movie_file(sample: MovieSample) -> Finding:
     """Report the contents of a movie file, and the remarks of its reader."""
     movie = sample.stream.movie
-    title, remarks, (height, width) = f"movie {sample.name}", movie.remarks, movie.frame_shape
+    height, width = movie.frame_shape
     brightest = f"brightest level {sample.background.full_scale:.0f}"
     measured = f"{movie.path.name}: {len(movie)} pictures of {width} x {height} px, {brightest}"
-    if not remarks:
-        return ok(title, measured)
-    return warning(title, "; ".join([measured, *remarks]), "record or export the movie again if this is not meant")
+    complaint = (bool(movie.remarks), WARNING, "record or export the movie again if this is not meant")
+    return judged(f"movie {sample.name}", "; ".join([measured, *movie.remarks]), complaint)
 
 
 def pictures(samples: Sequence[MovieSample]) -> Finding:
@@ -84,11 +81,12 @@ def pictures(samples: Sequence[MovieSample]) -> Finding:
     title = f"pictures {samples[0].name}"
     bad = {row: reason for row, reason in sorted(seen.items()) if reason is not Reason.OK}
     if not bad:
-        return ok(title, f"{len(seen)} frames sampled: all readable, none black, white or repeated")
+        return judged(title, f"{len(seen)} frames sampled: all readable, none black, white or repeated")
     counts = Counter(bad.values()).most_common()
     words = ", ".join(f"{count} {reason}" for reason, count in counts)
     measured = f"of {len(seen)} frames sampled: {words} (the first: picture {next(iter(bad))} of the movie)"
-    return (fault if len(bad) > MANY * len(seen) else warning)(title, measured, REMEDY[counts[0][0]])
+    severity = FAULT if len(bad) > MANY * len(seen) else WARNING
+    return judged(title, measured, (True, severity, REMEDY[counts[0][0]]))
 
 
 def ball(sample: MovieSample) -> Finding:
@@ -99,17 +97,16 @@ def ball(sample: MovieSample) -> Finding:
     measured = f"found in {seen} of {len(usable)} frames"
     if reasons:
         measured += " (" + ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) + ")"
-    if seen >= BALL_SEEN * len(usable) and seen:
-        return ok(title, measured)
-    likely = reasons.most_common(1)[0][0] if reasons else Reason.NOT_FOUND
-    return (warning if seen else fault)(title, measured, REMEDY[likely])
+    remedy = REMEDY[reasons.most_common(1)[0][0] if reasons else Reason.NOT_FOUND]
+    few = seen < BALL_SEEN * len(usable)
+    return judged(title, measured, (not seen, FAULT, remedy), (few, WARNING, remedy))
 
 
 def background(sample: MovieSample, experiment: Experiment) -> Finding:
     """Report whether the movie itself shows the background of the ball."""
     title = f"background {sample.name}"
     if sample.name in experiment.background_paths:
-        return ok(title, f"given: {experiment.background_paths[sample.name].name}")
+        return judged(title, f"given: {experiment.background_paths[sample.name].name}")
     advice = f"write backgrounds: {{{sample.name}: FILE}}, a picture of the scene without the ball"
     if experiment.fixed:
         return warning(title, "none given: the background of a fixed ball is guessed from its surroundings", advice)
@@ -117,7 +114,7 @@ def background(sample: MovieSample, experiment: Experiment) -> Finding:
     shares = [sum((u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in centres) / len(centres) for u, v, _ in centres]
     share = max(shares, default=0.0)
     measured = f"learnt from the movie: the ball covers no pixel in more than {100 * share:.0f} % of the frames"
-    return ok(title, measured) if share <= STAYS else warning(title, measured, advice)
+    return judged(title, measured, (share > STAYS, WARNING, advice))
 
 
 def exposure(sample: MovieSample) -> Finding:
@@ -137,26 +134,27 @@ def exposure(sample: MovieSample) -> Finding:
         f"paint from {black:.0f} to {white:.0f} of {full_scale:.0f}; {100 * saturated:.1f} % of the ball saturated, "
         f"{100 * dark:.1f} % at 0; noise {noise:.1f}, signal {signal:.0f} times that"
     )
-    if saturated > SATURATED:
-        return (fault if saturated > MUCH_SATURATED else warning)(title, measured, REMEDY[Reason.SATURATED])
-    if white - black < RANGE * full_scale or signal < SIGNAL:
-        advice = "light the ball more, or paint it with more contrast: black and white are hardly apart"
-        return warning(title, measured, advice)
-    if dark > BLACK:
-        return warning(title, measured, "raise the camera's black level: dark paint is cut off at 0")
-    return ok(title, measured)
+    faint = white - black < RANGE * full_scale or signal < SIGNAL
+    alike = "light the ball more, or paint it with more contrast: black and white are hardly apart"
+    return judged(
+        title,
+        measured,
+        (saturated > MUCH_SATURATED, FAULT, REMEDY[Reason.SATURATED]),
+        (saturated > SATURATED, WARNING, REMEDY[Reason.SATURATED]),
+        (faint, WARNING, alike),
+        (dark > BLACK, WARNING, "raise the camera's black level: dark paint is cut off at 0"),
+    )
 
 
 def sharpness(sample: MovieSample) -> Finding:
     """Judge the blur of the ball's limb."""
     title, blur_px = f"sharpness {sample.name}", limb_blur_px(sample)
     if math.isnan(blur_px):
-        return ok(title, "unknown: too little of the limb stands out")
+        return judged(title, "unknown: too little of the limb stands out")
     radius_px = float(np.median([outline.radius_px for _, outline in sample.balls]))
     measured = f"the limb is blurred by {blur_px:.2f} px (standard deviation), on a ball of {2 * radius_px:.0f} px"
-    if blur_px <= max(SOFT_PX, SOFT_SHARE * radius_px):
-        return ok(title, measured)
-    return warning(title, measured, "focus on the ball, close the lens for more depth, or expose shorter")
+    advice = "focus on the ball, close the lens for more depth, or expose shorter"
+    return judged(title, measured, (blur_px > max(SOFT_PX, SOFT_SHARE * radius_px), WARNING, advice))
 
 
 def limb_blur_px(sample: MovieSample) -> float:
@@ -208,13 +206,11 @@ def motion_blur(sample: MovieSample, exposure_s: float | None, frame_s: float) -
     moved = (centre[neighbours + 1] - centre[neighbours]).norm(dim=-1).numpy()
     moved = moved[np.isfinite(moved)]
     if not len(moved):
-        return ok(title, "unknown: no two consecutive frames show the ball")
+        return judged(title, "unknown: no two consecutive frames show the ball")
     usual, fast = np.percentile(moved, [50, 95])
     measured = f"the ball moves {usual:.2f} px a frame, {fast:.2f} at its fastest"
     if exposure_s is None:
-        return ok(title, measured + "; exposure: is not given")
+        return judged(title, measured + "; exposure: is not given")
     share = exposure_s / frame_s
     measured += f"; {share * usual:.2f} and {share * fast:.2f} px during an exposure"
-    if share * fast <= SMEAR_PX:
-        return ok(title, measured)
-    return warning(title, measured, "expose shorter, with more light")
+    return judged(title, measured, (share * fast > SMEAR_PX, WARNING, "expose shorter, with more light"))

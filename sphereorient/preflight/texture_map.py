@@ -11,7 +11,8 @@ from sphereorient import so3
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.experiment.stream import spread_frames
 from sphereorient.mapping.compare import fibonacci_directions
-from sphereorient.preflight.finding import Finding, fault, ok, warning
+from sphereorient.mapping.grid import texel_areas
+from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.search import TemplateBank, crop_disk
 from sphereorient.search.normalisation import LocalNormalisation
@@ -71,15 +72,11 @@ class TextureMatch:
 
 def measure_texture(texture: Tensor) -> TextureMeasures:
     """Measure a map, (H, 2 H), 0 black .. 1 white."""
-    height = texture.shape[0]
-    factor = max(1, height // ROWS)
-    while height % factor:
-        factor -= 1
-    small = torch.nn.functional.avg_pool2d(texture[None, None].double(), factor)[0, 0]
-    direction, area = map_directions(len(small)).reshape(-1, 3), _cos_latitude(len(small))
+    small = reduced_texture(texture.double(), 2 * ROWS / math.pi)
+    direction, area = map_directions(len(small)).reshape(-1, 3), texel_areas(len(small))
     mean = (small * area).sum() / area.sum()
     fine = reduced_texture(texture, 200.0).double()
-    share = _cos_latitude(len(fine)) / _cos_latitude(len(fine)).sum()
+    share = texel_areas(len(fine)) / (4 * math.pi)
     deviation = ((fine - (fine * share).sum()).square() * share).sum()
     weight = (map_directions(ROWS).reshape(-1, 3) @ direction.T).clamp_min(0) * area.reshape(-1)
     brightness = (weight @ small.reshape(-1)) / weight.sum(1)
@@ -88,11 +85,6 @@ def measure_texture(texture: Tensor) -> TextureMeasures:
         view_brightness=brightness.reshape(ROWS, 2 * ROWS),
         patch_rad=_patch_rad(fine.float(), float(mean)),
     )
-
-
-def _cos_latitude(height: int) -> Tensor:
-    cosine: Tensor = map_directions(height)[..., :2].norm(dim=-1)
-    return cosine
 
 
 def _patch_rad(texture: Tensor, mean: float) -> float:
@@ -116,26 +108,24 @@ def _patch_rad(texture: Tensor, mean: float) -> float:
 
 def contrast(measures: TextureMeasures, radius_px: float) -> Finding:
     """Judge contrast, balance and patches of a map, for a ball of this radius in the pictures."""
-    title, patch_deg = "paint", math.degrees(measures.patch_rad)
+    patch_deg, patch_px = math.degrees(measures.patch_rad), measures.patch_rad * radius_px
     low, high = float(measures.view_brightness.min()), float(measures.view_brightness.max())
-    patch_px = measures.patch_rad * radius_px
     measured = (
         f"views are {100 * low:.0f} to {100 * high:.0f} % bright; patches of about "
         f"{patch_deg:.0f} degrees, {patch_px:.0f} px; contrast {measures.contrast:.2f}"
     )
-    if measures.contrast < ONE_COLOUR:
-        return fault(title, measured, "check the map: it has one colour, which shows no orientation")
-    if measures.contrast < FAINT:
-        advice = "paint with more contrast, or check that the map was exported from black to white"
-        return warning(title, measured, advice)
-    if patch_px < FINE_PX:
-        advice = "paint larger patches, or bring the ball larger into the picture: such detail is blurred away"
-        return warning(title, measured, advice)
-    if patch_deg > COARSE_DEG:
-        return warning(title, measured, "paint smaller patches: many views show hardly a border")
-    if low < LOPSIDED[0] or high > LOPSIDED[1]:
-        return warning(title, measured, "balance black and white: some views show hardly more than one of them")
-    return ok(title, measured)
+    lopsided = low < LOPSIDED[0] or high > LOPSIDED[1]
+    faint = "paint with more contrast, or check that the map was exported from black to white"
+    fine = "paint larger patches, or bring the ball larger into the picture: such detail is blurred away"
+    return judged(
+        "paint",
+        measured,
+        (measures.contrast < ONE_COLOUR, FAULT, "check the map: it has one colour, which shows no orientation"),
+        (measures.contrast < FAINT, WARNING, faint),
+        (patch_px < FINE_PX, WARNING, fine),
+        (patch_deg > COARSE_DEG, WARNING, "paint smaller patches: many views show hardly a border"),
+        (lopsided, WARNING, "balance black and white: some views show hardly more than one of them"),
+    )
 
 
 def most_similar_views(texture: Tensor, settings: GreySearchSettings) -> ViewPair:
@@ -182,18 +172,13 @@ def views_towards(direction_body: Tensor) -> Tensor:
 
 def look_alikes(pair: ViewPair) -> Finding:
     """Judge the two most similar views."""
-    title = "views that look alike"
-    measured = (
-        f"the worst pair, {math.degrees(pair.angle_rad):.0f} degrees apart: "
-        f"one explains {100 * pair.score:.0f} % of the other"
-    )
-    if pair.score >= SAME:
-        advice = "break the paint's symmetry: add a patch that exists only once; these two views cannot be told apart"
-        return fault(title, measured, advice)
-    if pair.score >= ALIKE:
-        advice = "add a patch where the two views are alike: there a single frame is ambiguous without its history"
-        return warning(title, measured, advice)
-    return ok(title, measured + ": single frames are unambiguous")
+    apart, explained = f"{math.degrees(pair.angle_rad):.0f} degrees apart", f"{100 * pair.score:.0f} % of the other"
+    measured = f"the worst pair, {apart}: one explains {explained}"
+    measured += ": single frames are unambiguous" if pair.score < ALIKE else ""
+    same = "break the paint's symmetry: add a patch that exists only once; these two views cannot be told apart"
+    alike = "add a patch where the two views are alike: there a single frame is ambiguous without its history"
+    complaints = (pair.score >= SAME, FAULT, same), (pair.score >= ALIKE, WARNING, alike)
+    return judged("views that look alike", measured, *complaints)
 
 
 def match_texture(search: TemplateBank, samples: Sequence[MovieSample]) -> list[TextureMatch]:
@@ -222,29 +207,27 @@ def _best(search: TemplateBank, disks: Tensor) -> tuple[Tensor, Tensor]:
     """Return the best proposal for each disk (n, S, S): R_view_body (n, 3, 3) and score (n,)."""
     found = search.propose(disks)
     R, score = torch.full((len(disks), 3, 3), math.nan, dtype=torch.float64), torch.zeros(len(disks)).double()
-    for k, first in enumerate(found.offset[:-1].tolist()):
-        if found.offset[k + 1] > first:
-            R[k], score[k] = found.R_view_body[first], found.score[first]
+    there = found.counts > 0
+    first = found.offset[:-1][there]
+    R[there], score[there] = found.R_view_body[first], found.score[first]
     return R, score
 
 
 def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
     """Judge the match of the map with one camera's pictures."""
-    title = f"map in {match.name}"
     score, mirrored = float(match.score.median()), float(match.mirrored.median())
     measured = f"the best view explains {100 * score:.0f} % of the picture, its mirror image {100 * mirrored:.0f} %"
-    if mirrored > score + CLEARLY and mirrored > POOR:
-        if len(matches) > 1 and all(float((one.mirrored - one.score).median()) > CLEARLY for one in matches):
-            advice = "mirror the map left to right, or write flip: for both movies: all pictures are mirrored"
-        else:
-            advice = f"write flip: {{{match.name}: vertical}}, or horizontal: this movie is mirrored"
-        return fault(title, measured, advice)
-    if score < POOR:
-        return fault(title, measured, "check sphere.texture: the movie does not show this map")
-    if score < FITS or score < mirrored + CLEARLY:
-        advice = "check light and map: reflections, worn paint and errors of the map reduce the certainty"
-        return warning(title, measured, advice)
-    return ok(title, measured)
+    flip = f"write flip: {{{match.name}: vertical}}, or horizontal: this movie is mirrored"
+    if len(matches) > 1 and all(float((one.mirrored - one.score).median()) > CLEARLY for one in matches):
+        flip = "mirror the map left to right, or write flip: for both movies: all pictures are mirrored"
+    unsure = "check light and map: reflections, worn paint and errors of the map reduce the certainty"
+    return judged(
+        f"map in {match.name}",
+        measured,
+        (mirrored > score + CLEARLY and mirrored > POOR, FAULT, flip),
+        (score < POOR, FAULT, "check sphere.texture: the movie does not show this map"),
+        (score < FITS or score < mirrored + CLEARLY, WARNING, unsure),
+    )
 
 
 def one_orientation(matches: Sequence[TextureMatch]) -> Finding:
@@ -252,8 +235,6 @@ def one_orientation(matches: Sequence[TextureMatch]) -> Finding:
     title, (first, second) = "one orientation", matches
     angle = _median_angle_deg(matches, (first.camera, second.camera))
     measured = f"the orientations from {first.name} and {second.name} differ by {angle:.1f} degrees (median)"
-    if angle <= ONE_DEG:
-        return ok(title, measured)
     if math.isnan(angle):
         return warning(title, "unknown: the map is not found in the pictures", "see the findings on the map")
     swapped = _median_angle_deg(matches, (second.camera, first.camera))
@@ -261,7 +242,7 @@ def one_orientation(matches: Sequence[TextureMatch]) -> Finding:
         advice = f"swap {first.name} and {second.name} in movies: (then they differ by {swapped:.1f} degrees)"
     else:
         advice = "check R of both cameras in cameras.yaml, flip:, and whether the movies are of one experiment"
-    return fault(title, measured, advice)
+    return judged(title, measured, (angle > ONE_DEG, FAULT, advice))
 
 
 def _median_angle_deg(matches: Sequence[TextureMatch], cameras: tuple[Camera, Camera]) -> float:

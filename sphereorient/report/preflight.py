@@ -13,8 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from sphereorient.preflight import Preflight, Severity
-from sphereorient.preflight.cameras import expected_outline_px, sample_gaps
-from sphereorient.preflight.offset import REACH
+from sphereorient.preflight.cameras import REACH, expected_outline_px, sample_gaps
 from sphereorient.preflight.sample import MovieSample
 
 FOUND, EXPECTED, USED = "#009E73", "#D55E00", "#0072B2"  # Okabe and Ito's

@@ -76,7 +76,8 @@ def sample_texture(texture: Tensor, direction_body: Tensor) -> Tensor:
 
     Source: docs/conventions.md (texture map); kornia's remap needs align_corners=True for pixel coordinates.
     """
-    column, row = _texel_coordinates(texture, direction_body)
+    check_texture_shape(texture)
+    column, row = texel_coordinates(direction_body, len(texture))
     grey = kornia_transform.remap(
         _continued(texture, 1)[None, None],
         (column + 1).reshape(1, 1, -1),
@@ -91,11 +92,12 @@ def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
 
     Source: Unser 1999, Splines, a perfect fit, eq. 3; the texels are the coefficients: a blur of 0.58 texels.
     """
-    column, row = _texel_coordinates(texture, direction_body)
+    check_texture_shape(texture)
     height, width = texture.shape
+    column, row = texel_coordinates(direction_body, height)
     closed = _continued(texture, SPLINE_TEXELS)
-    first_column, columns = _spline_weights(column)
-    first_row, rows = _spline_weights(row)
+    first_column, columns = spline_weights(column)
+    first_row, rows = spline_weights(row)
     # A longitude of pi may round to one column beyond the edge.
     first_column = first_column.clamp(-SPLINE_TEXELS, width + SPLINE_TEXELS - 4) + SPLINE_TEXELS
     first_row = first_row.clamp(-SPLINE_TEXELS, height + SPLINE_TEXELS - 4) + SPLINE_TEXELS
@@ -112,13 +114,10 @@ def check_texture_shape(texture: Tensor) -> None:
         raise ShapeError(refusal("texture", expected=expected, got=str(tuple(texture.shape)), do="pass one map"))
 
 
-def _texel_coordinates(texture: Tensor, direction_body: Tensor) -> tuple[Tensor, Tensor]:
-    """Return column and row (...) of body directions; integers are texel centres."""
-    check_texture_shape(texture)
-    height, width = texture.shape
+def texel_coordinates(direction_body: Tensor, height: int) -> tuple[Tensor, Tensor]:
+    """Return column and row (...) of body directions (..., 3) in a map (H, 2 H); integers are texel centres."""
     longitude, latitude = texture_coordinates(direction_body)
-    column = (longitude + math.pi) * (width / (2 * math.pi)) - 0.5
-    return column, (math.pi / 2 - latitude) * (height / math.pi) - 0.5
+    return (longitude + math.pi) * (height / math.pi) - 0.5, (math.pi / 2 - latitude) * (height / math.pi) - 0.5
 
 
 def _continued(texture: Tensor, texels: int) -> Tensor:
@@ -128,7 +127,7 @@ def _continued(texture: Tensor, texels: int) -> Tensor:
     return torch.cat([tall[:, -texels:], tall, tall[:, :texels]], dim=1)
 
 
-def _spline_weights(place: Tensor) -> tuple[Tensor, Tensor]:
+def spline_weights(place: Tensor) -> tuple[Tensor, Tensor]:
     """Return the first of four texels (...) int64 and the weights (..., 4), sum 1."""
     below = place.detach().floor()
     t = place - below

@@ -140,14 +140,20 @@ def _disk_nodes(
     centre: Tensor, width: float, rule: tuple[tuple[float, ...], tuple[float, ...]]
 ) -> Iterator[tuple[float, Tensor, Tensor]]:
     """Yield weight, tangent offset (M, 3) and direction (M, 3) of the nodes of a Gaussian about directions (M, 3)."""
-    helper = torch.where(centre[:, 2:].abs() < 0.9, centre.new_tensor([0.0, 0, 1]), centre.new_tensor([1.0, 0, 0]))
-    right = torch.nn.functional.normalize(torch.linalg.cross(helper, centre), dim=-1)
-    up = torch.linalg.cross(centre, right)
+    right, up = tangents(centre)
     for a, share_a in zip(*rule, strict=True):
         for b, share_b in zip(*rule, strict=True):
             offset = width * (a * right + b * up)
             at = torch.nn.functional.normalize(centre + offset, dim=-1)
             yield share_a * share_b, offset.float(), at.float()
+
+
+def tangents(direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Return two unit vectors (M, 3) at right angles to each of some directions (M, 3) and to each other."""
+    z, x = direction.new_tensor([0.0, 0, 1]), direction.new_tensor([1.0, 0, 0])
+    helper = torch.where(direction[:, 2:].abs() < 0.9, z, x)
+    right = torch.nn.functional.normalize(torch.linalg.cross(helper, direction), dim=-1)
+    return right, torch.linalg.cross(direction, right)
 
 
 def _rows(value: Tensor, slope: Tensor, centre: Tensor) -> Tensor:

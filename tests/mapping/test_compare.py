@@ -13,6 +13,7 @@ from sphereorient import so3
 from sphereorient.errors import PaintError, ShapeError
 from sphereorient.mapping.compare import (
     compare_maps,
+    compass,
     fibonacci_directions,
     fit_levels,
     nearest_texels,
@@ -20,7 +21,6 @@ from sphereorient.mapping.compare import (
     turned_map,
     without_changed,
 )
-from sphereorient.mapping.patches import compass
 from sphereorient.synth.textures import map_directions, random_texture
 
 HEIGHT = 128

@@ -20,10 +20,16 @@ from sphereorient.experiment.stream import pictures_of
 from sphereorient.locate import Background
 from sphereorient.locate.outline import Outline
 from sphereorient.preflight import Finding, Severity
-from sphereorient.preflight.cameras import expected_outline_px, gaps_between
+from sphereorient.preflight.cameras import (
+    REACH,
+    OffsetScan,
+    expected_outline_px,
+    gaps_between,
+    scan_offsets,
+    starts_in_step,
+)
 from sphereorient.preflight.finding import worst
 from sphereorient.preflight.movies import limb_blur_px
-from sphereorient.preflight.offset import REACH, OffsetScan, scan_offsets, starts_in_step
 from sphereorient.preflight.sample import frames_to_sample, pair_starts
 
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.errors import OutputError, PaintError, refusal
+from sphereorient.errors import PaintError, refusal
 from sphereorient.files.outputs import put_aside
 from sphereorient.report.plots.style import in_style
 from sphereorient.sphere import sample_texture
@@ -134,11 +134,8 @@ def write_gores(texture: Tensor, gores: Gores, folder: Path) -> list[Path]:
                 figure.savefig(aside, metadata={when: None})
             written.append(path)
     path = folder / "gores.txt"
-    try:
-        path.write_text(instructions(gores), encoding="utf-8")
-    except OSError as error:
-        do = "choose a folder that exists and may be written"
-        raise OutputError(refusal(str(path), expected="a file that can be written", got=str(error), do=do)) from error
+    with put_aside(path) as aside:
+        aside.write_text(instructions(gores), encoding="utf-8")
     return [*written, path]
 
 

@@ -1,18 +1,21 @@
 """The spin of a ball from a few photographs: orientations from each alone, then one uniform spin."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from matplotlib.figure import Figure
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
 from sphereorient.experiment.recording import Progress, silent
+from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure
 from sphereorient.search import Candidates, GreySearchSettings, Proposer, TemplateBank
 from sphereorient.search.refine_rotation import DetailLevel, detail_level, level_reference, refine_rotation
-from sphereorient.sphere import orthographic_view
+from sphereorient.sphere import orthographic_view, reduced_texture
 from sphereorient.sphere.texture_table import texture_table
 from sphereorient.tools.spin.disks import BallOutline, Photographs
 from sphereorient.tools.spin.dots import DOT_SEARCH, DotSearch, DotTable
@@ -31,6 +34,7 @@ FOLLOWED_RAD = math.radians(20.0)  # how far a picture's own orientation may lie
 LAST_ITERATIONS = 8
 AS_EVIDENT = 6.0  # difference of evidence (log) below which pictures do not distinguish two spins
 AT_ONCE = 4  # photographs between two reports of progress
+COLUMNS, MOST_DRAWN = 6, 36  # photographs of the figure: in a row, and altogether, the first ones
 
 
 class SpinSettings(BaseModel):
@@ -156,3 +160,26 @@ def _check_explained(best: float, mirror: float) -> None:
     if mirror > best - AS_EVIDENT:
         do = "check that texture, times and pictures belong together and that the ball spins uniformly, or add pictures"
         raise PaintError(refusal("spin", expected="one that explains more than chance", got=got, do=do))
+
+
+@in_style
+def spin_figure(found: SpinFound, texture: Tensor, time_s: Tensor, names: Sequence[str]) -> Figure:
+    """Draw photographs and the map (H, 2 H) at the first spin's orientations, in order of the times (F,), s."""
+    chosen = time_s.argsort()[:MOST_DRAWN].tolist()
+    size, rows = found.disks.shape[-1], math.ceil(len(chosen) / COLUMNS)
+    texture = reduced_texture(texture.float(), size)
+    predicted = orthographic_view(size).render(texture, found.spins.R_view_body(time_s)[0].float(), math.nan)
+    figure = new_figure(WIDTH_IN, 2.4 * rows + 0.4)
+    axes = figure.subplots(2 * rows, COLUMNS, squeeze=False)
+    for one in axes.flat:
+        one.set_axis_off()
+    inside = torch.isfinite(predicted[0])
+    for place, k in enumerate(chosen):
+        row, column = 2 * (place // COLUMNS), place % COLUMNS
+        disk = torch.where(inside, found.disks[k], torch.nan)
+        axes[row, column].imshow(disk.numpy(), cmap="gray", interpolation="nearest")
+        axes[row + 1, column].imshow(predicted[k].numpy(), cmap="gray", vmin=0, vmax=1.2, interpolation="nearest")
+        off = float(found.residual_rad[k])
+        words = f"{math.degrees(off):.1f}° off" if math.isfinite(off) else "no attitude"
+        axes[row, column].set_title(f"{names[k]}, {1e3 * float(time_s[k]):.1f} ms\n{words}", fontsize=6)
+    return figure

@@ -1,11 +1,15 @@
-"""Wear of a ball from a series of its texture maps: the same worn places followed from map to map."""
+"""Wear of a ball from a series of its texture maps: the same worn places from map to map, and their figure."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -14,6 +18,7 @@ from torch import Tensor
 from sphereorient.errors import PaintError, refusal
 from sphereorient.mapping.compare import (
     CHANGED,
+    RADIUS_DEG,
     MapComparison,
     compare_maps,
     fit_levels,
@@ -22,11 +27,17 @@ from sphereorient.mapping.compare import (
     without_changed,
 )
 from sphereorient.mapping.grid import texel_areas
+from sphereorient.report.map_figure import CHANGE_REACH, draw_map
+from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note
 from sphereorient.synth.textures import map_directions
 
 BEYOND = 5.0  # times the scatter of the unworn texture: noise alone seldom exceeds this
 LEAST_DEG = 1.5  # radius of the smallest place that is reported
 HALF = 0.5  # share of a place that a map must know to give its worn share
+SHOWN = 6  # maps that are drawn at most, spread over the series
+NAMED = 6  # places that have their number in the maps, and their own curve
+EXTENT = (-180, 180, -90, 90)
+LEAST_PERCENT = 0.1  # height of the smallest scale of the curve
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,8 +111,7 @@ def _shares(height: int) -> Tensor:
 
 
 def _sizes(number: Tensor) -> Tensor:
-    area = _shares(len(number)).reshape(-1)
-    return torch.zeros(int(number.max()) + 1, dtype=torch.float64).index_add(0, number.reshape(-1), area)
+    return torch.bincount(number.reshape(-1), _shares(len(number)).reshape(-1))
 
 
 def _wear(texture: Tensor, first: Tensor, turned: bool) -> Wear:
@@ -169,3 +179,65 @@ def _places(worn: Tensor) -> Tensor:
     number = np.zeros(mask.size, np.int64)
     number[mask.reshape(-1)] = np.unique(label[mask.reshape(-1)], return_inverse=True)[1] + 1
     return torch.from_numpy(number.reshape(mask.shape))
+
+
+@in_style
+def wear_figure(first: Tensor, series: WearSeries, names: Sequence[str]) -> Figure:
+    """Draw the wear of a series of maps against the first (H, 2 H), NaN where unknown; `names` are of all maps."""
+    count = len(series.wear)
+    drawn = np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int)).tolist()
+    rows = math.ceil((len(drawn) + 1) / 2)
+    figure = new_figure(WIDTH_IN, 1.75 * rows + 2.7)
+    grid = figure.add_gridspec(rows + 1, 2, height_ratios=[1.0] * rows + [1.15])
+    maps = [figure.add_subplot(grid[k // 2, k % 2]) for k in range(len(drawn) + 1)]
+    _drawn(maps[0], first, f"{names[0]}: the first map")
+    style = {"cmap": "RdBu_r", "vmin": -CHANGE_REACH, "vmax": CHANGE_REACH}
+    for axes, k in zip(maps[1:], drawn, strict=True):
+        worn = f"{names[k + 1]}: {100 * series.growth[k].worn:.1f} % worn"
+        shown = _drawn(axes, series.wear[k].change, worn, **style)
+        _mark(axes, series, k)
+    figure.colorbar(shown, ax=maps, shrink=0.6, extend="both", label="change, red where brighter")
+    _draw_growth(figure.add_subplot(grid[rows, :]), series, names)
+    note(
+        figure,
+        f"Change is what lies outside of all grey levels that the first map has within {RADIUS_DEG:g}°; 1 is the step "
+        "from black to white. Outlined: worn places, the largest ones numbered. Sand: unknown.",
+    )
+    return figure
+
+
+def _drawn(axes: Axes, values: Tensor, title: str, **style: Any) -> Any:
+    shown = draw_map(axes, values, title, **style)
+    axes.set_xlabel("")
+    axes.title.set_fontsize(8)
+    return shown
+
+
+def _mark(axes: Axes, series: WearSeries, k: int) -> None:
+    worn = series.wear[k].worn.numpy()
+    if worn.any():
+        axes.contour(worn.astype(float), [0.5], colors=BLACK, linewidths=0.6, extent=EXTENT, origin="upper")
+    for number, place in enumerate(series.places[:NAMED], start=1):
+        if place.share[k] > 0:
+            axes.annotate(
+                str(number),
+                (place.longitude_deg, place.latitude_deg),
+                xytext=(7, 7),
+                textcoords="offset points",
+                fontsize=7,
+                bbox={"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5},
+            )
+
+
+def _draw_growth(axes: Axes, series: WearSeries, names: Sequence[str]) -> None:
+    at = np.arange(1, len(series.wear) + 1)
+    whole = 100 * np.array([one.worn for one in series.growth])
+    axes.plot(np.append(0, at), np.append(0, whole), marker=ALL.marker, label="all, of the known area", **ALL.drawn)
+    for number, place in enumerate(series.places[:NAMED], start=1):
+        shares = 100 * np.array([0, *place.share])
+        axes.plot(np.append(0, at), shares, marker=".", linewidth=0.9, label=f"place {number}")
+    axes.set(ylabel="worn (% of the ball)", xticks=np.append(0, at), ylim=(0, None))
+    axes.set_ylim(0, max(LEAST_PERCENT, axes.get_ylim()[1]))
+    axes.set_xticklabels(list(names))
+    axes.yaxis.set_major_locator(MaxNLocator(6))
+    axes.legend(loc="upper left")
