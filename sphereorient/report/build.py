@@ -1,18 +1,20 @@
 """A report: a folder with one page, the figures, and the tables."""
 
+import base64
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from sphereorient.errors import ExperimentError, OutputError, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.report import plots
+from sphereorient.report.frame_warnings import bad_stretches
 from sphereorient.report.gallery import gallery
-from sphereorient.report.page import DrawnFigure, Report, page_html, strip_html
-from sphereorient.report.strip import bad_stretches
+from sphereorient.report.page import Report, page_html, strip_html
 from sphereorient.report.tables import tables_of, write_tables
 from sphereorient.report.verdicts import Verdict, verdicts
 from sphereorient.statistics import StatisticsSettings, Summary, Surroundings, summarise
@@ -152,12 +154,13 @@ def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequ
         yield "durations", "Durations of the segments.", lambda: plots.durations_figure(found), True
 
 
-def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[DrawnFigure]:
+def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[dict[str, Any]]:
     drawn = []
     for k, (name, caption, draw, half) in enumerate(plans):
         progress("figures", k, len(plans))
         plots.write_figure(draw(), folder / name)
-        drawn.append(DrawnFigure(name=name, caption=caption, png=(folder / f"{name}.png").read_bytes(), half=half))
+        png = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
+        drawn.append({"name": name, "caption": caption, "png": png, "half": half})
     progress("figures", len(plans), len(plans))
     return drawn
 

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sphereorient.report.frame_warnings import runs_of
+
 Colour = tuple[int, int, int]
 BACKGROUND: Colour = (18, 18, 22)
 INK: Colour = (235, 235, 235)
@@ -58,6 +60,7 @@ class Panel:
         (left, top), (width, height) = corner, size
         self.canvas, self.corner, self.size = canvas, corner, size
         self.pixels = canvas.pixels[top : top + height, left : left + width]
+        self.pixels[:] = 0
         self.first_px, self.scale = np.asarray(first_px, np.float64), scale
 
     def show(self, picture: NDArray[np.uint8]) -> None:
@@ -72,10 +75,13 @@ class Panel:
 
     def line(self, uv_px: NDArray[np.float64], colour: Colour, width: int = 1, dotted: bool = False) -> None:
         """Draw a line through points (n, 2) of the picture, interrupted at NaN."""
-        for run in _runs(self.place(uv_px)):
-            for piece in _dots(run) if dotted else [run]:
-                points = np.round(piece * (1 << SHIFT)).astype(np.int32)
-                cv2.polylines(self.pixels, [points], False, colour, width, cv2.LINE_AA, SHIFT)
+        points = self.place(uv_px)
+        # Points too far away for integers interrupt it, too.
+        for first, last in runs_of((np.abs(np.nan_to_num(points, nan=1e9)) < 1e5).all(-1)):
+            run = points[first:last]
+            for piece in _dots(run) if dotted else [run] if len(run) > 1 else []:
+                ends = np.round(piece * (1 << SHIFT)).astype(np.int32)
+                cv2.polylines(self.pixels, [ends], False, colour, width, cv2.LINE_AA, SHIFT)
 
     def text(self, uv_px: NDArray[np.float64], words: str, size: int, colour: Colour) -> None:
         """Write text around a point of the picture if it is inside the panel."""
@@ -83,19 +89,15 @@ class Panel:
         if 0 <= x < self.size[0] and 0 <= y < self.size[1]:
             self.canvas.text((self.corner[0] + x, self.corner[1] + y), words, size, colour, "mm")
 
+    def say(self, words: str, size: int = 13) -> None:
+        """Write text in the middle of the panel."""
+        (left, top), (width, height) = self.corner, self.size
+        self.canvas.text((left + width / 2, top + height / 2), words, size, FAINT, "mm")
+
     def border(self, colour: Colour, width: int) -> None:
         """Draw a border along the edges."""
         for edge in (np.s_[:width], np.s_[-width:], np.s_[:, :width], np.s_[:, -width:]):
             self.pixels[edge] = colour
-
-
-def _runs(points: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    """Yield the parts of a line between NaN and points too far away for integers."""
-    good = (np.abs(np.nan_to_num(points, nan=1e9)) < 1e5).all(-1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
-    for first, last in edges.reshape(-1, 2):
-        if last - first > 1:
-            yield points[first:last]
 
 
 def _dots(points: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from sphereorient.movies import Grey
 from sphereorient.report import overlay_canvas as ink
-from sphereorient.report.frame_warnings import flag_words, lost_cameras
+from sphereorient.report.frame_warnings import flag_words, lost_cameras, shown_flags
 from sphereorient.report.overlay_canvas import Canvas, Panel
 from sphereorient.report.overlay_model import CropWindow, LightFit, Model, axes_px, crop, outline_px
-from sphereorient.trajectory import CameraTrack, Flag, Trajectory
+from sphereorient.trajectory import CameraTrack, Trajectory
 
 HEAD, FOOT, GAP, TITLE, SIDE = 62, 56, 10, 24, 310  # px: bands above and below, between panels, titles, square panels
 FRAME_HEIGHT = 440  # px, of a camera's frame
@@ -50,6 +50,10 @@ class OverlayView:
     def centre_px(self, seen: CameraTrack, k: int) -> NDArray[np.float64]:
         """Return the centre in frame k from the track, else from the camera alone, px; NaN if neither is known."""
         return np.asarray(self.trail_px[k] if self.placed(k) else seen.centre_px[k])
+
+    def window(self, seen: CameraTrack, k: int) -> CropWindow:
+        """Return the crop around `centre_px` of frame k, as fine as the panels of the page."""
+        return CropWindow(centre_px=self.centre_px(seen, k), half_px=self.half_px, side=crop_side(self.half_px))
 
     def placed(self, k: int) -> bool:
         """Whether the track has a position in frame k."""
@@ -105,24 +109,21 @@ class Page:
     ) -> None:
         seen = self.track.cameras[view.name]
         frame = Panel(canvas, corner, size, (-0.5, -0.5), size[1] / view.model.camera.image_size[1])
-        frame.pixels[:] = 0
         if picture is not None:
             frame.show(view.shown(picture))
-        centre, half = view.centre_px(seen, k), view.half_px
-        left = corner[0] + size[0] + GAP
+        missing = "no picture" if picture is None else ""
+        window, left = view.window(seen, k), corner[0] + size[0] + GAP
         panels = []
         for column, title in enumerate(("crop", "re-rendered", "residual")):
             at = (left + column * (SIDE + GAP), corner[1] + TITLE)
             canvas.text((at[0], at[1] - 7), title, 14, ink.FAINT)
-            panels.append(Panel(canvas, at, (SIDE, SIDE), centre - half, SIDE / (2 * half)))
-            panels[-1].pixels[:] = 0
-        here = bool(np.isfinite(centre).all()) and np.isfinite(half)
-        window = CropWindow(centre_px=centre, half_px=half, side=crop_side(half))
-        blank = _fill(panels, view, k, picture, window) if here else "no position"
-        no_crop = "no picture" if picture is None else "" if here else blank
-        no_residual = blank or ("no picture" if picture is None else "")
-        for panel, words in zip(panels, (no_crop, blank, no_residual), strict=True):
-            canvas.text((panel.corner[0] + SIDE / 2, panel.corner[1] + SIDE / 2), words, 15, ink.FAINT, "mm")
+            panels.append(crop_panel(canvas, at, SIDE, window))
+        blank = "no position"
+        if window.known:
+            rendered = draw_pictures(panels, view, k, picture, window)
+            blank = "" if rendered else view.why_unlit if view.light is None else "no orientation"
+        for panel, words in zip(panels, (missing or blank * (not window.known), blank, blank or missing), strict=True):
+            panel.say(words, 15)
         for panel, letters in ((frame, False), (panels[0], True)):
             if view.placed(k) and np.isfinite(panel.first_px).all():
                 draw_outline(panel, view, k)
@@ -133,8 +134,7 @@ class Page:
             panels[0].line(seen.centre_px[k] + seen.radius_px[k] * around, ink.INK, 1, dotted=True)
         frame.line(view.trail_px[max(0, k - TRAIL_FRAMES) : k + 1], ink.TRAIL, 1)
         canvas.text((corner[0] + 8, corner[1] + 20), view.name, 16)
-        if picture is None:
-            canvas.text((corner[0] + size[0] / 2, corner[1] + size[1] / 2), "no picture", 16, ink.FAINT, "mm")
+        frame.say(missing, 16)
         mark = self.state(k)[1]
         if mark != ink.GOOD:
             frame.border(mark, 3)
@@ -179,8 +179,7 @@ class Page:
 
     def _strip(self, width: int) -> NDArray[np.uint8]:
         """Return the states of all frames side by side, (width, 3); a pixel shows the worst of its frames."""
-        flags = self.track.flags if len(self.track.cameras) > 1 else self.track.flags & ~np.uint32(Flag.ONE_CAMERA)
-        state = np.where(self.track.valid, np.where(flags != 0, 1, 0), 2)
+        state = np.where(self.track.valid, np.where(shown_flags(self.track) != 0, 1, 0), 2)
         edges = np.linspace(0, len(state), width + 1)
         first = edges[:-1].astype(int)
         last = np.maximum(np.ceil(edges[1:]).astype(int), first + 1)
@@ -193,18 +192,24 @@ def crop_side(half_px: float) -> int:
     return max(48, min(SIDE, round(2 * half_px))) if np.isfinite(half_px) else SIDE
 
 
-def _fill(panels: Sequence[Panel], view: OverlayView, k: int, picture: Grey | None, window: CropWindow) -> str:
-    """Show crop, re-rendered sphere and residual; return why the sphere is not rendered, or an empty string."""
+def crop_panel(canvas: Canvas, corner: tuple[int, int], side: int, window: CropWindow) -> Panel:
+    """Return a square panel, `side` px wide, that shows a window."""
+    return Panel(canvas, corner, (side, side), window.centre_px - window.half_px, side / (2 * window.half_px))
+
+
+def draw_pictures(panels: Sequence[Panel], view: OverlayView, k: int, picture: Grey | None, window: CropWindow) -> bool:
+    """Show crop, re-rendered sphere and, in a third panel, residual; return whether the sphere could be rendered."""
     grey = None if picture is None else crop(picture, window)
     if grey is not None:
         panels[0].show(view.shown(grey))
     if view.light is None or not view.model.path.whole[k]:
-        return "no orientation" if view.light is not None else view.why_unlit
+        return False
     model = view.light.picture(view.model.look(k, window), grey)
     panels[1].show(view.shown(model))
     if grey is not None:
-        panels[2].show(residual_colours((grey - model) / view.light.contrast))
-    return ""
+        for panel in panels[2:]:
+            panel.show(residual_colours((grey - model) / view.light.contrast))
+    return True
 
 
 def residual_colours(residual: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, refusal
-from sphereorient.experiment import Experiment, open_movies
-from sphereorient.experiment.stream import CameraStream
+from sphereorient.experiment import Experiment
 from sphereorient.movies import Grey
-from sphereorient.report.export_columns import package
+from sphereorient.report.export import package
 from sphereorient.report.frame_warnings import frame_warnings
-from sphereorient.report.overlay import frames_of, pictures_by_row
+from sphereorient.report.overlay import pictures_by_row, streams_of
 from sphereorient.report.overlay_canvas import AXES, OUTLINE, TRAIL
 from sphereorient.report.overlay_model import Path3D, finite_rows, path_of, radius_of
 from sphereorient.sphere import load_texture, reduced_texture
@@ -246,12 +245,7 @@ def _log_pictures(
 
     names = [name for name in track.cameras if name in experiment.cameras]
     with ExitStack() as opened:
-        movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
-        _, rows = frames_of(track, experiment, movies)
-        streams = {
-            name: CameraStream(name=name, camera=experiment.cameras[name], movie=movies[name], rows=rows[name])
-            for name in names
-        }
+        _, streams = streams_of(track, experiment, names, opened)
         white: dict[str, float] = {}
         for done, (k, pictures) in enumerate(pictures_by_row(streams, chosen), start=1):
             recording.set_time(TIME, duration=float(track.time[k]))

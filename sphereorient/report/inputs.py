@@ -1,31 +1,140 @@
-"""The figure of a check: pictures of the cameras, their agreement, the texture map, and all findings."""
+"""Pictures of what a measurement starts from: a movie's frames, a calibration, and the check before a run."""
 
 import math
 import textwrap
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from sphereorient.calibration import Calibrated, PictureReport
+from sphereorient.movies import Movie
+from sphereorient.movies.survey import Survey, SurveyedFrame
 from sphereorient.preflight import Preflight, Severity
 from sphereorient.preflight.cameras import expected_outline_px, sample_gaps
 from sphereorient.preflight.offset import REACH
 from sphereorient.preflight.sample import MovieSample
+from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, write_figure
 
-FOUND, EXPECTED, USED = "#009E73", "#D55E00", "#0072B2"  # Okabe and Ito's
+EXPECTED, FOUND, USED = AXIS_COLOURS
+OUTLIER = "#CC79A7"
 # Shape and colour both: readable without colours, and by colour-blind readers.
-MARKS = {
-    Severity.OK: ("\u25cf", "#009E73"),
-    Severity.WARNING: ("\u25b2", "#E69F00"),
-    Severity.FAULT: ("\u2716", "#D55E00"),
-}
-WIDTH, PICTURE, LINE = 13.0, 3.3, 0.165  # inches: of the figure, of a row of pictures, of a line of text
+MARKS = {Severity.OK: ("\u25cf", FOUND), Severity.WARNING: ("\u25b2", "#E69F00"), Severity.FAULT: ("\u2716", EXPECTED)}
+WIDTH = 13.0  # inches, of the figures; so are:
+COLUMNS, TITLE, HEAD = 6, 0.27, 0.8  # of a contact sheet: frames in a row; the line above a frame, the title
+PICTURE, LINE = 3.3, 0.165  # of a check: a row of pictures, a line of text
+BRIGHT_QUANTILE = 0.999  # of the pixels: shown white, so that a few glints do not darken the rest
+SHOWN = 3  # pictures of each camera
 CHARACTERS = 145  # in a line of the list
+
+
+@in_style
+def contact_sheet(movie: Movie, seen: Survey, path: Path) -> None:
+    """Draw the frames of a survey of a movie side by side, on one scale of grey, into a PNG or PDF."""
+    rows = math.ceil(len(seen.frames) / COLUMNS)
+    height, width = movie.frame_shape
+    figure = new_figure(WIDTH, HEAD + rows * ((WIDTH / COLUMNS) * height / width + TITLE))
+    pictures = [frame.small for frame in seen.frames if frame.small is not None and not frame.fault]
+    pictures = pictures or [frame.small for frame in seen.frames if frame.small is not None]
+    values = np.concatenate([picture.ravel() for picture in pictures]) if pictures else np.array([0.0])
+    black = float(values.min())
+    white = max(float(np.quantile(values, BRIGHT_QUANTILE)), black + 1)
+    figure.suptitle(
+        f"{movie.path.name}: {len(movie)} frames of {width} x {height} px, {8 * movie.dtype.itemsize} bit\n"
+        f"grey levels {black:.0f} (black) to {white:.0f} (white)",
+        fontsize=11,
+    )
+    axes = np.ravel(figure.subplots(rows, COLUMNS, squeeze=False))
+    for ax, frame in zip(axes, seen.frames, strict=False):
+        _draw_frame(ax, frame, movie, black, white)
+    for ax in axes[len(seen.frames) :]:
+        ax.set_axis_off()
+    write_figure(figure, path, dpi=110)
+
+
+def _draw_frame(ax: Any, frame: SurveyedFrame, movie: Movie, black: float, white: float) -> None:
+    height, width = movie.frame_shape
+    edges = (-0.5, width - 0.5, height - 0.5, -0.5)  # row 0 on top
+    picture = np.zeros((1, 1)) if frame.small is None else frame.small
+    ax.imshow(picture, cmap="gray", vmin=black, vmax=white, extent=edges, interpolation="nearest")
+    ax.set(xticks=[], yticks=[], xlim=edges[:2], ylim=edges[2:])
+    title = f"{frame.number}"
+    if movie.times_s is not None:
+        time_s = float(movie.times_s[frame.number])
+        title += f", {time_s:.6g} s" if abs(time_s) >= 1 or not time_s else f", {1e3 * time_s:.5g} ms"
+    ax.set_title(title, fontsize=8, pad=2)
+    if frame.fault:
+        ax.set_title(f"{title}: {frame.fault}", fontsize=8, pad=2, color=EXPECTED, fontweight="bold")
+        for spine in ax.spines.values():
+            spine.set(color=EXPECTED, linewidth=2)
+
+
+@in_style
+def calibration_figure(result: Calibrated, path: Path) -> None:
+    """Draw the pictures, read again, with points found and expected, and all residuals; into a PNG or PDF."""
+    names = list(result.cameras)
+    figure = new_figure(4.2 * (SHOWN + 2), 4.3 * len(names))
+    axes = figure.subplots(len(names), SHOWN + 2, squeeze=False)
+    for row, name in zip(axes, names, strict=True):
+        used = [one for one in result.pictures if one.picture.camera == name and not one.reason]
+        chosen = [used[int(k)] for k in np.linspace(0, len(used) - 1, min(SHOWN, len(used))).round()]
+        for ax in row:
+            ax.grid(visible=False)
+        for ax, one in zip(row, chosen, strict=False):
+            _draw_picture(ax, one)
+        for ax in row[len(chosen) : SHOWN]:
+            ax.set_axis_off()
+        row[0].set_ylabel(name, fontsize=12)
+        place = np.concatenate([np.zeros((0, 2)), *(one.view.uv_px[one.used] for one in used)])
+        missed = np.concatenate([np.zeros((0, 2)), *(one.residual_px[one.used] for one in used)])
+        _draw_residuals(row[SHOWN], place, missed, result.cameras[name].image_size)
+        _draw_histogram(row[SHOWN + 1], missed, result.rms_px(name))
+    write_figure(figure, path, dpi=110)
+
+
+def _draw_picture(ax: Any, one: PictureReport) -> None:
+    data = np.fromfile(one.picture.path, np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if picture is not None:  # a table of points has no picture
+        ax.imshow(picture, cmap="gray")
+    else:
+        ax.set_aspect("equal")
+        ax.invert_yaxis()
+    found = one.view.uv_px
+    expected = found - one.residual_px
+    ax.plot(*expected.T, "+", ms=7, mew=0.9, color=EXPECTED, label="expected")
+    ax.plot(*found.T, "o", ms=4, mfc="none", mew=0.8, color=FOUND, label="found")
+    if not one.used.all():
+        ax.plot(*found[~one.used].T, "x", ms=8, color=OUTLIER, label="left out")
+    ax.set(xticks=[], yticks=[])
+    ax.set_title(f"pose {one.pose}: {len(found)} points, rms {one.rms_px:.3f} px", fontsize=9)
+    ax.legend(loc="lower right", frameon=True, framealpha=0.8)
+
+
+def _draw_residuals(
+    ax: Any, place: NDArray[np.float64], missed: NDArray[np.float64], image_size: tuple[int, int]
+) -> None:
+    usual = float(np.sqrt((missed**2).sum(1).mean())) if len(missed) else 1.0
+    # The arrow of the usual length is a fortieth of the picture long.
+    times = image_size[0] / 40 / max(usual, 1e-9)
+    style = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.002, "color": EXPECTED, "alpha": 0.7}
+    ax.quiver(*place.T, *(times * missed.T), **style)
+    ax.set(xlim=(0, image_size[0]), ylim=(image_size[1], 0), aspect="equal", xlabel="u (px)", ylabel="v (px)")
+    ax.set_title(f"found less expected, {times:.0f} times", fontsize=9)
+
+
+def _draw_histogram(ax: Any, missed: NDArray[np.float64], rms_px: float) -> None:
+    reach = 4 * max(rms_px, 1e-6) / np.sqrt(2)
+    for part, colour, label in zip(missed.T, (FOUND, EXPECTED), ("u", "v"), strict=True):
+        ax.hist(part, np.linspace(-reach, reach, 41), histtype="step", lw=1.5, color=colour, label=label)
+    ax.set(xlabel="found less expected (px)", ylabel="points")
+    ax.xaxis.set_major_locator(MaxNLocator(5))
+    ax.set_title(f"all pictures: rms {rms_px:.3f} px", fontsize=9)
+    ax.legend()
 
 
 def preflight_figure(result: Preflight, path: Path) -> None:
@@ -33,8 +142,7 @@ def preflight_figure(result: Preflight, path: Path) -> None:
     lines = _lines(result)
     agreement = result.scan is not None or result.texture is not None
     heights = [PICTURE, PICTURE if agreement else 0.01, LINE * (len(lines) + 2)]
-    figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(WIDTH, sum(heights))
     top, middle, bottom = np.ravel(figure.subfigures(3, 1, height_ratios=heights, squeeze=False))
     _cameras_part(top, result)
     if agreement:
@@ -56,7 +164,7 @@ def _cameras_part(part: Any, result: Preflight) -> None:
     for sample, pair in zip(result.samples, axes.reshape(2, 2), strict=False):
         expected = _expected_px(result, sample, k)
         for ax, near in zip(pair, (False, True), strict=True):
-            _draw_frame(ax, sample, k, expected, near)
+            _draw_ball(ax, sample, k, expected, near)
     if axes[0].lines:
         axes[0].legend(loc="lower left", fontsize=7, framealpha=0.8)
 
@@ -71,7 +179,7 @@ def _expected_px(result: Preflight, sample: MovieSample, k: int) -> NDArray[np.f
     return expected_outline_px(sample.camera, position, result.experiment.diameter_mm / 2).numpy()
 
 
-def _draw_frame(ax: Any, sample: MovieSample, k: int, expected: NDArray[np.float64] | None, near: bool) -> None:
+def _draw_ball(ax: Any, sample: MovieSample, k: int, expected: NDArray[np.float64] | None, near: bool) -> None:
     picture, (outline, reason) = sample.picture[k], sample.found[k]
     ax.set(xticks=[], yticks=[])
     if picture is None:
