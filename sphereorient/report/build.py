@@ -14,7 +14,7 @@ from sphereorient.experiment import Experiment
 from sphereorient.report import plots
 from sphereorient.report.frame_warnings import bad_stretches
 from sphereorient.report.gallery import gallery
-from sphereorient.report.page import Report, page_html, strip_html
+from sphereorient.report.page import page_html, strip_html
 from sphereorient.report.tables import tables_of, write_tables
 from sphereorient.report.verdicts import Verdict, verdicts
 from sphereorient.statistics import StatisticsSettings, Summary, Surroundings, summarise
@@ -63,17 +63,17 @@ def write_report(
     words = verdicts(summary, tracks, distances)
     with _folder(out) as aside:
         tables = tables_of(summary, tracks, distances)
-        report = Report(
-            summary=summary,
-            tracks=tracks,
+        page = page_html(
+            summary,
+            tracks,
+            command,
             verdicts=words,
             tables=tables,
             suffixes=write_tables(tables, aside / "tables"),
             figures=_draw_all(list(_figures(summary, tracks, distances)), aside / "figures", progress),
             strips=list(_strips(tracks, known, progress)),
-            command=command,
         )
-        (aside / "index.html").write_text(page_html(report), "utf-8")
+        (aside / "index.html").write_text(page, "utf-8")
     return words
 
 

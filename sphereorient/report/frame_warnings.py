@@ -1,8 +1,9 @@
 """Quality of the frames of a track: warnings as text, the worst frames, stretches of bad ones, the data of the page."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, zip_longest
 from typing import Any
 
 import numpy as np
@@ -83,25 +84,16 @@ def choose_worst(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
     Of frames less than three apart one is taken. If fewer frames are bad, those with the lowest scores follow.
     """
     kinds = [list(ranked) for ranked in _kinds(track)]
-    taken: list[int] = []
     why: dict[int, list[str]] = {}
-
-    def take(k: int) -> None:
+    for k, words in chain.from_iterable(kinds):
+        why.setdefault(k, []).append(words)
+    lowest = {k: [words] for k, words in _lowest(track) if k not in why}
+    in_turn = [entry[0] for entry in chain.from_iterable(zip_longest(*kinds)) if entry is not None]
+    taken: list[int] = []
+    for k in chain(in_turn, lowest):
         if len(taken) < count and all(abs(k - other) >= APART_FRAMES for other in taken):
             taken.append(k)
-
-    for ranked in kinds:
-        for k, words in ranked:
-            why.setdefault(k, []).append(words)
-    for place in range(max(len(ranked) for ranked in kinds)):
-        for ranked in kinds:
-            if place < len(ranked):
-                take(ranked[place][0])
-    for k, words in _lowest(track):
-        if k not in why:
-            take(k)
-            why[k] = [words]
-    return {k: tuple(dict.fromkeys(why[k])) for k in taken}
+    return {k: tuple(dict.fromkeys(why.get(k) or lowest[k])) for k in taken}
 
 
 def _kinds(track: Trajectory) -> Iterator[Ranked]:
@@ -146,9 +138,10 @@ def _flags(track: Trajectory) -> Ranked:
 
 def _lowest(track: Trajectory) -> Ranked:
     score = _score(track)
-    for k in np.argsort(np.where(np.isfinite(score) & track.valid, score, np.inf), kind="stable").tolist():
-        if np.isfinite(score[k]) and track.valid[k]:
-            yield k, f"not in doubt; among the lowest scores: {score[k]:.3f}, usually {np.nanmedian(score):.3f}"
+    known = np.flatnonzero(np.isfinite(score) & track.valid)
+    usual = np.nanmedian(score) if len(known) else np.nan
+    for k in known[np.argsort(score[known], kind="stable")].tolist():
+        yield k, f"not in doubt; among the lowest scores: {score[k]:.3f}, usually {usual:.3f}"
 
 
 def _outliers(values: Floats, words: str, sign: int = 1) -> Ranked:
@@ -318,12 +311,11 @@ def _reason_codes(track: Trajectory) -> tuple[dict[str, Ints], list[str]]:
 
 def _reasons(group: Ints, warnings: Sequence[Sequence[str]]) -> tuple[tuple[str, int], ...]:
     """Count the frames of each warning, without "not valid", which is counted apart."""
-    counted: dict[str, int] = {}
+    counted: Counter[str] = Counter()
     for which, frames in zip(*np.unique(group, return_counts=True), strict=True):
-        for words in warnings[which]:
-            counted[words] = counted.get(words, 0) + int(frames)
-    counted.pop("not valid", None)
-    return tuple(sorted(counted.items(), key=lambda entry: -entry[1]))
+        counted.update(dict.fromkeys(warnings[which], int(frames)))
+    del counted["not valid"]
+    return tuple(counted.most_common())
 
 
 def _short(values: Floats, digits: int = DIGITS) -> list[float | None]:

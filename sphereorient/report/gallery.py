@@ -17,15 +17,8 @@ from sphereorient.errors import OutputError, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.files.outputs import put_aside
 from sphereorient.movies import Grey
+from sphereorient.report import frame_warnings as quality
 from sphereorient.report import overlay_canvas as ink
-from sphereorient.report.frame_warnings import (
-    GOOD,
-    BadStretch,
-    bad_stretches,
-    choose_worst,
-    frame_warnings,
-    status_of,
-)
 from sphereorient.report.overlay import pictures_by_row, prepared
 from sphereorient.report.overlay_canvas import Canvas
 from sphereorient.report.overlay_page import Page, crop_panel, draw_axes, draw_outline, draw_pictures
@@ -90,7 +83,7 @@ def gallery(
     why = chosen_frames(track, count)
     rows = np.array(sorted(why), dtype=np.int64)
     rank = {k: place for place, k in enumerate(why)}
-    status = status_of(track)
+    status = quality.status_of(track)
     frames = []
     with ExitStack() as opened:
         page, streams = prepared(track, experiment, None, opened)
@@ -119,34 +112,34 @@ def chosen_frames(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
 
     Two thirds are bad frames, the middles of the longest stretches first; good frames, spread evenly, serve to compare.
     """
-    status = status_of(track)
-    good, bad = np.flatnonzero(status == GOOD), np.flatnonzero(status != GOOD)
+    status = quality.status_of(track)
+    good, bad = np.flatnonzero(status == quality.GOOD), np.flatnonzero(status != quality.GOOD)
     room = min(count, len(track))
     bad_room = room - min(len(good), room - round(BAD_SHARE * room))
     # At most half are middles, so that frames of `choose_worst` are shown too.
-    why = dict(list(_middles(track, bad, bad_stretches(track)))[: -(-bad_room // 2)])
+    why = dict(list(_middles(track, bad, quality.bad_stretches(track)))[: -(-bad_room // 2)])
 
     def fill(more: dict[int, tuple[str, ...]], upto: int) -> None:
         for k, words in more.items():
             if k not in why and len(why) < upto:
                 why[k] = words
 
-    worst = choose_worst(track, bad_room)
+    worst = quality.choose_worst(track, bad_room)
     fill({k: words for k, words in worst.items() if not words[0].startswith("not in doubt")}, bad_room)
     left = np.setdiff1d(bad, list(why))
-    fill({k: tuple(frame_warnings(track, k)) for k in _spread(left, bad_room - len(why))}, bad_room)
+    fill({k: tuple(quality.frame_warnings(track, k)) for k in _spread(left, bad_room - len(why))}, bad_room)
     left = np.setdiff1d(good, list(why))
     fill(dict.fromkeys(_spread(left, room - len(why)), (TO_COMPARE,)), room)
     return why
 
 
-def _middles(track: Trajectory, bad: Rows, found: list[BadStretch]) -> Iterator[tuple[int, tuple[str, ...]]]:
+def _middles(track: Trajectory, bad: Rows, found: list[quality.BadStretch]) -> Iterator[tuple[int, tuple[str, ...]]]:
     """Yield the bad frame nearest to the middle of each stretch."""
     for stretch in found:
         inside = bad[np.searchsorted(bad, stretch.first) : np.searchsorted(bad, stretch.last, "right")]
         k = int(inside[np.abs(inside - (stretch.first + stretch.last) / 2).argmin()])
         place = "alone among good ones" if stretch.frames == 1 else f"in a stretch of {stretch.frames} frames"
-        yield k, (place, *frame_warnings(track, k))
+        yield k, (place, *quality.frame_warnings(track, k))
 
 
 def _spread(rows: Rows, count: int) -> list[int]:
@@ -177,7 +170,7 @@ def worst_frames(
     if path.suffix.lower() not in SUFFIXES:
         do = "end the name in .png"
         raise OutputError(refusal(f"--worst {path}", expected=" ".join(SUFFIXES), got=f"'{path.suffix}'", do=do))
-    bad = choose_worst(track, count)
+    bad = quality.choose_worst(track, count)
     with ExitStack() as opened:
         page, streams = prepared(track, experiment, cameras, opened)
         width, height = _pairs_size(page)

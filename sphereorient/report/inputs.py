@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sphereorient.calibration import Calibrated, PictureReport
 from sphereorient.movies import Movie
 from sphereorient.movies.survey import Survey, SurveyedFrame
-from sphereorient.preflight import Preflight, Severity
+from sphereorient.preflight import Finding, Preflight, Severity
 from sphereorient.preflight.cameras import expected_outline_px, sample_gaps
 from sphereorient.preflight.offset import REACH
 from sphereorient.preflight.sample import MovieSample
@@ -257,24 +257,23 @@ def _no_data(ax: Any, text: str) -> None:
     ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes, fontsize=9)
 
 
-def _lines(result: Preflight) -> list[tuple[Severity | None, str, str, bool]]:
-    """Return the findings line by line, faults first: mark, title, text, whether it is advice."""
-    lines: list[tuple[Severity | None, str, str, bool]] = []
+def _lines(result: Preflight) -> list[tuple[Finding | None, str, str]]:
+    """Return the findings line by line, faults first: the finding that begins, text, font style."""
+    lines: list[tuple[Finding | None, str, str]] = []
     order = list(Severity)
     for finding in sorted(result.findings, key=lambda one: -order.index(one.severity)):
-        first, *more = textwrap.wrap(finding.measured, CHARACTERS) or [""]
-        lines.append((finding.severity, finding.title, first, False))
-        lines += [(None, "", text, False) for text in more]
+        texts = [(text, "normal") for text in textwrap.wrap(finding.measured, CHARACTERS) or [""]]
         if finding.advice:
-            lines += [(None, "", text, True) for text in textwrap.wrap(f"do: {finding.advice}", CHARACTERS)]
+            texts += [(text, "italic") for text in textwrap.wrap(f"do: {finding.advice}", CHARACTERS)]
+        lines += [(None if k else finding, *text) for k, text in enumerate(texts)]
     return lines
 
 
-def _list_part(part: Any, lines: list[tuple[Severity | None, str, str, bool]], height: float) -> None:
-    for k, (severity, title, text, advice) in enumerate(lines):
+def _list_part(part: Any, lines: list[tuple[Finding | None, str, str]], height: float) -> None:
+    for k, (finding, text, style) in enumerate(lines):
         y = 1 - LINE * (k + 0.8) / height
-        if severity is not None:
-            mark, colour = MARKS[severity]
+        if finding is not None:
+            mark, colour = MARKS[finding.severity]
             part.text(0.012, y, mark, color=colour, fontsize=9, va="center")
-            part.text(0.03, y, title, fontsize=8, weight="bold", va="center")
-        part.text(0.18, y, text, fontsize=8, va="center", style="italic" if advice else "normal")
+            part.text(0.03, y, finding.title, fontsize=8, weight="bold", va="center")
+        part.text(0.18, y, text, fontsize=8, va="center", style=style)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
@@ -16,8 +15,6 @@ from sphereorient.files.provenance import versions
 from sphereorient.report.frame_warnings import STATUS_WORDS, BadStretch, bad_stretches, stated_error, strip_of
 from sphereorient.report.gallery import Gallery, GalleryFrame
 from sphereorient.report.plots.style import SYMBOLS, decimals
-from sphereorient.report.tables import Table
-from sphereorient.report.verdicts import Verdict
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.moments import COMPONENTS
 from sphereorient.trajectory import Trajectory
@@ -36,23 +33,12 @@ Cell = tuple[str, str]  # a number or words, and the interval
 Grid = dict[str, Any]  # a table of the page: title, about, head, rows of cells; the files have all digits
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Report:
-    """The contents of the page; made by `build`."""
+def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, **parts: Any) -> str:
+    """Return the page of a report, from statistics, tracks by the name of their file, and the command that made it.
 
-    summary: Summary
-    tracks: Mapping[str, Trajectory]  # by the name of their file
-    verdicts: Sequence[Verdict]
-    figures: Sequence[Mapping[str, Any]]  # name, caption, png in base64, half (two beside each other)
-    tables: Sequence[Table]  # that were written
-    suffixes: Sequence[str]  # of the tables' files
-    strips: Sequence[str]  # HTML of the tracks' quality strips, of `strip_html`
-    command: str  # that made the report
-
-
-def page_html(report: Report) -> str:
-    """Return the page of a report."""
-    summary, tracks = report.summary, report.tracks
+    `parts`: verdicts; figures (name, caption, png in base64, half: two beside each other); tables that were written,
+    and the suffixes of their files; strips, HTML of `strip_html`.
+    """
     css, js = strip_assets()
     names = sorted({track.experiment for track in tracks.values() if track.experiment})
     page = {
@@ -63,9 +49,10 @@ def page_html(report: Report) -> str:
         "grids": [grid for grid in (*_moments(summary), _flow(summary)) if grid["rows"]],
         "settings": _settings(summary),
         "provenance": [_provenance(name, track) for name, track in tracks.items()],
-        "footer": f"sphereorient {versions()['sphereorient']}; {report.command}",
+        "footer": f"sphereorient {versions()['sphereorient']}; {command}",
     }
-    return _template("page.html.j2").render(page=page, report=report, css=_asset("page.css") + css, js=js)
+    template, css = _template("page.html.j2"), _asset("page.css") + css
+    return template.render(page=page, summary=summary, tracks=tracks, css=css, js=js, **parts)
 
 
 @cache

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from scipy.stats import chi2
 
 from sphereorient import so3
@@ -119,8 +120,8 @@ def _missing(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracker
 def kept_result(path: Path) -> SceneResult:
     """Read the result of a scene; raise BenchError if the file is damaged."""
     try:
-        return SceneResult.from_tree(json.loads(path.read_text("utf-8")))
-    except (OSError, ValueError, KeyError, TypeError):
+        return TypeAdapter(SceneResult).validate_json(path.read_bytes())
+    except (OSError, ValueError):
         do = "delete the file and run again"
         raise BenchError(refusal(str(path), expected="the result of a scene", got="something else", do=do)) from None
 
