@@ -250,9 +250,8 @@ def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStr
     group, warnings = _groups(track)
     status = status_of(track)
     bad, found = np.flatnonzero(status), []
-    breaks = np.flatnonzero(np.diff(bad) > STRETCH_FRAMES)
-    firsts, lasts = bad[np.concatenate([[0], breaks + 1])[: len(bad)]], bad[np.append(breaks, -1)[: len(bad)]]
-    for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
+    parts = np.split(bad, np.flatnonzero(np.diff(bad) > STRETCH_FRAMES) + 1) if len(bad) else []
+    for first, last in ((int(part[0]), int(part[-1])) for part in parts):
         _, doubtful, not_valid = np.bincount(status[first : last + 1], minlength=3).tolist()
         stretch = BadStretch(
             first=first,

@@ -18,10 +18,9 @@ from sphereorient.experiment import Experiment
 from sphereorient.files.outputs import put_aside
 from sphereorient.movies import Grey
 from sphereorient.report import frame_warnings as quality
-from sphereorient.report import overlay_canvas as ink
+from sphereorient.report import overlay_page as ink
 from sphereorient.report.overlay import pictures_by_row, prepared
-from sphereorient.report.overlay_canvas import Canvas
-from sphereorient.report.overlay_page import Page, crop_panel, draw_axes, draw_outline, draw_pictures
+from sphereorient.report.overlay_page import Canvas, Page, crop_panel, draw_axes, draw_outline, draw_pictures
 from sphereorient.trajectory import Trajectory
 
 COUNT = 120

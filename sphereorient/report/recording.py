@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.movies import Grey
 from sphereorient.report.export import package
 from sphereorient.report.frame_warnings import frame_warnings
 from sphereorient.report.overlay import pictures_by_row, streams_of
-from sphereorient.report.overlay_canvas import AXES, OUTLINE, TRAIL
 from sphereorient.report.overlay_model import Path3D, finite_rows, path_of, radius_of
+from sphereorient.report.overlay_page import AXES, OUTLINE, TRAIL
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Trajectory, quaternions_wxyz
 
@@ -254,12 +253,8 @@ def _log_pictures(
                 if picture is not None:
                     # One scale for the whole movie, from the first picture.
                     top = white.setdefault(name, max(1.0, float(np.percentile(picture, 99.9))))
-                    encoded = rr.EncodedImage(contents=_jpeg(picture, top), media_type="image/jpeg")
+                    bright = np.clip(picture.astype(np.float32) * (255 / top), 0, 255).astype(np.uint8)
+                    _, jpeg = cv2.imencode(".jpg", bright, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+                    encoded = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
                     recording.log(f"lab/{name}/picture", encoded)
             progress(done, len(chosen))
-
-
-def _jpeg(picture: Grey, white: float) -> bytes:
-    bright = np.clip(picture.astype(np.float32) * (255 / white), 0, 255).astype(np.uint8)
-    _, content = cv2.imencode(".jpg", bright, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return content.tobytes()
