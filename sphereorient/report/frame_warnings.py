@@ -52,7 +52,9 @@ Ranked = Iterator[tuple[int, str]]  # rows with the reason, worst first
 def shown_flags(track: Trajectory, rows: Any = slice(None)) -> NDArray[np.uint32]:
     """Return the flags of some rows that have words, without ONE_CAMERA in an experiment of one camera."""
     alone = len(track.cameras) < 2
-    return track.flags[rows] & np.uint32(sum(flag for flag in FLAG_WORDS if not (alone and flag == Flag.ONE_CAMERA)))
+    known = sum(flag for flag in FLAG_WORDS if not (alone and flag == Flag.ONE_CAMERA))
+    flags: NDArray[np.uint32] = track.flags[rows] & np.uint32(known)
+    return flags
 
 
 def flag_words(track: Trajectory, k: int) -> list[str]:

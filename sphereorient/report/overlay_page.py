@@ -223,7 +223,8 @@ class Page:
         if window.known:
             rendered = draw_pictures(panels, view, k, picture, window)
             blank = "" if rendered else view.why_unlit if view.light is None else "no orientation"
-        for panel, words in zip(panels, (missing or blank * (not window.known), blank, blank or missing), strict=True):
+        no_crop = missing or ("" if window.known else blank)
+        for panel, words in zip(panels, (no_crop, blank, blank or missing), strict=True):
             panel.say(words, 15)
         for panel, letters in ((frame, False), (panels[0], True)):
             if view.placed(k) and np.isfinite(panel.first_px).all():
