@@ -231,9 +231,8 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
             {
                 "name": name,
                 "score": _short(-largest(-camera.score)),  # the lowest of the bin
-                "reason": codes[name][
-                    first(codes[name] != 0)
-                ].tolist(),  # index in reason_words: the first not measured
+                # Index in reason_words, 0: measured; of a bin the first other one.
+                "reason": codes[name][first(codes[name] != 0)].tolist(),
             }
             for name, camera in track.cameras.items()
         ],
