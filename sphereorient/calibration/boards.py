@@ -154,7 +154,8 @@ def _circles_in_order(dots: Dots, grid: targets.CircleGrid) -> Ints | None:
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
         found, centres = find(points, (grid.columns, grid.rows), flags, None, cv2.CirclesGridFinderParameters())
         if found:
-            away, order = cKDTree(dots.uv_px).query(centres.reshape(-1, 2))
+            tree: Any = cKDTree(dots.uv_px)
+            away, order = tree.query(centres.reshape(-1, 2))
             if len(set(order.tolist())) == len(order) and float(away.max()) < 0.5:
                 return np.asarray(order, dtype=np.int64)
     return None

@@ -53,11 +53,12 @@ def _camera(document: CalibrationDocument, name: str, start: PinholeCamera) -> C
         got, do = f"pixel_pitch {pitch_u:g}, {pitch_v:g}", "choose model: tsai or brown"
         raise camera_error("model: pinhole", "square pixels", got, do)
     start = start if port is None else _in_air(start, port)
-    fields: dict[str, Any] = {
+    models: dict[str, dict[str, Any]] = {
         "pinhole": {"f_px": start.f_px},
         "tsai": {"f_mm": start.f_px * pitch_v, "pixel_pitch_mm": (pitch_u, pitch_v), "sx": 1.0, "kappa1": 0.0},
         "brown": {"f_px": torch.stack([start.f_px * pitch_v / pitch_u, start.f_px]), "k": (0.0,) * 3, "p": (0.0, 0.0)},
-    }[document.model]
+    }
+    fields = models[document.model]
     lens = MODELS[document.model](**fields, **{name: getattr(start, name) for name in SAME})
     return lens if port is None else PortCamera(camera=lens, port=port)
 

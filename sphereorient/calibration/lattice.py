@@ -148,7 +148,7 @@ class _Map:
         straight = cls(np.asarray(found, dtype=np.float64), middle, size, np.zeros((10, 2)))
         if len(index) < CUBIC_FROM:
             return straight
-        bend = np.linalg.lstsq(straight._terms(index), uv_px - straight(index), rcond=1e-9)[0]
+        bend: Any = np.linalg.lstsq(straight._terms(index), uv_px - straight(index), rcond=1e-9)[0]
         return replace(straight, bend=bend)
 
     def _terms(self, index: Floats | Ints) -> Floats:

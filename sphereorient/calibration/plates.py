@@ -193,7 +193,8 @@ def tie_floating(
         candidates = [placed(view, document.plate, placement) for placement in view.placements]
         missed = [_missed(rig, picture, candidate) for candidate in candidates]
         order = np.argsort(missed)
-        step = float(np.median(cKDTree(view.uv_px).query(view.uv_px, k=2)[0][:, 1]))  # to the neighbouring point
+        tree: Any = cKDTree(view.uv_px)
+        step = float(np.median(tree.query(view.uv_px, k=2)[0][:, 1]))  # to the neighbouring point
         if missed[order[0]] < CLEARLY * step and (len(order) == 1 or missed[order[1]] > 2 * CLEARLY * step):
             tied[picture] = candidates[order[0]]
     return tied

@@ -48,7 +48,8 @@ class Port:
     @property
     def normal_lab(self) -> Tensor:
         """(3,), the normal with length 1 to the last digit."""
-        return self.normal / torch.linalg.vector_norm(self.normal)
+        unit: Tensor = self.normal / torch.linalg.vector_norm(self.normal)
+        return unit
 
     @property
     def air_side_mm(self) -> Tensor:

@@ -100,7 +100,7 @@ def show_movie(
     check_writable(sheet)
     from sphereorient.movies import flipped, open_movie
     from sphereorient.movies.survey import survey
-    from sphereorient.report.contact_sheet import contact_sheet
+    from sphereorient.report.inputs import contact_sheet
 
     with flipped(open_movie(source), flip) as opened:
         with progress_bar(quiet) as advance:

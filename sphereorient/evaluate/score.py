@@ -64,8 +64,8 @@ def score_track(track: Trajectory, truth_path: str | Path) -> Score:
     return Score(
         frames=len(track),
         valid=track.valid & np.isfinite(track.orientation).all(axis=(1, 2)) & np.isfinite(track.position).all(axis=1),
-        orientation_deg=_angle_deg(track.orientation, R_true),
-        camera_orientation_deg={name: _angle_deg(seen.orientation, R_true) for name, seen in track.cameras.items()},
+        orientation_deg=distance_deg(track.orientation, R_true),
+        camera_orientation_deg={name: distance_deg(seen.orientation, R_true) for name, seen in track.cameras.items()},
         position_mm=np.linalg.norm(track.position - truth["position"][row], axis=1),
         relative_rms=relative,
         coverage=coverage,
@@ -115,7 +115,8 @@ def _rows(known_s: Floats, time_s: Floats, path: str | Path) -> Frames:
     return row
 
 
-def _angle_deg(A: Floats, B: Floats) -> Floats:
+def distance_deg(A: Floats, B: Floats) -> Floats:
+    """Return the angle between orientations (N, 3, 3), (N,), degrees; NaN where either is."""
     distance = so3.geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy()
     return np.asarray(np.rad2deg(distance), np.float64)
 

@@ -1,6 +1,5 @@
 """Pictures of tracks and calibrations; figures, tables and the page of a report; export to other programs."""
 
-from sphereorient.report.calibration import calibration_figure
-from sphereorient.report.preflight import preflight_figure
+from sphereorient.report.inputs import calibration_figure, preflight_figure
 
 __all__ = ["calibration_figure", "preflight_figure"]

@@ -1,18 +1,20 @@
 """A report: a folder with one page, the figures, and the tables."""
 
+import base64
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from sphereorient.errors import ExperimentError, OutputError, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.report import plots
+from sphereorient.report.frame_warnings import bad_stretches
 from sphereorient.report.gallery import gallery
-from sphereorient.report.page import DrawnFigure, Report, page_html, strip_html
-from sphereorient.report.strip import bad_stretches
+from sphereorient.report.page import page_html, strip_html
 from sphereorient.report.tables import tables_of, write_tables
 from sphereorient.report.verdicts import Verdict, verdicts
 from sphereorient.statistics import StatisticsSettings, Summary, Surroundings, summarise
@@ -22,6 +24,7 @@ from sphereorient.trajectory import Trajectory
 PARTS = ("index.html", "figures", "tables")
 MOST_STRIPS = 8  # tracks shown frame by frame
 PICTURES = 120  # frames of a report with pictures
+HALF = ("path", "camera_distance", "noise", "isotropy", "durations")  # figures that stand two beside each other
 FLOW_KEYS = {
     "viscosity": "viscosity_m2_s",
     "dissipation": "dissipation_w_kg",
@@ -61,17 +64,17 @@ def write_report(
     words = verdicts(summary, tracks, distances)
     with _folder(out) as aside:
         tables = tables_of(summary, tracks, distances)
-        report = Report(
-            summary=summary,
-            tracks=tracks,
+        page = page_html(
+            summary,
+            tracks,
+            command,
             verdicts=words,
             tables=tables,
             suffixes=write_tables(tables, aside / "tables"),
             figures=_draw_all(list(_figures(summary, tracks, distances)), aside / "figures", progress),
             strips=list(_strips(tracks, known, progress)),
-            command=command,
         )
-        (aside / "index.html").write_text(page_html(report), "utf-8")
+        (aside / "index.html").write_text(page, "utf-8")
     return words
 
 
@@ -117,47 +120,44 @@ def surroundings_of(experiments: Sequence[Experiment]) -> Surroundings:
     return Surroundings(**known)
 
 
-Plan = tuple[str, str, Callable[[], Figure], bool]  # name, caption, function, two beside each other
+Plan = tuple[str, str, Callable[[], Figure]]  # name, caption, function
 
 
 def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> Iterator[Plan]:
     name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
     of = "" if len(tracks) == 1 else f" of {name}"
-    yield "track", f"Track{of}, with bands of two standard errors.", lambda: plots.track_figure(track), False
-    yield "path", f"Path{of} with the sphere's axes.", lambda: plots.path_figure(track), True
+    yield "track", f"Track{of}, with bands of two standard errors.", lambda: plots.track_figure(track)
+    yield "path", f"Path{of} with the sphere's axes.", lambda: plots.path_figure(track)
     if any(len(one.distance_rad) for one in distances):
         caption = "Distance of the cameras' own orientations."
-        yield "camera_distance", caption, lambda: plots.camera_distance_figure(distances), True
+        yield "camera_distance", caption, lambda: plots.camera_distance_figure(distances)
     caption = "Share of each variance that is noise, or was smoothed away."
-    yield "noise", caption, lambda: plots.noise_figure(summary.table, summary.ensemble.error), True
+    yield "noise", caption, lambda: plots.noise_figure(summary.table, summary.ensemble.error)
     if (more := summary.distributions) is None:
         return
     caption = "PDFs of the components in their standard deviations, the stretched exponential and the Gaussian."
-    yield "densities", caption, lambda: plots.densities_figure(summary, list(more.densities)), False
+    yield "densities", caption, lambda: plots.densities_figure(summary, list(more.densities))
     caption = "Increments of omega over lags: PDFs, shifted by decades, and flatness."
-    yield "increments", caption, lambda: plots.increments_figure(more, summary.table), False
-    yield (
-        "correlations",
-        "Autocorrelations and integral times.",
-        lambda: plots.correlations_figure(more.correlations),
-        False,
-    )
+    yield "increments", caption, lambda: plots.increments_figure(more, summary.table)
+    caption = "Autocorrelations and integral times."
+    yield "correlations", caption, lambda: plots.correlations_figure(more.correlations)
     caption = "Euler angles against the law of uniform attitudes."
-    yield "angles", caption, lambda: plots.angles_figure(more.angles, more.uniformity), False
+    yield "angles", caption, lambda: plots.angles_figure(more.angles, more.uniformity)
     caption = "Rms and flatness by the width of a Gaussian kernel; a plateau is the motion's value."
-    yield "kernel_widths", caption, lambda: plots.widths_figure(more.widths), False
+    yield "kernel_widths", caption, lambda: plots.widths_figure(more.widths)
     caption = "Shares of the components in the variance, in the lab and in the body."
-    yield "isotropy", caption, lambda: plots.isotropy_figure(more.isotropies), True
+    yield "isotropy", caption, lambda: plots.isotropy_figure(more.isotropies)
     if (found := more.durations) is not None:
-        yield "durations", "Durations of the segments.", lambda: plots.durations_figure(found), True
+        yield "durations", "Durations of the segments.", lambda: plots.durations_figure(found)
 
 
-def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[DrawnFigure]:
+def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[dict[str, Any]]:
     drawn = []
-    for k, (name, caption, draw, half) in enumerate(plans):
+    for k, (name, caption, draw) in enumerate(plans):
         progress("figures", k, len(plans))
         plots.write_figure(draw(), folder / name)
-        drawn.append(DrawnFigure(name=name, caption=caption, png=(folder / f"{name}.png").read_bytes(), half=half))
+        png = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
+        drawn.append({"name": name, "caption": caption, "png": png, "half": name in HALF})
     progress("figures", len(plans), len(plans))
     return drawn
 

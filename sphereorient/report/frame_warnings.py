@@ -1,13 +1,15 @@
-"""The warnings of a frame as text, and the choice of the worst frames of a track with the reasons."""
+"""Quality of the frames of a track: warnings as text, the worst frames, stretches of bad ones, the data of the page."""
 
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, zip_longest
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from sphereorient import so3
+from sphereorient.evaluate.score import distance_deg
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
 FLAG_WORDS = {
@@ -21,7 +23,7 @@ FLAG_WORDS = {
     Flag.SPIKE: "the orientation jumps",
     Flag.EXTRAPOLATED: "not measured; the smoother's value",
 }
-REASON_WORDS = {
+REASON_WORDS: dict[str, str] = {
     Reason.OK: "measured",
     Reason.NOT_FOUND: "no ball found",
     Reason.OUTLINE: "no clear outline",
@@ -37,28 +39,34 @@ REASON_WORDS = {
 }
 FAR = 4.0  # robust standard deviations from the usual value: an outlier
 APART_FRAMES = 3  # frames nearer than this show the same problem
+STRETCH_FRAMES = 10  # stretches with fewer frames between them are one
+MOST_BINS = 20_000  # frames of longer tracks are binned, so that a browser can show the page
+DIGITS = 4  # of the numbers on the page
+GOOD, DOUBTFUL, NOT_VALID = range(3)
+STATUS_WORDS = ("good", "doubtful", "not valid")
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Ranked = Iterator[tuple[int, str]]  # rows with the reason, worst first
 
 
+def shown_flags(track: Trajectory, rows: Any = slice(None)) -> NDArray[np.uint32]:
+    """Return the flags of some rows that have words, without ONE_CAMERA in an experiment of one camera."""
+    alone = len(track.cameras) < 2
+    known = sum(flag for flag in FLAG_WORDS if not (alone and flag == Flag.ONE_CAMERA))
+    flags: NDArray[np.uint32] = track.flags[rows] & np.uint32(known)
+    return flags
+
+
 def flag_words(track: Trajectory, k: int) -> list[str]:
-    """Return the flags of frame k as text, without ONE_CAMERA in an experiment of one camera."""
-    bits = int(track.flags[k])
-    if len(track.cameras) < 2:
-        bits &= ~Flag.ONE_CAMERA
+    """Return the shown flags of frame k as text."""
+    bits = int(shown_flags(track, k))
     return [words for flag, words in FLAG_WORDS.items() if bits & flag]
 
 
-def reason_words(track: Trajectory, k: int) -> dict[str, str]:
-    """Return the reason of every camera in frame k as text, by name."""
-    said = {name: camera.reason[k] for name, camera in track.cameras.items()}
-    return {name: REASON_WORDS.get(Reason(why), why) if why in set(Reason) else str(why) for name, why in said.items()}
-
-
 def lost_cameras(track: Trajectory, k: int) -> dict[str, str]:
-    """Return the reasons of the cameras without an orientation in frame k, by name."""
-    words = reason_words(track, k)
-    return {name: why for name, why in words.items() if track.cameras[name].reason[k] != Reason.OK}
+    """Return the reasons of the cameras without an orientation in frame k as text, by name."""
+    said = {name: camera.reason[k] for name, camera in track.cameras.items()}
+    return {name: REASON_WORDS.get(why, str(why)) for name, why in said.items() if why != Reason.OK}
 
 
 def frame_warnings(track: Trajectory, k: int) -> list[str]:
@@ -72,50 +80,47 @@ def stated_error(cov: Floats) -> Floats:
     return np.asarray(np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3), np.float64)
 
 
-def distance_deg(one: Floats, other: Floats) -> Floats:
-    """Return the angle between orientations (N, 3, 3), (N,), degrees."""
-    angle_rad = so3.geodesic_distance(torch.from_numpy(one), torch.from_numpy(other))
-    return np.asarray(np.rad2deg(angle_rad.numpy()), np.float64)
-
-
-@dataclass(frozen=True, kw_only=True)
-class BadFrame:
-    """A frame to look at; made by `choose_worst`, read by the sheet."""
-
-    k: int  # row of the track
-    words: tuple[str, ...]  # reasons
-
-
-def choose_worst(track: Trajectory, count: int) -> list[BadFrame]:
-    """Choose at most `count` of the worst frames of a track, worst first, the kinds of problem in turn.
+def choose_worst(track: Trajectory, count: int) -> dict[int, tuple[str, ...]]:
+    """Choose at most `count` of the worst frames; return the reasons by row, worst first, the kinds of problem in turn.
 
     Of frames less than three apart one is taken. If fewer frames are bad, those with the lowest scores follow.
     """
-    kinds = [list(kind(track)) for kind in KINDS]
-    taken: list[int] = []
+    kinds = [list(ranked) for ranked in _kinds(track)]
     why: dict[int, list[str]] = {}
-
-    def take(k: int) -> None:
+    for k, words in chain.from_iterable(kinds):
+        why.setdefault(k, []).append(words)
+    lowest = {k: [words] for k, words in _lowest(track) if k not in why}
+    in_turn = [entry[0] for entry in chain.from_iterable(zip_longest(*kinds)) if entry is not None]
+    taken: list[int] = []
+    for k in chain(in_turn, lowest):
         if len(taken) < count and all(abs(k - other) >= APART_FRAMES for other in taken):
             taken.append(k)
+    return {k: tuple(dict.fromkeys(why.get(k) or lowest[k])) for k in taken}
 
-    for ranked in kinds:
-        for k, words in ranked:
-            why.setdefault(k, []).append(words)
-    for place in range(max((len(ranked) for ranked in kinds), default=0)):
-        for ranked in kinds:
-            if place < len(ranked):
-                take(ranked[place][0])
-    for k, words in _lowest(track):
-        if k not in why:
-            take(k)
-            why[k] = [words]
-    return [BadFrame(k=k, words=tuple(dict.fromkeys(why[k]))) for k in taken]
+
+def _kinds(track: Trajectory) -> Iterator[Ranked]:
+    """Yield the bad frames of each kind of problem."""
+    yield _gaps(track)
+    yield _flags(track)
+    seen = [camera.orientation for camera in track.cameras.values()]
+    if len(seen) == 2:
+        yield _outliers(distance_deg(*seen), "cameras {:.2g}\u00b0 apart, usually {:.2g}\u00b0")
+    yield chain.from_iterable(
+        _outliers(-camera.score, f"{name}: score {{:.3f}}, usually {{:.3f}}", sign=-1)
+        for name, camera in track.cameras.items()
+    )
+    off = distance_deg(track.orientation, track.orientation_smooth)
+    yield _outliers(off, "{:.2g}\u00b0 off the smooth motion, usually {:.2g}\u00b0")
+    degrees, mm = np.rad2deg(stated_error(track.orientation_cov)), stated_error(track.position_cov)
+    yield chain(
+        _outliers(degrees, "stated error of the orientation {:.2g}\u00b0, usually {:.2g}\u00b0"),
+        _outliers(mm, "stated error of the position {:.2g} mm, usually {:.2g} mm"),
+    )
 
 
 def _gaps(track: Trajectory) -> Ranked:
     """Yield the first frame of every gap, longest gap first, and the first one after it."""
-    for first, last in sorted(_runs(~track.valid), key=lambda run: run[0] - run[1]):
+    for first, last in sorted(runs_of(~track.valid), key=lambda run: run[0] - run[1]):
         lasts = "1 frame" if last - first == 1 else f"{last - first} frames"
         found = [words for words in frame_warnings(track, first) if words != "not valid"]
         yield first, f"gap of {lasts} begins" + (f": {', '.join(found)}" if found else "")
@@ -126,51 +131,19 @@ def _gaps(track: Trajectory) -> Ranked:
 def _flags(track: Trajectory) -> Ranked:
     """Yield flagged valid frames, the rarest flags first; of each run the one with the lowest score."""
     score = np.nan_to_num(_score(track), nan=np.inf)
-    ignored = 0 if len(track.cameras) > 1 else int(Flag.ONE_CAMERA)
-    counted = [(int((track.flags & flag > 0).sum()), flag) for flag in FLAG_WORDS if not flag & ignored]
-    for _, flag in sorted(counted):
-        runs = list(_runs((track.flags & flag > 0) & track.valid))
+    flags = shown_flags(track)
+    for _, flag in sorted((int((flags & flag > 0).sum()), flag) for flag in FLAG_WORDS):
+        runs = list(runs_of((flags & flag > 0) & track.valid))
         for first, last in sorted(runs, key=lambda run: float(score[run[0] : run[1]].min())):
             yield first + int(score[first:last].argmin()), FLAG_WORDS[flag]
 
 
-def _cameras_apart(track: Trajectory) -> Ranked:
-    seen = [camera.orientation for camera in track.cameras.values()]
-    if len(seen) == 2:
-        yield from _outliers(distance_deg(*seen), "cameras {:.2g}\u00b0 apart, usually {:.2g}\u00b0")
-
-
-def _scores(track: Trajectory) -> Ranked:
-    for name, camera in track.cameras.items():
-        yield from _outliers(-camera.score, f"{name}: score {{:.3f}}, usually {{:.3f}}", sign=-1)
-
-
-def _off_the_smoother(track: Trajectory) -> Ranked:
-    off = distance_deg(track.orientation, track.orientation_smooth)
-    yield from _outliers(off, "{:.2g}\u00b0 off the smooth motion, usually {:.2g}\u00b0")
-
-
-def _sigmas(track: Trajectory) -> Ranked:
-    degrees = np.rad2deg(stated_error(track.orientation_cov))
-    yield from _outliers(degrees, "stated error of the orientation {:.2g}\u00b0, usually {:.2g}\u00b0")
-    yield from _outliers(stated_error(track.position_cov), "stated error of the position {:.2g} mm, usually {:.2g} mm")
-
-
-KINDS: tuple[Callable[[Trajectory], Ranked], ...] = (
-    _gaps,
-    _flags,
-    _cameras_apart,
-    _scores,
-    _off_the_smoother,
-    _sigmas,
-)
-
-
 def _lowest(track: Trajectory) -> Ranked:
     score = _score(track)
-    for k in np.argsort(np.where(np.isfinite(score) & track.valid, score, np.inf), kind="stable").tolist():
-        if np.isfinite(score[k]) and track.valid[k]:
-            yield k, f"not in doubt; among the lowest scores: {score[k]:.3f}, usually {np.nanmedian(score):.3f}"
+    known = np.flatnonzero(np.isfinite(score) & track.valid)
+    usual = np.nanmedian(score) if len(known) else np.nan
+    for k in known[np.argsort(score[known], kind="stable")].tolist():
+        yield k, f"not in doubt; among the lowest scores: {score[k]:.3f}, usually {usual:.3f}"
 
 
 def _outliers(values: Floats, words: str, sign: int = 1) -> Ranked:
@@ -195,7 +168,155 @@ def _score(track: Trajectory) -> Floats:
     return np.asarray(np.where(np.isfinite(lowest), lowest, np.nan), np.float64)
 
 
-def _runs(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+def runs_of(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     """Yield first and last + 1 of the runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     yield from ((first, last) for first, last in edges.reshape(-1, 2).tolist())
+
+
+@dataclass(frozen=True, kw_only=True)
+class BadStretch:
+    """Frames that are doubtful or not valid, with at most nine good ones in a row among them."""
+
+    first: int  # row of the track
+    last: int  # row, included
+    first_number: int  # the experiment's
+    last_number: int
+    start_s: float
+    end_s: float  # of the last frame
+    doubtful: int  # frames
+    not_valid: int  # frames
+    reasons: tuple[tuple[str, int], ...]  # warning, and its number of frames; the most frequent first
+
+    @property
+    def frames(self) -> int:
+        """Number of frames, including the good ones among the others."""
+        return self.last - self.first + 1
+
+
+def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
+    """Return the quality of n bins of frames, each represented by its worst one, for JSON; None where unknown.
+
+    `numbers` (N,) are the experiment's; None: by the times. A bin is one frame, or more of a long track.
+    """
+    size = max(1, -(-len(track) // MOST_BINS))
+    rows, starts = np.arange(len(track)), np.arange(0, len(track), size)
+    numbers = frame_numbers(track) if numbers is None else numbers
+    status = status_of(track)
+    codes, words = _reason_codes(track)
+    seen = [camera.orientation for camera in track.cameras.values()]
+
+    def first(wanted: NDArray[np.bool_]) -> Ints:
+        """Return the first such frame of every bin; else the first of the bin."""
+        found = np.minimum.reduceat(np.where(wanted, rows, len(track)), starts)
+        return np.where(found < len(track), found, starts)
+
+    def largest(values: Floats) -> Floats:
+        return np.asarray(np.fmax.reduceat(values, starts), np.float64)
+
+    row = first(status == np.repeat(np.maximum.reduceat(status, starts), size)[: len(track)])
+    return {
+        "name": track.experiment,
+        "frames": len(track),
+        "per_bin": size,  # the last bin may have fewer
+        "counts": np.bincount(status, minlength=3).tolist(),  # frames that are good, doubtful, not valid
+        "row": row.tolist(),  # (n), row of the track: the first of those of the bin's status
+        "number": numbers[row].tolist(),  # the experiment's number of that frame
+        "time_s": _short(track.time[row], 9),  # of that frame
+        "status": status[row].tolist(),  # index in status_words
+        # Stated, one standard deviation about or along an axis; the largest of the bin.
+        "orientation_error_deg": _short(largest(np.rad2deg(stated_error(track.orientation_cov)))),
+        "position_error_mm": _short(largest(stated_error(track.position_cov))),
+        "cameras": [
+            {
+                "name": name,
+                "score": _short(-largest(-camera.score)),  # the lowest of the bin
+                # Index in reason_words, 0: measured; of a bin the first other one.
+                "reason": codes[name][first(codes[name] != 0)].tolist(),
+            }
+            for name, camera in track.cameras.items()
+        ],
+        # Between the two cameras' own orientations, the largest; None without two cameras.
+        "apart_deg": _short(largest(distance_deg(*seen))) if len(seen) == 2 else None,
+        "flags": np.bitwise_or.reduceat(shown_flags(track), starts).tolist(),  # those of all frames of the bin
+        "status_words": STATUS_WORDS,
+        "reason_words": words,
+        "flag_words": [(int(flag), words) for flag, words in FLAG_WORDS.items()],  # bit and its meaning
+    }
+
+
+def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStretch]:
+    """Find runs of bad frames, joined over fewer than ten good ones, longest first; `numbers` as for `strip_of`."""
+    numbers = frame_numbers(track) if numbers is None else numbers
+    group, warnings = _groups(track)
+    status = status_of(track)
+    bad, found = np.flatnonzero(status), []
+    parts = np.split(bad, np.flatnonzero(np.diff(bad) > STRETCH_FRAMES) + 1) if len(bad) else []
+    for first, last in ((int(part[0]), int(part[-1])) for part in parts):
+        _, doubtful, not_valid = np.bincount(status[first : last + 1], minlength=3).tolist()
+        stretch = BadStretch(
+            first=first,
+            last=last,
+            first_number=int(numbers[first]),
+            last_number=int(numbers[last]),
+            start_s=float(track.time[first]),
+            end_s=float(track.time[last]),
+            doubtful=doubtful,
+            not_valid=not_valid,
+            reasons=_reasons(group[first : last + 1], warnings),
+        )
+        found.append(stretch)
+    return sorted(found, key=lambda stretch: (-stretch.frames, -stretch.not_valid, stretch.first))
+
+
+def status_of(track: Trajectory) -> Ints:
+    """Return the status of every frame, GOOD, DOUBTFUL or NOT_VALID, (N,)."""
+    group, warnings = _groups(track)
+    doubtful = np.array([bool(words) for words in warnings], dtype=bool)[group]
+    return np.where(track.valid, np.where(doubtful, DOUBTFUL, GOOD), NOT_VALID)
+
+
+def frame_numbers(track: Trajectory) -> Ints:
+    """Return the experiment's numbers of the frames by their times, (N,); the rows if the times are irregular."""
+    rows = np.arange(len(track))
+    at = track.time * track.frame_rate
+    if not np.isfinite(at).all():
+        return rows
+    number = np.rint(at).astype(np.int64)
+    # Times of a table or a camera's clock do not give numbers.
+    even = bool((np.abs(at - number) < 0.1).all() and (np.diff(number) > 0).all())
+    return number if even else rows
+
+
+def _groups(track: Trajectory) -> tuple[Ints, list[list[str]]]:
+    """Group frames with the same warnings; return each frame's group, (N,), and the warnings of each group."""
+    codes, _ = _reason_codes(track)
+    group = np.asarray(track.valid, np.int64)
+    for values in (track.flags.astype(np.int64), *codes.values()):
+        _, part = np.unique(values, return_inverse=True)
+        _, group = np.unique(group * (part.max(initial=0) + 1) + part, return_inverse=True)
+    _, first = np.unique(group, return_index=True)
+    return group, [frame_warnings(track, int(k)) for k in first]
+
+
+def _reason_codes(track: Trajectory) -> tuple[dict[str, Ints], list[str]]:
+    """Return each camera's reasons as numbers, (N,), 0 if measured, and the meaning of the numbers."""
+    code: dict[str, int] = {Reason.OK: 0}
+    codes = {
+        name: np.array([code.setdefault(reason, len(code)) for reason in camera.reason], np.int64)
+        for name, camera in track.cameras.items()
+    }
+    return codes, [REASON_WORDS.get(reason, str(reason)) for reason in code]
+
+
+def _reasons(group: Ints, warnings: Sequence[Sequence[str]]) -> tuple[tuple[str, int], ...]:
+    """Count the frames of each warning, without "not valid", which is counted apart."""
+    counted: Counter[str] = Counter()
+    for which, frames in zip(*np.unique(group, return_counts=True), strict=True):
+        counted.update(dict.fromkeys(warnings[which], int(frames)))
+    del counted["not valid"]
+    return tuple(counted.most_common())
+
+
+def _short(values: Floats, digits: int = DIGITS) -> list[float | None]:
+    return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in values.tolist()]

@@ -58,7 +58,6 @@ def examples_figure(examples: Sequence[Example]) -> Figure:
             axes.set(xticks=[], yticks=[])
             axes.grid(visible=False)
             axes.set_frame_on(False)
-        names = "\n".join(name.replace("_", " ") for name in example.degradations)
         row[0].imshow(example.disk.numpy(), cmap="gray", vmin=0, vmax=255)
         names = "\n".join(name.replace("_", " ") for name in example.degradations) or "nothing"
         row[0].set_xlabel(names, fontsize=5.5, labelpad=2)

@@ -5,7 +5,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -18,7 +17,7 @@ from sphereorient.experiment.stream import CameraStream, given_mask, pictures_of
 from sphereorient.experiment.timeline import NONE, timeline
 from sphereorient.files.outputs import put_aside
 from sphereorient.files.yaml_file import refuse_unknown
-from sphereorient.movies import Grey, Movie
+from sphereorient.movies import Grey
 from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of, radius_of
 from sphereorient.report.overlay_page import OverlayView, Page, crop_side
 from sphereorient.sphere import load_texture, reduced_texture
@@ -90,28 +89,23 @@ def prepared(
     track: Trajectory, experiment: Experiment, cameras: Sequence[str] | None, opened: ExitStack
 ) -> tuple[Page, dict[str, CameraStream]]:
     """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them."""
-    names = _names(track, experiment, cameras)
+    names = _names(track, cameras)
     texture = None if experiment.texture_path is None else load_texture(experiment.texture_path)
-    movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
-    numbers, rows = frames_of(track, experiment, movies)
+    numbers, streams = streams_of(track, experiment, names, opened)
     where = path_of(track, radius_of(experiment))
-    streams = {
-        name: CameraStream(
-            name=name,
-            camera=experiment.cameras[name],
-            movie=movies[name],
-            rows=rows[name],
-            shown=given_mask(experiment, name, movies[name].frame_shape),
-        )
-        for name in names
-    }
     models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in names]
     views = [_view(track, model, streams[name]) for name, model in zip(names, models, strict=True)]
     return Page(track=track, numbers=numbers, views=views), streams
 
 
-def frames_of(track: Trajectory, experiment: Experiment, movies: Mapping[str, Movie]) -> tuple[Rows, dict[str, Rows]]:
-    """Find a track's frames by time: numbers (N,), and pictures (N,) or NONE by camera; TrackError if none is found."""
+def streams_of(
+    track: Trajectory, experiment: Experiment, names: Sequence[str], opened: ExitStack
+) -> tuple[Rows, dict[str, CameraStream]]:
+    """Find a track's frames by time: their numbers (N,), and the streams by camera; `opened` closes them.
+
+    Raise TrackError if no frame is found.
+    """
+    movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
     known = timeline(experiment, movies)
     after = np.searchsorted(known.time_s, track.time).clip(1, max(len(known) - 1, 1))
     low, high = after - 1, np.minimum(after, len(known) - 1)
@@ -124,17 +118,24 @@ def frames_of(track: Trajectory, experiment: Experiment, movies: Mapping[str, Mo
         expected = f"frames at {known.time_s[0]:.4g} .. {known.time_s[-1]:.4g} s as in {experiment.path}"
         do = "pass the experiment that the track was measured from"
         raise TrackError(refusal("track", expected=expected, got=got, do=do))
-    rows = {name: np.where(near, row[at], NONE) for name, row in known.rows.items()}
-    return known.number[at], rows
+    streams = {
+        name: CameraStream(
+            name=name,
+            camera=experiment.cameras[name],
+            movie=movie,
+            rows=np.where(near, known.rows[name][at], NONE),
+            shown=given_mask(experiment, name, movie.frame_shape),
+        )
+        for name, movie in movies.items()
+    }
+    return known.number[at], streams
 
 
-def _names(track: Trajectory, experiment: Experiment, cameras: Sequence[str] | None) -> list[str]:
+def _names(track: Trajectory, cameras: Sequence[str] | None) -> list[str]:
     names = list(track.cameras) if cameras is None else list(cameras)
     for name in names:
         if name not in track.cameras:
             raise ExperimentError(refuse_unknown(name, track.cameras, "cameras of the track"))
-        if name not in experiment.cameras:
-            raise ExperimentError(refuse_unknown(name, experiment.cameras, f"{experiment.path}, movies"))
     if not names:
         got, do = "none", "write --cameras cam1, or leave it out"
         raise ExperimentError(refusal("--cameras", expected="names of cameras", got=got, do=do))
@@ -191,26 +192,19 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -
         OutputError: a suffix other than .mp4, .mov, .mkv, no picture, or a failure; an old file is kept.
     """
     _check_video_name(path)
+    rate, count = Fraction(fps).limit_denominator(1000), 0
     kind = FORMATS[path.suffix.lower()]
     with put_aside(path, also=(av.FFmpegError,)) as aside, av.open(str(aside), "w", format=kind) as container:
-        count = _encode(container, pictures, Fraction(fps).limit_denominator(1000))
+        for picture in pictures:
+            if not count:
+                stream = container.add_stream("libx264", rate=rate, options=dict(H264))
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            frame.pts, frame.time_base = count, 1 / rate
+            container.mux(stream.encode(frame))
+            count += 1
         if not count:
             raise OutputError(refusal(str(path), expected="pictures to write", got="none", do="ask for more frames"))
-    return count
-
-
-def _encode(container: Any, pictures: Iterable[NDArray[np.uint8]], rate: Fraction) -> int:
-    stream = None
-    count = 0
-    for picture in pictures:
-        if stream is None:
-            stream = container.add_stream("libx264", rate=rate, options=dict(H264))
-            stream.height, stream.width = picture.shape[:2]
-            stream.pix_fmt = "yuv420p"
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-        frame.pts, frame.time_base = count, 1 / rate
-        container.mux(stream.encode(frame))
-        count += 1
-    if stream is not None:
         container.mux(stream.encode(None))
     return count

@@ -79,6 +79,11 @@ class CropWindow:
     half_px: float
     side: int  # samples along each side
 
+    @property
+    def known(self) -> bool:
+        """Whether centre and size are."""
+        return bool(np.isfinite(self.centre_px).all() and np.isfinite(self.half_px))
+
     def grid_px(self, fine: int = 1) -> Floats:
         """Return the sampling positions (u, v), (fine side, fine side, 2), px."""
         count = fine * self.side

@@ -1,19 +1,35 @@
-"""The pictures of the overlay: each camera's frame, crop, re-rendered sphere and residual."""
+"""The pictures of the overlay: each camera's frame, crop, re-rendered sphere and residual; and what draws them."""
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
+import cv2
+import matplotlib
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from sphereorient.movies import Grey
-from sphereorient.report import overlay_canvas as ink
-from sphereorient.report.frame_warnings import flag_words, lost_cameras
-from sphereorient.report.overlay_canvas import Canvas, Panel
+from sphereorient.report.frame_warnings import flag_words, lost_cameras, runs_of, shown_flags
 from sphereorient.report.overlay_model import CropWindow, LightFit, Model, axes_px, crop, outline_px
-from sphereorient.trajectory import CameraTrack, Flag, Trajectory
+from sphereorient.trajectory import CameraTrack, Trajectory
 
+Colour = tuple[int, int, int]
+BACKGROUND: Colour = (18, 18, 22)
+INK: Colour = (235, 235, 235)
+FAINT: Colour = (165, 165, 170)
+# Okabe and Ito's hues for dark pictures; the axes x, y, z as in plots.style.
+OUTLINE: Colour = (240, 228, 66)
+AXES: tuple[Colour, Colour, Colour] = ((255, 140, 59), (43, 224, 168), (99, 195, 255))
+TRAIL: Colour = (224, 150, 195)
+DOUBT: Colour = (255, 140, 59)
+LOST: Colour = (130, 130, 135)
+GOOD: Colour = (43, 224, 168)
+SHIFT = 4  # bits of a pixel's fraction
+DOT, SPACE = 3.0, 3.5  # px, of dotted lines
 HEAD, FOOT, GAP, TITLE, SIDE = 62, 56, 10, 24, 310  # px: bands above and below, between panels, titles, square panels
 FRAME_HEIGHT = 440  # px, of a camera's frame
 WIDEST = 1.4  # of a frame's height
@@ -23,6 +39,91 @@ LINE, LETTER = 18, 8  # px, of text: from line to line, and a letter's usual wid
 LABEL_AT = 1.16  # of the sphere's radius: letters of the axes
 RESIDUAL_REACH = 0.5  # of the contrast of white and black: the ends of the residual's scale
 BLANK = 45  # grey of pixels without a residual
+
+
+class Canvas:
+    """An (H, W, 3) RGB picture; panels clip what is drawn in them."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.pixels = np.full((height, width, 3), BACKGROUND, np.uint8)
+        self._texts: list[tuple[tuple[float, float], str, int, Colour, str]] = []
+
+    def text(
+        self, at: tuple[float, float], words: str, size: int = 15, colour: Colour = INK, anchor: str = "ls"
+    ) -> None:
+        """Write text at (column, row), px; `anchor` is Pillow's: ls is left and baseline, mm the middle."""
+        self._texts.append((at, words, size, colour, anchor))
+
+    def finished(self) -> NDArray[np.uint8]:
+        """Return the picture with its texts."""
+        image = Image.fromarray(self.pixels)
+        draw = ImageDraw.Draw(image)
+        for at, words, size, colour, anchor in self._texts:
+            # A dark outline keeps text readable on bright pictures.
+            draw.text(at, words, fill=colour, font=_font(size), anchor=anchor, stroke_width=1, stroke_fill=(0, 0, 0))
+        return np.asarray(image)
+
+
+class Panel:
+    """A rectangle of a canvas that shows a picture from pixel `first_px` (u, v) on; drawn in the picture's pixels."""
+
+    def __init__(
+        self, canvas: Canvas, corner: tuple[int, int], size: tuple[int, int], first_px: ArrayLike, scale: float
+    ) -> None:
+        (left, top), (width, height) = corner, size
+        self.canvas, self.corner, self.size = canvas, corner, size
+        self.pixels = canvas.pixels[top : top + height, left : left + width]
+        self.pixels[:] = 0
+        self.first_px, self.scale = np.asarray(first_px, np.float64), scale
+
+    def show(self, picture: NDArray[np.uint8]) -> None:
+        """Fill the panel with a picture, (h, w) grey or (h, w, 3) RGB, resized."""
+        shrinks = picture.shape[0] > self.size[1]
+        fitted = cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        self.pixels[:] = fitted if fitted.ndim == 3 else fitted[..., None]
+
+    def place(self, uv_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return canvas positions of pixels (..., 2) of the picture; integers are pixel centres."""
+        return np.asarray((uv_px - self.first_px) * self.scale - 0.5, np.float64)
+
+    def line(self, uv_px: NDArray[np.float64], colour: Colour, width: int = 1, dotted: bool = False) -> None:
+        """Draw a line through points (n, 2) of the picture, interrupted at NaN."""
+        points = self.place(uv_px)
+        # Points too far away for integers interrupt it, too.
+        for first, last in runs_of(np.asarray((np.abs(np.nan_to_num(points, nan=1e9)) < 1e5).all(-1))):
+            run = points[first:last]
+            for piece in _dots(run) if dotted else [run] if len(run) > 1 else []:
+                ends = np.round(piece * (1 << SHIFT)).astype(np.int32)
+                cv2.polylines(self.pixels, [ends], False, colour, width, cv2.LINE_AA, SHIFT)
+
+    def text(self, uv_px: NDArray[np.float64], words: str, size: int, colour: Colour) -> None:
+        """Write text around a point of the picture if it is inside the panel."""
+        x, y = self.place(uv_px).tolist()
+        if 0 <= x < self.size[0] and 0 <= y < self.size[1]:
+            self.canvas.text((self.corner[0] + x, self.corner[1] + y), words, size, colour, "mm")
+
+    def say(self, words: str, size: int = 13) -> None:
+        """Write text in the middle of the panel."""
+        (left, top), (width, height) = self.corner, self.size
+        self.canvas.text((left + width / 2, top + height / 2), words, size, FAINT, "mm")
+
+    def border(self, colour: Colour, width: int) -> None:
+        """Draw a border along the edges."""
+        for edge in (np.s_[:width], np.s_[-width:], np.s_[:, :width], np.s_[:, -width:]):
+            self.pixels[edge] = colour
+
+
+def _dots(points: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    along = np.concatenate([[0], np.cumsum(steps)])
+    for start in np.arange(0, along[-1], DOT + SPACE):
+        ends = np.array([start, min(start + DOT, along[-1])])
+        yield np.stack([np.interp(ends, along, points[:, axis]) for axis in range(2)], axis=1)
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,6 +151,10 @@ class OverlayView:
     def centre_px(self, seen: CameraTrack, k: int) -> NDArray[np.float64]:
         """Return the centre in frame k from the track, else from the camera alone, px; NaN if neither is known."""
         return np.asarray(self.trail_px[k] if self.placed(k) else seen.centre_px[k])
+
+    def window(self, seen: CameraTrack, k: int) -> CropWindow:
+        """Return the crop around `centre_px` of frame k, as fine as the panels of the page."""
+        return CropWindow(centre_px=self.centre_px(seen, k), half_px=self.half_px, side=crop_side(self.half_px))
 
     def placed(self, k: int) -> bool:
         """Whether the track has a position in frame k."""
@@ -83,16 +188,16 @@ class Page:
         place = f"segment {segment}" if segment >= 0 else "outside any segment"
         words = f"frame {int(self.numbers[k])}    t = {self.track.time[k]:.4f} s    {place}"
         canvas.text((GAP, 24), words, 18)
-        canvas.text((width - GAP, 24), f"{self.track.experiment}, {self.track.method}", 15, ink.FAINT, "rs")
+        canvas.text((width - GAP, 24), f"{self.track.experiment}, {self.track.method}", 15, FAINT, "rs")
         state, colour = self.state(k)
         canvas.text((GAP, 50), textwrap.shorten(state, (width - 2 * GAP) // LETTER, placeholder=" ..."), 15, colour)
 
-    def state(self, k: int) -> tuple[str, ink.Colour]:
+    def state(self, k: int) -> tuple[str, Colour]:
         """Return the state of a frame as text, with a mark for colour-blind readers, and its colour."""
         flags = ", ".join(flag_words(self.track, k))
         if not self.track.valid[k]:
-            return f"\u2716 not valid{': ' + flags if flags else ''}", ink.LOST
-        return (f"\u25b2 doubt: {flags}", ink.DOUBT) if flags else ("\u25cf valid", ink.GOOD)
+            return f"\u2716 not valid{': ' + flags if flags else ''}", LOST
+        return (f"\u25b2 doubt: {flags}", DOUBT) if flags else ("\u25cf valid", GOOD)
 
     def _camera(
         self,
@@ -105,24 +210,22 @@ class Page:
     ) -> None:
         seen = self.track.cameras[view.name]
         frame = Panel(canvas, corner, size, (-0.5, -0.5), size[1] / view.model.camera.image_size[1])
-        frame.pixels[:] = 0
         if picture is not None:
             frame.show(view.shown(picture))
-        centre, half = view.centre_px(seen, k), view.half_px
-        left = corner[0] + size[0] + GAP
+        missing = "no picture" if picture is None else ""
+        window, left = view.window(seen, k), corner[0] + size[0] + GAP
         panels = []
         for column, title in enumerate(("crop", "re-rendered", "residual")):
             at = (left + column * (SIDE + GAP), corner[1] + TITLE)
-            canvas.text((at[0], at[1] - 7), title, 14, ink.FAINT)
-            panels.append(Panel(canvas, at, (SIDE, SIDE), centre - half, SIDE / (2 * half)))
-            panels[-1].pixels[:] = 0
-        here = bool(np.isfinite(centre).all()) and np.isfinite(half)
-        window = CropWindow(centre_px=centre, half_px=half, side=crop_side(half))
-        blank = _fill(panels, view, k, picture, window) if here else "no position"
-        no_crop = "no picture" if picture is None else "" if here else blank
-        no_residual = blank or ("no picture" if picture is None else "")
-        for panel, words in zip(panels, (no_crop, blank, no_residual), strict=True):
-            canvas.text((panel.corner[0] + SIDE / 2, panel.corner[1] + SIDE / 2), words, 15, ink.FAINT, "mm")
+            canvas.text((at[0], at[1] - 7), title, 14, FAINT)
+            panels.append(crop_panel(canvas, at, SIDE, window))
+        blank = "no position"
+        if window.known:
+            rendered = draw_pictures(panels, view, k, picture, window)
+            blank = "" if rendered else view.why_unlit if view.light is None else "no orientation"
+        no_crop = missing or ("" if window.known else blank)
+        for panel, words in zip(panels, (no_crop, blank, blank or missing), strict=True):
+            panel.say(words, 15)
         for panel, letters in ((frame, False), (panels[0], True)):
             if view.placed(k) and np.isfinite(panel.first_px).all():
                 draw_outline(panel, view, k)
@@ -130,32 +233,31 @@ class Page:
         if own_distance_px(view, seen, k) > OWN_PX:
             angle = np.linspace(0, 2 * np.pi, 73)
             around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-            panels[0].line(seen.centre_px[k] + seen.radius_px[k] * around, ink.INK, 1, dotted=True)
-        frame.line(view.trail_px[max(0, k - TRAIL_FRAMES) : k + 1], ink.TRAIL, 1)
+            panels[0].line(seen.centre_px[k] + seen.radius_px[k] * around, INK, 1, dotted=True)
+        frame.line(view.trail_px[max(0, k - TRAIL_FRAMES) : k + 1], TRAIL, 1)
         canvas.text((corner[0] + 8, corner[1] + 20), view.name, 16)
-        if picture is None:
-            canvas.text((corner[0] + size[0] / 2, corner[1] + size[1] / 2), "no picture", 16, ink.FAINT, "mm")
+        frame.say(missing, 16)
         mark = self.state(k)[1]
-        if mark != ink.GOOD:
+        if mark != GOOD:
             frame.border(mark, 3)
         self._words(canvas, view, k, (left, corner[1] + TITLE + SIDE + 24), size[1] - SIDE - TITLE)
 
     def _words(self, canvas: Canvas, view: OverlayView, k: int, at: tuple[int, int], room: int) -> None:
         seen = self.track.cameras[view.name]
         lost = lost_cameras(self.track, k).get(view.name)
-        lines = [(f"{view.name}: {lost}", ink.DOUBT) if lost else (f"{view.name}: measured", ink.GOOD)]
+        lines = [(f"{view.name}: {lost}", DOUBT) if lost else (f"{view.name}: measured", GOOD)]
         numbers = [f"score {seen.score[k]:.3f}" if np.isfinite(seen.score[k]) else "no score"]
         if np.isfinite(seen.radius_px[k]):
             numbers.append(f"radius {seen.radius_px[k]:.1f} px")
-        lines.append((", ".join(numbers), ink.INK))
+        lines.append((", ".join(numbers), INK))
         sigma = np.sqrt(np.trace(self.track.orientation_cov[k]) / 3)
         if np.isfinite(sigma):
-            lines.append((f"error of the orientation, stated: {np.rad2deg(sigma):.3f}\u00b0 an axis", ink.INK))
+            lines.append((f"error of the orientation, stated: {np.rad2deg(sigma):.3f}\u00b0 an axis", INK))
         off_px = own_distance_px(view, seen, k)
         if off_px > OWN_PX:
-            lines.append((f"white circle: what it sees by itself, {off_px:.1f} px off", ink.DOUBT))
+            lines.append((f"white circle: what it sees by itself, {off_px:.1f} px off", DOUBT))
         if view.model.path.smoothed[k]:
-            lines.append(("outline and axes: of the smoother", ink.DOUBT))
+            lines.append(("outline and axes: of the smoother", DOUBT))
         wrapped = [(part, colour) for text, colour in lines for part in textwrap.wrap(text, 66)]
         for row, (text, colour) in enumerate(wrapped[: max(1, room // LINE)]):
             canvas.text((at[0], at[1] + LINE * row), text, 14, colour)
@@ -164,28 +266,27 @@ class Page:
     def _foot(self, canvas: Canvas, k: int) -> None:
         height, width = canvas.pixels.shape[:2]
         left, top = GAP, height - FOOT
-        entries = [("outline", ink.OUTLINE), ("body axes x", ink.AXES[0]), ("y", ink.AXES[1]), ("z", ink.AXES[2])]
-        entries += [(f"last {TRAIL_FRAMES} frames", ink.TRAIL)]
+        entries = [("outline", OUTLINE), ("body axes x", AXES[0]), ("y", AXES[1]), ("z", AXES[2])]
+        entries += [(f"last {TRAIL_FRAMES} frames", TRAIL)]
         for words, colour in entries:
             canvas.text((left, top + 16), words, 13, colour)
             left += 8 * len(words) + 14
-        canvas.text((left, top + 16), "axes solid: towards the camera, dotted: away", 13, ink.FAINT)
+        canvas.text((left, top + 16), "axes solid: towards the camera, dotted: away", 13, FAINT)
         strip = canvas.pixels[height - 26 : height - 14, GAP : width - GAP]
         strip[:] = self._strip(strip.shape[1])
         at = round((k + 0.5) / len(self.track) * strip.shape[1])
         canvas.pixels[height - 31 : height - 9, GAP + max(0, at - 1) : GAP + at + 1] = 255
         words = f"whole track: green valid, orange in doubt, grey not valid ({int(self.track.valid.sum())} of "
-        canvas.text((width - GAP, top + 16), f"{words}{len(self.track)} valid)", 13, ink.FAINT, "rs")
+        canvas.text((width - GAP, top + 16), f"{words}{len(self.track)} valid)", 13, FAINT, "rs")
 
     def _strip(self, width: int) -> NDArray[np.uint8]:
         """Return the states of all frames side by side, (width, 3); a pixel shows the worst of its frames."""
-        flags = self.track.flags if len(self.track.cameras) > 1 else self.track.flags & ~np.uint32(Flag.ONE_CAMERA)
-        state = np.where(self.track.valid, np.where(flags != 0, 1, 0), 2)
+        state = np.where(self.track.valid, np.where(shown_flags(self.track) != 0, 1, 0), 2)
         edges = np.linspace(0, len(state), width + 1)
         first = edges[:-1].astype(int)
         last = np.maximum(np.ceil(edges[1:]).astype(int), first + 1)
         worst = [int(state[a:b].max()) for a, b in zip(first, last, strict=True)]
-        return np.array([ink.GOOD, ink.DOUBT, ink.LOST], np.uint8)[worst]
+        return np.array([GOOD, DOUBT, LOST], np.uint8)[worst]
 
 
 def crop_side(half_px: float) -> int:
@@ -193,24 +294,30 @@ def crop_side(half_px: float) -> int:
     return max(48, min(SIDE, round(2 * half_px))) if np.isfinite(half_px) else SIDE
 
 
-def _fill(panels: Sequence[Panel], view: OverlayView, k: int, picture: Grey | None, window: CropWindow) -> str:
-    """Show crop, re-rendered sphere and residual; return why the sphere is not rendered, or an empty string."""
+def crop_panel(canvas: Canvas, corner: tuple[int, int], side: int, window: CropWindow) -> Panel:
+    """Return a square panel, `side` px wide, that shows a window."""
+    return Panel(canvas, corner, (side, side), window.centre_px - window.half_px, side / (2 * window.half_px))
+
+
+def draw_pictures(panels: Sequence[Panel], view: OverlayView, k: int, picture: Grey | None, window: CropWindow) -> bool:
+    """Show crop, re-rendered sphere and, in a third panel, residual; return whether the sphere could be rendered."""
     grey = None if picture is None else crop(picture, window)
     if grey is not None:
         panels[0].show(view.shown(grey))
     if view.light is None or not view.model.path.whole[k]:
-        return "no orientation" if view.light is not None else view.why_unlit
+        return False
     model = view.light.picture(view.model.look(k, window), grey)
     panels[1].show(view.shown(model))
     if grey is not None:
-        panels[2].show(residual_colours((grey - model) / view.light.contrast))
-    return ""
+        for panel in panels[2:]:
+            panel.show(residual_colours((grey - model) / view.light.contrast))
+    return True
 
 
 def residual_colours(residual: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return a residual relative to the contrast as colours: blue too dark, black equal, orange too bright."""
     share = np.clip(np.nan_to_num(residual) / RESIDUAL_REACH, -1, 1)[..., None]
-    ends = np.where(share < 0, np.array(ink.AXES[2], np.float32), np.array(ink.AXES[0], np.float32))
+    ends = np.where(share < 0, np.array(AXES[2], np.float32), np.array(AXES[0], np.float32))
     colours: NDArray[np.uint8] = np.asarray(np.abs(share) * ends, np.uint8)
     colours[np.isnan(residual)] = BLANK
     return colours
@@ -219,7 +326,7 @@ def residual_colours(residual: NDArray[np.float32]) -> NDArray[np.uint8]:
 def draw_outline(panel: Panel, view: OverlayView, k: int) -> None:
     """Draw the outline of frame k; dotted if it is the smoother's."""
     path = view.model.path
-    panel.line(outline_px(view.model.camera, path, k), ink.OUTLINE, 1, dotted=bool(path.smoothed[k]))
+    panel.line(outline_px(view.model.camera, path, k), OUTLINE, 1, dotted=bool(path.smoothed[k]))
 
 
 def draw_axes(panel: Panel, view: OverlayView, k: int, letters: bool = True) -> None:
@@ -228,7 +335,7 @@ def draw_axes(panel: Panel, view: OverlayView, k: int, letters: bool = True) -> 
     if not path.whole[k]:
         return
     tips, near = axes_px(view.model.camera, path, k)
-    for tip, towards, colour, letter in zip(tips, near, ink.AXES, "xyz", strict=True):
+    for tip, towards, colour, letter in zip(tips, near, AXES, "xyz", strict=True):
         panel.line(np.stack([centre, tip]), colour, 2, dotted=not towards)
         if letters:
             panel.text(centre + LABEL_AT * (tip - centre), letter, 15, colour)
@@ -246,6 +353,6 @@ def scale_bar(canvas: Canvas, at: tuple[int, int], width: int, light: LightFit |
     bar[:] = residual_colours(np.broadcast_to(ramp, bar.shape[:2]))
     reach = f"{100 * RESIDUAL_REACH:.0f} %"
     for share, words, anchor in ((0, f"-{reach}", "ls"), (0.5, "filmed less model", "ms"), (1, f"+{reach}", "rs")):
-        canvas.text((at[0] + share * width, at[1] + 26), words, 13, ink.FAINT, anchor)
+        canvas.text((at[0] + share * width, at[1] + 26), words, 13, FAINT, anchor)
     words = "of white less black paint" + ("" if light is None else f" ({light.contrast:.0f} levels)")
-    canvas.text((at[0] + 0.5 * width, at[1] + 44), words, 13, ink.FAINT, "ms")
+    canvas.text((at[0] + 0.5 * width, at[1] + 44), words, 13, FAINT, "ms")

@@ -1,9 +1,7 @@
 """The page of a report: one HTML file without external parts."""
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
@@ -14,12 +12,9 @@ import yaml
 from jinja2 import Environment, StrictUndefined, Template
 
 from sphereorient.files.provenance import versions
-from sphereorient.report.frame_warnings import stated_error
+from sphereorient.report.frame_warnings import STATUS_WORDS, BadStretch, bad_stretches, stated_error, strip_of
 from sphereorient.report.gallery import Gallery, GalleryFrame
 from sphereorient.report.plots.style import SYMBOLS, decimals
-from sphereorient.report.strip import STATUS_WORDS, BadStretch, bad_stretches, strip_of
-from sphereorient.report.tables import Table
-from sphereorient.report.verdicts import Verdict
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.moments import COMPONENTS
 from sphereorient.trajectory import Trajectory
@@ -34,58 +29,16 @@ CONTENTS = (
 )
 MOST_STRETCHES = 200  # rows of the table
 UNFOLDED = 12  # pictures that are visible without JavaScript
+Cell = tuple[str, str]  # a number or words, and the interval
+Grid = dict[str, Any]  # a table of the page: title, about, head, rows of cells; the files have all digits
 
 
-@dataclass(frozen=True, kw_only=True)
-class DrawnFigure:
-    """A figure that was written; made by `build`, shown by the page."""
+def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, **parts: Any) -> str:
+    """Return the page of a report, from statistics, tracks by the name of their file, and the command that made it.
 
-    name: str
-    caption: str
-    png: bytes
-    half: bool = False  # two beside each other
-
-    @property
-    def base64(self) -> str:
-        """The PNG in base64."""
-        return base64.b64encode(self.png).decode()
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Report:
-    """The contents of the page; made by `build`."""
-
-    summary: Summary
-    tracks: Mapping[str, Trajectory]  # by the name of their file
-    verdicts: Sequence[Verdict]
-    figures: Sequence[DrawnFigure]  # in the order of the page
-    tables: Sequence[Table]  # that were written
-    suffixes: Sequence[str]  # of the tables' files
-    strips: Sequence[str]  # HTML of the tracks' quality strips, of `strip_html`
-    command: str  # that made the report
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cell:
-    """A number with its interval, as text."""
-
-    value: str
-    range: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Grid:
-    """A table of the page; the files have all digits."""
-
-    title: str
-    about: str
-    head: Sequence[str]
-    rows: Sequence[Sequence[str | Cell]]
-
-
-def page_html(report: Report) -> str:
-    """Return the page of a report."""
-    summary, tracks = report.summary, report.tracks
+    `parts`: verdicts; figures (name, caption, png in base64, half: two beside each other); tables that were written,
+    and the suffixes of their files; strips, HTML of `strip_html`.
+    """
     css, js = strip_assets()
     names = sorted({track.experiment for track in tracks.values() if track.experiment})
     page = {
@@ -93,12 +46,13 @@ def page_html(report: Report) -> str:
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
         "contents": CONTENTS,
         "tiles": _tiles(summary, tracks),
-        "grids": [grid for grid in (*_moments(summary), _flow(summary)) if grid.rows],
+        "grids": [grid for grid in (*_moments(summary), _flow(summary)) if grid["rows"]],
         "settings": _settings(summary),
         "provenance": [_provenance(name, track) for name, track in tracks.items()],
-        "footer": f"sphereorient {versions()['sphereorient']}; {report.command}",
+        "footer": f"sphereorient {versions()['sphereorient']}; {command}",
     }
-    return _template("page.html.j2").render(page=page, report=report, css=_asset("page.css") + css, js=js)
+    template, css = _template("page.html.j2"), _asset("page.css") + css
+    return template.render(page=page, summary=summary, tracks=tracks, css=css, js=js, **parts)
 
 
 @cache
@@ -129,7 +83,6 @@ def strip_html(name: str, track: Trajectory, gallery: Gallery | None) -> str:
     ranked = [] if gallery is None else sorted(gallery.frames, key=lambda frame: frame.rank)
     return _template("strip.html.j2").render(
         name=name,
-        data=strip.as_json(),
         strip=strip,
         stretches=found[:MOST_STRETCHES],
         more=found[MOST_STRETCHES:],
@@ -156,7 +109,7 @@ def _some(names: Sequence[str], most: int = 4) -> str:
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
-def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[dict[str, str]]:
+def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str, str]]:
     frames = sum(len(track) for track in tracks.values())
     valid = sum(int(track.valid.sum()) for track in tracks.values())
     sigma = np.concatenate([stated_error(track.orientation_cov) for track in tracks.values()])
@@ -172,7 +125,7 @@ def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[dict[str,
         part = summary.table[quantity]
         rms = float(np.sqrt(np.square(part.rms.value[:3]).sum()))
         found.append((f"{rms:.3g} {_unit(part.units)}", f"rms of {SYMBOLS[quantity]}, all components"))
-    return [{"number": number, "words": words} for number, words in found]
+    return found
 
 
 def _unit(units: str) -> str:
@@ -198,36 +151,37 @@ def _moments(summary: Summary) -> list[Grid]:
     for name, (title, about) in shown.items():
         columns = COMPONENTS[:3] if name.startswith(("corrected", "noise")) else COMPONENTS
         factor, most = (100.0, 3) if name == "noise_share" else (1.0, 6)
-        rows: list[list[str | Cell]] = []
+        rows: list[list[Cell]] = []
         for quantity, part in summary.table.items():
             found = getattr(part, name).scaled(factor)
             unit = f", {_unit(part.units)}" if name in ("mean", "rms", "corrected_rms") else ""
-            rows.append([f"{SYMBOLS[quantity]}{unit}", *(_cell(found.part(i), most) for i in range(len(columns)))])
-        grids.append(Grid(title=title, about=about, head=["", *columns], rows=rows))
+            cells = [_cell(found.part(i), most) for i in range(len(columns))]
+            rows.append([(f"{SYMBOLS[quantity]}{unit}", ""), *cells])
+        grids.append({"title": title, "about": about, "head": ["", *columns], "rows": rows})
     return grids
 
 
 def _cell(of: Interval, most: int) -> Cell:
     value, low, high = float(of.value), float(of.low), float(of.high)
     if not math.isfinite(value):
-        return Cell(value="\u2013")
+        return "\u2013", ""
     if not math.isfinite(low + high):
-        return Cell(value=f"{value:.4g}")
+        return f"{value:.4g}", ""
     digits = min(decimals(high - low), most)
-    return Cell(value=f"{value:.{digits}f}", range=f"{low:.{digits}f} to {high:.{digits}f}")
+    return f"{value:.{digits}f}", f"{low:.{digits}f} to {high:.{digits}f}"
 
 
 def _flow(summary: Summary) -> Grid:
     flow = summary.surroundings.flow
-    rows: list[list[str | Cell]] = []
+    rows = [(one.name, one.formula, one.value) for one in summary.comparisons]
     about = "Components' rms, corrected if the errors are known."
     if flow is not None:
         about += f" With the viscosity {flow.viscosity_m2_s:.4g} m\u00b2/s and the dissipation "
         about += f"{flow.dissipation_w_kg:.4g} W/kg of the experiment."
-        rows += [["Kolmogorov's length, m", "eta = (nu^3 / epsilon)^(1/4)", f"{flow.eta_m:.4g}"]]
-        rows += [["Kolmogorov's time, s", "tau_eta = (nu / epsilon)^(1/2)", f"{flow.tau_eta_s:.4g}"]]
-    rows += [[one.name, one.formula, f"{one.value:.4g}"] for one in summary.comparisons]
-    return Grid(title="The sphere and its flow", about=about, head=["", "", "value"], rows=rows)
+        rows.insert(0, ("Kolmogorov's length, m", "eta = (nu^3 / epsilon)^(1/4)", flow.eta_m))
+        rows.insert(1, ("Kolmogorov's time, s", "tau_eta = (nu / epsilon)^(1/2)", flow.tau_eta_s))
+    cells = [[(name, ""), (formula, ""), (f"{value:.4g}", "")] for name, formula, value in rows]
+    return {"title": "The sphere and its flow", "about": about, "head": ["", "", "value"], "rows": cells}
 
 
 def _settings(summary: Summary) -> str:

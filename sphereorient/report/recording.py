@@ -1,7 +1,7 @@
 """A track as a Rerun recording: cameras, pictures, the sphere along its path, and time series (docs/export.md)."""
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, refusal
-from sphereorient.experiment import Experiment, open_movies
-from sphereorient.experiment.stream import CameraStream
-from sphereorient.movies import Grey
-from sphereorient.report.export_columns import package
+from sphereorient.experiment import Experiment
+from sphereorient.report.export import package
 from sphereorient.report.frame_warnings import frame_warnings
-from sphereorient.report.overlay import frames_of, pictures_by_row
-from sphereorient.report.overlay_canvas import AXES, OUTLINE, TRAIL
+from sphereorient.report.overlay import pictures_by_row, streams_of
 from sphereorient.report.overlay_model import Path3D, finite_rows, path_of, radius_of
+from sphereorient.report.overlay_page import AXES, OUTLINE, TRAIL
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Trajectory, quaternions_wxyz
+
+with suppress(ImportError):  # an extra: `view_track` says how to install it
+    import rerun as rr
+    import rerun.blueprint as rrb
 
 Floats = NDArray[np.float64]
 Advance = Callable[[int, int], None]
@@ -64,8 +66,6 @@ def view_track(
         TrackError: the track is of another experiment.
     """
     package("rerun", "view")
-    import rerun as rr
-
     if save is not None and save.suffix.lower() != ".rrd":
         do = "end the name in .rrd"
         raise OutputError(refusal(f"--save {save}", expected=".rrd", got=f"'{save.suffix}'", do=do))
@@ -87,9 +87,6 @@ def view_track(
 
 
 def _layout(track: Trajectory, experiment: Experiment | None) -> Any:
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     space = rrb.Spatial3DView(origin="lab", name="lab")
     names = [] if experiment is None else [name for name in experiment.cameras if name in track.cameras]
     shown = [rrb.Spatial2DView(origin=f"lab/{name}/picture", name=name) for name in names]
@@ -100,8 +97,6 @@ def _layout(track: Trajectory, experiment: Experiment | None) -> Any:
 
 
 def _log(recording: Any, track: Trajectory, experiment: Experiment | None, every: int, progress: Advance) -> None:
-    import rerun as rr
-
     def when(rows: NDArray[np.int64]) -> list[Any]:
         return [rr.TimeColumn(TIME, duration=track.time[rows]), rr.TimeColumn(FRAME, sequence=rows)]
 
@@ -141,8 +136,6 @@ def pinhole_near(camera: Camera, near_lab_mm: Floats) -> tuple[Floats, float] | 
 
 
 def _log_cameras(recording: Any, cameras: Mapping[str, Camera], near_lab_mm: Floats) -> None:
-    import rerun as rr
-
     for name, camera in cameras.items():
         R_lab_cam = camera.R_cam_lab.mT.numpy()
         centre_mm = -R_lab_cam @ camera.T_cam_lab_mm.numpy()
@@ -161,8 +154,6 @@ def _log_cameras(recording: Any, cameras: Mapping[str, Camera], near_lab_mm: Flo
 def _log_sphere(
     recording: Any, track: Trajectory, path: Path3D, experiment: Experiment | None, when: Callable[[Any], Any]
 ) -> None:
-    import rerun as rr
-
     radius = path.radius_mm
     if experiment is None or experiment.texture_path is None:
         recording.log("lab/sphere/ball", rr.Ellipsoids3D(half_sizes=[[radius] * 3], colors=[OUTLINE]), static=True)
@@ -185,8 +176,6 @@ def _log_sphere(
 
 
 def _textured(radius: float, map_: NDArray[np.float32]) -> Any:
-    import rerun as rr
-
     across, down = np.linspace(0, 1, MESH + 1), np.linspace(0, 1, MESH // 2 + 1)
     u, v = np.meshgrid(across, down)
     longitude, latitude = 2 * np.pi * u - np.pi, np.pi / 2 - np.pi * v
@@ -214,8 +203,6 @@ def series_of(track: Trajectory) -> dict[str, tuple[Floats, Floats]]:
 
 def _log_series(recording: Any, track: Trajectory, when: Callable[[Any], Any]) -> None:
     """Log every series as nine lines (value, one sigma above and below), states and warnings."""
-    import rerun as rr
-
     rows = np.arange(len(track))
 
     def send(name: str, lines: Floats, style: Any) -> None:
@@ -242,16 +229,9 @@ def _log_series(recording: Any, track: Trajectory, when: Callable[[Any], Any]) -
 def _log_pictures(
     recording: Any, track: Trajectory, experiment: Experiment, chosen: NDArray[np.int64], progress: Advance
 ) -> None:
-    import rerun as rr
-
     names = [name for name in track.cameras if name in experiment.cameras]
     with ExitStack() as opened:
-        movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
-        _, rows = frames_of(track, experiment, movies)
-        streams = {
-            name: CameraStream(name=name, camera=experiment.cameras[name], movie=movies[name], rows=rows[name])
-            for name in names
-        }
+        _, streams = streams_of(track, experiment, names, opened)
         white: dict[str, float] = {}
         for done, (k, pictures) in enumerate(pictures_by_row(streams, chosen), start=1):
             recording.set_time(TIME, duration=float(track.time[k]))
@@ -260,12 +240,8 @@ def _log_pictures(
                 if picture is not None:
                     # One scale for the whole movie, from the first picture.
                     top = white.setdefault(name, max(1.0, float(np.percentile(picture, 99.9))))
-                    encoded = rr.EncodedImage(contents=_jpeg(picture, top), media_type="image/jpeg")
+                    bright = np.clip(picture.astype(np.float32) * (255 / top), 0, 255).astype(np.uint8)
+                    _, jpeg = cv2.imencode(".jpg", bright, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+                    encoded = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
                     recording.log(f"lab/{name}/picture", encoded)
             progress(done, len(chosen))
-
-
-def _jpeg(picture: Grey, white: float) -> bytes:
-    bright = np.clip(picture.astype(np.float32) * (255 / white), 0, 255).astype(np.uint8)
-    _, content = cv2.imencode(".jpg", bright, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return content.tobytes()

@@ -1,5 +1,5 @@
 // The strip of every frame's quality: draws it, and shows the frame that is pointed at. Each section.strip of the page
-// is by itself; its data, made by strip.py, lies in it as JSON. A bin is one frame, or `per_bin` of a long track.
+// is by itself; its data, made by frame_warnings.py, lies in it as JSON. A bin is one frame, or `per_bin` of a long track.
 (() => {
   "use strict";
   const DETAIL = { least: 40, most: 200, share: 1 / 5 }; // bins shown large: a share of all, within limits

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sphereorient.errors import OutputError
-from sphereorient.report.export_columns import package
+from sphereorient.report.export import package
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.statistics.density import Density, stretched_exponential
@@ -19,6 +19,7 @@ from sphereorient.trajectory import Reason, Trajectory
 
 POOLED = ("x", "y", "z", "all")
 VECTOR = ("x", "y", "z", "vector")
+WIDTH_COLUMNS = ("rms", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
 Row = dict[str, Any]
 
 
@@ -83,13 +84,14 @@ def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:
     return ["csv", "parquet"]
 
 
-def _values(key: Any, **found: Interval) -> Row:
-    """Return values and their intervals as three columns each."""
-    row = {}
-    for name, of in found.items():
-        for column, values in ((name, of.value), (f"{name}_low", of.low), (f"{name}_high", of.high)):
-            row[column] = float(np.asarray(values)[key])
-    return row
+def _rows(**columns: Any) -> Iterator[Row]:
+    """Yield a row for each entry of columns that broadcast to one shape; an interval becomes three columns."""
+    parts: Row = {}
+    for name, of in columns.items():
+        whole = isinstance(of, Interval)
+        parts |= {name: of.value, f"{name}_low": of.low, f"{name}_high": of.high} if whole else {name: of}
+    entries = zip(*(values.ravel().tolist() for values in np.broadcast_arrays(*parts.values())), strict=True)
+    yield from (dict(zip(parts, row, strict=True)) for row in entries)
 
 
 def _tracks(tracks: Mapping[str, Trajectory]) -> Iterator[Row]:
@@ -108,23 +110,21 @@ def _tracks(tracks: Mapping[str, Trajectory]) -> Iterator[Row]:
 
 
 def _segments(summary: Summary, names: Sequence[str]) -> Iterator[Row]:
-    ensemble = summary.ensemble
-    for k, (first, last) in enumerate(zip(ensemble.starts[:-1].tolist(), ensemble.starts[1:].tolist(), strict=True)):
-        yield {
-            "segment": k,
-            "file": names[int(ensemble.track[k])],
-            "begins_s": float(ensemble.time_s[first]),
-            "duration_s": float(ensemble.span_s[k]),
-            "frames": last - first,
-        }
+    of = summary.ensemble
+    return _rows(
+        segment=np.arange(of.segments),
+        file=np.array(names, object)[of.track],
+        begins_s=of.time_s[of.starts[:-1]],
+        duration_s=of.span_s,
+        frames=np.diff(of.starts),
+    )
 
 
 def _moments(summary: Summary) -> Iterator[Row]:
-    for quantity, part in summary.table.items():
-        for i, component in enumerate(COMPONENTS):
-            row: Row = {"quantity": quantity, "component": component, "units": part.units}
-            row |= _values(i, **{name: getattr(part, name) for name in STATISTICS})
-            yield row | {"samples": part.samples, "segments": part.segments}
+    for quantity, of in summary.table.items():
+        found = {name: getattr(of, name) for name in STATISTICS}
+        more = {"samples": of.samples, "segments": of.segments}
+        yield from _rows(quantity=quantity, component=COMPONENTS, units=of.units, **found, **more)
 
 
 def _comparisons(summary: Summary) -> Iterator[Row]:
@@ -139,108 +139,95 @@ def _comparisons(summary: Summary) -> Iterator[Row]:
 
 def _distances(distances: Sequence[CameraDistance]) -> Iterator[Row]:
     for one in distances:
-        edges = np.rad2deg(one.edges_rad).tolist()
-        pdf = np.deg2rad(one.pdf).tolist()
-        rough = np.full(len(pdf), np.nan) if one.uncorrected_pdf is None else np.deg2rad(one.uncorrected_pdf)
-        names = ("cameras", "from_deg", "to_deg", "pdf_per_deg", "without_perspective_pdf_per_deg")
-        for values in zip(edges[:-1], edges[1:], pdf, rough.tolist(), strict=True):
-            yield dict(zip(names, (" ".join(one.cameras), *values), strict=True))
+        edges = np.rad2deg(one.edges_rad)
+        yield from _rows(
+            cameras=" ".join(one.cameras),
+            from_deg=edges[:-1],
+            to_deg=edges[1:],
+            pdf_per_deg=np.deg2rad(one.pdf),
+            without_perspective_pdf_per_deg=np.deg2rad(np.nan if one.uncorrected_pdf is None else one.uncorrected_pdf),
+        )
 
 
 def _densities(more: Distributions) -> Iterator[Row]:
-    for quantity, component, part in _by_component(more):
-        yield from _density({"quantity": quantity, "component": component}, part)
-    for lag, part in more.increment_densities.items():
-        yield from _density({"quantity": f"increment of omega_lab over {lag} frames", "component": "x"}, part)
+    steps = {(f"increment of omega_lab over {lag} frames", "x"): part for lag, part in more.increment_densities.items()}
+    for (quantity, component), part in (_by_component(more) | steps).items():
+        yield from _rows(
+            quantity=quantity,
+            component=component,
+            standard_deviations=part.centres,
+            count=part.counts,
+            pdf=part.pdf,
+            stretched_exponential=stretched_exponential(part.centres, float(part.fit.a.value)),
+            gaussian=np.exp(-(part.centres**2) / 2) / np.sqrt(2 * np.pi),
+        )
 
 
-def _by_component(more: Distributions) -> Iterator[tuple[str, str, Density]]:
-    for quantity, parts in more.densities.items():
-        for component, part in zip("xyz", parts, strict=True):
-            yield quantity, component, part
-
-
-def _density(head: Row, part: Density) -> Iterator[Row]:
-    law = stretched_exponential(part.centres, float(part.fit.a.value))
-    for k, centre in enumerate(part.centres.tolist()):
-        row = head | {"standard_deviations": centre, "count": int(part.counts[k])} | _values(k, pdf=part.pdf)
-        gauss = float(np.exp(-(centre**2) / 2) / np.sqrt(2 * np.pi))
-        yield row | {"stretched_exponential": float(law[k]), "gaussian": gauss}
+def _by_component(more: Distributions) -> dict[tuple[str, str], Density]:
+    return {
+        (quantity, component): part
+        for quantity, parts in more.densities.items()
+        for component, part in zip("xyz", parts, strict=True)
+    }
 
 
 def _fits(more: Distributions) -> Iterator[Row]:
-    for quantity, component, part in _by_component(more):
+    for (quantity, component), part in _by_component(more).items():
         fit = part.fit
-        row: Row = {"quantity": quantity, "component": component}
-        row |= _values((), a=fit.a, flatness_of_fit=fit.flatness)
-        row |= {"log_likelihood": fit.log_likelihood, "log_likelihood_gaussian": fit.log_likelihood_gaussian}
-        yield row | {"better_than_gaussian": fit.better_than_gaussian}
+        likely = {"log_likelihood": fit.log_likelihood, "log_likelihood_gaussian": fit.log_likelihood_gaussian}
+        better = {"better_than_gaussian": fit.better_than_gaussian}
+        found = {"a": fit.a, "flatness_of_fit": fit.flatness}
+        yield from _rows(quantity=quantity, component=component, **found, **likely, **better)
 
 
 def _increments(more: Distributions) -> Iterator[Row]:
-    found = more.increments
-    for k, lag_s in enumerate(found.lag_s.tolist()):
-        for i, component in enumerate(POOLED):
-            row: Row = {"lag_s": lag_s, "pairs": int(found.pairs[k]), "component": component}
-            yield row | _values((k, i), rms=found.rms, flatness=found.flatness)
+    of = more.increments
+    by_lag = {"lag_s": of.lag_s[:, None], "pairs": of.pairs[:, None]}
+    return _rows(**by_lag, component=POOLED, rms=of.rms, flatness=of.flatness)
 
 
 def _correlations(more: Distributions) -> Iterator[Row]:
-    for quantity, found in more.correlations.items():
-        for k, lag_s in enumerate(found.lag_s.tolist()):
-            for i, component in enumerate(VECTOR):
-                row: Row = {"quantity": quantity, "lag_s": lag_s, "pairs": int(found.pairs[k]), "component": component}
-                yield row | _values((k, i), correlation=found.value)
+    for quantity, of in more.correlations.items():
+        by_lag = {"lag_s": of.lag_s[:, None], "pairs": of.pairs[:, None]}
+        yield from _rows(quantity=quantity, **by_lag, component=VECTOR, correlation=of.value)
 
 
 def _integral_times(more: Distributions) -> Iterator[Row]:
-    for quantity, found in more.correlations.items():
-        for i, component in enumerate(VECTOR):
-            row: Row = {"quantity": quantity, "component": component}
-            row |= _values(i, integral_time_s=found.integral_time_s)
-            yield row | {"reached_zero": bool(found.reached_zero[i])}
+    for quantity, of in more.correlations.items():
+        found = {"integral_time_s": of.integral_time_s, "reached_zero": of.reached_zero}
+        yield from _rows(quantity=quantity, component=VECTOR, **found)
 
 
 def _durations(more: Distributions) -> Iterator[Row]:
-    if (found := more.durations) is not None:
-        for k, (count, expected) in enumerate(zip(found.counts.tolist(), found.expected.tolist(), strict=True)):
-            row: Row = {"from_s": float(found.edges_s[k]), "to_s": float(found.edges_s[k + 1])}
-            yield row | {"segments": count, "expected": expected}
+    if (of := more.durations) is not None:
+        yield from _rows(from_s=of.edges_s[:-1], to_s=of.edges_s[1:], segments=of.counts, expected=of.expected)
 
 
 def _angles(more: Distributions) -> Iterator[Row]:
-    for one in more.angles:
-        edges = np.rad2deg(one.edges_rad)
-        for k, uniform in enumerate(one.uniform.tolist()):
-            row: Row = {"angle": one.name, "from_deg": float(edges[k]), "to_deg": float(edges[k + 1])}
-            yield row | _values(k, pdf_per_rad=one.pdf) | {"uniform_pdf_per_rad": uniform}
+    for of in more.angles:
+        edges = np.rad2deg(of.edges_rad)
+        densities = {"pdf_per_rad": of.pdf, "uniform_pdf_per_rad": of.uniform}
+        yield from _rows(angle=of.name, from_deg=edges[:-1], to_deg=edges[1:], **densities)
 
 
 def _isotropy(more: Distributions) -> Iterator[Row]:
-    for quantity, found in more.isotropies.items():
-        for i, (component, pair) in enumerate(zip("xyz", ("xy", "xz", "yz"), strict=True)):
-            row: Row = {"quantity": quantity, "component": component}
-            row |= _values(i, variance_share=found.variance_share) | {"pair": pair}
-            yield row | _values(i, cross_correlation=found.cross_correlation) | {"p_value": found.p_value}
+    for quantity, of in more.isotropies.items():
+        shares = {"component": list("xyz"), "variance_share": of.variance_share}
+        pairs = {"pair": ["xy", "xz", "yz"], "cross_correlation": of.cross_correlation}
+        yield from _rows(quantity=quantity, **shares, **pairs, p_value=of.p_value)
 
 
 def _widths(more: Distributions) -> Iterator[Row]:
-    names = ("rms", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
-    for quantity, found in more.widths.items():
-        for k, width_s in enumerate(found.width_s.tolist()):
-            for i, component in enumerate("xyz"):
-                row: Row = {"quantity": quantity, "width_s": width_s, "component": component}
-                yield row | _values((k, i), **{name: getattr(found, name) for name in names})
+    for quantity, of in more.widths.items():
+        found = {name: getattr(of, name) for name in WIDTH_COLUMNS}
+        yield from _rows(quantity=quantity, width_s=of.width_s[:, None], component=list("xyz"), **found)
 
 
 def _multi_lag(more: Distributions) -> Iterator[Row]:
-    for quantity, found in more.multi_lag.items():
-        for i, component in enumerate("xyz"):
-            row: Row = {"quantity": quantity, "component": component, "rms": float(found.rms[i])}
-            yield row | _values(i, variance=found.variance, noise_variance=found.noise_variance)
+    for quantity, of in more.multi_lag.items():
+        found = {"rms": of.rms, "variance": of.variance, "noise_variance": of.noise_variance}
+        yield from _rows(quantity=quantity, component=list("xyz"), **found)
 
 
 def _lift(more: Distributions) -> Iterator[Row]:
-    for i, component in enumerate(VECTOR):
-        found = more.lift
-        yield {"component": component} | _values(i, correlation=found.correlation, coefficient=found.coefficient)
+    return _rows(component=VECTOR, correlation=more.lift.correlation, coefficient=more.lift.coefficient)

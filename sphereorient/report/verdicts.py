@@ -122,12 +122,12 @@ def _tails(summary: Summary, more: Distributions) -> Iterator[Verdict]:
 def _attitude(more: Distributions) -> Iterator[Verdict]:
     test = more.uniformity
     how = f"p = {test.p_value:.2g}, as good as {test.effective:.0f} independent attitudes"
+    words, good = "nothing against all attitudes being equally likely", None
     if test.p_value < CLEAR:
-        yield _say("Attitudes", f"not all attitudes are equally likely ({how})", good=False)
+        words, good = "not all attitudes are equally likely", False
     elif test.p_value < WEAK:
-        yield _say("Attitudes", f"weak signs that not all attitudes are equally likely ({how})")
-    else:
-        yield _say("Attitudes", f"nothing against all attitudes being equally likely ({how})")
+        words = "weak signs that not all attitudes are equally likely"
+    yield _say("Attitudes", f"{words} ({how})", good)
 
 
 def _frames(more: Distributions) -> Iterator[Verdict]:

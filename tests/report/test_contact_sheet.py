@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from sphereorient.movies import open_movie
 from sphereorient.movies.survey import survey
-from sphereorient.report.contact_sheet import contact_sheet
+from sphereorient.report.inputs import contact_sheet
 
 FRAMES = 40
 
@@ -33,9 +33,7 @@ def path(tmp_path):
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     figures: list[Figure] = []
-    monkeypatch.setattr(
-        "sphereorient.report.contact_sheet.write_figure", lambda figure, *_, **__: figures.append(figure)
-    )
+    monkeypatch.setattr("sphereorient.report.inputs.write_figure", lambda figure, *_, **__: figures.append(figure))
     return figures
 
 

@@ -13,8 +13,7 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from sphereorient.errors import OutputError
-from sphereorient.report.export import export_track, format_of, to_xarray
-from sphereorient.report.export_columns import columns, safe_names
+from sphereorient.report.export import columns, export_track, format_of, safe_names, to_xarray
 from sphereorient.trajectory import CameraTrack, Trajectory
 
 pd = pytest.importorskip("pandas")

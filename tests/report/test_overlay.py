@@ -16,9 +16,18 @@ from sphereorient.cameras import load_cameras
 from sphereorient.errors import ExperimentError, OutputError, TrackError
 from sphereorient.report.frame_warnings import FLAG_WORDS, REASON_WORDS, flag_words, frame_warnings
 from sphereorient.report.overlay import FrameSelection, overlay_movie, pictures_by_row, prepared, write_video
-from sphereorient.report.overlay_canvas import AXES, DOUBT, LOST, OUTLINE, Canvas, Panel
 from sphereorient.report.overlay_model import LightFit, Model, SeenDisk, axes_px, crop, fit_light, outline_px, path_of
-from sphereorient.report.overlay_page import BLANK, own_distance_px, residual_colours
+from sphereorient.report.overlay_page import (
+    AXES,
+    BLANK,
+    DOUBT,
+    LOST,
+    OUTLINE,
+    Canvas,
+    Panel,
+    own_distance_px,
+    residual_colours,
+)
 from sphereorient.trajectory import Flag, Reason
 
 K = 20  # a frame

@@ -15,9 +15,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sphereorient.errors import SphereOrientError
+from sphereorient.report.frame_warnings import bad_stretches, frame_numbers, strip_of
 from sphereorient.report.gallery import GAP, TILE, chosen_frames, gallery
 from sphereorient.report.page import strip_assets, strip_html
-from sphereorient.report.strip import bad_stretches, frame_numbers, strip_of
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 TURN = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
@@ -83,28 +83,29 @@ def test_the_strip_says_of_every_frame_what_was_planted():
     status = np.zeros(300, int)
     status[[85, 120, 121, 122, 200]] = 1
     status[60:80] = 2
-    assert strip.status == tuple(status)
-    assert strip.counts == (275, 5, 20)
-    assert strip.number == strip.row == tuple(range(300))
-    words = {camera.name: [strip.reason_words[code] for code in camera.reason] for camera in strip.cameras}
+    assert strip["status"] == status.tolist()
+    assert strip["counts"] == [275, 5, 20]
+    assert strip["number"] == strip["row"] == list(range(300))
+    told = strip["reason_words"]
+    words = {camera["name"]: [told[code] for code in camera["reason"]] for camera in strip["cameras"]}
     assert words["cam1"] == ["measured"] * 60 + ["too dark"] * 20 + ["measured"] * 220
     assert set(words["cam2"][60:70]) == {"no clear outline"}
     assert set(words["cam2"][70:80]) == {"measured"}
     assert words["cam2"][121] == "no orientation explains the picture"
-    told = dict(strip.flag_words)
-    assert {told[bit] for bit in told if strip.flags[200] & bit} == {
+    told = dict(strip["flag_words"])
+    assert {told[bit] for bit in told if strip["flags"][200] & bit} == {
         "found again after a loss",
         "the orientation jumps",
     }
-    assert [k for k in range(300) if strip.flags[k]] == [85, 200]
-    assert strip.cameras[0].score[5] == 0.6
-    assert strip.cameras[0].score[61] is None
-    assert strip.orientation_error_deg[0] == 0.1
-    assert strip.position_error_mm[0] == 0.2
-    assert strip.orientation_error_deg[61] is None
-    assert strip.apart_deg is not None
-    assert strip.apart_deg[7] == pytest.approx(np.rad2deg(0.1), rel=1e-3)
-    assert strip.apart_deg[8] == 0.0
+    assert [k for k in range(300) if strip["flags"][k]] == [85, 200]
+    assert strip["cameras"][0]["score"][5] == 0.6
+    assert strip["cameras"][0]["score"][61] is None
+    assert strip["orientation_error_deg"][0] == 0.1
+    assert strip["position_error_mm"][0] == 0.2
+    assert strip["orientation_error_deg"][61] is None
+    assert strip["apart_deg"] is not None
+    assert strip["apart_deg"][7] == pytest.approx(np.rad2deg(0.1), rel=1e-3)
+    assert strip["apart_deg"][8] == 0.0
 
 
 @pytest.mark.parametrize("frames", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
@@ -115,19 +116,19 @@ def test_one_bad_frame_of_a_million_survives(frames):
     cov = np.array(track.orientation_cov)
     cov[bad] *= 900
     strip = strip_of(replace(track, orientation_cov=cov))
-    assert strip.per_bin == per_bin
-    assert len(strip.status) == 20_000
+    assert strip["per_bin"] == per_bin
+    assert len(strip["status"]) == 20_000
     place = bad // per_bin
-    assert [k for k, status in enumerate(strip.status) if status] == [place]
-    assert strip.number[place] == strip.row[place] == bad
-    assert strip.time_s[place] == pytest.approx(bad / 600)
-    assert strip.orientation_error_deg[place] == 3.0
-    assert strip.cameras[1].score[place] == 0.2
-    assert strip.cameras[0].score[place] == 0.95
-    assert strip.reason_words[strip.cameras[1].reason[place]] == "too dark"
-    assert strip.flags[place] == Flag.AMBIGUOUS
-    assert strip.apart_deg is not None
-    assert strip.apart_deg[place] == pytest.approx(np.rad2deg(0.1), rel=1e-3)
+    assert [k for k, status in enumerate(strip["status"]) if status] == [place]
+    assert strip["number"][place] == strip["row"][place] == bad
+    assert strip["time_s"][place] == pytest.approx(bad / 600)
+    assert strip["orientation_error_deg"][place] == 3.0
+    assert strip["cameras"][1]["score"][place] == 0.2
+    assert strip["cameras"][0]["score"][place] == 0.95
+    assert strip["reason_words"][strip["cameras"][1]["reason"][place]] == "too dark"
+    assert strip["flags"][place] == Flag.AMBIGUOUS
+    assert strip["apart_deg"] is not None
+    assert strip["apart_deg"][place] == pytest.approx(np.rad2deg(0.1), rel=1e-3)
     assert [(one.first, one.frames) for one in bad_stretches(track)] == [(bad, 1)]
 
 
@@ -135,12 +136,12 @@ def test_the_last_bin_may_be_shorter_and_a_gap_in_a_bin_hides_no_error():
     track = changed(good_track(20_001), 20_000, valid=False)
     track = changed(track, 4, orientation_cov=np.nan)
     strip = strip_of(track)
-    assert (strip.per_bin, len(strip.status), strip.status[-1], strip.row[-1]) == (2, 10_001, 2, 20_000)
-    assert strip.orientation_error_deg[2] == 0.1
+    assert (strip["per_bin"], len(strip["status"]), strip["status"][-1], strip["row"][-1]) == (2, 10_001, 2, 20_000)
+    assert strip["orientation_error_deg"][2] == 0.1
 
 
 def test_numbers_are_the_experiments():
-    assert strip_of(good_track(30, first=100)).number[:2] == (100, 101)
+    assert strip_of(good_track(30, first=100))["number"][:2] == [100, 101]
     uneven = replace(good_track(4), time=np.array([0.0, 0.0013, 0.0022, 0.0051]))
     assert frame_numbers(uneven).tolist() == [0, 1, 2, 3]
     given = bad_stretches(changed(good_track(30), 3, valid=False), np.arange(1000, 1030))
@@ -150,8 +151,8 @@ def test_numbers_are_the_experiments():
 def test_one_camera_only_is_no_doubt_where_there_is_no_other():
     alone = changed(good_track(30, ("cam1",)), slice(None), flags=Flag.ONE_CAMERA)
     assert bad_stretches(alone) == []
-    assert set(strip_of(alone).flags) == {0}
-    assert strip_of(alone).apart_deg is None
+    assert set(strip_of(alone)["flags"]) == {0}
+    assert strip_of(alone)["apart_deg"] is None
     of_two = changed(good_track(30), slice(None), flags=Flag.ONE_CAMERA)
     assert bad_stretches(of_two)[0].reasons == (("one camera only", 30),)
 
@@ -164,7 +165,7 @@ def test_a_reason_of_a_newer_file_is_shown_as_it_is():
 @pytest.mark.parametrize("frames", [0, 1, 50])
 def test_nothing_measured_is_json_and_a_page(frames):
     track = Trajectory.empty(np.arange(frames) / 600.0, cameras=("cam1",))
-    text = json.dumps(strip_of(track).as_json(), allow_nan=False)
+    text = json.dumps(strip_of(track), allow_nan=False)
     assert json.loads(text)["counts"] == [0, 0, frames]
     assert "Quality of every frame" in strip_html("empty", track, None)
 

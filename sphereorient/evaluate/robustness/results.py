@@ -1,13 +1,11 @@
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from sphereorient.errors import BenchError, refusal
 from sphereorient.evaluate.robustness.scenes import BenchSettings
@@ -67,12 +65,6 @@ class SceneResult:
     def lost(self) -> int:
         """Frames without an orientation."""
         return int(np.isnan(self.errors_deg).sum())
-
-    @classmethod
-    def from_tree(cls, tree: Mapping[str, Any]) -> SceneResult:
-        """Return the result from the content of its JSON file."""
-        values: dict[str, Any] = {entry.name: tree[entry.name] for entry in fields(cls)}
-        return cls(**values | {name: tuple(value) for name, value in values.items() if isinstance(value, list)})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -172,9 +164,8 @@ def load_results(path: Path) -> Results:
         do = "run the benchmark again with this version"
         raise BenchError(refusal(f"{path}: schema", expected=SCHEMA, got=str(schema)[:60], do=do))
     try:
-        outcomes = [SceneResult.from_tree(one) for one in tree["outcomes"]]
-        return Results(settings=BenchSettings(**tree["settings"]), versions=tree["versions"], outcomes=outcomes)
-    except (KeyError, TypeError, ValueError) as error:
+        return TypeAdapter(Results).validate_python(tree)
+    except ValueError as error:
         got = " ".join(str(error).split())[:120]
         raise BenchError(refusal(str(path), expected="whole results", got=f"'{got}'", do=do)) from None
 

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from scipy.stats import chi2
 
 from sphereorient import so3
 from sphereorient.errors import BenchError, OutputError, SphereOrientError, refusal
 from sphereorient.evaluate.robustness.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
 from sphereorient.evaluate.robustness.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
-from sphereorient.evaluate.score import score_track, true_orientations
+from sphereorient.evaluate.score import distance_deg, score_track, true_orientations
 from sphereorient.files.outputs import put_aside
 from sphereorient.files.provenance import versions
 from sphereorient.methods.settings import Settings
@@ -119,8 +120,8 @@ def _missing(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracker
 def kept_result(path: Path) -> SceneResult:
     """Read the result of a scene; raise BenchError if the file is damaged."""
     try:
-        return SceneResult.from_tree(json.loads(path.read_text("utf-8")))
-    except (OSError, ValueError, KeyError, TypeError):
+        return TypeAdapter(SceneResult).validate_json(path.read_bytes())
+    except (OSError, ValueError):
         do = "delete the file and run again"
         raise BenchError(refusal(str(path), expected="the result of a scene", got="something else", do=do)) from None
 
@@ -193,8 +194,7 @@ def _ranks(seen: CameraTrack, R_true: Floats) -> Floats:
     """Return the rank (N,), 0 the best, of the right orientation among a camera's candidates; inf: missing."""
     counts = np.diff(seen.candidate_offset)
     frame = np.repeat(np.arange(len(counts)), counts)
-    pair = (torch.from_numpy(seen.candidate_orientation), torch.from_numpy(R_true[frame]))
-    right = np.rad2deg(so3.geodesic_distance(*pair).numpy()) <= WRONG_DEG
+    right = distance_deg(seen.candidate_orientation, R_true[frame]) <= WRONG_DEG
     order = np.lexsort((-np.nan_to_num(seen.candidate_score, nan=-np.inf), frame))
     rank = np.empty(len(frame))
     rank[order] = np.arange(len(frame)) - seen.candidate_offset[:-1][frame[order]]

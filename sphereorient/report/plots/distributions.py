@@ -10,27 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sphereorient.errors import TrackError, refusal
-from sphereorient.report.plots.style import (
-    ALL,
-    COMPONENTS,
-    GREY,
-    PLAIN,
-    SECOND,
-    SYMBOLS,
-    WIDTH_IN,
-    X,
-    band,
-    in_style,
-    interval_text,
-    legend_above,
-    legend_of_figure,
-    new_figure,
-    note,
-    panel_grid,
-    plain_logarithms,
-    points,
-    three_digits,
-)
+from sphereorient.report.plots import style as look
 from sphereorient.statistics import Moments, Summary
 from sphereorient.statistics.density import Density, stretched_exponential
 from sphereorient.statistics.lags import Correlation
@@ -39,14 +19,14 @@ from sphereorient.statistics.summary import Distributions
 
 Floats = NDArray[np.float64]
 
-FOUR = (*COMPONENTS, ALL)
+FOUR = (*look.COMPONENTS, look.ALL)
 CURVE_POINTS = 401
 SHORTEST = 4.0  # bars of shifted PDFs end at this part of the value
 SHOWN_TIMES, SHOWN_ZEROS = 4.0, 1.5  # shown range of lags: integral times, or lags of the first zero
 BARS: Final[dict[str, Any]] = {"facecolor": "#E0E0E0", "edgecolor": "#444444", "linewidth": 0.7}
 
 
-@in_style
+@look.in_style
 def densities_figure(summary: Summary, quantities: Sequence[str] = tuple(UNITS)) -> Figure:
     """Draw the PDFs of the components of some quantities, in standard deviations, with the fit and the Gaussian.
 
@@ -58,7 +38,7 @@ def densities_figure(summary: Summary, quantities: Sequence[str] = tuple(UNITS))
     if summary.distributions is None:
         got, do = f"{summary.ensemble.segments}", "pass more tracks, or cut a long one with statistics.max_duration_s"
         raise TrackError(refusal("densities", expected="two segments or more", got=got, do=do))
-    figure, panels = panel_grid(len(quantities), 2.7, 0.5, shared=True)
+    figure, panels = look.panel_grid(len(quantities), 2.7, 0.5, shared=True)
     drawn = [summary.distributions.densities[quantity] for quantity in quantities]
     for axes, quantity, densities in zip(panels, quantities, drawn, strict=True):
         _densities_panel(axes, quantity, densities)
@@ -70,36 +50,36 @@ def densities_figure(summary: Summary, quantities: Sequence[str] = tuple(UNITS))
         axes.set_xlabel("component (standard deviations)")
         axes.tick_params(labelbottom=True)
     handles = [
-        PLAIN.handle("bins with intervals", linestyle="none", marker="o"),
-        PLAIN.handle("stretched exponential, a and its flatness F"),
-        SECOND.handle("Gaussian"),
+        look.PLAIN.handle("bins with intervals", linestyle="none", marker="o"),
+        look.PLAIN.handle("stretched exponential, a and its flatness F"),
+        look.SECOND.handle("Gaussian"),
     ]
-    legend_of_figure(figure, handles, ncols=3 if columns > 1 else 1)
+    look.legend_of_figure(figure, handles, ncols=3 if columns > 1 else 1)
     return figure
 
 
 def _densities_panel(axes: Axes, quantity: str, densities: Sequence[Density]) -> None:
     axes.set_yscale("log")
     handles = []
-    for style, density in zip(COMPONENTS, densities, strict=True):
+    for style, density in zip(look.COMPONENTS, densities, strict=True):
         there = density.counts > 0
-        points(axes, density.centres[there], density.pdf.part(there), style)
+        look.points(axes, density.centres[there], density.pdf.part(there), style)
         fit = density.fit
-        label = f"{style.name}: a = {interval_text(fit.a)}, F = {three_digits(float(fit.flatness.value))}"
+        label = f"{style.name}: a = {look.interval_text(fit.a)}, F = {look.three_digits(float(fit.flatness.value))}"
         x = np.linspace(density.edges[0], density.edges[-1], CURVE_POINTS)
         known = np.isfinite(fit.a.value)
         y = stretched_exponential(x, float(fit.a.value)) if known else np.full_like(x, np.nan)
         axes.plot(x, y, label=label, **(style.drawn | {"linewidth": 0.9}))
         handles.append(style.handle(label, marker=style.marker, linewidth=0.9))
     _gaussian(axes, densities[0])
-    axes.set_ylabel(f"PDF of {SYMBOLS[quantity]} (1/standard deviation)")
-    legend_above(axes, handles=handles)
+    axes.set_ylabel(f"PDF of {look.SYMBOLS[quantity]} (1/standard deviation)")
+    look.legend_above(axes, handles=handles)
 
 
 def _gaussian(axes: Axes, density: Density, factor: float = 1.0) -> None:
     x = np.linspace(density.edges[0], density.edges[-1], CURVE_POINTS)
     y = factor * np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
-    axes.plot(x, y, label="_gaussian", **(SECOND.drawn | {"linewidth": 1.0}))
+    axes.plot(x, y, label="_gaussian", **(look.SECOND.drawn | {"linewidth": 1.0}))
 
 
 def _lowest(densities: Sequence[Density]) -> float:
@@ -113,13 +93,13 @@ def _reach(densities: Sequence[Density]) -> tuple[float, float]:
     return -reach - 0.5, reach + 0.5
 
 
-@in_style
+@look.in_style
 def increments_figure(distributions: Distributions, table: Mapping[str, Moments] | None = None) -> Figure:
     """Draw the PDFs of increments of omega, each a decade above that of the next shorter lag, and flatness against lag.
 
     `table` gives lines at the flatness of omega and alpha. Source: the paper, section IV, with docs/errata.md E7.
     """
-    figure = new_figure(WIDTH_IN, 4.6)
+    figure = look.new_figure(look.WIDTH_IN, 4.6)
     left, right = figure.subplots(1, 2)
     _shifted_densities(left, distributions)
     steps = distributions.increments
@@ -127,11 +107,11 @@ def increments_figure(distributions: Distributions, table: Mapping[str, Moments]
     for i, style in enumerate(FOUR):
         of = steps.flatness.part((slice(None), i))
         right.plot(lag_ms, of.value, marker=style.marker, label=style.name, **style.drawn)
-        band(right, lag_ms, of.low, of.high, style)
+        look.band(right, lag_ms, of.low, of.high, style)
     right.set(xscale="log", xlabel="lag (ms)", ylabel="flatness of increments of ω, lab (–)")
     _levels(right, table or {})
-    plain_logarithms(right.xaxis)
-    legend_above(right, ncols=2)
+    look.plain_logarithms(right.xaxis)
+    look.legend_above(right, ncols=2)
     return figure
 
 
@@ -145,7 +125,7 @@ def _shifted_densities(axes: Axes, distributions: Distributions) -> None:
         there = density.counts > 0
         pdf = density.pdf.part(there).scaled(factor)
         # Bars that reach zero would cross the other curves.
-        points(axes, density.centres[there], replace(pdf, low=np.maximum(pdf.low, pdf.value / SHORTEST)), X)
+        look.points(axes, density.centres[there], replace(pdf, low=np.maximum(pdf.low, pdf.value / SHORTEST)), look.X)
         _gaussian(axes, density, factor)
         top = float(np.nanmax(density.pdf.value, initial=0.4))
         axes.text(0, 1.25 * top * factor, f"{lag_ms[lag]:.2g} ms", ha="center", va="bottom", fontsize=6.5)
@@ -153,18 +133,18 @@ def _shifted_densities(axes: Axes, distributions: Distributions) -> None:
     axes.set(ylim=(bottom / 3, 8 * 10.0 ** max(len(lags) - 1, 0)), xlim=_reach(list(shown.values())))
     axes.set_xlabel(r"increment of $\omega_x$, lab (standard deviations)")
     axes.set_ylabel("PDF, shifted by decades (1/standard deviation)")
-    bins = X.handle("bins with intervals, drawn down to ¼ of the value", marker=X.marker, linestyle="none")
-    legend_above(axes, handles=[bins, SECOND.handle("Gaussian")])
+    bins = look.X.handle("bins with intervals, drawn down to ¼ of the value", marker=look.X.marker, linestyle="none")
+    look.legend_above(axes, handles=[bins, look.SECOND.handle("Gaussian")])
 
 
 def _levels(axes: Axes, table: Mapping[str, Moments]) -> None:
     levels = {"Gaussian": 3.0}
     names = {"ω lab": "omega_lab", "α lab": "alpha_lab"}
     levels |= {name: pooled_flatness(table[key]) for name, key in names.items() if key in table}
-    styles = {"Gaussian": SECOND.line, "ω lab": (0, (1, 1.5)), "α lab": (0, (8, 2))}
+    styles = {"Gaussian": look.SECOND.line, "ω lab": (0, (1, 1.5)), "α lab": (0, (8, 2))}
     for name, level in levels.items():
         if np.isfinite(level):
-            axes.axhline(level, color=GREY, linestyle=styles[name], linewidth=1.0, label=f"{name}: {level:.3g}")
+            axes.axhline(level, color=look.GREY, linestyle=styles[name], linewidth=1.0, label=f"{name}: {level:.3g}")
 
 
 def pooled_flatness(of: Moments) -> float:
@@ -173,16 +153,18 @@ def pooled_flatness(of: Moments) -> float:
     return float((of.flatness.value[:3] * var**2).mean() / var.mean() ** 2)
 
 
-@in_style
+@look.in_style
 def correlations_figure(correlations: Mapping[str, Correlation]) -> Figure:
     """Draw autocorrelations against the lag, with bands; markers below zero are integral times. Source: textbook."""
-    figure, panels = panel_grid(len(correlations), 3.0, 0.4)
+    figure, panels = look.panel_grid(len(correlations), 3.0, 0.4)
     for axes, (quantity, correlation) in zip(panels, correlations.items(), strict=True):
         _correlation_panel(axes, correlation)
-        axes.set_ylabel(f"autocorrelation of {SYMBOLS.get(quantity, quantity)} (–)")
+        axes.set_ylabel(f"autocorrelation of {look.SYMBOLS.get(quantity, quantity)} (–)")
         axes.set_xlabel("lag (ms)")
     figure.align_ylabels()
-    note(figure, "markers below the line of zero: integral times with intervals; each panel has its own range of lags")
+    look.note(
+        figure, "markers below the line of zero: integral times with intervals; each panel has its own range of lags"
+    )
     return figure
 
 
@@ -191,11 +173,11 @@ def _correlation_panel(axes: Axes, correlation: Correlation) -> None:
     axes.axhline(0.0, color="#444444", linewidth=0.6)
     for i, style in enumerate(FOUR):
         of = correlation.value.part((slice(None), i))
-        words = interval_text(correlation.integral_time_s.part(i), "ms", 1e3)
+        words = look.interval_text(correlation.integral_time_s.part(i), "ms", 1e3)
         if words != "unknown" and not correlation.reached_zero[i]:
             words = f"above {words}, zero not reached"
         axes.plot(lag_ms, of.value, label=f"{style.name}: {words}", **style.drawn)
-        band(axes, lag_ms, of.low, of.high, style)
+        look.band(axes, lag_ms, of.low, of.high, style)
     for i, style in enumerate(FOUR):
         time = correlation.integral_time_s.part(i).scaled(1e3)
         place = np.array([-0.05 * (1 + i)])  # one below the other, since they are close together
@@ -203,7 +185,7 @@ def _correlation_panel(axes: Axes, correlation: Correlation) -> None:
         axes.hlines(place, [float(time.low)], [float(time.high)], color=style.colour, linewidth=0.9)
     axes.set_xlim(0.0, _longest_ms(correlation))
     axes.set_ylim(bottom=min(axes.get_ylim()[0], -0.3), top=1.05)
-    legend_above(axes, title="integral time")
+    look.legend_above(axes, title="integral time")
 
 
 def _longest_ms(correlation: Correlation) -> float:
@@ -214,10 +196,10 @@ def _longest_ms(correlation: Correlation) -> float:
     return max(min(float(lag_ms[-1]), max(SHOWN_TIMES * longest, SHOWN_ZEROS * zero)), 1e-3)
 
 
-@in_style
+@look.in_style
 def durations_figure(durations: Durations) -> Figure:
     """Draw the histogram of the segments' durations, counts on a logarithmic axis, with the exponential law."""
-    figure = new_figure(WIDTH_IN * 0.7, 3.0)
+    figure = look.new_figure(look.WIDTH_IN * 0.7, 3.0)
     axes = figure.subplots()
     unit, factor = ("ms", 1e3) if durations.edges_s[-1] < 2 else ("s", 1.0)
     edges = factor * durations.edges_s
@@ -226,12 +208,12 @@ def durations_figure(durations: Durations) -> Figure:
     label = f"{durations.segments:,} segments of at least {factor * durations.truncated_s:.3g} {unit}"
     axes.stairs(counts, edges, baseline=0.1, fill=True, label=label, **BARS)
     middle, decay = (edges[1:] + edges[:-1]) / 2, durations.decay_time_s
-    label = f"exponential, decay time {interval_text(decay, unit, factor)}"
-    axes.plot(middle, durations.expected, label=label, **SECOND.drawn)
+    label = f"exponential, decay time {look.interval_text(decay, unit, factor)}"
+    axes.plot(middle, durations.expected, label=label, **look.SECOND.drawn)
     ends = [durations.law(float(time)) for time in (decay.low, decay.high)]
-    band(axes, middle, np.minimum(*ends), np.maximum(*ends), SECOND)
+    look.band(axes, middle, np.minimum(*ends), np.maximum(*ends), look.SECOND)
     axes.set(xlabel=f"duration ({unit})", ylabel="segments (number in a bin)")
     axes.set_ylim(0.5, 2.0 * max(float(np.nanmax(counts, initial=1.0)), 1.0))
-    plain_logarithms(axes.yaxis)
-    legend_above(axes)
+    look.plain_logarithms(axes.yaxis)
+    look.legend_above(axes)
     return figure

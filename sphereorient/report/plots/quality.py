@@ -8,25 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sphereorient.report.plots.style import (
-    ALL,
-    COMPONENTS,
-    PLAIN,
-    SECOND,
-    SYMBOLS,
-    WIDTH_IN,
-    LineStyle,
-    in_frame,
-    in_style,
-    legend_above,
-    legend_of_figure,
-    new_figure,
-    note,
-    p_value_text,
-    plain_logarithms,
-    points,
-    say_empty,
-)
+from sphereorient.report.plots import style as look
 from sphereorient.statistics import Interval, Moments
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.statistics.isotropy import EulerDensity, Isotropy, Uniformity
@@ -44,24 +26,24 @@ NEAREST = 30.0  # the smaller median over the first of the geometric bins
 GEOMETRIC_BINS = 36
 
 
-@in_style
+@look.in_style
 def angles_figure(angles: Sequence[EulerDensity], uniformity: Uniformity) -> Figure:
     """Draw PDFs of the Euler angles and of uniform rotations. Source: the paper, section II; docs/errata.md E1."""
-    figure = new_figure(WIDTH_IN, 2.9)
+    figure = look.new_figure(look.WIDTH_IN, 2.9)
     panels = figure.subplots(1, len(angles), sharey=True, squeeze=False)[0]
-    for axes, angle, style in zip(panels, angles, COMPONENTS, strict=True):
+    for axes, angle, style in zip(panels, angles, look.COMPONENTS, strict=True):
         edges_deg = np.rad2deg(angle.edges_rad)
-        points(axes, (edges_deg[1:] + edges_deg[:-1]) / 2, angle.pdf.scaled(np.pi / 180), style, angle.name)
-        law = {"color": SECOND.colour, "linestyle": SECOND.line, "linewidth": 1.1}
+        look.points(axes, (edges_deg[1:] + edges_deg[:-1]) / 2, angle.pdf.scaled(np.pi / 180), style, angle.name)
+        law = {"color": look.SECOND.colour, "linestyle": look.SECOND.line, "linewidth": 1.1}
         axes.stairs(angle.uniform * np.pi / 180, edges_deg, baseline=None, **law)
         axes.set_xlabel(rf"$\theta_{angle.name[-1]}$ (degrees)")
         step = 45 if edges_deg[-1] < 100 else 90
         axes.set(xlim=(edges_deg[0], edges_deg[-1]), xticks=np.arange(edges_deg[0], edges_deg[-1] + 1, step))
     panels[0].set_ylabel("PDF (1/degree)")
     panels[0].set_ylim(bottom=0.0)
-    bins = PLAIN.handle("bins with intervals", marker="o", linestyle="none")
-    legend_of_figure(figure, [bins, SECOND.handle("all attitudes equally likely")], ncols=2)
-    note(figure, _uniformity_words(uniformity))
+    bins = look.PLAIN.handle("bins with intervals", marker="o", linestyle="none")
+    look.legend_of_figure(figure, [bins, look.SECOND.handle("all attitudes equally likely")], ncols=2)
+    look.note(figure, _uniformity_words(uniformity))
     return figure
 
 
@@ -70,22 +52,22 @@ def _uniformity_words(of: Uniformity) -> str:
         return "uniformity of the attitudes could not be tested"
     found = "nothing speaks against uniform attitudes" if of.uniform else "the attitudes are not uniform"
     return (
-        f"{found}: {p_value_text(of.p_value)}, test on SO(3) of {of.samples:,} frames in {of.segments:,} segments, "
-        f"worth {of.effective:,.0f} independent attitudes"
+        f"{found}: {look.p_value_text(of.p_value)}, test on SO(3) of {of.samples:,} frames "
+        f"in {of.segments:,} segments, worth {of.effective:,.0f} independent attitudes"
     )
 
 
-@in_style
+@look.in_style
 def isotropy_figure(isotropies: Mapping[str, Isotropy]) -> Figure:
     """Draw each component's share in the variance, and p-values. Source: the paper, Table I, with docs/errata.md E6."""
-    figure = new_figure(WIDTH_IN, 3.2)
+    figure = look.new_figure(look.WIDTH_IN, 3.2)
     axes = figure.subplots()
     for k, one in enumerate(isotropies.values()):
         share = one.variance_share.scaled(100.0)
-        for i, style in enumerate(COMPONENTS):
-            points(axes, np.array([k + (i - 1) * BESIDE]), share.part(slice(i, i + 1)), style, style.name)
-    axes.axhline(100 / 3, label="a third", **SECOND.drawn)
-    labels = [f"{in_frame(name)}\n{p_value_text(one.p_value)}" for name, one in isotropies.items()]
+        for i, style in enumerate(look.COMPONENTS):
+            look.points(axes, np.array([k + (i - 1) * BESIDE]), share.part(slice(i, i + 1)), style, style.name)
+    axes.axhline(100 / 3, label="a third", **look.SECOND.drawn)
+    labels = [f"{look.in_frame(name)}\n{look.p_value_text(one.p_value)}" for name, one in isotropies.items()]
     axes.set_xticks(np.arange(len(labels)), labels)
     axes.grid(visible=False, axis="x")
     axes.set_xlabel("vector and its frame, p-value of isotropy (–)")
@@ -93,41 +75,41 @@ def isotropy_figure(isotropies: Mapping[str, Isotropy]) -> Figure:
     if isotropies:
         axes.set_xlim(-0.5, len(labels) - 0.5)
     else:
-        say_empty(axes)
-    handles = [style.handle(style.name, marker=style.marker, linestyle="none") for style in COMPONENTS]
-    legend_of_figure(figure, [*handles, SECOND.handle("isotropic: a third")], ncols=4)
+        look.say_empty(axes)
+    handles = [style.handle(style.name, marker=style.marker, linestyle="none") for style in look.COMPONENTS]
+    look.legend_of_figure(figure, [*handles, look.SECOND.handle("isotropic: a third")], ncols=4)
     return figure
 
 
-@in_style
+@look.in_style
 def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"] = "added") -> Figure:
     """Draw the share of noise in each variance; `error`: `Ensemble.error`. Source: docs/statistics.md, Noise."""
-    figure = new_figure(WIDTH_IN, 3.2)
+    figure = look.new_figure(look.WIDTH_IN, 3.2)
     axes = figure.subplots()
     shares = [one.noise_share.part(slice(0, 3)).scaled(100.0) for one in table.values()]
     floor = _floor(shares)
     bars = []
-    for i, style in enumerate(COMPONENTS):
+    for i, style in enumerate(look.COMPONENTS):
         at = np.arange(len(shares)) + (i - 1) * BAR
         value, low, high = (np.array([float(getattr(s, key)[i]) for s in shares]) for key in ("value", "low", "high"))
         drawn: dict[str, Any] = {"color": style.colour, "edgecolor": "white", "hatch": style.hatch}
         bars.append(axes.bar(at, value - floor, BAR, bottom=floor, label=style.name, **drawn))
         there = np.isfinite(low) & np.isfinite(high)
         axes.vlines(at[there], np.maximum(low[there], floor), high[there], color="black", linewidth=1.0)
-    limit = axes.axhline(100 * WARN_SHARE, label=f"{100 * WARN_SHARE:.0f} %: worth a warning", **SECOND.drawn)
-    axes.set_xticks(np.arange(len(table)), [in_frame(name) for name in table])
+    limit = axes.axhline(100 * WARN_SHARE, label=f"{100 * WARN_SHARE:.0f} %: worth a warning", **look.SECOND.drawn)
+    axes.set_xticks(np.arange(len(table)), [look.in_frame(name) for name in table])
     axes.grid(visible=False, axis="x")
     axes.set_xlabel("vector and its frame (–)")
     axes.set_ylabel(NOISE_WORDS[error])
     top = max([100 * WARN_SHARE, *(float(np.nan_to_num([s.value, s.high]).max()) for s in shares)])
     if floor:
         axes.set(yscale="log", ylim=(floor, 1.5 * top))
-        plain_logarithms(axes.yaxis)
+        look.plain_logarithms(axes.yaxis)
     else:
         axes.set_ylim(0.0, 1.2 * top)
-    legend_above(axes, ncols=4, handles=[*bars, limit])
+    look.legend_above(axes, ncols=4, handles=[*bars, limit])
     if not any(np.isfinite(share.value).any() for share in shares):
-        say_empty(axes, "the errors of this track are unknown")
+        look.say_empty(axes, "the errors of this track are unknown")
     return figure
 
 
@@ -138,7 +120,7 @@ def _floor(shares: list[Interval]) -> float:
     return float(10.0 ** (np.floor(np.log10(known.min())) - (np.log10(known.min()) % 1 < 0.3))) if len(known) else 0.0
 
 
-@in_style
+@look.in_style
 def widths_figure(widths: Mapping[str, WidthCurve]) -> Figure:
     """Draw rms, flatness and share of noise of a and alpha, else of velocity, against the kernel's width.
 
@@ -146,39 +128,39 @@ def widths_figure(widths: Mapping[str, WidthCurve]) -> Figure:
     Source: Voth et al. 2002, J. Fluid Mech. 469, 121; the paper, section III.
     """
     shown = [name for name in WIDTHS_OF if name in widths] or list(widths)[:1]
-    figure = new_figure(WIDTH_IN * max(len(shown), 1) / 2, 6.6)
+    figure = look.new_figure(look.WIDTH_IN * max(len(shown), 1) / 2, 6.6)
     panels = figure.subplots(3, max(len(shown), 1), sharex="col", squeeze=False)
     for column, name in zip(panels.T, shown, strict=True):
         _widths_column(column, widths[name])
     figure.align_ylabels()
-    x, y, z = (style.handle(style.name, marker=style.marker) for style in COMPONENTS)
-    corrected = PLAIN.handle("corrected for noise", marker="o")
-    measured = PLAIN.handle("as measured", marker="o", markerfacecolor="white", linestyle="none")
-    limit = SECOND.handle(f"{100 * WARN_SHARE:.0f} % of the variance")
-    legend_of_figure(figure, [x, corrected, y, measured, z, limit], ncols=3)
+    x, y, z = (style.handle(style.name, marker=style.marker) for style in look.COMPONENTS)
+    corrected = look.PLAIN.handle("corrected for noise", marker="o")
+    measured = look.PLAIN.handle("as measured", marker="o", markerfacecolor="white", linestyle="none")
+    limit = look.SECOND.handle(f"{100 * WARN_SHARE:.0f} % of the variance")
+    look.legend_of_figure(figure, [x, corrected, y, measured, z, limit], ncols=3)
     return figure
 
 
 def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
     rms, flatness, share = panels
-    symbol, unit = SYMBOLS[curve.quantity], UNITS[curve.quantity].replace("^2", "²")
+    symbol, unit = look.SYMBOLS[curve.quantity], UNITS[curve.quantity].replace("^2", "²")
     width_ms = 1e3 * curve.width_s
     nudge = 0.04 * float(np.min(np.diff(width_ms))) if len(width_ms) > 1 else 0.0
     open_ = {"markerfacecolor": "white", "linestyle": "none"}
-    for i, style in enumerate(COMPONENTS):
+    for i, style in enumerate(look.COMPONENTS):
         x, column = width_ms + (i - 1) * nudge, (slice(None), i)
         for axes, corrected, measured in (
             (rms, curve.corrected_rms, curve.rms),
             (flatness, curve.corrected_flatness, curve.flatness),
         ):
-            points(axes, x, corrected.part(column), style, f"{style.name}, corrected", joined=True)
+            look.points(axes, x, corrected.part(column), style, f"{style.name}, corrected", joined=True)
             label = f"{style.name}, measured"
             axes.plot(x, measured.value[column], marker=style.marker, color=style.colour, label=label, **open_)
-        points(share, x, curve.noise_share.part(column).scaled(100.0), style, style.name, joined=True)
-    share.axhline(100 * WARN_SHARE, label="_10 %", **SECOND.drawn)
+        look.points(share, x, curve.noise_share.part(column).scaled(100.0), style, style.name, joined=True)
+    share.axhline(100 * WARN_SHARE, label="_10 %", **look.SECOND.drawn)
     if (curve.noise_share.value > 0).any():
         share.set_yscale("log")
-        plain_logarithms(share.yaxis)
+        look.plain_logarithms(share.yaxis)
     rms.set_ylim(bottom=0.0)  # a plateau looks level only above zero
     rms.set_ylabel(f"rms of {symbol} ({unit})")
     flatness.set_ylabel(f"flatness of {symbol} (–)")
@@ -186,19 +168,19 @@ def _widths_column(panels: NDArray[np.object_], curve: WidthCurve) -> None:
     share.set_xlabel("kernel width σ (ms)")
 
 
-@in_style
+@look.in_style
 def camera_distance_figure(distances: Sequence[CameraDistance]) -> Figure:
     """Draw the PDF of the distance of the cameras' orientations and its median, a panel for each pair of cameras.
 
     Both axes are logarithmic if even bins would show the smaller distances as one bar; the PDF is per degree.
     Source: the paper, section III, distance of the two cameras; the sign of the correction by docs/errata.md A1.
     """
-    figure = new_figure(WIDTH_IN * 0.7, 2.9 * max(len(distances), 1))
+    figure = look.new_figure(look.WIDTH_IN * 0.7, 2.9 * max(len(distances), 1))
     panels = figure.subplots(max(len(distances), 1), 1, squeeze=False)[:, 0]
     for axes in panels:
         axes.set(xlabel="distance of two cameras' orientations (degrees)", ylabel="PDF (1/degree)")
     if not distances:
-        say_empty(panels[0], "no two cameras to compare")
+        look.say_empty(panels[0], "no two cameras to compare")
     for axes, distance in zip(panels, distances, strict=False):
         _distance_panel(axes, distance)
     return figure
@@ -207,12 +189,14 @@ def camera_distance_figure(distances: Sequence[CameraDistance]) -> Figure:
 def _distance_panel(axes: Axes, distance: CameraDistance) -> None:
     names = " and ".join(distance.cameras)
     corrected = "distance" if distance.uncorrected_rad is None else "perspective corrected"
-    laws: list[tuple[Floats, Floats, LineStyle, str]] = [(distance.distance_rad, distance.pdf, ALL, corrected)]
+    laws: list[tuple[Floats, Floats, look.LineStyle, str]] = [
+        (distance.distance_rad, distance.pdf, look.ALL, corrected)
+    ]
     if distance.uncorrected_rad is not None and distance.uncorrected_pdf is not None:
-        laws.append((distance.uncorrected_rad, distance.uncorrected_pdf, SECOND, "not corrected"))
+        laws.append((distance.uncorrected_rad, distance.uncorrected_pdf, look.SECOND, "not corrected"))
     laws = [(np.rad2deg(values), pdf, style, what) for values, pdf, style, what in laws if len(values)]
     if not laws:
-        say_empty(axes, f"no frame in which {names} both have an orientation")
+        look.say_empty(axes, f"no frame in which {names} both have an orientation")
         return
     edges = np.rad2deg(distance.edges_rad)
     nearest = min(float(np.median(law[0])) for law in laws)
@@ -230,9 +214,9 @@ def _distance_panel(axes: Axes, distance: CameraDistance) -> None:
         axes.set_ylim(bottom=0.0)
     else:
         axes.set(xscale="log", yscale="log", xlim=(edges[0], 1.2 * edges[-1]))
-        plain_logarithms(axes.xaxis)
-        plain_logarithms(axes.yaxis)
-    legend_above(axes, title=names)
+        look.plain_logarithms(axes.xaxis)
+        look.plain_logarithms(axes.yaxis)
+    look.legend_above(axes, title=names)
 
 
 def _density(values_deg: Floats, edges_deg: Floats) -> Floats:

@@ -2,13 +2,11 @@
 
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import wraps
 from pathlib import Path
-from typing import Any, Final, ParamSpec, TypeVar
+from typing import Any, Final
 
-import matplotlib
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,8 +20,6 @@ from numpy.typing import NDArray
 from sphereorient.files.outputs import put_aside
 from sphereorient.statistics import Interval
 
-P = ParamSpec("P")
-R = TypeVar("R")
 Floats = NDArray[np.float64]
 
 WIDTH_IN = 7.0  # of a page with margins: 178 mm
@@ -97,15 +93,8 @@ PLAIN = LineStyle(name="", colour=GREY, line="-", marker="o")  # of legends that
 COMPONENTS = (X, Y, Z)
 
 
-def in_style(draw: Callable[P, R]) -> Callable[P, R]:
-    """Run a function in the style of the reports, independent of the user's matplotlibrc."""
-
-    @wraps(draw)
-    def styled(*args: P.args, **kwargs: P.kwargs) -> R:
-        with matplotlib.style.context(["default", SETTINGS]):
-            return draw(*args, **kwargs)
-
-    return styled
+# Decorates functions that draw: in the style of the reports, independent of the user's matplotlibrc.
+in_style = matplotlib.style.context(["default", SETTINGS])
 
 
 def new_figure(width_in: float = WIDTH_IN, height_in: float = 3.0) -> Figure:

@@ -12,20 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from sphereorient import so3
-from sphereorient.report.plots.style import (
-    ALL,
-    BAND,
-    COMPONENTS,
-    PLAIN,
-    SHADE,
-    WIDTH_IN,
-    band,
-    in_style,
-    legend_of_figure,
-    new_figure,
-    note,
-    say_empty,
-)
+from sphereorient.report.plots import style as look
 from sphereorient.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -33,7 +20,12 @@ Floats = NDArray[np.float64]
 MOST_FRAMES = 2000  # more are not distinguishable on a page
 GAP = 1.5  # typical steps: a longer one is a gap
 SIGMAS = 2.0  # half width of the bands
-NOT_VALID: Final[dict[str, Any]] = {"facecolor": "#E8E8E8", "edgecolor": SHADE, "hatch": "//////", "linewidth": 0.0}
+NOT_VALID: Final[dict[str, Any]] = {
+    "facecolor": "#E8E8E8",
+    "edgecolor": look.SHADE,
+    "hatch": "//////",
+    "linewidth": 0.0,
+}
 LATE_S, LONG_S = 10.0, 2.0  # from here on times are given in seconds
 WRAP_DEG = 90.0  # no sphere turns so far from frame to frame: the angle has wrapped, or passed its pole
 RATES = {
@@ -56,7 +48,7 @@ class TrackPart:
     broken: NDArray[np.bool_]  # (n - 1,), interrupt the line between a frame and the next
 
 
-@in_style
+@look.in_style
 def track_figure(track: Trajectory) -> Figure:
     """Draw position, Tait-Bryan angles, velocities and accelerations against time: smooth with 2 sigma, and measured.
 
@@ -67,7 +59,7 @@ def track_figure(track: Trajectory) -> Figure:
     track = part.track
     late = len(track) > 0 and (float(np.ptp(track.time)) > LONG_S or float(track.time.max()) > LATE_S)
     unit, time = ("s", track.time) if late else ("ms", 1e3 * track.time)
-    figure = new_figure(WIDTH_IN, 7.6)
+    figure = look.new_figure(look.WIDTH_IN, 7.6)
     panels = figure.subplots(3, 2, sharex=True)
     _dots(panels[0, 0], time, track.position)
     _curves(panels[0, 0], time, track.position_smooth, _sigma(track.position_smooth_cov), part.broken)
@@ -80,48 +72,50 @@ def track_figure(track: Trajectory) -> Figure:
         _shade(axes, time, track.valid)
         axes.margins(x=0.01)
         if not any(np.isfinite(np.asarray(line.get_ydata(), np.float64)).any() for line in axes.lines):
-            say_empty(axes)
+            look.say_empty(axes)
             axes.set_yticks([])
     for axes in panels[-1]:
         axes.set_xlabel(f"time ({unit})")
     figure.align_ylabels()
     handles = [
-        *(style.handle(style.name) for style in COMPONENTS),
-        PLAIN.handle("measured", marker=".", linestyle="none"),
-        Patch(color=COMPONENTS[0].colour, alpha=BAND, linewidth=0, label=f"± {SIGMAS:.0f} standard deviations"),
+        *(style.handle(style.name) for style in look.COMPONENTS),
+        look.PLAIN.handle("measured", marker=".", linestyle="none"),
+        Patch(
+            color=look.COMPONENTS[0].colour, alpha=look.BAND, linewidth=0, label=f"± {SIGMAS:.0f} standard deviations"
+        ),
         Patch(label="frame not valid", **NOT_VALID),
     ]
-    legend_of_figure(figure, handles, ncols=6)
+    look.legend_of_figure(figure, handles, ncols=6)
     if part.words:
-        note(figure, part.words)
+        look.note(figure, part.words)
     return figure
 
 
-@in_style
+@look.in_style
 def path_figure(track: Trajectory) -> Figure:
     """Draw the path in the lab, to scale, with body axes; of a long track `shown_part`. Source: the paper, figure."""
     part = shown_part(track)
-    figure = new_figure(WIDTH_IN, 5.6)
+    figure = look.new_figure(look.WIDTH_IN, 5.6)
     axes: Any = figure.add_subplot(projection="3d")
     axes.set(xlabel="x, lab (mm)", ylabel="y, lab (mm)", zlabel="z, lab (mm)")
     position = part.track.position_smooth
     there = np.flatnonzero(np.isfinite(position).all(1))
     if len(there):
         size = TRIPOD_SIZE * max(float(np.ptp(position[there], axis=0).max()), 1.0)
-        axes.plot(*_cut(position, part.broken).T, color=ALL.colour, linewidth=1.0, label="path")
-        axes.plot(*position[there[:1]].T, marker="o", markersize=5, color=ALL.colour, label="start")
+        axes.plot(*_cut(position, part.broken).T, color=look.ALL.colour, linewidth=1.0, label="path")
+        axes.plot(*position[there[:1]].T, marker="o", markersize=5, color=look.ALL.colour, label="start")
         _tripods(axes, part.track, there, size)
         _equal_scale(axes, position[there], size)
     else:
-        say_empty(axes)
-    start = ALL.handle("start", marker="o", linestyle="none", markersize=5)
+        look.say_empty(axes)
+    start = look.ALL.handle("start", marker="o", linestyle="none", markersize=5)
     arms = [
         style.handle(f"body axis {style.name}", linestyle="-", marker=style.marker, linewidth=1.6)
-        for style in COMPONENTS
+        for style in look.COMPONENTS
     ]
-    legend_of_figure(figure, [ALL.handle("path", linewidth=1.0), start, *arms], ncols=5)
+    look.legend_of_figure(figure, [look.ALL.handle("path", linewidth=1.0), start, *arms], ncols=5)
     words = "the sphere's axes are not to scale"
-    note(figure, f"{part.words}; {words}" if part.words else words)
+    look.note(figure, f"{part.words}; {words}" if part.words else words)
     return figure
 
 
@@ -198,14 +192,14 @@ def _curves(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDA
 
 
 def _curve(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDArray[np.bool_], i: int) -> None:
-    style = COMPONENTS[i]
+    style = look.COMPONENTS[i]
     x, y, half = (_cut(part, broken) for part in (time, values, SIGMAS * sigma))
     axes.plot(x, y, label=style.name, **style.drawn)
-    band(axes, x, y - half, y + half, style)
+    look.band(axes, x, y - half, y + half, style)
 
 
 def _dots(axes: Axes, time: Floats, values: Floats) -> None:
-    for style, column in zip(COMPONENTS, values.T, strict=True):
+    for style, column in zip(look.COMPONENTS, values.T, strict=True):
         axes.plot(time, column, ".", color=style.colour, alpha=0.35, markersize=2.5, markeredgewidth=0, label="_")
 
 
@@ -224,7 +218,7 @@ def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float
         return
     chosen = known[np.unique(np.linspace(0, len(known) - 1, TRIPODS).round().astype(int))]
     start = track.position_smooth[chosen]
-    for i, style in enumerate(COMPONENTS):
+    for i, style in enumerate(look.COMPONENTS):
         tip = start + size * track.orientation_smooth[chosen, :, i]
         ends = np.stack([start, tip, np.full_like(tip, np.nan)], axis=1).reshape(-1, 3)
         axes.plot(*ends.T, color=style.colour, linewidth=1.6, label=f"body axis {style.name}")

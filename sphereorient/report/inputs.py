@@ -1,0 +1,278 @@
+"""Pictures of what a measurement starts from: a movie's frames, a calibration, and the check before a run."""
+
+import math
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from sphereorient.calibration import Calibrated, PictureReport
+from sphereorient.movies import Movie
+from sphereorient.movies.survey import Survey, SurveyedFrame
+from sphereorient.preflight import Finding, Preflight, Severity
+from sphereorient.preflight.cameras import REACH, expected_outline_px, sample_gaps
+from sphereorient.preflight.sample import MovieSample
+from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, write_figure
+
+EXPECTED, FOUND, USED = AXIS_COLOURS
+OUTLIER = "#CC79A7"
+# Shape and colour both: readable without colours, and by colour-blind readers.
+MARKS = {Severity.OK: ("\u25cf", FOUND), Severity.WARNING: ("\u25b2", "#E69F00"), Severity.FAULT: ("\u2716", EXPECTED)}
+WIDTH = 13.0  # inches, of the figures; so are:
+COLUMNS, TITLE, HEAD = 6, 0.27, 0.8  # of a contact sheet: frames in a row; the line above a frame, the title
+PICTURE, LINE = 3.3, 0.165  # of a check: a row of pictures, a line of text
+BRIGHT_QUANTILE = 0.999  # of the pixels: shown white, so that a few glints do not darken the rest
+SHOWN = 3  # pictures of each camera
+CHARACTERS = 145  # in a line of the list
+
+
+@in_style
+def contact_sheet(movie: Movie, seen: Survey, path: Path) -> None:
+    """Draw the frames of a survey of a movie side by side, on one scale of grey, into a PNG or PDF."""
+    rows = math.ceil(len(seen.frames) / COLUMNS)
+    height, width = movie.frame_shape
+    figure = new_figure(WIDTH, HEAD + rows * ((WIDTH / COLUMNS) * height / width + TITLE))
+    pictures = [frame.small for frame in seen.frames if frame.small is not None and not frame.fault]
+    pictures = pictures or [frame.small for frame in seen.frames if frame.small is not None]
+    values = np.concatenate([picture.ravel() for picture in pictures]) if pictures else np.array([0.0])
+    black = float(values.min())
+    white = max(float(np.quantile(values, BRIGHT_QUANTILE)), black + 1)
+    figure.suptitle(
+        f"{movie.path.name}: {len(movie)} frames of {width} x {height} px, {8 * movie.dtype.itemsize} bit\n"
+        f"grey levels {black:.0f} (black) to {white:.0f} (white)",
+        fontsize=11,
+    )
+    axes = np.ravel(figure.subplots(rows, COLUMNS, squeeze=False))
+    for ax, frame in zip(axes, seen.frames, strict=False):
+        _draw_frame(ax, frame, movie, black, white)
+    for ax in axes[len(seen.frames) :]:
+        ax.set_axis_off()
+    write_figure(figure, path, dpi=110)
+
+
+def _draw_frame(ax: Any, frame: SurveyedFrame, movie: Movie, black: float, white: float) -> None:
+    height, width = movie.frame_shape
+    edges = (-0.5, width - 0.5, height - 0.5, -0.5)  # row 0 on top
+    picture = np.zeros((1, 1)) if frame.small is None else frame.small
+    ax.imshow(picture, cmap="gray", vmin=black, vmax=white, extent=edges, interpolation="nearest")
+    ax.set(xticks=[], yticks=[], xlim=edges[:2], ylim=edges[2:])
+    title = f"{frame.number}"
+    if movie.times_s is not None:
+        time_s = float(movie.times_s[frame.number])
+        title += f", {time_s:.6g} s" if abs(time_s) >= 1 or not time_s else f", {1e3 * time_s:.5g} ms"
+    ax.set_title(title, fontsize=8, pad=2)
+    if frame.fault:
+        ax.set_title(f"{title}: {frame.fault}", fontsize=8, pad=2, color=EXPECTED, fontweight="bold")
+        for spine in ax.spines.values():
+            spine.set(color=EXPECTED, linewidth=2)
+
+
+@in_style
+def calibration_figure(result: Calibrated, path: Path) -> None:
+    """Draw the pictures, read again, with points found and expected, and all residuals; into a PNG or PDF."""
+    names = list(result.cameras)
+    figure = new_figure(4.2 * (SHOWN + 2), 4.3 * len(names))
+    axes = figure.subplots(len(names), SHOWN + 2, squeeze=False)
+    for row, name in zip(axes, names, strict=True):
+        used = [one for one in result.pictures if one.picture.camera == name and not one.reason]
+        chosen = [used[int(k)] for k in np.linspace(0, len(used) - 1, min(SHOWN, len(used))).round()]
+        for ax in row:
+            ax.grid(visible=False)
+        for ax, one in zip(row, chosen, strict=False):
+            _draw_picture(ax, one)
+        for ax in row[len(chosen) : SHOWN]:
+            ax.set_axis_off()
+        row[0].set_ylabel(name, fontsize=12)
+        place = np.concatenate([np.zeros((0, 2)), *(one.view.uv_px[one.used] for one in used)])
+        missed = np.concatenate([np.zeros((0, 2)), *(one.residual_px[one.used] for one in used)])
+        _draw_residuals(row[SHOWN], place, missed, result.cameras[name].image_size)
+        _draw_histogram(row[SHOWN + 1], missed, result.rms_px(name))
+    write_figure(figure, path, dpi=110)
+
+
+def _draw_picture(ax: Any, one: PictureReport) -> None:
+    data = np.fromfile(one.picture.path, np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if picture is not None:  # a table of points has no picture
+        ax.imshow(picture, cmap="gray")
+    else:
+        ax.set_aspect("equal")
+        ax.invert_yaxis()
+    found = one.view.uv_px
+    expected = found - one.residual_px
+    ax.plot(*expected.T, "+", ms=7, mew=0.9, color=EXPECTED, label="expected")
+    ax.plot(*found.T, "o", ms=4, mfc="none", mew=0.8, color=FOUND, label="found")
+    if not one.used.all():
+        ax.plot(*found[~one.used].T, "x", ms=8, color=OUTLIER, label="left out")
+    ax.set(xticks=[], yticks=[])
+    ax.set_title(f"pose {one.pose}: {len(found)} points, rms {one.rms_px:.3f} px", fontsize=9)
+    ax.legend(loc="lower right", frameon=True, framealpha=0.8)
+
+
+def _draw_residuals(
+    ax: Any, place: NDArray[np.float64], missed: NDArray[np.float64], image_size: tuple[int, int]
+) -> None:
+    usual = float(np.sqrt((missed**2).sum(1).mean())) if len(missed) else 1.0
+    # The arrow of the usual length is a fortieth of the picture long.
+    times = image_size[0] / 40 / max(usual, 1e-9)
+    style = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.002, "color": EXPECTED, "alpha": 0.7}
+    ax.quiver(*place.T, *(times * missed.T), **style)
+    ax.set(xlim=(0, image_size[0]), ylim=(image_size[1], 0), aspect="equal", xlabel="u (px)", ylabel="v (px)")
+    ax.set_title(f"found less expected, {times:.0f} times", fontsize=9)
+
+
+def _draw_histogram(ax: Any, missed: NDArray[np.float64], rms_px: float) -> None:
+    reach = 4 * max(rms_px, 1e-6) / np.sqrt(2)
+    for part, colour, label in zip(missed.T, (FOUND, EXPECTED), ("u", "v"), strict=True):
+        ax.hist(part, np.linspace(-reach, reach, 41), histtype="step", lw=1.5, color=colour, label=label)
+    ax.set(xlabel="found less expected (px)", ylabel="points")
+    ax.xaxis.set_major_locator(MaxNLocator(5))
+    ax.set_title(f"all pictures: rms {rms_px:.3f} px", fontsize=9)
+    ax.legend()
+
+
+def preflight_figure(result: Preflight, path: Path) -> None:
+    """Write a PNG or PDF: a frame of each camera with outlines, the gap by offset, texture map, and findings."""
+    lines = _lines(result)
+    agreement = result.scan is not None or result.texture is not None
+    heights = [PICTURE, PICTURE if agreement else 0.01, LINE * (len(lines) + 2)]
+    figure = new_figure(WIDTH, sum(heights))
+    top, middle, bottom = np.ravel(figure.subfigures(3, 1, height_ratios=heights, squeeze=False))
+    _cameras_part(top, result)
+    if agreement:
+        gap, balance, pair = middle.subplots(1, 3, width_ratios=[1.1, 1.5, 1.4])
+        _draw_gap(gap, result)
+        _draw_texture(balance, result)
+        _draw_pair(pair, result)
+    _list_part(bottom, lines, heights[2])
+    figure.suptitle(str(result.experiment.path), fontsize=10)
+    figure.savefig(path, dpi=110)
+
+
+def _cameras_part(part: Any, result: Preflight) -> None:
+    coverage = torch.stack([torch.nan_to_num(one.sightings.coverage, nan=-1.0) for one in result.samples]).amin(0)
+    k = int(coverage.argmax())
+    axes = part.subplots(1, 4)
+    for ax in axes[2 * len(result.samples) :]:
+        ax.set_axis_off()
+    for sample, pair in zip(result.samples, axes.reshape(2, 2), strict=False):
+        expected = _expected_px(result, sample, k)
+        for ax, near in zip(pair, (False, True), strict=True):
+            _draw_ball(ax, sample, k, expected, near)
+    if axes[0].lines:
+        axes[0].legend(loc="lower left", fontsize=7, framealpha=0.8)
+
+
+def _expected_px(result: Preflight, sample: MovieSample, k: int) -> NDArray[np.float64] | None:
+    """Return the outline expected from both cameras and the diameter, (n, 2) px; None if unknown."""
+    if result.scan is None or result.experiment.diameter_mm is None:
+        return None
+    position = sample_gaps(result.samples).position_lab_mm[k]
+    if not bool(torch.isfinite(position).all()):
+        return None
+    return expected_outline_px(sample.camera, position, result.experiment.diameter_mm / 2).numpy()
+
+
+def _draw_ball(ax: Any, sample: MovieSample, k: int, expected: NDArray[np.float64] | None, near: bool) -> None:
+    picture, (outline, reason) = sample.picture[k], sample.found[k]
+    ax.set(xticks=[], yticks=[])
+    if picture is None:
+        picture = np.zeros(sample.stream.movie.frame_shape)
+    ax.imshow(picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(picture, 99.8))))
+    if outline is not None:
+        angle = np.linspace(0, 2 * np.pi, 181)
+        u, v = outline.u_px + outline.radius_px * np.cos(angle), outline.v_px + outline.radius_px * np.sin(angle)
+        ax.plot(u, v, lw=1.4, color=FOUND, label="outline found")
+    if expected is not None:
+        closed = np.concatenate([expected, expected[:1]])
+        ax.plot(*closed.T, "--", lw=1.4, color=EXPECTED, label="expected from both cameras and the diameter")
+    height, width = picture.shape
+    if not near or outline is None:
+        ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+        what = f"frame {int(sample.frame[k])}" if outline is not None else f"no ball: {reason}"
+        ax.set_title(f"{sample.name}, {what}", fontsize=9)
+        return
+    reach = 1.35 * outline.radius_px
+    ax.set(xlim=(outline.u_px - reach, outline.u_px + reach), ylim=(outline.v_px + reach, outline.v_px - reach))
+    ax.set_title(f"{sample.name}: {2 * outline.radius_px:.1f} px across", fontsize=9)
+
+
+def _draw_gap(ax: Any, result: Preflight) -> None:
+    scan = result.scan
+    if scan is None:
+        _no_data(ax, "one camera: no gap")
+        return
+    ax.plot(scan.offset, scan.gap_px, "o-", ms=4, lw=1.2, color=USED, label="gap")
+    ax.plot(scan.offset, scan.varying_px, ".:", ms=4, lw=1, color="#777777", label="without its constant part")
+    ax.axvline(0, lw=0.8, color="#444444")
+    if not math.isnan(scan.best):
+        ax.axvline(scan.best, ls="--", lw=1.2, color=EXPECTED, label=f"least at {scan.best:+.2f}")
+    ax.set(xlabel=f"frames later in {scan.names[1]}", ylabel="gap of the lines of sight (px)")
+    ax.set(xlim=(-REACH - 0.5, REACH + 0.5), ylim=(0, None))
+    ax.xaxis.set_major_locator(MaxNLocator(9, integer=True))
+    ax.legend(fontsize=7, framealpha=0.8)
+    ax.set_title("are the movies in step", fontsize=9)
+
+
+def _draw_texture(ax: Any, result: Preflight) -> None:
+    if result.texture is None or result.measures is None:
+        _no_data(ax, "no map of the paint")
+        return
+    span = (-180, 180, -90, 90)
+    ax.imshow(result.texture.numpy(), cmap="gray", vmin=0, vmax=1, extent=span, interpolation="nearest")
+    seen = 100 * result.measures.view_brightness.numpy()
+    longitude = (np.arange(seen.shape[1]) + 0.5) * (360 / seen.shape[1]) - 180
+    latitude = 90 - (np.arange(seen.shape[0]) + 0.5) * (180 / seen.shape[0])
+    if np.ptp(seen) > 1e-4:
+        drawn = ax.contour(longitude, latitude, seen, levels=6, colors=EXPECTED, linewidths=1.2)
+        ax.clabel(drawn, fmt="%.0f %%", fontsize=7)
+    ax.set(xticks=[-180, -90, 0, 90, 180], yticks=[-90, 0, 90])
+    ax.tick_params(labelsize=7)
+    ax.set_xlabel("longitude on the ball (degrees)", fontsize=8)
+    ax.set_ylabel("latitude", fontsize=8)
+    title = f"the map; lines: brightness of the view from there, {seen.min():.0f} to {seen.max():.0f} %"
+    ax.set_title(title, fontsize=9)
+
+
+def _draw_pair(ax: Any, result: Preflight) -> None:
+    ax.set_axis_off()
+    if result.similar is None:
+        return
+    angle, explained = math.degrees(result.similar.angle_rad), 100 * result.similar.score
+    ax.set_title(f"most alike, {angle:.0f} degrees apart: {explained:.0f} % explained", fontsize=9)
+    for k, view in enumerate(result.similar.pictures.numpy()):
+        inset = ax.inset_axes((0.02 + 0.5 * k, 0.0, 0.46, 0.98))
+        inset.imshow(view, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        inset.set_axis_off()
+
+
+def _no_data(ax: Any, text: str) -> None:
+    ax.set_axis_off()
+    ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes, fontsize=9)
+
+
+def _lines(result: Preflight) -> list[tuple[Finding | None, str, str]]:
+    """Return the findings line by line, faults first: the finding that begins, text, font style."""
+    lines: list[tuple[Finding | None, str, str]] = []
+    order = list(Severity)
+    for finding in sorted(result.findings, key=lambda one: -order.index(one.severity)):
+        texts = [(text, "normal") for text in textwrap.wrap(finding.measured, CHARACTERS) or [""]]
+        if finding.advice:
+            texts += [(text, "italic") for text in textwrap.wrap(f"do: {finding.advice}", CHARACTERS)]
+        lines += [(None if k else finding, *text) for k, text in enumerate(texts)]
+    return lines
+
+
+def _list_part(part: Any, lines: list[tuple[Finding | None, str, str]], height: float) -> None:
+    for k, (finding, text, style) in enumerate(lines):
+        y = 1 - LINE * (k + 0.8) / height
+        if finding is not None:
+            mark, colour = MARKS[finding.severity]
+            part.text(0.012, y, mark, color=colour, fontsize=9, va="center")
+            part.text(0.03, y, finding.title, fontsize=8, weight="bold", va="center")
+        part.text(0.18, y, text, fontsize=8, va="center", style=style)
