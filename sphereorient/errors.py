@@ -3,8 +3,6 @@
 Every message is worded by `refusal`: what was looked at, what was expected, what came, what to do.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -64,7 +62,7 @@ def refusal(name: str, *, expected: str, got: str, do: str) -> str:
     return f"{name}: expected {expected}, got {got}; {do}."
 
 
-def check_tail(name: str, tensor: Tensor, *tail: int) -> None:
+def check_tail(name: str, tensor: "Tensor", *tail: int) -> None:
     """Refuse a tensor whose last axes are not `tail`, after any leading shape (ShapeError)."""
     if tuple(tensor.shape[-len(tail) :]) != tail:
         expected = ", ".join(["...", *map(str, tail)])

@@ -6,25 +6,3 @@ from sphereorient.assemble.second_order import Chosen, Hypotheses, physical_path
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.assemble.trellis import ShortestPath, SoftPath, shortest_path, soft_path
 from sphereorient.assemble.two_cameras import Fused, fuse
-
-__all__ = [
-    "AssembleSettings",
-    "Chosen",
-    "Fused",
-    "Hypotheses",
-    "Path",
-    "PathLayer",
-    "PathSettings",
-    "ShortestPath",
-    "SoftPath",
-    "SoftTrack",
-    "assemble_path",
-    "assemble_paths",
-    "edge_costs",
-    "expected_orientation",
-    "fuse",
-    "physical_path",
-    "shortest_path",
-    "soft_path",
-    "soft_track",
-]

@@ -3,8 +3,6 @@
 docs/differentiable.md connects the soft track to the cameras.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -160,7 +158,7 @@ def triple_costs(
     return torch.cat(parts, -4) if parts else none
 
 
-def _chunk(cost: SecondOrderCost, links: _Links, variance: Tensor, still: Tensor, steps: slice) -> Tensor:
+def _chunk(cost: SecondOrderCost, links: "_Links", variance: Tensor, still: Tensor, steps: slice) -> Tensor:
     before = links.before[..., steps]
     earlier = links.before.gather(-1, before)
     dt, span = (each[..., None, None, None] for each in (links.dt_s[..., steps], links.dt_s.gather(-1, before)))
@@ -181,7 +179,7 @@ def _chunk(cost: SecondOrderCost, links: _Links, variance: Tensor, still: Tensor
     return cost.candidate(follows, still[..., steps, None, None, :])
 
 
-def _still(cost: SecondOrderCost, links: _Links, R_lab_body: Tensor, variance: Tensor) -> Tensor:
+def _still(cost: SecondOrderCost, links: "_Links", R_lab_body: Tensor, variance: Tensor) -> Tensor:
     """Return the log ratio (..., N, C) of each candidate if one of the frame before stays."""
     misfit = _squared_chord(taken(R_lab_body, links.before, 3).flatten(-2), R_lab_body.flatten(-2))
     here = taken(variance, links.before, 1)[..., :, None]

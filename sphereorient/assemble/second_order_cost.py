@@ -3,8 +3,6 @@
 Densities of orientations are ratios to the uniform density on SO(3).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
@@ -40,7 +38,7 @@ class SecondOrderCost:
     sigma_scale: float | Tensor
 
     @classmethod
-    def of(cls, settings: PathSettings) -> SecondOrderCost:
+    def of(cls, settings: PathSettings) -> "SecondOrderCost":
         """Take the parameters from settings with a number for the acceleration."""
         if settings.acceleration_rad_s2 is None:
             do = "set it; only `track` estimates it from the movie"

@@ -1,10 +1,8 @@
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 
-class AssembleSettings(BaseModel):
+class AssembleSettings(BaseModel, frozen=True, extra="forbid"):
     """How candidates of single frames become one history (the paper's assembly and its two cameras)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     quality_min: float = Field(0.5, ge=0, le=1, description="least quality T of a candidate; the paper's 0.5")
     gap_frames_max: int = Field(4, ge=0, description="longest gap inside a segment, frames; the paper: under 5")
@@ -33,10 +31,8 @@ class AssembleSettings(BaseModel):
     )
 
 
-class PathSettings(BaseModel):
+class PathSettings(BaseModel, frozen=True, extra="forbid"):
     """How candidates of single frames become one history: the second-order path."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     acceleration_rad_s2: float | None = Field(
         None, gt=0, description="scale of the angular acceleration per axis, rad/s^2; null estimates it from the movie"

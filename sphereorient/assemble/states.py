@@ -1,7 +1,5 @@
 """Records of the beam search: candidates as rows, ends of histories, and the edges that lead to them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -27,7 +25,7 @@ class CandidateRows:
     time_s: Floats  # (F,)
     frame_s: float  # usual time between frames of the movie
 
-    def part(self, first: int, last: int) -> CandidateRows:
+    def part(self, first: int, last: int) -> "CandidateRows":
         """Return the frames first .. last - 1."""
         rows = slice(self.offset[first], self.offset[last])
         return replace(
@@ -55,12 +53,12 @@ class PathStates:
     before: Floats  # rad^2 per axis, of the last but one
 
     @classmethod
-    def begin(cls, frame: int, row: Ints) -> PathStates:
+    def begin(cls, frame: int, row: Ints) -> "PathStates":
         """Return states without a motion."""
         nothing, at = np.zeros(len(row)), np.full(len(row), frame)
         return cls(frame=at, row=row, turn=np.zeros((len(row), 3)), span=nothing, before=nothing)
 
-    def take(self, which: Ints) -> PathStates:
+    def take(self, which: Ints) -> "PathStates":
         """Return some of the states."""
         return PathStates(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
 

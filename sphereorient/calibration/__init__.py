@@ -7,19 +7,3 @@ from sphereorient.calibration.plates import Calibrated, PictureReport, calibrate
 from sphereorient.calibration.self_calibration import check_cameras, refine_with_track
 from sphereorient.calibration.systematic import systematic_errors
 from sphereorient.calibration.targets import DotPlate, PlateView, placed, plate_from_entry
-
-__all__ = [
-    "Calibrated",
-    "DotPlate",
-    "PictureReport",
-    "PlateView",
-    "calibrate_cameras",
-    "check_cameras",
-    "disk_centre_shift",
-    "load_calibration",
-    "placed",
-    "plate_from_entry",
-    "refine_with_track",
-    "see_plate",
-    "systematic_errors",
-]

@@ -1,7 +1,5 @@
 """Dots in a picture: found as blobs, then measured by a fit of each rim."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -43,7 +41,7 @@ class Dots:
         """(n,), px^2, within the fitted rims."""
         return np.asarray(np.pi / np.sqrt(np.maximum(np.linalg.det(self.shape), 1e-12)))
 
-    def __getitem__(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> Dots:
+    def __getitem__(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> "Dots":
         return Dots(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
 
 
@@ -215,7 +213,7 @@ class _Windows:
     @classmethod
     def cut(
         cls, grey: NDArray[np.float32], owner: NDArray[np.int32], which: Ints, centre_px: Floats, shape: Floats
-    ) -> _Windows:
+    ) -> "_Windows":
         height, width = grey.shape
         half = int(_window(shape).max())
         steps = np.arange(-half, half + 1)

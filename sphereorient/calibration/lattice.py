@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import Any
@@ -138,7 +136,7 @@ class _Map:
     bend: Floats  # (10, 2) px
 
     @classmethod
-    def fitted(cls, index: Ints, uv_px: Floats) -> _Map | None:
+    def fitted(cls, index: Ints, uv_px: Floats) -> "_Map | None":
         middle = index.mean(axis=0)
         size = max(float(np.abs(index - middle).max()), 1.0)
         near = (index - middle) / size

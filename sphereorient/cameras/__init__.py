@@ -5,18 +5,3 @@ from sphereorient.cameras.ideal import PinholeCamera
 from sphereorient.cameras.io.cameras_yaml import load_cameras, load_covariance, save_cameras
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.cameras.tsai import TsaiCamera
-
-__all__ = [
-    "Camera",
-    "ParameterCovariance",
-    "PinholeCamera",
-    "Port",
-    "PortCamera",
-    "R_cam_view",
-    "Rays",
-    "TsaiCamera",
-    "load_cameras",
-    "load_covariance",
-    "save_cameras",
-    "triangulate",
-]

@@ -1,7 +1,5 @@
 """What every camera gives: rays, projection and the covariance of its parameters; and the geometry of rays."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
@@ -59,7 +57,7 @@ class ParameterCovariance:
         """Standard deviation of each parameter, in its own unit."""
         return dict(zip(self.names, self.matrix.diagonal().sqrt().tolist(), strict=True))
 
-    def of(self, cameras: Iterable[str]) -> ParameterCovariance | None:
+    def of(self, cameras: Iterable[str]) -> "ParameterCovariance | None":
         """Return the block of some cameras, for names like cam1.f; None without parameters of them."""
         wanted = set(cameras)
         kept = [k for k, name in enumerate(self.names) if name.partition(".")[0] in wanted]

@@ -1,7 +1,5 @@
 """Synthetic movies with exact truth: `sphereorient synth`, `score`, and `bench`, the robustness benchmark."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -66,7 +64,7 @@ def score(
     Console().print(error_table(score_track(Trajectory.load(track), truth)))
 
 
-def error_table(found: Score) -> Table:
+def error_table(found: "Score") -> "Table":
     """Return errors of orientation and position, and relative errors of the rates, as a table."""
     from rich.table import Table
 
@@ -95,7 +93,7 @@ Full = Annotated[bool, typer.Option("--full", help="All severities, three movies
 
 def _settings(
     full: bool, degradations: str | None, levels: str | None, seeds: int | None, frames: int | None
-) -> BenchSettings:
+) -> "BenchSettings":
     """Return the default settings, or those of the full run, with the changes of the options."""
     from pydantic import ValidationError
 
@@ -228,7 +226,7 @@ def score_result(
         )
 
 
-def _print(found: Results) -> None:
+def _print(found: "Results") -> None:
     """Print one line for each degradation, level and method."""
     from rich.console import Console
     from rich.table import Table
@@ -250,7 +248,7 @@ def _print(found: Results) -> None:
     Console().print(table)
 
 
-def _print_changes(now: Results, baseline: Results, quiet: bool) -> None:
+def _print_changes(now: "Results", baseline: "Results", quiet: bool) -> None:
     """Print the changes; exit 1 if a number got worse."""
     from sphereorient.evaluate.robustness import compare_runs
 

@@ -1,7 +1,5 @@
 """`sphereorient calibrate`, `check-cameras` and `convert-cameras`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -139,7 +137,7 @@ def convert_cameras(
     typer.echo(f"Wrote {out}: {', '.join(cameras)}")
 
 
-def _load(source: Path, image_size: tuple[int, int] | None, par: Path | None) -> Camera:
+def _load(source: Path, image_size: tuple[int, int] | None, par: Path | None) -> "Camera":
     from sphereorient.cameras.io.opencv import load_opencv
     from sphereorient.cameras.io.openptv import load_openptv, load_ptv_par
 

@@ -1,7 +1,5 @@
 """`sphereorient check`, `movie` and `convert`: what goes in, before a run."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import textwrap
@@ -69,7 +67,7 @@ def check(
         raise typer.Exit(EXIT_FAULT)
 
 
-def _print_findings(findings: Sequence[Finding], quiet: bool) -> None:
+def _print_findings(findings: "Sequence[Finding]", quiet: bool) -> None:
     """Print a paragraph for each finding: mark, title, measurement; below it the advice."""
     width = max(60, shutil.get_terminal_size().columns)
     margin = " " * (MARK + TITLE)
@@ -147,7 +145,7 @@ def convert(
             typer.echo(f"Wrote {times_path(target)}: their times (experiment.yaml, times:)")
 
 
-def _facts(opened: Movie, seen: Survey) -> list[tuple[str, str]]:
+def _facts(opened: "Movie", seen: "Survey") -> list[tuple[str, str]]:
     """Return the properties of the file and the result of the survey, as title and text."""
     from sphereorient.movies import movie_files
 
@@ -166,7 +164,7 @@ def _facts(opened: Movie, seen: Survey) -> list[tuple[str, str]]:
     ]
 
 
-def _times(times_s: NDArray[np.float64] | None) -> str:
+def _times(times_s: "NDArray[np.float64] | None") -> str:
     if times_s is None:
         return "none that are exact: give frame_rate or times in experiment.yaml"
     if len(times_s) < 2:
@@ -198,7 +196,7 @@ def _stem(source: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", Path(source.replace("::", "_").rstrip("/")).name) or "movie"
 
 
-def _range(text: str, opened: Movie) -> tuple[int, int]:
+def _range(text: str, opened: "Movie") -> tuple[int, int]:
     found = frames_of(text)
     first, last = (found[0] or 0, len(opened) if found[1] is None else found[1]) if found else (0, 0)
     if not 0 <= first < last <= len(opened):
@@ -207,7 +205,7 @@ def _range(text: str, opened: Movie) -> tuple[int, int]:
     return first, last
 
 
-def _pictures(opened: Movie, first: int, last: int, dead: list[int], advance: Advance) -> Iterator[Grey | None]:
+def _pictures(opened: "Movie", first: int, last: int, dead: list[int], advance: Advance) -> "Iterator[Grey | None]":
     """Yield the frames to write; append the numbers of those that cannot be decoded to `dead`."""
     for number, picture in enumerate(opened.readable(first, last), start=first):
         if picture is None:

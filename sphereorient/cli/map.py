@@ -1,7 +1,5 @@
 """`sphereorient map` and `compare-maps`: texture maps learnt from movies, two of them, or a series."""
 
-from __future__ import annotations
-
 import json
 import math
 import time
@@ -72,7 +70,7 @@ def map_(
         typer.echo(f"next: write texture: {out.name} under sphere: in the experiment, then `sphereorient track`")
 
 
-def _write(result: MapResult, old: Tensor | None, out: Path) -> tuple[list[Path], list[MapExample]]:
+def _write(result: "MapResult", old: "Tensor | None", out: Path) -> "tuple[list[Path], list[MapExample]]":
     """Write all files beside the map; return them, and how well re-rendered pictures match."""
     from sphereorient.report import map_figure, map_files
     from sphereorient.report.plots.style import write_figure
@@ -90,7 +88,7 @@ def _write(result: MapResult, old: Tensor | None, out: Path) -> tuple[list[Path]
     return [out, seen, learnt, figure, moved], compared
 
 
-def _print(learnt: LearntMap, compared: list[MapExample]) -> None:
+def _print(learnt: "LearntMap", compared: "list[MapExample]") -> None:
     """Print from what the map was learnt, and how well it explains the pictures."""
     import numpy as np
 
@@ -190,7 +188,7 @@ def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json
         _print_series(found, names)
 
 
-def _print_series(found: WearSeries, names: list[str]) -> None:
+def _print_series(found: "WearSeries", names: list[str]) -> None:
     """Print the wear of each map, then of each place."""
     width = max(len(name) for name in names)
     typer.echo(f"{'against ' + names[0]:{width + 8}}  known of the ball  worn of it  since the map before  stays worn")
@@ -217,7 +215,7 @@ def _percent(share: float, sign: str = "", digits: int = 1) -> str:
     return f"{100 * share:{sign}.{digits}f} %" if math.isfinite(share) else "-"
 
 
-def _series_numbers(found: WearSeries, names: list[str]) -> dict[str, object]:
+def _series_numbers(found: "WearSeries", names: list[str]) -> dict[str, object]:
     """Return the figures of a series for JSON."""
     rows = [
         {
@@ -240,7 +238,7 @@ def _series_numbers(found: WearSeries, names: list[str]) -> dict[str, object]:
     return {"first": names[0], "maps": rows, "places": places}
 
 
-def _print_moved(comparison: MapComparison, against: str) -> None:
+def _print_moved(comparison: "MapComparison", against: str) -> None:
     """Print the displacement of the texture."""
     count = len(comparison.length_rad)
     if not count:
@@ -250,7 +248,7 @@ def _print_moved(comparison: MapComparison, against: str) -> None:
     typer.echo(f"{against}: texture displaced by {rms:.2f}° (rms of {count} patches), {most:.2f}° at most")
 
 
-def _numbers(comparison: MapComparison) -> dict[str, object]:
+def _numbers(comparison: "MapComparison") -> dict[str, object]:
     """Return the figures of a displacement for JSON."""
     return {
         "patches": len(comparison.length_rad),
@@ -265,7 +263,7 @@ def _or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _known_map(path: Path) -> Tensor:
+def _known_map(path: Path) -> "Tensor":
     """Read a map, NaN where the counts beside it are 0."""
     import torch
 

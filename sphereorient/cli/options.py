@@ -1,7 +1,5 @@
 """Options that several commands have, and what their texts mean."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,7 +19,7 @@ Overrides = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
 
 
-def settings_of(path: Path | None, overrides: list[str] | None, method: str) -> Settings:
+def settings_of(path: Path | None, overrides: list[str] | None, method: str) -> "Settings":
     """Read the settings that a method reads, and print remarks on the others."""
     from sphereorient.methods.settings import BRANCHES, read_settings
 

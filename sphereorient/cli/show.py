@@ -1,7 +1,5 @@
 """`sphereorient report`, `overlay`, `export` and `view`: what a track is looked at with."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -49,7 +47,7 @@ def report(
         typer.echo(f"Wrote {out / 'index.html'}")
 
 
-def _load(paths: list[Path]) -> dict[str, Trajectory]:
+def _load(paths: list[Path]) -> "dict[str, Trajectory]":
     """Read the tracks; the name of each is the shortest unique end of its path."""
     from sphereorient.trajectory import Trajectory
 

@@ -1,7 +1,5 @@
 """Tools beside tracking: `sphereorient spin`, the spin of a ball from photographs, and `texture`, the design of one."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -71,7 +69,7 @@ def spin(
         typer.echo(f"Wrote {out}, {out.with_suffix('.png')}")
 
 
-def _spin_document(found: SpinFound, photographs: Photographs) -> dict[str, Any]:
+def _spin_document(found: "SpinFound", photographs: "Photographs") -> dict[str, Any]:
     """Return the result for JSON; null: not measured."""
     spins, sigma = found.spins, found.spins.rate_sigma()
     rate = spins.omega_view_rad_s.norm(dim=-1)
@@ -205,7 +203,7 @@ def _check_design(map_: Path | None, make: bool, gores: int | None, diameter_mm:
         raise TextureError(refusal("texture design", expected="numbers", got="nan or infinity", do=do))
 
 
-def _loaded(path: Path) -> Tensor:
+def _loaded(path: Path) -> "Tensor":
     """Read a map, averaged down where it is finer than any picture shows."""
     from sphereorient.sphere import load_texture, reduced_texture
 
@@ -214,7 +212,7 @@ def _loaded(path: Path) -> Tensor:
     return drawn if height <= HEIGHT_MAX else reduced_texture(drawn, 2 * HEIGHT_MAX / math.pi)
 
 
-def _written(out: Path, drawn: Tensor, judgement: Judgement, title: str, *, make: bool) -> list[Path]:
+def _written(out: Path, drawn: "Tensor", judgement: "Judgement", title: str, *, make: bool) -> list[Path]:
     """Write judgement and figure, and the map where it was made; return the files."""
     from sphereorient.report.map_files import write_texture
     from sphereorient.report.plots.style import write_figure
@@ -236,7 +234,7 @@ def _written(out: Path, drawn: Tensor, judgement: Judgement, title: str, *, make
     return files
 
 
-def _print_judgement(judgement: Judgement, title: str) -> None:
+def _print_judgement(judgement: "Judgement", title: str) -> None:
     """Print the judgement as a table."""
     from rich.console import Console
     from rich.table import Table

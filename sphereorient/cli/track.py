@@ -1,7 +1,5 @@
 """`sphereorient track`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -94,7 +92,7 @@ def track(
 
 
 @contextmanager
-def _kept(requests: Sequence[Request]) -> Iterator[None]:
+def _kept(requests: "Sequence[Request]") -> Iterator[None]:
     """Print what is kept when the user stops a run."""
     try:
         yield
@@ -106,7 +104,9 @@ def _kept(requests: Sequence[Request]) -> Iterator[None]:
         raise
 
 
-def _track_side_by_side(requests: Sequence[Request], jobs: int, cluster: str | None, resume: bool, quiet: bool) -> None:
+def _track_side_by_side(
+    requests: "Sequence[Request]", jobs: int, cluster: str | None, resume: bool, quiet: bool
+) -> None:
     """Track on worker processes or a cluster, and print a table of the results."""
     from sphereorient.run import run_many
     from sphereorient.run.many import ProcessExecutor, dask_executor
@@ -125,7 +125,7 @@ def _track_side_by_side(requests: Sequence[Request], jobs: int, cluster: str | N
         raise typer.Exit(EXIT_SOME_FAILED)
 
 
-def _print_table(outcomes: Sequence[Outcome]) -> None:
+def _print_table(outcomes: "Sequence[Outcome]") -> None:
     """Print frames, valid frames and time of each experiment."""
     from rich.console import Console
     from rich.table import Column, Table
@@ -139,7 +139,7 @@ def _print_table(outcomes: Sequence[Outcome]) -> None:
     Console().print(table)
 
 
-def _print_summary(result: Trajectory, out: Path) -> None:
+def _print_summary(result: "Trajectory", out: Path) -> None:
     """Print the number of valid frames, the frames that each camera lost and why, and cameras that moved."""
     from sphereorient.calibration.table import contradiction_lines
 

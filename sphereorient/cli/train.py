@@ -1,7 +1,5 @@
 """`sphereorient train` and `sphereorient evaluate`."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -83,7 +81,7 @@ def evaluate(
         _print(found)
 
 
-def _print(found: ProposerBenchmark) -> None:
+def _print(found: "ProposerBenchmark") -> None:
     """Print a line for each degradation, then the metrics of the mixed pictures."""
     from rich.console import Console
     from rich.table import Table

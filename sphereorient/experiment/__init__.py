@@ -9,13 +9,3 @@ from sphereorient.experiment.experiment import (
     outside_paths,
     write_experiment,
 )
-
-__all__ = [
-    "Experiment",
-    "ExperimentKeys",
-    "input_files",
-    "load_experiment",
-    "open_movies",
-    "outside_paths",
-    "write_experiment",
-]

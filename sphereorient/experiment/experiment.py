@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StrictBool
+from pydantic import BaseModel, Field, FiniteFloat, StrictBool
 
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
 from sphereorient.errors import ExperimentError, MovieError, refusal
@@ -48,29 +48,26 @@ class Experiment:
         return self.path.parent
 
 
-class SphereKeys(BaseModel):
+class SphereKeys(BaseModel, frozen=True, extra="forbid"):
     """The key `sphere`."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     diameter: Positive | None
     texture: str | None = None
     fixed: StrictBool = False
 
 
-class FlowKeys(BaseModel):
+class FlowKeys(BaseModel, frozen=True, extra="forbid"):
     """The key `flow`, SI."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     viscosity: Positive | None = None
     dissipation: Positive | None = None
     u_rms: Positive | None = None
     integral_length: Positive | None = None
 
 
-class ExperimentKeys(BaseModel):
+class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):
     """The keys of experiment.yaml (docs/data-format.md)."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     name: str | None = None
     frame_rate: Positive | None = None
     times: str | None = None

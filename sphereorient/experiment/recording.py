@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -59,7 +57,7 @@ class Recording:
         whole = self.experiment.camera_covariance
         return None if whole is None else whole.of(list(self.cameras))
 
-    def gridded(self) -> tuple[Recording, Rows]:
+    def gridded(self) -> "tuple[Recording, Rows]":
         """Return the recording on a regular time grid, and its frames' indices in it; see `Timeline`."""
         grid, place = self.timeline.gridded()
         streams = [replace(stream, rows=grid.rows[stream.name]) for stream in self.streams]

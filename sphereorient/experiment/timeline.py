@@ -1,7 +1,5 @@
 """Times of an experiment's frames, and the picture of each movie at each frame."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,7 +41,7 @@ class Timeline:
         """Median time between frames, s; NaN for a single frame."""
         return float(np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")
 
-    def gridded(self) -> tuple[Timeline, Rows]:
+    def gridded(self) -> "tuple[Timeline, Rows]":
         """Resample onto a regular grid, inserting missing frames; return it and the frames' indices in it.
 
         Raises:

@@ -3,5 +3,3 @@
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.poses import Poses
 from sphereorient.follow.tracker import ChunkTracker
-
-__all__ = ["Appearance", "ChunkTracker", "Poses"]

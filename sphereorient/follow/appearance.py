@@ -1,7 +1,5 @@
 """Appearance of a movie (light, blur, noise), estimated from a few frames before tracking."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

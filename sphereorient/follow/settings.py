@@ -1,10 +1,8 @@
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 
-class RefineSettings(BaseModel):
+class RefineSettings(BaseModel, frozen=True, extra="forbid"):
     """How poses are fitted to pictures (method precise)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     background_frames: int = Field(
         32, ge=1, description="evenly spread frames whose mean is the background; fewer than paper's: starts sooner"

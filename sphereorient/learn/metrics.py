@@ -1,7 +1,5 @@
 """The quality of a proposer: metrics, and recall by degradation, speed and example pictures on unseen maps."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterable, Sequence
@@ -42,7 +40,7 @@ class Predictions:
     R_view_body: Tensor  # (N, 3, 3), the truth
 
     @classmethod
-    def joined(cls, parts: Sequence[Predictions]) -> Predictions:
+    def joined(cls, parts: "Sequence[Predictions]") -> "Predictions":
         """Join several predictions."""
         return cls(
             logits=torch.cat([one.logits for one in parts]), R_view_body=torch.cat([one.R_view_body for one in parts])

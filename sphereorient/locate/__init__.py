@@ -5,25 +5,3 @@ from sphereorient.locate.position import Positions, find_positions
 from sphereorient.locate.scene import CameraScene, expected_diameter_px, find_scene, known_diameter_px, learn_background
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import Found, Sightings, check_seen, fill_gaps, find_ball, sightings_of, size_of
-
-__all__ = [
-    "Background",
-    "CameraScene",
-    "Found",
-    "Frame",
-    "LocateSettings",
-    "Positions",
-    "Sightings",
-    "check_seen",
-    "expected_diameter_px",
-    "fill_gaps",
-    "find_ball",
-    "find_positions",
-    "find_scene",
-    "known_diameter_px",
-    "learn_background",
-    "screened",
-    "screened_frames",
-    "sightings_of",
-    "size_of",
-]

@@ -1,10 +1,8 @@
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 
-class LocateSettings(BaseModel):
+class LocateSettings(BaseModel, frozen=True, extra="forbid"):
     """How the sphere is found in a picture (paper section III A)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     background_frames: int = Field(
         100,

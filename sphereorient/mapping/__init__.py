@@ -3,5 +3,3 @@
 from sphereorient.mapping.crops import take_crops
 from sphereorient.mapping.learn import LearntMap, fit_map
 from sphereorient.mapping.settings import MapSettings
-
-__all__ = ["LearntMap", "MapSettings", "fit_map", "take_crops"]

@@ -1,7 +1,5 @@
 """Locally normalised disks of the sphere with their slopes, to compare pictures before there is a map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +31,7 @@ class Disks:
     def __len__(self) -> int:
         return len(self.layers)
 
-    def where(self, rows: Tensor | slice, cameras: slice = slice(None)) -> Disks:
+    def where(self, rows: Tensor | slice, cameras: slice = slice(None)) -> "Disks":
         """Select instants and cameras."""
         shown = None if self.shown is None else self.shown[rows, cameras]
         names = ("layers", "R_lab_view", "distance_radii", "seen")

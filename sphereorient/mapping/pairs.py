@@ -1,7 +1,5 @@
 """Relative rotations of pairs of instants from pictures alone, and orientations from them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -40,7 +38,7 @@ class RelativeRotations:
     def __len__(self) -> int:
         return len(self.score)
 
-    def where(self, chosen: Tensor) -> RelativeRotations:
+    def where(self, chosen: Tensor) -> "RelativeRotations":
         """Return some of the pairs."""
         return RelativeRotations(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
 
@@ -61,7 +59,7 @@ class Closure:
     moved_rad: float  # rms move of the orientations, the body frame's own turn removed
 
     @classmethod
-    def of(cls, closed: RelativeRotations, before: Tensor, after: Tensor, *, pairs: int, loops: int) -> Closure:
+    def of(cls, closed: RelativeRotations, before: Tensor, after: Tensor, *, pairs: int, loops: int) -> "Closure":
         """Compare orientations (N, 3, 3) before and after the loops `closed`."""
         return cls(
             pairs=pairs,

@@ -1,10 +1,8 @@
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 
-class MapSettings(BaseModel):
+class MapSettings(BaseModel, frozen=True, extra="forbid"):
     """How the texture map is learnt from the movies."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     background_frames: int = Field(
         32, ge=1, description="evenly spread frames whose mean is the background, where the ball moves"

@@ -1,7 +1,5 @@
 """The appearance and motion that a run learnt, in a file: another run uses it to measure the same to the last bit."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +40,7 @@ class Learnt:
     @classmethod
     def of(
         cls, study: Appearance, process: ProcessNoise | None = None, acceleration_rad_s2: float | None = None
-    ) -> Learnt:
+    ) -> "Learnt":
         """Return what was learnt before the first frame was measured, and the motion of the finished track."""
         fitter = study.fitter
         told = acceleration_rad_s2 is not None and np.isfinite(acceleration_rad_s2)
@@ -82,7 +80,7 @@ class Learnt:
             _write(self, file)
 
     @classmethod
-    def load(cls, path: Path) -> Learnt:
+    def load(cls, path: Path) -> "Learnt":
         """Read what `save` wrote; raise TrackError if the file is missing, damaged or of another schema."""
         do = "write one with `sphereorient track --save-learnt FILE`"
         if not path.is_file():

@@ -8,26 +8,3 @@ from sphereorient.motion.path import rotvec_between
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
 from sphereorient.motion.smooth import RATE_UNITS, MeasuredPoses, Smoothed, rates_of, smooth_motion
 from sphereorient.motion.stencil import gaussian_derivative, gaussian_kernel, noise_gain
-
-__all__ = [
-    "RATE_UNITS",
-    "MeasuredPoses",
-    "Motion",
-    "MotionSettings",
-    "Prior",
-    "ProcessNoise",
-    "ProcessPrior",
-    "SmoothSettings",
-    "Smoothed",
-    "gaussian_derivative",
-    "gaussian_kernel",
-    "kabsch",
-    "measure_motion",
-    "noise_gain",
-    "omega_from_markers",
-    "omega_from_orientations",
-    "rates_of",
-    "rotvec_between",
-    "smooth_motion",
-    "to_body",
-]

@@ -1,7 +1,5 @@
 """Positions or orientations of a track: estimate the process, reject outliers, smooth every segment."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -36,7 +34,7 @@ class ProcessPrior:
     prior: Prior  # per frame
     scale: float  # true errors of the measurements over their sigmas
 
-    def at_rate(self, ratio: float) -> ProcessPrior:
+    def at_rate(self, ratio: float) -> "ProcessPrior":
         """Return the same motion in frames that last `ratio` times as long."""
         return replace(self, prior=Prior(pole=self.prior.pole * ratio, deviation=self.prior.deviation * ratio))
 

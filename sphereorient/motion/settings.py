@@ -1,7 +1,7 @@
 from collections.abc import Sequence
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from sphereorient.errors import SettingsError, refusal
 
@@ -13,14 +13,12 @@ def check_separations(separations: Sequence[int], name: str = "separations") -> 
         raise SettingsError(refusal(name, expected=expected, got=str(tuple(separations)), do=do))
 
 
-class MotionSettings(BaseModel):
+class MotionSettings(BaseModel, frozen=True, extra="forbid"):
     """How positions and orientations become velocities and accelerations.
 
     The defaults fit the experiment of the paper, 600 Hz and 1 degree of attitude noise; they are widths in frames, so
     double them at twice the frame rate. Wider means less noise and more low-pass bias.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     velocity_sigma_frames: float = Field(
         3.5, gt=0, description="width of the Gaussian for velocity, frames; 0.1 mm of white noise at 600 Hz: 0.003 m/s"
@@ -65,10 +63,8 @@ class MotionSettings(BaseModel):
         return self
 
 
-class SmoothSettings(BaseModel):
+class SmoothSettings(BaseModel, frozen=True, extra="forbid"):
     """How the precise track becomes smooth motion."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     position_band_hz: float | None = Field(
         None, gt=0, description="frequency up to which places are followed, Hz; null learns it from the track itself"

@@ -3,5 +3,3 @@
 from sphereorient.movies.movie import Grey, Movie, flipped, flipped_picture
 from sphereorient.movies.open import movie_files, open_movie
 from sphereorient.movies.write import write_ffv1, write_movie
-
-__all__ = ["Grey", "Movie", "flipped", "flipped_picture", "movie_files", "open_movie", "write_ffv1", "write_movie"]

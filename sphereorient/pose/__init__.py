@@ -4,16 +4,3 @@ from sphereorient.pose.fitter import CameraView, Fitter, Optics, PoseFitter, bas
 from sphereorient.pose.implicit import ImplicitPose, implicit_pose
 from sphereorient.pose.model import Light
 from sphereorient.pose.pixels import LinesOfSight
-
-__all__ = [
-    "CameraView",
-    "Fitter",
-    "ImplicitPose",
-    "Light",
-    "LinesOfSight",
-    "Optics",
-    "PoseFitter",
-    "base_table",
-    "estimate_blur_px",
-    "implicit_pose",
-]

@@ -3,8 +3,6 @@
 `learn_light` estimates the light and the noise that all frames share from their fits.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -41,7 +39,7 @@ class FittedPoses:
         """Return the arrays by name."""
         return {name: getattr(self, name) for name in POSE_PARTS}
 
-    def where(self, mask: Tensor, other: FittedPoses) -> FittedPoses:
+    def where(self, mask: Tensor, other: "FittedPoses") -> "FittedPoses":
         """Return these poses where the mask (B,) holds, the others elsewhere."""
         own, others = self.parts(), other.parts()
         return FittedPoses(

@@ -1,7 +1,5 @@
 """The fit at three levels of blur, what it needs of each camera, and a first guess of the blur; `PoseFitter`: alone."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from copy import copy
@@ -53,7 +51,7 @@ class CameraView:
     sight: LinesOfSight
 
     @classmethod
-    def of(cls, name: str, camera: Camera, scene: CameraScene) -> CameraView:
+    def of(cls, name: str, camera: Camera, scene: CameraScene) -> "CameraView":
         """Return the view of a camera whose scene is known."""
         background, diameter_px = scene.background, scene.diameter_px
         return cls(name=name, camera=camera, background=background, diameter_px=diameter_px, sight=LinesOfSight(camera))
@@ -101,7 +99,7 @@ class Optics:
         self.middle = level_of(self.fine.paint, blur_px, MIDDLE * radius_px, radius_px)
         self.coarse = level_of(self.middle.paint, blur_px, COARSE * radius_px, radius_px)
 
-    def to(self, device: torch.device) -> Optics:
+    def to(self, device: torch.device) -> "Optics":
         """Return the same with its tables on another device."""
         moved = copy(self)
         for name in ("fine", "middle", "coarse"):
@@ -134,15 +132,15 @@ class Fitter:
             radius_mm=self.radius_mm, paint=level.paint, blur_px=level.blur_px, light=self.light, shading=shading
         )
 
-    def with_light_of(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> Fitter:
+    def with_light_of(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> "Fitter":
         """Return a fitter with the light and the noise of fitted pictures; see `learn_light`."""
         return replace(self, light=learn_light(pixels, fit, use, self.model(self.optics.fine)))
 
-    def on(self, device: torch.device) -> Fitter:
+    def on(self, device: torch.device) -> "Fitter":
         """Return a fitter that computes on another device."""
         return replace(self, optics=self.optics.to(device), light=moved_to(device, self.light), device=device)
 
-    def of(self, camera: int) -> Fitter:
+    def of(self, camera: int) -> "Fitter":
         """Return the fitter of one camera by itself."""
         return replace(self, views=[self.views[camera]], light=self.light.of(camera))
 

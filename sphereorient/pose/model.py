@@ -3,8 +3,6 @@
 Light: brightness of white and black paint over the disk, low-order maps per camera, estimated from the movie.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -86,13 +84,13 @@ class Light:
         found = self._map.index_select(0, cell.reshape(-1)).to(across.dtype)
         return found[:, 0].reshape(cell.shape), found[:, 1].reshape(cell.shape)
 
-    def of(self, camera: int) -> Light:
+    def of(self, camera: int) -> "Light":
         """Return the light of one camera."""
         one = slice(camera, camera + 1)
         return replace(self, difference=self.difference[one], black=self.black[one], noise=self.noise[one])
 
     @classmethod
-    def unknown(cls, cameras: int, noise: Tensor) -> Light:
+    def unknown(cls, cameras: int, noise: Tensor) -> "Light":
         """Return flat light, for the first fits."""
         count = light_basis(torch.zeros(1, 2, 1)).shape[-2]
         difference = torch.zeros(cameras, count)

@@ -1,7 +1,5 @@
 """The pixels of a sphere in a frame, each with its own line of sight: the data of the fit."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -43,11 +41,11 @@ class Pixels:
         """Return the number of disks."""
         return len(self.grey)
 
-    def where(self, chosen: Tensor) -> Pixels:
+    def where(self, chosen: Tensor) -> "Pixels":
         """Return some of the disks, by mask (L,) or by index."""
         return self._with(OF_DISKS, lambda part: part[chosen])
 
-    def thinned(self, step: int) -> Pixels:
+    def thinned(self, step: int) -> "Pixels":
         """Return every `step`-th place of all disks."""
         places = torch.arange(0, self.grey.shape[1], step)
         places = places[: whole_vectors(len(places))]
@@ -55,7 +53,7 @@ class Pixels:
         some = self._with((*ALONG_PLACES, *own, "tile"), lambda part: part[..., places])
         return replace(some, inner=int((places < self.inner).sum()))
 
-    def _with(self, names: Iterable[str], change: Callable[[Tensor], Tensor]) -> Pixels:
+    def _with(self, names: Iterable[str], change: Callable[[Tensor], Tensor]) -> "Pixels":
         parts: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
         return replace(self, **parts)
 

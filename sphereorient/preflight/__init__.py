@@ -2,5 +2,3 @@
 
 from sphereorient.preflight.check import Preflight, preflight
 from sphereorient.preflight.finding import Finding, Severity
-
-__all__ = ["Finding", "Preflight", "Severity", "preflight"]

@@ -1,7 +1,5 @@
 """A track for other programs: CSV, Parquet, MATLAB, xarray; columns with the unit in the name (docs/export.md)."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Iterator
@@ -62,7 +60,7 @@ def format_of(path: Path, to: str | None) -> str:
     return to or str(by_name)
 
 
-def to_arrow(track: Trajectory) -> pa.Table:
+def to_arrow(track: Trajectory) -> "pa.Table":
     """Return a track as an Arrow table, a row for each frame, each field with `units` and `description`.
 
     Raises:
@@ -150,7 +148,7 @@ WRITERS: dict[str, Callable[[Trajectory, Path, Advance], None]] = {
 }
 
 
-def to_xarray(track: Trajectory) -> xr.Dataset:
+def to_xarray(track: Trajectory) -> "xr.Dataset":
     """Return a track as an xarray dataset, with units and descriptions as attributes; candidates are left out.
 
     Dimensions: time (s), axis (x, y, z of lab or body), axis_2 (covariances), body_axis (columns of orientations),
@@ -181,7 +179,7 @@ def to_xarray(track: Trajectory) -> xr.Dataset:
     return named
 
 
-def _dims(dataset: Dataset) -> tuple[str, ...]:
+def _dims(dataset: "Dataset") -> tuple[str, ...]:
     second = "body_axis" if dataset.rotation else "axis_2"
     named = {(): (), (2,): ("image_axis",), (3,): ("axis",), (3, 3): ("axis", second)}
     return ("time", *named[dataset.tail])

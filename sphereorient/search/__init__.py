@@ -5,16 +5,3 @@ from sphereorient.search.normalisation import crop_disk
 from sphereorient.search.paper_search import PaperSearch, extract_paint
 from sphereorient.search.settings import GreySearchSettings, OrientSettings, ProposeSettings
 from sphereorient.search.template_bank import TemplateBank
-
-__all__ = [
-    "Candidates",
-    "FallbackProposer",
-    "GreySearchSettings",
-    "OrientSettings",
-    "PaperSearch",
-    "ProposeSettings",
-    "Proposer",
-    "TemplateBank",
-    "crop_disk",
-    "extract_paint",
-]

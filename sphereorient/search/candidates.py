@@ -1,7 +1,5 @@
 """Candidate orientations without history, and who proposes them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -53,7 +51,7 @@ class Candidates:
         )
 
     @classmethod
-    def joined(cls, parts: Sequence[Candidates]) -> Self:
+    def joined(cls, parts: "Sequence[Candidates]") -> Self:
         """Return the disks of all parts, one after the other."""
         parts = [cls.none(()), *parts]
         counts = torch.cat([part.counts for part in parts])
@@ -68,7 +66,7 @@ class Candidates:
         """Return the number of disks or frames."""
         return len(self.offset) - 1
 
-    def each(self) -> list[Candidates]:
+    def each(self) -> "list[Candidates]":
         """Return the candidates of each disk alone."""
         counts = self.counts.tolist()
         rows = zip(torch.split(self.R_view_body, counts), torch.split(self.score, counts), self.reason, strict=True)

@@ -1,12 +1,10 @@
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 
-class OrientSettings(BaseModel):
+class OrientSettings(BaseModel, frozen=True, extra="forbid"):
     """How possible orientations are found (paper sections III B and C)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     size_px: int | None = Field(
         None, ge=16, description="side of the disk's picture, px; null takes the movie's median diameter (real size)"
@@ -49,10 +47,8 @@ class OrientSettings(BaseModel):
     score_min: float = Field(0.5, ge=0, le=1, description="candidates of lower T are no candidates; the paper's 0.5")
 
 
-class GreySearchSettings(BaseModel):
+class GreySearchSettings(BaseModel, frozen=True, extra="forbid"):
     """How orientations are searched for on grey values (method precise)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     size_px: int = Field(
         40, ge=16, le=128, description="side of the disk's picture, px; 40 has 1,256 pixels, 24 twice the speed"
@@ -86,10 +82,8 @@ class GreySearchSettings(BaseModel):
     )
 
 
-class ProposeSettings(BaseModel):
+class ProposeSettings(BaseModel, frozen=True, extra="forbid"):
     """Who proposes orientations: the template search, a trained network, or both (docs/proposer.md)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     checkpoint: str | None = Field(
         None, description="a trained network's file, `default` for the one that comes along; null: the templates alone"

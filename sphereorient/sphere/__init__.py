@@ -4,17 +4,3 @@ from sphereorient.sphere.renderer import Sampling, SphereRenderer, see_sphere
 from sphereorient.sphere.texture import load_texture, reduced_texture, sample_texture
 from sphereorient.sphere.texture_table import DirectionTable
 from sphereorient.sphere.view import DiskView, orthographic_view, perspective_view, sphere_normals
-
-__all__ = [
-    "DirectionTable",
-    "DiskView",
-    "Sampling",
-    "SphereRenderer",
-    "load_texture",
-    "orthographic_view",
-    "perspective_view",
-    "reduced_texture",
-    "sample_texture",
-    "see_sphere",
-    "sphere_normals",
-]

@@ -1,7 +1,5 @@
 """Tables of the texture map over directions: black and white for banks, value and slope for fits."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 
@@ -98,11 +96,11 @@ class TextureTable:
         value = found[..., 0] + slope[:, 0] * x + slope[:, 1] * y + slope[:, 2] * z
         return value, slope
 
-    def to(self, device: torch.device) -> TextureTable:
+    def to(self, device: torch.device) -> "TextureTable":
         """Return the table on another device for `sample`; `blurred` needs the CPU."""
         return TextureTable(self.rows.to(device), self.blur_rad)
 
-    def blurred(self, blur_rad: float) -> TextureTable:
+    def blurred(self, blur_rad: float) -> "TextureTable":
         """Return a table whose total blur is `blur_rad`, or itself if that is not wider."""
         if blur_rad <= self.blur_rad:
             return self

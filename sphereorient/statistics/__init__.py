@@ -6,17 +6,3 @@ from sphereorient.statistics.moments import Moments, table_of_moments
 from sphereorient.statistics.segments import Ensemble, ensemble_of
 from sphereorient.statistics.settings import BootstrapSettings, SegmentSettings, StatisticsSettings
 from sphereorient.statistics.summary import Summary, summarise
-
-__all__ = [
-    "BootstrapSettings",
-    "Ensemble",
-    "Interval",
-    "Moments",
-    "SegmentSettings",
-    "StatisticsSettings",
-    "Summary",
-    "Surroundings",
-    "ensemble_of",
-    "summarise",
-    "table_of_moments",
-]

@@ -1,7 +1,5 @@
 """Intervals from independent segments: the BCa bootstrap, and the studentized one for skewed statistics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -32,12 +30,12 @@ class Interval:
     high: Floats
     error: Floats  # standard deviation of the resampled values
 
-    def part(self, key: Any) -> Interval:
+    def part(self, key: Any) -> "Interval":
         """Return some of the values, selected by an array index."""
         value, low, high, error = (np.asarray(x)[key] for x in (self.value, self.low, self.high, self.error))
         return Interval(value=value, low=low, high=high, error=error)
 
-    def scaled(self, factor: Floats | float, shift: Floats | float = 0.0) -> Interval:
+    def scaled(self, factor: Floats | float, shift: Floats | float = 0.0) -> "Interval":
         """Return factor (positive) times the values, plus a shift."""
         value, low, high = (np.asarray(x * factor + shift) for x in (self.value, self.low, self.high))
         return Interval(value=value, low=low, high=high, error=np.asarray(self.error * factor))

@@ -1,12 +1,10 @@
 """Settings of the room statistics."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 
-class SegmentSettings(BaseModel):
+class SegmentSettings(BaseModel, frozen=True, extra="forbid"):
     """Which frames and segments of a track go into its statistics."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     min_frames: int = Field(50, ge=2, description="segments with fewer frames are left out, as the paper does")
     min_integral_times: float = Field(
@@ -30,10 +28,8 @@ class SegmentSettings(BaseModel):
     keep_extrapolated: bool = Field(False, description="also use frames that the smoother filled from their neighbours")
 
 
-class BootstrapSettings(BaseModel):
+class BootstrapSettings(BaseModel, frozen=True, extra="forbid"):
     """How the error bars are drawn: whole segments are resampled, since frames of one segment are not independent."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     resamples: int = Field(1000, ge=100, description="number of resampled ensembles")
     level: float = Field(0.95, gt=0, lt=1, description="probability that an interval is to hold the true value")

@@ -8,23 +8,3 @@ from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import DEGRADATIONS, severity
 from sphereorient.synth.textures import random_texture
 from sphereorient.synth.write import write_degraded, write_synthetic_experiment
-
-__all__ = [
-    "DEGRADATIONS",
-    "EnsembleSpec",
-    "Motion6D",
-    "RandomMotion",
-    "RenderedScene",
-    "SynthSettings",
-    "degrade",
-    "draw_ensemble",
-    "filtered_track",
-    "make_scene",
-    "random_motion",
-    "random_texture",
-    "render_frame",
-    "severity",
-    "smoothed_track",
-    "write_degraded",
-    "write_synthetic_experiment",
-]

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from torch import Tensor
 
 from sphereorient import so3
@@ -34,10 +34,8 @@ DISK_DEGRADATIONS = tuple(
 )
 
 
-class DiskSettings(BaseModel):
+class DiskSettings(BaseModel, frozen=True, extra="forbid"):
     """How single balls are filmed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     size_px: int = Field(40, ge=16, le=128, description="side of the disks that come out, px")
     diameter_px: float = Field(78.0, ge=16, description="of the ball where `ball_size` says nothing, px")

@@ -4,8 +4,6 @@ A rate is rms (sqrt(1 - b) g1 + sqrt(b / <A^2>) A g2): g1 and g2 are Gaussian pr
 cos(phase). A is bounded: with log-normal bursts the largest event would set the flatness of 300 segments.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import cache
@@ -56,7 +54,7 @@ class Law:
         fast = math.sqrt(steep * whole / (max(share, 1e-12) * growth))
         return cls(rms=rms, share=share, slow=slow, fast=fast)
 
-    def draw(self, segments: int, rng: np.random.Generator) -> Draw:
+    def draw(self, segments: int, rng: np.random.Generator) -> "Draw":
         """Draw one independent realisation per segment."""
         coefficients = rng.standard_normal((segments, 2, 2, WAVES)) / math.sqrt(WAVES)
         return Draw(law=self, coefficients=coefficients, phase=rng.uniform(0.0, 2 * np.pi, (segments, len(TURNS))))

@@ -1,14 +1,12 @@
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from sphereorient.errors import SettingsError, refusal
 
 
-class SynthSettings(BaseModel):
+class SynthSettings(BaseModel, frozen=True, extra="forbid"):
     """A synthetic experiment: motion, light, cameras and noise."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field("synthetic", description="name of the experiment")
     frames: int = Field(120, ge=2, description="frames of each movie")

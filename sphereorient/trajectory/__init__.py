@@ -2,5 +2,3 @@
 
 from sphereorient.trajectory.reasons import Flag, Reason
 from sphereorient.trajectory.trajectory import CameraTrack, Trajectory, quaternions_wxyz
-
-__all__ = ["CameraTrack", "Flag", "Reason", "Trajectory", "quaternions_wxyz"]

@@ -1,7 +1,5 @@
 # ruff: noqa: RUF009 -- stored returns a dataclass field without a default
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -234,7 +232,7 @@ class Trajectory:
         parts = {name: getattr(self, name)[rows] for name, _ in stored_fields(type(self))}
         return replace(self, **parts, cameras={name: camera.at(rows) for name, camera in self.cameras.items()})
 
-    def to_pandas(self) -> pd.DataFrame:
+    def to_pandas(self) -> "pd.DataFrame":
         """Return a table, one row per frame, units in the column names (time_s, position_x_mm, velocity_x_m_s, ...).
 
         It has quaternions quat_* and quat_smooth_* (R_lab_body, w >= 0), but neither covariances nor cameras.
@@ -257,7 +255,7 @@ class Trajectory:
             table |= {f"{name}_{axis}": part for axis, part in zip("wxyz", quaternions_wxyz(R).T, strict=True)}
         return pd.DataFrame(table)
 
-    def plot(self) -> Figure:
+    def plot(self) -> "Figure":
         """Draw position, quaternion (continuous sign), velocity and omega over time: measured dots, smoothed lines."""
         from matplotlib.figure import Figure
 

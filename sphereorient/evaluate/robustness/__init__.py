@@ -3,14 +3,3 @@
 from sphereorient.evaluate.robustness.results import Results, SceneResult, compare_runs, load_results
 from sphereorient.evaluate.robustness.run import run_benchmark
 from sphereorient.evaluate.robustness.scenes import BenchSettings, scenes_of, write_scene
-
-__all__ = [
-    "BenchSettings",
-    "Results",
-    "SceneResult",
-    "compare_runs",
-    "load_results",
-    "run_benchmark",
-    "scenes_of",
-    "write_scene",
-]

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.synth import write_degraded
@@ -16,10 +16,8 @@ SIDE_PX, VOLUME_MM = 480, 30.0  # of the pictures, and of the ball's volume: sma
 MIXED_SEED = 20110  # of the random combinations
 
 
-class BenchSettings(BaseModel):
+class BenchSettings(BaseModel, frozen=True, extra="forbid"):
     """The list of scenes, part of the results: these are compared scene by scene."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     degradations: tuple[str, ...] = Field(
         tuple(DEGRADATIONS), description="one at a time; names of docs/degradations.md"

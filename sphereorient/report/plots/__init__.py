@@ -15,18 +15,3 @@ from sphereorient.report.plots.quality import (
 )
 from sphereorient.report.plots.style import write_figure
 from sphereorient.report.plots.track import path_figure, track_figure
-
-__all__ = [
-    "angles_figure",
-    "camera_distance_figure",
-    "correlations_figure",
-    "densities_figure",
-    "durations_figure",
-    "increments_figure",
-    "isotropy_figure",
-    "noise_figure",
-    "path_figure",
-    "track_figure",
-    "widths_figure",
-    "write_figure",
-]

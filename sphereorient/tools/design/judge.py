@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from torch import Tensor
 
 from sphereorient import so3
@@ -34,10 +34,8 @@ FEW_VIEWS, FINALISTS = 24, 3  # of the first judgement in a search, and maps tha
 WHITE_SHARE = (0.15, 0.85)  # of a view, in a search
 
 
-class DesignSettings(BaseModel):
+class DesignSettings(BaseModel, frozen=True, extra="forbid"):
     """Pictures for which a map is judged."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     diameter_px: float = Field(80.0, ge=12, le=400, description="of the ball in the pictures, px")
     noise_share: float = Field(0.05, gt=0, le=1, description="a pixel's noise over the step from black to white")

@@ -1,7 +1,5 @@
 """A ball with dots: table of directions, map, size in pictures, and search for orientations."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
@@ -60,11 +58,11 @@ class DotTable:
         away = torch.acos((map_directions(height) @ self.unit().mT).clamp(-1, 1)).amin(-1)
         return (0.5 + (away - math.radians(self.radius_deg)) * height / math.pi).clamp(0, 1).float()
 
-    def mirrored(self) -> DotTable:
+    def mirrored(self) -> "DotTable":
         """Return the table of the mirror image, body y reversed."""
         return replace(self, direction_body=self.direction_body * self.direction_body.new_tensor([1.0, -1.0, 1.0]))
 
-    def measured(self, disks: Tensor, R_view_body: Tensor) -> DotTable:
+    def measured(self, disks: Tensor, R_view_body: Tensor) -> "DotTable":
         """Return the table with the radius measured in disks (F, S, S) at R_view_body (F, 3, 3), blur included.
 
         R_view_body must be right to half a dot, the present radius to a factor of 2. Raise PaintError if no dot is

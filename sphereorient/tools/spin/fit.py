@@ -3,8 +3,6 @@
 At multiples of one step, omega and its aliases omega + 2 pi k / step agree; all aliases below a limit are reported.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -59,7 +57,7 @@ class Spins:
     def __len__(self) -> int:
         return len(self.evidence)
 
-    def of(self, chosen: Tensor) -> Spins:
+    def of(self, chosen: Tensor) -> "Spins":
         """Select spins by mask or by index."""
         return Spins(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from matplotlib.figure import Figure
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from torch import Tensor
 
 from sphereorient import so3
@@ -37,10 +37,8 @@ AT_ONCE = 4  # photographs between two reports of progress
 COLUMNS, MOST_DRAWN = 6, 36  # photographs of the figure: in a row, and altogether, the first ones
 
 
-class SpinSettings(BaseModel):
+class SpinSettings(BaseModel, frozen=True, extra="forbid"):
     """How a spin is searched in photographs."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     omega_max_rad_s: float = Field(
         2 * math.pi * 300, gt=0, description="fastest spin, rad/s: all aliases of the frame rate below it are reported"
