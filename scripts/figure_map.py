@@ -20,7 +20,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from sphereorient.report.map_files import write_texture
+from sphereorient.report.texture_map import write_texture
 from sphereorient.sphere import load_texture, sample_texture
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 from sphereorient.synth.textures import map_directions

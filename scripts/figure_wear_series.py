@@ -22,7 +22,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.mapping.compare import turned_map
 from sphereorient.mapping.grid import texel_areas
-from sphereorient.report.map_files import write_texture
+from sphereorient.report.texture_map import write_texture
 from sphereorient.sphere import sample_texture
 from sphereorient.synth import random_texture
 from sphereorient.synth.textures import map_directions

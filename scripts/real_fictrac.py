@@ -33,9 +33,8 @@ from sphereorient.mapping.chain import find_chain
 from sphereorient.mapping.disks import disks_of
 from sphereorient.methods.results import map_track
 from sphereorient.methods.settings import Settings, load_settings
-from sphereorient.report.map_figure import compare_pictures, map_figure
-from sphereorient.report.map_files import write_learnt, write_texture
 from sphereorient.report.plots.style import write_figure
+from sphereorient.report.texture_map import compare_pictures, map_figure, write_learnt, write_texture
 from sphereorient.trajectory import Trajectory
 
 REPO = Path(__file__).resolve().parents[1]

@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 
 from sphereorient import __version__
 from sphereorient.errors import OutputError, SphereOrientError, refusal
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 
 
 class InOrder(TyperGroup):

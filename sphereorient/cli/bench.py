@@ -9,7 +9,7 @@ import typer
 from sphereorient.cli.app import app, check_writable, progress_bar
 from sphereorient.cli.options import Quiet, TrackPath, names_in
 from sphereorient.errors import SettingsError, refusal
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -9,7 +9,7 @@ import typer
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
 from sphereorient.cli.options import ExperimentPath, cameras_of
 from sphereorient.errors import CameraError, ExperimentError, OutputError, refusal
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 
 if TYPE_CHECKING:
     from sphereorient.cameras import Camera

@@ -12,7 +12,7 @@ import typer
 from sphereorient.cli.app import Advance, app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import ExperimentPath, Overrides, Quiet, SettingsPath, frames_of
 from sphereorient.errors import MovieError, OutputError, refusal
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 
 if TYPE_CHECKING:
     import numpy as np

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sphereorient.mapping import LearntMap
     from sphereorient.mapping.compare import MapComparison
     from sphereorient.methods.map import MapResult
-    from sphereorient.report.map_figure import MapExample
+    from sphereorient.report.texture_map import MapExample
     from sphereorient.tools.wear.series import WearSeries
 
 OFTEN = 10  # pictures from which on a texel counts as well seen
@@ -41,7 +41,7 @@ def map_(
     quiet: Quiet = False,
 ) -> None:
     """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed."""
-    from sphereorient.report.map_files import check_picture_name
+    from sphereorient.report.texture_map import check_picture_name
 
     check_picture_name(out)
     check_writable(out)
@@ -72,19 +72,19 @@ def map_(
 
 def _write(result: "MapResult", old: "Tensor | None", out: Path) -> "tuple[list[Path], list[MapExample]]":
     """Write all files beside the map; return them, and how well re-rendered pictures match."""
-    from sphereorient.report import map_figure, map_files
+    from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
 
     endings = ("_seen.png", "_map.h5", "_map.png", "_moved.png")
     seen, learnt, figure, moved = (out.with_name(out.stem + ending) for ending in endings)
-    map_files.write_texture(result.texture, out)
-    map_files.write_seen(result.seen, seen)
-    map_files.write_learnt(result.learnt, result.track, learnt)
-    compared = map_figure.compare_pictures(result.track, result.experiment, out)
-    write_figure(map_figure.map_figure(result.learnt, compared), figure)
+    texture_map.write_texture(result.texture, out)
+    texture_map.write_seen(result.seen, seen)
+    texture_map.write_learnt(result.learnt, result.track, learnt)
+    compared = texture_map.compare_pictures(result.track, result.experiment, out)
+    write_figure(texture_map.map_figure(result.learnt, compared), figure)
     if result.comparison is None or old is None:
         return [out, seen, learnt, figure], compared
-    write_figure(map_figure.moved_figure(old, result.comparison), moved)
+    write_figure(texture_map.moved_figure(old, result.comparison), moved)
     return [out, seen, learnt, figure, moved], compared
 
 
@@ -92,7 +92,7 @@ def _print(learnt: "LearntMap", compared: "list[MapExample]") -> None:
     """Print from what the map was learnt, and how well it explains the pictures."""
     import numpy as np
 
-    from sphereorient.report.map_files import shares_seen
+    from sphereorient.report.texture_map import shares_seen
 
     seen, often = shares_seen(learnt.seen, (1, OFTEN))
     closure, last = learnt.closure, learnt.rounds[-1]
@@ -150,7 +150,7 @@ def compare_maps_(
 
 def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
     from sphereorient.mapping.compare import CHANGED, compare_maps, texture_change, turned_map, without_changed
-    from sphereorient.report import map_figure
+    from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
     from sphereorient.so3 import angle
 
@@ -162,7 +162,7 @@ def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: b
     known = change[change.isfinite()]
     changed = float((known.abs() > CHANGED).float().mean()) if len(known) else math.nan
     if out is not None:
-        write_figure(map_figure.moved_figure(before, comparison, change), out)
+        write_figure(texture_map.moved_figure(before, comparison, change), out)
     if as_json:
         numbers = {**_numbers(comparison), "changed_share": _or_none(changed), "R_new_old": R.tolist()}
         typer.echo(json.dumps(numbers))
@@ -267,7 +267,7 @@ def _known_map(path: Path) -> "Tensor":
     """Read a map, NaN where the counts beside it are 0."""
     import torch
 
-    from sphereorient.report.map_files import read_seen, seen_path
+    from sphereorient.report.texture_map import read_seen, seen_path
     from sphereorient.sphere import load_texture
 
     texture, seen = load_texture(path), read_seen(seen_path(path))

@@ -9,7 +9,7 @@ import typer
 from sphereorient.cli.app import app, check_writable, command_line, progress_bar
 from sphereorient.cli.options import ExperimentPath, Quiet, SettingsPath, TrackPath, cameras_of, frames_of, settings_of
 from sphereorient.errors import OutputError, SettingsError, TrackError, refusal
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 
 if TYPE_CHECKING:
     from sphereorient.trajectory import Trajectory

@@ -10,7 +10,7 @@ import typer
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
 from sphereorient.cli.options import Quiet, names_in
 from sphereorient.errors import OutputError, TextureError, refusal
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -214,9 +214,9 @@ def _loaded(path: Path) -> "Tensor":
 
 def _written(out: Path, drawn: "Tensor", judgement: "Judgement", title: str, *, make: bool) -> list[Path]:
     """Write judgement and figure, and the map where it was made; return the files."""
-    from sphereorient.report.map_files import write_texture
     from sphereorient.report.plots.style import write_figure
-    from sphereorient.tools.design.figure import design_figure
+    from sphereorient.report.texture_map import write_texture
+    from sphereorient.tools.design.judge import design_figure
 
     try:
         out.mkdir(exist_ok=True)

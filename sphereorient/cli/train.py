@@ -30,7 +30,7 @@ def train(
 ) -> None:
     """Train a network that proposes orientations (docs/proposer.md)."""
     check_writable(out)
-    from sphereorient.files.outputs import put_aside
+    from sphereorient.files.whole_file import put_aside
     from sphereorient.methods.settings import load_proposer_settings, proposer_settings_yaml
 
     settings = load_proposer_settings(config, set_ or [])

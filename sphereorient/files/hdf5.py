@@ -6,7 +6,7 @@ from pathlib import Path
 
 import h5py
 
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 
 # What h5py raises on damaged files, depending on the place of the damage.
 DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)

@@ -1,11 +1,16 @@
+"""Files that are read whole, or written whole or not at all."""
+
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from sphereorient.errors import SphereOrientError, refusal
+from sphereorient.errors import OutputError, SphereOrientError, refusal
 
 TEXT_BYTES = 1_000_000  # of a text file written by hand: a hundred times the usual size
 TABLE_BYTES = 5_000_000  # of a table of points: 100,000 of them
+ROOM = "choose a folder that exists, may be written and has room"
 
 
 def read_whole(path: Path, largest: int, expected: str, error: type[SphereOrientError], do: str) -> bytes:
@@ -28,3 +33,20 @@ def read_whole(path: Path, largest: int, expected: str, error: type[SphereOrient
     except (OSError, ValueError) as fault:  # ValueError: a zero byte in the name, or half a character
         got = f"'{getattr(fault, 'strerror', None) or 'a name that no file can have'}'"
     raise error(refusal(str(path), expected=expected, got=got, do=do))
+
+
+@contextmanager
+def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()) -> Iterator[Path]:
+    """Give a temporary name with the same suffix; the file replaces `path` at the end, or is deleted after an error.
+    OutputError with the remedy `do` for OSError or an error of `also`; the old file is kept.
+    """
+    aside = path.with_name(f".{path.stem}.partial{path.suffix}")
+    failures: tuple[type[Exception], ...] = (OSError, *also)
+    try:
+        yield aside
+        aside.replace(path)
+    except failures as error:
+        got = f"'{(getattr(error, 'strerror', None) or str(error)).splitlines()[0]}'"
+        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
+    finally:
+        aside.unlink(missing_ok=True)

@@ -11,8 +11,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.composer import ComposerError
 
 from sphereorient.errors import SphereOrientError, refusal
-from sphereorient.files.outputs import put_aside
-from sphereorient.files.whole_file import TEXT_BYTES, read_whole
+from sphereorient.files.whole_file import TEXT_BYTES, put_aside, read_whole
 
 Model = TypeVar("Model", bound=BaseModel)
 SHOWN = 20  # known names in a message

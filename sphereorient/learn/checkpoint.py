@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field, FiniteFloat, StrictInt
 from torch import Tensor
 
 from sphereorient.errors import CheckpointError, refusal
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 from sphereorient.files.yaml_file import short, validated
 from sphereorient.learn.network import Correlator
 from sphereorient.learn.settings import ProposerSettings

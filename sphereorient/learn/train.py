@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader
 from sphereorient import __version__
 from sphereorient.errors import CheckpointError, OutputError, SettingsError, refusal
 from sphereorient.experiment.recording import Progress, silent
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 from sphereorient.learn import metrics
 from sphereorient.learn.checkpoint import Checkpoint, correlator_of, load_checkpoint, save_checkpoint, texture_sha256
 from sphereorient.learn.metrics import WITHIN_DEG, Metrics, Predictions

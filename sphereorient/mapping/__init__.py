@@ -1,5 +1,5 @@
 """The texture map from movies or photographs: relative rotations, loops, then orientations, light and map together."""
 
-from sphereorient.mapping.crops import take_crops
+from sphereorient.mapping.disks import take_crops
 from sphereorient.mapping.learn import LearntMap, fit_map
 from sphereorient.mapping.settings import MapSettings

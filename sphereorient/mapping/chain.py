@@ -8,8 +8,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.mapping.crops import evenly_spread, too_few
-from sphereorient.mapping.disks import Disks, reduced
+from sphereorient.mapping.disks import Disks, evenly_spread, reduced, too_few
 from sphereorient.mapping.pairs import (
     Closure,
     RelativeRotations,

@@ -11,8 +11,7 @@ from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.mapping.crops import Crops, evenly_spread, pixels_of
-from sphereorient.mapping.disks import Disks
+from sphereorient.mapping.disks import Crops, Disks, evenly_spread, pixels_of
 from sphereorient.mapping.grid import (
     NormalMatrix,
     map_sums,

@@ -10,8 +10,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.experiment.recording import Progress
 from sphereorient.mapping.chain import PairwiseAttitudes, find_chain
-from sphereorient.mapping.crops import Crops, evenly_spread
-from sphereorient.mapping.disks import Disks, disks_of
+from sphereorient.mapping.disks import Crops, Disks, disks_of, evenly_spread
 from sphereorient.mapping.grid import look_up, sharpened, texel_areas
 from sphereorient.mapping.iterations import (
     LIGHT_ITERATIONS,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.files.hdf5 import GuardedFile
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 from sphereorient.movies.movie import Grey, refused
 
 PLAYER_RATE_HZ = 25.0

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError, refusal
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 from sphereorient.trajectory import CameraTrack, Flag, Trajectory, quaternions_wxyz
 from sphereorient.trajectory.datasets import stored_fields
 

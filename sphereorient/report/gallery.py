@@ -15,7 +15,7 @@ from PIL import Image
 
 from sphereorient.errors import OutputError, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 from sphereorient.movies import Grey
 from sphereorient.report import frame_warnings as quality
 from sphereorient.report import overlay_page as ink

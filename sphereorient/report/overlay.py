@@ -15,7 +15,7 @@ from sphereorient.errors import ExperimentError, OutputError, TrackError, refusa
 from sphereorient.experiment import Experiment, open_movies
 from sphereorient.experiment.stream import CameraStream, given_mask, pictures_of
 from sphereorient.experiment.timeline import NONE, timeline
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Grey
 from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of, radius_of

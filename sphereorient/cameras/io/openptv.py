@@ -19,8 +19,7 @@ from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.errors import CameraError
-from sphereorient.files.outputs import put_aside
-from sphereorient.files.whole_file import TEXT_BYTES, read_whole
+from sphereorient.files.whole_file import TEXT_BYTES, put_aside, read_whole
 from sphereorient.files.yaml_file import short
 
 # How many numbers each file has, and which.

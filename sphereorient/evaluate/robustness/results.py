@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 
 from sphereorient.errors import BenchError, refusal
 from sphereorient.evaluate.robustness.scenes import BenchSettings
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 
 SCHEMA = "sphereorient-robustness/1"
 WRONG_DEG = 10.0

@@ -22,8 +22,8 @@ from sphereorient.errors import BenchError, OutputError, SphereOrientError, refu
 from sphereorient.evaluate.robustness.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
 from sphereorient.evaluate.robustness.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
 from sphereorient.evaluate.score import distance_deg, score_track, true_orientations
-from sphereorient.files.outputs import put_aside
 from sphereorient.files.provenance import versions
+from sphereorient.files.whole_file import put_aside
 from sphereorient.methods.settings import Settings
 from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import CameraTrack, Trajectory

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 from sphereorient.statistics import Interval
 
 Floats = NDArray[np.float64]

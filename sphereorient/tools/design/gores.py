@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import PaintError, refusal
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 from sphereorient.report.plots.style import in_style
 from sphereorient.sphere import sample_texture
 

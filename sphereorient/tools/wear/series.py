@@ -27,8 +27,8 @@ from sphereorient.mapping.compare import (
     without_changed,
 )
 from sphereorient.mapping.grid import texel_areas
-from sphereorient.report.map_figure import CHANGE_REACH, draw_map
 from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note
+from sphereorient.report.texture_map import CHANGE_REACH, draw_map
 from sphereorient.synth.textures import map_directions
 
 BEYOND = 5.0  # times the scatter of the unworn texture: noise alone seldom exceeds this

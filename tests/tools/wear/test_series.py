@@ -19,7 +19,7 @@ from sphereorient.cli import main
 from sphereorient.errors import PaintError
 from sphereorient.mapping.compare import turned_map
 from sphereorient.mapping.grid import texel_areas
-from sphereorient.report.map_files import write_seen
+from sphereorient.report.texture_map import write_seen
 from sphereorient.synth.textures import map_directions, random_texture
 from sphereorient.tools.wear.series import WearSeries, _places, wear_series
 

@@ -10,7 +10,7 @@ import pytest
 
 from sphereorient.errors import OutputError
 from sphereorient.files.hdf5 import GuardedFile, whole_hdf5
-from sphereorient.files.outputs import put_aside
+from sphereorient.files.whole_file import put_aside
 from sphereorient.files.yaml_file import read_yaml, write_document
 
 
