@@ -31,7 +31,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cli.app import progress_bar
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
-from sphereorient.learn.proposer import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
+from sphereorient.learn.network import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.report.plots.style import write_figure
 from sphereorient.search import (
     Candidates,

@@ -26,7 +26,7 @@ import yaml
 from numpy.typing import NDArray
 
 from sphereorient import so3
-from sphereorient.methods.learnt import Learnt
+from sphereorient.methods.method import Learnt
 from sphereorient.methods.settings import load_settings
 from sphereorient.movies import open_movie, write_ffv1
 from sphereorient.run import MemoryStore, Request, run

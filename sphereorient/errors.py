@@ -62,6 +62,12 @@ def refusal(name: str, *, expected: str, got: str, do: str) -> str:
     return f"{name}: expected {expected}, got {got}; {do}."
 
 
+def error_words(error: Exception) -> str:
+    """Return the error of a library or the system in one line of at most 200 characters."""
+    text = str(getattr(error, "strerror", None) or error)
+    return f"'{text.splitlines()[0][:200]}'" if text else type(error).__name__
+
+
 def check_tail(name: str, tensor: "Tensor", *tail: int) -> None:
     """Refuse a tensor whose last axes are not `tail`, after any leading shape (ShapeError)."""
     if tuple(tensor.shape[-len(tail) :]) != tail:

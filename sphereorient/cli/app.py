@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 
 from sphereorient import __version__
 from sphereorient.errors import OutputError, SphereOrientError, refusal
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import write_text
 
 
 class InOrder(TyperGroup):
@@ -125,8 +125,7 @@ def settings(
         typer.echo(settings_yaml())
         return
     check_writable(out)
-    with put_aside(out) as aside:
-        aside.write_text(settings_yaml(), encoding="utf-8")
+    write_text(out, settings_yaml())
 
 
 @app.command()

@@ -9,7 +9,7 @@ import typer
 from sphereorient.cli.app import app, check_writable, progress_bar
 from sphereorient.cli.options import Quiet, TrackPath, names_in
 from sphereorient.errors import SettingsError, refusal
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import write_text
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -182,8 +182,7 @@ def write_scenes(
             write_scene(out / scene.name, scene)
             advance("scenes", done, len(scenes))
     index = [{"name": scene.name, "degradations": dict(scene.degradations), "seed": scene.seed} for scene in scenes]
-    with put_aside(out / "scenes.json") as aside:
-        aside.write_text(json.dumps(index, indent=1) + "\n", "utf-8")
+    write_text(out / "scenes.json", json.dumps(index, indent=1) + "\n")
     if not quiet:
         typer.echo(f"Wrote {out}: {len(scenes)} scenes, each with experiment.yaml and truth.h5")
 

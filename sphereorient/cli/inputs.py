@@ -104,8 +104,7 @@ def show_movie(
         with progress_bar(quiet) as advance:
             seen = survey(opened, count, every, lambda *at: advance("look", *at))
             advance("sheet", 0, 1)
-            with put_aside(sheet) as partial:
-                contact_sheet(opened, seen, partial)
+            contact_sheet(opened, seen, sheet)
             advance("sheet", 1, 1)
         for title, text in [*_facts(opened, seen), ("sheet", str(sheet))]:
             typer.echo(textwrap.fill(text, LINE, initial_indent=f"{title:14}", subsequent_indent=" " * 14))

@@ -11,6 +11,7 @@ import typer
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
 from sphereorient.cli.options import Cameras, ExperimentPath, Overrides, Quiet, SettingsPath, cameras_of, settings_of
 from sphereorient.errors import PaintError, refusal
+from sphereorient.files.whole_file import check_ending
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -41,9 +42,7 @@ def map_(
     quiet: Quiet = False,
 ) -> None:
     """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed."""
-    from sphereorient.report.texture_map import check_picture_name
-
-    check_picture_name(out)
+    check_ending(out, "--out", [".png", ".tif", ".tiff"])  # other formats lose grey values
     check_writable(out)
     from sphereorient.methods.map import learn_map
     from sphereorient.sphere import load_texture

@@ -9,8 +9,8 @@ import typer
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
 from sphereorient.cli.options import Quiet, names_in
-from sphereorient.errors import OutputError, TextureError, refusal
-from sphereorient.files.whole_file import put_aside
+from sphereorient.errors import TextureError, refusal
+from sphereorient.files.whole_file import check_ending, make_folder, write_text
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,9 +40,7 @@ def spin(
     quiet: Quiet = False,
 ) -> None:
     """Measure angular velocity and attitudes of a spinning ball from photographs (docs/photographs.md)."""
-    if out.suffix.lower() != ".json":
-        do = "choose a name such as spin.json"
-        raise OutputError(refusal(f"--out {out}", expected=".json", got=out.suffix or "no ending", do=do))
+    check_ending(out, "--out", [".json"])
     check_writable(out)
     from sphereorient.report.plots.style import write_figure
     from sphereorient.tools.spin.disks import load_ball, load_photographs
@@ -59,8 +57,7 @@ def spin(
     result = _spin_document(found, loaded)
     if isinstance(ball, DotTable):
         result["dot_radius_deg"] = ball.radius_deg
-    with put_aside(out) as aside:
-        aside.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    write_text(out, json.dumps(result, indent=2) + "\n")
     drawn = ball.texture() if isinstance(ball, DotTable) else ball
     names = [Path(name).stem for name in loaded.names]
     write_figure(spin_figure(found, drawn, loaded.time_s, names), out.with_suffix(".png"))
@@ -218,15 +215,10 @@ def _written(out: Path, drawn: "Tensor", judgement: "Judgement", title: str, *, 
     from sphereorient.report.texture_map import write_texture
     from sphereorient.tools.design.judge import design_figure
 
-    try:
-        out.mkdir(exist_ok=True)
-    except OSError as error:
-        do = "choose another --out"
-        raise OutputError(refusal(f"--out {out}", expected="a folder", got=str(error.strerror), do=do)) from error
+    make_folder(out, f"--out {out}")
     files = [out / "judgement.json", out / "design.png"]
-    with put_aside(files[0]) as aside:
-        about = {"map": title, "command": command_line(), **judgement.as_dict()}
-        aside.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    about = {"map": title, "command": command_line(), **judgement.as_dict()}
+    write_text(files[0], json.dumps(about, indent=2) + "\n")
     write_figure(design_figure(drawn, judgement, title), files[1])
     if make:
         files.append(out / "texture.png")

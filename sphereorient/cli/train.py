@@ -30,7 +30,7 @@ def train(
 ) -> None:
     """Train a network that proposes orientations (docs/proposer.md)."""
     check_writable(out)
-    from sphereorient.files.whole_file import put_aside
+    from sphereorient.files.whole_file import write_text
     from sphereorient.methods.settings import load_proposer_settings, proposer_settings_yaml
 
     settings = load_proposer_settings(config, set_ or [])
@@ -40,8 +40,7 @@ def train(
     from sphereorient.report.plots.style import write_figure
 
     prepare(settings, out, resume)
-    with put_aside(out / "settings.yaml") as aside:
-        aside.write_text(proposer_settings_yaml(settings), encoding="utf-8")
+    write_text(out / "settings.yaml", proposer_settings_yaml(settings))
     with progress_bar(quiet, unit="steps") as advance:
         trained = train_proposer(settings, out, resume=resume, progress=advance)
     curve = learning_curve_figure(trained.rows, int(trained.checkpoint.about["best_step"]))

@@ -1,11 +1,14 @@
 import warnings
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+
+from sphereorient.files.whole_file import put_aside
 
 FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF")
 GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
@@ -39,3 +42,10 @@ def decoded_grey(content: bytes) -> NDArray[Any] | None:
     """Return the grey values of a picture file, (H, W), in its own depth; None where decoding fails."""
     picture = decoded(content, GREY)
     return None if picture is None or picture.ndim != 2 else np.asarray(picture)
+
+
+def write_picture(path: Path, grey: NDArray[np.uint8]) -> None:
+    """Write a picture (H, W) by the suffix of its name, whole or not at all (OutputError)."""
+    with put_aside(path) as aside:
+        if not cv2.imwrite(str(aside), grey):
+            raise OSError("the picture could not be written")

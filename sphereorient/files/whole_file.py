@@ -2,11 +2,11 @@
 
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sphereorient.errors import OutputError, SphereOrientError, refusal
+from sphereorient.errors import OutputError, SphereOrientError, error_words, refusal
 
 TEXT_BYTES = 1_000_000  # of a text file written by hand: a hundred times the usual size
 TABLE_BYTES = 5_000_000  # of a table of points: 100,000 of them
@@ -46,7 +46,29 @@ def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()
         yield aside
         aside.replace(path)
     except failures as error:
-        got = f"'{(getattr(error, 'strerror', None) or str(error)).splitlines()[0]}'"
-        raise OutputError(refusal(str(path), expected="a file that can be written", got=got, do=do)) from error
+        expected = "a file that can be written"
+        raise OutputError(refusal(str(path), expected=expected, got=error_words(error), do=do)) from error
     finally:
         aside.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text in UTF-8 with `put_aside`."""
+    with put_aside(path) as aside:
+        aside.write_text(text, encoding="utf-8")
+
+
+def make_folder(path: Path, name: str) -> None:
+    """Make a folder and its parents where there is none; raise OutputError, with `name`, if that fails."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        expected, do = "a folder that can be made", "choose another --out"
+        raise OutputError(refusal(name, expected=expected, got=error_words(error), do=do)) from error
+
+
+def check_ending(path: Path, option: str, endings: Collection[str]) -> None:
+    """Raise OutputError if the name of a file to write, given with `option`, has none of the endings."""
+    if path.suffix.lower() not in endings:
+        do = f"end the name in {next(iter(endings))}"
+        raise OutputError(refusal(f"{option} {path}", expected=" ".join(endings), got=f"'{path.suffix}'", do=do))

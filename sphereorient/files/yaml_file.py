@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.composer import ComposerError
 
 from sphereorient.errors import SphereOrientError, refusal
-from sphereorient.files.whole_file import TEXT_BYTES, put_aside, read_whole
+from sphereorient.files.whole_file import TEXT_BYTES, read_whole, write_text
 
 Model = TypeVar("Model", bound=BaseModel)
 SHOWN = 20  # known names in a message
@@ -75,8 +75,7 @@ def write_document(path: Path, schema: str, document: Mapping[str, Any], comment
     lines = "".join(f"# {line}\n" for line in comment.splitlines())
     content = {"schema": schema, **document}
     text = lines + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
-    with put_aside(path) as aside:
-        aside.write_text(text, encoding="utf-8")
+    write_text(path, text)
 
 
 def short(value: object) -> str:

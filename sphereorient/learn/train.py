@@ -22,9 +22,9 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from sphereorient import __version__
-from sphereorient.errors import CheckpointError, OutputError, SettingsError, refusal
+from sphereorient.errors import CheckpointError, SettingsError, refusal
 from sphereorient.experiment.recording import Progress, silent
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import make_folder, put_aside
 from sphereorient.learn import metrics
 from sphereorient.learn.checkpoint import Checkpoint, correlator_of, load_checkpoint, save_checkpoint, texture_sha256
 from sphereorient.learn.metrics import WITHIN_DEG, Metrics, Predictions
@@ -300,11 +300,7 @@ def prepare(settings: ProposerSettings, out: Path, resume: bool = False) -> Corr
     if resume:
         _check_last(out / LAST, settings)
     network = _initial_network(settings)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        got = f"'{error.strerror}'"
-        raise OutputError(refusal(str(out), expected="a folder", got=got, do="choose another --out")) from error
+    make_folder(out, str(out))
     return network
 
 

@@ -1,17 +1,107 @@
-"""The interface between `run` and a method."""
+"""The interface between `run` and a method: the job, the stages, and what the method learnt, with its file.
 
-from collections.abc import Callable, Iterable, Iterator
+From what another run learnt, a run measures the same to the last bit.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import h5py
+import numpy as np
 import torch
 
+from sphereorient.errors import TrackError, error_words, refusal
 from sphereorient.experiment.recording import Progress, Recording
+from sphereorient.files.hdf5 import whole_hdf5
+from sphereorient.follow import Appearance
 from sphereorient.follow.follower import Follower
 from sphereorient.follow.poses import Poses
-from sphereorient.methods.learnt import Learnt
+from sphereorient.locate import Background, CameraScene
 from sphereorient.methods.settings import Settings
+from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
+from sphereorient.pose import CameraView, Fitter, Light, Optics, base_table
 from sphereorient.trajectory import Trajectory
+
+SCHEMA = "sphereorient-learnt/1"
+OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
+NUMBERS = ("blur_px", "widest_px", *OF_SCORES)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Learnt:
+    """Everything that the precise method learns from the movies, before and after tracking; made by the pipeline."""
+
+    scenes: Mapping[str, CameraScene]  # by camera, in the order of the fit
+    light: Light
+    blur_px: float
+    widest_px: float
+    score_min: float
+    right_score: float
+    usual_apart_rad: float
+    together: bool
+    process: ProcessNoise | None = None  # None: no track yet, or too short a one
+    acceleration_rad_s2: float | None = None  # that the path was chosen with
+
+    @classmethod
+    def of(
+        cls, study: Appearance, process: ProcessNoise | None = None, acceleration_rad_s2: float | None = None
+    ) -> "Learnt":
+        """Return what was learnt before the first frame was measured, and the motion of the finished track."""
+        fitter = study.fitter
+        told = acceleration_rad_s2 is not None and np.isfinite(acceleration_rad_s2)
+        return cls(
+            scenes={
+                view.name: CameraScene(background=view.background, diameter_px=view.diameter_px)
+                for view in fitter.views
+            },
+            light=fitter.light,
+            blur_px=fitter.optics.blur_px,
+            widest_px=fitter.widest_px,
+            **{name: getattr(study, name) for name in (*OF_SCORES, "together")},
+            process=process,
+            acceleration_rad_s2=acceleration_rad_s2 if told else None,
+        )
+
+    def appearance(self, recording: Recording) -> Appearance:
+        """Return the estimated appearance; raise TrackError for other cameras or another picture size."""
+        used = {stream.name: stream.movie.frame_shape for stream in recording.streams}
+        known = {name: scene.background.mean.shape for name, scene in self.scenes.items()}
+        if list(used.items()) != list(known.items()):
+            other = {name: shape for name, shape in used.items() if known.get(name) != shape} or used
+            expected, got = (", ".join(f"{name} {shape}" for name, shape in each.items()) for each in (other, known))
+            do = "pass that of the same cameras"
+            raise TrackError(refusal("learnt", expected=f"what was learnt of {expected}", got=got, do=do))
+        views = [CameraView.of(stream.name, stream.camera, self.scenes[stream.name]) for stream in recording.streams]
+        widest = max(scene.diameter_px for scene in self.scenes.values())
+        optics = Optics(base_table(recording.texture, widest), self.blur_px, widest)
+        fitter = Fitter(
+            views=views, radius_mm=recording.radius_mm, optics=optics, light=self.light, widest_px=self.widest_px
+        )
+        return Appearance(fitter=fitter, **{name: getattr(self, name) for name in (*OF_SCORES, "together")})
+
+    def save(self, path: Path) -> None:
+        """Write everything as HDF5, atomically; raise OutputError if the file cannot be written."""
+        with whole_hdf5(path) as file:
+            _write(self, file)
+
+    @classmethod
+    def load(cls, path: Path) -> "Learnt":
+        """Read what `save` wrote; raise TrackError if the file is missing, damaged or of another schema."""
+        do = "write one with `sphereorient track --save-learnt FILE`"
+        if not path.is_file():
+            raise TrackError(refusal(str(path), expected="a file of what was learnt", got="no such file", do=do))
+        try:
+            with h5py.File(path, "r") as file:
+                schema = file.attrs.get("schema")
+                if schema != SCHEMA:
+                    raise TrackError(refusal(f"{path}: schema", expected=SCHEMA, got=str(schema), do=do))
+                return _read(file)
+        except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+            expected, got = "a whole file of what was learnt", error_words(error)
+            raise TrackError(refusal(str(path), expected=expected, got=got, do=do)) from error
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,3 +132,64 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def _write(learnt: Learnt, file: h5py.File) -> None:
+    file.attrs["schema"] = SCHEMA
+    for name in NUMBERS:
+        file.attrs[name] = getattr(learnt, name)
+    file.attrs["together"] = learnt.together
+    if learnt.acceleration_rad_s2 is not None:
+        file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
+    file.attrs["cameras"] = list(learnt.scenes)
+    for name, scene in learnt.scenes.items():
+        group, background = file.create_group(f"cameras/{name}"), scene.background
+        group.attrs["full_scale"], group.attrs["diameter_px"] = background.full_scale, scene.diameter_px
+        for part in ("mean", "noise", "shown"):
+            if getattr(background, part) is not None:
+                group.create_dataset(part, data=getattr(background, part), track_times=False)
+    light = file.create_group("light")
+    light.attrs["known"] = learnt.light.known
+    for part in ("difference", "black", "noise"):
+        light.create_dataset(part, data=getattr(learnt.light, part).cpu().numpy(), track_times=False)
+    if learnt.process is not None:
+        group = file.create_group("process")
+        group.attrs["frame_s"] = learnt.process.frame_s
+        for part in ("place", "turn"):
+            motion: ProcessPrior | None = getattr(learnt.process, part)
+            if motion is not None:
+                group.attrs[part] = np.array([motion.prior.pole, motion.prior.deviation, motion.scale])
+
+
+def _read(file: h5py.File) -> Learnt:
+    scenes = {}
+    for name in map(str, file.attrs["cameras"]):
+        group: Any = file[f"cameras/{name}"]
+        background = Background(
+            mean=np.asarray(group["mean"][()], np.float32),
+            noise=np.asarray(group["noise"][()], np.float32),
+            full_scale=float(group.attrs["full_scale"]),
+            shown=np.asarray(group["shown"][()], bool) if "shown" in group else None,
+        )
+        scenes[name] = CameraScene(background=background, diameter_px=float(group.attrs["diameter_px"]))
+    light = file["light"]
+    parts = {part: torch.from_numpy(light[part][()]) for part in ("difference", "black", "noise")}
+    acceleration = file.attrs.get("acceleration_rad_s2")
+    return Learnt(
+        scenes=scenes,
+        light=Light(known=bool(light.attrs["known"]), **parts),
+        together=bool(file.attrs["together"]),
+        process=_process(file["process"]) if "process" in file else None,
+        acceleration_rad_s2=None if acceleration is None else float(acceleration),
+        **{name: float(file.attrs[name]) for name in NUMBERS},
+    )
+
+
+def _process(group: h5py.Group) -> ProcessNoise:
+    def motion(part: str) -> ProcessPrior | None:
+        if part not in group.attrs:
+            return None
+        pole, deviation, scale = (float(value) for value in group.attrs[part])
+        return ProcessPrior(prior=Prior(pole=pole, deviation=deviation), scale=scale)
+
+    return ProcessNoise(place=motion("place"), turn=motion("turn"), frame_s=float(group.attrs["frame_s"]))

@@ -13,8 +13,7 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, pose_table
 from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.methods import results
-from sphereorient.methods.learnt import Learnt
-from sphereorient.methods.method import Job, Method
+from sphereorient.methods.method import Job, Learnt, Method
 from sphereorient.methods.proposers import BlurMatchedSearch, open_views
 from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, estimate_blur_px, first_fitter, widest_px
 from sphereorient.trajectory import Trajectory

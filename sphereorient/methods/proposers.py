@@ -90,7 +90,7 @@ def trained_network(texture: Tensor, settings: ProposeSettings) -> Proposer | No
         return None
     # Import late: most runs use no network.
     from sphereorient.learn.checkpoint import check_texture, correlator_of, load_checkpoint
-    from sphereorient.learn.proposer import LearnedProposer
+    from sphereorient.learn.network import LearnedProposer
 
     checkpoint = load_checkpoint(checkpoint_path(settings.checkpoint))
     check_texture(checkpoint, texture)
@@ -99,6 +99,6 @@ def trained_network(texture: Tensor, settings: ProposeSettings) -> Proposer | No
 
 def checkpoint_path(named: str) -> Path:
     """Return the file of a checkpoint; `default` is the bundled one."""
-    from sphereorient.learn.proposer import DEFAULT_CHECKPOINT
+    from sphereorient.learn.network import DEFAULT_CHECKPOINT
 
     return DEFAULT_CHECKPOINT if named == DEFAULT else Path(named)

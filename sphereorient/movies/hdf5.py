@@ -9,8 +9,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from sphereorient.errors import error_words
 from sphereorient.files.hdf5 import DAMAGE
-from sphereorient.movies.movie import LARGEST_RATIO, Grey, Movie, error_words, refused
+from sphereorient.movies.movie import LARGEST_RATIO, Grey, Movie, refused
 
 KIND = "data set (N, H, W) of uint8 or uint16"
 SEPARATOR = "::"  # between the file and the data set in it

@@ -140,9 +140,3 @@ def luma(red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any]) -> NDArray[
 def refused(name: object, expected: str, got: str, do: str) -> MovieError:
     """Return the MovieError about a movie file, or a thing in it."""
     return MovieError(refusal(str(name), expected=expected, got=got, do=do))
-
-
-def error_words(error: Exception) -> str:
-    """Return a library's error in one line of at most 200 characters."""
-    text = str(getattr(error, "strerror", None) or error)
-    return f"'{text.splitlines()[0][:200]}'" if text else type(error).__name__

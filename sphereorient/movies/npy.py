@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sphereorient.movies.movie import Grey, Movie, error_words, mapped, refused
+from sphereorient.errors import error_words
+from sphereorient.movies.movie import Grey, Movie, mapped, refused
 
 # numpy parses a header as a Python literal, and old ones as its tokens.
 DAMAGE = (OSError, ValueError, EOFError, TypeError, LookupError, SyntaxError, TokenError, RecursionError, MemoryError)

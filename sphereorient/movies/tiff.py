@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tifffile import TiffFile
 
-from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, Grey, Movie, error_words, luma, mapped, refused
+from sphereorient.errors import error_words
+from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, Grey, Movie, luma, mapped, refused
 
 # What tifffile and imagecodecs raise on damaged files, depending on the place of the damage.
 DAMAGE = (

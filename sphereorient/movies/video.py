@@ -10,8 +10,8 @@ from typing import Any
 import av
 import numpy as np
 
-from sphereorient.errors import MovieError
-from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, error_words, luma, refused
+from sphereorient.errors import MovieError, error_words
+from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, luma, refused
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
 
 LOSSLESS = "lossless"

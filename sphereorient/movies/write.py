@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.files.hdf5 import GuardedFile
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import put_aside, write_text
 from sphereorient.movies.movie import Grey, refused
 
 PLAYER_RATE_HZ = 25.0
@@ -43,8 +43,7 @@ def write_movie(
     count = write_ffv1(path, frames, frame_rate_hz)
     if times_s is not None:
         text = "".join(f"{time!r}\n" for time in np.asarray(times_s, np.float64).tolist())
-        with put_aside(times_path(path)) as aside:
-            aside.write_text(f"time_s\n{text}", encoding="utf-8")
+        write_text(times_path(path), f"time_s\n{text}")
     return count
 
 

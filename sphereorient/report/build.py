@@ -9,8 +9,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from sphereorient.errors import ExperimentError, OutputError, refusal
+from sphereorient.errors import ExperimentError, OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
+from sphereorient.files.whole_file import ROOM
 from sphereorient.report import plots
 from sphereorient.report.frame_warnings import bad_stretches
 from sphereorient.report.gallery import gallery
@@ -197,9 +198,8 @@ def _folder(out: Path) -> Iterator[Path]:
             out.replace(old)
         aside.replace(out)
     except OSError as error:
-        got = f"'{error.strerror or error}'"
-        do = "choose a folder that exists, may be written and has room"
-        raise OutputError(refusal(f"--out {out}", expected="a folder that can be written", got=got, do=do)) from error
+        expected, got = "a folder that can be written", error_words(error)
+        raise OutputError(refusal(f"--out {out}", expected=expected, got=got, do=ROOM)) from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sphereorient.errors import OutputError, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.movies import Grey
 from sphereorient.report import frame_warnings as quality
 from sphereorient.report import overlay_page as ink
@@ -166,9 +165,7 @@ def worst_frames(
         TrackError: the track is of another experiment.
         OutputError: another suffix, or a file that cannot be written.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        do = "end the name in .png"
-        raise OutputError(refusal(f"--worst {path}", expected=" ".join(SUFFIXES), got=f"'{path.suffix}'", do=do))
+    check_ending(path, "--worst", SUFFIXES)
     bad = quality.choose_worst(track, count)
     with ExitStack() as opened:
         page, streams = prepared(track, experiment, cameras, opened)

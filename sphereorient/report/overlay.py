@@ -15,7 +15,7 @@ from sphereorient.errors import ExperimentError, OutputError, TrackError, refusa
 from sphereorient.experiment import Experiment, open_movies
 from sphereorient.experiment.stream import CameraStream, given_mask, pictures_of
 from sphereorient.experiment.timeline import NONE, timeline
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Grey
 from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of, radius_of
@@ -71,7 +71,7 @@ def overlay_movie(
         TrackError: no frame of the track is in the range.
         OutputError: a suffix that is not a movie's, or a file that cannot be written.
     """
-    _check_video_name(path)
+    check_ending(path, "--out", FORMATS)
     selection = selection or FrameSelection()
     with ExitStack() as opened:
         page, streams = prepared(track, experiment, selection.cameras, opened)
@@ -179,19 +179,13 @@ def _view(track: Trajectory, model: Model, stream: CameraStream) -> OverlayView:
     )
 
 
-def _check_video_name(path: Path) -> None:
-    if path.suffix.lower() not in FORMATS:
-        do = "end the name in .mp4"
-        raise OutputError(refusal(f"--out {path}", expected=" ".join(FORMATS), got=f"'{path.suffix}'", do=do))
-
-
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float) -> int:
     """Write RGB pictures (H, W, 3), H and W even, as H.264 (yuv420p), and return their number.
 
     Raises:
         OutputError: a suffix other than .mp4, .mov, .mkv, no picture, or a failure; an old file is kept.
     """
-    _check_video_name(path)
+    check_ending(path, "--out", FORMATS)
     rate, count = Fraction(fps).limit_denominator(1000), 0
     kind = FORMATS[path.suffix.lower()]
     with put_aside(path, also=(av.FFmpegError,)) as aside, av.open(str(aside), "w", format=kind) as container:

@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from sphereorient.cameras import Camera
-from sphereorient.errors import OutputError, refusal
+from sphereorient.errors import OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
+from sphereorient.files.whole_file import check_ending
 from sphereorient.report.export import package
 from sphereorient.report.frame_warnings import frame_warnings
 from sphereorient.report.overlay import pictures_by_row, streams_of
@@ -66,9 +67,8 @@ def view_track(
         TrackError: the track is of another experiment.
     """
     package("rerun", "view")
-    if save is not None and save.suffix.lower() != ".rrd":
-        do = "end the name in .rrd"
-        raise OutputError(refusal(f"--save {save}", expected=".rrd", got=f"'{save.suffix}'", do=do))
+    if save is not None:
+        check_ending(save, "--save", [".rrd"])
     recording: Any = rr.RecordingStream("sphereorient", recording_id=None)
     layout = _layout(track, experiment)
     if save is None:
@@ -77,8 +77,8 @@ def view_track(
         try:
             recording.save(save, default_blueprint=layout)
         except (OSError, RuntimeError) as error:
-            got, do = f"'{str(error).splitlines()[0]}'", "choose a folder that exists and may be written"
-            raise OutputError(refusal(str(save), expected="a file that can be written", got=got, do=do)) from error
+            expected, do = "a file that can be written", "choose a folder that exists and may be written"
+            raise OutputError(refusal(str(save), expected=expected, got=error_words(error), do=do)) from error
     try:
         _log(recording, track, experiment, every if pictures else 0, progress)
     finally:

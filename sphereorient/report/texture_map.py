@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 import torch
@@ -17,9 +16,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.errors import OutputError, TextureError, refusal
+from sphereorient.errors import TextureError, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.files.picture import decoded_grey
+from sphereorient.files.picture import decoded_grey, write_picture
 from sphereorient.files.whole_file import put_aside
 from sphereorient.mapping import LearntMap
 from sphereorient.mapping.compare import MapComparison
@@ -51,18 +50,12 @@ def seen_path(texture: Path) -> Path:
 def write_texture(texture: Tensor, path: Path) -> None:
     """Write a texture map (H, 2 H), 0 .. 1 or NaN (mid-grey), as 8-bit picture; may raise OutputError."""
     grey = torch.where(torch.isfinite(texture), 255 * texture, float(UNSEEN_GREY))
-    _write_picture(grey.round().clamp(0, 255).byte().numpy(), path)
+    write_picture(path, grey.round().clamp(0, 255).byte().numpy())
 
 
 def write_seen(seen: Tensor, path: Path) -> None:
     """Write counts (H, 2 H) as 8-bit picture, limited to 255; may raise OutputError."""
-    _write_picture(seen.clamp(0, MOST).byte().numpy(), path)
-
-
-def _write_picture(grey: NDArray[np.uint8], path: Path) -> None:
-    with put_aside(path) as aside:
-        if not cv2.imwrite(str(aside), grey):
-            raise OSError("the picture could not be written")
+    write_picture(path, seen.clamp(0, MOST).byte().numpy())
 
 
 def read_seen(path: Path) -> Tensor | None:
@@ -102,13 +95,6 @@ def _write_map(learnt: LearntMap, group: h5py.Group) -> None:
 def _put(group: h5py.Group, name: str, values: NDArray[np.generic], units: str, description: str) -> None:
     dataset = group.create_dataset(name, data=values, track_times=False, compression="gzip")
     dataset.attrs["units"], dataset.attrs["description"] = units, description
-
-
-def check_picture_name(path: Path) -> None:
-    """Raise OutputError for a suffix other than .png, .tif or .tiff: other formats lose grey values."""
-    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
-        do = "choose a name such as texture.png"
-        raise OutputError(refusal(f"--out {path}", expected=".png or .tif", got=path.suffix or "no ending", do=do))
 
 
 def shares_seen(seen: Tensor, counts: tuple[int, ...]) -> list[float]:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from sphereorient.errors import SettingsError, SphereOrientError, refusal
+from sphereorient.errors import SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.experiment.recording import Progress, silent
 from sphereorient.follow.follower import Batch
 from sphereorient.methods.method import one_thread
@@ -132,8 +132,8 @@ def dask_executor(cluster: str, workers: int | None = None) -> DaskExecutor:
         return DaskExecutor(join(cluster, timeout=20))
     except (OSError, TimeoutError, ValueError) as error:
         do = "start one (docs/long-runs.md), and name its scheduler's address"
-        got = f"'{str(error).splitlines()[0] if str(error) else type(error).__name__}'"
-        raise SettingsError(refusal(f"--cluster {cluster}", expected="a Dask scheduler", got=got, do=do)) from error
+        name, got = f"--cluster {cluster}", error_words(error)
+        raise SettingsError(refusal(name, expected="a Dask scheduler", got=got, do=do)) from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,8 +291,7 @@ def _take(future: Future[Any], job: _Job, task: Task, executor: Executor, worker
         job.deaths = 1 if done > job.done_at_death else job.deaths + 1
         job.done_at_death = done
         if job.deaths >= DEATHS:
-            why = str(error).splitlines()[0] if str(error) else type(error).__name__
-            job.error = f"{job.request.experiment}: worker {worker} died {DEATHS} times ({why}); "
+            job.error = f"{job.request.experiment}: worker {worker} died {DEATHS} times ({error_words(error)}); "
             job.error += "check its memory, then run again with --resume."
         else:
             job.waiting.appendleft(task)

@@ -9,14 +9,13 @@ from typing import Any
 
 import torch
 
-from sphereorient.errors import OutputError, SettingsError, refusal
+from sphereorient.errors import OutputError, SettingsError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import Progress, open_recording, silent
 from sphereorient.files.provenance import provenance, sha256
 from sphereorient.follow.follower import Batch, Follower
 from sphereorient.methods import results
-from sphereorient.methods.learnt import Learnt
-from sphereorient.methods.method import Job, Method, one_thread
+from sphereorient.methods.method import Job, Learnt, Method, one_thread
 from sphereorient.methods.paper import PAPER
 from sphereorient.methods.precise import PRECISE
 from sphereorient.methods.proposers import checkpoint_path
@@ -227,6 +226,6 @@ def torch_device(name: str) -> torch.device:
         device = torch.device(name)
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
-        got, do = f"'{name}': {str(error).splitlines()[0]}", "name cpu, or install torch for your GPU"
+        got, do = f"'{name}': {error_words(error)}", "name cpu, or install torch for your GPU"
         raise SettingsError(refusal("device", expected="a device that torch can use", got=got, do=do)) from None
     return device

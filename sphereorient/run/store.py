@@ -20,7 +20,7 @@ from sphereorient.experiment import Experiment, input_files, load_experiment
 from sphereorient.files.hdf5 import whole_hdf5
 from sphereorient.follow.follower import Batch
 from sphereorient.follow.poses import Poses
-from sphereorient.methods.learnt import Learnt
+from sphereorient.methods.method import Learnt
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, settings_yaml
 from sphereorient.pose.fit import POSE_PARTS

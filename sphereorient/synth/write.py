@@ -6,7 +6,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 import yaml
@@ -14,8 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera, TsaiCamera, save_cameras
-from sphereorient.errors import OutputError, refusal
 from sphereorient.files.hdf5 import whole_hdf5
+from sphereorient.files.picture import write_picture
+from sphereorient.files.whole_file import make_folder
 from sphereorient.movies import write_ffv1
 from sphereorient.synth.degrade_scene import Filming, degraded_settings, wrong_cameras
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion
@@ -82,12 +82,7 @@ def write_synthetic_experiment(
     for name, value in values.items():
         degradation(name).check(value)
     settings = degraded_settings(settings, values)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            refusal(f"folder {folder}", expected="a folder that can be made", got=str(error), do="choose another --out")
-        ) from None
+    make_folder(folder, f"folder {folder}")
     cameras = default_cameras(settings)
     filming = Filming(settings, values, cameras)
     # Rounded to grey levels, as in the file.
@@ -96,8 +91,8 @@ def write_synthetic_experiment(
     for index, name in enumerate(cameras):
         frames = _frames(scene, filming, name, np.random.default_rng([settings.seed, index]), progress)
         write_ffv1(folder / f"{name}.mkv", frames, settings.frame_rate)
-        _write_picture(folder / f"empty_{name}.png", _without_the_ball(filming, name))
-    _write_picture(folder / "texture.png", _as_file(filming.reported_texture(texture)))
+        write_picture(folder / f"empty_{name}.png", _without_the_ball(filming, name))
+    write_picture(folder / "texture.png", _as_file(filming.reported_texture(texture)))
     reported = wrong_cameras(cameras, values)
     exact = "exact cameras" if reported is cameras else "cameras, wrong on purpose"
     save_cameras(folder / "cameras.yaml", reported, comment=f"{exact}; X_cam = R X_lab + T, mm")
@@ -127,11 +122,6 @@ def motion_of(settings: SynthSettings) -> RandomMotion:
 def _as_file(texture: Tensor) -> NDArray[np.uint8]:
     grey: NDArray[np.uint8] = np.rint(texture.numpy() * 255).astype(np.uint8)
     return grey
-
-
-def _write_picture(path: Path, grey: NDArray[np.uint8]) -> None:
-    if not cv2.imwrite(str(path), grey):
-        raise OutputError(refusal(str(path), expected="a writable file", got="a refusal", do="check the disk"))
 
 
 def _frames(

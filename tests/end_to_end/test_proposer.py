@@ -18,8 +18,8 @@ from sphereorient.errors import CheckpointError, ShapeError
 from sphereorient.evaluate import score_track
 from sphereorient.files.provenance import sha256
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
+from sphereorient.learn.network import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.learn.pictures import film
-from sphereorient.learn.proposer import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.learn.settings import PictureSettings
 from sphereorient.methods.proposers import paper_proposer, precise_proposer
 from sphereorient.methods.settings import Settings, load_settings

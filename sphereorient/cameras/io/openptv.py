@@ -19,7 +19,7 @@ from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.errors import CameraError
-from sphereorient.files.whole_file import TEXT_BYTES, put_aside, read_whole
+from sphereorient.files.whole_file import TEXT_BYTES, read_whole, write_text
 from sphereorient.files.yaml_file import short
 
 # How many numbers each file has, and which.
@@ -90,9 +90,9 @@ def save_openptv(ori: Path | str, addpar: Path | str, camera: Camera) -> None:
     shift_mm = (inner.centre_px.detach() - middle_of_picture(inner.image_size)) * inner.pixel_pitch_mm.detach()
     xh_yh = shift_mm * _tensor((1.0, -1.0))
     lines = [inner.centre_lab_mm.detach(), so3.to_tait_bryan(dm), *dm, xh_yh, inner.f_mm.detach()[None], glass]
-    _write(Path(ori), "".join(_row(line) for line in lines))
+    write_text(Path(ori), "".join(_row(line) for line in lines))
     parts = (inner.k, inner.p, inner.scx[None], inner.she[None])
-    _write(Path(addpar), _row(torch.cat([part.detach() for part in parts])))
+    write_text(Path(addpar), _row(torch.cat([part.detach() for part in parts])))
 
 
 def load_ptv_par(path: Path | str) -> PtvPar:
@@ -119,7 +119,7 @@ def save_ptv_par(path: Path | str, par: PtvPar, names: Sequence[str]) -> None:
         lines += [f"img/{name}.", f"cal/{name}.tif"]
     lines += ["1", "0", "1", *map(str, par.image_size), *map(repr, par.pixel_pitch_mm), "0"]
     lines += map(repr, (par.n_air, par.n_glass, par.n_fluid, par.thickness_mm))
-    _write(Path(path), "\n".join(lines) + "\n")
+    write_text(Path(path), "\n".join(lines) + "\n")
 
 
 def par_of(camera: Camera) -> PtvPar:
@@ -196,11 +196,6 @@ def _numbers(path: Path, words: Sequence[str] | None, count: int, parts: str) ->
 
 def _row(numbers: Tensor) -> str:
     return " ".join(map(repr, numbers.tolist())) + "\n"
-
-
-def _write(path: Path, text: str) -> None:
-    with put_aside(path) as aside:
-        aside.write_text(text, encoding="utf-8")
 
 
 def _tensor(value: object) -> Tensor:

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 
 from sphereorient.errors import BenchError, refusal
 from sphereorient.evaluate.robustness.scenes import BenchSettings
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import write_text
 
 SCHEMA = "sphereorient-robustness/1"
 WRONG_DEG = 10.0
@@ -147,8 +147,7 @@ def save_results(results: Results, path: Path) -> None:
         "versions": dict(results.versions),
         "outcomes": [asdict(one) for one in results.outcomes],
     }
-    with put_aside(path) as aside:
-        aside.write_text(json.dumps(tree, separators=(",", ":")) + "\n", "utf-8")
+    write_text(path, json.dumps(tree, separators=(",", ":")) + "\n")
 
 
 def load_results(path: Path) -> Results:

@@ -18,12 +18,12 @@ from pydantic import TypeAdapter
 from scipy.stats import chi2
 
 from sphereorient import so3
-from sphereorient.errors import BenchError, OutputError, SphereOrientError, refusal
+from sphereorient.errors import BenchError, OutputError, SphereOrientError, error_words, refusal
 from sphereorient.evaluate.robustness.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
 from sphereorient.evaluate.robustness.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
 from sphereorient.evaluate.score import distance_deg, score_track, true_orientations
 from sphereorient.files.provenance import versions
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.methods.settings import Settings
 from sphereorient.run.stages import track_movies
 from sphereorient.trajectory import CameraTrack, Trajectory
@@ -94,17 +94,13 @@ def limit_threads() -> None:
 def _prepare(folder: Path, settings: BenchSettings) -> None:
     plan: dict[str, Any] = {"schema": SCHEMA, "settings": settings.model_dump(mode="json")}
     path, name, do = folder / PLAN, f"--out {folder}", "choose a new --out, or the same settings to go on"
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(refusal(name, expected="a folder", got="a file", do=do))
+    make_folder(folder / KEPT, name)
     try:
-        (folder / KEPT).mkdir(parents=True, exist_ok=True)
         known = json.loads(path.read_text("utf-8")) if path.exists() else None
     except (OSError, ValueError) as error:
-        got = f"'{' '.join(str(error).split())[:120]}'"
-        raise OutputError(refusal(name, expected="a folder to write to", got=got, do=do)) from None
+        raise OutputError(refusal(name, expected=f"a readable {PLAN}", got=error_words(error), do=do)) from None
     if known is None:
-        with put_aside(path) as aside:
-            aside.write_text(json.dumps(plan, indent=1) + "\n", "utf-8")
+        write_text(path, json.dumps(plan, indent=1) + "\n")
     elif known != plan:
         raise OutputError(refusal(name, expected="a run of this plan", got="another run's", do=do))
 
@@ -132,8 +128,7 @@ def run_scene(folder: Path, scene: BenchmarkScene, trackers: Mapping[str, Tracke
         experiment = write_scene(Path(rendered), scene)
         for name, tracker in trackers.items():
             result = track_scene(experiment, scene, name, tracker)
-            with put_aside(_path(folder, scene, name)) as aside:
-                aside.write_text(json.dumps(asdict(result), separators=(",", ":")), "utf-8")
+            write_text(_path(folder, scene, name), json.dumps(asdict(result), separators=(",", ":")))
 
 
 def track_scene(experiment: Path, scene: BenchmarkScene, method: str, tracker: Tracker) -> SceneResult:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import PaintError, refusal
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import put_aside, write_text
 from sphereorient.report.plots.style import in_style
 from sphereorient.sphere import sample_texture
 
@@ -134,8 +134,7 @@ def write_gores(texture: Tensor, gores: Gores, folder: Path) -> list[Path]:
                 figure.savefig(aside, metadata={when: None})
             written.append(path)
     path = folder / "gores.txt"
-    with put_aside(path) as aside:
-        aside.write_text(instructions(gores), encoding="utf-8")
+    write_text(path, instructions(gores))
     return [*written, path]
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from sphereorient.errors import PaintError, refusal
+from sphereorient.errors import PaintError, error_words, refusal
 from sphereorient.files.whole_file import TABLE_BYTES, read_whole
 from sphereorient.search import crop_disk
 from sphereorient.sphere import load_texture
@@ -200,8 +200,7 @@ def load_ball(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
         with warnings.catch_warnings(action="ignore"):  # of an empty table, which is refused below
             rows = np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2)
     except ValueError as error:
-        got = f"'{str(error).splitlines()[0]}'"
-        raise PaintError(refusal(str(path), expected="a table of numbers", got=got, do=do)) from None
+        raise PaintError(refusal(str(path), expected="a table of numbers", got=error_words(error), do=do)) from None
     if rows.size and rows.shape[1] != 3:
         raise PaintError(refusal(str(path), expected="three columns", got=str(rows.shape[1]), do=do))
     table = DotTable(direction_body=torch.from_numpy(rows.reshape(-1, 3)))
@@ -232,8 +231,8 @@ def _table_times(path: Path, files: Sequence[Path]) -> Tensor:
     try:
         return torch.tensor([float(found[file.name]) for file in files], dtype=torch.float64)
     except ValueError as error:
-        got = f"'{error}'"
-        raise PaintError(refusal(str(path), expected="times in seconds", got=got, do="correct t_s")) from None
+        do = "correct t_s"
+        raise PaintError(refusal(str(path), expected="times in seconds", got=error_words(error), do=do)) from None
 
 
 def _text(path: Path, expected: str) -> str:
@@ -256,5 +255,5 @@ def _picture(path: Path) -> Photograph:
                 raise PaintError(refusal(str(path), expected=expected, got=got, do=do))
             return np.asarray(picture.convert("RGB"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        got = f"'{(str(error) or type(error).__name__).splitlines()[0]}'"
-        raise PaintError(refusal(str(path), expected="a picture that can be decoded", got=got, do=do)) from None
+        expected = "a picture that can be decoded"
+        raise PaintError(refusal(str(path), expected=expected, got=error_words(error), do=do)) from None
