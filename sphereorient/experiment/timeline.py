@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.experiment.experiment import MOVIES_OWN, Experiment
-from sphereorient.files.whole_file import read_whole
+from sphereorient.files.whole_file import read_text
 from sphereorient.movies import Movie
 
 Rows = NDArray[np.int64]
@@ -123,12 +123,7 @@ def load_times(path: Path) -> Floats:
         ExperimentError: missing, too large, a line without a number, or times not increasing.
     """
     do = "write one time a line, in seconds, increasing"
-    content = read_whole(path, TIMES_BYTES, "a table of times", ExperimentError, "correct times:")
-    try:
-        lines = content.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        got = "bytes that are no text"
-        raise ExperimentError(refusal(str(path), expected="a text file", got=got, do=do)) from error
+    lines = read_text(path, TIMES_BYTES, "a table of times", ExperimentError, "correct times:").splitlines()
     values: list[float] = []
     for number, line in enumerate(lines, 1):
         text = line.split("#")[0].strip().rstrip(",;")

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import h5py
 
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import ROOM, put_aside
 
 # What h5py raises on damaged files, depending on the place of the damage.
 DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)
-ROOM = "check the space left and the permissions of the folder"
 
 
 @contextmanager

@@ -35,6 +35,15 @@ def read_whole(path: Path, largest: int, expected: str, error: type[SphereOrient
     raise error(refusal(str(path), expected=expected, got=got, do=do))
 
 
+def read_text(path: Path, largest: int, expected: str, error: type[SphereOrientError], do: str) -> str:
+    """Read a text in UTF-8 with the arguments of `read_whole`; raise `error` also for other bytes."""
+    try:
+        return read_whole(path, largest, expected, error, do).decode("utf-8-sig")  # some editors begin with such a mark
+    except UnicodeDecodeError:
+        got, do = "bytes that are no text", "save it as UTF-8"
+        raise error(refusal(str(path), expected=expected, got=got, do=do)) from None
+
+
 @contextmanager
 def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()) -> Iterator[Path]:
     """Give a temporary name with the same suffix; the file replaces `path` at the end, or is deleted after an error.

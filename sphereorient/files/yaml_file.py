@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.composer import ComposerError
 
 from sphereorient.errors import SphereOrientError, refusal
-from sphereorient.files.whole_file import TEXT_BYTES, read_whole, write_text
+from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text
 
 Model = TypeVar("Model", bound=BaseModel)
 SHOWN = 20  # known names in a message
@@ -41,12 +41,9 @@ def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> di
 
 def read_yaml(path: Path, error: type[SphereOrientError]) -> Any:
     """Read a YAML file of plain values, UTF-8, at most TEXT_BYTES; None if empty; raise `error` for anything else."""
-    content = read_whole(path, TEXT_BYTES, "a YAML file", error, "correct the path")
+    text = read_text(path, TEXT_BYTES, "a YAML file", error, "correct the path")
     try:
-        return parse_yaml(content.decode("utf-8-sig"))  # some editors put a byte order mark in front
-    except UnicodeDecodeError:
-        got, do = "bytes that are no text", "save it as UTF-8"
-        raise error(refusal(str(path), expected="a YAML file", got=got, do=do)) from None
+        return parse_yaml(text)
     except FAULTS as fault:
         raise error(refusal(str(path), expected="YAML", got=yaml_words(fault), do="correct the file there")) from fault
 

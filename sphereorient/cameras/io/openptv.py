@@ -19,7 +19,7 @@ from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.model import middle_of_picture
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.errors import CameraError
-from sphereorient.files.whole_file import TEXT_BYTES, read_whole, write_text
+from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text
 from sphereorient.files.yaml_file import short
 
 # How many numbers each file has, and which.
@@ -168,12 +168,8 @@ def _openptv_of(camera: Camera) -> OpenPTVCamera:
 
 
 def _words(path: Path, separator: str | None = None) -> list[str]:
-    content = read_whole(path, TEXT_BYTES, "a text file of OpenPTV", CameraError, "correct the path")
-    try:
-        return content.decode("utf-8-sig").strip().split(separator)
-    except UnicodeDecodeError:
-        got, do = "bytes that are no text", "name OpenPTV's file"
-        raise camera_error(str(path), "a text file of OpenPTV", got, do) from None
+    text = read_text(path, TEXT_BYTES, "a text file of OpenPTV", CameraError, "correct the path")
+    return text.strip().split(separator)
 
 
 def _numbers(path: Path, words: Sequence[str] | None, count: int, parts: str) -> list[float]:

@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from sphereorient.errors import PaintError, error_words, refusal
-from sphereorient.files.whole_file import TABLE_BYTES, read_whole
+from sphereorient.files.whole_file import TABLE_BYTES, read_text, read_whole
 from sphereorient.search import crop_disk
 from sphereorient.sphere import load_texture
 from sphereorient.tools.spin.dots import DotTable
@@ -195,7 +195,8 @@ def load_ball(path: Path, dot_radius_deg: float | None) -> Tensor | DotTable:
     """
     if path.suffix.lower() not in (".csv", ".txt"):
         return load_texture(path)
-    text, do = _text(path, "a table of dots"), "write x,y,z of one dot a line, without a head"
+    text = read_text(path, TABLE_BYTES, "a table of dots", PaintError, "name a file that exists")
+    do = "write x,y,z of one dot a line, without a head"
     try:
         with warnings.catch_warnings(action="ignore"):  # of an empty table, which is refused below
             rows = np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2)
@@ -219,7 +220,8 @@ def _times(times: str, files: Sequence[Path]) -> Tensor:
 
 
 def _table_times(path: Path, files: Sequence[Path]) -> Tensor:
-    table = csv.DictReader(io.StringIO(_text(path, "a table of times")))
+    text = read_text(path, TABLE_BYTES, "a table of times", PaintError, "name a file that exists")
+    table = csv.DictReader(io.StringIO(text))
     if not {"file", "t_s"} <= set(table.fieldnames or ()):
         got, do = ", ".join(table.fieldnames or ()) or "nothing", "write a head with file,t_s"
         raise PaintError(refusal(str(path), expected="the columns file and t_s", got=got, do=do))
@@ -233,15 +235,6 @@ def _table_times(path: Path, files: Sequence[Path]) -> Tensor:
     except ValueError as error:
         do = "correct t_s"
         raise PaintError(refusal(str(path), expected="times in seconds", got=error_words(error), do=do)) from None
-
-
-def _text(path: Path, expected: str) -> str:
-    content = read_whole(path, TABLE_BYTES, expected, PaintError, "name a file that exists")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        do = "save it as UTF-8 text"
-        raise PaintError(refusal(str(path), expected=expected, got="a file that is no text", do=do)) from None
 
 
 def _picture(path: Path) -> Photograph:
