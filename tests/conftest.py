@@ -22,6 +22,11 @@ TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-12}
 BATCHES: list[tuple[int, ...]] = [(), (0,), (1,), (2, 1, 3)]
 
 
+def slow(*values: object) -> object:
+    """One more case of a test whose first cases already show the same in `make test`."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if not SHARED.is_dir():
         skip = pytest.mark.skip(reason="the large data sets (../shared) are not here")

@@ -100,8 +100,9 @@ def test_the_figure_of_the_conventions_is_drawn_by_its_script(tmp_path):
 
 @cache
 def defined(folder: Path) -> set[str]:
-    """Names of the functions and classes that a folder's modules define."""
-    text = "\n".join(path.read_text() for path in folder.rglob("*.py"))
+    """Names of the functions and classes that a room, a folder or one file, defines."""
+    files = folder.rglob("*.py") if folder.is_dir() else [folder.with_suffix(".py")]
+    text = "\n".join(path.read_text() for path in files)
     return set(re.findall(r"^(?:def|class) (\w+)", text, re.MULTILINE))
 
 

@@ -238,7 +238,8 @@ def disk_centre_shift(
     rim = uv_px[..., 1:, :] - uv_px[..., :1, :]
     # d/d angle of the trigonometric interpolant (Trefethen 2000, chapter 3).
     order = 1j * torch.arange(RIM_POINTS // 2 + 1, device=rim.device)[:, None]
-    along = torch.fft.irfft(order * torch.fft.rfft(rim, dim=-2), n=RIM_POINTS, dim=-2)
+    unit = torch.eye(RIM_POINTS, dtype=torch.float64, device=rim.device)
+    along = torch.fft.irfft(order * torch.fft.rfft(unit, dim=0), n=RIM_POINTS, dim=0).to(rim) @ rim
     u, v = rim.unbind(-1)
     du, dv = along.unbind(-1)
     twice_area = (u * dv - v * du).sum(-1)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import SHARED
+from conftest import SHARED, slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plate_drawing import PLATE, Scene
@@ -71,7 +71,7 @@ def test_every_pose_that_shows_the_fiducials_is_told_right(
         assert_told_right(view, scene, 12)
 
 
-@pytest.mark.parametrize("spin_deg", [0, 90, 180, 270, 37])
+@pytest.mark.parametrize("spin_deg", [slow(0), slow(90), slow(180), slow(270), 37])
 def test_pictures_are_told_right_at_sixty_degrees_and_partial_view(spin_deg: float) -> None:
     scene = Scene(tilt_deg=60, about_deg=70, spin_deg=spin_deg, at_mm=(16.0, 10.0), distance_mm=190)
     view = see_plate(scene.picture(uneven=0.4), PLATE)

@@ -57,6 +57,7 @@ def test_training_finds_what_the_untrained_network_does_not(trained):
     assert trained[0].metrics.recall_1 > 0.6
 
 
+@pytest.mark.slow
 def test_the_checkpoint_is_the_best_of_the_validations_and_says_what_it_is(trained):
     result, folder = trained
     loaded = load_checkpoint(folder / "proposer.ckpt")

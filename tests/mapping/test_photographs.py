@@ -48,6 +48,7 @@ def found_in(whole, detail=0.04):
     return find_photographs(disks_of_pictures(whole), disks_of_pictures(whole, detail, 0.2), SETTINGS)
 
 
+@pytest.mark.slow
 def test_photographs_in_any_order_get_their_attitudes():
     R = random_attitudes(12, 2)
     chain = found_in(pictures(R))

@@ -83,6 +83,7 @@ def test_the_defaults_serve_one_degree_of_attitude_noise_even_with_lost_frames(
         assert coverage >= 0.9, name
 
 
+@pytest.mark.slow
 def test_each_sigma_is_the_scatter_that_white_noise_causes(rng: torch.Generator) -> None:
     draws, frames = 3000, 41
     position_mm, R, segment = steady(frames)

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import h5py
 import pytest
 import torch
-from conftest import SHARED, assert_close
+from conftest import SHARED, assert_close, slow
 from torch import Tensor
 
 from sphereorient import so3
@@ -89,7 +89,7 @@ def errors(truth: Motion6D, result: Smoothed) -> dict[str, tuple[Tensor, Tensor]
 
 @pytest.mark.shared
 @pytest.mark.parametrize(
-    ("noise_deg", "limits"), [(0.036, (0.009, 0.085, 0.033)), (0.025, (0.007, 0.068, 0.024))], ids=str
+    ("noise_deg", "limits"), [(0.036, (0.009, 0.085, 0.033)), slow(0.025, (0.007, 0.068, 0.024))], ids=str
 )
 def test_the_motion_of_the_experiment_is_recovered_as_a_plain_gaussian_process_does(
     noise_deg: float, limits: tuple[float, float, float], rng: torch.Generator
@@ -120,7 +120,7 @@ def test_the_motion_of_the_experiment_is_recovered_as_a_plain_gaussian_process_d
         assert 0.7 < (error / sigma).square().mean().sqrt() < 1.4, name
 
 
-@pytest.mark.parametrize("omega_rms", [10.5, 145.0, 292.0], ids=["2 deg", "22 deg", "45 deg a frame"])
+@pytest.mark.parametrize("omega_rms", [slow(10.5), slow(145.0), 292.0], ids=["2 deg", "22 deg", "45 deg a frame"])
 def test_every_sigma_is_honest_whatever_the_turn_between_frames(omega_rms: float, rng: torch.Generator) -> None:
     truth = planted(omega_rms)
     result = smoothed(truth, *measured(truth, rng))
@@ -158,7 +158,9 @@ def test_slow_errors_are_covered_by_the_share_that_is_set_aside_for_them(rng: to
 # gaps, ends, uneven times
 
 
-@pytest.mark.parametrize(("omega_rms", "lost"), [(10.5, (60, 80)), (22.0, (60, 72)), (292.0, (60, 72))], ids=str)
+@pytest.mark.parametrize(
+    ("omega_rms", "lost"), [slow(10.5, (60, 80)), slow(22.0, (60, 72)), (292.0, (60, 72))], ids=str
+)
 def test_a_gap_is_bridged_with_sigmas_that_say_how_well(
     omega_rms: float, lost: tuple[int, int], rng: torch.Generator
 ) -> None:
@@ -194,6 +196,7 @@ def test_a_third_of_the_frames_may_be_missing_even_at_45_degrees_a_frame(rng: to
     assert torch.equal(result.extrapolated, lost)
 
 
+@pytest.mark.slow
 def test_positions_and_orientations_may_be_missing_in_different_frames(rng: torch.Generator) -> None:
     truth = planted()
     position, R = measured(truth, rng)
@@ -205,6 +208,7 @@ def test_positions_and_orientations_may_be_missing_in_different_frames(rng: torc
     assert result.velocity_m_s.isfinite().all()
 
 
+@pytest.mark.slow
 def test_times_may_be_uneven_and_jump(rng: torch.Generator) -> None:
     time_s = (torch.rand(220, generator=rng, dtype=torch.float64).sort().values * 220 + torch.arange(220) * 0.2) / RATE
     time_s = torch.cat([time_s[:100], time_s[100:] + 15 / RATE])
@@ -219,7 +223,7 @@ def test_times_may_be_uneven_and_jump(rng: torch.Generator) -> None:
 
 
 @pytest.mark.parametrize("omega_rms", [10.5, 292.0], ids=["2 deg", "45 deg a frame"])
-@pytest.mark.parametrize("wrong", [[70], [0, 3, 90, 91, 199], [50, 51, 52]], ids=str)
+@pytest.mark.parametrize("wrong", [slow([70]), [0, 3, 90, 91, 199], slow([50, 51, 52])], ids=str)
 def test_wrong_frames_bend_nothing(omega_rms: float, wrong: list[int], rng: torch.Generator) -> None:
     truth = planted(omega_rms)
     position, R = measured(truth, rng)
@@ -306,6 +310,7 @@ def test_segments_know_nothing_of_each_other(rng: torch.Generator) -> None:
             torch.testing.assert_close(getattr(other, entry.name)[:85], values[:85], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_narrower_band_follows_less() -> None:
     truth = planted()
     narrow, wide = (

@@ -26,6 +26,7 @@ def test_a_clean_experiment_raises_no_complaint(clean, tmp_path):
     assert result.severity is OK
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("late", "start"),
     [("cam2", "{cam1: 0, cam2: 2}"), pytest.param("cam1", "{cam1: 2, cam2: 0}", marks=pytest.mark.slow)],
@@ -105,6 +106,7 @@ def test_a_movie_mirrored_left_to_right_is_told_by_the_lines_of_sight(clean, tmp
     assert "flip: {cam1: horizontal}" in found.advice
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [16.2, pytest.param(19.8, marks=pytest.mark.slow)])
 def test_a_diameter_ten_per_cent_off_is_found_and_the_right_one_named(clean, tmp_path, wrong):
     found = of(checked(clean, tmp_path, sphere={"diameter": wrong}), "size of the ball")

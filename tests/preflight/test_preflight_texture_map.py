@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import assert_close
+from conftest import assert_close, slow
 from preflight_examples import PAINTED, Example, checked, clean_example, of
 
 from sphereorient import so3
@@ -95,7 +95,7 @@ def test_the_angle_is_that_between_the_two_views(pair):
     assert pair.angle_rad > math.radians(20)
 
 
-@pytest.mark.parametrize("times", [2, 3, 5])
+@pytest.mark.parametrize("times", [2, slow(3), slow(5)])
 def test_a_paint_that_repeats_itself_around_its_axis_is_a_fault(good, times):
     """Twice around is alike after half a turn, three times after a third; and so on."""
     found = most_similar_views(_repeated(good, times), GreySearchSettings())

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import matplotlib
 import numpy as np
 import pytest
+from conftest import slow
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex, to_rgb
@@ -287,7 +288,7 @@ def test_legends_cover_no_data_and_leave_the_page_nowhere(name):
         assert not one.overlaps(other)
 
 
-@every_figure
+@pytest.mark.parametrize("name", ["densities", *(slow(name) for name in FIGURES if name != "densities")])
 def test_the_same_input_gives_the_same_bytes_whatever_the_users_own_style(name, tmp_path):
     first = plots.write_figure(FIGURES[name](), tmp_path / "first.one")
     with matplotlib.rc_context({"font.size": 20, "lines.linewidth": 7, "axes.facecolor": "yellow", "pdf.fonttype": 3}):
@@ -832,7 +833,7 @@ def without_values(record: object) -> object:
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("frames", [0, 1, 2, 50, 100_000])
+@pytest.mark.parametrize("frames", [0, slow(1), slow(2), 50, slow(100_000)])
 @pytest.mark.parametrize("cameras", [(), ("one",), ("one", "two")], ids=len)
 def test_tracks_without_anything_measured_are_drawn(frames, cameras, tmp_path):
     track = blank_track(frames, cameras)

@@ -7,7 +7,7 @@ from functools import cache
 
 import pytest
 import torch
-from conftest import assert_close
+from conftest import assert_close, slow
 from torch import Tensor
 
 from sphereorient import so3
@@ -81,7 +81,7 @@ def blurred_by_force(kind: str, at: Tensor, blur_rad: float) -> Tensor:
 # --- value
 
 
-@pytest.mark.parametrize("kind", ["patches", "dots", "blobs"])
+@pytest.mark.parametrize("kind", ["patches", slow("dots"), slow("blobs")])
 @pytest.mark.parametrize("blur_rad", BLURS)
 def test_the_value_is_the_map_under_a_gaussian(kind, blur_rad):
     at = directions(300)
@@ -136,7 +136,7 @@ def test_even_paint_stays_even_and_has_no_slope():
 # --- slope
 
 
-@pytest.mark.parametrize("kind", ["patches", "blobs"])
+@pytest.mark.parametrize("kind", ["patches", slow("blobs")])
 @pytest.mark.parametrize("blur_rad", BLURS)
 def test_the_slope_is_how_the_blurred_map_changes(kind, blur_rad):
     at, h = directions(200), 0.05 * blur_rad
@@ -174,7 +174,7 @@ def test_the_slope_lies_in_the_sphere(blur_rad):
 # --- blurring again
 
 
-@pytest.mark.parametrize("kind", ["patches", "dots"])
+@pytest.mark.parametrize("kind", ["patches", slow("dots")])
 def test_blurring_twice_is_blurring_once_by_the_root_of_the_sum_of_squares(kind):
     at = directions(2000)
     once = base_of(kind).blurred(0.06)

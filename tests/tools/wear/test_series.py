@@ -99,6 +99,7 @@ def test_the_worn_share_grows_as_it_was_planted():
     assert min(growth[1].stays, growth[2].stays) > 0.95, "a place that is worn stays worn"
 
 
+@pytest.mark.slow
 def test_places_keep_their_number_from_map_to_map():
     first, later = found().places
     for place, spot in ((first, FIRST_SPOT), (later, LATER_SPOT)):
