@@ -12,7 +12,7 @@ import typer
 from sphereorient.cli.app import Advance, app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import ExperimentPath, Overrides, Quiet, SettingsPath, frames_of
 from sphereorient.errors import MovieError, OutputError, refusal
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import check_ending, put_aside
 
 if TYPE_CHECKING:
     import numpy as np
@@ -95,6 +95,7 @@ def show_movie(
 ) -> None:
     """Print what is in a movie, and draw a contact sheet of it."""
     sheet = Path(f"{_stem(source)}.contact.png") if out is None else out
+    check_ending(sheet, "--out", [".png", ".pdf", ".svg"])  # before the movie is read
     check_writable(sheet)
     from sphereorient.movies import flipped, open_movie
     from sphereorient.movies.survey import survey
