@@ -68,10 +68,9 @@ class Learnt:
             raise TrackError(refusal("learnt", expected=f"what was learnt of {expected}", got=got, do=do))
         views = [CameraView.of(stream.name, stream.camera, self.scenes[stream.name]) for stream in recording.streams]
         widest = max(scene.diameter_px for scene in self.scenes.values())
+        radius_mm = recording.experiment.radius_mm
         optics = Optics(base_table(recording.texture, widest), self.blur_px, widest)
-        fitter = Fitter(
-            views=views, radius_mm=recording.radius_mm, optics=optics, light=self.light, widest_px=self.widest_px
-        )
+        fitter = Fitter(views=views, radius_mm=radius_mm, optics=optics, light=self.light, widest_px=self.widest_px)
         return Appearance(fitter=fitter, **{name: getattr(self, name) for name in (*OF_SCORES, "together")})
 
     def save(self, path: Path) -> None:
