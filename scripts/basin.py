@@ -40,7 +40,7 @@ def main() -> None:
     torch.set_num_threads(1)
     settings, every = Settings(), arguments.every
     with open_recording(arguments.experiment / "experiment.yaml") as recording:
-        numbers, texture, radius_mm = recording.frames, recording.texture, recording.radius_mm
+        numbers, texture, radius_mm = recording.frames, recording.texture, recording.experiment.radius_mm
         views = [open_view(recording, stream, settings, silent) for stream in recording.streams]
         shots = [
             list(screened_frames(stream, view.background))[::every]

@@ -10,6 +10,7 @@ and how well the confidence is calibrated. Ten minutes on two cores; an unfinish
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from sphereorient.evaluate.robustness import BenchSettings, Results, SceneResult
 from sphereorient.evaluate.robustness.results import WRONG_DEG, ResultSummary, save_results, summaries
 from sphereorient.evaluate.robustness.scenes import CLEAN, FULL, TOGETHER
 from sphereorient.report.plots.style import write_figure
-from sphereorient.report.robustness import markdown, robustness_figure, write_table
+from sphereorient.report.robustness import level_labels, robustness_figure, unit_of, write_table
 from sphereorient.statistics.reliability import reliability
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -49,6 +50,25 @@ def main() -> None:
     page.write_text(f"{head}{BEGIN}\n{markdown(found)}{END}{tail}", "utf-8")
     print_methods(found)
     print_confidence([one for one in found.outcomes if one.method == "precise"])
+
+
+def markdown(results: Results) -> str:
+    """Return the table of docs/robustness.md: error and bad frames of each method by degradation and level."""
+    methods = results.methods
+    lines = {(line.kind, line.level, line.method): line for line in summaries(results)}
+    head = ["", "value", *(f"{m}: median, 95 % (degrees); wrong, lost (%)" for m in methods)]
+    text = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    for kind, level in dict.fromkeys((line.kind, line.level) for line in lines.values()):
+        value = "" if kind == CLEAN else f"{level_labels(kind, [level])[0]} {unit_of(kind)}"
+        cells = [_cell(lines[kind, level, method]) for method in methods if (kind, level, method) in lines]
+        text.append(f"| {kind.replace('_', ' ')} | {value} | {' | '.join(cells)} |")
+    return "\n".join(text) + "\n"
+
+
+def _cell(line: ResultSummary) -> str:
+    if not math.isfinite(line.p50_deg):
+        return "refused" if line.refused else "nothing"
+    return f"{line.p50_deg:.3g}, {line.p95_deg:.3g}; {100 * line.wrong_after:.0f}, {100 * line.lost:.0f}"
 
 
 def print_methods(found: Results) -> None:

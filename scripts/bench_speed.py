@@ -104,7 +104,7 @@ def prepared(folder: Path) -> Bench:
             decoding = cpu_s(lambda reel=reel: list(reel.pictures(0, 20)), 3) / 20
             say(f"decoding {reel.name}, CPU ms a frame (floor of a movie)", f"{1e3 * decoding:.2f}")
         texture, times = recording.texture, recording.timeline.time_s[:FOLLOWED].tolist()
-        experiment, radius_mm = recording.experiment, recording.radius_mm
+        experiment, radius_mm = recording.experiment, recording.experiment.radius_mm
     search = TemplateBank(texture, settings.search)
     say("search bank, CPU s", f"{cpu_s(lambda: TemplateBank(texture, settings.search), 2):.2f}")
     base = base_table(texture, widest_px(eyes))

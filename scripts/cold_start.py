@@ -116,7 +116,7 @@ def measured(folder: Path) -> None:
         for stream in recording.streams:
             view = open_view(recording, stream, settings, silent)
             pictures = [picture for picture, _ in stream.pictures() if picture is not None]
-            errors = errors_deg(view, recording.texture, recording.radius_mm, pictures, R_lab_body)
+            errors = errors_deg(view, recording.texture, recording.experiment.radius_mm, pictures, R_lab_body)
             report(f"{folder.name}, {stream.name}", errors)
 
 

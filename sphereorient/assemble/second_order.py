@@ -55,8 +55,6 @@ class Chosen:
     """The most probable history of N frames; made by `physical_path`."""
 
     choice: Tensor  # (N,) int64, index of the candidate, -1 where no candidate is right
-    R_lab_body: Tensor  # (N, 3, 3) float64, NaN where choice is -1
-    covariance_rad2: Tensor  # (N, 3, 3), NaN where choice is -1
     probability: Tensor  # (N,) float64, of the choice, NaN where it is -1
     posterior: Tensor  # (N, C) float64, of each candidate, 0 where masked
     turn_rad: Tensor  # (N, 3), rad, lab, from the orientation before, may exceed half a turn; NaN where a motion begins
@@ -142,8 +140,6 @@ def _chosen(
     }
     return Chosen(
         choice=empty.choice.index_put((seen,), choice),
-        R_lab_body=empty.R_lab_body.index_put((seen,), known.R_lab_body[seen, choice]),
-        covariance_rad2=empty.covariance_rad2.index_put((seen,), known.covariance_rad2[seen, choice]),
         probability=probability,
         posterior=posterior,
         turn_rad=empty.turn_rad.index_put((frames,), torch.from_numpy(histories.turn_rad)),
@@ -155,14 +151,12 @@ def _chosen(
 
 def _nothing(mask: Tensor) -> Chosen:
     none = torch.full(mask.shape[:1], -1)
-    missing = torch.full((*mask.shape[:1], 3, 3), torch.nan, dtype=torch.float64)
+    missing = torch.full((len(mask), 3), torch.nan, dtype=torch.float64)
     return Chosen(
         choice=none,
-        R_lab_body=missing,
-        covariance_rad2=missing,
-        probability=missing[:, 0, 0],
+        probability=missing[:, 0],
         posterior=torch.zeros(mask.shape, dtype=torch.float64),
-        turn_rad=missing[:, 0],
+        turn_rad=missing,
         segment=none,
         flags=torch.zeros_like(none),
         acceleration_rad_s2=math.nan,

@@ -26,9 +26,7 @@ class Fused:
 
     R_lab_body: Tensor  # (N, 3, 3), NaN where no camera has one
     sigma_rad: Tensor  # (N,), standard deviation per axis; NaN where not measurable
-    disagreement_rad: Tensor  # (N,), distance of the two cameras' orientations after repair; NaN with one
     segment: Tensor  # (N,) int64, -1 outside any
-    spike: Tensor  # (N,) bool
     flags: Tensor  # (N,) int64, bits of trajectory.Flag
     weight: Mapping[str, Tensor]  # (N,) of each camera, its share in the mean, of sum 1; 0 without any orientation
     repaired: Mapping[str, Tensor]  # (N,) bool of each camera
@@ -78,9 +76,7 @@ def fuse(
     return Fused(
         R_lab_body=R,
         sigma_rad=_sigma(variance, share, apart, calm),
-        disagreement_rad=apart,
         segment=number_segments(present.any(0), spike, settings.gap_frames_max),
-        spike=spike,
         flags=torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0),
         weight=dict(zip(names, share, strict=True)),
         repaired=dict(zip(names, repaired, strict=True)),

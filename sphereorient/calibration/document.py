@@ -2,7 +2,7 @@ import csv
 import io
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -50,15 +50,15 @@ class PictureKeys(BaseModel, frozen=True, extra="allow"):
 class CalibrationKeys(BaseModel, frozen=True, extra="forbid"):
     """Keys of calibration.yaml (docs/calibration.md)."""
 
-    image_size: tuple[PositiveInt, PositiveInt]
-    pixel_pitch: tuple[Positive, Positive]
+    image_size: tuple[PositiveInt, PositiveInt]  # W, H px
+    pixel_pitch: tuple[Positive, Positive]  # mm
     plate: Any = None
     surveyed: SurveyedKeys | None = None
     ports: dict[str, PortEntry] = {}
     pictures: list[PictureKeys] = []
     points: dict[str, str] = {}
     model: Model = "tsai"
-    fit_ports: tuple[str, ...] = ()
+    fit_ports: tuple[str, ...] = ()  # names of the ports' parameters that are fitted too
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,21 +75,14 @@ class CalibrationDocument:
     """A checked calibration.yaml."""
 
     path: Path
-    image_size: tuple[int, int]  # W, H px
-    pixel_pitch_mm: tuple[float, float]
-    model: Model
+    keys: CalibrationKeys
     plate: CalibrationTarget | None
     poses: tuple[int, ...]  # numbers of the poses, by row
     surveyed: Mapping[int, tuple[Tensor, Tensor]]  # row of the pose -> R_lab_plate, T_lab_plate (mm)
     pictures: tuple[Picture, ...]
     points: Mapping[str, Path]  # camera -> table of lab points and their pixels
+    cameras: tuple[str, ...]  # names, in the file's order
     ports: Mapping[str, Port]
-    fit_ports: tuple[str, ...]  # names of the ports' parameters that are fitted too
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras, in the file's order."""
-        return tuple(dict.fromkeys([*(picture.camera for picture in self.pictures), *self.points]))
 
 
 def load_calibration(path: Path | str) -> CalibrationDocument:
@@ -103,20 +96,18 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
     pictures = _pictures(keys, path, numbers)
     if keys.pictures and keys.plate is None:
         raise camera_error(f"{path}, plate", "a plate", "none", "write what the plate is: type, columns, rows, pitch")
-    document = CalibrationDocument(
+    cameras = tuple(dict.fromkeys([*(picture.camera for picture in pictures), *keys.points]))
+    return CalibrationDocument(
         path=path,
-        image_size=keys.image_size,
-        pixel_pitch_mm=keys.pixel_pitch,
-        model=keys.model,
+        keys=keys,
         plate=plate_from_entry(keys.plate, f"{path}, plate") if keys.pictures else None,
         poses=numbers,
         surveyed=_surveyed(keys, path, numbers) if keys.pictures else IN_THE_LAB,
         pictures=pictures,
         points={name: path.parent / file for name, file in keys.points.items()},
-        ports={},
-        fit_ports=keys.fit_ports,
+        cameras=cameras,
+        ports=_ports(keys, path, cameras),
     )
-    return replace(document, ports=_ports(keys, path, document.cameras))
 
 
 def read_points(path: Path) -> NDArray[np.float64]:

@@ -32,7 +32,7 @@ def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, Pl
     cameras: dict[str, Camera] = {}
     for name, (f_px, centre_px, _) in lenses.items():
         R, T = placed[name]
-        pose: dict[str, Any] = {"image_size": document.image_size, "R_cam_lab": R, "T_cam_lab_mm": T}
+        pose: dict[str, Any] = {"image_size": document.keys.image_size, "R_cam_lab": R, "T_cam_lab_mm": T}
         cameras[name] = _camera(document, name, PinholeCamera(f_px=f_px, centre_px=centre_px, **pose))
     unknown = torch.eye(3, dtype=torch.float64), torch.full((3,), torch.nan, dtype=torch.float64)
     R_all, T_all = zip(*(plate.get(row, unknown) for row in range(len(document.poses))), strict=True)
@@ -41,15 +41,15 @@ def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, Pl
 
 def guess_from_points(document: CalibrationDocument, name: str, x_lab_mm: Tensor, uv_px: Tensor) -> Camera:
     """Return a camera without distortion from lab points (n, 3), mm, and pixels (n, 2), by Tsai 1987 (CameraError)."""
-    found = calibrate_tsai(x_lab_mm, uv_px, document.image_size, document.pixel_pitch_mm)
+    found = calibrate_tsai(x_lab_mm, uv_px, document.keys.image_size, document.keys.pixel_pitch)
     same: dict[str, Any] = {name: getattr(found, name) for name in SAME}
-    return _camera(document, name, PinholeCamera(f_px=found.f_mm / document.pixel_pitch_mm[1], **same))
+    return _camera(document, name, PinholeCamera(f_px=found.f_mm / document.keys.pixel_pitch[1], **same))
 
 
 def _camera(document: CalibrationDocument, name: str, start: PinholeCamera) -> Camera:
     """Return a camera of the document's model, behind its port if it has one, from a pinhole camera in the liquid."""
-    port, (pitch_u, pitch_v) = document.ports.get(name), document.pixel_pitch_mm
-    if document.model == "pinhole" and pitch_u != pitch_v:
+    port, (pitch_u, pitch_v) = document.ports.get(name), document.keys.pixel_pitch
+    if document.keys.model == "pinhole" and pitch_u != pitch_v:
         got, do = f"pixel_pitch {pitch_u:g}, {pitch_v:g}", "choose model: tsai or brown"
         raise camera_error("model: pinhole", "square pixels", got, do)
     start = start if port is None else _in_air(start, port)
@@ -58,8 +58,8 @@ def _camera(document: CalibrationDocument, name: str, start: PinholeCamera) -> C
         "tsai": {"f_mm": start.f_px * pitch_v, "pixel_pitch_mm": (pitch_u, pitch_v), "sx": 1.0, "kappa1": 0.0},
         "brown": {"f_px": torch.stack([start.f_px * pitch_v / pitch_u, start.f_px]), "k": (0.0,) * 3, "p": (0.0, 0.0)},
     }
-    fields = models[document.model]
-    lens = MODELS[document.model](**fields, **{name: getattr(start, name) for name in SAME})
+    fields = models[document.keys.model]
+    lens = MODELS[document.keys.model](**fields, **{name: getattr(start, name) for name in SAME})
     return lens if port is None else PortCamera(camera=lens, port=port)
 
 
@@ -73,12 +73,12 @@ def _zhang(
         raise camera_error(name, f"{VIEWS_MIN} pictures or more with {POINTS_MIN} points of the plate", got, do)
     points = [seen[row].points_plate_mm.astype(np.float32) for row in rows]
     pixels = [seen[row].uv_px.astype(np.float32) for row in rows]
-    (width, height), (pitch_u, pitch_v) = document.image_size, document.pixel_pitch_mm
+    (width, height), (pitch_u, pitch_v) = document.keys.image_size, document.keys.pixel_pitch
     guess = np.array([[pitch_v / pitch_u * 3000.0, 0, width / 2], [0, 3000.0, height / 2], [0, 0, 1]])
     flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     flags |= cv2.CALIB_FIX_PRINCIPAL_POINT  # hardly improves the guess, and spoils it with a weak set of poses
     none: Any = None
-    _, K, _, turns, moves = cv2.calibrateCamera(points, pixels, document.image_size, guess, none, flags=flags)
+    _, K, _, turns, moves = cv2.calibrateCamera(points, pixels, document.keys.image_size, guess, none, flags=flags)
     turn, move = (torch.from_numpy(np.stack(parts)[..., 0]) for parts in (turns, moves))
     relative = {row: (so3.exp(turn[k]), move[k]) for k, row in enumerate(rows)}
     lens = torch.from_numpy(K)

@@ -112,7 +112,7 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
     assert document.plate is not None
     plate = document.plate
     # Read all files first, to report a faulty one before the long computation.
-    grey = [_read_grey(picture.path, document.image_size) for picture in document.pictures]
+    grey = [_read_grey(picture.path, document.keys.image_size) for picture in document.pictures]
     views = {}
     with ThreadPoolExecutor(2) as pool:
         seen = pool.map(lambda one, picture: see_plate(one, plate, picture.path.name), grey, document.pictures)
@@ -171,7 +171,7 @@ def _by_camera(document: CalibrationDocument, tied: Mapping[Picture, PlateView])
 
 
 def _problem(document: CalibrationDocument, rig: Rig, tied: Mapping[Picture, PlateView]) -> Problem:
-    of_port = {name: document.fit_ports if name in document.ports else () for name in rig.cameras}
+    of_port = {name: document.keys.fit_ports if name in document.ports else () for name in rig.cameras}
     return Problem(
         rig=rig,
         seen={name: gathered(seen) for name, seen in _by_camera(document, tied).items()},

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
-from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, triangulate
+from sphereorient.cameras import Camera, ParameterCovariance, R_cam_view, load_cameras, triangulate
 from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.errors import TrackError
@@ -195,13 +195,8 @@ class _Pair:
 
 
 def _R_lab_view(camera: Camera, uv_px: Tensor) -> Tensor:
-    """Return frames (N, 3, 3) at pixels: z along the line of sight, x along rows."""
-    step = torch.zeros_like(uv_px)
-    step[:, 0] = 1.0
-    z = camera.rays(uv_px).direction_lab
-    x = camera.rays(uv_px + step).direction_lab - camera.rays(uv_px - step).direction_lab
-    x = torch.nn.functional.normalize(x - (x * z).sum(-1, keepdim=True) * z, dim=-1)
-    return torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
+    """Return frames (N, 3, 3) at pixels: z along the line of sight."""
+    return camera.R_cam_lab.mT @ R_cam_view(camera.rays(uv_px).direction_lab @ camera.R_cam_lab.mT)
 
 
 def _with_spread(camera: Camera, known: ParameterCovariance, spread: Tensor) -> Camera:

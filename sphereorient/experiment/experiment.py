@@ -47,6 +47,11 @@ class Experiment:
         """Folder of experiment.yaml; its paths are relative to it."""
         return self.path.parent
 
+    @property
+    def radius_mm(self) -> float:
+        """Radius of the sphere; 1 if its diameter is unknown and lengths are in radii."""
+        return 1.0 if self.diameter_mm is None else self.diameter_mm / 2
+
 
 class SphereKeys(BaseModel, frozen=True, extra="forbid"):
     """The key `sphere`."""

@@ -47,11 +47,6 @@ class Recording:
         return torch.from_numpy(self.timeline.time_s)
 
     @property
-    def radius_mm(self) -> float:
-        """Radius of the sphere; 1 if lengths are in radii."""
-        return 1.0 if self.experiment.diameter_mm is None else self.experiment.diameter_mm / 2
-
-    @property
     def covariance(self) -> ParameterCovariance | None:
         """Parameter covariance of the cameras in use."""
         whole = self.experiment.camera_covariance

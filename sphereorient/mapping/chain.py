@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -86,10 +87,8 @@ def _chained_pairs(disks: Disks, settings: MapSettings) -> tuple[Tensor, Relativ
 
 def chained(R_next: Tensor) -> Tensor:
     """Return orientations (N, 3, 3) from rotations (N - 1, 3, 3) between neighbours, the first one the identity."""
-    R = [torch.eye(3, dtype=R_next.dtype)]
-    for turn in R_next:
-        R.append(turn @ R[-1])
-    return so3.nearest_rotation(torch.stack(R))
+    R = accumulate(R_next, lambda before, turn: turn @ before, initial=torch.eye(3, dtype=R_next.dtype))
+    return so3.nearest_rotation(torch.stack(list(R)))
 
 
 def close_loops(disks: Disks, R_lab_body: Tensor, pairs: RelativeRotations, settings: MapSettings) -> PairwiseAttitudes:

@@ -127,7 +127,7 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
         X = X.nanmedian(0).values.expand(len(X), 3).clone()
     elif len(views) > 1:
         gap = positions.gap_mm[torch.isfinite(positions.gap_mm)]
-        if len(gap) and float(gap.median()) > GAP_SHARE * recording.radius_mm:
+        if len(gap) and float(gap.median()) > GAP_SHARE * recording.experiment.radius_mm:
             got = f"lines of sight with a median distance of {float(gap.median()):.3g} mm"
             do = "check the cameras, or use one of them"
             raise PaintError(refusal("movies", expected="one ball in both movies", got=got, do=do))
@@ -137,7 +137,7 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
         crops=rows,
         position_lab_mm=X,
         seen=there & torch.isfinite(X).all(1)[:, None],
-        radius_mm=recording.radius_mm,
+        radius_mm=recording.experiment.radius_mm,
         fixed=experiment.fixed,
     )
 

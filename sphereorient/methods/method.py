@@ -78,7 +78,11 @@ class Learnt:
         widest = max(scene.diameter_px for scene in self.scenes.values())
         optics = Optics(base_table(recording.texture, widest), self.blur_px, widest)
         fitter = Fitter(
-            views=views, radius_mm=recording.radius_mm, optics=optics, light=self.light, widest_px=self.widest_px
+            views=views,
+            radius_mm=recording.experiment.radius_mm,
+            optics=optics,
+            light=self.light,
+            widest_px=self.widest_px,
         )
         return Appearance(fitter=fitter, **{name: getattr(self, name) for name in (*OF_SCORES, "together")})
 

@@ -29,7 +29,7 @@ def learn(job: Job, progress: Progress) -> Follower:
     seen_px = settings.refine.blur_px or estimate_blur_px(views, frames, settings.locate)
     blur_px = seen_px if defocus_radii(seen_px, search.diameter_px) else FIRST_BLUR_PX
     first = Initialiser(
-        fitter=first_fitter(views, recording.radius_mm, base, blur_px),
+        fitter=first_fitter(views, recording.experiment.radius_mm, base, blur_px),
         proposers=search.by_camera(views, blur_px),
         locating=settings.locate,
         candidates=settings.refine.candidates,

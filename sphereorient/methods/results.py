@@ -1,6 +1,6 @@
 """From the stages' results to the trajectory, one function for each method."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import chain, combinations
 from typing import Any
@@ -51,9 +51,7 @@ def paper_track(
     tracks: Mapping[str, CameraTrack],
 ) -> Trajectory:
     """Collect all results of the paper's method in a trajectory."""
-    empty = Trajectory.empty(
-        clock.numpy(), cameras=tuple(tracks), frame_rate=experiment.frame_rate_hz, experiment=experiment.name
-    )
+    empty = _empty(experiment, clock, tracks)
     oriented = torch.isfinite(fused.R_lab_body).all(-1).all(-1)
     variance = fused.sigma_rad.square()[:, None, None] * torch.eye(3, dtype=torch.float64)
     return replace(
@@ -104,9 +102,7 @@ def precise_track(
 ) -> Trajectory:
     """Collect all results of the precise method in a trajectory."""
     names = [view.name for view in learnt.fitter.views]
-    empty = Trajectory.empty(
-        clock.numpy(), cameras=tuple(names), frame_rate=experiment.frame_rate_hz, experiment=experiment.name
-    )
+    empty = _empty(experiment, clock, names)
     picked = table.rows(chosen.choice)
     covariance = picked["covariance"]
     margin, angle = _margin(table, chosen.choice)
@@ -138,16 +134,7 @@ def map_track(
 ) -> Trajectory:
     """Return the orientations of a learnt map as a trajectory, without errors; clock: times (N,), s, of its frames."""
     names = [view.name for view in learnt.views]
-    empty = Trajectory.empty(
-        clock.numpy(),
-        cameras=tuple(names),
-        frame_rate=experiment.frame_rate_hz,
-        method="map",
-        settings=settings,
-        experiment=experiment.name,
-        provenance=provenance,
-    )
-    radius_mm = 1.0 if experiment.diameter_mm is None else experiment.diameter_mm / 2
+    empty = _empty(experiment, clock, names, method="map", settings=settings, provenance=provenance)
     position, R = learnt.position_lab_mm, learnt.R_lab_body
     placed = torch.isfinite(position).all(1)  # photographs that share no paint with the others have a place only
     reasons = tuple(
@@ -161,7 +148,7 @@ def map_track(
         cameras[view.name] = replace(
             empty.cameras[view.name],
             centre_px=centre_px.numpy(),
-            radius_px=view.radius_px(position, radius_mm).numpy(),
+            radius_px=view.radius_px(position, experiment.radius_mm).numpy(),
             orientation=torch.where(used[:, None, None], R, torch.nan).numpy(),
             score=learnt.score[:, c].numpy(),
             reason=reasons,
@@ -177,6 +164,11 @@ def map_track(
         flags=flags.numpy().astype(np.uint32),
         cameras=cameras,
     )
+
+
+def _empty(experiment: Experiment, clock: Tensor, cameras: Iterable[str], **about: Any) -> Trajectory:
+    known = {"frame_rate": experiment.frame_rate_hz, "experiment": experiment.name} | about
+    return Trajectory.empty(clock.numpy(), cameras=tuple(cameras), **known)
 
 
 def _margin(table: PoseTable, choice: Tensor) -> tuple[Tensor, Tensor]:

@@ -86,17 +86,13 @@ def gaussian_derivative(
 def gaussian_kernel(
     sigma_frames: float, order: Order, truncate: float = TRUNCATE, like: Tensor | None = None
 ) -> Tensor:
-    """Return the weights (2 h + 1) of the frames k - h .. k + h in `gaussian_derivative` with dt_s = 1."""
+    """Return the weights (2 h + 1) of the frames k - h .. k + h in `gaussian_derivative` with dt_s = 1.
+    Their norm is the gain of white noise: for sigma above 1.5 frames, orders 0, 1, 2: 0.531 sigma^-0.5,
+    0.376 sigma^-1.5, 0.460 sigma^-2.5.
+    """
     like = torch.empty(0, dtype=torch.float64) if like is None else like
     gauss, step = _gaussian(sigma_frames, _half_width(sigma_frames, order, truncate), like)
     return _with_exact_moments(gauss, step, order)
-
-
-def noise_gain(sigma_frames: float, order: Order, truncate: float = TRUNCATE) -> float:
-    """Return the standard deviation of white noise of standard deviation 1 after `gaussian_derivative` with dt_s = 1.
-    For sigma above 1.5 frames, orders 0, 1, 2: 0.531 sigma^-0.5, 0.376 sigma^-1.5, 0.460 sigma^-2.5.
-    """
-    return float(gaussian_kernel(sigma_frames, order, truncate).norm())
 
 
 def gap_aware_stencil(

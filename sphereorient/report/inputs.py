@@ -5,13 +5,13 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from sphereorient.calibration import Calibrated, PictureReport
+from sphereorient.files.picture import decoded_grey
 from sphereorient.movies import Movie
 from sphereorient.movies.survey import Survey, SurveyedFrame
 from sphereorient.preflight import Finding, Preflight, Severity
@@ -96,8 +96,7 @@ def calibration_figure(result: Calibrated, path: Path) -> None:
 
 
 def _draw_picture(ax: Any, one: PictureReport) -> None:
-    data = np.fromfile(one.picture.path, np.uint8)
-    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    picture = decoded_grey(one.picture.path.read_bytes())
     if picture is not None:  # a table of points has no picture
         ax.imshow(picture, cmap="gray")
     else:

@@ -18,7 +18,7 @@ from sphereorient.experiment.timeline import NONE, timeline
 from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.files.yaml_file import refuse_unknown
 from sphereorient.movies import Grey
-from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of, radius_of
+from sphereorient.report.overlay_model import MARGIN, LightFit, Model, crop, fit_light, path_of
 from sphereorient.report.overlay_page import OverlayView, Page, crop_side
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Trajectory
@@ -92,7 +92,7 @@ def prepared(
     names = _names(track, cameras)
     texture = None if experiment.texture_path is None else load_texture(experiment.texture_path)
     numbers, streams = streams_of(track, experiment, names, opened)
-    where = path_of(track, radius_of(experiment))
+    where = path_of(track, experiment.radius_mm)
     models = [Model(camera=experiment.cameras[name], texture=texture, path=where) for name in names]
     views = [_view(track, model, streams[name]) for name, model in zip(names, models, strict=True)]
     return Page(track=track, numbers=numbers, views=views), streams

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera
 from sphereorient.errors import TextureError, refusal
-from sphereorient.experiment import Experiment
 from sphereorient.movies import Grey
 from sphereorient.preflight.cameras import expected_outline_px
 from sphereorient.sphere import see_sphere
@@ -50,11 +49,6 @@ def path_of(track: Trajectory, radius_mm: float) -> Path3D:
     orientation = np.where(no_orientation[:, None, None], track.orientation_smooth, track.orientation)
     smoothed = (no_position | no_orientation) & finite_rows(position) & finite_rows(orientation)
     return Path3D(position_mm=position, R_lab_body=orientation, smoothed=smoothed, radius_mm=radius_mm)
-
-
-def radius_of(experiment: Experiment) -> float:
-    """Return the radius of the sphere, mm; 1 if its diameter is unknown and lengths are in radii."""
-    return 1.0 if experiment.diameter_mm is None else experiment.diameter_mm / 2
 
 
 def outline_px(camera: Camera, path: Path3D, k: int) -> Floats:

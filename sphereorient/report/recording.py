@@ -18,7 +18,7 @@ from sphereorient.files.whole_file import check_ending
 from sphereorient.report.export import package
 from sphereorient.report.frame_warnings import frame_warnings
 from sphereorient.report.overlay import pictures_by_row, streams_of
-from sphereorient.report.overlay_model import Path3D, finite_rows, path_of, radius_of
+from sphereorient.report.overlay_model import Path3D, finite_rows, path_of
 from sphereorient.report.overlay_page import AXES, OUTLINE, TRAIL
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Trajectory, quaternions_wxyz
@@ -100,7 +100,7 @@ def _log(recording: Any, track: Trajectory, experiment: Experiment | None, every
     def when(rows: NDArray[np.int64]) -> list[Any]:
         return [rr.TimeColumn(TIME, duration=track.time[rows]), rr.TimeColumn(FRAME, sequence=rows)]
 
-    path = path_of(track, PLAIN_RADIUS_MM if experiment is None else radius_of(experiment))
+    path = path_of(track, PLAIN_RADIUS_MM if experiment is None else experiment.radius_mm)
     recording.log("lab", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if experiment is not None:
         there = path.position_mm[finite_rows(path.position_mm)]

@@ -62,8 +62,8 @@ def _panel(part: Any, kind: str, lines: Sequence[ResultSummary], methods: Sequen
     above.set(yscale="log", ylim=(LEAST_DEG, MOST_DEG), yticks=[0.01, 0.1, 1, 10, 100])
     above.set_yticklabels(["0.01", "0.1", "1", "10", "100"])
     below.set(ylim=(0, 100), yticks=[0, 50, 100], xticks=levels)
-    below.set_xticklabels(_values(kind, levels), fontsize=7)
-    below.set_xlabel(_unit(kind), fontsize=8)
+    below.set_xticklabels(level_labels(kind, levels), fontsize=7)
+    below.set_xlabel(unit_of(kind), fontsize=8)
     above.set_title(kind.replace("_", " "), fontsize=9, pad=3)
     if first:
         above.set_ylabel("error (degrees)", fontsize=8)
@@ -73,13 +73,15 @@ def _panel(part: Any, kind: str, lines: Sequence[ResultSummary], methods: Sequen
         axes.grid(alpha=0.3)
 
 
-def _values(kind: str, levels: Sequence[int]) -> list[str]:
+def level_labels(kind: str, levels: Sequence[int]) -> list[str]:
+    """Return the values of a degradation at some levels as text."""
     if kind == TOGETHER:
         return [str(level) for level in levels]
     return [f"{DEGRADATIONS[kind].values[level - 1]:g}" for level in levels]
 
 
-def _unit(kind: str) -> str:
+def unit_of(kind: str) -> str:
+    """Return the unit of a degradation's values."""
     return "severity of each" if kind == TOGETHER else DEGRADATIONS[kind].unit
 
 
@@ -92,22 +94,3 @@ def write_table(results: Results, path: Path) -> None:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-
-
-def markdown(results: Results) -> str:
-    """Return the table of docs/robustness.md: error and bad frames of each method by degradation and level."""
-    methods = results.methods
-    lines = {(line.kind, line.level, line.method): line for line in summaries(results)}
-    head = ["", "value", *(f"{m}: median, 95 % (degrees); wrong, lost (%)" for m in methods)]
-    text = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    for kind, level in dict.fromkeys((line.kind, line.level) for line in lines.values()):
-        value = "" if kind == CLEAN else f"{_values(kind, [level])[0]} {_unit(kind)}"
-        cells = [_cell(lines[kind, level, method]) for method in methods if (kind, level, method) in lines]
-        text.append(f"| {kind.replace('_', ' ')} | {value} | {' | '.join(cells)} |")
-    return "\n".join(text) + "\n"
-
-
-def _cell(line: ResultSummary) -> str:
-    if not math.isfinite(line.p50_deg):
-        return "refused" if line.refused else "nothing"
-    return f"{line.p50_deg:.3g}, {line.p95_deg:.3g}; {100 * line.wrong_after:.0f}, {100 * line.lost:.0f}"

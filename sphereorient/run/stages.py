@@ -185,7 +185,9 @@ def track_movies(
 def finished(track: Trajectory, job: Job, request: Request) -> Trajectory:
     """Add the systematic errors of the calibration, and the provenance, to a track."""
     recording, settings = job.recording, job.settings
-    track = results.with_systematic_errors(track, recording.cameras, recording.covariance, recording.radius_mm)
+    track = results.with_systematic_errors(
+        track, recording.cameras, recording.covariance, recording.experiment.radius_mm
+    )
     inputs = input_files(recording.experiment, list(recording.cameras))
     origin = provenance(inputs, recording.experiment.folder, request.command)
     origin["remarks"] = list(recording.remarks)

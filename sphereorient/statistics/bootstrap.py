@@ -40,10 +40,6 @@ class Interval:
         value, low, high = (np.asarray(x * factor + shift) for x in (self.value, self.low, self.high))
         return Interval(value=value, low=low, high=high, error=np.asarray(self.error * factor))
 
-    def holds(self, truth: Floats | float) -> NDArray[np.bool_]:
-        """Return which intervals contain the truth."""
-        return np.asarray((self.low <= truth) & (truth <= self.high))
-
 
 def segment_sums(values: Floats, segment: Rows, segments: int) -> Floats:
     """Return the sums (S, ...) over the rows (M, ...) of each segment; `segment` (M,) is increasing, 0 .. S - 1."""

@@ -24,11 +24,6 @@ class CameraDistance:
     uncorrected_rad: Floats | None  # (K',), the same without the correction of perspective, if given
     uncorrected_pdf: Floats | None  # (B,)
 
-    @property
-    def median_rad(self) -> float:
-        """Median distance, rad; NaN without frames."""
-        return float(np.median(self.distance_rad)) if len(self.distance_rad) else float("nan")
-
 
 def camera_distances(
     tracks: Trajectory | Sequence[Trajectory], uncorrected: Sequence[Mapping[str, Floats] | None] = (), bins: int = 60

@@ -38,11 +38,6 @@ class Isotropy:
     cross_correlation: Interval  # (3,), xy, xz, yz; 0 if isotropic
     p_value: float
 
-    @property
-    def isotropic(self) -> bool:
-        """Whether the test does not reject isotropy at 5 %."""
-        return self.p_value >= 0.05
-
 
 def isotropy(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Isotropy:
     """Test whether the covariance of a quantity (a name in UNITS) is the same in all directions of its frame.

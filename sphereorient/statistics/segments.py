@@ -15,7 +15,7 @@ from sphereorient.trajectory import Flag, Trajectory
 from sphereorient.trajectory.datasets import stored_fields
 
 UNITS = {name: spec.units for name, spec in stored_fields(Trajectory) if name in RATE_UNITS}  # of the six quantities
-COLUMNS = {"time_s": "time", "position_mm": "position_smooth", "R_lab_body": "orientation_smooth", "label": "segment"}
+COLUMNS = {"time_s": "time", "R_lab_body": "orientation_smooth", "label": "segment"}
 COLUMNS |= {name: name for quantity in UNITS for name in (quantity, f"{quantity}_sigma")}
 
 
@@ -29,7 +29,6 @@ class Ensemble:
     track: Rows  # (S,), number of the track of a segment
     span_s: Floats  # (S,), from a segment's first frame to its last, one step included
     step_s: float  # typical time between frames
-    position_mm: Floats  # (M, 3), smooth, lab
     R_lab_body: Floats  # (M, 3, 3), smooth
     values: Mapping[str, Floats]  # (M, 3) by name, UNITS
     sigmas: Mapping[str, Floats]  # (M, 3), standard deviations of the same; NaN where unknown
@@ -52,7 +51,7 @@ class Ensemble:
         """Return the ensemble of the segments marked in `kept` (S,); TrackError if fewer than two are left."""
         _refuse_few(int(kept.sum()), "the segments kept")
         rows = kept[self.segment]
-        parts = {name: getattr(self, name)[rows] for name in ("time_s", "frame", "position_mm", "R_lab_body")}
+        parts = {name: getattr(self, name)[rows] for name in ("time_s", "frame", "R_lab_body")}
         parts |= {name: {q: x[rows] for q, x in getattr(self, name).items()} for name in ("values", "sigmas")}
         segment = (np.cumsum(kept) - 1)[self.segment[rows]]
         return replace(self, **parts, segment=segment, track=self.track[kept], span_s=self.span_s[kept])
@@ -106,7 +105,6 @@ def ensemble_of(
         track=whole["track"][begin][kept],
         span_s=span_s[kept],
         step_s=step_s,
-        position_mm=whole["position_mm"][rows],
         R_lab_body=whole["R_lab_body"][rows],
         values={quantity: whole[quantity][rows] for quantity in UNITS},
         sigmas={quantity: whole[f"{quantity}_sigma"][rows] for quantity in UNITS},

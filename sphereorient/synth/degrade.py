@@ -79,11 +79,6 @@ def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torc
     return pictures
 
 
-def to_bytes(pictures: Tensor) -> Tensor:
-    """Round and clip grey levels to 8 bits."""
-    return pictures.round().clamp(0, WHITE_LEVEL).to(torch.uint8)
-
-
 def uneven_light(pictures: Tensor, ratio: float, disk: Disk, rng: torch.Generator) -> Tensor:
     """Dim the sphere across the disk, to 1 / ratio at one limb."""
     angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]

@@ -4,15 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from assemble_examples import noisy, turned_deg
 from torch import Tensor
 
-from sphereorient import so3
-from sphereorient.assemble import Chosen, Hypotheses
+from sphereorient import assemble, so3
+from sphereorient.assemble import Chosen, Hypotheses, PathSettings
 
 SIGMA = 1.0e-3  # rad per axis, of every candidate
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solved(Chosen):
+    """A history with its orientations (N, 3, 3), NaN where none is right."""
+
+    R_lab_body: Tensor
+
+
+def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings) -> Solved:
+    """The most probable history, and the orientations that it chooses."""
+    chosen = assemble.physical_path(hypotheses, time_s, settings)
+    there = chosen.present
+    R = torch.full((len(hypotheses), 3, 3), torch.nan, dtype=torch.float64)
+    R[there] = hypotheses.R_lab_body[there, chosen.choice[there]].double()
+    return Solved(**vars(chosen), R_lab_body=R)
 
 
 def pooled(*tracks: Tensor, nll: Sequence[float] | Tensor | None = None, mask: Tensor | None = None) -> Hypotheses:
@@ -46,7 +63,7 @@ def standing(frames: int) -> Tensor:
     return turned_deg(start, 0.0, 0.0, 120.0).expand(frames, 3, 3)
 
 
-def wrong_frames(path: Chosen, R: Tensor) -> list[int]:
+def wrong_frames(path: Solved, R: Tensor) -> list[int]:
     """Frames with an orientation more than 1 degree from the truth."""
     apart = so3.geodesic_distance(path.R_lab_body, R)
     return torch.nonzero(apart > math.radians(1.0)).flatten().tolist()

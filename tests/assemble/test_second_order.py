@@ -9,7 +9,16 @@ import pytest
 import torch
 from assemble_examples import RATE_HZ, candidates_of, times, turned_deg, turning
 from conftest import assert_close
-from second_order_examples import SIGMA, flagged, lost_frames, pooled, seen, standing, without, wrong_frames
+from second_order_examples import (
+    flagged,
+    lost_frames,
+    physical_path,
+    pooled,
+    seen,
+    standing,
+    without,
+    wrong_frames,
+)
 
 from sphereorient import so3
 from sphereorient.assemble import (
@@ -19,7 +28,6 @@ from sphereorient.assemble import (
     PathSettings,
     assemble_path,
     beam,
-    physical_path,
 )
 from sphereorient.errors import ShapeError
 from sphereorient.trajectory import Flag
@@ -230,7 +238,6 @@ def test_single_candidates_are_left_as_they_are(deg_per_frame, rng):
     assert (path.probability > 0.99).all()
     assert path.segment.tolist() == [0] * 200
     assert not path.flags.any()
-    assert_close(path.covariance_rad2, SIGMA**2 * torch.eye(3, dtype=torch.float64).expand(200, 3, 3))
 
 
 def crowded(rng: torch.Generator, frames: int = 60) -> tuple[Hypotheses, torch.Tensor]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.calibration import DotPlate, PlateView, disk_centre_shift
 from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
-from sphereorient.calibration.document import CalibrationDocument
+from sphereorient.calibration.document import CalibrationDocument, CalibrationKeys
 from sphereorient.calibration.guess import guess_rig
 from sphereorient.cameras import Camera, PinholeCamera, Port, PortCamera, TsaiCamera
 from sphereorient.cameras.brown import BrownCamera
@@ -113,16 +113,14 @@ def document(
     """What a calibration.yaml would say of the rig."""
     return CalibrationDocument(
         path=Path("calibration.yaml"),
-        image_size=SIZE,
-        pixel_pitch_mm=pitch,
-        model=model,
+        keys=CalibrationKeys(image_size=SIZE, pixel_pitch=pitch, model=model),
         plate=PLATE,
         poses=tuple(range(len(rig.R_lab_plate))),
         surveyed={0: (rig.R_lab_plate[0], rig.T_lab_plate_mm[0])},
         pictures=(),
         points={},
+        cameras=tuple(rig.cameras),
         ports=ports or {},
-        fit_ports=(),
     )
 
 

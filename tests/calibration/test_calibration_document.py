@@ -28,7 +28,7 @@ def test_a_calibration_file_is_read_with_poses_as_rows(tmp_path):
         ("cam1", 0, tmp_path / "a.png"),
     }
     assert list(read.surveyed) == [1]
-    assert read.model == "tsai"
+    assert read.keys.model == "tsai"
 
 
 def test_a_rotation_with_few_digits_is_made_one(tmp_path):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sphereorient.statistics.bootstrap import Interval
 from sphereorient.statistics.segments import UNITS, Ensemble
 from sphereorient.trajectory import Trajectory
 
@@ -27,7 +28,6 @@ def ensemble(frames: list[int], *, error: str = "added", sigma: float = 0.0, **v
         track=np.zeros(len(frames), dtype=np.int64),
         span_s=np.array(frames) * STEP_S,
         step_s=STEP_S,
-        position_mm=np.zeros((count, 3)),
         R_lab_body=Rotation.random(count, rng).as_matrix(),
         values=everything,
         sigmas={name: np.full((count, 3), sigma) for name in UNITS},
@@ -35,11 +35,16 @@ def ensemble(frames: list[int], *, error: str = "added", sigma: float = 0.0, **v
     )
 
 
+def holds(interval: Interval, truth: float | np.ndarray) -> np.ndarray:
+    """Which intervals contain the truth."""
+    return np.asarray((interval.low <= truth) & (truth <= interval.high))
+
+
 def without(whole: Ensemble, kept: np.ndarray) -> Ensemble:
     """The same with some samples lost."""
     return replace(
         whole,
-        **{name: getattr(whole, name)[kept] for name in ("time_s", "frame", "segment", "position_mm", "R_lab_body")},
+        **{name: getattr(whole, name)[kept] for name in ("time_s", "frame", "segment", "R_lab_body")},
         values={name: x[kept] for name, x in whole.values.items()},
         sigmas={name: x[kept] for name, x in whole.sigmas.items()},
     )

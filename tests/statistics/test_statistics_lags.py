@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from statistics_examples import STEP_S, ensemble, without
+from statistics_examples import STEP_S, ensemble, holds, without
 
 from sphereorient.statistics.lags import Pairs, correlation, increment_density, increments, integral_time
 from sphereorient.statistics.settings import BootstrapSettings
@@ -44,7 +44,7 @@ def test_autocorrelation_and_integral_time_of_a_forgetful_process():
     found = correlation(ensemble([150] * 600, velocity=x), "velocity", 100 * STEP_S, FEW)
     exact = np.exp(-found.lag_s / STEP_S / TAU)
     assert np.abs((found.value.value - exact[:, None]) / np.maximum(found.value.error, 1e-12))[1:].mean() < 1.5
-    assert found.integral_time_s.holds(TAU * STEP_S).sum() >= 3
+    assert holds(found.integral_time_s, TAU * STEP_S).sum() >= 3
     # the curve of a sample crosses zero at some 3 TAU, beyond which 4 % of the integral lie
     assert found.integral_time_s.value[3] == pytest.approx(TAU * STEP_S, rel=0.06)
 

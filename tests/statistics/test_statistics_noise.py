@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sphereorient.errors import TrackError
-from sphereorient.motion import gaussian_derivative, noise_gain
+from sphereorient.motion import gaussian_derivative, gaussian_kernel
 from sphereorient.statistics.noise import multi_lag, width_curve
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
@@ -72,7 +72,7 @@ def test_foretold_noise_is_what_a_standing_sphere_shows(track):
     still = replace(track, position=NOISE_MM * rng.standard_normal(track.position.shape))
     found = width_curve(still, "acceleration", settings=FEW)
     np.testing.assert_allclose(found.noise_share.value[:5], 1.0, atol=0.05)
-    by_hand = 1e-3 * NOISE_MM * noise_gain(2.0, 2) * 600.0**2
+    by_hand = 1e-3 * NOISE_MM * float(gaussian_kernel(2.0, 2).norm()) * 600.0**2
     np.testing.assert_allclose(found.rms.value[2], by_hand, rtol=0.03)
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from statistics_examples import STEP_S, track
+from statistics_examples import STEP_S, holds, track
 
 from sphereorient.errors import TrackError
 from sphereorient.statistics.segments import durations, ensemble_of
@@ -125,7 +125,7 @@ def test_decay_time_of_truncated_durations_and_its_interval():
     held, means = 0, []
     for _ in range(500):
         found = durations(0.08 + rng.exponential(0.15, 40), 0.08)
-        held += bool(found.decay_time_s.holds(0.15))
+        held += bool(holds(found.decay_time_s, 0.15))
         means.append(float(found.decay_time_s.value))
     assert 0.92 <= held / 500 <= 0.98
     assert np.mean(means) == pytest.approx(0.15, rel=0.02)
