@@ -2,8 +2,8 @@
 
     scripts/mutants.py [--only TEXT] [--jobs 2] [--list]
 
-Each mutant of scripts/mutants.yaml is applied in a temporary copy of the package. The tests of its room run first, the
-most likely file before the others, then tests/end_to_end; the first failure ends it. Results are kept in
+Each mutant of scripts/mutants.yaml is applied in a temporary copy of the package. The quick tests of its room run first, the
+most likely file before the others, then its slow ones, then tests/end_to_end; the first failure ends it. Results are kept in
 out/mutants.json, and a second call continues there unless package or tests changed. Exits 1 if a mutant survives, or if
 its text is not found.
 """
@@ -29,7 +29,8 @@ import yaml
 REPO = Path(__file__).resolve().parents[1]
 RESULTS = REPO / "out" / "mutants.json"
 LONGEST_S = 1200  # of one call of pytest; a mutant that takes longer hangs, and counts as killed
-FAILED, INTERRUPTED, PASSED = 1, 2, 0  # exit codes of pytest; a module that cannot be imported interrupts it
+# Exit codes of pytest; a module that cannot be imported interrupts it.
+FAILED, INTERRUPTED, PASSED, NO_TESTS = 1, 2, 0, 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,13 +49,14 @@ class Mutant:
         every = sorted(room.rglob("*.py")) or [room.with_suffix(".py")]
         return [path.relative_to(REPO) for path in every if self.old in path.read_text()]
 
-    def calls(self) -> list[list[Path]]:
-        """Return the test files of each call of pytest, in order; the unchanged package runs its room's only."""
+    def calls(self) -> list[tuple[str, list[Path]]]:
+        """Return mark and test files of each call of pytest, in order; the unchanged package runs quick ones only."""
         every = sorted((REPO / "tests" / self.room).rglob("test_*.py"))
         likely = [path for path in every if path.match(self.first)]
         rest = [path for path in every if path not in likely]
         end_to_end = sorted((REPO / "tests" / "end_to_end").glob("test_*.py"))
-        return [call for call in (likely, rest, [] if self.old == self.new else end_to_end) if call]
+        calls = [("not slow", likely), ("not slow", rest), ("slow", every), ("not slow", end_to_end)]
+        return [(mark, files) for mark, files in (calls[:2] if self.old == self.new else calls) if files]
 
     def run(self) -> str:
         """Return killed, survived or broken, with what killed it or why it is broken."""
@@ -65,20 +67,20 @@ class Mutant:
             for file in self.files():
                 mutated = Path(folder) / file
                 mutated.write_text(mutated.read_text().replace(self.old, self.new))
-            for tests in self.calls():
-                code, last = _pytest(tests, folder)
+            for mark, tests in self.calls():
+                code, last = _pytest(mark, tests, folder)
                 if code in (FAILED, INTERRUPTED):
                     return f"killed: {last}"
-                if code != PASSED:
+                if code not in (PASSED, NO_TESTS):
                     return f"broken: pytest ended with {code}, {last}"
         return "survived"
 
 
-def _pytest(tests: Sequence[Path], package: str) -> tuple[int, str]:
+def _pytest(mark: str, tests: Sequence[Path], package: str) -> tuple[int, str]:
     """Run test files against another copy of the package until one fails; return the exit code and the last word."""
     # PYTHONSAFEPATH: the working directory, with the package as it is, must not come first.
     environment = {**os.environ, "PYTHONPATH": package, "PYTHONSAFEPATH": "1", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-m", "not slow", "--tb=no"]
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-m", mark, "--tb=no"]
     try:
         run = subprocess.run(
             [*command, *map(str, tests)], cwd=REPO, env=environment, capture_output=True, text=True, timeout=LONGEST_S

@@ -85,6 +85,7 @@ def test_frames_with_one_wrong_candidate_are_skipped(deg_per_frame, rng):
     assert torch.equal(path.present, ~junk)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deg_per_frame", [3.7, 22.0, 45.0])
 def test_thirty_per_cent_of_the_frames_may_be_missing(deg_per_frame, rng):
     R = turning(300, deg_per_frame)

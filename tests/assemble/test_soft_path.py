@@ -75,6 +75,7 @@ def gradients_agree(temperature: float, seed: int) -> None:
     assert torch.autograd.gradcheck(lambda *x: path(*x).pair_marginals, inputs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temperature", [0.5, 1.0, 4.0])
 def test_first_and_second_derivatives_agree_with_differences(temperature):
     gradients_agree(temperature, seed=1)

@@ -114,6 +114,7 @@ def test_marginals_are_the_gradient_of_the_free_energy():
     assert_close(of_pair, soft.pair_marginals.detach())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temperature", [0.5, 1.0, 4.0])
 def test_first_and_second_derivatives_agree_with_differences(temperature):
     costs = random_costs((2, 5), 2, 3, order=2)

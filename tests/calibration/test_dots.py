@@ -85,6 +85,7 @@ def test_bright_dots_on_a_dark_plate_are_found_as_well() -> None:
     assert rms(miss) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_mm", [(45.0, 0.0), (-50.0, 30.0), (10.0, -47.3), (38.2, 44.9)])
 def test_dots_cut_by_the_edge_of_the_picture_are_left_out_and_whole_ones_kept(at_mm: tuple[float, float]) -> None:
     scene = Scene(at_mm=at_mm, tilt_deg=25, about_deg=10, spin_deg=4, distance_mm=200)
@@ -107,6 +108,7 @@ def test_a_dot_that_touches_the_edge_is_measured_as_well_as_others() -> None:
     assert max(worst) < 0.05
 
 
+@pytest.mark.slow
 def test_eight_and_sixteen_bits_and_fractions_give_the_same_dots() -> None:
     picture = Scene().picture()
     eight = find_dots(picture)
@@ -114,6 +116,7 @@ def test_eight_and_sixteen_bits_and_fractions_give_the_same_dots() -> None:
         assert_close(torch.from_numpy(find_dots(other).uv_px), torch.from_numpy(eight.uv_px), atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_picture_shifted_by_whole_pixels_shifts_the_dots() -> None:
     picture = Scene().picture()
     moved = find_dots(np.roll(picture, (3, 5), axis=(0, 1)))
@@ -149,6 +152,7 @@ def test_squares_bars_and_half_disks_are_no_dots() -> None:
     assert len(find_dots(picture, settings=DotSettings(worst_misfit=0.08))) == 0
 
 
+@pytest.mark.slow
 def test_axes_follow_the_foreshortening() -> None:
     scene = Scene(tilt_deg=60, about_deg=0, distance_mm=400, f_px=2000)
     dots = find_dots(scene.picture(noise=1.0))

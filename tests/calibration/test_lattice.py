@@ -71,6 +71,7 @@ def test_every_pose_that_shows_the_fiducials_is_told_right(
         assert_told_right(view, scene, 12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spin_deg", [slow(0), slow(90), slow(180), slow(270), 37])
 def test_pictures_are_told_right_at_sixty_degrees_and_partial_view(spin_deg: float) -> None:
     scene = Scene(tilt_deg=60, about_deg=70, spin_deg=spin_deg, at_mm=(16.0, 10.0), distance_mm=190)
@@ -119,6 +120,7 @@ def test_stray_dots_between_the_rows_are_left_out() -> None:
     assert_told_right(index_dots(Dots(**parts), PLATE), scene, 95)
 
 
+@pytest.mark.slow
 def test_a_plate_without_its_fiducials_in_view_floats_and_the_true_place_is_among_the_placements() -> None:
     scene = Scene(at_mm=(75.0, 0.0), spin_deg=180, distance_mm=200)
     view = see_plate(scene.picture(), PLATE, "cam1_07.png")
@@ -144,6 +146,7 @@ def test_fiducials_hidden_on_a_whole_plate_are_where_dots_are_missing_and_replac
     assert "larger dots at the grid indices" in small.reason
 
 
+@pytest.mark.slow
 def test_a_mirrored_plate_is_refused() -> None:
     scene = Scene(tilt_deg=35, about_deg=40, spin_deg=20)
     view = see_plate(scene.picture()[:, ::-1].copy(), PLATE, "cam2_03.png")
@@ -154,6 +157,7 @@ def test_a_mirrored_plate_is_refused() -> None:
     assert "\n" not in view.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("columns", "rows"), [(9, 9), (11, 7), (7, 7)])
 def test_a_plate_with_more_dots_than_stated_is_refused(columns: int, rows: int) -> None:
     view = see_plate(Scene(tilt_deg=30).picture(), replace(PLATE, columns=columns, rows=rows))
@@ -174,6 +178,7 @@ def test_dots_that_stick_out_on_one_side_are_refused_although_their_number_fits(
     assert see_plate(scene.picture(), PLATE).state == "refused"
 
 
+@pytest.mark.slow
 def test_dots_of_another_width_than_stated_are_refused() -> None:
     view = see_plate(Scene().picture(), replace(PLATE, dot_diameter_mm=1.6, fiducial_diameter_mm=2.0))
     assert view.state == "refused"

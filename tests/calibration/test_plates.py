@@ -68,6 +68,7 @@ def test_errors_of_the_cameras_are_those_that_the_sigmas_promise(result):
         assert abs(float((camera.centre_px - true.centre_px)[0])) < 4 * sigma["centre_u"]
 
 
+@pytest.mark.slow
 def test_table_and_figure_show_all_of_it(result, tmp_path):
     console = Console(record=True, width=140, file=io.StringIO())
     console.print(pictures_table(result))
@@ -157,6 +158,7 @@ def refused(path, words):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_no_dots_found_is_said_with_the_first_reason(tmp_path):
     path = write(tmp_path)
     for name in pictures():
@@ -209,6 +211,7 @@ def test_poses_too_alike_are_refused_and_the_loose_parameter_is_named(tmp_path):
     refused(path, r"expected poses that determine all parameters.*got loose: .*cam[12]\.\w+ \(sigma .*add pictures")
 
 
+@pytest.mark.slow
 def test_two_pictures_are_too_few(tmp_path):
     path = write(tmp_path, {"pictures": document()["pictures"][:2]})
     refused(path, r"3 pictures or more")

@@ -87,6 +87,7 @@ def test_it_does_not_matter_where_the_labs_origin_appears(place, T_mm):
     assert_same_camera(tsai_stages(points, moved.project(points), SIZE, PITCH), moved, tolerance=1e-7)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(
     rotvec=st.tuples(*[st.floats(-1.8, 1.8)] * 3),
@@ -219,6 +220,7 @@ def test_the_fit_to_points_works_for_a_camera_behind_a_port():
 # Bad input: one clear line each.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt_rad", [0.0, 1e-6, 0.005])
 @pytest.mark.parametrize("sigma_px", [0.0, 0.05])
 def test_a_plane_parallel_to_the_sensor_is_refused(tilt_rad, sigma_px):

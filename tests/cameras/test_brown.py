@@ -44,6 +44,7 @@ def test_pixels_are_undistorted_as_opencv_does_it():
     assert_close(brown().undistort(uv_px), torch.from_numpy(back[:, 0]), atol=0.1)
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(
     k=st.tuples(st.floats(-0.4, 0.6), st.floats(-0.3, 0.3), st.floats(-0.2, 0.2)),

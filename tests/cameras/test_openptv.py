@@ -95,6 +95,7 @@ def test_the_sensor_shift_moves_the_axis_and_not_the_distortion():
     assert_close(shifted.undistort(f64((324.5, 239.5))), f64((324.5, 239.5)))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     k=st.tuples(st.floats(-8e-4, 1e-3), st.floats(-1e-6, 1e-6), st.floats(-1e-9, 1e-9)),

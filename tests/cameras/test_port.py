@@ -96,6 +96,7 @@ def test_pixels_agree_with_a_bisection_on_the_wall():
         assert_close(seen, f64((200 + 60 * slope, 200 + 80 * slope)), atol=1e-8)
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(
     model=st.sampled_from(sorted(MODELS)),

@@ -152,6 +152,7 @@ def test_gradients_to_camera_and_texel_are_those_of_the_whole_chain_run_again(sc
         assert_close(got[:, k] / slope, torch.ones(2, dtype=torch.float64), 1e-4)
 
 
+@pytest.mark.slow
 def test_the_chain_is_what_it_should_be(scene):
     with torch.no_grad():
         track, picture = chain(scene, f64([0.0, 0.0, 0.0]))

@@ -156,6 +156,7 @@ def test_settings_choose_who_proposes(texture: torch.Tensor) -> None:
     assert isinstance(paper_proposer(texture, 60, both), FallbackProposer)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [None, b"nothing of the kind"])
 def test_a_checkpoint_that_is_none_is_one_line(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "other.ckpt"

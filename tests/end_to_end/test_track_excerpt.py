@@ -230,6 +230,7 @@ def _replace(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -282,6 +283,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work():
     assert len(run.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_one_line_and_no_file(tmp_path):
     out = tmp_path / "track.h5"
     command = [sys.executable, "-m", "sphereorient.cli", "track", EXCERPT / "experiment.yaml", "--out", out, "--quiet"]

@@ -24,6 +24,7 @@ def answer(*arguments: str | Path) -> str:
     return lines[0]
 
 
+@pytest.mark.slow
 def test_a_pipe_in_place_of_an_experiment_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "experiment.yaml")
     line = answer("track", tmp_path / "experiment.yaml", "--out", tmp_path / "track.h5")

@@ -185,6 +185,7 @@ def test_the_committed_settings_are_the_defaults():
     assert load_proposer_settings(REPO / "configs" / "train_proposer.yaml") == ProposerSettings()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["settings"], ["evaluate", "none.ckpt"]])
 def test_only_training_waits_for_lightning(arguments):
     code = (

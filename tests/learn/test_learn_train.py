@@ -70,6 +70,7 @@ def test_the_checkpoint_is_the_best_of_the_validations_and_says_what_it_is(train
     assert loaded.about["steps"] == 100
 
 
+@pytest.mark.slow
 def test_the_log_has_a_row_an_epoch(trained):
     result, folder = trained
     rows = rows_of(folder)

@@ -106,6 +106,7 @@ def test_two_different_balls_are_refused():
     assert "one ball in both movies" in refused(both)
 
 
+@pytest.mark.slow
 def test_two_cameras_seen_through_mirrors_contradict_each_other():
     assert "one ball in both movies" in refused(pictures(turning(16, 8.0, (0.4, 0.7, -0.5)), 2).flip(-1))
 

@@ -87,6 +87,7 @@ def errors(truth: Motion6D, result: Smoothed) -> dict[str, tuple[Tensor, Tensor]
 # oracle: planted truth
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize(
     ("noise_deg", "limits"), [(0.036, (0.009, 0.085, 0.033)), slow(0.025, (0.007, 0.068, 0.024))], ids=str
@@ -133,6 +134,7 @@ def test_every_sigma_is_honest_whatever_the_turn_between_frames(omega_rms: float
     assert not result.rejected.any()
 
 
+@pytest.mark.slow
 def test_a_factor_on_the_sigmas_is_learnt(rng: torch.Generator) -> None:
     truth = planted()
     result = smoothed(truth, *measured(truth, rng, factor=1.4))
@@ -158,6 +160,7 @@ def test_slow_errors_are_covered_by_the_share_that_is_set_aside_for_them(rng: to
 # gaps, ends, uneven times
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("omega_rms", "lost"), [slow(10.5, (60, 80)), slow(22.0, (60, 72)), (292.0, (60, 72))], ids=str
 )
@@ -177,6 +180,7 @@ def test_a_gap_is_bridged_with_sigmas_that_say_how_well(
     assert rel_rms(result.omega_lab_rad_s, truth.omega_lab_rad_s) < 0.03
 
 
+@pytest.mark.slow
 def test_both_ends_have_values_and_their_own_larger_sigma(rng: torch.Generator) -> None:
     truth = planted()
     result = smoothed(truth, *measured(truth, rng))
@@ -186,6 +190,7 @@ def test_both_ends_have_values_and_their_own_larger_sigma(rng: torch.Generator) 
             assert ((error / sigma)[end].abs() < 4).all()
 
 
+@pytest.mark.slow
 def test_a_third_of_the_frames_may_be_missing_even_at_45_degrees_a_frame(rng: torch.Generator) -> None:
     truth = planted(292.0)
     position, R = measured(truth, rng)
@@ -222,6 +227,7 @@ def test_times_may_be_uneven_and_jump(rng: torch.Generator) -> None:
 # wrong frames
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("omega_rms", [10.5, 292.0], ids=["2 deg", "45 deg a frame"])
 @pytest.mark.parametrize("wrong", [slow([70]), [0, 3, 90, 91, 199], slow([50, 51, 52])], ids=str)
 def test_wrong_frames_bend_nothing(omega_rms: float, wrong: list[int], rng: torch.Generator) -> None:
@@ -238,6 +244,7 @@ def test_wrong_frames_bend_nothing(omega_rms: float, wrong: list[int], rng: torc
     assert ((truth.position_lab_mm - result.position_lab_mm).norm(dim=-1) < 0.1).all()
 
 
+@pytest.mark.slow
 def test_a_frame_that_is_off_by_ten_sigmas_is_found_and_one_by_two_is_kept(rng: torch.Generator) -> None:
     truth = planted()
     position, R = measured(truth, rng)
@@ -249,6 +256,7 @@ def test_a_frame_that_is_off_by_ten_sigmas_is_found_and_one_by_two_is_kept(rng: 
 # convention and laws
 
 
+@pytest.mark.slow
 def test_constant_velocity_and_spin_come_out_exactly() -> None:
     t = clock(60)
     velocity = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
@@ -291,6 +299,7 @@ def test_time_backwards_turns_rates_around(rng: torch.Generator) -> None:
     assert_close(other.acceleration_m_s2.flip(0), one.acceleration_m_s2, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_segments_know_nothing_of_each_other(rng: torch.Generator) -> None:
     truth = planted()
     position, R = measured(truth, rng)
@@ -352,6 +361,7 @@ def test_too_few_frames_to_learn_from_come_back_as_they_are(frames: int, rng: to
     assert result.position_scale == result.orientation_scale == 1.0
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bytes_and_is_left_alone(rng: torch.Generator) -> None:
     truth = planted(time_s=clock(60))
     position, R = measured(truth, rng)
@@ -380,6 +390,7 @@ def test_every_setting_is_described() -> None:
     assert all(entry.description for entry in SmoothSettings.model_fields.values())
 
 
+@pytest.mark.slow
 def test_a_slow_share_adds_its_part_of_the_measured_variance_to_the_covariances_of_the_poses():
     # Of a variance c^2 s^2 the smoother estimates the fast part f; the slow one is f share / (1 - share).
     truth, share = planted(), 0.25

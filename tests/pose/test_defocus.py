@@ -58,6 +58,7 @@ def share_found(search: TemplateBank, disks: torch.Tensor, R: torch.Tensor) -> f
     return float((away < np.deg2rad(15)).sum()) / len(R)
 
 
+@pytest.mark.slow
 def test_templates_as_soft_as_the_pictures_find_what_sharp_ones_miss():
     R = attitudes(24)
     disks = blurred_disks(R)

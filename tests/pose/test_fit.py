@@ -448,6 +448,7 @@ def test_score_and_likelihood_tell_wrong_poses():
     assert (nll[-1] - nll[0]).min() > 1000
 
 
+@pytest.mark.slow
 def test_the_likelihood_falls_off_as_the_covariance_says():
     # Three standard deviations from the best pose the negative logarithm is 4.5 higher; noise moves its minimum.
     fit = from_truth()
@@ -463,6 +464,7 @@ def test_the_likelihood_falls_off_as_the_covariance_says():
     assert ((mean > 2.5) & (mean < 7)).all()
 
 
+@pytest.mark.slow
 def test_a_map_in_a_mirror_scores_worse():
     mirrored = texture_table(paint_of("patches").flip(1), 2 * BLUR_PX / DIAMETER_PX)
     fit = fitted(rig(), "patches", disks(), *truth(), SIGMA, paint=mirrored)
@@ -519,6 +521,7 @@ def test_a_fit_is_float64_with_rotations_that_are_rotations_and_covariances_that
 # --- honest errors: many noisy renders
 
 
+@pytest.mark.slow
 def test_errors_that_neighbours_share_widen_the_covariance():
     # The same scatter in every pixel, but in clouds of two pixels: there is far less to learn from them.
     X, R = truth()

@@ -40,6 +40,7 @@ def test_a_saturated_movie_is_told(clean, tmp_path, gain):
     assert all("expose shorter" in one.advice for one in told)
 
 
+@pytest.mark.slow
 def test_a_movie_wholly_white_is_a_fault_and_no_crash(clean, tmp_path):
     result = checked(clean.spoilt(lambda movie: np.clip(movie * 100.0, 0, 255), ("cam1",)), tmp_path)
     assert result.severity is FAULT
@@ -92,6 +93,7 @@ def test_a_ball_of_unknown_size_is_measured_and_the_setting_named(clean, tmp_pat
     assert told.severity is OK
 
 
+@pytest.mark.slow
 def test_a_fixed_ball_is_better_off_with_pictures_without_it(clean, tmp_path):
     sphere = {"diameter": 18.0, "fixed": True}
     still = clean.spoilt(lambda movie: np.repeat(movie[:1], 12, axis=0))

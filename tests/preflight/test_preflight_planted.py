@@ -73,6 +73,7 @@ def turned(folder: Path, name: str, deg: float) -> None:
     (folder / "cameras.yaml").write_text(yaml.safe_dump(document))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deg", [0.25, pytest.param(1.0, marks=pytest.mark.slow)])  # 7 and 28 px
 def test_a_bumped_camera_is_not_taken_for_a_late_movie(clean, tmp_path, deg):
     path = write(clean, tmp_path)

@@ -95,6 +95,7 @@ def test_the_angle_is_that_between_the_two_views(pair):
     assert pair.angle_rad > math.radians(20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [2, slow(3), slow(5)])
 def test_a_paint_that_repeats_itself_around_its_axis_is_a_fault(good, times):
     """Twice around is alike after half a turn, three times after a third; and so on."""
@@ -111,6 +112,7 @@ def _repeated(map_: torch.Tensor, times: int) -> torch.Tensor:
     return map_[:, source]
 
 
+@pytest.mark.slow
 def test_a_paint_in_bands_looks_alike_however_it_spins():
     bands = (torch.sin(5 * map_directions(256)[..., 2]) > 0).float()
     assert look_alikes(most_similar_views(bands, GreySearchSettings())).severity is FAULT

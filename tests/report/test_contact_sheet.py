@@ -55,6 +55,7 @@ def test_frames_are_upright_with_numbers_times_and_faults(path, kept):
     assert {ax.images[0].get_clim() for ax in shown} == {(60.0, 250.0)}  # one scale, set by the good frames
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 24, 40])
 def test_the_sheet_is_a_picture_of_sensible_size(path, count):
     movie = open_movie(path)

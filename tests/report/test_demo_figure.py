@@ -101,6 +101,7 @@ def test_without_a_truth_the_last_panel_shows_the_cameras(experiment, tmp_path, 
     assert ("error" in label) == scored
 
 
+@pytest.mark.slow
 def test_the_rerendered_sphere_looks_like_the_filmed_one(experiment, tmp_path, kept):
     """True orientations must give the filmed paint, in the same place and neither mirrored nor turned."""
     demo_figure(true_track(experiment, ("cam1", "cam2")), experiment, tmp_path / "figure.png")
@@ -137,6 +138,7 @@ def likeness(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a[inside], b[inside])[0, 1])
 
 
+@pytest.mark.slow
 def test_a_part_of_the_frames_shows_these_frames(experiment, tmp_path, kept):
     """The clock does not restart: frame 12 of the movie belongs to the first row of such a track."""
     whole, part = true_track(experiment, ("cam1",)), true_track(experiment, ("cam1",), 12, 30)
@@ -183,6 +185,7 @@ def blind(track: Trajectory, name: str, frames: slice = slice(None)) -> Trajecto
     return replace(track, cameras=dict(track.cameras) | {name: replace(seen, **lost)})
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_frames_that_one_camera_lost_are_drawn(experiment, tmp_path, drawn):
     track = blind(true_track(experiment, ("cam1", "cam2")), "cam2", slice(0, 20))
@@ -192,6 +195,7 @@ def test_frames_that_one_camera_lost_are_drawn(experiment, tmp_path, drawn):
     assert len(lost.lines) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("scored", [True, False])
 def test_a_track_without_a_single_valid_frame_is_drawn(experiment, tmp_path, drawn, scored):
@@ -200,6 +204,7 @@ def test_a_track_without_a_single_valid_frame_is_drawn(experiment, tmp_path, dra
     assert len(drawn) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_positions_without_orientations_are_drawn(experiment, tmp_path, drawn):
     track = replace(true_track(experiment, ("cam1",)), orientation=np.full((40, 3, 3), np.nan))
@@ -208,6 +213,7 @@ def test_positions_without_orientations_are_drawn(experiment, tmp_path, drawn):
     assert len(filmed.lines) == 1  # the outline without axes
 
 
+@pytest.mark.slow
 def test_a_pdf_can_be_written(experiment, tmp_path):
     demo_figure(true_track(experiment, ("cam1",), 0, 4), experiment, tmp_path / "figure.pdf")
     assert (tmp_path / "figure.pdf").read_bytes().startswith(b"%PDF")

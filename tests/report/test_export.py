@@ -119,6 +119,7 @@ def test_matlab_gets_matrices_quaternions_structs_and_metadata(track, tmp_path):
     assert about["units"]["alpha_lab_rad_s2"] == "rad/s^2"
 
 
+@pytest.mark.slow
 def test_xarray_names_axes_and_units(track):
     pytest.importorskip("xarray")
     data = to_xarray(track)

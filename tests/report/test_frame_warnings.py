@@ -97,6 +97,7 @@ def test_one_camera_only_is_no_trouble_where_there_is_no_other():
     assert all("not in doubt" in words for words in said(choose_worst(track, 3)).values())
 
 
+@pytest.mark.slow
 def test_the_sheet_is_a_picture_of_the_frames(tmp_path):
     track = lost(true_track(), slice(30, 36), Reason.DARK)
     track = changed(track, slice(30, 36), position_smooth=np.nan, orientation_smooth=np.nan)

@@ -314,6 +314,7 @@ def test_pictures_are_taken_one_by_one(tmp_path):
     assert write_video(tmp_path / "o.mkv", pictures(), 25) == 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "error", "words"),
     [

@@ -288,6 +288,7 @@ def test_legends_cover_no_data_and_leave_the_page_nowhere(name):
         assert not one.overlaps(other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["densities", *(slow(name) for name in FIGURES if name != "densities")])
 def test_the_same_input_gives_the_same_bytes_whatever_the_users_own_style(name, tmp_path):
     first = plots.write_figure(FIGURES[name](), tmp_path / "first.one")

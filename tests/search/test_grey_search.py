@@ -72,6 +72,7 @@ def test_one_pixel_of_80_off_is_found():
     assert error.max() < 3.0
 
 
+@pytest.mark.slow
 def test_a_near_camera_sees_less_of_the_ball_and_says_so_by_its_distance():
     R_view_body = attitudes(10)
     texture = reduced_texture(texture_of("blobs"), SIZE)
@@ -146,6 +147,7 @@ def test_a_negative_and_a_mirrored_picture_explain_less(kind):
             assert (of_disk(wrong, disk)[1] < 0.8).all()
 
 
+@pytest.mark.slow
 def test_no_proposal_scores_below_score_min_and_those_above_stay():
     disks = camera_disks("blobs", attitudes(10))
     some, few = (
@@ -184,6 +186,7 @@ def test_proposals_are_rotations_of_float64_best_first_and_distinct():
     assert several >= 3
 
 
+@pytest.mark.slow
 def test_a_disks_answer_is_the_same_to_the_last_bit_alone_or_among_37():
     search, disks = grey_search_of("patches"), camera_disks("patches", attitudes(37))
     disks[5] = 70.0  # one that shows nothing shifts no other's rows
@@ -256,6 +259,7 @@ def test_whole_numbers_keep_the_correlation_to_a_few_thousandths():
     assert error.abs().max() < 5e-3
 
 
+@pytest.mark.slow
 def test_a_small_bank_and_small_disks_work_alike():
     settings = GreySearchSettings(size_px=24)
     search = TemplateBank(texture_of("blobs"), settings)

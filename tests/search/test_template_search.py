@@ -68,6 +68,7 @@ def test_a_finer_grid_answers_more_exactly():
     assert fine.max() < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_tells_a_mirrored_picture_and_a_mirrored_map_from_the_right_one(kind):
     disks = clean_disks(kind, attitudes(10))
@@ -118,6 +119,7 @@ def test_T_of_the_coarse_search_is_1_half_and_0_for_a_template_noise_and_its_neg
 # --- one disk, many disks
 
 
+@pytest.mark.slow
 def test_a_disks_answer_does_not_depend_on_which_others_come_with_it():
     search, R_view_body = search_of("blobs"), attitudes(35)  # more than one batch
     disks = clean_disks("blobs", R_view_body) + noise(35) / 20
@@ -178,6 +180,7 @@ def test_noise_does_not_change_its_neighbours():
     assert torch.equal(found.score, alone.score)
 
 
+@pytest.mark.slow
 def test_no_proposal_scores_below_score_min_and_those_above_stay():
     disks = clean_disks("dots", attitudes(30))
     all_of_them = search_of("dots").propose(disks)
@@ -225,6 +228,7 @@ def test_more_groups_than_allowed_are_a_runaway():
     assert Reason.OK in one.reason
 
 
+@pytest.mark.slow
 def test_two_groups_that_climb_to_one_place_give_one_proposal():
     settings = OrientSettings(group_deg=10.0, groups_max=500, score_margin=0.15)
     found = PaperSearch(texture_of("blobs"), SIZE, settings).propose(clean_disks("blobs", attitudes(2)))

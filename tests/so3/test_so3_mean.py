@@ -104,6 +104,7 @@ def test_a_rotation_without_weight_does_not_count_even_where_it_is_nan(rng):
     assert so3.weighted_mean(R, torch.zeros(3)).isnan().all()
 
 
+@pytest.mark.slow
 def test_gradients_agree_with_differences(rng):
     rotvec = (0.8 * torch.randn(2, 3, 3, generator=rng, dtype=F64)).requires_grad_()
     weights = (0.1 + torch.rand(2, 3, generator=rng, dtype=F64)).requires_grad_()

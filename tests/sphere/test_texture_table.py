@@ -81,6 +81,7 @@ def blurred_by_force(kind: str, at: Tensor, blur_rad: float) -> Tensor:
 # --- value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["patches", slow("dots"), slow("blobs")])
 @pytest.mark.parametrize("blur_rad", BLURS)
 def test_the_value_is_the_map_under_a_gaussian(kind, blur_rad):
@@ -112,6 +113,7 @@ def harmonic(at: Tensor) -> tuple[Tensor, Tensor]:
     return value, gradient - (gradient * at).sum(-1, keepdim=True) * at
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blur_rad", [0.017, 0.03, 0.1])
 def test_a_harmonic_fades_by_its_degree_and_its_slope_with_it(blur_rad):
     # The Gaussian on the sphere multiplies degree n by exp(-n (n + 1) blur^2 / 2).
@@ -174,6 +176,7 @@ def test_the_slope_lies_in_the_sphere(blur_rad):
 # --- blurring again
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["patches", slow("dots")])
 def test_blurring_twice_is_blurring_once_by_the_root_of_the_sum_of_squares(kind):
     at = directions(2000)
@@ -263,6 +266,7 @@ def test_the_length_of_a_direction_does_not_matter_for_its_cell():
     assert octahedral_cells(x, y, z, 256).equal(octahedral_cells(4 * x, 4 * y, 4 * z, 256))
 
 
+@pytest.mark.slow
 def test_a_map_that_is_turned_gives_a_table_that_is_turned():
     # A quarter turn about the pole is a shift of columns: the octahedron's faces change places.
     texture, at = map_of("patches"), directions(2000)

@@ -107,6 +107,7 @@ def test_a_noisy_density_is_the_convolution():
     np.testing.assert_allclose(found[inner], expected[inner], rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_the_fit_sees_through_noise_that_it_is_told_of():
     rng = np.random.default_rng(11)
     x = planted(0.7, 200_000, 11)

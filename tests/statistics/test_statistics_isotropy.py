@@ -27,11 +27,13 @@ def verdict(spec: EnsembleSpec) -> str:
     return anisotropic_frame(isotropy(found, "omega_lab", FEW), isotropy(found, "omega_body", FEW))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["lab", "body"])
 def test_the_frame_that_has_axes_is_told_from_the_other(frame):  # docs/errata.md E6
     assert verdict(EnsembleSpec(segments=200, mean_frames=120, frame=frame, **UNEQUAL)) == frame
 
 
+@pytest.mark.slow
 def test_equal_components_are_isotropic_in_both():
     assert verdict(EnsembleSpec(segments=200, mean_frames=120, omega_rms=(8.0, 8.0, 8.0))) == "neither"
 

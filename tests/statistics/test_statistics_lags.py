@@ -39,6 +39,7 @@ def test_pairs_are_those_that_a_slow_loop_finds(lag):
     assert set(zip(first.tolist(), second.tolist(), strict=True)) == slow_pairs(gappy, lag)
 
 
+@pytest.mark.slow
 def test_autocorrelation_and_integral_time_of_a_forgetful_process():
     x = forgetful(600, 150, 1)
     found = correlation(ensemble([150] * 600, velocity=x), "velocity", 100 * STEP_S, FEW)

@@ -26,6 +26,7 @@ def test_moments_agree_with_scipy():
     np.testing.assert_allclose(found.flatness.value, stats.kurtosis(every, fisher=False))
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=20)
 @given(shift=st.floats(-1e4, 1e4), scale=st.floats(1e-3, 1e3))
 def test_intervals_move_and_stretch_with_the_data(shift, scale):
@@ -66,6 +67,7 @@ def test_intervals_of_a_skewed_mean_hold_it_as_often_as_they_say():
     assert 0.90 <= held / 400 <= 0.98
 
 
+@pytest.mark.slow
 def test_interval_agrees_with_scipys_bca():
     x = np.random.default_rng(5).lognormal(0, 0.6, 80)
     ours = bootstrap(
@@ -89,6 +91,7 @@ def noisy(share: float) -> tuple[np.ndarray, np.ndarray, float]:
     return motion, motion + sigma * rng.standard_normal(motion.shape), sigma
 
 
+@pytest.mark.slow
 def test_what_a_kernel_let_through_is_taken_off():
     _, measured, sigma = noisy(0.3)
     found = moments(ensemble([4000] * 100, velocity=measured, sigma=sigma), "velocity", FEW)
@@ -109,6 +112,7 @@ def test_what_a_smoother_removed_is_put_back():
     np.testing.assert_allclose(found.noise_share.value[:3], 0.2, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_noise_that_a_smoother_let_through_does_not_flatten_heavy_tails():
     # what LET_THROUGH says of the error is noise: a shrunk motion plus noise of that variance
     rng = np.random.default_rng(9)

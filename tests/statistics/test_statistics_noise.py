@@ -26,6 +26,7 @@ def track(true):
     return filtered_track(true, NOISE_DEG, NOISE_MM, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("quantity", "noise"), [("acceleration", NOISE_MM * 1e-3), ("alpha_lab", np.radians(NOISE_DEG))]
 )

@@ -192,6 +192,7 @@ def test_what_blurs_makes_pictures_less_sharp(name, rng):
     assert mild < 0.95 * plain
 
 
+@pytest.mark.slow
 def test_a_blur_by_motion_is_about_the_attitude_in_the_middle_of_the_exposure():
     """A dot is smeared on both sides of where it is."""
     dot = dotted(torch.tensor([0.0, 0, -1]))

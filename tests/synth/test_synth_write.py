@@ -170,6 +170,7 @@ def test_progress_counts_the_frames_of_both_cameras_and_old_files_are_replaced(t
     assert {len(frames) for frames in frames_of(path).values()} == {2}
 
 
+@pytest.mark.slow
 def test_a_momentary_exposure_gives_an_experiment_that_loads(tmp_path):
     few = SETTINGS.model_copy(update={"frames": 2, "image_size": (64, 60), "exposure": 0.0})
     assert load_experiment(write_synthetic_experiment(tmp_path, few)).exposure_s is None

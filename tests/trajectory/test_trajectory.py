@@ -354,6 +354,7 @@ def test_the_summary_in_a_notebook_is_an_escaped_table() -> None:
     assert page.count("<tr>") == 5
 
 
+@pytest.mark.slow
 def test_the_plot_has_a_row_of_axes_for_each_quantity_with_its_unit(tmp_path: Path) -> None:
     track = full_trajectory()
     about_z = np.linspace(0, 5, FRAMES)  # rad: the canonical quaternion changes its sign on the way

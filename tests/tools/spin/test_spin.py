@@ -60,6 +60,7 @@ def test_a_planted_spin_comes_back_among_wrong_candidates_and_wrong_pictures(tur
     assert float(spins.rate_sigma()[0]) < 0.01 * TURN
 
 
+@pytest.mark.slow
 def test_beyond_half_a_turn_per_picture_all_aliases_are_told_with_the_same_evidence():
     axis = torch.nn.functional.normalize(torch.tensor([0.5, -0.3, 0.8], dtype=torch.float64), dim=0)
     omega = 0.8 * TURN * axis  # looks like 0.2 turns backwards
