@@ -2,10 +2,10 @@
 
     scripts/mutants.py [--only TEXT] [--jobs 2] [--list]
 
-Each mutant of scripts/mutants.yaml is applied in a temporary copy of the package. The quick tests of its room run first,
-the most likely file before the others, then its slow ones, then tests/end_to_end; the first failure ends it. Results are
-kept in out/mutants.json, and a second call continues there unless package or tests changed. Exits 1 if a mutant
-survives, or if its text is not found.
+Each mutant of scripts/mutants.yaml is applied in a temporary copy of the package. The quick tests of its room run
+first, the most likely file before the others, then its slow ones, then tests/end_to_end; the first failure ends it.
+Results are kept in out/mutants.json, and a second call continues there unless package or tests changed. Exits 1 if a
+mutant survives, or if its text is not found.
 """
 
 from __future__ import annotations
