@@ -121,10 +121,20 @@ def prepared(folder: Path) -> Bench:
     return Bench(experiment=experiment, eyes=eyes, shots=shots, times=times, search=search, learnt=learnt)
 
 
+def initialiser(bench: Bench) -> Initialiser:
+    """Return who finds the sphere without history."""
+    return Initialiser(
+        fitter=bench.learnt.fitter,
+        proposers={eye.name: bench.search for eye in bench.eyes},
+        locating=Settings().locate,
+        candidates=Settings().refine.candidates,
+        score_min=bench.learnt.clear_score,
+    )
+
+
 def stages(bench: Bench) -> float:
     """Time single frames: found from nothing, and predicted; return CPU s of a block's mean frame, a camera."""
     settings, cameras = Settings(), len(bench.eyes)
-    proposers = {eye.name: bench.search for eye in bench.eyes}
     first = [movie[0] for movie in bench.shots]
     frames = [shot.picture for shot in first]
     for eye, frame in zip(bench.eyes, frames, strict=True):
@@ -140,7 +150,7 @@ def stages(bench: Bench) -> float:
         return bench.search.propose(torch.from_numpy(disk)[None])
 
     say("first pose of a disk without history (crop, search, climb), CPU ms; bar 20", f"{1e3 * cpu_s(first_pose):.1f}")
-    search = bench.learnt.search(proposers, settings.locate, settings.refine.candidates)
+    search = initialiser(bench)
     found = cpu_s(lambda: replace(search, score_min=0.0).poses(first))
     say("frame without history, outlines to covariances, CPU ms a camera", f"{1e3 * found / cameras:.1f}")
     tracker = ChunkTracker(bench.learnt, search, settings.refine)
@@ -185,9 +195,8 @@ def literal(bench: Bench, mean_s: float) -> None:
             quality(R @ fine)
 
     paper = cpu_s(once, 1)
-    proposers = {each.name: bench.search for each in bench.eyes}
     frames = [movie[0] for movie in bench.shots]
-    search = replace(bench.learnt.search(proposers, Settings().locate, 4), score_min=0.0)
+    search = replace(initialiser(bench), score_min=0.0)
     ours = cpu_s(lambda: search.poses(frames)) / len(bench.eyes)
     say("the paper's literal search, full-size renderings, CPU s a camera and frame", f"{paper:.1f}")
     say("ratio to a frame without history, outline and refinement included", f"{paper / ours:.0f}")

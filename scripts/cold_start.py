@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -18,9 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient import locate, so3
+from sphereorient import so3
 from sphereorient.cameras import Camera
 from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.experiment.stream import spread_frames
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Background, Frame
@@ -63,7 +65,7 @@ def errors_deg(
     """Find each frame by itself; infinite where nothing is found."""
     settings = Settings()
     search = {view.name: TemplateBank(texture, settings.search)}
-    spread = locate.spread_frames(range(len(frames)), settings.refine.appearance_frames)
+    spread = spread_frames(range(len(frames)), settings.refine.appearance_frames)
     base = base_table(texture, view.diameter_px)
     shots = [[Frame(picture=frames[k])] for k in spread]
     first = Initialiser(
@@ -75,7 +77,7 @@ def errors_deg(
     learnt = estimate_appearance(first, shots, base, settings.refine)
     errors = []
     for frame, R in zip(frames, R_lab_body, strict=True):
-        poses = learnt.search(search, settings.locate, settings.refine.candidates).poses([Frame(picture=frame)])
+        poses = replace(first, fitter=learnt.fitter, score_min=learnt.clear_score).poses([Frame(picture=frame)])
         error = float(so3.geodesic_distance(poses.R_lab_body[0], R)) if len(poses) else math.inf
         errors.append(math.degrees(error))
     return errors

@@ -16,6 +16,7 @@ import numpy as np
 
 from sphereorient import locate
 from sphereorient.experiment import load_experiment, open_movies
+from sphereorient.experiment.stream import spread_frames
 from sphereorient.locate import Background, LocateSettings
 from sphereorient.movies import Movie
 
@@ -30,7 +31,7 @@ def main() -> None:
         with h5py.File(folder / "truth.h5") as file:
             truth = file[f"{name}/centre_px"][()]
         diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
-        spread = locate.spread_frames(range(len(movie)), settings.background_frames)
+        spread = spread_frames(range(len(movie)), settings.background_frames)
         without = locate.learn_background(movie.sample(spread), diameter_px, settings)
         plain = replace(without, mean=movie.sample(spread).mean(axis=0, dtype=np.float32))
         for label, background in (("plain mean", plain), ("without the ball", without)):

@@ -20,6 +20,7 @@ import numpy as np
 
 from sphereorient import locate
 from sphereorient.experiment import load_experiment, open_movies
+from sphereorient.experiment.stream import spread_frames
 from sphereorient.locate import LocateSettings
 from sphereorient.movies import write_ffv1
 
@@ -48,7 +49,7 @@ def main() -> None:
     for name, movie in open_movies(experiment).items():
         write_ffv1(out / f"{name}.mkv", movie.frames(first, last), experiment.frame_rate_hz)
         diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
-        spread = locate.spread_frames(range(len(movie)), 100)
+        spread = spread_frames(range(len(movie)), 100)
         empty = locate.learn_background(movie.sample(spread), diameter_px, LocateSettings())
         cv2.imwrite(str(out / f"empty_{name}.png"), np.rint(empty.mean).astype(np.uint8))
     for file in ("texture.png", "cameras.yaml"):

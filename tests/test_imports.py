@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
+import inspect
 import subprocess
 import sys
 
@@ -37,3 +40,19 @@ def test_help_comes_without_torch():
     code += "except SystemExit as stop:\n    assert not stop.code\nassert 'torch' not in sys.modules"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "track" in run.stdout
+
+
+@pytest.mark.parametrize("path", sorted((REPO / "scripts").glob("*.py")), ids=lambda path: path.stem)
+def test_a_script_uses_names_that_exist(path):
+    tree = ast.parse(path.read_text())
+    modules = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("sphereorient"):
+            module = importlib.import_module(node.module)
+            for name in node.names:
+                found = getattr(module, name.name, None) or importlib.import_module(f"{node.module}.{name.name}")
+                if inspect.ismodule(found):
+                    modules[name.asname or name.name] = found
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules:
+            assert hasattr(modules[node.value.id], node.attr), f"{node.value.id}.{node.attr}"
