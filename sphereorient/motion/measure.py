@@ -97,15 +97,9 @@ def _rotation(
 
 
 def _stencil(x: Tensor, segment: Tensor, sigma_frames: float, order: Order, settings: MotionSettings) -> Tensor:
-    return gap_aware_stencil(
-        x.isfinite().all(-1),
-        segment,
-        sigma_frames,
-        order,
-        truncate=settings.truncate,
-        min_share=settings.min_share,
-        dtype=x.dtype,
-    )
+    there = x.isfinite().all(-1)
+    share, reach = settings.min_share, settings.truncate
+    return gap_aware_stencil(there, segment, sigma_frames, order, truncate=reach, min_share=share).to(x.dtype)
 
 
 def _by_axis(sigma: Tensor | None, like: Tensor) -> Tensor:

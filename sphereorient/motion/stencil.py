@@ -103,9 +103,8 @@ def gap_aware_stencil(
     *,
     truncate: float = TRUNCATE,
     min_share: float = 1.0,
-    dtype: torch.dtype = torch.float64,
 ) -> Tensor:
-    """Return the kernel of `gaussian_derivative` for every frame, (..., N, 2 h + 1), corrected for missing frames.
+    """Return the kernel of `gaussian_derivative` at every frame, (..., N, 2 h + 1) float64, also beside missing frames.
     A neighbour is used where its mirror image is measured and both are in the segment; polynomials stay exact. `there`
     (..., N) marks measured frames; segment (..., N) is -1 outside any, None is one segment. NaN where less than
     `min_share` of the Gaussian's weight is measured.
@@ -114,7 +113,7 @@ def gap_aware_stencil(
         SettingsError: an order other than 0, 1, 2, or a width that is not positive.
     """
     half = _half_width(sigma_frames, order, truncate)
-    like = torch.empty(0, dtype=dtype, device=there.device)
+    like = torch.empty(0, dtype=torch.float64, device=there.device)
     gauss, step = _gaussian(sigma_frames, half, like)
     kept = gauss * paired(there, segment, half)
     share = kept.sum(-1) / gauss.sum()

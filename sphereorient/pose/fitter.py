@@ -167,8 +167,7 @@ class Fitter:
         disks = []
         for b, frames in enumerate(pictures):
             for c, (view, frame) in enumerate(zip(self.views, frames, strict=True)):
-                scene, blur_px = view.background, level.extra_px
-                disks.append(cut_pixels(frame, scene.mean, view.sight, middles[c][b], stencil, blur_px, scene.shown))
+                disks.append(cut_pixels(frame, view.background, view.sight, middles[c][b], stencil, level.extra_px))
         return stacked(disks)
 
     def fit(

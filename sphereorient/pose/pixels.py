@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.cameras import Camera
+from sphereorient.locate import Background
 
 VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
 ALONG_PLACES = ("grey", "behind", "inside", "direction")  # parts of `Pixels`, the places along their last axis
@@ -125,28 +126,26 @@ def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stenci
 
 def cut_pixels(
     frame: NDArray[np.generic],
-    background: NDArray[np.float32],
+    background: Background,
     sight: LinesOfSight,
     middle_px: tuple[float, float],
     stencil: Stencil,
     blur_px: float = 0.0,
-    shown: NDArray[np.bool_] | None = None,
 ) -> Pixels:
     """Return a disk's pixels about middle_px (u, v) without resampling, so that the noise of neighbours is independent.
-    `frame`, `background` and `shown` (False where something hides the sphere) are (H, W); a Gaussian of blur_px is laid
-    over the first two, for coarse fits.
+    A Gaussian of blur_px is laid over the frame (H, W) and the background's mean, for coarse fits.
     """
     width, height = sight.size
     u, v = round(middle_px[0]), round(middle_px[1])
     columns, rows = u + stencil.right, v + stencil.down
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     columns, rows = columns.clip(0, width - 1), rows.clip(0, height - 1)
-    if shown is not None:
-        inside &= shown[rows, columns]
+    if background.shown is not None:
+        inside &= background.shown[rows, columns]
     reach = stencil.reach + math.ceil(3 * blur_px)
     left, top = min(max(u - reach, 0), width - 1), min(max(v - reach, 0), height - 1)
     window = np.s_[top : max(v + reach + 1, top + 1), left : max(u + reach + 1, left + 1)]
-    grey, behind = frame[window].astype(np.float32), background[window]
+    grey, behind = frame[window].astype(np.float32), background.mean[window]
     if blur_px > 0:
         grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), blur_px), np.float32)
         behind = np.asarray(cv2.GaussianBlur(behind, (0, 0), blur_px), np.float32)

@@ -12,7 +12,7 @@ from locate_examples import BACK, DIAMETER, SETTINGS, SHAPE, blobs, even_backgro
 
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment.stream import load_mask
-from sphereorient.locate import find_ball
+from sphereorient.locate import Background, find_ball
 from sphereorient.locate.scene import fixed_ball, learn_background
 from sphereorient.pose.pixels import LinesOfSight, cut_pixels, disk_stencil
 
@@ -70,7 +70,11 @@ def test_a_learnt_background_keeps_the_mask():
 def test_hidden_pixels_are_not_inside_a_disk():
     rows = np.repeat(np.arange(SHAPE[0], dtype=np.float32)[:, None], SHAPE[1], 1)
     pixels = cut_pixels(
-        rows, rows, LinesOfSight(looking_down(image_size=SHAPE[::-1])), MIDDLE, disk_stencil(35.0), shown=shown()
+        rows,
+        Background(mean=rows, noise=rows, full_scale=255.0, shown=shown()),
+        LinesOfSight(looking_down(image_size=SHAPE[::-1])),
+        MIDDLE,
+        disk_stencil(35.0),
     )
     assert torch.equal(pixels.inside, pixels.grey < LOW)  # the whole stencil lies within the cup's radius
     assert 0.2 < float(pixels.inside.float().mean()) < 0.95

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, PinholeCamera, TsaiCamera
+from sphereorient.locate import Background
 from sphereorient.pose.fit import FittedPoses, PoseStart, refine
 from sphereorient.pose.model import LATER, Light, Shading, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
@@ -115,10 +116,15 @@ def noisy(pictures: Tensor, sigma: float, seed: int) -> Tensor:
     return pictures + sigma * torch.randn(pictures.shape, generator=torch.Generator().manual_seed(seed))
 
 
+def scene_of(mean: NDArray[np.float32], shown: NDArray[np.bool_] | None = None) -> Background:
+    """The background with this mean picture."""
+    return Background(mean=mean, noise=np.ones_like(mean), full_scale=255.0, shown=shown)
+
+
 def cut(rig: Rig, pictures: Tensor, X: Tensor, behind: float = BEHIND) -> Pixels:
     """The pixels of all disks, cameras of a pose next to each other, about places that need not be exact."""
     stencil = disk_stencil(1.06 * rig.diameter_px / 2 + 2.5 * BLUR_PX)
-    background: NDArray[np.float32] = np.full(pictures.shape[-2:], behind, np.float32)
+    background = scene_of(np.full(pictures.shape[-2:], behind, np.float32))
     disks = []
     for one, frames in zip(X, pictures, strict=True):
         for camera, sight, frame in zip(rig.cameras, rig.sights, frames, strict=True):

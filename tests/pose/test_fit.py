@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from conftest import assert_close
-from numpy.typing import NDArray
 from refine_examples import (
     BEHIND,
     BLACK,
@@ -28,6 +27,7 @@ from refine_examples import (
     noisy,
     paint_of,
     rig_of,
+    scene_of,
     share_pictures,
     turn_errors,
     turned,
@@ -159,7 +159,7 @@ def test_an_error_of_the_rotation_is_made_good_on_fine_detail(cameras, angle_deg
 def cut_at(level: PyramidLevel, cameras: str, frames: Tensor, X: Tensor) -> Pixels:
     one = rig(cameras)
     stencil = level.stencil(1.06 * DIAMETER_PX / 2)
-    background: NDArray[np.float32] = np.full(frames.shape[-2:], BEHIND, np.float32)
+    background = scene_of(np.full(frames.shape[-2:], BEHIND, np.float32))
     return stacked(
         [
             cut_pixels(frame.numpy(), background, sight, tuple(camera.project(x).tolist()), stencil, level.extra_px)

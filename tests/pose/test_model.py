@@ -21,6 +21,7 @@ from refine_examples import (
     model_of,
     paint_of,
     rig_of,
+    scene_of,
     table_of,
 )
 from torch import Tensor
@@ -66,7 +67,7 @@ def empty(rig: Rig, X: Tensor, shift: tuple[int, int] = (0, 0)) -> Pixels:
     stencil = disk_stencil(1.06 * rig.diameter_px / 2 + 2.5 * BLUR_PX)
     nothing = np.zeros((sight.size[1], sight.size[0]), np.float32)
     middles = [(u + shift[0], v + shift[1]) for u, v in camera.project(X).tolist()]
-    return stacked([cut_pixels(nothing, nothing, sight, middle, stencil) for middle in middles])
+    return stacked([cut_pixels(nothing, scene_of(nothing), sight, middle, stencil) for middle in middles])
 
 
 def places(rig: Rig, X: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import assert_close
-from refine_examples import LOOKS, camera_of, f64
+from refine_examples import LOOKS, camera_of, f64, scene_of
 
 from sphereorient.cameras import Camera
 from sphereorient.cameras.ideal import TelecentricCamera
@@ -36,7 +36,7 @@ def places() -> np.ndarray:
 
 def disk(model: str = "pinhole", middle=(30.2, 20.7), radius_px: float = 9.0, step_px: int = 1, **more) -> Pixels:
     stencil = disk_stencil(radius_px, step_px)
-    return cut_pixels(places(), BACKGROUND, LinesOfSight(camera(model)), middle, stencil, **more)
+    return cut_pixels(places(), scene_of(BACKGROUND), LinesOfSight(camera(model)), middle, stencil, **more)
 
 
 # --- lines of sight
@@ -103,7 +103,7 @@ def test_the_disk_is_cut_about_the_nearest_whole_pixel():
 def test_grey_levels_are_as_they_were():
     frame = np.random.default_rng(3).integers(0, 65536, (HEIGHT, WIDTH)).astype(np.uint16)
     stencil = disk_stencil(6.0)
-    pixels = cut_pixels(frame, BACKGROUND, LinesOfSight(camera("pinhole")), (20, 15), stencil)
+    pixels = cut_pixels(frame, scene_of(BACKGROUND), LinesOfSight(camera("pinhole")), (20, 15), stencil)
     expected = frame[15 + stencil.down, 20 + stencil.right].astype(np.float32)
     assert pixels.grey.dtype == torch.float32
     assert pixels.grey[0].numpy().tolist() == expected.tolist()
@@ -127,7 +127,7 @@ def test_a_blurred_disk_is_that_of_the_blurred_picture():
     background, stencil = frame[::-1].copy(), disk_stencil(9.0)
     sight = LinesOfSight(camera("pinhole"))
     for middle in ((30, 20), (25, 24)):
-        pixels = cut_pixels(frame, background, sight, middle, stencil, blur_px=1.5)
+        pixels = cut_pixels(frame, scene_of(background), sight, middle, stencil, blur_px=1.5)
         at = np.s_[middle[1] + stencil.down, middle[0] + stencil.right]
         for part, picture in ((pixels.grey, frame), (pixels.behind, background)):
             whole = cv2.GaussianBlur(picture, (0, 0), 1.5)
@@ -138,7 +138,7 @@ def test_a_blurred_disk_is_that_of_the_blurred_picture():
 
 def test_the_frame_is_not_written_to():
     frame, behind = places(), BACKGROUND.copy()
-    cut_pixels(frame, behind, LinesOfSight(camera("pinhole")), (30, 20), disk_stencil(9.0), blur_px=1.0)
+    cut_pixels(frame, scene_of(behind), LinesOfSight(camera("pinhole")), (30, 20), disk_stencil(9.0), blur_px=1.0)
     assert (frame == places()).all()
     assert (behind == BACKGROUND).all()
 
