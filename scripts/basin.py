@@ -25,7 +25,7 @@ from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import base_table
 from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
-from sphereorient.search import TemplateBank
+from sphereorient.search import GreySearch
 
 REPO = Path(__file__).resolve().parents[1]
 ANGLES_DEG = (1, 2, 4, 6, 8, 10, 14, 20)
@@ -50,7 +50,7 @@ def main() -> None:
         X, R = (
             torch.from_numpy(file[key][()])[numbers.start : numbers.stop : every] for key in ("position", "orientation")
         )
-    proposers = {view.name: TemplateBank(texture, settings.search) for view in views}
+    proposers = {view.name: GreySearch(texture, settings.search) for view in views}
     base = base_table(texture, widest_px(views))
     taken = list(zip(*shots, strict=True))
     first = Initialiser(

@@ -39,7 +39,7 @@ from sphereorient.search import (
     GreySearchSettings,
     Proposer,
     ProposeSettings,
-    TemplateBank,
+    GreySearch,
 )
 from sphereorient.search.candidates import resized
 from sphereorient.statistics.reliability import Z95, reliability, wilson
@@ -137,11 +137,11 @@ class Remembering:
 def methods(texture: Tensor, checkpoint: Path) -> Iterator[tuple[str, Proposer]]:
     """Yield what is compared."""
     settings = GreySearchSettings()
-    search = Remembering(TemplateBank(texture, settings))
+    search = Remembering(GreySearch(texture, settings))
     yield "template search", search
     # As fast as the network: smaller pictures, a coarser bank, fewer climbs.
     quick = settings.model_copy(update={"size_px": 24, "step_deg": 15.0, "peaks": 4, "finalists": 2, "rough_steps": 2})
-    yield "template search, quick", Smaller(TemplateBank(texture, quick), settings.size_px)
+    yield "template search, quick", Smaller(GreySearch(texture, quick), settings.size_px)
     learnt = load_checkpoint(checkpoint)
     network = LearnedProposer(correlator_of(learnt), texture, temperature=learnt.temperature)
     yield "network", network

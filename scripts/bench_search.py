@@ -26,7 +26,7 @@ from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.experiment.recording import open_recording
 from sphereorient.locate import find_scene, screened_frames
 from sphereorient.methods.settings import Settings
-from sphereorient.search import GreySearchSettings, TemplateBank, crop_disk
+from sphereorient.search import GreySearchSettings, GreySearch, crop_disk
 from sphereorient.sphere import orthographic_view
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
@@ -63,7 +63,7 @@ def speed() -> None:
 def speed_at(size_px: int, rendered: list[Sample]) -> None:
     texture = random_texture("blobs", PATTERNS["blobs"])
     start = time.process_time()
-    search = TemplateBank(texture, GreySearchSettings(size_px=size_px))
+    search = GreySearch(texture, GreySearchSettings(size_px=size_px))
     built = time.process_time() - start
     templates = len(search.templates)
     disks = torch.cat([cropped(size_px, *one) for one in rendered]).repeat(8, 1, 1)
@@ -87,7 +87,7 @@ def accuracy(attitudes: int) -> None:
     print(f"\n| paint, light | disks | best proposal within {RIGHT_DEG:g}° | none | p50 / p95 / max (°) | score |")
     print("|---|---|---|---|---|---|")
     for paint in PATTERNS:
-        search = TemplateBank(random_texture(paint, PATTERNS[paint]), settings)
+        search = GreySearch(random_texture(paint, PATTERNS[paint]), settings)
         for light, ambient in LIGHTS.items():
             rendered = frames(paint, ambient, attitudes)
             disks = torch.cat([cropped(settings.size_px, *one) for one in rendered])
@@ -97,7 +97,7 @@ def accuracy(attitudes: int) -> None:
 def on_experiment(folder: Path) -> None:
     settings, whole = GreySearchSettings(), Settings()
     with open_recording(folder / "experiment.yaml") as recording:
-        search = TemplateBank(recording.texture, settings)
+        search = GreySearch(recording.texture, settings)
         with h5py.File(folder / "truth.h5") as truth:
             R_lab_body = torch.from_numpy(truth["orientation"][:])
         for stream in recording.streams:
@@ -113,7 +113,7 @@ def on_experiment(folder: Path) -> None:
             report(f"{folder.name}, {stream.name}", search, torch.stack(disks), torch.stack(R_view_body))
 
 
-def report(name: str, search: TemplateBank, disks: Tensor, R_view_body: Tensor) -> None:
+def report(name: str, search: GreySearch, disks: Tensor, R_view_body: Tensor) -> None:
     found = search.propose(disks)
     any_ = found.offset.diff() > 0
     best = found.offset[:-1][any_]

@@ -35,7 +35,7 @@ from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
 from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
-from sphereorient.search import TemplateBank, crop_disk, extract_paint
+from sphereorient.search import GreySearch, crop_disk, extract_paint
 from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
 
 FOLLOWED = 48  # frames over which one prediction after the other is timed
@@ -57,7 +57,7 @@ class Bench:
     eyes: list[CameraView]
     shots: list[list[Frame]]  # per eye
     times: list[float]  # of the same frames, s
-    search: TemplateBank
+    search: GreySearch
     learnt: Appearance
 
 
@@ -105,8 +105,8 @@ def prepared(folder: Path) -> Bench:
             say(f"decoding {reel.name}, CPU ms a frame (floor of a movie)", f"{1e3 * decoding:.2f}")
         texture, times = recording.texture, recording.timeline.time_s[:FOLLOWED].tolist()
         experiment, radius_mm = recording.experiment, recording.experiment.radius_mm
-    search = TemplateBank(texture, settings.search)
-    say("search bank, CPU s", f"{cpu_s(lambda: TemplateBank(texture, settings.search), 2):.2f}")
+    search = GreySearch(texture, settings.search)
+    say("search bank, CPU s", f"{cpu_s(lambda: GreySearch(texture, settings.search), 2):.2f}")
     base = base_table(texture, widest_px(eyes))
     proposers = {eye.name: search for eye in eyes}
     begin = time.process_time()

@@ -30,7 +30,7 @@ from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, LinesOfSight, base_table
 from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter
-from sphereorient.search import TemplateBank
+from sphereorient.search import GreySearch
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
 
@@ -64,7 +64,7 @@ def errors_deg(
 ) -> list[float]:
     """Find each frame by itself; infinite where nothing is found."""
     settings = Settings()
-    search = {view.name: TemplateBank(texture, settings.search)}
+    search = {view.name: GreySearch(texture, settings.search)}
     spread = spread_frames(range(len(frames)), settings.refine.appearance_frames)
     base = base_table(texture, view.diameter_px)
     shots = [[Frame(picture=frames[k])] for k in spread]

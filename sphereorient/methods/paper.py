@@ -1,7 +1,8 @@
 """Section III of the paper, corrected, step by step: each camera alone, then their fusion."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from sphereorient.methods import results
 from sphereorient.methods.method import Job, Method
 from sphereorient.methods.proposers import paper_proposer
 from sphereorient.methods.settings import Settings
-from sphereorient.search import Candidates, crop_disk
+from sphereorient.search import Candidates, Proposer, crop_disk
 from sphereorient.trajectory import Reason, Trajectory
 
 CHUNK = 64  # frames held at once; a result does not depend on it
@@ -39,8 +40,9 @@ def track(
     sightings = {stream.name: locate_sphere(grid, stream, settings, progress) for stream in grid.streams}
     locate.check_seen(sightings)
     positions = locate.find_positions(sightings, cameras, grid.experiment.diameter_mm)
+    proposer_of = cache(partial(paper_proposer, grid.texture, settings=settings))  # cameras of one scale share a bank
     candidates = {
-        stream.name: propose_orientations(stream, sightings[stream.name], grid.texture, settings, progress)
+        stream.name: propose_orientations(stream, sightings[stream.name], proposer_of, settings, progress)
         for stream in grid.streams
     }
     paths = assemble.assemble_paths(candidates, clock, settings.assemble)
@@ -77,15 +79,21 @@ def locate_sphere(recording: Recording, stream: CameraStream, settings: Settings
 
 
 def propose_orientations(
-    stream: CameraStream, sightings: Sightings, texture: Tensor, settings: Settings, progress: Progress
+    stream: CameraStream,
+    sightings: Sightings,
+    proposer_of: Callable[[int], Proposer],
+    settings: Settings,
+    progress: Progress,
 ) -> Candidates:
-    """Propose orientations, lab frame, for every frame in which one camera has the sphere."""
+    """Propose orientations, lab frame, for every frame in which one camera has the sphere.
+    `proposer_of` makes the proposer for disks of a size, px.
+    """
     stage = f"{stream.name}: orient"
     total = len(stream)
     progress(stage, 0, total)
     if not sightings.placed.any():
         return in_the_lab(Candidates.none(sightings.reason), stream.camera, sightings.centre_px)
-    proposer = paper_proposer(texture, locate.size_of(sightings, settings.orient.size_px), settings)
+    proposer = proposer_of(locate.size_of(sightings, settings.orient.size_px))
     # An interpolated position is of no use without a picture.
     readable = torch.tensor([reason not in BLIND for reason in sightings.reason])
     placed = sightings.placed & readable

@@ -12,7 +12,7 @@ from sphereorient.locate import find_scene, known_diameter_px
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
 from sphereorient.pose.fitter import defocus_radii
-from sphereorient.search import FallbackProposer, PaperSearch, Proposer, TemplateBank
+from sphereorient.search import FallbackProposer, GreySearch, Proposer, TemplateBank
 from sphereorient.search.settings import ProposeSettings
 from sphereorient.sphere.texture_table import TextureTable
 
@@ -24,7 +24,7 @@ def precise_proposer(texture: Tensor, settings: Settings, blur: float = 0.0) -> 
 
     Raise CheckpointError if the checkpoint cannot be used with this map.
     """
-    return _proposer(texture, settings.propose, lambda: TemplateBank(texture, settings.search, blur))
+    return _proposer(texture, settings.propose, lambda: GreySearch(texture, settings.search, blur))
 
 
 class BlurMatchedSearch:
@@ -74,7 +74,7 @@ def open_view(recording: Recording, stream: CameraStream, settings: Settings, pr
 
 def paper_proposer(texture: Tensor, size_px: int, settings: Settings) -> Proposer:
     """Return who proposes for the paper's method; templates are made for disks of `size_px`."""
-    return _proposer(texture, settings.propose, lambda: PaperSearch(texture, size_px, settings.orient))
+    return _proposer(texture, settings.propose, lambda: TemplateBank(texture, size_px, settings.orient))
 
 
 def _proposer(texture: Tensor, settings: ProposeSettings, templates: Callable[[], Proposer]) -> Proposer:

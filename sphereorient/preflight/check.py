@@ -15,7 +15,7 @@ from sphereorient.methods.settings import Settings
 from sphereorient.preflight import cameras, movies, texture_map
 from sphereorient.preflight.finding import FAULT, Finding, Severity, judged, warning, worst
 from sphereorient.preflight.sample import MovieSample, sample_more, sample_movie
-from sphereorient.search import TemplateBank
+from sphereorient.search import GreySearch
 from sphereorient.sphere import load_texture
 
 
@@ -63,7 +63,7 @@ def preflight(
         ]
         measures = image is not None and pool.submit(texture_map.measure_texture, image)
         similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
-        search = image is not None and pool.submit(TemplateBank, image, settings.search)
+        search = image is not None and pool.submit(GreySearch, image, settings.search)
         samples = tuple(one.result() for one in sampling)
         progress("frames", len(samples), len(samples))
         closer, scan = _offsets(samples, settings, pool)

@@ -14,7 +14,7 @@ from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample
-from sphereorient.search import TemplateBank, crop_disk
+from sphereorient.search import GreySearch, crop_disk
 from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
@@ -181,14 +181,14 @@ def look_alikes(pair: ViewPair) -> Finding:
     return judged("views that look alike", measured, *complaints)
 
 
-def match_texture(search: TemplateBank, samples: Sequence[MovieSample]) -> list[TextureMatch]:
+def match_texture(search: GreySearch, samples: Sequence[MovieSample]) -> list[TextureMatch]:
     """Search the map in some frames in which every camera shows the ball."""
     seen = torch.stack([sample.sightings.placed for sample in samples]).all(0).nonzero()[:, 0].tolist()
     chosen = [seen[k] for k in spread_frames(range(len(seen)), FRAMES)]
     return [_matched(search, sample, chosen) for sample in samples] if chosen else []
 
 
-def _matched(search: TemplateBank, sample: MovieSample, chosen: list[int]) -> TextureMatch:
+def _matched(search: GreySearch, sample: MovieSample, chosen: list[int]) -> TextureMatch:
     centre, radius = sample.sightings.centre_px[chosen], sample.sightings.radius_px[chosen]
     crops = []
     for k, (u, v), r in zip(chosen, centre.tolist(), radius.tolist(), strict=True):
@@ -203,7 +203,7 @@ def _matched(search: TemplateBank, sample: MovieSample, chosen: list[int]) -> Te
     )
 
 
-def _best(search: TemplateBank, disks: Tensor) -> tuple[Tensor, Tensor]:
+def _best(search: GreySearch, disks: Tensor) -> tuple[Tensor, Tensor]:
     """Return the best proposal for each disk (n, S, S): R_view_body (n, 3, 3) and score (n,)."""
     found = search.propose(disks)
     R, score = torch.full((len(disks), 3, 3), math.nan, dtype=torch.float64), torch.zeros(len(disks)).double()

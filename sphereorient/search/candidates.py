@@ -94,6 +94,15 @@ class Candidates:
             reason=tuple(next(own) if here else why for here, why in zip(placed.tolist(), reason, strict=True)),
         )
 
+    def padded_views(self, leading: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Return R_view_body (*leading, C, 3, 3) and scores (*leading, C), best first; NaN in unused places."""
+        counts = self.counts
+        mask = torch.arange(max([*counts.tolist(), 1])) < counts[:, None]
+        R = torch.full((*mask.shape, 3, 3), torch.nan, dtype=self.R_view_body.dtype)
+        score = torch.full(mask.shape, torch.nan, dtype=self.score.dtype)
+        R[mask], score[mask] = self.R_view_body, self.score
+        return R.reshape(*leading, -1, 3, 3), score.reshape(*leading, -1)
+
     def padded(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return R_lab_body (N, C, 3, 3), scores (N, C) and mask (N, C), C the largest count, at least 1.
 

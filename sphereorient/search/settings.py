@@ -39,10 +39,14 @@ class OrientSettings(BaseModel, frozen=True, extra="forbid"):
     )
     fine_step_deg: float = Field(3.0, gt=0.5, le=12, description="step of the fine grid; the paper's 3")
     fine_radius_deg: float = Field(
-        12.0,
+        8.5,
         gt=0,
         le=45,
-        description="reach of the fine grid about a group's best: covers the coarse cell (10.4 at 12)",
+        description="reach of the fine grid about each possible orientation of a group: the coarse grid's covering "
+        "radius, 0.704 steps",
+    )
+    renderer: Literal["table", "kornia"] = Field(
+        "table", description="who makes the fine grid's templates: a table that the renderer fills, or the renderer"
     )
     score_min: float = Field(0.5, ge=0, le=1, description="candidates of lower T are no candidates; the paper's 0.5")
 

@@ -1,4 +1,4 @@
-"""The template bank: normalised views over all rotations, distinct peaks, a coarse-to-fine fit from each."""
+"""The paper's search: a coarse bank at half size, groups of possible orientations, a fine grid at real size."""
 
 import math
 
@@ -10,160 +10,195 @@ from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.search.candidates import Candidates, check_disks, distinct
-from sphereorient.search.normalisation import LocalNormalisation
-from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
-from sphereorient.search.settings import GreySearchSettings
-from sphereorient.sphere import orthographic_view, perspective_view
-from sphereorient.sphere.texture_table import TextureTable, texture_table
+from sphereorient.search.extraction import extract_paint
+from sphereorient.search.settings import OrientSettings
+from sphereorient.sphere import DirectionTable, Sampling, SphereRenderer, reduced_texture
+from sphereorient.sphere.texture_table import STEPS
+from sphereorient.sphere.view import disk_offsets
+from sphereorient.trajectory import Reason
 
-# Disks normalised at once. Fixed, filled up with empty disks: the last bits of sums depend on their number.
+# Disks searched at once. Fixed, filled up with empty disks: the last bits of Otsu's sums depend on their number.
 BATCH = 32
-PRODUCT = 128  # disks in one product, at most: the scores of more leave the cache
-GROUP = 8  # neighbouring templates, represented by their best one
-LOOKED_AT = 32  # best groups that are searched for peaks: a broad peak spans several
-TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest detail
-DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
+RENDERED = 1024  # templates rendered at once
+FINALISTS = 3  # best of the fine grid by the table, whose T is within 0.01 of the renderer's
+POINTS = Sampling(blur_px=0.0, supersampling=1)  # one ray a pixel: the paint's borders stay as sharp as the picture's
 
 
 class TemplateBank(nn.Module):
-    """Searches all of SO(3) on the CPU for the views of a texture map that look like a disk, under any smooth light.
-    Detail finer than `detail` is removed, so that the nearest template of the Lattman grid still correlates.
+    """Search all of SO(3) for the views of a texture map that look like a disk in black and white.
+
+    Source: paper sections III B and C; docs/errata.md A2 (T), E5 (grid), E7 (possible orientations).
 
     Args:
-        texture: (H, 2 H), the texture map, 0 black .. 1 white.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white; an `nn.Parameter` gets gradients through `quality`.
+        size_px: side of the disks, rounded up to an even number; the templates of the coarse grid have half of it.
         settings: of the search; None: the defaults.
-        blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
 
-    `size_px` is the side of the disks, `templates` (K, 3, 3) float32 are the rotations of the bank.
+    `grid` (K, 3, 3) float32 are the rotations of the coarse grid, `bank` (K, P) their templates at half size.
     """
 
+    grid: Tensor
+    bank: Tensor
+
     def __init__(
-        self, texture: Tensor | NDArray[np.generic], settings: GreySearchSettings | None = None, blur: float = 0.0
+        self, texture: Tensor | NDArray[np.generic], size_px: int = 80, settings: OrientSettings | None = None
     ) -> None:
         super().__init__()
-        settings = settings or GreySearchSettings()
-        texture = torch.as_tensor(texture)
-        self._settings = settings
-        size, distance = settings.size_px, settings.distance_radii
-        self.size_px = size
-        self._view = orthographic_view(size) if distance is None else perspective_view(size, distance)
-        self._normalise = LocalNormalisation(size, detail=settings.detail, window=settings.window, clip=settings.clip)
-        pixel_rad = 2.0 / size
-        paint = texture_table(texture, max(blur, min(pixel_rad, settings.detail)), TABLE_SIDE)
-        self._rough = detail_level(self._view, paint, settings.detail, every=2, blur=blur)
-        self._fine = detail_level(self._view, paint, pixel_rad, every=1, blur=blur)
-        grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
-        # (GROUP, G): each group is a column, so that its maximum is one of whole rows.
-        self._grid = grid[compact_groups(grid, GROUP).T]
-        self.templates = self._grid.flatten(0, 1)
-        self._pixels = int(self._view.inside.sum())
-        self._bank = self._templates(paint)
+        self._settings = settings = settings or OrientSettings()
+        self.size_px = size = size_px + size_px % 2
+        self.renderer = SphereRenderer(texture, size_px=size, sampling=POINTS)
+        self._real, self._half = _compared(size, settings.disk_share), _compared(size // 2, settings.disk_share)
+        self._table = None
+        if settings.renderer == "table":
+            self._table = DirectionTable(reduced_texture(self.renderer.texture.detach().float(), size))
+        around = so3.local_grid(math.radians(settings.fine_step_deg), math.radians(settings.fine_radius_deg))
+        self._around = around.float()
+        self.register_buffer("grid", so3.lattman_grid(math.radians(settings.coarse_step_deg)).float(), persistent=False)
+        half = SphereRenderer(self.renderer.texture, size_px=size // 2, sampling=POINTS)
+        self.register_buffer("bank", _templates(half, self._half, self.grid), persistent=False)
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
-        """Return R_view_body (..., K, 3, 3) and score (..., K) float64 of each disk, best first, padded with NaN.
+        """Return R_view_body (..., M, 3, 3) and T (..., M) float64 of the candidates, best first, padded with NaN.
         Disks (..., S, S) are grey levels of any scale, the outline touching the borders.
 
         Raises:
             ShapeError: the disks are of another size.
         """
         grey = torch.as_tensor(disks).float()
-        found = self.propose(grey.reshape(-1, *grey.shape[-2:]))
-        counts = found.offset.diff()
-        mask = torch.arange(max([*counts.tolist(), 1])) < counts[:, None]
-        R = torch.full((*mask.shape, 3, 3), torch.nan, dtype=torch.float64)
-        score = torch.full(mask.shape, torch.nan, dtype=torch.float64)
-        R[mask], score[mask] = found.R_view_body, found.score
-        return R.reshape(*grey.shape[:-2], -1, 3, 3), score.reshape(*grey.shape[:-2], -1)
+        return self.propose(grey.reshape(-1, *grey.shape[-2:])).padded_views(grey.shape[:-2])
 
-    def score(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
-        """Return the correlation of disks (..., S, S) with all `templates`, (..., K) float32, -1 .. 1."""
+    def paint(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
+        """Return the paint (..., S, S) of grey disks: -1 black, +1 white, 0 undecided or outside."""
         grey = torch.as_tensor(disks).float()
-        steps = self._normalised(grey.reshape(-1, *grey.shape[-2:]))
-        scale = 127.0 / DEVIATIONS * math.sqrt(self._pixels)
-        return (torch._int_mm(steps, self._bank.T) / scale**2).reshape(*grey.shape[:-2], -1)
+        flat = grey.reshape(-1, *grey.shape[-2:])
+        filled = F.pad(flat, (0, 0, 0, 0, 0, -len(flat) % BATCH))
+        inside = disk_offsets(self.size_px).norm(dim=-1) < 1
+        parts = [extract_paint(some, inside, self._settings) for some in torch.split(filled, BATCH) if len(some)]
+        return torch.cat([flat[:0], *parts])[: len(flat)].reshape(grey.shape)
+
+    def quality(self, paint: Tensor, R_view_body: Tensor) -> Tensor:
+        """Return T (...) of paint (..., S, S) at orientations (..., 3, 3): the share of correct pixels; differentiable.
+        The renderer makes the pictures: T has gradients by the orientation, the paint and the renderer's texture.
+        Source: the paper's T = 1/2 + sum of products / (2 pixels compared), docs/errata.md A2.
+        """
+        template = 2 * self.renderer(R_view_body) - 1
+        product = (paint * template)[..., self._real]
+        T: Tensor = 0.5 + product.sum(-1) / (2 * product.shape[-1])
+        return T
+
+    def score(self, paint: Tensor) -> Tensor:
+        """Return T (..., K) of paint (..., S, S) at all rotations of the coarse grid, at half size."""
+        half = F.avg_pool2d(paint.reshape(-1, 1, *paint.shape[-2:]), 2)[:, 0, self._half]
+        T: Tensor = 0.5 + half @ self.bank.T / (2 * STEPS * half.shape[-1])
+        return T.reshape(*paint.shape[:-2], len(self.bank))
 
     def propose(self, disks: Tensor) -> Candidates:
-        """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
-        The outline touches the borders. The score, 0 .. 1, is the share of the disk's deviation from smooth light that
-        the paint explains. A disk below `score_min` has no proposal (`LOW_SCORE`).
+        """Propose the best orientation of each group for disks (F, S, S) float32, whose outlines touch the borders.
+        A disk that fits nearly everywhere has no proposal (`RUNAWAY`), nor one below `score_min` (`LOW_SCORE`).
 
         Raises:
             ShapeError: the disks are of another size.
         """
         check_disks(disks, self.size_px, self.size_px)
-        parts: list[Candidates] = []
-        for some in torch.split(disks, PRODUCT):
-            for disk, place, peak in zip(some, *self.search(some), strict=True):
-                parts.append(self._refined(disk, self.templates[place[peak][: self._settings.peaks]]))
-        return Candidates.joined(parts)
+        return Candidates.joined(
+            [self._proposals(paint) for paint in torch.split(self.paint(disks), BATCH) if len(paint)]
+        )
 
-    def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the best templates of the best groups, (F, M) int64, best first, and which are peaks, (F, M) bool.
-        All scores of the disks (F, S, S) float32 are held at once, 36 kB each.
+    def groups(self, T: Tensor) -> Tensor:
+        """Return the group (F, K) int64 of each possible orientation by T (F, K), 0 about the best; -1: not possible.
+        The best orientation left opens a group and takes all that are nearer than `group_deg`.
         """
-        scores = torch._int_mm(self._normalised(disks), self._bank.T)
-        place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
-        apart = math.radians(self._settings.peak_deg)
-        looked_at = self.templates[F.pad(place, (0, 0, 0, -len(disks) % BATCH))]
-        peak = torch.cat([distinct(R, apart) for R in torch.split(looked_at, BATCH)])[: len(disks)]
-        return place, peak
+        left = T.amax(-1, keepdim=True) - self._settings.score_margin < T
+        group = torch.full_like(T, -1, dtype=torch.int64)
+        flat, near = self.grid.flatten(1), 1 + 2 * math.cos(math.radians(self._settings.group_deg))
+        for number in range(self._settings.groups_max + 1):  # one group more than allowed is a runaway
+            if not left.any():
+                break
+            best = T.masked_fill(~left, -1).argmax(-1)
+            member = left & (flat[best] @ flat.T >= near)  # the product is the trace of A^T B
+            group[member] = number
+            left = left & ~member
+        return group
 
-    def _normalised(self, disks: Tensor) -> Tensor:
-        filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
-        return torch.cat([_steps(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
+    def _proposals(self, paint: Tensor) -> Candidates:
+        """Return the candidates of some disks, best first."""
+        frames, most = len(paint), self._settings.groups_max
+        group = self.groups(self.score(paint))
+        runaway = group.amax(-1) >= most
+        frame, start = torch.nonzero((group >= 0) & ~runaway[:, None], as_tuple=True)
+        of_group = frame * most + group[frame, start]
+        R, match, origin = self._fine_search(paint[:, self._real], frame, self.grid[start])
+        # The table chooses the best few of each group, the renderer the best of these.
+        few = best_of_each(of_group[origin], match, FINALISTS)
+        R, frame, of_group = R[few], frame[origin[few]], of_group[origin[few]]
+        quality = self.quality(paint[frame], R).detach()
+        best = best_of_each(of_group, quality, 1)
+        T = torch.full((frames, most), -1.0)
+        T.view(-1)[of_group[best]] = quality[best]
+        views = torch.eye(3).expand(frames, most, 3, 3).clone()
+        views.view(-1, 3, 3)[of_group[best]] = R[best]
+        order = T.argsort(dim=-1, descending=True, stable=True)
+        T, views = T.gather(-1, order), views.gather(1, order[..., None, None].expand_as(views))
+        # Two groups may reach one rotation: keep the better of those within two fine steps.
+        kept = (self._settings.score_min <= T) & distinct(views, 2 * math.radians(self._settings.fine_step_deg))
+        reason = [
+            Reason.RUNAWAY if lost else Reason.OK if any_ else Reason.LOW_SCORE
+            for lost, any_ in zip(runaway.tolist(), kept.any(-1).tolist(), strict=True)
+        ]
+        return Candidates(
+            offset=F.pad(kept.sum(-1).cumsum(0), (1, 0)),
+            R_view_body=so3.nearest_rotation(views[kept].double()),
+            score=T[kept].double(),
+            reason=tuple(reason),
+        )
 
-    def _templates(self, paint: TextureTable) -> Tensor:
-        """Return normalised views of all rotations, (K, P) int8."""
-        normal = self._view.normal_view.T.contiguous()
-        chunks = torch.split(self.templates, BATCH)
-        return torch.cat([_steps(self._normalise(self._view.picture(paint.sample(R.mT @ normal)[0]))) for R in chunks])
+    def _fine_search(self, seen: Tensor, frame: Tensor, starts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the best rotations (M, 3, 3) of the fine grid about each start, their matches (M,), and starts (M,).
+        `seen` (F, P) is the paint compared, `frame` (Q,) and `starts` (Q, 3, 3) the possible orientations; a match is a
+        whole number, M is `FINALISTS` Q.
+        """
+        count = min(FINALISTS, len(self._around))
+        R, match = [starts[:0]], [seen.new_zeros(0)]
+        batch = max(1, RENDERED // len(self._around))
+        for of, at in zip(torch.split(frame, batch), torch.split(starts, batch), strict=True):
+            near = self._around @ at[:, None]  # (q, A, 3, 3)
+            template = self._rendered(near.flatten(0, 1)).reshape(*near.shape[:2], int(self._real.sum()))
+            best = (template @ seen[of][..., None])[..., 0].topk(count)
+            R.append(near[torch.arange(len(near))[:, None], best.indices].flatten(0, 1))
+            match.append(best.values.flatten())
+        return torch.cat(R), torch.cat(match), torch.arange(len(starts)).repeat_interleave(count)
 
-    def _refined(self, disk: Tensor, starts: Tensor) -> Candidates:
-        """Refine the peaks of one disk; return its proposals, best first."""
-        settings = self._settings
-        R, score = refine_rotation(self._rough, level_reference(self._rough, disk), starts, settings.rough_steps)
-        R = R[self._distinct(R, score)[: settings.finalists]]
-        R, score = refine_rotation(self._fine, level_reference(self._fine, disk), R, settings.fine_steps)
-        chosen = self._distinct(R, score)
-        chosen = chosen[score[chosen] >= settings.score_min]
-        return Candidates.of_disk(so3.nearest_rotation(R[chosen].double()), score[chosen].double())
-
-    def _distinct(self, R: Tensor, score: Tensor) -> Tensor:
-        order = score.argsort(descending=True, stable=True)
-        return order[distinct(R[order], math.radians(self._settings.distinct_deg))]
-
-
-def _steps(even: Tensor) -> Tensor:
-    """Quantise normalised pictures to -127 .. 127, (B, P) int8, padded to a multiple of 8 pixels."""
-    scale = 127.0 / DEVIATIONS * math.sqrt(even.shape[1])
-    # One scale for all templates: as all have length 1, integer products rank them as they are.
-    return F.pad((even * scale).round().clamp(-127, 127), (0, -even.shape[1] % 8)).to(torch.int8)
+    def _rendered(self, R_view_body: Tensor) -> Tensor:
+        """Return templates (K, P) at real size, whole numbers."""
+        if self._table is None:
+            return _templates(self.renderer, self._real, R_view_body)
+        return self._table.render(R_view_body, _normals(self.size_px)[self._real]).float()
 
 
-def compact_groups(R: Tensor, size: int) -> Tensor:
-    """Divide rotations (K, 3, 3) into groups of neighbours, (G, size) int64; some come twice unless size divides K.
-    Source: halving along the matrix component that varies most (Bentley 1975).
-    """
-    flat = R.flatten(1)
-    groups = math.ceil(len(R) / size)
-    index = torch.arange(groups * size) % len(R)
-
-    def halved(members: Tensor) -> list[Tensor]:
-        if len(members) <= size:
-            return [members]
-        at = flat[members]
-        order = members[at[:, int(at.var(0).argmax())].argsort(stable=True)]
-        middle = len(members) // size // 2 * size
-        return [*halved(order[:middle]), *halved(order[middle:])]
-
-    return torch.stack(halved(index))
+def best_of_each(group: Tensor, value: Tensor, count: int) -> Tensor:
+    """Return the indices of the `count` largest values (M,) of each group (M,) int64, by group, largest first."""
+    order = value.argsort(descending=True, stable=True)
+    order = order[group[order].argsort(stable=True)]
+    first = torch.searchsorted(group[order], group[order])
+    return order[torch.arange(len(order)) - first < count]
 
 
-def best_of_groups(scores: Tensor, count: int) -> Tensor:
-    """Return the best members of the `count` best groups, (F, count) int64, best first, from scores (F, M, G).
-    Indices are into the flattened members and groups; all groups where there are fewer.
-    """
-    groups = scores.shape[2]
-    group = scores.amax(1).topk(min(count, groups), dim=1).indices
-    members = scores.gather(2, group[:, None].expand(-1, scores.shape[1], -1))
-    return members.argmax(1) * groups + group
+def _compared(size_px: int, disk_share: float) -> Tensor:
+    """Return which pixels are compared, (S, S) bool: those within a share of the radius."""
+    compared: Tensor = disk_offsets(size_px).norm(dim=-1) <= disk_share
+    return compared
+
+
+def _normals(size_px: int) -> Tensor:
+    """Return the outward normals (S, S, 3) float32, in the view, that the pixels of a disk see."""
+    at = disk_offsets(size_px)
+    depth = (1 - at.square().sum(-1, keepdim=True)).clamp_min(0).sqrt()
+    return torch.cat([at, -depth], -1).float()
+
+
+@torch.no_grad()
+def _templates(renderer: SphereRenderer, compared: Tensor, R_view_body: Tensor) -> Tensor:
+    """Return templates (K, P), -STEPS black .. STEPS white, of rotations (K, 3, 3)."""
+    parts = [renderer(R)[:, compared] for R in torch.split(R_view_body, RENDERED)]
+    steps: Tensor = ((2 * torch.cat(parts) - 1) * STEPS).round()
+    return steps

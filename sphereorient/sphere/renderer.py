@@ -123,12 +123,15 @@ class SphereRenderer(nn.Module):
         check_tail("position_mm", position, 3)
         radius = torch.as_tensor(self.radius_mm if radius_mm is None else radius_mm).to(position)
         shape = np.broadcast_shapes(R.shape[:-2], position.shape[:-1], radius.shape)
-        flat = (R.expand(*shape, 3, 3), position.expand(*shape, 3), radius.expand(shape))
-        picture = self._pictures(*(x.reshape(-1, *x.shape[len(shape) :]) for x in flat))
+        if position.numel() == 3 and radius.numel() == 1:  # all in one place: their rays are computed once
+            position, radius = position.reshape(1, 3), radius.reshape(1)
+        else:
+            position, radius = position.expand(*shape, 3).reshape(-1, 3), radius.expand(shape).reshape(-1)
+        picture = self._pictures(R.expand(*shape, 3, 3).reshape(-1, 3, 3), position, radius)
         return picture.reshape(*shape, *picture.shape[1:])
 
     def _pictures(self, R: Tensor, position: Tensor, radius: Tensor) -> Tensor:
-        """Render K spheres in windows that fit them, (K, H, W)."""
+        """Render spheres R (K, 3, 3) in windows that fit them, (K, H, W); position and radius have K rows or one."""
         (width, height), sampling = self.camera.image_size, self.sampling
         samples = sampling.supersampling
         middle_px = self.camera.project(position)
@@ -141,27 +144,29 @@ class SphereRenderer(nn.Module):
         fine_px = fine_pixels(size, samples).to(position)
         down, right = torch.meshgrid(fine_px, fine_px, indexing="ij")
         reached = (right - half).square() + (down - half).square() < (reach + 1.5) ** 2
-        place = torch.stack([right[reached], down[reached]], dim=-1)
+        fine_at = torch.stack([right[reached], down[reached]], dim=-1)
         aperture = aperture_matrix(size, samples, sampling.blur_px).to(R)
         texture = reduced_texture(self.texture.to(R.dtype), samples * 2 * reach / RIM_MARGIN)
         windows = [R.new_zeros(0, size, size)]
-        for k in torch.split(torch.arange(len(R), device=R.device), max(1, SAMPLES // len(place))):
-            rays = self.camera.rays(place + corner[k, None])
+        every = torch.arange(len(R), device=R.device)
+        for k in torch.split(every, max(1, SAMPLES // len(fine_at))):
+            at = k if len(position) > 1 else every[:1]
+            rays = self.camera.rays(fine_at + corner[at, None])
             # The limb is one sample wide: a step would have a noisy derivative.
-            beside = self.camera.rays(middle_px[k, None].detach() + position.new_tensor([1.0 / samples, 0.0]))
-            to_centre = position[k, None] - beside.origin_lab_mm
+            beside = self.camera.rays(middle_px[at, None].detach() + position.new_tensor([1.0 / samples, 0.0]))
+            to_centre = position[at, None] - beside.origin_lab_mm
             fine_mm = torch.linalg.cross(beside.direction_lab, to_centre).norm(dim=-1).detach()
-            seen = see_sphere(rays, position[k], R[k].to(position), texture, radius[k, None])
+            seen = see_sphere(rays, position[at], R[k].to(position), texture, radius[at, None])
             distance_radii = (1.0 - seen.depth2).clamp_min(1e-12).sqrt()
-            share = ((1.0 - distance_radii) * radius[k, None] / fine_mm + 0.5).clamp(0, 1)
+            share = ((1.0 - distance_radii) * radius[at, None] / fine_mm + 0.5).clamp(0, 1)
             fine = R.new_zeros(len(k), *reached.shape)
             fine[:, reached] = (share * (seen.paint - sampling.outside)).to(R.dtype)
             windows.append(aperture @ fine @ aperture.mT)
         canvas = R.new_full((len(R), height + 2 * size, width + 2 * size), sampling.outside)
         across = torch.arange(size, device=R.device)
-        rows, columns = (corner[:, axis, None] + size + across for axis in (1, 0))
-        at = (torch.arange(len(R), device=R.device)[:, None, None], rows[:, :, None], columns[:, None, :])
-        canvas = canvas.index_put(at, torch.cat(windows), accumulate=True)
+        rows, columns = ((corner[:, axis, None] + size + across).expand(len(R), -1) for axis in (1, 0))
+        place = (every[:, None, None], rows[:, :, None], columns[:, None, :])
+        canvas = canvas.index_put(place, torch.cat(windows), accumulate=True)
         return canvas[:, size : size + height, size : size + width]
 
 

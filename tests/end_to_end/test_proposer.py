@@ -23,7 +23,7 @@ from sphereorient.learn.pictures import film
 from sphereorient.learn.settings import PictureSettings
 from sphereorient.methods.proposers import paper_proposer, precise_proposer
 from sphereorient.methods.settings import Settings, load_settings
-from sphereorient.search import FallbackProposer, TemplateBank
+from sphereorient.search import FallbackProposer, GreySearch
 from sphereorient.so3 import geodesic_distance, random_rotations
 from sphereorient.synth import random_texture
 from sphereorient.trajectory import Reason, Trajectory
@@ -148,7 +148,7 @@ def test_disks_that_show_nothing_have_no_proposal(network: LearnedProposer) -> N
 @pytest.mark.slow
 def test_settings_choose_who_proposes(texture: torch.Tensor) -> None:
     alone = load_settings(None, ["propose.checkpoint=default", "propose.when=always"])
-    assert isinstance(precise_proposer(texture, Settings()), TemplateBank)
+    assert isinstance(precise_proposer(texture, Settings()), GreySearch)
     assert isinstance(precise_proposer(texture, alone), LearnedProposer)
     assert isinstance(paper_proposer(texture, 60, alone), LearnedProposer)
     both = load_settings(None, ["propose.checkpoint=default"])

@@ -11,7 +11,7 @@ from orient_examples import attitudes, texture_of
 
 from sphereorient import so3
 from sphereorient.pose.fitter import defocus_radii, steepest_blur_px
-from sphereorient.search import GreySearchSettings, TemplateBank
+from sphereorient.search import GreySearch, GreySearchSettings
 
 WIDE = 0.2  # radii
 
@@ -50,7 +50,7 @@ def blurred_disks(R: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(np.stack(soft))
 
 
-def share_found(search: TemplateBank, disks: torch.Tensor, R: torch.Tensor) -> float:
+def share_found(search: GreySearch, disks: torch.Tensor, R: torch.Tensor) -> float:
     """Share of the disks whose first proposal is the planted attitude."""
     found = search.propose(disks)
     some = found.offset.diff() > 0
@@ -62,7 +62,7 @@ def share_found(search: TemplateBank, disks: torch.Tensor, R: torch.Tensor) -> f
 def test_templates_as_soft_as_the_pictures_find_what_sharp_ones_miss():
     R = attitudes(24)
     disks = blurred_disks(R)
-    soft = TemplateBank(texture_of("patches"), GreySearchSettings(), blur=WIDE)
+    soft = GreySearch(texture_of("patches"), GreySearchSettings(), blur=WIDE)
     told = share_found(soft, disks, R)
     assert told > 0.85
     assert told > share_found(grey_search_of("patches"), disks, R) + 0.15

@@ -9,7 +9,7 @@ import torch
 from orient_examples import KINDS, texture_of
 from torch import Tensor
 
-from sphereorient.search import GreySearchSettings, TemplateBank, crop_disk
+from sphereorient.search import GreySearch, GreySearchSettings, crop_disk
 from sphereorient.sphere import orthographic_view, reduced_texture
 
 SIZE = GreySearchSettings().size_px
@@ -20,8 +20,8 @@ __all__ = ["KINDS", "SIZE", "camera_disks", "grey_search_of", "light_from"]
 
 
 @cache
-def grey_search_of(kind: str) -> TemplateBank:
-    return TemplateBank(texture_of(kind), GreySearchSettings())
+def grey_search_of(kind: str) -> GreySearch:
+    return GreySearch(texture_of(kind), GreySearchSettings())
 
 
 def camera_disks(

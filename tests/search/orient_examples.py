@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.search import Candidates, OrientSettings, PaperSearch
+from sphereorient.search import Candidates, OrientSettings, TemplateBank
 from sphereorient.sphere import orthographic_view, reduced_texture
 from sphereorient.synth import random_texture
 
@@ -23,8 +23,8 @@ def texture_of(kind: str) -> Tensor:
 
 
 @cache
-def search_of(kind: str) -> PaperSearch:
-    return PaperSearch(texture_of(kind), SIZE, OrientSettings())
+def search_of(kind: str) -> TemplateBank:
+    return TemplateBank(texture_of(kind), SIZE, OrientSettings())
 
 
 def attitudes(count: int, seed: int = 1) -> Tensor:

@@ -12,8 +12,8 @@ from orient_examples import attitudes, best_errors_deg, of_disk, texture_of
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError
-from sphereorient.search import Candidates, GreySearchSettings, TemplateBank
-from sphereorient.search.template_bank import BATCH, DEVIATIONS, _steps
+from sphereorient.search import Candidates, GreySearch, GreySearchSettings
+from sphereorient.search.grey_search import BATCH, DEVIATIONS, _steps
 from sphereorient.sphere import perspective_view, reduced_texture
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.trajectory import Reason
@@ -77,7 +77,7 @@ def test_a_near_camera_sees_less_of_the_ball_and_says_so_by_its_distance():
     R_view_body = attitudes(10)
     texture = reduced_texture(texture_of("blobs"), SIZE)
     disks = 20 + 150 * perspective_view(SIZE, 4.0).render(texture, R_view_body.float())
-    near = TemplateBank(texture_of("blobs"), GreySearchSettings(distance_radii=4.0)).propose(disks)
+    near = GreySearch(texture_of("blobs"), GreySearchSettings(distance_radii=4.0)).propose(disks)
     far = grey_search_of("blobs").propose(disks)
     assert best_errors_deg(near, R_view_body).max() < 0.5
     assert (near.score[near.offset[:-1]] > far.score[far.offset[:-1]] + 0.02).all()
@@ -151,7 +151,7 @@ def test_a_negative_and_a_mirrored_picture_explain_less(kind):
 def test_no_proposal_scores_below_score_min_and_those_above_stay():
     disks = camera_disks("blobs", attitudes(10))
     some, few = (
-        TemplateBank(texture_of("blobs"), GreySearchSettings(score_min=least, step_deg=15)).propose(disks)
+        GreySearch(texture_of("blobs"), GreySearchSettings(score_min=least, step_deg=15)).propose(disks)
         for least in (0.0, 0.6)
     )
     assert (some.score < 0.6).any()
@@ -262,7 +262,7 @@ def test_whole_numbers_keep_the_correlation_to_a_few_thousandths():
 @pytest.mark.slow
 def test_a_small_bank_and_small_disks_work_alike():
     settings = GreySearchSettings(size_px=24)
-    search = TemplateBank(texture_of("blobs"), settings)
+    search = GreySearch(texture_of("blobs"), settings)
     assert search.size_px == 24
     R_view_body = attitudes(15)
     small = torch.nn.functional.interpolate(camera_disks("blobs", R_view_body)[:, None], size=(24, 24), mode="area")

@@ -9,7 +9,7 @@ import torch
 
 from sphereorient import so3
 from sphereorient.search.candidates import distinct
-from sphereorient.search.template_bank import best_of_groups, compact_groups
+from sphereorient.search.grey_search import best_of_groups, compact_groups
 
 
 def turned_deg(*angles: float) -> torch.Tensor:

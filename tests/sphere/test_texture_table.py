@@ -311,7 +311,7 @@ def test_the_table_differs_from_the_renderer_only_at_borders_of_paint(rng, kind,
     R_view_body = so3.random_rotations(8, generator=rng, dtype=torch.float32)
     table = DirectionTable(texture).render(R_view_body, view.normal_view)
     assert table.dtype == torch.int8
-    assert set(table.unique().tolist()) == {-1, 1}
+    assert (table.min(), table.max()) == (-127, 127)
     exact = view.paint(texture, R_view_body) >= 0.5
     differs = (table > 0) != exact
     assert 0 < differs.float().mean() < 0.03
@@ -346,7 +346,7 @@ def test_axes_of_the_cube_stay_within_the_table():
     # Components of exactly 1, and a little above it, must not fall out of the last cell.
     table = DirectionTable(random_texture("blobs", 1, 32), 16)
     axes = torch.eye(3)
-    assert table.render(axes[None] * (1 + 5e-7), torch.cat([axes, -axes])).abs().eq(1).all()
+    assert table.render(axes[None] * (1 + 5e-7), torch.cat([axes, -axes])).abs().gt(0).all()
 
 
 def test_a_cell_of_the_direction_table_holds_the_paint_at_its_middle():
@@ -356,6 +356,7 @@ def test_a_cell_of_the_direction_table_holds_the_paint_at_its_middle():
     north[:16] = 1.0
     view = orthographic_view(60)
     upright = torch.tensor([[[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]])
-    up = torch.where(view.normal_view[:, 1] < 0, 1, -1).to(torch.int8)
-    assert torch.equal(DirectionTable(north, 64).render(upright, view.normal_view)[0], up)
-    assert torch.equal(DirectionTable(1 - north, 64).render(upright, view.normal_view)[0], -up)
+    up = view.normal_view[:, 1] < 0
+    white = DirectionTable(north, 64).render(upright, view.normal_view)[0]
+    assert torch.equal(white > 0, up)
+    assert torch.equal(DirectionTable(1 - north, 64).render(upright, view.normal_view)[0], -white)

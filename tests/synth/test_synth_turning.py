@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, R_cam_view
-from sphereorient.search import OrientSettings, PaperSearch, crop_disk
+from sphereorient.search import OrientSettings, TemplateBank, crop_disk
 from sphereorient.synth import SynthSettings, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
 
@@ -43,7 +43,7 @@ def measured(lens: Camera, place: Tensor, R_lab_body: Tensor, perspective: bool 
         crop_disk(render_frame(a_scene, lens, place[None], R[None], np.random.default_rng(k)), u, v, radius_px, 48)
         for k, R in enumerate(R_lab_body)
     ]
-    found = PaperSearch(TEXTURE, 48, OrientSettings()).propose(torch.from_numpy(np.stack(disks)))
+    found = TemplateBank(TEXTURE, 48, OrientSettings()).propose(torch.from_numpy(np.stack(disks)))
     assert (found.offset.diff() > 0).all()
     R_view_body = found.R_view_body[found.offset[:-1]]
     R_persp = R_cam_view(place_cam) if perspective else torch.eye(3, dtype=torch.float64)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.errors import PaintError, check_tail, refusal
-from sphereorient.search import GreySearchSettings, TemplateBank
+from sphereorient.search import GreySearch, GreySearchSettings
 from sphereorient.search.candidates import Candidates
 from sphereorient.search.normalisation import Blur, rim_share
 from sphereorient.sphere import orthographic_view
@@ -98,7 +98,7 @@ class DotSearch:
     """Search all of SO(3) for a table of dots: the grey search proposes; missing dots count, other dark hardly."""
 
     def __init__(self, table: DotTable, settings: GreySearchSettings = DOT_SEARCH) -> None:
-        self._search = TemplateBank(table.texture(), settings)
+        self._search = GreySearch(table.texture(), settings)
         view = orthographic_view(settings.size_px, torch.float64)
         self._inside, self._normal = view.inside, view.normal_view
         self._even = Blur(settings.size_px, EVEN)
@@ -112,7 +112,7 @@ class DotSearch:
         return self._search.size_px
 
     def propose(self, disks: Tensor) -> Candidates:
-        """Propose attitudes; see `TemplateBank.propose`.
+        """Propose attitudes; see `GreySearch.propose`.
 
         Returns:
             Candidates, best first; the score is 1 where all dark is dots and all dots are visible, 1/2 where a ball

@@ -13,7 +13,7 @@ from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
 from sphereorient.experiment.recording import Progress, silent
 from sphereorient.report.plots.style import WIDTH_IN, in_style, new_figure
-from sphereorient.search import Candidates, GreySearchSettings, Proposer, TemplateBank
+from sphereorient.search import Candidates, GreySearch, GreySearchSettings, Proposer
 from sphereorient.search.refine_rotation import DetailLevel, detail_level, level_reference, refine_rotation
 from sphereorient.sphere import orthographic_view, reduced_texture
 from sphereorient.sphere.texture_table import texture_table
@@ -124,7 +124,7 @@ def _searched(
 ) -> tuple[Candidates, PictureCandidates]:
     """Search each disk alone."""
     search: Proposer = (
-        DotSearch(texture, settings.search) if isinstance(texture, DotTable) else TemplateBank(texture, settings.search)
+        DotSearch(texture, settings.search) if isinstance(texture, DotTable) else GreySearch(texture, settings.search)
     )
     parts = []
     for some in torch.split(torch.arange(len(disks)), AT_ONCE):

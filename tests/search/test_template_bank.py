@@ -17,10 +17,12 @@ from orient_examples import (
     search_of,
     texture_of,
 )
+from torch import nn
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError
-from sphereorient.search import OrientSettings, PaperSearch
+from sphereorient.search import OrientSettings, TemplateBank
+from sphereorient.sphere.view import disk_offsets
 from sphereorient.trajectory import Reason
 
 
@@ -60,7 +62,7 @@ def test_a_finer_grid_answers_more_exactly():
     disks = clean_disks("blobs", R_view_body, 64)
     coarse, fine = (
         best_errors_deg(
-            PaperSearch(texture_of("blobs"), 64, OrientSettings(fine_step_deg=step)).propose(disks), R_view_body
+            TemplateBank(texture_of("blobs"), 64, OrientSettings(fine_step_deg=step)).propose(disks), R_view_body
         )
         for step in (6.0, 2.0)
     )
@@ -72,9 +74,9 @@ def test_a_finer_grid_answers_more_exactly():
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_tells_a_mirrored_picture_and_a_mirrored_map_from_the_right_one(kind):
     disks = clean_disks(kind, attitudes(10))
-    mirrored_search = PaperSearch(texture_of(kind).flip(1), SIZE, OrientSettings())
+    mirrored_search = TemplateBank(texture_of(kind).flip(1), SIZE, OrientSettings())
 
-    def best_scores(search: PaperSearch, disks: torch.Tensor) -> torch.Tensor:
+    def best_scores(search: TemplateBank, disks: torch.Tensor) -> torch.Tensor:
         found = search.propose(disks)
         none = torch.zeros(1, dtype=torch.float64)
         return torch.stack([torch.cat([of_disk(found, disk)[1], none])[0] for disk in range(len(disks))])
@@ -91,29 +93,98 @@ def test_it_tells_a_mirrored_picture_and_a_mirrored_map_from_the_right_one(kind)
 
 
 def test_T_of_the_perfect_picture_is_1_because_the_pixels_counted_are_divided_by():
-    search = search_of("patches")
-    on_grid = so3.lattman_grid(math.radians(12.0))[4321]
-    # The search's own template as the picture: each pixel of it is right.
-    template = search._table.render(on_grid[None].float(), search._fine.normal_view).float()
-    found = search.propose(search._fine.picture(template))
-    R, score = of_disk(found, 0)
-    assert score[0] == 1.0
-    assert_close(R[0], on_grid, atol=1e-6)
+    # Half white, half black, the border along the middle column of pixels: nothing in between.
+    halves = torch.zeros(128, 256)
+    halves[:, 128:] = 1.0  # east of longitude 0
+    bank = TemplateBank(halves, SIZE, OrientSettings(coarse_step_deg=30))
+    facing = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+    paint = torch.ones(SIZE, SIZE)
+    paint[:, : SIZE // 2] = -1
+    T = bank.quality(torch.stack([paint, -paint, 0 * paint]), facing)
+    assert_close(T, torch.tensor([1.0, 0.0, 0.5]), atol=0.01)
     # As printed, 1/2 + sum / (2 pi r^2): the disk that is compared has fewer pixels than pi r^2.
-    counted = int(search._fine_used.sum())
+    counted = int((disk_offsets(SIZE).norm(dim=-1) <= OrientSettings().disk_share).sum())
     as_printed = 0.5 + counted / (2 * math.pi * (SIZE / 2) ** 2)
     assert as_printed < 0.97
 
 
-def test_T_of_the_coarse_search_is_1_half_and_0_for_a_template_noise_and_its_negative():
-    search = search_of("blobs")
-    half_size = torch.zeros(1, int(search._coarse.inside.sum()))
-    half_size[:, search._coarse_used] = search._bank[777]
-    paint = search._coarse.picture(half_size).repeat_interleave(2, -1).repeat_interleave(2, -2)
-    score = search._coarse_scores(torch.cat([paint, -paint, 0 * paint]))
-    assert score[0, 777] == 1.0
-    assert score[1, 777] == 0.0
-    assert (score[2] == 0.5).all()
+def test_T_of_the_coarse_grid_is_greatest_for_a_template_least_for_its_negative_and_1_half_for_nothing():
+    bank = search_of("blobs")
+    picture = torch.sign(bank.renderer(bank.grid[777]) - 0.5)
+    T = bank.score(torch.stack([picture, -picture, 0 * picture]))
+    assert T.shape == (3, len(bank.grid))
+    assert T[0].argmax() == 777
+    assert T[0, 777] > 0.9
+    assert T[1].argmin() == 777
+    assert_close(T[0] + T[1], torch.ones(len(bank.grid)), atol=1e-6)
+    assert (T[2] == 0.5).all()
+
+
+def test_T_is_that_of_the_rendered_picture_pixel_by_pixel():
+    bank, R = search_of("patches"), attitudes(3)
+    disks = clean_disks("patches", R)
+    paint, template = bank.paint(disks), 2 * bank.renderer(R) - 1
+    counted = disk_offsets(SIZE).norm(dim=-1) <= OrientSettings().disk_share
+    expected = [
+        0.5
+        + sum(float(i) * float(s) for i, s in zip(paint[k][counted], template[k][counted], strict=True))
+        / 2
+        / counted.sum()
+        for k in range(3)
+    ]
+    assert_close(bank.quality(paint, R), torch.tensor(expected, dtype=torch.float64), atol=1e-6)
+
+
+def test_T_of_each_candidate_is_the_renderers():
+    bank, disks = search_of("dots"), clean_disks("dots", attitudes(4))
+    found = bank.propose(disks)
+    frame = torch.repeat_interleave(torch.arange(4), found.counts)
+    assert_close(found.score, bank.quality(bank.paint(disks)[frame], found.R_view_body.float()).double(), atol=1e-6)
+
+
+def test_gradients_of_T_by_orientation_paint_and_texture_agree_with_differences(rng):
+    texture = nn.Parameter(0.2 + 0.6 * torch.rand(8, 16, generator=rng, dtype=torch.float64))
+    bank = TemplateBank(texture, 16, OrientSettings(coarse_step_deg=30, renderer="kornia")).double()
+    paint = torch.rand(16, 16, generator=rng, dtype=torch.float64).requires_grad_()
+    turn = (0.7 * torch.randn(2, 3, generator=rng, dtype=torch.float64)).requires_grad_()
+
+    def T(texture: torch.Tensor, paint: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(
+            bank, {"renderer.texture": texture}, (paint, so3.exp(turn)), {"quality": True}
+        )
+
+    bank.forward = lambda paint, R, quality: bank.quality(paint, R)
+    assert torch.autograd.gradcheck(T, (texture, paint, turn))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["blobs", "dots"])
+def test_the_table_is_pinned_to_the_renderer(kind):
+    R = attitudes(25)
+    disks = clean_disks(kind, R) + noise(25) / 10
+    table, kornia = (
+        TemplateBank(texture_of(kind), SIZE, OrientSettings(renderer=name, score_min=0.0))
+        for name in ("table", "kornia")
+    )
+    paint, about = table.paint(disks), so3.random_rotations(8, generator=torch.Generator().manual_seed(3)).float()
+    T = [0.5 + bank._rendered(about) @ paint[:, bank._real].T / (254 * bank._real.sum()) for bank in (table, kornia)]
+    assert (T[0] - T[1]).abs().max() < 0.01
+    assert (T[1].T - kornia.quality(paint[:, None], about)).abs().max() < 1e-3
+    best = [bank.propose(disks) for bank in (table, kornia)]
+    apart = so3.geodesic_distance(*(found.R_view_body[found.offset[:-1]] for found in best)).rad2deg()
+    # The same template, or one whose T by the renderer is as high within what the table may be off.
+    assert (apart < 0.01).float().mean() >= 0.9
+    assert (best[0].score[best[0].offset[:-1]] - best[1].score[best[1].offset[:-1]]).abs().max() < 0.01
+
+
+def test_forward_keeps_the_leading_shape():
+    disks = clean_disks("dots", attitudes(4))
+    found = search_of("dots").propose(disks)
+    R, T = search_of("dots")(disks.reshape(2, 2, SIZE, SIZE))
+    assert R.shape == (*T.shape, 3, 3)
+    assert T.shape[:2] == (2, 2)
+    assert_close(T.flatten(0, 1)[:, 0], found.score[found.offset[:-1]])
+    assert torch.equal(torch.isfinite(T).sum(-1).flatten(), found.counts)
 
 
 # --- one disk, many disks
@@ -150,7 +221,7 @@ def test_no_disks_give_no_proposals():
 def test_disks_of_another_size_are_refused_and_an_odd_size_is_rounded_up():
     with pytest.raises(ShapeError, match=r"disks: expected \(F, 48, 48\)"):
         search_of("blobs").propose(torch.zeros(2, SIZE + 2, SIZE + 2))
-    search = PaperSearch(texture_of("blobs"), SIZE - 1, OrientSettings())
+    search = TemplateBank(texture_of("blobs"), SIZE - 1, OrientSettings())
     assert search.size_px == SIZE
     R_view_body = attitudes(2)
     assert best_errors_deg(search.propose(clean_disks("blobs", R_view_body)), R_view_body).max() < 4
@@ -184,14 +255,14 @@ def test_noise_does_not_change_its_neighbours():
 def test_no_proposal_scores_below_score_min_and_those_above_stay():
     disks = clean_disks("dots", attitudes(30))
     all_of_them = search_of("dots").propose(disks)
-    few = PaperSearch(texture_of("dots"), SIZE, OrientSettings(score_min=0.8)).propose(disks)
+    few = TemplateBank(texture_of("dots"), SIZE, OrientSettings(score_min=0.8)).propose(disks)
     assert (all_of_them.score < 0.8).any()
     assert (few.score >= 0.8).all()
     assert torch.equal(few.score, all_of_them.score[all_of_them.score >= 0.8])
 
 
 def test_a_disk_whose_best_is_below_score_min_says_so():
-    search = PaperSearch(texture_of("blobs"), SIZE, OrientSettings(score_min=1.0))
+    search = TemplateBank(texture_of("blobs"), SIZE, OrientSettings(score_min=1.0))
     found = search.propose(clean_disks("blobs", attitudes(2)))
     assert found.reason == (Reason.LOW_SCORE,) * 2
     assert found.offset.tolist() == [0, 0, 0]
@@ -201,27 +272,33 @@ def test_a_disk_whose_best_is_below_score_min_says_so():
 
 
 @pytest.mark.parametrize("group_deg", [30.0, 45.0])
-def test_the_groups_of_a_disk_are_apart_by_the_groups_angle(group_deg):
-    # A fine grid of one point: the proposals are the groups' best on the coarse grid.
-    settings = OrientSettings(
-        group_deg=group_deg, score_margin=0.2, groups_max=500, fine_radius_deg=0.1, fine_step_deg=1.0
-    )
-    found = PaperSearch(texture_of("dots"), SIZE, settings).propose(clean_disks("dots", attitudes(6)))
-    several = 0
-    for disk in range(6):
-        R, _ = of_disk(found, disk)
-        gap = so3.geodesic_distance(R[:, None], R[None]).rad2deg() + 360 * torch.eye(len(R))
-        several += len(R) > 1
-        if len(R) > 1:
-            assert gap.min() >= group_deg - 0.01
-    assert several >= 3
+def test_the_members_of_a_group_are_near_its_first_and_the_firsts_are_apart(group_deg):
+    settings = OrientSettings(group_deg=group_deg, score_margin=0.2, groups_max=500)
+    bank = TemplateBank(texture_of("dots"), SIZE, settings)
+    T = bank.score(bank.paint(clean_disks("dots", attitudes(6))))
+    group = bank.groups(T)
+    assert torch.equal(group >= 0, T.amax(-1, keepdim=True) - 0.2 < T)
+    assert (group.amax(-1) > 0).any()
+    for own, quality in zip(group, T, strict=True):
+        firsts = []
+        for number in range(int(own.max()) + 1):
+            members = torch.nonzero(own == number)[:, 0]
+            first = members[quality[members].argmax()]
+            assert so3.geodesic_distance(bank.grid[first], bank.grid[members]).rad2deg().max() <= group_deg + 0.01
+            firsts.append(first)
+        heads = torch.stack(firsts)
+        assert (quality[heads].diff() <= 0).all()
+        gap = so3.geodesic_distance(bank.grid[heads][:, None], bank.grid[heads]).rad2deg() + 360 * torch.eye(
+            len(firsts)
+        )
+        assert gap.min() >= group_deg - 0.01
 
 
 def test_more_groups_than_allowed_are_a_runaway():
     disks = clean_disks("dots", attitudes(12))
     many = search_of("dots").propose(disks)
     assert (many.offset.diff() > 1).any()
-    one = PaperSearch(texture_of("dots"), SIZE, OrientSettings(groups_max=1)).propose(disks)
+    one = TemplateBank(texture_of("dots"), SIZE, OrientSettings(groups_max=1)).propose(disks)
     for disk in range(12):
         if many.offset.diff()[disk] > 1:
             assert one.reason[disk] == Reason.RUNAWAY
@@ -231,7 +308,7 @@ def test_more_groups_than_allowed_are_a_runaway():
 @pytest.mark.slow
 def test_two_groups_that_climb_to_one_place_give_one_proposal():
     settings = OrientSettings(group_deg=10.0, groups_max=500, score_margin=0.15)
-    found = PaperSearch(texture_of("blobs"), SIZE, settings).propose(clean_disks("blobs", attitudes(2)))
+    found = TemplateBank(texture_of("blobs"), SIZE, settings).propose(clean_disks("blobs", attitudes(2)))
     for disk in range(2):
         R, _ = of_disk(found, disk)
         gap = so3.geodesic_distance(R[:, None], R[None]).rad2deg() + 360 * torch.eye(len(R))

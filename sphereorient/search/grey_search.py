@@ -1,0 +1,163 @@
+"""The grey search: normalised views over all rotations, distinct peaks, a coarse-to-fine fit from each."""
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sphereorient import so3
+from sphereorient.search.candidates import Candidates, check_disks, distinct
+from sphereorient.search.normalisation import LocalNormalisation
+from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
+from sphereorient.search.settings import GreySearchSettings
+from sphereorient.sphere import orthographic_view, perspective_view
+from sphereorient.sphere.texture_table import TextureTable, texture_table
+
+# Disks normalised at once. Fixed, filled up with empty disks: the last bits of sums depend on their number.
+BATCH = 32
+PRODUCT = 128  # disks in one product, at most: the scores of more leave the cache
+GROUP = 8  # neighbouring templates, represented by their best one
+LOOKED_AT = 32  # best groups that are searched for peaks: a broad peak spans several
+TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest detail
+DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
+
+
+class GreySearch(nn.Module):
+    """Searches all of SO(3) on the CPU for the views of a texture map that look like a disk, under any smooth light.
+    Detail finer than `detail` is removed, so that the nearest template of the Lattman grid still correlates.
+
+    Args:
+        texture: (H, 2 H), the texture map, 0 black .. 1 white.
+        settings: of the search; None: the defaults.
+        blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
+
+    `size_px` is the side of the disks, `templates` (K, 3, 3) float32 are the rotations of the bank.
+    """
+
+    def __init__(
+        self, texture: Tensor | NDArray[np.generic], settings: GreySearchSettings | None = None, blur: float = 0.0
+    ) -> None:
+        super().__init__()
+        settings = settings or GreySearchSettings()
+        texture = torch.as_tensor(texture)
+        self._settings = settings
+        size, distance = settings.size_px, settings.distance_radii
+        self.size_px = size
+        self._view = orthographic_view(size) if distance is None else perspective_view(size, distance)
+        self._normalise = LocalNormalisation(size, detail=settings.detail, window=settings.window, clip=settings.clip)
+        pixel_rad = 2.0 / size
+        paint = texture_table(texture, max(blur, min(pixel_rad, settings.detail)), TABLE_SIDE)
+        self._rough = detail_level(self._view, paint, settings.detail, every=2, blur=blur)
+        self._fine = detail_level(self._view, paint, pixel_rad, every=1, blur=blur)
+        grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
+        # (GROUP, G): each group is a column, so that its maximum is one of whole rows.
+        self._grid = grid[compact_groups(grid, GROUP).T]
+        self.templates = self._grid.flatten(0, 1)
+        self._pixels = int(self._view.inside.sum())
+        self._bank = self._templates(paint)
+
+    def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
+        """Return R_view_body (..., K, 3, 3) and score (..., K) float64 of each disk, best first, padded with NaN.
+        Disks (..., S, S) are grey levels of any scale, the outline touching the borders.
+
+        Raises:
+            ShapeError: the disks are of another size.
+        """
+        grey = torch.as_tensor(disks).float()
+        return self.propose(grey.reshape(-1, *grey.shape[-2:])).padded_views(grey.shape[:-2])
+
+    def score(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
+        """Return the correlation of disks (..., S, S) with all `templates`, (..., K) float32, -1 .. 1."""
+        grey = torch.as_tensor(disks).float()
+        steps = self._normalised(grey.reshape(-1, *grey.shape[-2:]))
+        scale = 127.0 / DEVIATIONS * math.sqrt(self._pixels)
+        return (torch._int_mm(steps, self._bank.T) / scale**2).reshape(*grey.shape[:-2], -1)
+
+    def propose(self, disks: Tensor) -> Candidates:
+        """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
+        The outline touches the borders. The score, 0 .. 1, is the share of the disk's deviation from smooth light that
+        the paint explains. A disk below `score_min` has no proposal (`LOW_SCORE`).
+
+        Raises:
+            ShapeError: the disks are of another size.
+        """
+        check_disks(disks, self.size_px, self.size_px)
+        parts: list[Candidates] = []
+        for some in torch.split(disks, PRODUCT):
+            for disk, place, peak in zip(some, *self.search(some), strict=True):
+                parts.append(self._refined(disk, self.templates[place[peak][: self._settings.peaks]]))
+        return Candidates.joined(parts)
+
+    def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the best templates of the best groups, (F, M) int64, best first, and which are peaks, (F, M) bool.
+        All scores of the disks (F, S, S) float32 are held at once, 36 kB each.
+        """
+        scores = torch._int_mm(self._normalised(disks), self._bank.T)
+        place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
+        apart = math.radians(self._settings.peak_deg)
+        looked_at = self.templates[F.pad(place, (0, 0, 0, -len(disks) % BATCH))]
+        peak = torch.cat([distinct(R, apart) for R in torch.split(looked_at, BATCH)])[: len(disks)]
+        return place, peak
+
+    def _normalised(self, disks: Tensor) -> Tensor:
+        filled = F.pad(disks, (0, 0, 0, 0, 0, -len(disks) % BATCH))
+        return torch.cat([_steps(self._normalise(batch)) for batch in torch.split(filled, BATCH)])[: len(disks)]
+
+    def _templates(self, paint: TextureTable) -> Tensor:
+        """Return normalised views of all rotations, (K, P) int8."""
+        normal = self._view.normal_view.T.contiguous()
+        chunks = torch.split(self.templates, BATCH)
+        return torch.cat([_steps(self._normalise(self._view.picture(paint.sample(R.mT @ normal)[0]))) for R in chunks])
+
+    def _refined(self, disk: Tensor, starts: Tensor) -> Candidates:
+        """Refine the peaks of one disk; return its proposals, best first."""
+        settings = self._settings
+        R, score = refine_rotation(self._rough, level_reference(self._rough, disk), starts, settings.rough_steps)
+        R = R[self._distinct(R, score)[: settings.finalists]]
+        R, score = refine_rotation(self._fine, level_reference(self._fine, disk), R, settings.fine_steps)
+        chosen = self._distinct(R, score)
+        chosen = chosen[score[chosen] >= settings.score_min]
+        return Candidates.of_disk(so3.nearest_rotation(R[chosen].double()), score[chosen].double())
+
+    def _distinct(self, R: Tensor, score: Tensor) -> Tensor:
+        order = score.argsort(descending=True, stable=True)
+        return order[distinct(R[order], math.radians(self._settings.distinct_deg))]
+
+
+def _steps(even: Tensor) -> Tensor:
+    """Quantise normalised pictures to -127 .. 127, (B, P) int8, padded to a multiple of 8 pixels."""
+    scale = 127.0 / DEVIATIONS * math.sqrt(even.shape[1])
+    # One scale for all templates: as all have length 1, integer products rank them as they are.
+    return F.pad((even * scale).round().clamp(-127, 127), (0, -even.shape[1] % 8)).to(torch.int8)
+
+
+def compact_groups(R: Tensor, size: int) -> Tensor:
+    """Divide rotations (K, 3, 3) into groups of neighbours, (G, size) int64; some come twice unless size divides K.
+    Source: halving along the matrix component that varies most (Bentley 1975).
+    """
+    flat = R.flatten(1)
+    groups = math.ceil(len(R) / size)
+    index = torch.arange(groups * size) % len(R)
+
+    def halved(members: Tensor) -> list[Tensor]:
+        if len(members) <= size:
+            return [members]
+        at = flat[members]
+        order = members[at[:, int(at.var(0).argmax())].argsort(stable=True)]
+        middle = len(members) // size // 2 * size
+        return [*halved(order[:middle]), *halved(order[middle:])]
+
+    return torch.stack(halved(index))
+
+
+def best_of_groups(scores: Tensor, count: int) -> Tensor:
+    """Return the best members of the `count` best groups, (F, count) int64, best first, from scores (F, M, G).
+    Indices are into the flattened members and groups; all groups where there are fewer.
+    """
+    groups = scores.shape[2]
+    group = scores.amax(1).topk(min(count, groups), dim=1).indices
+    members = scores.gather(2, group[:, None].expand(-1, scores.shape[1], -1))
+    return members.argmax(1) * groups + group
