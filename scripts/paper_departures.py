@@ -109,6 +109,7 @@ def changes() -> dict[str, Change]:
         "as it is": setting(0),
         "background: plain mean, the ball in it": (0, (), lambda: patch.object(scene, "learn_background", plain_mean)),
         "no outliers replaced": setting(0, "locate.outlier_px=1000.0"),
+        "disks of 64 px": setting(1, "orient.size_px=64"),
         "Otsu by majority": (1, (), lambda: patch.object(paper_search, "extract_paint", majority)),
         "moving regions always count": setting(1, "orient.region_contrast_min=0.0"),
         "whole disk compared": setting(1, "orient.disk_share=1.0"),
