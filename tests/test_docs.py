@@ -118,8 +118,8 @@ SENTENCES = {
 
 
 def rows_of_paper_map() -> list[list[str]]:
-    """The cells of each row of the page's tables."""
-    lines = (REPO / "docs" / "paper-map.md").read_text().splitlines()
+    """The cells of each row of the page's tables of sentences."""
+    lines = (REPO / "docs" / "paper-map.md").read_text().partition("\n## Departures\n")[0].splitlines()
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
 
 
