@@ -131,7 +131,7 @@ def changes() -> dict[str, Change]:
         "leader by continuity": setting(2, "assemble.repair_margin=2.0"),
         "weights not limited": (2, (), limits_off),
         "omega from frame k to k + m": (2, (), lambda: patch.object(measure, "omega_from_orientations", forward)),
-        "fine grid to 30 degrees": setting(1, "orient.fine_radius_deg=30.0"),  # a hundred times as long
+        "fine grid to 30 degrees": setting(1, "orient.fine_radius_deg=30.0"),  # fifteen times the views
     }
 
 
@@ -185,7 +185,7 @@ def row(track: Trajectory, truth: Path, name: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", nargs="*", help="names of departures; all but the slow last one without it")
+    parser.add_argument("--only", nargs="*", help="names of departures; all but the last, which is slow, without it")
     parser.add_argument("--list", action="store_true", help="print the names")
     options = parser.parse_args()
     names = list(changes())
