@@ -15,8 +15,9 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
+from sphereorient.evaluate.robustness import BenchSettings
 from sphereorient.learn.settings import ProposerSettings
-from sphereorient.methods.settings import Settings, proposer_settings_yaml, settings_yaml, synth_settings_yaml
+from sphereorient.methods.settings import Settings, flat_settings_yaml, proposer_settings_yaml, settings_yaml
 from sphereorient.synth import SynthSettings
 
 REPO = Path(__file__).resolve().parents[1]
@@ -24,9 +25,10 @@ HEAD = """\
 # Parameters
 
 All settings; each heading names the methods that read them. A default in **bold** is the paper's value; where the paper
-gives none, the description states the reason. `--settings FILE` reads a file with any of them (`configs/default.yaml`
-lists all), `--set room.key=value` changes one. A track keeps the settings used in its attribute `settings`. Written by
-`scripts/make_parameters.py`.
+gives none, the description states the reason. `--settings FILE` reads a file with any of them, `--set room.key=value`
+changes one. `configs/paper.yaml` and `configs/precise.yaml` hold what each method reads, `sphereorient settings` writes
+all; a command reads a file only where it is named. A track keeps the settings used in its attribute `settings`. Written
+by `scripts/make_parameters.py`.
 """
 
 FROM_PAPER = re.compile(r"the paper(:|'s (b|w|\d))")  # "the paper's 12", "the paper: under 5", "the paper's b"
@@ -61,6 +63,13 @@ def parameters() -> str:
         lines += [f"## {room}: {field.description}", "", inspect.cleandoc(model.__doc__ or ""), "", *table(model), ""]
     lines += ["## synth", "", "Of `sphereorient synth`: `--settings configs/synth.yaml`, `--set key=value`.", ""]
     lines += [*table(SynthSettings, of_method=False), ""]
+    lines += [
+        "## robustness",
+        "",
+        "Of `sphereorient bench robustness` and `bench scenes`: `--settings configs/robustness.yaml`.",
+        "",
+    ]
+    lines += [*table(BenchSettings, of_method=False), ""]
     how = "Of `sphereorient train configs/train_proposer.yaml`; `--set room.key=value` ([proposer.md](proposer.md))."
     lines += ["## train", "", how, ""]
     for room, field in ProposerSettings.model_fields.items():
@@ -74,8 +83,10 @@ def pages() -> dict[Path, str]:
     """Every file that this script writes, with its text."""
     return {
         REPO / "docs" / "parameters.md": parameters(),
-        REPO / "configs" / "default.yaml": settings_yaml(),
-        REPO / "configs" / "synth.yaml": synth_settings_yaml(),
+        REPO / "configs" / "paper.yaml": settings_yaml(method="paper"),
+        REPO / "configs" / "precise.yaml": settings_yaml(method="precise"),
+        REPO / "configs" / "synth.yaml": flat_settings_yaml("A synthetic experiment", SynthSettings()),
+        REPO / "configs" / "robustness.yaml": flat_settings_yaml("The robustness benchmark", BenchSettings()),
         REPO / "configs" / "train_proposer.yaml": proposer_settings_yaml(),
     }
 

@@ -27,7 +27,7 @@ from sphereorient.cameras.io.cameras_yaml import ENTRIES, MODELS, PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT, parameter_names
 from sphereorient.cli import app
 from sphereorient.experiment import ExperimentKeys, load_experiment
-from sphereorient.methods.settings import load_proposer_settings, load_settings, load_synth_settings
+from sphereorient.methods.settings import DEFAULTS, load_proposer_settings, load_settings, load_synth_settings
 from sphereorient.trajectory import Flag, Reason, Trajectory
 
 DOCS = sorted([*REPO.glob("*.md"), *(REPO / "docs").glob("*.md")])
@@ -106,19 +106,68 @@ def defined(folder: Path) -> set[str]:
     return set(re.findall(r"^(?:def|class) (\w+)", text, re.MULTILINE))
 
 
+# Sentences of each paragraph of the paper's sections III and IV, counted in the paper.
+SENTENCES = {
+    "III A": (4, 11, 2),
+    "III B 0": (2,),
+    "III B 1": (2, 6, 2, 3, 4, 3, 5),
+    "III B 2": (8, 5, 9, 7, 4),
+    "III C": (8, 6),
+    "IV": (5, 4, 2, 13, 6, 6),
+}
+
+
+def rows_of_paper_map() -> list[list[str]]:
+    """The cells of each row of the page's tables of sentences."""
+    lines = (REPO / "docs" / "paper-map.md").read_text().partition("\n## Departures\n")[0].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
+
+
+def test_every_sentence_of_sections_iii_and_iv_stands_in_one_row_of_the_paper_map():
+    found = []
+    for section, paragraph, first, last in (
+        re.fullmatch(r"(I[IV]+[ ABC012]*), (\d+)\.(\d+)(?:-(\d+))?", row[0]).groups()
+        for row in rows_of_paper_map()
+        if re.match(r"I[IV]+( [A-C])?( \d)?, ", row[0])
+    ):
+        found += [(section, int(paragraph), n) for n in range(int(first), int(last or first) + 1)]
+    expected = [
+        (section, paragraph, n)
+        for section, counts in SENTENCES.items()
+        for paragraph, count in enumerate(counts, 1)
+        for n in range(1, count + 1)
+    ]
+    assert found == expected
+
+
 def test_every_test_that_the_paper_map_names_exists():
     named = re.findall(r"`(tests/\w+)::(\w+)`", (REPO / "docs" / "paper-map.md").read_text())
-    assert len(named) > 40
+    assert len(named) > 120
     for folder, test in named:
         assert test in defined(REPO / folder), f"{folder}::{test}"
 
 
 def test_every_function_that_the_paper_map_names_exists():
-    rows = re.findall(r"^\|[^|]*\|[^|]*\|([^|]*)\| `tests/", (REPO / "docs" / "paper-map.md").read_text(), re.MULTILINE)
-    named = [name for row in rows for name in re.findall(r"`(\w+)\.(\w+)`", row)]
-    assert len(named) > 30
+    named = [name for row in rows_of_paper_map() if len(row) > 3 for name in re.findall(r"`(\w+)\.(\w+)`", row[2])]
+    assert len(named) > 100
     for room, name in named:
         assert name in defined(REPO / "sphereorient" / room), f"{room}.{name}"
+
+
+def test_every_setting_of_the_paper_map_exists_and_those_of_the_method_are_all_there():
+    keys = {key for row in rows_of_paper_map() if len(row) == 5 for key in re.findall(r"`(\w+\.\w+)`", row[4])}
+    assert keys <= set(DEFAULTS), keys - set(DEFAULTS)
+    own = {key for key in DEFAULTS if key.startswith(("orient.", "assemble."))}
+    assert own <= keys, own - keys
+
+
+def test_every_departure_of_the_paper_map_is_in_its_list_and_the_other_way_round():
+    text = (REPO / "docs" / "paper-map.md").read_text()
+    sentences, departures = text.split("\n## Departures\n")
+    marks = re.findall(r"\*\*departures? ([\d, ]+)\*\*", sentences, re.IGNORECASE)
+    named = {int(number) for mark in marks for number in mark.split(",")}
+    listed = [int(number) for number in re.findall(r"^\| (\d+) \|", departures, re.MULTILINE)]
+    assert listed == sorted(named) == list(range(1, len(listed) + 1))
 
 
 def sources() -> list[Path]:

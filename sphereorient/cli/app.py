@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from sphereorient import __version__
-from sphereorient.errors import OutputError, SphereOrientError, refusal
+from sphereorient.errors import OutputError, SettingsError, SphereOrientError, refusal
 from sphereorient.files.whole_file import write_text
 
 
@@ -117,15 +117,19 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
 @app.command()
 def settings(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write; the screen without it.")] = None,
+    method: Annotated[str | None, typer.Option(help="precise, paper, map or report; all without it.")] = None,
 ) -> None:
-    """Write all settings of the methods with defaults and explanations."""
-    from sphereorient.methods.settings import settings_yaml
+    """Write all settings of the methods, or those that one reads, with defaults and explanations."""
+    from sphereorient.methods.settings import BRANCHES, settings_yaml
 
+    if method not in (None, *BRANCHES):
+        raise SettingsError(refusal("--method", expected=", ".join(BRANCHES), got=repr(method)[:40], do="choose one"))
+    text = settings_yaml(method=method)
     if out is None:
-        typer.echo(settings_yaml())
+        typer.echo(text)
         return
     check_writable(out)
-    write_text(out, settings_yaml())
+    write_text(out, text)
 
 
 @app.command()

@@ -89,15 +89,15 @@ Levels = Annotated[str | None, typer.Option(help="Severities, e.g. 1,2,3,4,5; 1,
 Seeds = Annotated[int | None, typer.Option(min=1, max=100, help="Movies of each degradation and severity.")]
 Frames = Annotated[int | None, typer.Option(min=12, help="Of each movie.")]
 Full = Annotated[bool, typer.Option("--full", help="All severities, three movies of 60 frames each: hours.")]
+BenchFile = Annotated[Path | None, typer.Option(help="YAML with keys of configs/robustness.yaml; options win.")]
 
 
 def _settings(
-    full: bool, degradations: str | None, levels: str | None, seeds: int | None, frames: int | None
+    path: Path | None, full: bool, degradations: str | None, levels: str | None, seeds: int | None, frames: int | None
 ) -> "BenchSettings":
-    """Return the default settings, or those of the full run, with the changes of the options."""
-    from pydantic import ValidationError
-
+    """Return the settings of a file, or the defaults, with the changes of the full run and then of the options."""
     from sphereorient.evaluate.robustness.scenes import FULL, BenchSettings
+    from sphereorient.methods.settings import read_flat
 
     if levels is not None and not all(part.strip().isdecimal() for part in levels.split(",")):
         expected, got, do = "whole numbers between commas", repr(levels)[:40], "write e.g. --levels 1,3,5"
@@ -109,10 +109,7 @@ def _settings(
         "frames": frames,
     }
     changes = {name: value for name, value in options.items() if value is not None}
-    try:
-        return BenchSettings(**(FULL if full else BenchSettings()).model_dump() | changes)
-    except ValidationError as error:
-        raise SettingsError(str(error.errors()[0]["msg"]).removeprefix("Value error, ")) from None
+    return read_flat(BenchSettings, path, (FULL.model_dump(exclude_unset=True) if full else {}) | changes)
 
 
 @bench.command()
@@ -123,6 +120,7 @@ def robustness(
     seeds: Seeds = None,
     frames: Frames = None,
     full: Full = False,
+    settings: BenchFile = None,
     quiet: Quiet = False,
     methods: Annotated[str, typer.Option(help="Methods to compare.")] = "precise,paper",
     baseline: Annotated[Path | None, typer.Option(help="results.json of an older run to compare with.")] = None,
@@ -130,7 +128,7 @@ def robustness(
 ) -> None:
     """Measure the effect of noise, blur, dirt, wrong cameras and more on a track; the default ends in minutes."""
     check_writable(out)
-    settings = _settings(full, degradations, levels, seeds, frames)
+    chosen = _settings(settings, full, degradations, levels, seeds, frames)
     from sphereorient.evaluate.robustness import load_results, run_benchmark
     from sphereorient.evaluate.robustness.run import trackers_of
     from sphereorient.report.plots.style import write_figure
@@ -139,7 +137,7 @@ def robustness(
     trackers = trackers_of(names_in(methods))
     older = None if baseline is None else load_results(baseline)
     with progress_bar(quiet, unit="") as advance:
-        found = run_benchmark(out, settings, trackers, jobs=jobs, progress=lambda *at: advance("scenes", *at))
+        found = run_benchmark(out, chosen, trackers, jobs=jobs, progress=lambda *at: advance("scenes", *at))
     write_table(found, out / "results.csv")
     write_figure(robustness_figure(found), out / "robustness")
     if not quiet:
@@ -169,14 +167,15 @@ def write_scenes(
     seeds: Seeds = None,
     frames: Frames = None,
     full: Full = False,
+    settings: BenchFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Render the scenes of the benchmark with their truth, for other programs (docs/robustness.md)."""
     check_writable(out)
-    settings = _settings(full, degradations, levels, seeds, frames)
+    chosen = _settings(settings, full, degradations, levels, seeds, frames)
     from sphereorient.evaluate.robustness import scenes_of, write_scene
 
-    scenes = scenes_of(settings)
+    scenes = scenes_of(chosen)
     with progress_bar(quiet, unit="") as advance:
         for done, scene in enumerate(scenes, start=1):
             write_scene(out / scene.name, scene)

@@ -4,7 +4,7 @@ import difflib
 import math
 import textwrap
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -115,8 +115,10 @@ def read_settings(path: Path | None = None, overrides: Iterable[str] = (), metho
     settings = _load(Settings, tree, path, overrides)
     if method is not None and path is not None:
         check_settings(settings, method, str(path))
-        given = [f"{branch}.{name}" for branch, part in tree.items() for name in part]
-        aside = sorted({key.partition(".")[0] for key in given if not is_read(key, method)})
+        given = [(branch, f"{branch}.{name}") for branch, part in tree.items() for name in part]
+        aside = sorted(
+            {key if branch in BRANCHES[method] else branch for branch, key in given if not is_read(key, method)}
+        )
         if aside:
             remarks.append(f"{path}: method {method} does not read {', '.join(aside)}: left aside")
     return Loaded(settings, tuple(remarks))
@@ -152,6 +154,11 @@ def _renamed(key: str, where: str, remarks: list[str]) -> str:
     if new != key:
         remarks.append(f"{where} {key} is now {new}; the old name goes with the next version")
     return new
+
+
+def read_flat(model: type[Model], path: Path | None, changes: Mapping[str, Any]) -> Model:
+    """Read settings without branches from a file, and change some; as `load_settings`."""
+    return _load(model, {**_read(path), **changes}, path, ())
 
 
 def load_synth_settings(path: Path | None = None, overrides: Iterable[str] = ()) -> SynthSettings:
@@ -192,7 +199,7 @@ def _not_finite(value: Any) -> str:
 def _read(path: Path | None) -> dict[str, Any]:
     tree = None if path is None else read_yaml(path, SettingsError)
     if not isinstance(tree, dict | None):
-        got, do = type(tree).__name__, "see configs/default.yaml"
+        got, do = type(tree).__name__, "see `sphereorient settings`"
         raise SettingsError(refusal(f"settings {path}", expected="keys and values", got=got, do=do))
     return tree or {}
 
@@ -231,16 +238,16 @@ def _explain(error: ValidationError, source: str, model: type[BaseModel]) -> str
     return refusal(f"{source}, {key}", expected=expected, got=short(first["input"]), do="correct the value")
 
 
-def settings_yaml(settings: Settings | None = None) -> str:
-    """Write settings as YAML with each key's description as a comment above it."""
-    head = "# Settings of sphereorient; any key may be left out. --set room.key=value overrides one."
-    return _tree_yaml(head, settings or Settings())
+def settings_yaml(settings: Settings | None = None, method: str | None = None) -> str:
+    """Write settings, of a method the keys that it reads, as YAML with each key's description as a comment above it."""
+    of = f", method {method}" if method else ""
+    head = f"# Settings of sphereorient{of}; any key may be left out. --set room.key=value overrides one."
+    return _tree_yaml(head, settings or Settings(), method)
 
 
-def synth_settings_yaml() -> str:
-    """Write the settings of a synthetic experiment as commented YAML."""
-    head = "# A synthetic experiment; any key may be left out. --set key=value overrides one."
-    return "\n".join([head, "", *_commented(SynthSettings(), ""), ""])
+def flat_settings_yaml(head: str, settings: BaseModel) -> str:
+    """Write settings without branches, those of `synth` and `bench robustness`, as commented YAML."""
+    return "\n".join([f"# {head}; any key may be left out.", "", *_commented(settings, ""), ""])
 
 
 def proposer_settings_yaml(settings: ProposerSettings | None = None) -> str:
@@ -249,16 +256,20 @@ def proposer_settings_yaml(settings: ProposerSettings | None = None) -> str:
     return _tree_yaml(head, settings or ProposerSettings())
 
 
-def _tree_yaml(head: str, tree: BaseModel) -> str:
+def _tree_yaml(head: str, tree: BaseModel, method: str | None = None) -> str:
     lines = [head, ""]
     for room, field in type(tree).model_fields.items():
-        lines += [f"{room}:  # {field.description}", *_commented(getattr(tree, room), "  "), ""]
+        if method is None or room in BRANCHES[method]:
+            left_out = [key.partition(".")[2] for key in NOT_READ.get(method or "", ()) if key.startswith(f"{room}.")]
+            lines += [f"{room}:  # {field.description}", *_commented(getattr(tree, room), "  ", left_out), ""]
     return "\n".join(lines)
 
 
-def _commented(branch: BaseModel, indent: str) -> list[str]:
+def _commented(branch: BaseModel, indent: str, left_out: Iterable[str] = ()) -> list[str]:
     lines = []
     for key, field in type(branch).model_fields.items():
+        if key in left_out:
+            continue
         value = getattr(branch, key)
         lines += [f"{indent}# {line}" for line in textwrap.wrap(field.description or "", 110)]
         if isinstance(value, BaseModel):

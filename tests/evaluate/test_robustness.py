@@ -273,6 +273,24 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, words):
     assert words in said
 
 
+def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, capsys):
+    config = tmp_path / "bench.yaml"
+    config.write_text("degradations: [defocus]\nlevels: [2]\ntogether: 0\nframes: 12\n")
+    seen = []
+    monkeypatch.setattr("sphereorient.evaluate.robustness.write_scene", lambda folder, scene: seen.append(scene))
+    out = tmp_path / "scenes"
+    out.mkdir()
+    assert run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config)[0] == 0
+    assert [(scene.name, scene.frames) for scene in seen] == [("clean-0-0-0", 12), ("defocus-2-0-0", 12)]
+    seen.clear()
+    run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config, "--levels", "4", "--frames", "15")
+    assert [(scene.name, scene.frames) for scene in seen] == [("clean-0-0-0", 15), ("defocus-4-0-0", 15)]
+    config.write_text("level: [2]\n")
+    code, _, said = run_command(monkeypatch, capsys, "scenes", "--out", out, "--settings", config)
+    assert (code, len(said.strip().splitlines())) == (2, 1)
+    assert "did you mean levels" in said
+
+
 def test_compare_as_a_command(tmp_path, monkeypatch, capsys):
     save_results(results(outcome()), tmp_path / "old.json")
     save_results(results(outcome(orientation_deg=(0.2,) * FRAMES)), tmp_path / "new.json")

@@ -13,21 +13,25 @@ from conftest import REPO
 from pydantic import BaseModel, ValidationError
 
 from sphereorient.errors import SettingsError
+from sphereorient.evaluate.robustness import BenchSettings
 from sphereorient.experiment import input_files, load_experiment
 from sphereorient.files.provenance import provenance, sha256, versions
 from sphereorient.locate import LocateSettings
 from sphereorient.methods.settings import (
     BRANCHES,
     DEFAULT_METHOD,
+    DEFAULTS,
     RENAMED,
     Settings,
     check_settings,
+    flat_settings_yaml,
+    is_read,
     load_proposer_settings,
     load_settings,
     load_synth_settings,
+    read_flat,
     read_settings,
     settings_yaml,
-    synth_settings_yaml,
 )
 from sphereorient.synth.settings import SynthSettings
 
@@ -44,7 +48,11 @@ CHANGES = [
 ]
 
 
-LOADERS = {"synth": load_synth_settings, "train": load_proposer_settings}
+LOADERS = {
+    "synth": load_synth_settings,
+    "train": load_proposer_settings,
+    "robustness": lambda path: read_flat(BenchSettings, path, {}),
+}
 
 
 def write(folder: Path, text: str) -> Path:
@@ -206,8 +214,9 @@ def test_small_and_large_numbers_are_read_back_as_numbers(tmp_path):
 
 
 def test_synthetic_settings_written_are_settings_read(tmp_path):
-    assert load_synth_settings(write(tmp_path, synth_settings_yaml())) == SynthSettings()
-    assert yaml.safe_load(synth_settings_yaml()).keys() == SynthSettings.model_fields.keys()
+    text = flat_settings_yaml("A synthetic experiment", SynthSettings())
+    assert load_synth_settings(write(tmp_path, text)) == SynthSettings()
+    assert yaml.safe_load(text).keys() == SynthSettings.model_fields.keys()
 
 
 def test_the_file_names_and_explains_every_setting():
@@ -241,6 +250,50 @@ def test_all_settings_have_a_default_and_a_description_and_are_frozen(model):
 def test_the_committed_settings_are_accepted():
     for path in sorted((REPO / "configs").glob("*.yaml")):
         LOADERS.get(path.stem.partition("_")[0], load_settings)(path)
+
+
+@pytest.mark.parametrize("method", ["paper", "precise"])
+def test_the_file_of_a_method_holds_the_defaults_of_all_keys_that_it_reads_and_no_other(method):
+    path = REPO / "configs" / f"{method}.yaml"
+    assert path.read_text() == settings_yaml(method=method)
+    assert read_settings(path, [], method).remarks == ()
+    tree = yaml.safe_load(path.read_text())
+    assert {f"{branch}.{name}" for branch in tree for name in tree[branch]} == {
+        key for key in DEFAULTS if is_read(key, method)
+    }
+    assert Settings.model_validate(tree) == Settings()
+    assert read_flat(BenchSettings, REPO / "configs" / "robustness.yaml", {}) == BenchSettings()
+
+
+@pytest.mark.parametrize(
+    ("method", "other", "aside"),
+    [
+        ("paper", "precise", "path, refine, search, smooth"),
+        (
+            "precise",
+            "paper",
+            "assemble, locate.gap_frames_max, locate.outlier_factor, locate.outlier_px, "
+            "locate.spline_knot_frames, motion, orient",
+        ),
+    ],
+)
+def test_the_file_of_the_other_method_is_left_aside_with_one_remark_and_refused_once_it_is_changed(
+    tmp_path, method, other, aside
+):
+    path = REPO / "configs" / f"{other}.yaml"
+    loaded = read_settings(path, [], method)
+    assert loaded.settings == Settings()
+    assert loaded.remarks == (f"{path}: method {method} does not read {aside}: left aside",)
+    key, before, after = {
+        "precise": ("search.step_deg", "step_deg: 12.0", "step_deg: 10.0"),
+        "paper": ("orient.fine_step_deg", "fine_step_deg: 3.0", "fine_step_deg: 2.0"),
+    }[other]
+    text = path.read_text()
+    assert before in text
+    changed = write(tmp_path, text.replace(before, after))
+    assert f"{key}: expected a key that method {method} reads" in refused(
+        path=changed, load=lambda path, overrides: read_settings(path, overrides, method)
+    )
 
 
 @pytest.mark.parametrize(
