@@ -41,7 +41,7 @@ class Path(Track):
     """Chosen orientations of one camera in N frames; xi and spike of a link stand at the frame that it enters."""
 
     choice: Tensor  # (N,) int64, row within the frame's candidates; -1 without any
-    xi: Tensor  # (N,), rad/s, cost of the link that enters the frame; NaN without a link
+    xi: Tensor  # (N,), rad/s, angle over time of the link that enters the frame; NaN without a link
     spike: Tensor  # (N,) bool, that link is a spike
     segment: Tensor  # (N,) int64, -1 outside any
 
@@ -81,23 +81,23 @@ def _path(graph: Graph, time_s: Tensor, settings: AssembleSettings) -> Path:
     R = torch.full((len(choice), 3, 3), torch.nan).to(R_all)
     score = torch.full((len(choice),), torch.nan).to(score_all)
     R[there], score[there] = R_all[there, choice[there]], score_all[there, choice[there]]
-    xi, turn = links(R, score, time_s)
+    xi, turn = links(R, time_s)
     spike = find_spikes(xi, turn, settings)
     segment = number_segments(there, spike, settings.gap_frames_max)
     return Path(choice=choice, R_lab_body=R, score=score, xi=xi, spike=spike, segment=segment)
 
 
-def links(R_lab_body: Tensor, score: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:
-    """Return cost xi (rad/s) and angle (rad) of the link that enters each frame, (N,) each, NaN without a link.
-    R_lab_body (N, 3, 3) and score (N,), the quality T, are NaN in frames that are skipped.
+def links(R_lab_body: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:
+    """Return xi (rad/s), the angle over the time, and the angle (rad) of the link that enters each frame, (N,) each.
+    R_lab_body (N, 3, 3) is NaN in frames that are skipped; xi and angle are NaN without a link. time_s (N,) increases.
+    Source: the paper's assembly of III, direct neighbour distance.
     """
-    frame = torch.nonzero(torch.isfinite(score))[:, 0]
-    xi = torch.full_like(score, torch.nan)
-    turn = torch.full_like(score, torch.nan)
-    R, T = R_lab_body[frame], score[frame]
-    dt = time_s[frame].diff().to(score)  # in this order: single precision cannot separate late times
+    frame = torch.nonzero(torch.isfinite(R_lab_body[:, 0, 0]))[:, 0]
+    R, turn = R_lab_body[frame], torch.full_like(R_lab_body[:, 0, 0], torch.nan)
+    xi = turn.clone()
     turn[frame[1:]] = so3.geodesic_distance(R[:-1], R[1:])
-    xi[frame[1:]] = turn[frame[1:]] * (2 - T[:-1] - T[1:]) / dt
+    # The times' difference in their own precision: single precision cannot separate late times.
+    xi[frame[1:]] = turn[frame[1:]] / time_s[frame].diff().to(R)
     return xi, turn
 
 

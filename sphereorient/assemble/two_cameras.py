@@ -56,15 +56,14 @@ def fuse(
         mended = repair((tracks[0], tracks[1]), (first, second), settings)
         tracks, repaired, ambiguous = list(mended.tracks), mended.repaired, mended.ambiguous
     present = torch.stack([track.present for track in tracks])
-    linked = [links(track.R_lab_body, track.score, time_s) for track in tracks]
+    linked = [links(track.R_lab_body, time_s) for track in tracks]
     variance = relative_variance([xi for xi, _ in linked], settings)
     spikes = [moving(find_spikes(xi, turn, settings).to(xi), settings.weight_window_frames) for xi, turn in linked]
     calm = torch.stack([window.nansum(-1) == 0 for window in spikes]).all(0)  # no spike raises the variance
     share = _shares(variance, present)
     R = _mean(tracks, share)
     apart = _apart(tracks)
-    score = torch.stack([track.score for track in tracks]).nanmean(0)
-    xi, turn = links(R, score, time_s)
+    xi, turn = links(R, time_s)
     spike = find_spikes(xi, turn, settings)
     alone = present.sum(0) == 1 if len(tracks) == 2 else torch.ones_like(present[0])
     bits = {
