@@ -28,6 +28,10 @@ class Track:
         """Frames with an orientation, (N,) bool."""
         return torch.isfinite(self.score)
 
+    def part(self, frames: Tensor) -> "Track":
+        """Return some frames of the track."""
+        return Track(R_lab_body=self.R_lab_body[frames], score=self.score[frames])
+
     def with_part(self, frames: Tensor, other: "Track") -> "Track":
         """Return the track with some frames from another one."""
         return Track(

@@ -29,8 +29,8 @@ class AssembleSettings(BaseModel, frozen=True, extra="forbid"):
     weight_window_frames: int = Field(
         51,
         ge=5,
-        description="frames of the moving variance of xi that weighs the cameras; 50 degrees of freedom: the ratio of two "
-        "variances is known to 28 %, which costs 2 % of the mean's variance",
+        description="frames of the moving variance of xi that weighs the cameras; 50 degrees of freedom know the ratio"
+        " of two variances to 28 %, which costs 2 % of the mean's variance",
     )
 
 
