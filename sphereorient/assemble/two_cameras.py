@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble.path import Graph, Path, Track, find_spikes, graph_of, links, moving, number_segments
+from sphereorient.assemble.path import Graph, Path, Track, graph_of
+from sphereorient.assemble.segments import find_spikes, links, moving, number_segments
 from sphereorient.assemble.settings import AssembleSettings
 from sphereorient.errors import ExperimentError, ShapeError, refusal
 from sphereorient.search import Candidates

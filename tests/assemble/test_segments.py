@@ -11,7 +11,7 @@ from conftest import assert_close
 
 from sphereorient import so3
 from sphereorient.assemble import AssembleSettings, assemble_path
-from sphereorient.assemble.path import find_spikes, moving, number_segments
+from sphereorient.assemble.segments import find_spikes, moving, number_segments
 
 SETTINGS = AssembleSettings()
 
