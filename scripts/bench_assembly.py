@@ -47,7 +47,7 @@ def rows(frames: int, width: int) -> dict[str, tuple[float, ...]]:
     score = torch.rand(frames, width, generator=rng, dtype=torch.float64)
     time_s = torch.arange(frames, dtype=torch.float64) / RATE_HZ
     mask, variance = torch.ones(frames, width, dtype=torch.bool), torch.full_like(score, 1e-4)
-    parameters = PathLayer(settings=PathSettings(acceleration_rad_s2=1000.0)).requires_grad_(False).cost(R)
+    parameters = PathLayer(soft=1.0, settings=PathSettings(acceleration_rad_s2=1000.0)).requires_grad_(False).cost(R)
 
     def pairs() -> Tensor:
         return edge_costs(R, score, time_s)

@@ -23,7 +23,7 @@ import yaml
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble import Hypotheses, PathLayer, PathSettings, physical_path
+from sphereorient.assemble import PathLayer, PathSettings
 from sphereorient.assemble.second_order_cost import PARAMETERS
 from sphereorient.statistics.reliability import reliability
 from sphereorient.synth.motion import random_motion
@@ -136,28 +136,11 @@ def learn(known: Labelled, begin: PathSettings, steps: int) -> PathSettings:
     return learnt
 
 
-@torch.no_grad()
 def answer(settings: PathSettings, known: Labelled) -> Answer:
-    """The shortest path of the layer, and the marginals of its places."""
-    marginals = PathLayer(2, soft=1.0, settings=settings)(**known.frames).marginals
-    choice = PathLayer(2, settings=settings)(**known.frames).choice
-    width = known.frames["mask"].shape[-1]
-    choice = torch.where(choice < 0, width, choice)
-    confidence = marginals.gather(-1, choice[..., None])[..., 0]
-    return Answer(choice=choice, confidence=confidence, nll=true_nll(marginals, known))
-
-
-def physical_answer(settings: PathSettings, known: Labelled) -> Answer:
     """The path of `track`."""
-    parts, width = known.frames, known.frames["mask"].shape[-1]
-    choices, posteriors = [], []
-    for R, score, variance, mask, time_s in zip(*parts.values(), strict=True):
-        covariance = variance[..., None, None] * torch.eye(3, dtype=torch.float64)
-        every = Hypotheses(R_lab_body=R, nll=-score, covariance_rad2=covariance, mask=mask)
-        path = physical_path(every, time_s, settings)
-        choices.append(torch.where(path.choice < 0, width, path.choice))
-        posteriors.append(torch.cat([path.posterior, (1 - path.posterior.sum(-1, keepdim=True)).clamp_min(0)], -1))
-    choice, marginals = torch.stack(choices), torch.stack(posteriors)
+    path, width = PathLayer(2, settings=settings)(**known.frames), known.frames["mask"].shape[-1]
+    choice = torch.where(path.choice < 0, width, path.choice)
+    marginals = torch.cat([path.posterior, (1 - path.posterior.sum(-1, keepdim=True)).clamp_min(0)], -1)
     confidence = marginals.gather(-1, choice[..., None])[..., 0]
     return Answer(choice=choice, confidence=confidence, nll=true_nll(marginals, known))
 
@@ -217,15 +200,12 @@ def main() -> None:
     print(f"\n{2 * count} other movies:\n")
     print("| path | wrong frames, % | false one taken, % | true one there and not taken, % | nats | ECE (chance) |")
     print("|---|---|---|---|---|---|")
-    quiet = DEFAULT.model_copy(update={"acceleration_rad_s2": learnt.acceleration_rad_s2})
-    said = {name: answer(s, other) for name, s in (("default", DEFAULT), ("default, acceleration learnt", quiet))}
-    said["learnt"] = answer(learnt, other)
-    said["`track`, default"] = physical_answer(PathSettings(), other)
-    said["`track`, learnt"] = physical_answer(learnt, other)
+    quiet = PathSettings(acceleration_rad_s2=learnt.acceleration_rad_s2)
+    named = {"default": PathSettings(), "default, acceleration learnt": quiet, "learnt": learnt}
+    said = {name: answer(settings, other) for name, settings in named.items()}
     for name, each in said.items():
         print(row(name, each, other))
     print(f"\nLearnt against default: {compared(said['learnt'], said['default'], other)}.")
-    print(f"`track`, learnt against default: {compared(said['`track`, learnt'], said['`track`, default'], other)}.")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""The choice among candidates along time: the paper's path and two cameras; the second-order path, also as a layer."""
+"""The choice among candidates along time: the paper's path and two cameras; the second-order path; both as a layer."""
 
+from sphereorient.assemble.first_order_cost import edge_costs
 from sphereorient.assemble.layer import PathLayer, SoftTrack, expected_orientation, soft_track
-from sphereorient.assemble.path import Path, assemble_path, assemble_paths, edge_costs
-from sphereorient.assemble.second_order import Chosen, Hypotheses, physical_path
+from sphereorient.assemble.path import Path, assemble_path, assemble_paths
+from sphereorient.assemble.second_order import Chosen
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.assemble.trellis import ShortestPath, SoftPath, shortest_path, soft_path
 from sphereorient.assemble.two_cameras import Fused, fuse

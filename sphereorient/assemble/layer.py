@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sphereorient import so3
-from sphereorient.assemble.path import edge_costs, turns_over_gaps
+from sphereorient.assemble.first_order_cost import edge_costs, turns_over_gaps
+from sphereorient.assemble.second_order import Chosen, physical_path
 from sphereorient.assemble.second_order_cost import PARAMETERS, VARIANCE_MAX, SecondOrderCost
 from sphereorient.assemble.settings import AssembleSettings, PathSettings
 from sphereorient.assemble.trellis import ShortestPath, SoftPath, shortest_path, soft_path, taken, visited_before
@@ -29,16 +30,17 @@ MOST |= {"stuck_probability": 0.5, "follow_probability": 0.5}
 
 
 class PathLayer(nn.Module):
-    """Choose among candidate orientations along time; the parameters of the cost can be learnt.
-    Order 1 is the paper's: an edge costs d(A, B) (2 - T_A - T_B) / dt. Order 2 is that of `track`, `SecondOrderCost`,
-    with one more place C for frames without a right candidate. Unlike in `track`, a break of the motion is a mixture
-    and no state, rotations between frames visited are below half a turn, and omega is forgotten after a miss.
+    """Choose among candidate orientations along time; the methods `paper` (order 1) and `precise` (order 2) call it.
+    Order 1 is the paper's: an edge costs d(A, B) (2 - T_A - T_B) / dt. Order 2 has the `SecondOrderCost`: its hard path
+    is a beam search, its soft path a recursion through which the cost is learnt. In the soft path a break of the motion
+    is a mixture and no state, rotations between frames visited are below half a turn, and omega is forgotten after a
+    frame without a right candidate, which has a place of its own.
 
     Args:
         order: 1 or 2.
-        soft: temperature of the soft path, in units of the costs; None: the cheapest path.
-        settings: AssembleSettings (order 1) or PathSettings with an acceleration (order 2), whose other cost
-            settings become parameters of the module: logarithms, or logits of probabilities.
+        soft: temperature of the soft path, in units of the costs; None: the cheapest, or most probable, path.
+        settings: AssembleSettings (order 1) or PathSettings (order 2). In a soft path of order 2 the settings of the
+            cost, with an acceleration, become parameters of the module: logarithms, or logits of probabilities.
     """
 
     def __init__(
@@ -53,7 +55,7 @@ class PathLayer(nn.Module):
             got, do = type(settings).__name__, "pass the settings of this order"
             raise SettingsError(refusal("settings", expected=f"{kind.__name__} for order {order}", got=got, do=do))
         self.order, self.soft = order, soft
-        if isinstance(self._settings, PathSettings):
+        if isinstance(self._settings, PathSettings) and soft is not None:
             cost = SecondOrderCost.of(self._settings)
             for name in PARAMETERS:
                 value = torch.tensor(float(getattr(cost, name)), dtype=torch.float64)
@@ -63,13 +65,11 @@ class PathLayer(nn.Module):
     @property
     def settings(self) -> AssembleSettings | PathSettings:
         """Return the settings with the parameters as they are now; `track` reads them under the key `path`."""
-        if self.order == 1:
-            return self._settings
-        learnt = {name: float(self._value(name).detach()) for name in PARAMETERS}
-        return PathSettings(**{**self._settings.model_dump(), **learnt})
+        learnt = {name: float(self._value(name).detach()) for name, _ in self.named_parameters()}
+        return type(self._settings)(**{**self._settings.model_dump(), **learnt})
 
     def cost(self, like: Tensor) -> SecondOrderCost:
-        """Return the second-order cost, differentiable in the parameters, with the dtype and device of a tensor."""
+        """Return the cost of the soft second-order path, with the dtype and device of a tensor; differentiable."""
         return SecondOrderCost(**{name: self._value(name).to(like) for name in PARAMETERS})
 
     def forward(
@@ -79,9 +79,9 @@ class PathLayer(nn.Module):
         time_s: Values,
         variance_rad2: Values | None = None,
         mask: Values | None = None,
-    ) -> ShortestPath | SoftPath:
-        """Return the cheapest path, or the probabilities where `soft` is set, differentiable in all but mask and times.
-        The path of order 2 has C + 1 places, the last of which means no candidate.
+    ) -> ShortestPath | Chosen | SoftPath:
+        """Return the cheapest path (order 1), the most probable history (order 2), or probabilities (`soft`).
+        Probabilities are differentiable in all but mask and times; those of order 2 have one more place, for none.
 
         Args:
             R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.
@@ -109,6 +109,8 @@ class PathLayer(nn.Module):
         unit = torch.eye(3, dtype=R.dtype, device=R.device)
         R = torch.where(there[..., None, None], R, unit)  # 0 times NaN would reach the gradients
         score, variance = torch.where(there, score, 0.0), torch.where(there, variance, 0.0)
+        if self.order == 2 and self.soft is None:
+            return self._histories(R, -score, variance, there, time)
         node: Tensor | None = None
         triple: Tensor | None = None
         if self.order == 1:
@@ -118,6 +120,19 @@ class PathLayer(nn.Module):
         if self.soft is None:
             return shortest_path(edge, there, node, triple)
         return soft_path(edge, there, self.soft, node, triple)
+
+    def _histories(self, R: Tensor, nll: Tensor, variance: Tensor, mask: Tensor, time_s: Tensor) -> Chosen:
+        """Search movie after movie."""
+        settings, leading = self.settings, mask.shape[:-2]
+        assert isinstance(settings, PathSettings)
+        every = R, nll, variance, mask, time_s
+        R, nll, variance, known, time_s = (x.reshape(math.prod(leading), *x.shape[len(leading) :]) for x in every)
+        movies = zip(R, nll, variance, known, time_s, strict=True)
+        found = [vars(physical_path(*movie, settings)) for movie in movies]
+        if not found:
+            return Chosen.nothing(mask)
+        parts = {name: torch.stack([one[name] for one in found]) for name in found[0]}
+        return Chosen(**{name: part.reshape(leading + part.shape[1:]) for name, part in parts.items()})
 
     def _second_order_costs(
         self, R: Tensor, score: Tensor, time_s: Tensor, variance: Tensor, mask: Tensor

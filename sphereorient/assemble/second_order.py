@@ -2,19 +2,17 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sphereorient.assemble.beam import BeamSearch, Histories
-from sphereorient.assemble.path import number_segments
 from sphereorient.assemble.second_order_cost import SecondOrderCost
+from sphereorient.assemble.segments import number_segments
 from sphereorient.assemble.settings import PathSettings
 from sphereorient.assemble.states import CandidateRows, Floats, Ints, rotated, rotation_between
-from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.trajectory import Flag
 
 VARIANCE_MIN = 1e-10  # rad^2; a smaller variance (0.0006 degrees) is rounding
@@ -28,39 +26,31 @@ FLOOR_SIGMAS = 1.0  # of a single orientation: a smaller acceleration is not see
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Hypotheses:
-    """Candidate orientations of N frames, C places each, best first; masked places may hold anything."""
-
-    R_lab_body: Tensor  # (N, C, 3, 3) float64
-    nll: Tensor  # (N, C) float64, negative log-likelihood of the pictures, less that of the frame's best
-    covariance_rad2: Tensor  # (N, C, 3, 3), of delta in R_true = exp([delta]x) R_lab_body
-    mask: Tensor  # (N, C) bool, where there is a candidate
-
-    def __post_init__(self) -> None:
-        check_tail("Hypotheses.R_lab_body", self.R_lab_body, 3, 3)
-        for entry in fields(self):
-            tail = (3, 3) if entry.name in ("R_lab_body", "covariance_rad2") else ()
-            part, expected = getattr(self, entry.name), (*self.R_lab_body.shape[:-2], *tail)
-            if self.R_lab_body.ndim != 4 or tuple(part.shape) != expected:
-                sizes, got = f"shape (N, C{', 3, 3' if tail else ''})", str(tuple(part.shape))
-                do = "give every part one row a frame and one place a candidate"
-                raise ShapeError(refusal(f"Hypotheses.{entry.name}", expected=sizes, got=got, do=do))
-
-    def __len__(self) -> int:
-        return len(self.mask)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Chosen:
-    """The most probable history of N frames; made by `physical_path`."""
+    """The most probable history of N frames; made by `PathLayer` of second order."""
 
-    choice: Tensor  # (N,) int64, index of the candidate, -1 where no candidate is right
-    probability: Tensor  # (N,) float64, of the choice, NaN where it is -1
-    posterior: Tensor  # (N, C) float64, of each candidate, 0 where masked
-    turn_rad: Tensor  # (N, 3), rad, lab, from the orientation before, may exceed half a turn; NaN where a motion begins
-    segment: Tensor  # (N,) int64, -1 outside any; gaps inside a segment belong to it
-    flags: Tensor  # (N,) int64, bits of trajectory.Flag
-    acceleration_rad_s2: float  # scale per axis that the choice was made with
+    choice: Tensor  # (..., N) int64, index of the candidate, -1 where no candidate is right
+    probability: Tensor  # (..., N) float64, of the choice, NaN where it is -1
+    posterior: Tensor  # (..., N, C) float64, of each candidate, 0 where masked
+    turn_rad: Tensor  # (..., N, 3), lab, from the orientation before, may exceed half a turn; NaN where a motion begins
+    segment: Tensor  # (..., N) int64, -1 outside any; gaps inside a segment belong to it
+    flags: Tensor  # (..., N) int64, bits of trajectory.Flag
+    acceleration_rad_s2: Tensor  # (...), scale per axis that the choice was made with; NaN without candidates
+
+    @classmethod
+    def nothing(cls, mask: Tensor) -> "Chosen":
+        """Return histories without an orientation for candidates in a mask (..., N, C)."""
+        none = torch.full(mask.shape[:-1], -1, device=mask.device)
+        missing = torch.full((*none.shape, 3), torch.nan, dtype=torch.float64, device=mask.device)
+        return cls(
+            choice=none,
+            probability=missing[..., 0],
+            posterior=torch.zeros(mask.shape, dtype=torch.float64, device=mask.device),
+            turn_rad=missing,
+            segment=none,
+            flags=torch.zeros_like(none),
+            acceleration_rad_s2=missing.new_full(mask.shape[:-2], torch.nan),
+        )
 
     @property
     def present(self) -> Tensor:
@@ -68,57 +58,46 @@ class Chosen:
         return self.choice >= 0
 
 
-def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings) -> Chosen:
-    """Choose one candidate of each frame, or none, for the most probable history (`SecondOrderCost`); time_s (N,)
-    increases.
+def physical_path(
+    R_lab_body: Tensor, nll: Tensor, variance_rad2: Tensor, mask: Tensor, time_s: Tensor, settings: PathSettings
+) -> Chosen:
+    """Choose one candidate of each frame of a movie, or none, for the most probable history (`SecondOrderCost`).
+    Candidates R (N, C, 3, 3), nll (N, C) of the pictures, variance (N, C) per axis, mask (N, C); time_s (N,) increases.
     Flags: `AMBIGUOUS` where the choice is not sure, `RECOVERED` on the first frame with an orientation after a gap or a
     break, `SPIKE` where a rotation does not follow from the motion.
     Source: textbook hidden Markov model of second order; unlike the paper's cost, it does not favour candidates at rest
     (docs/errata.md A6).
-
-    Raises:
-        ShapeError: the number of times is not N.
     """
-    if tuple(time_s.shape) != (len(hypotheses),):
-        do, got = "pass one time a frame", str(tuple(time_s.shape))
-        raise ShapeError(refusal("time_s", expected=f"shape ({len(hypotheses)},)", got=got, do=do))
-    device = hypotheses.mask.device
-    parts = {entry.name: getattr(hypotheses, entry.name).detach().cpu() for entry in fields(hypotheses)}
-    known = Hypotheses(**{name: part if name == "mask" else part.double() for name, part in parts.items()})
-    frames = torch.nonzero(known.mask.any(1))[:, 0]
-    chosen = _nothing(known.mask)
-    if len(frames):
-        scale = settings.acceleration_rad_s2 or 1.0
-        cost = SecondOrderCost.of(settings.model_copy(update={"acceleration_rad_s2": scale}))
-        rows = _rows(known, time_s.detach().cpu().double(), frames, cost)
-        chosen = _chosen(known, frames, rows, *_search(rows, cost, settings), settings)
-    moved: dict[str, Any] = {name: part.to(device) for name, part in vars(chosen).items() if torch.is_tensor(part)}
-    return replace(chosen, **moved)
-
-
-def _rows(known: Hypotheses, time_s: Tensor, frames: Tensor, cost: SecondOrderCost) -> CandidateRows:
-    """Return the candidates as rows; the variance is the mean over axes: false candidates are degrees away."""
-    mask = known.mask
-    variance = (float(cost.sigma_scale) ** 2 * known.covariance_rad2).diagonal(dim1=-2, dim2=-1).mean(-1)
-    return CandidateRows(
-        R_lab_body=known.R_lab_body[mask].numpy(),
-        variance=variance[mask].clamp_min(VARIANCE_MIN).numpy(),
-        log_weight=cost.picture_log_weight(known.nll[frames], mask[frames])[mask[frames]].numpy(),
+    device, chosen = mask.device, Chosen.nothing(mask)
+    R, nll, variance, time = (part.detach().cpu().double() for part in (R_lab_body, nll, variance_rad2, time_s))
+    mask = mask.cpu()
+    frames = torch.nonzero(mask.any(1))[:, 0]
+    if not len(frames):
+        return chosen
+    scale = settings.acceleration_rad_s2 or 1.0
+    cost = SecondOrderCost.of(settings.model_copy(update={"acceleration_rad_s2": scale}))
+    variance = float(cost.sigma_scale) ** 2 * variance[mask]
+    rows = CandidateRows(
+        R_lab_body=R[mask].numpy(),
+        variance=variance.clamp_min(VARIANCE_MIN).numpy(),
+        log_weight=cost.picture_log_weight(nll[frames], mask[frames])[mask[frames]].numpy(),
         offset=np.concatenate([[0], mask[frames].sum(-1).cumsum(0).numpy()]),
-        time_s=time_s[frames].numpy(),
-        frame_s=float(time_s.diff().median()) if len(time_s) > 1 else 1.0,
+        time_s=time[frames].numpy(),
+        frame_s=float(time.diff().median()) if len(time) > 1 else 1.0,
     )
+    chosen = _chosen(mask, frames, rows, *_search(rows, cost, settings), settings)
+    return Chosen(**{name: part.to(device) for name, part in vars(chosen).items()})
 
 
 def _chosen(
-    known: Hypotheses,
+    mask: Tensor,
     frames: Tensor,
     rows: CandidateRows,
     histories: Histories,
     cost: SecondOrderCost,
     settings: PathSettings,
 ) -> Chosen:
-    mask, empty = known.mask, _nothing(known.mask)
+    empty = Chosen.nothing(mask)
     place = torch.arange(mask.shape[1]).expand_as(mask)[mask]
     row = torch.from_numpy(histories.row)
     seen, choice = frames[row >= 0], place[row[row >= 0]]
@@ -145,21 +124,7 @@ def _chosen(
         turn_rad=empty.turn_rad.index_put((frames,), torch.from_numpy(histories.turn_rad)),
         segment=number_segments(present, begins | spike, len(mask)),
         flags=torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0),
-        acceleration_rad_s2=float(cost.acceleration_rad_s2),
-    )
-
-
-def _nothing(mask: Tensor) -> Chosen:
-    none = torch.full(mask.shape[:1], -1)
-    missing = torch.full((len(mask), 3), torch.nan, dtype=torch.float64)
-    return Chosen(
-        choice=none,
-        probability=missing[:, 0],
-        posterior=torch.zeros(mask.shape, dtype=torch.float64),
-        turn_rad=missing,
-        segment=none,
-        flags=torch.zeros_like(none),
-        acceleration_rad_s2=math.nan,
+        acceleration_rad_s2=torch.tensor(float(cost.acceleration_rad_s2), dtype=torch.float64),
     )
 
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.assemble.path import Graph, Path, Track, find_spikes, graph_of, links, moving, number_segments
+from sphereorient.assemble.path import Graph, Path, Track, graph_of
+from sphereorient.assemble.segments import find_spikes, links, moving, number_segments
 from sphereorient.assemble.settings import AssembleSettings
 from sphereorient.errors import ExperimentError, ShapeError, refusal
 from sphereorient.search import Candidates
@@ -37,7 +38,7 @@ def fuse(
     paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings
 ) -> Fused:
     """Fuse the paths of one or two cameras, in the lab frame, into one; `time_s` (N,).
-    Frames that differ by more than `repair_deg` are repaired. Then each frame is the mean of both, weighted by the
+    Stretches that differ by more than `repair_deg` are repaired. Then each frame is the mean of both, weighted by the
     inverse moving variance of xi; their differences give the sigma, so that one camera alone has none. Flags:
     `ONE_CAMERA`, and `AMBIGUOUS` for an undecided repair.
     Source: the paper's two cameras; docs/errata.md A7 (which camera is right), A8 (xi contains the motion's variance).
@@ -53,18 +54,17 @@ def fuse(
     repaired, ambiguous = torch.zeros_like(present), torch.zeros_like(present[0])
     if len(tracks) == 2:
         first, second = (graph_of(candidates[name], settings.quality_min) for name in names)
-        mended = repair((tracks[0], tracks[1]), (first, second), settings)
+        mended = repair((paths[names[0]], paths[names[1]]), (first, second), settings)
         tracks, repaired, ambiguous = list(mended.tracks), mended.repaired, mended.ambiguous
     present = torch.stack([track.present for track in tracks])
-    linked = [links(track.R_lab_body, track.score, time_s) for track in tracks]
+    linked = [links(track.R_lab_body, time_s) for track in tracks]
     variance = relative_variance([xi for xi, _ in linked], settings)
     spikes = [moving(find_spikes(xi, turn, settings).to(xi), settings.weight_window_frames) for xi, turn in linked]
     calm = torch.stack([window.nansum(-1) == 0 for window in spikes]).all(0)  # no spike raises the variance
     share = _shares(variance, present)
     R = _mean(tracks, share)
     apart = _apart(tracks)
-    score = torch.stack([track.score for track in tracks]).nanmean(0)
-    xi, turn = links(R, score, time_s)
+    xi, turn = links(R, time_s)
     spike = find_spikes(xi, turn, settings)
     alone = present.sum(0) == 1 if len(tracks) == 2 else torch.ones_like(present[0])
     bits = {
@@ -165,44 +165,59 @@ class Repair:
     ambiguous: Tensor  # (N,) bool, the choice of the right camera was not decided by T
 
 
-def repair(tracks: tuple[Track, Track], graphs: tuple[Graph, Graph], settings: AssembleSettings) -> Repair:
-    """Repair each run of frames where the cameras disagree; the better supported camera leads.
+def repair(paths: tuple[Path, Path], graphs: tuple[Graph, Graph], settings: AssembleSettings) -> Repair:
+    """Repair each stretch (`_stretches`) in which the cameras disagree; the better supported camera leads.
     Each camera in turn is assumed right; the other takes its nearest candidates, none (T = 0) beyond `repair_deg`. The
     larger mean T of both cameras decides. Within `repair_margin`, or without such candidates, the leader with the
     smaller largest rotation holds, and the frames are ambiguous.
+    A segment of the loser that the leader contradicts wherever it sees the sphere is dropped where the leader does not.
     Source: the paper's two cameras, which does not say which camera is right; docs/errata.md A7.
     """
     limit = math.radians(settings.repair_deg)
-    apart = _apart(tracks)
-    both, wrong = torch.isfinite(apart), apart > limit
-    agreed = torch.nonzero(both & ~wrong)[:, 0]
-    result, repaired, ambiguous = list(tracks), torch.zeros_like(torch.stack([both, both])), torch.zeros_like(both)
-    for frames in _stretches(wrong, both, settings.gap_frames_max):
-        followers = [_follow(tracks[leader], graphs[1 - leader], frames, limit) for leader in (0, 1)]
-        scores = [tracks[leader].score[frames] + followers[leader].score.nan_to_num(0.0) for leader in (0, 1)]
+    apart, segment = _apart(paths), torch.stack([path.segment for path in paths])
+    agreed = apart <= limit
+    result: list[Track] = list(paths)
+    decided: list[Track] = list(paths)  # the loser of a stretch has the leader's orientations
+    repaired, ambiguous = torch.zeros_like(torch.stack([agreed, agreed])), torch.zeros_like(agreed)
+    for frames in _stretches(apart, segment, limit):
+        followers = [_follow(paths[leader], graphs[1 - leader], frames, limit) for leader in (0, 1)]
+        scores = [paths[leader].score[frames] + followers[leader].score.nan_to_num(0.0) for leader in (0, 1)]
         merits = [float(score.mean() / 2) for score in scores]
         matched = any(bool(follower.present.any()) for follower in followers)
         guess = not matched or abs(merits[0] - merits[1]) < settings.repair_margin
         if guess:
-            frames_beside = _beside(frames, agreed, settings.gap_frames_max)
-            rough = [_roughest_turn(track, frames_beside) for track in tracks]
+            frames_beside = _beside(frames, torch.nonzero(agreed)[:, 0], settings.gap_frames_max)
+            rough = [_roughest_turn(track, frames_beside) for track in decided]
             leader = int(rough[1] < rough[0])
         else:
             leader = int(merits[1] > merits[0])
         loser = 1 - leader
-        result[loser] = result[loser].with_part(frames, followers[leader])
-        repaired[loser, frames] = followers[leader].present
-        ambiguous[frames] = guess
+        agreed[frames], ambiguous[frames] = True, guess
+        decided[loser] = decided[loser].with_part(frames, paths[leader].part(frames))
+        own = segment[loser] == segment[loser, frames[0]]
+        if not guess and apart[own].nanmedian() > limit:
+            frames = torch.cat([frames, torch.nonzero(own & ~paths[leader].present)[:, 0]])
+        follower = _follow(paths[leader], graphs[loser], frames, limit)
+        moved = (follower.R_lab_body != paths[loser].R_lab_body[frames]).flatten(1).any(1)
+        result[loser] = result[loser].with_part(frames, follower)
+        repaired[loser, frames] = follower.present & moved
     return Repair(tracks=(result[0], result[1]), repaired=repaired, ambiguous=ambiguous)
 
 
-def _stretches(wrong: Tensor, both: Tensor, gap_frames_max: int) -> list[Tensor]:
-    seen = torch.nonzero(both)[:, 0]
-    place = torch.nonzero(wrong[seen])[:, 0]
-    frame = seen[place]
-    ends = (place.diff() > 1) | (frame.diff() > gap_frames_max + 1)
-    lengths = torch.nonzero(ends)[:, 0] + 1
-    return [run for run in torch.tensor_split(frame, lengths.cpu()) if len(run)]
+def _stretches(apart: Tensor, segment: Tensor, limit: float) -> list[Tensor]:
+    """Return the frames of each stretch in which the cameras disagree; segment (2, N) of each camera alone.
+    A piece lies between spikes or gaps of either camera. It is one stretch if its median distance exceeds the limit:
+    after a spike the whole path may be false. In other pieces each run of frames beyond the limit is a stretch.
+    """
+    seen = torch.nonzero(torch.isfinite(apart))[:, 0]
+    borders = torch.nonzero((segment[:, seen].diff() != 0).any(0))[:, 0] + 1
+    stretches: list[Tensor] = []
+    for piece in torch.tensor_split(seen, borders.cpu()) if len(seen) else ():
+        wrong = apart[piece] > limit
+        whole = bool(apart[piece].median() > limit)
+        runs = torch.tensor_split(piece, torch.nonzero(wrong.diff())[:, 0].cpu() + 1)
+        stretches += [piece] if whole else [run for run in runs if apart[run[0]] > limit]
+    return stretches
 
 
 def _follow(leader: Track, graph: Graph, frames: Tensor, limit: float) -> Track:

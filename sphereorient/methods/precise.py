@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
-from sphereorient import assemble, motion
-from sphereorient.assemble import Hypotheses
+from sphereorient import motion
+from sphereorient.assemble import Chosen, PathLayer
 from sphereorient.experiment.recording import Progress
 from sphereorient.follow.appearance import Appearance, estimate_appearance
 from sphereorient.follow.fixed_centre import find_fixed_centre
@@ -77,13 +77,12 @@ def join(
     assert follower is not None  # `learn` and `resume` return one
     clock, given, settings = job.recording.clock, job.given, job.settings
     table = pose_table(measured, len(job.recording.streams))
-    hypotheses = Hypotheses(
-        R_lab_body=table.R_lab_body, nll=table.nll, covariance_rad2=table.covariance[..., :3, :3], mask=table.mask
-    )
     path = settings.path
     if given is not None and given.acceleration_rad_s2 is not None:
         path = path.model_copy(update={"acceleration_rad_s2": given.acceleration_rad_s2})
-    chosen = assemble.physical_path(hypotheses, clock, path)
+    # The mean variance over the axes: false candidates are degrees away.
+    variance = table.covariance[..., :3, :3].diagonal(dim1=-2, dim2=-1).mean(-1)
+    chosen: Chosen = PathLayer(2, settings=path)(table.R_lab_body, -table.nll, clock, variance, table.mask)
     picked = table.rows(chosen.choice)
     poses = motion.MeasuredPoses(
         time_s=clock,
@@ -95,7 +94,7 @@ def join(
     )
     smoothed = motion.smooth_motion(poses, settings.smooth, None if given is None else given.process)
     track = results.precise_track(job.recording.experiment, clock, table, chosen, smoothed, follower.appearance)
-    return track, Learnt.of(follower.appearance, smoothed.process, chosen.acceleration_rad_s2)
+    return track, Learnt.of(follower.appearance, smoothed.process, float(chosen.acceleration_rad_s2))
 
 
 PRECISE = Method(learn=learn, resume=resume, join=join)

@@ -48,7 +48,7 @@ class CameraTrack:
     orientation: Floats = stored("1", "R_lab_body of this camera's own best candidate", 3, 3)
     orientation_cov: Floats = stored("rad^2", "covariance of delta, R_true = exp([delta]x) R, lab components", 3, 3)
     score: Floats = stored("1", "agreement of the picture with the map at this orientation, 0 to 1")
-    xi: Floats = stored("rad", "the paper's measure of this camera's noise; its moving variance weighs the cameras")
+    xi: Floats = stored("rad/s", "angle over time of the link that enters the frame; its variance weighs the cameras")
     reason: tuple[str, ...]  # N values of Reason; newer files may have unknown reasons
     candidate_offset: NDArray[np.int64] = stored(
         "1", "candidates of frame k are the rows offset[k] .. offset[k + 1]", dtype="int64", fill=0, rows="offsets"

@@ -10,10 +10,20 @@ import torch
 from assemble_examples import noisy, turned_deg
 from torch import Tensor
 
-from sphereorient import assemble, so3
-from sphereorient.assemble import Chosen, Hypotheses, PathSettings
+from sphereorient import so3
+from sphereorient.assemble import Chosen, PathLayer, PathSettings
 
 SIGMA = 1.0e-3  # rad per axis, of every candidate
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hypotheses:
+    """Candidates of N frames, C places each; masked places may hold anything."""
+
+    R_lab_body: Tensor  # (N, C, 3, 3)
+    nll: Tensor  # (N, C)
+    variance_rad2: Tensor  # (N, C)
+    mask: Tensor  # (N, C) bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,10 +34,11 @@ class Solved(Chosen):
 
 
 def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings) -> Solved:
-    """The most probable history, and the orientations that it chooses."""
-    chosen = assemble.physical_path(hypotheses, time_s, settings)
+    """The most probable history by the layer that `track` calls, and the orientations that it chooses."""
+    h = hypotheses
+    chosen: Chosen = PathLayer(2, settings=settings)(h.R_lab_body, -h.nll, time_s, h.variance_rad2, h.mask)
     there = chosen.present
-    R = torch.full((len(hypotheses), 3, 3), torch.nan, dtype=torch.float64)
+    R = torch.full((len(h.mask), 3, 3), torch.nan, dtype=torch.float64)
     R[there] = hypotheses.R_lab_body[there, chosen.choice[there]].double()
     return Solved(**vars(chosen), R_lab_body=R)
 
@@ -40,7 +51,7 @@ def pooled(*tracks: Tensor, nll: Sequence[float] | Tensor | None = None, mask: T
     return Hypotheses(
         R_lab_body=R,
         nll=given.expand(shape),
-        covariance_rad2=(SIGMA**2 * torch.eye(3, dtype=torch.float64)).expand(*shape, 3, 3),
+        variance_rad2=torch.full(shape, SIGMA**2, dtype=torch.float64),
         mask=torch.ones(shape, dtype=torch.bool) if mask is None else mask,
     )
 

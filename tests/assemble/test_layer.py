@@ -20,14 +20,12 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.assemble import (
     AssembleSettings,
-    Hypotheses,
+    Chosen,
     PathLayer,
     PathSettings,
-    ShortestPath,
     SoftPath,
     edge_costs,
     layer,
-    physical_path,
     shortest_path,
     soft_path,
 )
@@ -67,12 +65,21 @@ def soft(parts: Mapping[str, Tensor], settings: PathSettings = SETTINGS, tempera
 
 def choice(parts: Mapping[str, Tensor], settings: PathSettings = SETTINGS) -> Tensor:
     found = PathLayer(2, settings=settings)(**parts)
-    assert isinstance(found, ShortestPath)
+    assert isinstance(found, Chosen)
     return found.choice
 
 
+def cheapest(parts: Mapping[str, Tensor], settings: PathSettings = SETTINGS) -> Tensor:
+    """The cheapest path of the costs of the soft path: another algorithm and a coarser cost; -1 for none."""
+    module, mask = PathLayer(2, soft=1.0, settings=settings), parts["mask"]
+    costs = (parts[name] for name in ("R_lab_body", "score", "time_s", "variance_rad2", "mask"))
+    edge, there, node, triple = module._second_order_costs(*costs)
+    place = shortest_path(edge, there, node, triple).choice
+    return torch.where(place == mask.shape[-1], -1, place)
+
+
 def triples(settings: PathSettings, *parts: Tensor) -> Tensor:
-    return layer.triple_costs(PathLayer(settings=settings).cost(parts[0]), *parts)
+    return layer.triple_costs(PathLayer(soft=1.0, settings=settings).cost(parts[0]), *parts)
 
 
 def density(chord: float, spread: float, w: PathSettings) -> float:
@@ -158,7 +165,7 @@ def test_the_true_candidate_is_found_among_false_ones_that_stand_and_that_are_an
     R = turning(60, 4.0)
     standing = so3.random_rotations((), generator=rng).expand(60, 3, 3)
     every = movie(R, standing, so3.random_rotations(60, generator=rng))
-    assert choice(every).tolist() == [0] * 60
+    assert choice(every).tolist() == cheapest(every).tolist() == [0] * 60
     marginals = soft(every).marginals
     assert marginals.shape == (60, 4)
     assert (marginals[:, 0] > 0.97).all()
@@ -171,9 +178,12 @@ def test_frames_in_which_no_candidate_is_right_say_none_and_empty_frames_nothing
     every["mask"][40:43] = False
     every["R_lab_body"][40:43] = torch.nan
     chosen = choice(every)
-    assert chosen[20] == 1
+    assert chosen[20] == -1
     assert chosen[40:43].tolist() == [-1] * 3
     assert (chosen == 0).sum() == 56
+    every["R_lab_body"][40:43] = torch.eye(3, dtype=torch.float64)
+    assert torch.equal(cheapest(every), chosen)
+    every["R_lab_body"][40:43] = torch.nan
     marginals = soft(every).marginals
     assert marginals[20, 1] > 0.9
     assert not marginals[40:43].any()
@@ -186,7 +196,7 @@ def test_what_the_pictures_say_decides_between_twins(rng):
     half = so3.exp(torch.tensor([0.0, 0.0, torch.pi], dtype=torch.float64))
     every = movie(R, R @ half, nll=nll)
     every["R_lab_body"][:, 1] = every["R_lab_body"][:, 0] @ half  # exactly as smooth
-    assert choice(every).tolist() == [1] * 30
+    assert choice(every).tolist() == cheapest(every).tolist() == [1] * 30
     assert soft(every).marginals[15, 1] > 0.99
     assert abs(float(soft(every, changed(evidence_scale=1e-3)).marginals[15, 1].detach()) - 0.5) < 0.02
 
@@ -218,6 +228,26 @@ def test_a_batch_is_the_stack_of_its_movies_and_arrays_of_numpy_are_accepted(ord
     assert_close(module(**{name: part.numpy() for name, part in parts.items()}).marginals, together, 0.0)
     single = module(**{name: part if name == "mask" else part.float() for name, part in parts.items()})
     assert single.marginals.dtype == torch.float32
+
+
+def test_histories_of_a_batch_are_the_stack_of_those_of_its_movies(batch, rng):
+    parts = random_parts(batch, rng)
+    module = PathLayer(2, settings=PathSettings())
+    assert list(module.parameters()) == []
+    together = module(**parts)
+    assert together.choice.shape == (*batch, 8)
+    assert together.posterior.shape == (*batch, 8, 2)
+    assert together.acceleration_rad_s2.shape == batch
+    for at in itertools.product(*map(range, batch)):
+        alone = module(**{name: part[at] for name, part in parts.items()})
+        for name in Chosen.__dataclass_fields__:
+            assert_close(getattr(together, name)[at], getattr(alone, name), 0.0)
+    assert torch.equal(module(**{name: part.numpy() for name, part in parts.items()}).choice, together.choice)
+
+
+def test_no_movies_are_data(rng):
+    parts = random_parts((0,), rng)
+    assert PathLayer(2)(**parts).posterior.shape == (0, 8, 2)
 
 
 def test_the_first_order_is_the_papers_path(rng):
@@ -299,30 +329,25 @@ def test_learnt_settings_are_read_by_track_and_change_its_path(rng, tmp_path):
     nll[:10, 1] = nll[30:, 1] = 4 * 1.5
     anywhere = so3.random_rotations(40, generator=rng)
     every = movie(R, torch.where((torch.arange(40) % 2 == 0)[:, None, None], twin, anywhere), nll=nll)
-    hypotheses = Hypotheses(
-        R_lab_body=every["R_lab_body"],
-        nll=nll,
-        covariance_rad2=torch.diag_embed(every["variance_rad2"][..., None].expand(40, 2, 3)),
-        mask=every["mask"],
-    )
     module = PathLayer(2, soft=1.0, settings=SETTINGS)
     with torch.no_grad():
         module.get_parameter("evidence_scale").fill_(math.log(0.25))
     (tmp_path / "learnt.yaml").write_text(yaml.safe_dump({"path": module.settings.model_dump()}))
     learnt = load_settings(tmp_path / "learnt.yaml").path
     assert learnt.evidence_scale == pytest.approx(0.25)
-    claimed, honest = (Hypotheses(**{**vars(hypotheses), "nll": each}) for each in (nll, nll / 4))
-    before, after = (physical_path(claimed, times(40), each) for each in (SETTINGS, learnt))
-    assert_close(after.posterior, physical_path(honest, times(40), SETTINGS).posterior, 1e-9)
+    before, after = (PathLayer(2, settings=each)(**every) for each in (SETTINGS, learnt))
+    honest = PathLayer(2, settings=SETTINGS)(**{**every, "score": -nll / 4})
+    assert_close(after.posterior, honest.posterior, 1e-9)
     assert (before.posterior - after.posterior).abs().max() > 0.01
 
 
 def test_settings_come_back_as_they_went_in_and_impossible_ones_are_refused():
-    there = PathLayer(settings=SETTINGS).settings
+    assert PathLayer(settings=SETTINGS).settings == SETTINGS
+    there = PathLayer(soft=1.0, settings=SETTINGS).settings
     for name in PathSettings.model_fields:
         assert getattr(there, name) == pytest.approx(getattr(SETTINGS, name), rel=1e-12)
     with pytest.raises(SettingsError, match="acceleration_rad_s2: expected a number, got null"):
-        PathLayer(2)
+        PathLayer(2, soft=1.0)
     with pytest.raises(SettingsError, match="settings: expected AssembleSettings for order 1"):
         PathLayer(1, settings=SETTINGS)
     with pytest.raises(SettingsError, match="order: expected 1 or 2, got 3"):

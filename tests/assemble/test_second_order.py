@@ -10,6 +10,7 @@ import torch
 from assemble_examples import RATE_HZ, candidates_of, times, turned_deg, turning
 from conftest import assert_close
 from second_order_examples import (
+    Hypotheses,
     flagged,
     lost_frames,
     physical_path,
@@ -24,7 +25,6 @@ from sphereorient import so3
 from sphereorient.assemble import (
     AssembleSettings,
     Chosen,
-    Hypotheses,
     PathSettings,
     assemble_path,
     beam,
@@ -283,7 +283,7 @@ def test_the_choice_of_body_and_of_time_zero_and_unit_does_not_matter(rng):
     other = physical_path(moved, 10 * times(60) + 1000.0, SETTINGS)
     assert torch.equal(other.choice, one.choice)
     assert_close(other.posterior, one.posterior, 1e-6)
-    assert other.acceleration_rad_s2 == pytest.approx(one.acceleration_rad_s2 / 100, rel=1e-6)
+    assert float(other.acceleration_rad_s2) == pytest.approx(float(one.acceleration_rad_s2) / 100, rel=1e-6)
 
 
 def test_the_same_candidates_give_the_same_path_and_are_left_as_they_were(rng):
@@ -291,8 +291,7 @@ def test_the_same_candidates_give_the_same_path_and_are_left_as_they_were(rng):
     before = {name: getattr(hypotheses, name).clone() for name in Hypotheses.__dataclass_fields__}
     one, other = (physical_path(hypotheses, times(60), SETTINGS) for _ in range(2))
     for name in Chosen.__dataclass_fields__:
-        if name != "acceleration_rad_s2":
-            assert_close(getattr(other, name), getattr(one, name), 0.0)
+        assert_close(getattr(other, name), getattr(one, name), 0.0)
     for name, kept in before.items():
         assert torch.equal(getattr(hypotheses, name), kept)
 
@@ -303,7 +302,7 @@ def test_places_that_are_not_in_use_may_hold_anything(rng):
     filled = Hypotheses(
         R_lab_body=hypotheses.R_lab_body.masked_fill(unused[..., None, None], torch.nan),
         nll=hypotheses.nll.masked_fill(unused, torch.nan),
-        covariance_rad2=hypotheses.covariance_rad2.masked_fill(unused[..., None, None], torch.nan),
+        variance_rad2=hypotheses.variance_rad2.masked_fill(unused, torch.nan),
         mask=hypotheses.mask,
     )
     one, other = (physical_path(each, times(60), SETTINGS) for each in (hypotheses, filled))
@@ -357,7 +356,7 @@ def test_a_movie_without_candidates_has_an_empty_path(frames, places):
     nothing = Hypotheses(
         R_lab_body=R,
         nll=torch.zeros(frames, places, dtype=torch.float64),
-        covariance_rad2=R,
+        variance_rad2=torch.zeros(frames, places, dtype=torch.float64),
         mask=torch.zeros(frames, places, dtype=torch.bool),
     )
     path = physical_path(nothing, times(frames), SETTINGS)
@@ -378,8 +377,8 @@ def test_a_short_movie_is_a_path(frames):
 
 def test_parts_of_unequal_size_are_refused():
     hypotheses = pooled(turning(5), standing(5))
-    with pytest.raises(ShapeError, match=r"Hypotheses\.nll: expected shape \(N, C\), got \(4, 2\); "):
-        replace(hypotheses, nll=hypotheses.nll[:4])
+    with pytest.raises(ShapeError, match=r"score: expected shape \(5, 2\), got \(4, 2\); "):
+        physical_path(replace(hypotheses, nll=hypotheses.nll[:4]), times(5), SETTINGS)
     with pytest.raises(ShapeError, match=r"time_s: expected shape \(5,\), got \(4,\); "):
         physical_path(hypotheses, times(4), SETTINGS)
 

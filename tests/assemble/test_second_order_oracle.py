@@ -13,10 +13,10 @@ from assemble_examples import RATE_HZ, times, turned_deg, turning
 from conftest import assert_close
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_t
-from second_order_examples import pooled
+from second_order_examples import Hypotheses, physical_path, pooled
 
 from sphereorient import so3
-from sphereorient.assemble import Hypotheses, PathSettings, beam, physical_path
+from sphereorient.assemble import PathSettings, beam
 
 
 @dataclass
@@ -33,7 +33,7 @@ class Enumeration:
     def __post_init__(self) -> None:
         h = self.hypotheses
         self.R = [[Rotation.from_matrix(R.numpy()) for R in frame] for frame in h.R_lab_body]
-        self.variance = h.covariance_rad2.diagonal(dim1=-2, dim2=-1).mean(-1).tolist()
+        self.variance = h.variance_rad2.tolist()
         self.there = [[int(k) for k in torch.nonzero(mask)] for mask in h.mask]
         self.frames = [f for f, there in enumerate(self.there) if there]
         self.usual = float(np.median(np.diff(self.time)))
@@ -128,7 +128,7 @@ def short_movie(seed: int) -> tuple[Hypotheses, torch.Tensor]:
     hypotheses = Hypotheses(
         R_lab_body=every,
         nll=2 * torch.rand(6, 2, generator=rng, dtype=torch.float64),
-        covariance_rad2=torch.diag_embed(size.expand(6, 2, 3) ** 2),
+        variance_rad2=size[..., 0] ** 2,
         mask=mask,
     )
     uneven = torch.tensor([0.0, 1.0, 2.0, 3.2, 4.0, 6.0], dtype=torch.float64) / RATE_HZ
@@ -191,7 +191,7 @@ def world(seed: int, frames: int, sigma: float, change: float, seen_share: float
     hypotheses = Hypotheses(
         R_lab_body=every,
         nll=nll,
-        covariance_rad2=(sigma**2 * torch.eye(3, dtype=torch.float64)).expand(frames, 3, 3, 3),
+        variance_rad2=torch.full((frames, 3), sigma**2, dtype=torch.float64),
         mask=torch.ones(frames, 3, dtype=torch.bool),
     )
     return hypotheses, torch.where(missing, -1, place)

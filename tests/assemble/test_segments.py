@@ -11,7 +11,7 @@ from conftest import assert_close
 
 from sphereorient import so3
 from sphereorient.assemble import AssembleSettings, assemble_path
-from sphereorient.assemble.path import find_spikes, moving, number_segments
+from sphereorient.assemble.segments import find_spikes, moving, number_segments
 
 SETTINGS = AssembleSettings()
 
@@ -128,7 +128,7 @@ def test_a_path_over_a_hole_is_one_segment_where_the_hole_is_short(hole, bridged
     inside, behind = (0, 0) if bridged else (-1, 1)
     assert path.segment.tolist() == [0] * 20 + [inside] * hole + [behind] * (40 - hole)
     assert not path.spike.any()
-    assert_close(path.xi[20 + hole], so3.geodesic_distance(R[19], R[20 + hole]) * 0.2 * 600.0 / (hole + 1), 1e-9)
+    assert_close(path.xi[20 + hole], so3.geodesic_distance(R[19], R[20 + hole]) * 600.0 / (hole + 1), 1e-9)
 
 
 @pytest.mark.parametrize(("longest", "segments"), [(0, 3), (1, 2), (2, 1)])
