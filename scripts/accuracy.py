@@ -3,7 +3,8 @@
     scripts/accuracy.py EXPERIMENT_FOLDER [EXPERIMENT_FOLDER ...] [--method precise] [--no-synth]
 
 Each folder holds experiment.yaml and truth.h5. Tracks it with all cameras and with each alone; then three synthetic
-movies of other paints (seeded). Prints one Markdown table.
+movies of other paints (seeded). Prints one Markdown table. With `paper` its last columns are parts of the rates'
+errors: those of the kernels applied to the true poses, and the rest, which is noise.
 """
 
 from __future__ import annotations
@@ -14,13 +15,17 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import h5py
 import numpy as np
+import torch
 
 from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.methods.settings import DEFAULT_METHOD
+from sphereorient.motion import MotionSettings, datasets_of, measure_motion
 from sphereorient.run.stages import track_movies
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
+from sphereorient.trajectory import Trajectory
 
 COLUMNS = (
     "movie",
@@ -34,6 +39,8 @@ COLUMNS = (
     "velocity",
     "s",
 )
+PARTS = ("velocity", "acceleration", "omega_lab", "alpha_lab")
+PAPER = tuple(f"{'/'.join(PARTS)} by {part}" for part in ("kernels", "noise"))
 
 
 def main() -> None:
@@ -42,7 +49,8 @@ def main() -> None:
     parser.add_argument("--method", default=DEFAULT_METHOD)
     parser.add_argument("--no-synth", action="store_true")
     arguments = parser.parse_args()
-    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
+    columns = COLUMNS + PAPER * (arguments.method == "paper")
+    print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
     for folder in arguments.folders:
         names = list(load_experiment(folder / "experiment.yaml").cameras)
         for cameras in [names] + ([[name] for name in names] if len(names) > 1 else []):
@@ -74,7 +82,23 @@ def row(folder: Path, label: str, cameras: Sequence[str], method: str) -> str:
         _share(score, "velocity") if len(cameras) == 2 else "",
         f"{seconds:.0f}",
     ]
+    if method == "paper":
+        cells += parts(track, folder / "truth.h5")
     return "| " + " | ".join(cells) + " |"
+
+
+def parts(track: Trajectory, truth_path: Path) -> list[str]:
+    """Return relative rms errors of PARTS, by the kernels applied to the true poses, and by noise."""
+    with h5py.File(truth_path) as file:
+        true = {name: file[name][: len(track)] for name in ("position", "orientation", *PARTS)}
+    position, R, segment = (torch.from_numpy(x) for x in (true["position"], true["orientation"], track.segment))
+    ideal = datasets_of(measure_motion(position, R, segment, track.frame_rate, MotionSettings()))
+    found = []
+    for wrong in (lambda key: ideal[key] - true[key], lambda key: getattr(track, key) - ideal[key]):
+        rows = {key: np.isfinite(getattr(track, key) + ideal[key]).all(1) for key in PARTS}
+        shares = (np.linalg.norm(wrong(key)[rows[key]]) / np.linalg.norm(true[key][rows[key]]) for key in PARTS)
+        found.append(" / ".join(f"{share:.3f}" for share in shares))
+    return found
 
 
 def _share(score: Score, key: str) -> str:
