@@ -3,8 +3,8 @@
     scripts/accuracy.py EXPERIMENT_FOLDER [EXPERIMENT_FOLDER ...] [--method precise] [--no-synth]
 
 Each folder holds experiment.yaml and truth.h5. Tracks it with all cameras and with each alone; then three synthetic
-movies of other paints (seeded). Prints one Markdown table. With `paper` its last columns are parts of the rates'
-errors: those of the kernels applied to the true poses, and the rest, which is noise.
+movies of other paints (seeded). Prints one Markdown table. With `paper` it has more columns, rms values over those of the
+truth: the rates' errors by the kernels alone, applied to the true poses; the rest, which is noise; and its sigmas.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -40,7 +41,8 @@ COLUMNS = (
     "s",
 )
 PARTS = ("velocity", "acceleration", "omega_lab", "alpha_lab")
-PAPER = tuple(f"{'/'.join(PARTS)} by {part}" for part in ("kernels", "noise"))
+PAPER = tuple(f"{'/'.join(PARTS)} {part}" for part in ("by kernels", "by noise", "by sigmas", "of the track"))
+PAPER += ("smooth orientation (°) / position (mm), rms",)
 
 
 def main() -> None:
@@ -88,17 +90,23 @@ def row(folder: Path, label: str, cameras: Sequence[str], method: str) -> str:
 
 
 def parts(track: Trajectory, truth_path: Path) -> list[str]:
-    """Return relative rms errors of PARTS, by the kernels applied to the true poses, and by noise."""
+    """Return rms values of PARTS over the truth's: errors of the kernels, noise, its sigmas, the track; smooth poses."""
     with h5py.File(truth_path) as file:
         true = {name: file[name][: len(track)] for name in ("position", "orientation", *PARTS)}
     position, R, segment = (torch.from_numpy(x) for x in (true["position"], true["orientation"], track.segment))
     ideal = datasets_of(measure_motion(position, R, segment, track.frame_rate, MotionSettings()))
-    found = []
-    for wrong in (lambda key: ideal[key] - true[key], lambda key: getattr(track, key) - ideal[key]):
-        rows = {key: np.isfinite(getattr(track, key) + ideal[key]).all(1) for key in PARTS}
-        shares = (np.linalg.norm(wrong(key)[rows[key]]) / np.linalg.norm(true[key][rows[key]]) for key in PARTS)
-        found.append(" / ".join(f"{share:.3f}" for share in shares))
-    return found
+    shares = []
+    for key in PARTS:
+        x, sigma = getattr(track, key), getattr(track, f"{key}_sigma")
+        known = np.isfinite(x + ideal[key]).all(1)
+        whole = np.linalg.norm(true[key][known])
+        shares.append([np.linalg.norm(y[known]) / whole for y in (ideal[key] - true[key], x - ideal[key], sigma, x)])
+    smooth = score_track(
+        replace(track, position=track.position_smooth, orientation=track.orientation_smooth), truth_path
+    )
+    poses = (np.sqrt(np.nanmean(np.square(error))) for error in (smooth.orientation_deg, smooth.position_mm))
+    words = [" / ".join(f"{share:.3f}" for share in row) for row in zip(*shares, strict=True)]
+    return [*words, " / ".join(f"{error:.3f}" for error in poses)]
 
 
 def _share(score: Score, key: str) -> str:
