@@ -3,8 +3,8 @@
     scripts/accuracy.py EXPERIMENT_FOLDER [EXPERIMENT_FOLDER ...] [--method precise] [--no-synth]
 
 Each folder holds experiment.yaml and truth.h5. Tracks it with all cameras and with each alone; then three synthetic
-movies of other paints (seeded). Prints one Markdown table. With `paper` it has more columns, rms values over those of the
-truth: the rates' errors by the kernels alone, applied to the true poses; the rest, which is noise; and its sigmas.
+movies of other paints (seeded). Prints one Markdown table. With `paper` it has more columns, rms values over those of
+the truth: the rates' errors by the kernels, applied to the true poses; the rest, which is noise; its sigmas.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def row(folder: Path, label: str, cameras: Sequence[str], method: str) -> str:
 
 
 def parts(track: Trajectory, truth_path: Path) -> list[str]:
-    """Return rms values of PARTS over the truth's: errors of the kernels, noise, its sigmas, the track; smooth poses."""
+    """Return rms values of PARTS over the truth's: errors by kernels, noise, its sigmas, rates; smooth poses."""
     with h5py.File(truth_path) as file:
         true = {name: file[name][: len(track)] for name in ("position", "orientation", *PARTS)}
     position, R, segment = (torch.from_numpy(x) for x in (true["position"], true["orientation"], track.segment))
