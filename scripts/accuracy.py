@@ -3,7 +3,8 @@
     scripts/accuracy.py EXPERIMENT_FOLDER [EXPERIMENT_FOLDER ...] [--method precise] [--no-synth]
 
 Each folder holds experiment.yaml and truth.h5. Tracks it with all cameras and with each alone; then three synthetic
-movies of other paints (seeded). Prints one Markdown table.
+movies of other paints (seeded). Prints one Markdown table. With `paper` it has more columns, rms values over those of
+the truth: the rates' errors by the kernels, applied to the true poses; the rest, which is noise; its sigmas.
 """
 
 from __future__ import annotations
@@ -12,15 +13,20 @@ import argparse
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
+import torch
 
 from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.methods.settings import DEFAULT_METHOD
+from sphereorient.motion import MotionSettings, datasets_of, measure_motion
 from sphereorient.run.stages import track_movies
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
+from sphereorient.trajectory import Trajectory
 
 COLUMNS = (
     "movie",
@@ -34,6 +40,9 @@ COLUMNS = (
     "velocity",
     "s",
 )
+PARTS = ("velocity", "acceleration", "omega_lab", "alpha_lab")
+PAPER = tuple(f"{'/'.join(PARTS)} {part}" for part in ("by kernels", "by noise", "by sigmas", "of the track"))
+PAPER += ("smooth orientation (°) / position (mm), rms",)
 
 
 def main() -> None:
@@ -42,7 +51,8 @@ def main() -> None:
     parser.add_argument("--method", default=DEFAULT_METHOD)
     parser.add_argument("--no-synth", action="store_true")
     arguments = parser.parse_args()
-    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
+    columns = COLUMNS + PAPER * (arguments.method == "paper")
+    print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
     for folder in arguments.folders:
         names = list(load_experiment(folder / "experiment.yaml").cameras)
         for cameras in [names] + ([[name] for name in names] if len(names) > 1 else []):
@@ -74,7 +84,29 @@ def row(folder: Path, label: str, cameras: Sequence[str], method: str) -> str:
         _share(score, "velocity") if len(cameras) == 2 else "",
         f"{seconds:.0f}",
     ]
+    if method == "paper":
+        cells += parts(track, folder / "truth.h5")
     return "| " + " | ".join(cells) + " |"
+
+
+def parts(track: Trajectory, truth_path: Path) -> list[str]:
+    """Return rms values of PARTS over the truth's: errors by kernels, noise, its sigmas, rates; smooth poses."""
+    with h5py.File(truth_path) as file:
+        true = {name: file[name][: len(track)] for name in ("position", "orientation", *PARTS)}
+    position, R, segment = (torch.from_numpy(x) for x in (true["position"], true["orientation"], track.segment))
+    ideal = datasets_of(measure_motion(position, R, segment, track.frame_rate, MotionSettings()))
+    shares = []
+    for key in PARTS:
+        x, sigma = getattr(track, key), getattr(track, f"{key}_sigma")
+        known = np.isfinite(x + ideal[key]).all(1)
+        whole = np.linalg.norm(true[key][known])
+        shares.append([np.linalg.norm(y[known]) / whole for y in (ideal[key] - true[key], x - ideal[key], sigma, x)])
+    smooth = score_track(
+        replace(track, position=track.position_smooth, orientation=track.orientation_smooth), truth_path
+    )
+    poses = (np.sqrt(np.nanmean(np.square(error))) for error in (smooth.orientation_deg, smooth.position_mm))
+    words = [" / ".join(f"{share:.3f}" for share in row) for row in zip(*shares, strict=True)]
+    return [*words, " / ".join(f"{error:.3f}" for error in poses)]
 
 
 def _share(score: Score, key: str) -> str:

@@ -76,8 +76,8 @@ def error_table(found: "Score") -> "Table":
     table.add_row("position (mm)", f"{p50:.4f}", f"{p95:.4f}", f"{largest:.4f}")
     table.add_section()
     table.add_row("quantity", "rms error / rms", "frames", "", style="bold")
-    for key in ("velocity", "omega_lab", "omega_body"):
-        table.add_row(key, f"{100 * found.relative_rms[key]:.2f} %", f"{100 * found.coverage[key]:.0f} %", "")
+    for key, error in found.relative_rms.items():
+        table.add_row(key, f"{100 * error:.2f} %", f"{100 * found.coverage[key]:.0f} %", "")
     return table
 
 

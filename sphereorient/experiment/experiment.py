@@ -68,6 +68,7 @@ class FlowKeys(BaseModel, frozen=True, extra="forbid"):
     dissipation: Positive | None = None
     u_rms: Positive | None = None
     integral_length: Positive | None = None
+    integral_time: Positive | None = None
 
 
 class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):

@@ -17,7 +17,7 @@ from sphereorient.follow import Appearance
 from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
-from sphereorient.motion import Motion, Smoothed, rates_of
+from sphereorient.motion import Motion, Smoothed, datasets_of
 from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
@@ -61,7 +61,7 @@ def paper_track(
         position_cov=positions.covariance_mm2.numpy(),
         orientation=fused.R_lab_body.numpy(),
         orientation_cov=variance.numpy(),
-        **rates_of(moved),
+        **datasets_of(moved),
         segment=fused.segment.numpy(),
         flags=(fused.flags | positions.flags).numpy().astype(np.uint32),
         cameras=dict(tracks),
@@ -115,11 +115,7 @@ def precise_track(
         position_cov=(covariance[:, 3:, 3:] * smoothed.position_scale**2).numpy(),
         orientation=picked["R_lab_body"].numpy(),
         orientation_cov=(covariance[:, :3, :3] * smoothed.orientation_scale**2).numpy(),
-        position_smooth=smoothed.position_lab_mm.numpy(),
-        position_smooth_cov=smoothed.position_cov_mm2.numpy(),
-        orientation_smooth=smoothed.R_lab_body.numpy(),
-        orientation_smooth_cov=smoothed.orientation_cov_rad2.numpy(),
-        **rates_of(smoothed),
+        **datasets_of(smoothed),
         segment=chosen.segment.numpy(),
         flags=flags.numpy().astype(np.uint32),
         confidence=chosen.probability.numpy(),

@@ -7,16 +7,21 @@ from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.motion.angular_velocity import omega_from_orientations, omega_stencil, to_body, usable_separations
 from sphereorient.motion.settings import MotionSettings
 from sphereorient.motion.stencil import Order, apply, compose, gap_aware_stencil, propagated_sigma
+from sphereorient.so3 import nearest_rotation
 
 M_PER_MM = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
-    """Velocities and accelerations of N frames, (..., N, 3), NaN where unknown.
-    Each sigma is the standard deviation from white measurement noise; the low-pass bias is not in it.
+    """Smooth poses, velocities and accelerations of N frames, (..., N, 3), matrices (..., N, 3, 3), NaN where unknown.
+    Sigmas and covariances of `measure_motion` are those from white noise, without the low-pass bias, axis by axis.
     """
 
+    position_lab_mm: Tensor
+    position_cov_mm2: Tensor
+    R_lab_body: Tensor
+    orientation_cov_rad2: Tensor  # of delta in R_true = exp([delta]x) R_lab_body, lab components
     velocity_m_s: Tensor
     velocity_sigma_m_s: Tensor
     acceleration_m_s2: Tensor
@@ -41,9 +46,10 @@ def measure_motion(
     position_sigma_mm: Tensor | None = None,
     orientation_sigma_rad: Tensor | None = None,
 ) -> Motion:
-    """Return velocity, acceleration, omega and alpha of every frame whose neighbours determine them, else NaN.
+    """Return smooth pose, velocity, acceleration, omega, alpha of all frames whose neighbours determine them, else NaN.
+    Positions are smoothed with the Gaussian of velocity, orientations with that of alpha, by the chordal mean on SO(3).
     Nothing crosses the ends of a segment; single lost frames are bridged. Body components need the frame's orientation.
-    Source: the paper, section III; docs/errata.md E4 and E6.
+    Source: the paper, section III; docs/errata.md E4 and E6; the mean: Moakher 2002, SIAM J. Matrix Anal. 24, 1.
 
     Args:
         position_mm: (..., N, 3), lab; NaN where missing.
@@ -69,6 +75,16 @@ def measure_motion(
         ("acceleration", "m_s2", settings.acceleration_sigma_frames, 2),
     )
     found: dict[str, Tensor] = {}
+    R, eye = R_lab_body.flatten(-2), torch.eye(3, dtype=position_mm.dtype, device=position_mm.device)
+    poses = (
+        ("position_lab_mm", "position_cov_mm2", settings.velocity_sigma_frames, position_mm, position_sigma_mm),
+        ("R_lab_body", "orientation_cov_rad2", settings.alpha_sigma_frames, R, orientation_sigma_rad),
+    )
+    for name, covariance, width, x, noise in poses:
+        stencil = _stencil(x, segment, width, 0, settings)
+        found[name] = apply(stencil, x)
+        found[covariance] = propagated_sigma(stencil, _by_axis(noise, position_mm)).square()[..., None] * eye
+    found["R_lab_body"] = nearest_rotation(found["R_lab_body"].reshape(R_lab_body.shape))
     for name, unit, width, order in moves:
         stencil, scale = _stencil(position_mm, segment, width, order, settings), M_PER_MM / dt_s**order
         sigma = propagated_sigma(stencil, _by_axis(position_sigma_mm, position_mm))

@@ -22,12 +22,8 @@ LOST_RAD = 0.5  # an orientation with a larger sigma is discarded
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Smoothed(Motion):
-    """Smoothed motion of N frames, float64, NaN where it is unknown."""
+    """Motion of N frames by the smoother, float64; its covariances and sigmas hold what smoothing lost, too."""
 
-    position_lab_mm: Tensor  # (N, 3)
-    position_cov_mm2: Tensor  # (N, 3, 3)
-    R_lab_body: Tensor  # (N, 3, 3)
-    orientation_cov_rad2: Tensor  # (N, 3, 3), of delta in R_true = exp([delta]x) R_lab_body, lab components
     extrapolated: Tensor  # (N,) bool, frames of a segment without a measurement of their own of either kind
     rejected: Tensor  # (N,) bool, frames with a rejected measurement
     position_scale: float  # true errors of the measured positions over their sigmas, slow errors included
@@ -201,9 +197,16 @@ RATE_UNITS = {
 }
 
 
-def rates_of(found: Motion) -> dict[str, Any]:
-    """Return velocity to alpha_body and their sigmas, (N, 3) each, under the names of a track."""
-    values = {name: getattr(found, f"{name}_{unit}").numpy() for name, unit in RATE_UNITS.items()}
-    return values | {
-        f"{name}_sigma": getattr(found, f"{name}_sigma_{unit}").numpy() for name, unit in RATE_UNITS.items()
-    }
+POSES = {
+    "position_smooth": "position_lab_mm",
+    "position_smooth_cov": "position_cov_mm2",
+    "orientation_smooth": "R_lab_body",
+    "orientation_smooth_cov": "orientation_cov_rad2",
+}
+
+
+def datasets_of(found: Motion) -> dict[str, Any]:
+    """Return smooth poses, velocity to alpha_body, and the errors of all, under the names of a track."""
+    names = POSES | {name: f"{name}_{unit}" for name, unit in RATE_UNITS.items()}
+    names |= {f"{name}_sigma": f"{name}_sigma_{unit}" for name, unit in RATE_UNITS.items()}
+    return {name: getattr(found, own).numpy() for name, own in names.items()}

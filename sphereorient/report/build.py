@@ -31,6 +31,7 @@ FLOW_KEYS = {
     "dissipation": "dissipation_w_kg",
     "u_rms": "u_rms_m_s",
     "integral_length": "integral_length_m",
+    "integral_time": "integral_time_s",
 }
 Progress = Callable[[str, int, int], None]
 
@@ -49,7 +50,7 @@ def write_report(
     `out` is made, or replaced if it contains only an older report; `progress` gets stage, steps done and all steps.
 
     Raises:
-        TrackError: no usable frame, or tracks of kernels and of smoothers together.
+        TrackError: no valid frame, or tracks of kernels and of smoothers together.
         ExperimentError: an experiment without a track, or experiments that contradict each other.
         OutputError: `out` cannot be written, or contains something else.
     """
@@ -133,7 +134,8 @@ def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequ
         caption = "Distance of the cameras' own orientations."
         yield "camera_distance", caption, lambda: plots.camera_distance_figure(distances)
     caption = "Share of each variance that is noise, or was smoothed away."
-    yield "noise", caption, lambda: plots.noise_figure(summary.table, summary.ensemble.error)
+    if summary.ensemble.segments:
+        yield "noise", caption, lambda: plots.noise_figure(summary.table, summary.ensemble.error)
     if (more := summary.distributions) is None:
         return
     caption = "PDFs of the components in their standard deviations, the stretched exponential and the Gaussian."

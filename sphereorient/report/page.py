@@ -124,7 +124,8 @@ def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str
     for quantity in ("velocity", "omega_lab"):
         part = summary.table[quantity]
         rms = float(np.sqrt(np.square(part.rms.value[:3]).sum()))
-        found.append((f"{rms:.3g} {_unit(part.units)}", f"rms of {SYMBOLS[quantity]}, all components"))
+        known = f"{rms:.3g} {_unit(part.units)}" if math.isfinite(rms) else "unknown"
+        found.append((known, f"rms of {SYMBOLS[quantity]}, all components"))
     return found
 
 

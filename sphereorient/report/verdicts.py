@@ -38,7 +38,7 @@ class Verdict:
 
 def verdicts(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequence[CameraDistance]) -> list[Verdict]:
     """Return the findings, those on the measurement first; arguments as of `tables.tables_of`."""
-    found = [*_measured(tracks), *_segments(summary), *_noise(summary), *_apart(distances)]
+    found = [*_measured(tracks), *_segments(summary, tracks), *_noise(summary), *_apart(distances)]
     if (more := summary.distributions) is not None:
         found += [*_tails(summary, more), *_attitude(more), *_frames(more), *_isotropy(more), *_lift(more)]
     return found
@@ -63,29 +63,40 @@ def _measured(tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
         yield _say("Remark", str(remark), good=False)
 
 
-def _segments(summary: Summary) -> Iterator[Verdict]:
-    count = summary.ensemble.segments
+def _segments(summary: Summary, tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
+    count, least_s = summary.ensemble.segments, summary.settings.min_integral_times * summary.integral_time_s
+    if not count:
+        longest = max(int(np.bincount(track.segment + 1)[1:].max(initial=0)) for track in tracks.values())
+        least = f"{summary.settings.min_frames} frames" + (f" and {least_s:.3g} s" if np.isfinite(least_s) else "")
+        words = (
+            f"none has {least} with a motion: all numbers are unknown; the longest has {longest} frames, and its ends "
+        )
+        words += "are lost to kernels; pass longer tracks, or lower statistics.min_frames"
+        yield _say("Segments", words, good=False)
+        return
     if summary.distributions is None:
         words = "one segment only: no intervals and no distributions, since the scatter between segments is unknown; "
         words += "pass more tracks, or cut a long record with --set statistics.max_duration_s=SECONDS"
         yield _say("Segments", words, good=False)
         return
     words = f"{count:,} segments, {len(summary.ensemble):,} samples"
-    if np.isfinite(summary.integral_time_s):
-        least = summary.settings.min_integral_times * summary.integral_time_s
-        words += f", each longer than {least:.3g} s (integral time of the velocity {summary.integral_time_s:.3g} s)"
+    if np.isfinite(least_s):
+        whose = "flow" if summary.integral_time_s == summary.surroundings.integral_time_s else "velocity"
+        words += f", each longer than {least_s:.3g} s (integral time of the {whose} {summary.integral_time_s:.3g} s)"
     if count < FEW_SEGMENTS:
         words += "; with so few, tails are not well known and intervals of the flatness are too narrow"
     yield _say("Segments", words, None if count >= FEW_SEGMENTS else False)
 
 
 def _noise(summary: Summary) -> Iterator[Verdict]:
-    if not summary.warnings:
-        what = "noise" if summary.ensemble.error == "added" else "smoothed away"
-        largest = max(float(np.nanmax(part.noise_share.value[:3])) for part in summary.table.values())
-        if np.isfinite(largest):
-            yield _say("Noise", f"at most {100 * largest:.2g} % of any variance is {what}", good=True)
+    if not summary.ensemble.segments:
         return
+    shares = {quantity: part.noise_share.value[:3].max() for quantity, part in summary.table.items()}
+    if unknown := [quantity for quantity, share in shares.items() if not np.isfinite(share)]:
+        yield _say("Noise", f"the errors of {', '.join(unknown)} are unknown: noise is not subtracted", good=False)
+    elif not summary.warnings:
+        what = "noise" if summary.ensemble.error == "added" else "smoothed away"
+        yield _say("Noise", f"at most {100 * max(shares.values()):.2g} % of any variance is {what}", good=True)
     for warning in summary.warnings:
         yield _say("Noise", f"{warning.words}: trust the corrected values, if any", good=False)
 

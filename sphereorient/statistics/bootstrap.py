@@ -1,5 +1,6 @@
 """Intervals from independent segments: the BCa bootstrap, and the studentized one for skewed statistics."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -54,11 +55,11 @@ def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | 
     """Return a statistic of the total of `sums` (S, ...) over segments, with BCa intervals from resampled segments.
 
     `statistic` maps totals (..., *sums.shape[1:]) to values with the same leading shape; values are NaN where it is.
-    The intervals of a single segment are NaN.
+    The intervals of a single segment are NaN; of none, the values too.
     Source: Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 14.
     """
     settings = settings or BootstrapSettings()
-    flat = sums.reshape(len(sums), -1)
+    flat = sums.reshape(len(sums), math.prod(sums.shape[1:]))
     total = flat.sum(0)
 
     def at(totals: Floats) -> Floats:

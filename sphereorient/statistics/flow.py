@@ -40,6 +40,7 @@ class Surroundings:
     dissipation_w_kg: float | None = None
     u_rms_m_s: float | None = None
     integral_length_m: float | None = None
+    integral_time_s: float | None = None
 
     @property
     def flow(self) -> FlowScales | None:

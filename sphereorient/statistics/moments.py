@@ -49,8 +49,8 @@ def moments(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | Non
     x = np.concatenate([x, np.linalg.norm(x, axis=1, keepdims=True)], axis=1)
     sigma = np.concatenate([ensemble.sigmas[quantity], np.full((len(x), 1), np.nan)], axis=1)
     sign = 1.0 if ensemble.error == "added" else -1.0
-    centre, deviation = x.mean(0), x.std(0)
-    scale = np.where(deviation > 1e-12 * np.abs(x).max(0), deviation, 1.0)  # 1 for values equal to rounding
+    centre, deviation, largest = (x.mean(0), x.std(0), np.abs(x).max(0)) if len(x) else np.full((3, 4), np.nan)
+    scale = np.where(deviation > 1e-12 * largest, deviation, 1.0)  # 1 for values equal to rounding
     x, sigma = (x - centre) / scale, sigma / scale
     x2, s2 = x * x, sigma * sigma
     powers = np.stack([np.ones_like(x), x, x2, x2 * x, x2 * x2, s2, s2 * s2, x2 * s2], axis=-1)

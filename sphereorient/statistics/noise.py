@@ -232,4 +232,5 @@ def _width_statistics(totals: Floats) -> Floats:
     """Return rms, flatness, both corrected, and the share of noise, (..., 3 W, 5), of sums (..., 3 W, 6)."""
     var, fourth, s2, s4, mixed = np.moveaxis(totals[..., 1:] / totals[..., :1], -1, 0)
     true_var, true_fourth = without_noise(var, fourth, s2, s4, mixed, 1.0)
-    return np.stack([np.sqrt(var), fourth / var**2, np.sqrt(true_var), true_fourth / true_var**2, s2 / var], axis=-1)
+    true_flatness = np.where(s2 < var / 2, true_fourth / true_var**2, np.nan)  # else its errors are beyond any use
+    return np.stack([np.sqrt(var), fourth / var**2, np.sqrt(true_var), true_flatness, s2 / var], axis=-1)

@@ -69,7 +69,8 @@ def ensemble_of(
     counts if it has enough usable frames; frames with larger errors at its ends are then left out.
 
     Raises:
-        TrackError: no usable frame, fewer than `fewest` segments, or tracks of kernels and of smoothers together.
+        TrackError: no usable frame, fewer than `fewest` segments (if 0: no valid frame), or tracks of kernels and of
+            smoothers together.
 
     Source: the paper, section IV: segments above 0.25 T_L; docs/errata.md, settings of the paper: 50 frames.
     """
@@ -80,7 +81,8 @@ def ensemble_of(
         got, do = ", ".join(sorted(methods)), "report each kind by itself"
         raise TrackError(refusal(name, expected="tracks of one method", got=got, do=do))
     pieces = [_usable(track, number, settings) for number, track in enumerate(many)]
-    if not any(len(piece["time_s"]) for piece in pieces):
+    there = [len(piece["time_s"]) if fewest else track.valid.any() for piece, track in zip(pieces, many, strict=True)]
+    if not any(there):
         do = "look at the track's reasons with `sphereorient check`"
         raise TrackError(refusal(name, expected="frames with a motion", got="no valid frame", do=do))
     whole = {key: np.concatenate([piece[key] for piece in pieces]) for key in pieces[0]}

@@ -8,10 +8,12 @@ class SegmentSettings(BaseModel, frozen=True, extra="forbid"):
 
     min_frames: int = Field(50, ge=2, description="segments with fewer frames are left out, as the paper does")
     min_integral_times: float = Field(
-        0.25, ge=0, description="segments shorter than this many integral times of the velocity are left out"
+        0.25, ge=0, description="segments shorter than this many integral times are left out"
     )
     integral_time_s: float | None = Field(
-        None, gt=0, description="integral time of the velocity, s; null: the report measures it on these tracks"
+        None,
+        gt=0,
+        description="integral time, s; null: the flow's in experiment.yaml, else that of the velocity on these tracks",
     )
     max_duration_s: float | None = Field(
         None,

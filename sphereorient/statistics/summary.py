@@ -56,7 +56,7 @@ class Summary:
 
     @property
     def integral_time_s(self) -> float:
-        """Integral time of the velocity, given or measured; NaN if unknown."""
+        """Integral time: of the settings, of the flow, or measured on the velocity; NaN if unknown."""
         return self.settings.integral_time_s or float("nan")
 
 
@@ -67,19 +67,21 @@ def summarise(
     progress: Progress = lambda done, total: None,
     name: str = "tracks",
 ) -> Summary:
-    """Compute all statistics of tracks, with an integral time that is measured if not given; `name` is for messages.
+    """Compute all statistics of tracks, `name` in messages; an integral time that nobody gives is measured.
 
-    A single segment gives only the table, without intervals.
+    A single segment gives only the table, without intervals; without a segment that counts its numbers are NaN.
 
     Raises:
-        TrackError: no usable frame, or tracks of kernels and of smoothers together.
+        TrackError: no valid frame, or tracks of kernels and of smoothers together.
 
     Source: the paper, section IV, with docs/errata.md A5, E6, E7.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
     settings = settings or StatisticsSettings()
     around = surroundings or Surroundings()
-    ensemble = ensemble_of(many, settings, name, fewest=1)
+    if settings.integral_time_s is None:
+        settings = settings.model_copy(update={"integral_time_s": around.integral_time_s})
+    ensemble = ensemble_of(many, settings, name, fewest=0)
     progress(1, STEPS)
     if ensemble.segments >= FEWEST and settings.integral_time_s is None:
         ensemble, settings = _long_enough(ensemble, settings)
@@ -93,7 +95,7 @@ def summarise(
         ensemble=ensemble,
         table=table,
         warnings=noise.noise_warnings(table, ensemble.error),
-        comparisons=comparisons(table, around),
+        comparisons=comparisons(table, around) if ensemble.segments else [],
         distributions=more,
     )
 

@@ -254,11 +254,7 @@ def smoothed_track(
     found = motion.smooth_motion(poses, motion.SmoothSettings(), known)
     smooth = replace(
         track,
-        position_smooth=found.position_lab_mm.numpy(),
-        position_smooth_cov=found.position_cov_mm2.numpy(),
-        orientation_smooth=found.R_lab_body.numpy(),
-        orientation_smooth_cov=found.orientation_cov_rad2.numpy(),
-        **motion.rates_of(found),
+        **motion.datasets_of(found),
         flags=np.where(found.extrapolated.numpy(), np.uint32(Flag.EXTRAPOLATED), np.uint32(0)),
     )
     return smooth, found.process
@@ -283,9 +279,7 @@ def filtered_track(
         position_sigma_mm=sigma_mm.double(),
         orientation_sigma_rad=sigma_rad.double(),
     )
-    return replace(
-        track, position_smooth=track.position, orientation_smooth=track.orientation, **motion.rates_of(found)
-    )
+    return replace(track, **motion.datasets_of(found))
 
 
 def _noisy(true: Trajectory, noise_deg: float, noise_mm: float, seed: int, method: str) -> Trajectory:

@@ -37,6 +37,7 @@ def test_the_errors_of_a_track_are_printed(track):
     assert "40 of 40" in run.output
     assert "0.3000" in words
     assert "10.00" in words
+    assert all(name in words for name in ("acceleration", "omega_body", "alpha_lab", "alpha_body"))
 
 
 def refused(*arguments: object) -> str:

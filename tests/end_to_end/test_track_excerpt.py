@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 import signal
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -23,7 +25,10 @@ from sphereorient.evaluate import score_track
 from sphereorient.methods.settings import load_settings
 from sphereorient.movies import open_movie, write_ffv1
 from sphereorient.run.stages import track_movies
+from sphereorient.statistics import StatisticsSettings, ensemble_of
 from sphereorient.trajectory import Flag, Trajectory
+
+POSE_ENDS = {"position": 3, "orientation": 1}  # frames that the kernels of the defaults lose at each end
 
 
 def sphereorient(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -97,9 +102,54 @@ def test_the_file_has_every_dataset_with_units_and_its_provenance(tracked):
         provenance = json.loads(file.attrs["provenance"])
         assert len(provenance["sha256"]["cam1.mkv"]) == 64
         assert np.allclose(file["time"][()], np.arange(40) / 600)
-        assert np.isnan(file["position_smooth"][()]).all()  # not measured by this method: nothing is invented
         for name in ("position", "orientation", "omega_lab", "cameras/cam1/centre_px", "cameras/cam2/candidates/score"):
             assert "units" in file[name].attrs, name
+
+
+def test_smooth_poses_are_there_but_for_the_ends_and_orientations_are_closer_to_the_truth(tracked):
+    track = Trajectory.load(tracked[0])
+    known = {name: np.isfinite(getattr(track, f"{name}_smooth").reshape(40, -1)).all(1) for name in POSE_ENDS}
+    for name, lost in POSE_ENDS.items():
+        assert known[name].tolist() == [lost <= k < 40 - lost for k in range(40)]
+        assert np.isfinite(getattr(track, f"{name}_smooth_cov")[known[name]]).all()
+    np.testing.assert_array_equal(known["position"], np.isfinite(track.velocity).all(1))
+    rough, smooth = score_track(track, EXCERPT / "truth.h5"), replace(track, orientation=track.orientation_smooth)
+    smooth_deg = score_track(smooth, EXCERPT / "truth.h5").orientation_deg[known["orientation"]]
+    assert np.square(smooth_deg).mean() < 0.5 * np.square(rough.orientation_deg).mean()
+
+
+@pytest.mark.slow
+def test_a_track_of_the_paper_has_a_report_with_table_and_figures(tracked, tmp_path):
+    settings = StatisticsSettings(max_duration_s=0.03, min_frames=10, resamples=100)
+    chosen = settings.model_dump(exclude_unset=True).items()
+    more = [word for key, value in chosen for word in ("--set", f"statistics.{key}={value}")]
+    run = sphereorient(
+        "report", tracked[0], "--experiment", EXCERPT / "experiment.yaml", "--out", tmp_path / "r", *more
+    )
+    assert run.returncode == 0, run.stderr
+    assert "Frame of omega_lab: written in lab components" in run.stdout
+    page = (tmp_path / "r" / "index.html").read_text()
+    assert all(f"figure-{name}" in page for name in ("densities", "increments", "angles", "correlations", "isotropy"))
+    with (tmp_path / "r" / "tables" / "moments.csv").open() as file:
+        rows = {(row["quantity"], row["component"]): row for row in csv.DictReader(file)}
+    frames = np.rint(600 * ensemble_of(Trajectory.load(tracked[0]), settings).time_s).astype(int)
+    with h5py.File(EXCERPT / "truth.h5") as file:
+        for quantity in ("velocity", "omega_lab", "omega_body"):
+            true = file[quantity][()][frames].std(0)
+            measured = [float(rows[quantity, axis]["rms"]) for axis in "xyz"]
+            np.testing.assert_allclose(measured, true, atol=0.1 * np.linalg.norm(true))
+            assert all(np.isfinite(float(rows[quantity, axis]["rms_low"])) for axis in "xyz")
+
+
+@pytest.mark.slow
+def test_a_track_too_short_for_statistics_has_a_page_with_the_reason(tracked, tmp_path):
+    run = sphereorient("report", tracked[0], "--out", tmp_path / "r", "--quiet")
+    assert run.returncode == 0, run.stderr
+    assert run.stderr.startswith("Segments: none has 50 frames with a motion")
+    assert "Warning" not in run.stderr
+    page = (tmp_path / "r" / "index.html").read_text()
+    assert "figure-track" in page
+    assert "No segment counts" in page
 
 
 @pytest.mark.slow

@@ -132,7 +132,7 @@ def experiment_documents() -> list[dict[str, Any]]:
         "movies": {"cam1": "cam1.npy", "cam2": "cam2.npy"},
         "start": {"cam1": 1, "cam2": 0},
         "frames": [0, 240],
-        "flow": {"viscosity": 8.0e-6, "dissipation": 1.7, "u_rms": 0.61, "integral_length": 0.03},
+        "flow": {"viscosity": 8.0e-6, "dissipation": 1.7, "u_rms": 0.61, "integral_length": 0.03, "integral_time": 0.3},
     }
     short = schema | {
         "frame_rate": 30,

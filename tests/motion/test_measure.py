@@ -127,6 +127,34 @@ def test_a_sigma_is_nan_where_a_sigma_that_goes_into_it_is_unknown() -> None:
     assert motion.omega_lab_sigma_rad_s.isnan().all()
 
 
+def test_smooth_poses_are_the_means_that_their_kernels_make_and_bridge_a_lost_frame(rng: torch.Generator) -> None:
+    frames, settings = 41, MotionSettings()
+    position_mm, R, segment = steady(frames)
+    noise = torch.randn(2, frames, 3, generator=rng, dtype=torch.float64)
+    position_mm, R = position_mm + 0.1 * noise[0], so3.exp(0.02 * noise[1]) @ R
+    position_mm[18], R[18] = torch.nan, torch.nan
+    sigma = torch.tensor([0.1, 0.2, 0.3]).double().expand(frames, 3)
+    motion = measure_motion(
+        position_mm, R, segment, RATE, settings, position_sigma_mm=sigma, orientation_sigma_rad=0.1 * sigma
+    )
+    for k in (15, 18, 20):
+        j = torch.arange(-11, 12)
+        used = position_mm[k + j].isfinite().all(-1) & position_mm[k - j].isfinite().all(-1)
+        for width, reach in ((settings.velocity_sigma_frames, 11), (settings.alpha_sigma_frames, 6)):
+            weight = torch.exp(-0.5 * (j.double() / width) ** 2) * used * (j.abs() <= reach)
+            weight = weight / weight.sum()
+            if reach == 11:
+                mean = (weight[:, None] * position_mm[k + j].nan_to_num()).sum(0)
+                assert_close(motion.position_lab_mm[k], mean, atol=1e-12)
+                variance, found = sigma[0].square(), motion.position_cov_mm2[k]
+            else:
+                mean = so3.weighted_mean(R[k + j], weight)  # Karcher's, which differs in the third order
+                assert float(so3.geodesic_distance(motion.R_lab_body[k], mean)) < 2e-5
+                assert float(so3.geodesic_distance(R[20], mean)) > 1e-3
+                variance, found = (0.1 * sigma[0]).square(), motion.orientation_cov_rad2[k]
+            assert_close(found, torch.diag(weight.square().sum() * variance), atol=1e-12)
+
+
 # property
 
 
@@ -138,7 +166,9 @@ def test_nothing_is_measured_across_segments_or_outside_them() -> None:
     motion = measure_motion(position_mm, R, segment, RATE, MotionSettings())
     for entry in fields(Motion):
         values = getattr(motion, entry.name)
-        assert values[36:44].isnan().all(), entry.name
+        assert values[38:42].isnan().all(), entry.name
+        smooth = entry.name in ("R_lab_body", "orientation_cov_rad2")  # its kernel is narrow
+        assert values[36 + smooth : 44 - smooth].isnan().all(), entry.name
     assert_close(motion.velocity_m_s[20:30, 0], torch.full((10,), 0.5, dtype=torch.float64), atol=1e-9)
     seen = motion.velocity_m_s.isfinite().all(-1)
     assert_close(motion.velocity_m_s[seen, 0], torch.full((int(seen.sum()),), 0.5, dtype=torch.float64), atol=1e-9)
@@ -174,7 +204,7 @@ def test_a_batch_is_the_stack_of_its_singles(batch: tuple[int, ...], dtype: torc
     for entry in fields(Motion):
         values, single = getattr(got, entry.name), getattr(one, entry.name)
         assert values.dtype == dtype
-        torch.testing.assert_close(values, single.expand(*batch, 30, 3), rtol=1e-5, atol=1e-5, equal_nan=True)
+        torch.testing.assert_close(values, single.expand(*batch, *single.shape), rtol=1e-5, atol=1e-5, equal_nan=True)
 
 
 def test_gradients_are_finite_with_missing_frames() -> None:
@@ -183,7 +213,8 @@ def test_gradients_are_finite_with_missing_frames() -> None:
     position_mm.requires_grad_()
     R.requires_grad_()
     motion = measure_motion(position_mm, R, segment, RATE, MotionSettings())
-    parts = (motion.velocity_m_s, motion.acceleration_m_s2, motion.omega_body_rad_s, motion.alpha_body_rad_s2)
+    parts = [motion.velocity_m_s, motion.acceleration_m_s2, motion.omega_body_rad_s, motion.alpha_body_rad_s2]
+    parts += [motion.position_lab_mm, motion.R_lab_body]
     torch.stack([part[part.isfinite()].sum() for part in parts]).sum().backward()
     for leaf in (position_mm, R):
         assert leaf.grad is not None

@@ -98,6 +98,22 @@ def test_distances_are_told_in_degrees(lab):
     assert "without correction of perspective by 11°" in words
 
 
+def test_without_a_segment_that_counts_the_reason_is_told(lab):
+    short = lab.at(np.flatnonzero(lab.segment == np.bincount(lab.segment).argmax())[:30])
+    found = said(short)
+    assert found["Segments"].grade == Grade.DOUBT
+    assert "none has 50 frames with a motion" in found["Segments"].words
+    assert "the longest has 30 frames" in found["Segments"].words
+    assert "Noise" not in found
+
+
+def test_rates_without_errors_are_named(lab):
+    one = lab.at(np.flatnonzero(lab.segment == np.bincount(lab.segment).argmax()))
+    found = said(replace(one, omega_lab_sigma=one.omega_lab_sigma * np.nan))["Noise"]
+    assert found.grade == Grade.DOUBT
+    assert found.words == "the errors of omega_lab are unknown: noise is not subtracted"
+
+
 def test_of_one_segment_it_is_said_what_to_do(lab):
     one = lab.at(np.flatnonzero(lab.segment == np.bincount(lab.segment).argmax()))
     found = said(one)

@@ -75,6 +75,7 @@ def test_foretold_noise_is_what_a_standing_sphere_shows(track):
     np.testing.assert_allclose(found.noise_share.value[:5], 1.0, atol=0.05)
     by_hand = 1e-3 * NOISE_MM * float(gaussian_kernel(2.0, 2).norm()) * 600.0**2
     np.testing.assert_allclose(found.rms.value[2], by_hand, rtol=0.03)
+    assert np.isnan(found.corrected_flatness.value[:5]).all()  # nothing but noise
 
 
 def test_one_segment_is_differentiated_as_motion_does_it(track):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from statistics_examples import STEP_S, track
 
+from sphereorient.errors import TrackError
 from sphereorient.statistics import StatisticsSettings, Surroundings, summarise
 from sphereorient.statistics.lags import correlation
 from sphereorient.statistics.segments import UNITS, ensemble_of
@@ -62,6 +63,37 @@ def test_the_surroundings_make_the_dimensionless_numbers(whole):
     assert numbers["omega_rms D / v_rms"] == pytest.approx(omega * 0.018 / v)
     assert numbers["D / eta"] == pytest.approx(0.018 / (8e-6**3 / 1.7) ** 0.25)
     assert not summarise(track([60, 60]), FEW).comparisons
+
+
+@pytest.mark.slow
+def test_the_flows_integral_time_counts_unless_the_settings_give_one(planted):
+    flow = Surroundings(integral_time_s=0.2)
+    found = summarise(planted[1], FEW, flow)
+    assert found.integral_time_s == 0.2
+    assert 0.05 <= found.ensemble.span_s.min() < 0.1  # 0.25 of it; at least 50 frames
+    longer = summarise(planted[1], FEW, replace(flow, integral_time_s=0.6))
+    np.testing.assert_array_equal(longer.ensemble.span_s, found.ensemble.span_s[found.ensemble.span_s >= 0.15])
+    assert longer.ensemble.segments < found.ensemble.segments
+    given = FEW.model_copy(update={"integral_time_s": 0.3})
+    assert summarise(planted[1], given, flow).integral_time_s == 0.3
+
+
+@pytest.mark.parametrize("frames", [40, 4], ids=["too few", "fewer"])
+def test_without_a_segment_that_counts_the_numbers_are_nan(frames):
+    found = summarise(track([frames]), FEW, Surroundings(diameter_mm=18.0))
+    assert found.ensemble.segments == 0
+    assert found.table.keys() == UNITS.keys()
+    assert all(np.isnan(part.rms.value).all() and np.isnan(part.rms.low).all() for part in found.table.values())
+    assert not found.warnings
+    assert not found.comparisons
+    assert found.distributions is None
+
+
+def test_frames_without_any_motion_are_not_refused_but_frames_without_a_pose_are():
+    still = replace(track([60]), velocity=np.full((62, 3), np.nan))
+    assert np.isnan(summarise(still, FEW).table["omega_lab"].rms.value).all()
+    with pytest.raises(TrackError, match="no valid frame"):
+        summarise(replace(still, valid=np.zeros(62, bool)), FEW)
 
 
 def test_one_segment_has_numbers_and_no_intervals():
