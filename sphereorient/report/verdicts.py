@@ -93,7 +93,8 @@ def _noise(summary: Summary) -> Iterator[Verdict]:
         return
     shares = {quantity: part.noise_share.value[:3].max() for quantity, part in summary.table.items()}
     if unknown := [quantity for quantity, share in shares.items() if not np.isfinite(share)]:
-        yield _say("Noise", f"the errors of {', '.join(unknown)} are unknown: noise is not subtracted", good=False)
+        words = f"the errors of {', '.join(unknown)} are unknown, at least in some frames: nothing is corrected"
+        yield _say("Noise", words, good=False)
     elif not summary.warnings:
         what = "noise" if summary.ensemble.error == "added" else "smoothed away"
         yield _say("Noise", f"at most {100 * max(shares.values()):.2g} % of any variance is {what}", good=True)
