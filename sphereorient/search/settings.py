@@ -25,7 +25,7 @@ class OrientSettings(BaseModel, frozen=True, extra="forbid"):
         description="a region whose two classes differ less (0..1) shows one paint: the global one decides",
     )
     disk_share: float = Field(
-        0.96, gt=0.5, le=1, description="pixels within this share of the radius are compared; the rim is blurred"
+        1.0, gt=0.5, le=1, description="pixels within this share of the radius are compared; the paper: all"
     )
     coarse_step_deg: float = Field(12.0, ge=4, le=30, description="step of the coarse Lattman grid; the paper's 12")
     score_margin: float = Field(

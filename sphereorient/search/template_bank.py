@@ -20,8 +20,9 @@ from sphereorient.trajectory import Reason
 # Disks searched at once. Fixed, filled up with empty disks: the last bits of Otsu's sums depend on their number.
 BATCH = 32
 RENDERED = 1024  # templates rendered at once
-FINALISTS = 3  # best of the fine grid by the table, whose T is within 0.01 of the renderer's
-POINTS = Sampling(blur_px=0.0, supersampling=1)  # one ray a pixel: the paint's borders stay as sharp as the picture's
+FINALISTS = 4  # best of the fine grid by the table; the renderer chooses among them
+REAL = Sampling(outside=0.5, supersampling=1)  # blurred as by usual optics; 0 outside, as the paint
+HALF = Sampling(outside=0.5, blur_px=0.0, supersampling=1)  # sharp: in blurred templates more orientations are possible
 
 
 class TemplateBank(nn.Module):
@@ -46,7 +47,7 @@ class TemplateBank(nn.Module):
         super().__init__()
         self._settings = settings = settings or OrientSettings()
         self.size_px = size = size_px + size_px % 2
-        self.renderer = SphereRenderer(texture, size_px=size, sampling=POINTS)
+        self.renderer = SphereRenderer(texture, size_px=size, sampling=REAL)
         self._real, self._half = _compared(size, settings.disk_share), _compared(size // 2, settings.disk_share)
         self._table = None
         if settings.renderer == "table":
@@ -54,7 +55,7 @@ class TemplateBank(nn.Module):
         around = so3.local_grid(math.radians(settings.fine_step_deg), math.radians(settings.fine_radius_deg))
         self._around = around.float()
         self.register_buffer("grid", so3.lattman_grid(math.radians(settings.coarse_step_deg)).float(), persistent=False)
-        half = SphereRenderer(self.renderer.texture, size_px=size // 2, sampling=POINTS)
+        half = SphereRenderer(self.renderer.texture, size_px=size // 2, sampling=HALF)
         self.register_buffer("bank", _templates(half, self._half, self.grid), persistent=False)
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:

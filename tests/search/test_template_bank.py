@@ -160,21 +160,18 @@ def test_gradients_of_T_by_orientation_paint_and_texture_agree_with_differences(
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["blobs", "dots"])
 def test_the_table_is_pinned_to_the_renderer(kind):
-    R = attitudes(25)
-    disks = clean_disks(kind, R) + noise(25) / 10
-    table, kornia = (
-        TemplateBank(texture_of(kind), SIZE, OrientSettings(renderer=name, score_min=0.0))
-        for name in ("table", "kornia")
-    )
-    paint, about = table.paint(disks), so3.random_rotations(8, generator=torch.Generator().manual_seed(3)).float()
+    size = 72
+    settings, R = OrientSettings(score_min=0.0), attitudes(25)
+    disks = clean_disks(kind, R, size) + 10 * torch.rand(25, size, size, generator=torch.Generator().manual_seed(5))
+    table = TemplateBank(texture_of(kind), size, settings)
+    kornia = TemplateBank(texture_of(kind), size, settings.model_copy(update={"renderer": "kornia"}))
+    paint, about = table.paint(disks), so3.random_rotations(20, generator=torch.Generator().manual_seed(3)).float()
     T = [0.5 + bank._rendered(about) @ paint[:, bank._real].T / (254 * bank._real.sum()) for bank in (table, kornia)]
     assert (T[0] - T[1]).abs().max() < 0.01
     assert (T[1].T - kornia.quality(paint[:, None], about)).abs().max() < 1e-3
     best = [bank.propose(disks) for bank in (table, kornia)]
-    apart = so3.geodesic_distance(*(found.R_view_body[found.offset[:-1]] for found in best)).rad2deg()
-    # The same template, or one whose T by the renderer is as high within what the table may be off.
-    assert (apart < 0.01).float().mean() >= 0.9
-    assert (best[0].score[best[0].offset[:-1]] - best[1].score[best[1].offset[:-1]]).abs().max() < 0.01
+    apart = so3.geodesic_distance(*(found.R_view_body[found.offset[:-1]] for found in best))
+    assert (apart < 1e-6).float().mean() >= 0.99
 
 
 def test_forward_keeps_the_leading_shape():
