@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -13,7 +14,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from paper_table import Measured
+from paper_table import Measured, whole_in_picture
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -36,7 +37,8 @@ Floats = NDArray[np.float64]
 SIZE_PX = 80  # of the disks that are compared
 CAMERA = "cam1"
 SHOWN_FRAMES = 80  # of the path through the candidates
-CANDIDATES = (4, 8)  # the example frame has about so many
+WANTED = 5  # candidates of the example
+OUTSIDE = 0.5  # grey beside a rendering
 SETTINGS = OrientSettings()
 
 
@@ -45,7 +47,7 @@ class Example:
     """One picture of one camera with what was found in it; made by `example_of`."""
 
     experiment: Experiment
-    track: Trajectory
+    track: Trajectory  # of the method `paper`
     frame: int
     picture: NDArray[np.uint8]  # (H, W)
     texture: Tensor  # (H, 2 H)
@@ -75,24 +77,26 @@ class Example:
         return self.R_lab_view.mT @ torch.from_numpy(seen.candidate_orientation[rows]), seen.candidate_score[rows]
 
 
-def example_of(found: Measured, experiments: list[Experiment]) -> Example:
-    """Choose the track with the most valid frames, and of it a frame with several candidates, near its middle."""
+def example_of(found: Measured) -> Example:
+    """Choose the track with the most valid frames, and of it a frame with several candidates for the whole ball."""
     number = int(np.argmax([track.valid.sum() for track in found.tracks]))
-    track, experiment = found.tracks[number], experiments[number]
-    seen = track.cameras[CAMERA]
-    counts = np.diff(seen.candidate_offset)
+    track, experiment = found.tracks[number], found.experiments[number]
+    seen, camera = track.cameras[CAMERA], experiment.cameras[CAMERA]
     good = track.valid & (np.array(seen.reason) == Reason.OK)
+    good &= whole_in_picture(seen.centre_px, camera)
     if not good.any():
         do = "choose another --out, and film again"
-        raise TrackError(refusal(CAMERA, expected="a frame with candidates", got="none", do=do))
-    several = good & (counts >= CANDIDATES[0]) & (counts <= CANDIDATES[1])
-    chosen = np.flatnonzero(several if several.any() else good)
+        raise TrackError(refusal(CAMERA, expected="a frame with the whole ball", got="none", do=do))
+    counts = np.diff(seen.candidate_offset)
+    wanted = np.where(good, np.abs(counts - WANTED), 1000)
+    chosen = np.flatnonzero(wanted == wanted.min())
     frame = int(chosen[len(chosen) // 2])
     with open_movies(experiment, [CAMERA])[CAMERA] as movie:
         picture = np.asarray(movie.sample([frame])[0])
     centre = torch.from_numpy(seen.centre_px[frame : frame + 1])
-    view = in_the_lab(Candidates.none((Reason.OK,)), experiment.cameras[CAMERA], centre).R_lab_view
-    assert view is not None and experiment.texture_path is not None
+    view = in_the_lab(Candidates.none((Reason.OK,)), camera, centre).R_lab_view
+    assert view is not None
+    assert experiment.texture_path is not None
     return Example(
         experiment=experiment,
         track=track,
@@ -130,8 +134,8 @@ def show(axes: Axes, picture: Any, words: str = "", below: str = "", **more: Any
 
 
 def rendered(texture: Tensor, R_view_body: Tensor, size_px: int = SIZE_PX) -> NDArray[np.float32]:
-    """Return pictures (..., S, S), 0 black .. 1 white, NaN beside the sphere."""
-    return orthographic_view(size_px).render(texture, R_view_body.float(), outside=math.nan).numpy()
+    """Return pictures (..., S, S), 0 black .. 1 white, `OUTSIDE` beside the sphere."""
+    return orthographic_view(size_px).render(texture, R_view_body.float(), outside=OUTSIDE).numpy()
 
 
 def angles(x: float, y: float, z: float) -> Tensor:
@@ -149,6 +153,7 @@ def setup(example: Example) -> Figure:
     for side in (-1, 1):
         impeller(mixer, 100.0 * side)
     ball(mixer, example.texture, np.zeros(3), 26.0)
+    to_scale(mixer, np.full(3, -110.0), np.full(3, 110.0), 1.15)
     mixer.set_title("a) two counter-rotating disks with blades\nin a square tank of 20 cm", fontsize=8)
     tank(arrangement)
     ball(arrangement, example.texture, np.zeros(3), 22.0)
@@ -157,16 +162,18 @@ def setup(example: Example) -> Figure:
         at = 0.55 * centre.numpy()
         arrangement.plot(*np.stack([at, np.zeros(3)]).T, color=colour, linewidth=1.4)
         arrangement.scatter(*at, color=colour, marker="s", s=60, depthshade=False)
-        arrangement.text(*(1.2 * at), f"{name}\n600 Hz, 650 × 650", color=colour, fontsize=7, ha="center")
+        arrangement.text(
+            *(at + np.array([25.0, 0.0, -45.0])), f"{name}\n600 Hz\n650 × 650", color=colour, fontsize=7, va="center"
+        )
     for direction, name, colour in zip(np.eye(3), "xyz", look.AXIS_COLOURS, strict=True):
-        corner = np.array([-100.0, 100.0, -100.0])
+        corner = np.array([100.0, -100.0, -100.0])
         arrangement.quiver(*corner, *(70 * direction), color=colour, linewidth=1.4, arrow_length_ratio=0.25)
         arrangement.text(*(corner + 92 * direction), name, color=colour, fontsize=8, ha="center", va="center")
+    to_scale(arrangement, np.array([-120.0, -310.0, -110.0]), np.array([120.0, 110.0, 310.0]), 1.35)
     arrangement.set_title("b) two cameras at 90 degrees\n", fontsize=8)
     R = so3.random_rotations(7, generator=torch.Generator().manual_seed(3))
     for axes, picture in zip(bottom.subplots(1, 7), rendered(example.texture, R), strict=True):
         show(axes, picture)
-        axes.set_facecolor("white")
     bottom.suptitle("c) the painted sphere in seven orientations", fontsize=8)
     return figure
 
@@ -178,9 +185,14 @@ def tank(axes: Any) -> None:
         for b in corners[k + 1 :]:
             if np.isclose(np.linalg.norm(a - b), 200):
                 axes.plot(*np.stack([a, b]).T, color=look.GREY, linewidth=0.7)
-    axes.set_box_aspect((1, 1, 1), zoom=1.25)
     axes.view_init(elev=22, azim=-62)
     axes.set_axis_off()
+
+
+def to_scale(axes: Any, low: Floats, high: Floats, zoom: float) -> None:
+    """Show the box between two corners, with one scale for all axes."""
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect(tuple(high - low), zoom=zoom)
 
 
 def impeller(axes: Any, x: float) -> None:
@@ -213,14 +225,20 @@ def ball(axes: Any, texture: Tensor, centre: Floats, radius: float) -> None:
     points = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
     colours = np.repeat(grey[..., None], 3, axis=-1)
     axes.plot_surface(
-        *(centre[:, None, None] + radius * points), facecolors=colours, rstride=1, cstride=1, shade=False, linewidth=0
+        *(centre[:, None, None] + radius * points),
+        facecolors=colours,
+        rstride=1,
+        cstride=1,
+        shade=False,
+        linewidth=0,
+        antialiased=False,
     )
 
 
 @look.in_style
 def rotations(example: Example) -> Figure:
     """Figure 2: the three rotations of Tait-Bryan angles, about the fixed z, y and x (errata E9)."""
-    figure = look.new_figure(look.WIDTH_IN, 2.5)
+    figure = look.new_figure(look.WIDTH_IN, 2.4)
     theta = (35.0, 30.0, 50.0)
     steps = [
         ((0, 0, 0), "lab and body"),
@@ -246,9 +264,8 @@ def rotations(example: Example) -> Figure:
                     axes.plot(
                         *(so3.exp(turn).numpy() @ (0.8 * before[:, i])).T, color=look.COMPONENTS[i].colour, linewidth=1
                     )
-        axes.set_title(words, fontsize=8)
-        axes.set(xlim=(-0.8, 0.8), ylim=(-0.8, 0.8), zlim=(-0.8, 0.8))
-        axes.set_box_aspect((1, 1, 1), zoom=1.35)
+        axes.set_title(words, fontsize=8, pad=12)
+        to_scale(axes, np.full(3, -0.85), np.full(3, 0.95), 1.4)
         axes.view_init(elev=22, azim=35)
         axes.set_axis_off()
     look.note(figure, "grey: lab axes; dashed: the fixed axis of this rotation; coloured: body axes and their paths")
@@ -268,10 +285,7 @@ def renderings(example: Example) -> Figure:
     for r, c in places:
         turned = angles(24.0 * (r - 2), 0.0, 0.0) @ angles(0.0, 24.0 * (c - 3), 0.0) @ R[0]
         show(figure.add_subplot(grid[r, c]), rendered(example.texture, turned))
-    look.note(
-        figure,
-        "renderings: 24 degrees about the picture's vertical from column to column, about its horizontal from row to row",
-    )
+    look.note(figure, "renderings: 24 degrees from column to column and from row to row")
     return figure
 
 
@@ -282,16 +296,16 @@ def extraction(example: Example) -> Figure:
     view = orthographic_view(SIZE_PX)
     inside = view.inside & (disk_offsets(SIZE_PX).norm(dim=-1) <= SETTINGS.disk_share)
     paint = extract_paint(example.disk[None], view.inside, SETTINGS)[0]
-    R, score = example.candidates
+    R, _ = example.candidates
     synthetic = torch.where(view.inside, 2 * view.render(example.texture, R[0].float()) - 1, 0.0)
     product = paint * synthetic
     quality = 0.5 + float(product[inside].mean()) / 2
     panels = figure.subplots(1, 4)
     grey = np.where(view.inside, example.disk, np.nan)
-    show(panels[0], grey, "grey disk G", f"{2 * example.place[2]:.0f} px, resampled to {SIZE_PX}")
+    show(panels[0], grey, "grey disk G", f"{2 * example.place[2]:.0f} px across")
     three = {"vmin": -1, "vmax": 1}
-    show(panels[1], paint, "paint I", "−1 black, 0 undecided or outside, +1 white", **three)
-    show(panels[2], synthetic, "rendering S", f"of the best candidate, T = {score[0]:.3f}", **three)
+    show(panels[1], paint, "paint I", "−1 black, 0 undecided, +1 white", **three)
+    show(panels[2], synthetic, "rendering S", "of the best candidate", **three)
     show(panels[3], product, "product I · S", f"T = ½ + mean / 2 = {quality:.3f}", **(three | {"cmap": "PRGn"}))
     return figure
 
@@ -300,8 +314,8 @@ def extraction(example: Example) -> Figure:
 def candidates(example: Example) -> Figure:
     """Figure 5: T of the coarse grid, the possible orientations with their groups, and the candidates."""
     R, score = example.candidates
-    shown = min(len(R), 8)
-    figure = look.new_figure(look.WIDTH_IN, 5.0)
+    shown = min(len(R), 7)
+    figure = look.new_figure(look.WIDTH_IN, 4.6)
     top, bottom = figure.subfigures(2, 1, height_ratios=[2.2, 1])
     left, right = top.subfigures(1, 2, width_ratios=[1, 2.6])
     u, v, radius = example.place
@@ -337,9 +351,12 @@ def candidates(example: Example) -> Figure:
         fontsize=7.5,
     )
     right.colorbar(points, ax=sphere, shrink=0.7, label="T")
-    for k, panel in enumerate(np.atleast_1d(bottom.subplots(1, max(shown, 1)))):
-        show(panel, rendered(example.texture, R[k]), str(k + 1), f"T = {score[k]:.3f}")
-        panel.title.set_color(colours[k])
+    for k, panel in enumerate(bottom.subplots(1, 7)):
+        if k < shown:
+            show(panel, rendered(example.texture, R[k]), str(k + 1), f"T = {score[k]:.3f}")
+            panel.title.set_color(colours[k])
+        else:
+            panel.remove()
     if len(R) > shown:
         look.note(bottom, f"the best {shown} of {len(R)} candidates")
     return figure
@@ -366,7 +383,7 @@ def graph(example: Example) -> Figure:
     heights = {1: (1.0, 2.6), 3: (0.5, 1.7, 2.9), 4: (1.2, 2.4), 5: (0.7, 1.8, 3.0)}
     path = {1: 1.0, 3: 1.7, 4: 1.2, 5: 1.8}
     steps = list(heights)
-    for a, b in zip(steps, steps[1:], strict=False):
+    for a, b in pairwise(steps):
         for start in heights[a]:
             for end in heights[b]:
                 chosen = path[a] == start and path[b] == end
@@ -376,7 +393,7 @@ def graph(example: Example) -> Figure:
         for height in nodes:
             on = path[step] == height
             left.plot(step, height, "o", markersize=10, color="black" if on else "white", markeredgecolor=look.GREY)
-    left.text(2, 1.75, "no\ncandidate", ha="center", va="center", fontsize=7, color=look.GREY, backgroundcolor="white")
+    left.text(2, 3.15, "no candidate", ha="center", va="center", fontsize=7, color=look.GREY)
     left.text(3.5, 0.15, r"cost $d(A, B)\,(2 - T_A - T_B) / \Delta t$", ha="center", fontsize=7)
     left.grid(False)
     left.set(xlim=(0.6, 5.4), ylim=(-0.1, 3.4), xticks=range(1, 6), yticks=[], xlabel="time step", title="sketch")
@@ -384,7 +401,7 @@ def graph(example: Example) -> Figure:
     seen = track.cameras[CAMERA]
     first = max(0, min(example.frame - SHOWN_FRAMES // 2, len(track) - SHOWN_FRAMES))
     last = min(first + SHOWN_FRAMES, len(track))
-    origin = torch.from_numpy(seen.orientation[example.frame])
+    origin = torch.from_numpy(seen.orientation[first:last][np.isfinite(seen.score[first:last])][0])
     rows = slice(int(seen.candidate_offset[first]), int(seen.candidate_offset[last]))
     frame = np.repeat(np.arange(first, last), np.diff(seen.candidate_offset[first : last + 1]))
     apart = np.rad2deg(so3.geodesic_distance(torch.from_numpy(seen.candidate_orientation[rows]), origin).numpy())
@@ -392,7 +409,7 @@ def graph(example: Example) -> Figure:
     chosen = np.rad2deg(so3.geodesic_distance(torch.from_numpy(seen.orientation[first:last]), origin).numpy())
     right.plot(np.arange(first, last), chosen, color=look.AXIS_COLOURS[0], linewidth=1.2, label="path of least cost")
     figure.colorbar(dots, ax=right, label="T of the candidates")
-    right.set(xlabel="frame", ylabel=f"angle from the orientation in frame {example.frame} (degrees)")
+    right.set(xlabel="frame", ylabel="angle from the first orientation (degrees)")
     right.set(title=f"{example.experiment.name}, {CAMERA}", ylim=(-4, 184), yticks=range(0, 181, 45))
     right.legend(loc="upper right", frameon=True)
     return figure
@@ -428,7 +445,10 @@ def sample_track(example: Example) -> Figure:
 
 def camera_distance(found: Measured) -> Figure:
     """Figure 8: PDF of the distance of the cameras, with and without the correction of perspective."""
-    rough = [without_perspective(track, cameras) for track, cameras in zip(found.tracks, found.cameras, strict=True)]
+    rough = [
+        without_perspective(track, experiment.cameras)
+        for track, experiment in zip(found.tracks, found.experiments, strict=True)
+    ]
     return plots.camera_distance_figure(camera_distances(found.tracks, rough))
 
 
@@ -448,19 +468,54 @@ def durations(found: Measured) -> Figure:
 
 
 OF_EXAMPLE: Mapping[str, tuple[Callable[[Example], Figure], str]] = {
-    "01-setup": (setup, ""),
-    "02-angles": (rotations, ""),
-    "03-renderings": (renderings, ""),
-    "04-extraction": (extraction, ""),
-    "05-candidates": (candidates, ""),
-    "06-path": (graph, ""),
-    "07-track": (sample_track, ""),
+    "01-setup": (setup, "Setup: a) the mixer, b) the cameras, c) the painted sphere."),
+    "02-angles": (
+        rotations,
+        "Tait-Bryan angles. The matrix of the paper rotates about the fixed z, the fixed y and the fixed x, in this "
+        "order (errata E9).",
+    ),
+    "03-renderings": (
+        renderings,
+        "Upper left: a picture of the movie; the driving disks on either side and their reflections move. Around it: "
+        "renderings in neighbouring orientations.",
+    ),
+    "04-extraction": (
+        extraction,
+        "From grey levels to the quality T: the disk, its paint in three values, the rendering of the best candidate, "
+        "and the product of both (green: equal, violet: different).",
+    ),
+    "05-candidates": (
+        candidates,
+        "Candidates of one picture. Each template of the coarse grid is drawn at the side of the body that faces the "
+        "camera; below, the renderings of the candidates.",
+    ),
+    "06-path": (
+        graph,
+        "The graph between candidates, as a sketch, and the path through the candidates of one camera.",
+    ),
+    "07-track": (
+        sample_track,
+        "A track in six dimensions, as measured, and the distance of the two cameras. Positions jump where one camera "
+        "alone sees the sphere: they are then known from its size only, and no velocity is computed from them.",
+    ),
 }
 OF_TRACKS: Mapping[str, tuple[Callable[[Measured], Figure], str]] = {
-    "08-distance": (camera_distance, ""),
-    "09-durations": (durations, ""),
-    "10-orientations": (lambda one: plots.angles_figure(distributions(one).angles, distributions(one).uniformity), ""),
-    "11-omega": (lambda one: plots.densities_figure(one.summary, ["omega_lab"]), ""),
-    "11-increments": (lambda one: plots.increments_figure(distributions(one), one.summary.table), ""),
-    "12-alpha": (lambda one: plots.densities_figure(one.summary, ["alpha_lab"]), ""),
+    "08-distance": (camera_distance, "Distance of the cameras, with and without the correction of perspective."),
+    "09-durations": (durations, "Durations of the segments, with an exponential law of the same mean."),
+    "10-orientations": (
+        lambda one: plots.angles_figure(distributions(one).angles, distributions(one).uniformity),
+        "The angles, beside those of uniform orientations.",
+    ),
+    "11-omega": (
+        lambda one: plots.densities_figure(one.summary, ["omega_lab"]),
+        "Components of the angular velocity, in standard deviations.",
+    ),
+    "11-increments": (
+        lambda one: plots.increments_figure(distributions(one), one.summary.table),
+        "Increments of the angular velocity: short lags have the tails of the angular acceleration (errata E7).",
+    ),
+    "12-alpha": (
+        lambda one: plots.densities_figure(one.summary, ["alpha_lab"]),
+        "Components of the angular acceleration, in standard deviations.",
+    ),
 }

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,9 @@ from sphereorient import so3
 from sphereorient.cameras import Camera, save_cameras
 from sphereorient.files.picture import write_picture
 from sphereorient.movies import write_ffv1
-from sphereorient.synth import EnsembleSpec, RandomMotion, SynthSettings, make_scene, random_texture
+from sphereorient.synth import EnsembleSpec, RandomMotion, SynthSettings, degrade, make_scene, random_texture
+from sphereorient.synth.degrade import Disk
+from sphereorient.synth.degrade_scene import picture_of_ball
 from sphereorient.synth.ensemble import Draw, Law
 from sphereorient.synth.scene import digitise, expose
 from sphereorient.synth.write import default_cameras, frame_times_s, write_truth
@@ -26,6 +29,8 @@ Floats = NDArray[np.float64]
 TEXTURE_SEED = 2011  # one painted sphere in all movies
 LAWS = EnsembleSpec()  # of the paper's Table I, with docs/errata.md E6
 NEAR_MM = 40.0  # each coordinate of the centre is within this at one instant of every movie
+LAMPS = {"uneven_light": 3.0, "highlights": 100.0}  # severities as in docs/degradations.md
+MOST_BUBBLES = 5  # in front of the disk
 IMPELLER_HZ, BLADES, BAND_PX = 3.0, 8, 30.0
 
 
@@ -78,6 +83,29 @@ def impellers(size: tuple[int, int], camera: int, time_s: float) -> NDArray[np.f
     return light
 
 
+def disturb(light: NDArray[np.float32], cover: NDArray[np.float32], disk: Disk, seeds: tuple[int, int, int]) -> None:
+    """Put what real pictures have on the sphere in grey levels (H, W): lamps of the tank, and bubbles of each frame.
+
+    `seeds` are camera, movie and frame.
+    """
+    corner = [max(0, int(x) - round(1.5 * float(disk.radius_px))) for x in disk.centre_px]
+    window = tuple(slice(first, first + round(3 * float(disk.radius_px))) for first in reversed(corner))
+    part = torch.from_numpy(light[window])
+    if part.numel() == 0:
+        return
+    inside = replace(disk, centre_px=disk.centre_px - torch.tensor(corner), cover=torch.from_numpy(cover[window]))
+    static, moving = (torch.Generator().manual_seed(hash_of(seeds[:count])) for count in (1, 3))
+    part = degrade(part, inside, LAMPS, static)
+    light[window] = degrade(
+        part, inside, {"bubbles": float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))}, moving
+    )
+
+
+def hash_of(numbers: Sequence[int]) -> int:
+    """Return one seed of several numbers."""
+    return int(np.random.SeedSequence([TEXTURE_SEED, *numbers]).generate_state(1)[0])
+
+
 def film(folder: Path, number: int, frames: int) -> None:
     """Render one movie of two cameras with its truth; the folder appears when it is whole."""
     settings = SynthSettings(name=f"movie {number:03d}", frames=frames, diameter_px=78, seed=number)
@@ -97,7 +125,10 @@ def film(folder: Path, number: int, frames: int) -> None:
         for k, time_s in enumerate(times_s.tolist()):
             row = slice(k * count, (k + 1) * count)
             lit, cover = expose(scene, camera, now.position_lab_mm[row], now.R_lab_body[row])
-            yield digitise(lit + (1 - cover) * impellers(camera.image_size, index, time_s), settings, rng)
+            lit += (1 - cover) * impellers(camera.image_size, index, time_s)
+            centre_px, radius_px = picture_of_ball(camera, now.position_lab_mm[row].mean(0), settings.diameter_mm / 2)
+            disturb(lit, cover, Disk(centre_px=centre_px, radius_px=radius_px), (index, number, k))
+            yield digitise(lit, settings, rng)
 
     for index, (name, camera) in enumerate(cameras.items()):
         write_ffv1(aside / f"{name}.mkv", pictures(index, camera), settings.frame_rate)

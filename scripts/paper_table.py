@@ -17,7 +17,7 @@ from sphereorient import so3
 from sphereorient.cameras import Camera
 from sphereorient.errors import TrackError, refusal
 from sphereorient.evaluate import Score, score_track
-from sphereorient.experiment import load_experiment
+from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.methods.proposers import paper_proposer, precise_proposer
 from sphereorient.methods.settings import Settings
 from sphereorient.report.plots import style as look
@@ -35,7 +35,8 @@ from sphereorient.trajectory import Flag, Trajectory
 Floats = NDArray[np.float64]
 WRONG_DEG = 10.0  # an orientation further off is another candidate, not an error of measurement
 APART_DEG = 30.0  # the paper's limit above which cameras are repaired
-VIEW_PX = 80
+VIEW_PX = 80  # of single synthetic views
+LARGEST_PX = 96.0  # diameter of the disk at the near side of the field
 VISCOSITY_M2_S, DISSIPATION_W_KG = 8e-6, 1.7  # docs/errata.md A5; the paper's power
 
 
@@ -44,7 +45,7 @@ class Measured:
     """All tracks of one method, with truth."""
 
     tracks: list[Trajectory]
-    cameras: list[Mapping[str, Camera]]
+    experiments: list[Experiment]
     truths: list[dict[str, Floats]]  # datasets of truth.h5 at the frames of each track
     scores: list[Score]
     summary: Summary
@@ -78,7 +79,7 @@ def measured(folders: Sequence[Path], tracks: Sequence[Path], settings: Statisti
             truths.append(parts | {name: file[name]["centre_px"][()] for name in experiments[0].cameras})
     return Measured(
         tracks=loaded,
-        cameras=[experiment.cameras for experiment in experiments],
+        experiments=experiments,
         truths=truths,
         scores=[score_track(track, folder / "truth.h5") for track, (folder, _) in zip(loaded, there, strict=True)],
         summary=summarise(loaded, settings, Surroundings(diameter_mm=18.0)),
@@ -90,6 +91,12 @@ def with_smooth(track: Trajectory) -> Trajectory:
     if np.isfinite(track.orientation_smooth).any():
         return track
     return replace(track, position_smooth=track.position, orientation_smooth=track.orientation)
+
+
+def whole_in_picture(centre_px: Floats, camera: Camera) -> NDArray[np.bool_]:
+    """Mark the frames (N,) whose disk, about (N, 2), is wholly in the picture."""
+    reach = 0.5 * LARGEST_PX
+    return np.asarray(((centre_px > reach) & (centre_px < np.array(camera.image_size) - 1 - reach)).all(1))
 
 
 def mean_of(parts: Sequence[Floats], root: bool = False) -> Interval:
@@ -199,8 +206,8 @@ def accuracy_rows(found: Mapping[str, Measured], views: Mapping[str, Floats]) ->
 
     def distances(one: Measured, corrected: bool) -> list[Floats]:
         parts = []
-        for track, cameras in zip(one.tracks, one.cameras, strict=True):
-            (apart,) = camera_distances(track, [without_perspective(track, cameras)])
+        for track, experiment in zip(one.tracks, one.experiments, strict=True):
+            (apart,) = camera_distances(track, [without_perspective(track, experiment.cameras)])
             radians = apart.distance_rad if corrected else apart.uncorrected_rad
             parts.append(np.rad2deg(radians[radians < math.radians(APART_DEG)]))
         return parts
@@ -261,16 +268,10 @@ def accuracy_rows(found: Mapping[str, Measured], views: Mapping[str, Floats]) ->
 def path_rows(found: Mapping[str, Measured]) -> list[Row]:
     """How often there are candidates, and how often a path is repaired."""
 
-    def seen(track: Trajectory, truth: Mapping[str, Floats], name: str, camera: Camera) -> NDArray[np.bool_]:
-        """Mark the frames whose disk is wholly in the picture."""
-        reach = 0.5 * VIEW_PX * 1.2
-        inside = (truth[name] > reach) & (truth[name] < np.array(camera.image_size) - 1 - reach)
-        return np.asarray(inside.all(1))[: len(track)]
-
     def counts(one: Measured) -> list[Floats]:
         parts = []
-        for track, truth, cameras in zip(one.tracks, one.truths, one.cameras, strict=True):
-            whole = {name: seen(track, truth, name, camera) for name, camera in cameras.items()}
+        for track, truth, experiment in zip(one.tracks, one.truths, one.experiments, strict=True):
+            whole = {name: whole_in_picture(truth[name], camera) for name, camera in experiment.cameras.items()}
             parts.append(np.concatenate([np.diff(c.candidate_offset)[whole[n]] for n, c in track.cameras.items()]))
         return [part.astype(np.float64) for part in parts]
 
@@ -295,7 +296,9 @@ def path_rows(found: Mapping[str, Measured]) -> list[Row]:
 
     return [
         Row(
-            "pictures of the whole ball with candidates (%)", truth="100", **each(found, lambda o: mean_of(with_any(o)))
+            "pictures of the whole sphere with candidates (%)",
+            truth="100",
+            **each(found, lambda o: mean_of(with_any(o))),
         ),
         Row("candidates per picture", truth="1", **each(found, lambda one: mean_of(counts(one)))),
         Row("frames repaired from the other camera (%)", **only(repaired)),
