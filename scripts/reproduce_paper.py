@@ -186,10 +186,10 @@ Segments count from 50 frames and 0.25 T_L on, with T_L = 0.3 s.
 
 {table}
 
-Where the two differ from the truth: `paper` takes alpha as the derivative of averages of omega, a low-pass that a motion
-with strong bursts feels most; its rms is too small, and so is its flatness. `precise` estimates the motion's own
-spectrum. The acceleration of these movies is Gaussian, the paper's is not (a = 0.6). The decay time of the durations
-follows from the field and the velocity here, not from a flow.
+Where the methods differ from the truth: `paper` computes alpha from averages of omega. This low-pass removes most of
+the strong bursts, so its rms and its flatness are too small. `precise` estimates the spectrum of the motion itself.
+The acceleration of these movies is Gaussian; the paper's is not (a = 0.6). The decay time of the durations follows from
+the size of the field and the velocity of the sphere, as in any flow; the paper compares it with T_L.
 
 Movies that a method could not track:
 
