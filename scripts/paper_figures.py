@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from matplotlib import colormaps, patheffects
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -330,20 +331,14 @@ def candidates(example: Example) -> Figure:
     points = sphere.scatter(*facing(grid[order]), c=quality[order], s=9, cmap="viridis", linewidth=0)
     possible = quality > quality.max() - SETTINGS.score_margin
     near = so3.geodesic_distance(grid[possible][:, None].double(), R[None, :shown]).argmin(1)
-    colours = colour_cycle(shown)
+    colours = [colormaps["tab10"](k) for k in range(shown)]
+    outlined = [patheffects.withStroke(linewidth=2.5, foreground="white")]
     for k in range(shown):
-        sphere.scatter(
-            *facing(grid[possible][near == k]), s=16, facecolor="none", edgecolor=[colours[k]], linewidth=0.9
-        )
-        sphere.annotate(
-            str(k + 1),
-            [float(x) for x in facing(R[k])],
-            color="white",
-            fontsize=9,
-            fontweight="bold",
-            ha="center",
-            va="center",
-        )
+        rings = {"facecolor": "none", "edgecolor": [colours[k]], "linewidth": 1.3}
+        sphere.scatter(*facing(grid[possible][near == k]), s=30, **rings)
+        at = [float(x) for x in facing(R[k])]
+        words = {"color": colours[k], "fontsize": 11, "fontweight": "bold", "ha": "center", "va": "center"}
+        sphere.annotate(str(k + 1), at, path_effects=outlined, **words)
     sphere.set(xticklabels=[], yticklabels=[])
     sphere.set_title(
         f"T of the {len(grid):,} templates by the body's side that faces the camera (best roll on top);\n"
@@ -360,13 +355,6 @@ def candidates(example: Example) -> Figure:
     if len(R) > shown:
         look.note(bottom, f"the best {shown} of {len(R)} candidates")
     return figure
-
-
-def colour_cycle(count: int) -> list[Any]:
-    """Return distinct colours."""
-    import matplotlib
-
-    return [matplotlib.colormaps["tab10"](k) for k in range(count)]
 
 
 def facing(R_view_body: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,7 @@ from sphereorient.statistics.cameras import camera_distances, without_perspectiv
 from sphereorient.statistics.density import StretchedFit, fit_stretched, flatness_of
 from sphereorient.statistics.flow import FlowScales
 from sphereorient.statistics.moments import noise_let_through, table_of_moments
-from sphereorient.statistics.segments import UNITS, Ensemble
+from sphereorient.statistics.segments import UNITS, Ensemble, durations
 from sphereorient.trajectory import Flag, Trajectory
 
 Floats = NDArray[np.float64]
@@ -363,12 +363,25 @@ def shape_rows(found: Mapping[str, Measured], settings: StatisticsSettings) -> l
     return rows
 
 
+def stays(truth: Mapping[str, Floats], experiment: Experiment) -> Floats:
+    """Return how long the whole sphere stays in the picture of some camera, (S,), s."""
+    seen = np.any([whole_in_picture(truth[name], camera) for name, camera in experiment.cameras.items()], axis=0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(np.int8)))
+    return np.asarray((edges[1::2] - edges[::2]) / experiment.frame_rate_hz)
+
+
 def track_rows(found: Mapping[str, Measured]) -> list[Row]:
     """Durations, uniformity, and scales of the flow."""
     flow = FlowScales(viscosity_m2_s=VISCOSITY_M2_S, dissipation_w_kg=DISSIPATION_W_KG)
     more = {method: one.summary.distributions for method, one in found.items()}
     known = {method: one for method, one in more.items() if one is not None}
     decay = {m: pm(one.durations.decay_time_s) for m, one in known.items() if one.durations is not None}
+    stays_s = np.concatenate(
+        [stays(*both) for both in zip(found["paper"].truths, found["paper"].experiments, strict=True)]
+    )
+    spans = more["paper"].durations if more["paper"] is not None else None
+    if spans is not None and (stays_s >= spans.truncated_s).sum() >= 2:
+        decay["truth"] = pm(durations(stays_s, spans.truncated_s).decay_time_s)
     curves = {method: one.correlations["velocity"].integral_time_s for method, one in known.items()}
     return [
         Row("segments", **{method: str(one.summary.ensemble.segments) for method, one in found.items()}),

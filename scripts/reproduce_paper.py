@@ -30,6 +30,7 @@ from sphereorient.errors import BenchError, OutputError, SphereOrientError, refu
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.report.plots import style as look
 from sphereorient.run import MemoryStore, Request, run
+from sphereorient.run.many import end_with_parent
 from sphereorient.statistics import StatisticsSettings
 
 
@@ -97,7 +98,8 @@ def make_movies(out: Path, plan: Plan) -> list[str]:
     todo = [n for n in range(1, plan.movies + 1) if not all(place_of(out, n, method).exists() for method in METHODS)]
     begin, failed = time.perf_counter(), []
     context = multiprocessing.get_context("spawn")  # forked children of a process that used torch's threads hang
-    with ProcessPoolExecutor(max(1, min(len(todo), os.cpu_count() or 1)), mp_context=context) as pool:
+    workers = max(1, min(len(todo), os.cpu_count() or 1))
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool:
         made = [pool.submit(make_movie, out, number, plan.frames) for number in todo]
         for done, future in enumerate(as_completed(made), 1):
             failed += future.result()

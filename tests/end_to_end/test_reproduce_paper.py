@@ -90,6 +90,17 @@ def test_pooled_flatness_is_that_of_the_law():
     assert abs(float(fit.a.value) - 0.6) < 0.12
 
 
+def test_a_stay_lasts_while_some_camera_has_the_whole_sphere():
+    camera = SimpleNamespace(image_size=(650, 650))
+    experiment = SimpleNamespace(cameras={"a": camera, "b": camera}, frame_rate_hz=600.0)
+    inside, outside = [300.0, 300.0], [300.0, 10.0]
+    truth = {
+        "a": np.array([outside, inside, inside, outside, outside, inside]),
+        "b": np.array([outside] * 3 + [inside] + [outside] * 2),
+    }
+    np.testing.assert_allclose(paper_table.stays(truth, experiment), [3 / 600, 1 / 600])
+
+
 def test_means_have_the_error_of_resampled_movies():
     rng = np.random.default_rng(5)
     parts = [rng.normal(0.0, 2.0, 50) for _ in range(40)]
