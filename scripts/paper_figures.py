@@ -507,3 +507,6 @@ OF_TRACKS: Mapping[str, tuple[Callable[[Measured], Figure], str]] = {
         "Components of the angular acceleration, in standard deviations.",
     ),
 }
+OF_PRECISE: Mapping[str, tuple[Callable[[Measured], Figure], str]] = {
+    "12-alpha-precise": (OF_TRACKS["12-alpha"][0], "The same by `precise`, which does not damp the bursts."),
+}

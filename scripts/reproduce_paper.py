@@ -22,7 +22,7 @@ from typing import Any
 
 import h5py
 import torch
-from paper_figures import OF_EXAMPLE, OF_TRACKS, example_of
+from paper_figures import OF_EXAMPLE, OF_PRECISE, OF_TRACKS, example_of
 from paper_movies import film
 from paper_table import markdown, measured, single_views, table
 
@@ -136,8 +136,8 @@ def write_page(out: Path, plan: Plan, failed: list[str]) -> list[Path]:
     }
     make_folder(out / "paper", f"folder {out / 'paper'}")
     example, pictures, parts = example_of(found["paper"]), [], []
-    for name, (draw, caption) in (OF_EXAMPLE | OF_TRACKS).items():
-        drawn = draw(example if name in OF_EXAMPLE else found["paper"])
+    for name, (draw, caption) in (OF_EXAMPLE | OF_TRACKS | OF_PRECISE).items():
+        drawn = draw(example if name in OF_EXAMPLE else found["precise" if name in OF_PRECISE else "paper"])
         pictures += look.write_figure(drawn, out / "paper" / f"{name}.png", dpi=DPI)
         parts.append(f"![{name}](paper/{name}.png)\n\n**Figure {name[:2].lstrip('0')}.** {caption}\n")
     views = single_views(folders[0] / "texture.png", plan.views)
@@ -198,7 +198,7 @@ Movies that a method could not track:
 {failed}
 ## The figures
 
-Figures 7 to 12 show the method `paper`. Figures 8 to 12 are those of `sphereorient report`.
+Figures 7 to 12 show the method `paper`, the last one `precise`. Figures 8 to 12 are those of `sphereorient report`.
 
 {figures}"""
 
