@@ -146,6 +146,8 @@ def write_page(out: Path, plan: Plan, failed: list[str]) -> list[Path]:
         frames=plan.frames,
         total=f"{plan.movies * plan.frames:,}",
         option=" --quick" if plan is QUICK else "",
+        least=plan.statistics.min_frames,
+        share=plan.statistics.min_integral_times,
         costs=costs(out),
         failed="".join(f"- {line}\n" for line in failed) or "- none\n",
         table=markdown(table(found, views, plan.statistics)),
@@ -184,7 +186,7 @@ No background pictures are given: the methods learn the background from the movi
 
 Truth: the exact motion in the frames that `paper` measured (`law`: of the random process, without end). Errors behind
 ± are standard errors; whole movies or segments are resampled. Codes such as E6 name rows of [errata.md](errata.md).
-Segments count from 50 frames and 0.25 T_L on, with T_L = 0.3 s.
+Segments count from {least} frames and {share} T_L on, with T_L = 0.3 s.
 
 {table}
 
