@@ -57,10 +57,10 @@ class ProcessExecutor:
 def _worker() -> ProcessPoolExecutor:
     # Spawn: forked children of a process that used torch's threads hang.
     start = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(1, mp_context=start, initializer=_prepare)
+    return ProcessPoolExecutor(1, mp_context=start, initializer=end_with_parent)
 
 
-def _prepare() -> None:
+def end_with_parent() -> None:
     """Exit when the parent process dies; a killed parent cannot signal its workers."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     parent = multiprocessing.parent_process()

@@ -96,7 +96,7 @@ def write_synthetic_experiment(
     reported = wrong_cameras(cameras, values)
     exact = "exact cameras" if reported is cameras else "cameras, wrong on purpose"
     save_cameras(folder / "cameras.yaml", reported, comment=f"{exact}; X_cam = R X_lab + T, mm")
-    _write_truth(folder / "truth.h5", motion_of(settings).at(frame_times_s(settings)), cameras)
+    write_truth(folder / "truth.h5", motion_of(settings).at(frame_times_s(settings)), cameras)
     path = folder / "experiment.yaml"
     path.write_text(yaml.safe_dump(_experiment(filming), sort_keys=False), encoding="utf-8")
     return path
@@ -150,7 +150,7 @@ def _without_the_ball(filming: Filming, name: str) -> NDArray[np.uint8]:
     return rounded
 
 
-def _write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> None:
+def write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> None:
     """Write truth.h5 (docs/data-format.md)."""
     body = truth.R_lab_body.mT
     data = {

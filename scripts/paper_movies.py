@@ -1,0 +1,148 @@
+"""Synthetic movies as in the paper's experiment: a tumbling sphere between impellers, two cameras, exact truth."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from numpy.typing import NDArray
+from scipy.special import expit
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.cameras import Camera, save_cameras
+from sphereorient.files.picture import write_picture
+from sphereorient.movies import write_ffv1
+from sphereorient.synth import EnsembleSpec, RandomMotion, SynthSettings, degrade, make_scene, random_texture
+from sphereorient.synth.degrade import Disk
+from sphereorient.synth.degrade_scene import picture_of_ball
+from sphereorient.synth.ensemble import Draw, Law
+from sphereorient.synth.scene import digitise, expose
+from sphereorient.synth.write import default_cameras, frame_times_s, write_truth
+
+Floats = NDArray[np.float64]
+TEXTURE_SEED = 2011  # one painted sphere in all movies
+LAWS = EnsembleSpec()  # of the paper's Table I, with docs/errata.md E6
+NEAR_MM = 40.0  # each coordinate of the centre is within this at one instant of every movie
+LAMPS = {"uneven_light": 3.0, "highlights": 100.0}  # severities as in docs/degradations.md
+MOST_BUBBLES = 5  # in front of the disk
+IMPELLER_HZ, BLADES, BAND_PX = 3.0, 8, 30.0
+
+
+def waves(draws: list[Draw], scale: float, origin: Floats) -> Callable[..., Tensor]:
+    """Return a function of times (...), s, and the derivative: rates (..., 3) times `scale`; -1 is their integral."""
+
+    def at(time_s: Tensor, derivative: int = 0) -> Tensor:
+        flat = time_s.reshape(-1).numpy()
+        segment = np.zeros(len(flat), np.int64)
+        if derivative < 0:
+            found = origin + scale * np.stack([draw.integral(flat, segment) for draw in draws], 1)
+        else:
+            found = scale * np.stack([draw.at(flat, segment)[derivative] for draw in draws], 1)
+        return torch.from_numpy(found).reshape(*time_s.shape, 3)
+
+    return at
+
+
+def tumbling(number: int, duration_s: float) -> RandomMotion:
+    """Draw the motion of one movie: velocity Gaussian, omega intermittent; the sphere passes near the middle once."""
+    rng = np.random.default_rng([TEXTURE_SEED, number])
+    pairs = zip(LAWS.velocity_rms, LAWS.acceleration_rms, strict=True)
+    moves = [Law.of(rms, slope).draw(1, rng) for rms, slope in pairs]
+    turns = [law.draw(1, rng) for law in LAWS.omega_laws()]
+    once = torch.tensor([rng.uniform(0, duration_s)], dtype=torch.float64)
+    there = rng.uniform(-NEAR_MM, NEAR_MM, 3) - waves(moves, 1e3, np.zeros(3))(once, -1)[0].numpy()
+    start = torch.Generator().manual_seed(int(rng.integers(2**31)))
+    R_start = so3.random_rotations(1, generator=start, dtype=torch.float64)[0]
+    return RandomMotion(path=waves(moves, 1e3, there), omega=waves(turns, 1.0, np.zeros(3)), R_start=R_start)
+
+
+def impellers(size: tuple[int, int], camera: int, time_s: float) -> NDArray[np.float32]:
+    """Return the grey levels (H, W) of the turning disks on either side, seen from the edge, and of their reflections.
+
+    A blade is as wide as its height above the axis' plane and moves as the cosine of its angle.
+    """
+    width, height = size
+    u, v = np.arange(width), np.arange(height)[:, None]
+    blade = np.arange(BLADES)
+    light = np.zeros((height, width), np.float32)
+    for side, edge in ((1, u), (-1, width - 1 - u)):
+        angle = 2 * np.pi * (side * IMPELLER_HZ * time_s + (blade + 0.3 * camera) / BLADES)
+        up = np.maximum(np.sin(angle), 0.0)
+        down_px = height / 2 * (1 + 1.1 * np.cos(angle))
+        profile = np.exp(-0.5 * ((v - down_px) / (4 + 14 * up)) ** 2)  # (H, blades)
+        band = expit((BAND_PX - edge) / 2)
+        mirrored = np.exp(-0.5 * ((edge[:, None] - 50 - 0.085 * width * (blade + 1)) / 13) ** 2).T
+        across = np.where(up > 0, 35 + 65 * up, 0.0)[:, None] * band + 26 * up[:, None] * mirrored
+        light += profile.astype(np.float32) @ across.astype(np.float32) + 20 * band.astype(np.float32)
+    return light
+
+
+def disturb(light: NDArray[np.float32], cover: NDArray[np.float32], disk: Disk, seeds: tuple[int, int, int]) -> None:
+    """Put what real pictures have on the sphere in grey levels (H, W): lamps of the tank, and bubbles of each frame.
+
+    `seeds` are camera, movie and frame.
+    """
+    corner = [max(0, int(x) - round(1.5 * float(disk.radius_px))) for x in disk.centre_px]
+    window = tuple(slice(first, first + round(3 * float(disk.radius_px))) for first in reversed(corner))
+    part = torch.from_numpy(light[window])
+    if part.numel() == 0:
+        return
+    inside = replace(disk, centre_px=disk.centre_px - torch.tensor(corner), cover=torch.from_numpy(cover[window]))
+    static, moving = (torch.Generator().manual_seed(hash_of(seeds[:count])) for count in (1, 3))
+    part = degrade(part, inside, LAMPS, static)
+    light[window] = degrade(
+        part, inside, {"bubbles": float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))}, moving
+    )
+
+
+def hash_of(numbers: Sequence[int]) -> int:
+    """Return one seed of several numbers."""
+    return int(np.random.SeedSequence([TEXTURE_SEED, *numbers]).generate_state(1)[0])
+
+
+def film(folder: Path, number: int, frames: int) -> None:
+    """Render one movie of two cameras with its truth; the folder appears when it is whole."""
+    settings = SynthSettings(name=f"movie {number:03d}", frames=frames, diameter_px=78, seed=number)
+    aside = folder.with_name(f"{folder.name}.part")
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    grey = np.rint(random_texture(settings.texture, TEXTURE_SEED).numpy() * 255).astype(np.uint8)
+    write_picture(aside / "texture.png", grey)
+    scene = make_scene(torch.from_numpy(grey / np.float32(255)), settings)
+    cameras, motion = default_cameras(settings), tumbling(number, frames / settings.frame_rate)
+    count, times_s = settings.exposure_samples, frame_times_s(settings)
+    within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
+    now = motion.at((times_s[:, None] + within).reshape(-1))
+
+    def pictures(index: int, camera: Camera) -> Iterator[NDArray[np.uint8]]:
+        rng = np.random.default_rng([number, index])
+        for k, time_s in enumerate(times_s.tolist()):
+            row = slice(k * count, (k + 1) * count)
+            lit, cover = expose(scene, camera, now.position_lab_mm[row], now.R_lab_body[row])
+            lit += (1 - cover) * impellers(camera.image_size, index, time_s)
+            centre_px, radius_px = picture_of_ball(camera, now.position_lab_mm[row].mean(0), settings.diameter_mm / 2)
+            disturb(lit, cover, Disk(centre_px=centre_px, radius_px=radius_px), (index, number, k))
+            yield digitise(lit, settings, rng)
+
+    for index, (name, camera) in enumerate(cameras.items()):
+        write_ffv1(aside / f"{name}.mkv", pictures(index, camera), settings.frame_rate)
+    save_cameras(aside / "cameras.yaml", cameras, comment="exact cameras; X_cam = R X_lab + T, mm")
+    write_truth(aside / "truth.h5", motion.at(times_s), cameras)
+    # Without backgrounds: the mean of the movie is used, as in the paper.
+    document = {
+        "schema": "sphereorient-experiment/1",
+        "name": settings.name,
+        "frame_rate": settings.frame_rate,
+        "exposure": settings.exposure,
+        "sphere": {"diameter": settings.diameter_mm, "texture": "texture.png"},
+        "cameras": "cameras.yaml",
+        "movies": {name: f"{name}.mkv" for name in cameras},
+    }
+    (aside / "experiment.yaml").write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+    aside.rename(folder)
