@@ -36,10 +36,10 @@ from sphereorient.report.plots.style import write_figure
 from sphereorient.search import (
     Candidates,
     FallbackProposer,
+    GreySearch,
     GreySearchSettings,
     Proposer,
     ProposeSettings,
-    GreySearch,
 )
 from sphereorient.search.candidates import resized
 from sphereorient.statistics.reliability import Z95, reliability, wilson

@@ -26,7 +26,7 @@ from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.experiment.recording import open_recording
 from sphereorient.locate import find_scene, screened_frames
 from sphereorient.methods.settings import Settings
-from sphereorient.search import GreySearchSettings, GreySearch, crop_disk
+from sphereorient.search import GreySearch, GreySearchSettings, crop_disk
 from sphereorient.sphere import orthographic_view
 from sphereorient.synth import SynthSettings, make_scene, random_texture, render_frame
 from sphereorient.synth.write import default_cameras
