@@ -31,7 +31,7 @@ from sphereorient.methods import paper
 from sphereorient.methods.settings import load_settings
 from sphereorient.motion import measure
 from sphereorient.run.stages import track_movies
-from sphereorient.search import paper_search
+from sphereorient.search import extraction, template_bank
 from sphereorient.trajectory import Trajectory
 
 STAGES = ("locate_sphere", "propose_orientations")
@@ -50,18 +50,13 @@ def plain_mean(pictures: np.ndarray, *rest: Any, learn: Callable[..., Any] = sce
 
 def majority(disks: Tensor, inside: Tensor, settings: Any) -> Tensor:
     """Paint by two of Otsu's three votes instead of all three."""
-    grey = paper_search.stretch_contrast(disks, inside, settings.black_share, settings.white_share)
-    one_hot = paper_search._one_hot(grey, inside)
-    threshold, _ = paper_search.otsu(one_hot.sum((-2, -1)))
+    grey = extraction.stretch_contrast(disks, inside, settings.black_share, settings.white_share)
+    one_hot = extraction._one_hot(grey, inside)
+    threshold, _ = extraction.otsu(one_hot.sum((-2, -1)))
     votes = [grey > threshold[:, None, None]]
     for share in settings.regions:
-        votes.append(grey > paper_search._moving_threshold(one_hot, threshold, share, settings.region_contrast_min))
+        votes.append(grey > extraction._moving_threshold(one_hot, threshold, share, settings.region_contrast_min))
     return torch.where(sum(vote.int() for vote in votes) >= 2, 1.0, -1.0) * inside
-
-
-def of_all_pixels(R: Tensor, score: Tensor, *rest: Any, share: float, of: Callable[..., Any]) -> Any:
-    """Divide the sum in T by the pixels of the whole disk, pi r^2, instead of those compared."""
-    return of(R, 0.5 + share * (score - 0.5), *rest)
 
 
 @contextmanager
@@ -104,24 +99,25 @@ def limits_off() -> Any:
 
 def changes() -> dict[str, Change]:
     """The departures undone, by name."""
-    all_pixels = partial(of_all_pixels, share=0.96**2, of=paper_search.Candidates.of_disk)
     return {
         "as it is": setting(0),
         "background: plain mean, the ball in it": (0, (), lambda: patch.object(scene, "learn_background", plain_mean)),
         "no outliers replaced": setting(0, "locate.outlier_px=1000.0"),
         "disks of 64 px": setting(1, "orient.size_px=64"),
-        "Otsu by majority": (1, (), lambda: patch.object(paper_search, "extract_paint", majority)),
+        "Otsu by majority": (1, (), lambda: patch.object(template_bank, "extract_paint", majority)),
         "moving regions always count": setting(1, "orient.region_contrast_min=0.0"),
-        "whole disk compared": setting(1, "orient.disk_share=1.0"),
-        "T over pi r^2": (
+        "templates as sharp as one ray a pixel": (
             1,
-            (f"orient.score_margin={0.1 / 0.96**2:.4f}",),
-            lambda: patch.object(paper_search.Candidates, "of_disk", all_pixels),
+            (),
+            lambda: patch.object(template_bank, "REAL", template_bank.HALF),
         ),
+        "within 0.96 of the radius": setting(1, "orient.disk_share=0.96"),
         "twins not merged": (
             1,
             (),
-            lambda: patch.object(paper_search, "distinct", lambda R, apart: torch.ones(len(R), dtype=torch.bool)),
+            lambda: patch.object(
+                template_bank, "distinct", lambda R, apart: torch.ones(R.shape[:-2], dtype=torch.bool)
+            ),
         ),
         "groups of 45 degrees": setting(1, "orient.group_deg=45.0"),
         "no runaways": setting(1, "orient.groups_max=100000"),

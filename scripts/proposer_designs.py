@@ -24,7 +24,7 @@ from sphereorient import so3
 from sphereorient.learn.network import Correlator, PictureNetwork, find_modes, first_right, smoothed_target
 from sphereorient.learn.pictures import VALIDATION_SEED, RandomTextures, TrainingBatch, draw_batch, make_textures
 from sphereorient.learn.settings import NetworkSettings, PictureSettings
-from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
+from sphereorient.sphere import orthographic_view, reduced_texture
 
 GRID_STEP_DEG = 15.0
 SPREAD_DEG = 8.0
@@ -90,7 +90,7 @@ class DescriptorDesign(Design):
 
     def clean(self, texture: Tensor, R: Tensor) -> Tensor:
         """Views of the map under even light, (K, S, S)."""
-        paint = sample_texture(reduced_texture(texture, 40), self.view.normal_view @ R)
+        paint = self.view.paint(reduced_texture(texture, 40), R)
         black, white = VIEW_LEVELS
         return self.view.picture(black + (white - black) * paint, outside=black)
 

@@ -16,7 +16,7 @@ from sphereorient.learn.checkpoint import Checkpoint, check_texture, correlator_
 from sphereorient.learn.network import Correlator, find_modes, first_right, smoothed_target
 from sphereorient.learn.pictures import VALIDATION_SEED, TrainingBatch, draw_values, film, generator_of, make_textures
 from sphereorient.learn.settings import PictureSettings
-from sphereorient.sphere import load_texture, orthographic_view, reduced_texture, sample_texture
+from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
 from sphereorient.statistics.reliability import reliability
 from sphereorient.synth.severities import severity
 
@@ -251,8 +251,4 @@ def make_examples(checkpoint: Checkpoint, count: int, shown: int = 4, seed: int 
 
 def clean_views(texture: Tensor, R_view_body: Tensor, size_px: int) -> Tensor:
     """Render a map in orientations (F, 3, 3), (F, S, S), without light, NaN outside the outline."""
-    view = orthographic_view(size_px)
-    reduced = reduced_texture(texture, float(size_px))
-    pictures = torch.full((len(R_view_body), size_px, size_px), torch.nan)
-    pictures[:, view.inside] = sample_texture(reduced, view.normal_view.float() @ R_view_body)
-    return pictures
+    return orthographic_view(size_px).render(reduced_texture(texture, float(size_px)), R_view_body, math.nan)

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from sphereorient.cameras import Camera, Rays
 from sphereorient.cameras.ideal import TelecentricCamera
 from sphereorient.errors import CameraError, SettingsError, check_tail, refusal
-from sphereorient.sphere.texture import check_texture_shape, reduced_texture, sample_spline, sample_texture
-from sphereorient.sphere.view import smooth_positive, sphere_normals
+from sphereorient.sphere.texture import check_texture_shape, reduced_texture
+from sphereorient.sphere.view import paint_seen, smooth_positive, sphere_normals
 
 RIM = 0.02  # rounding of the limb, radii^2: the least depth is 0.1 radii
 SHADE = 0.02  # rounding of a lamp's cosine: no kink in the light
@@ -31,7 +31,7 @@ class SphereSight:
 def see_sphere(
     rays: Rays, centre: Tensor, R: Tensor, texture: Tensor, radius: float | Tensor = 1.0, *, smooth: bool = False
 ) -> SphereSight:
-    """Return the paint that rays (..., P, 3) see on a map (H, 2 H); all rendering uses this function.
+    """Return the paint that rays (..., P, 3) see on a map (H, 2 H).
 
     `R` (..., 3, 3) takes body components to the rays' frame; `centre` (..., 3) and `radius`, () or (..., 1), have its
     unit. `smooth` is twice differentiable (spline, rounded limb); otherwise bilinear and exact.
@@ -40,8 +40,8 @@ def see_sphere(
     check_tail("R_lab_body", R, 3, 3)
     corner = RIM if smooth else 0.0
     normal, depth2 = sphere_normals(rays.origin_lab_mm, rays.direction_lab, centre[..., None, :], radius, corner)
-    paint = (sample_spline if smooth else sample_texture)(texture, (normal @ R).to(texture.dtype))
-    return SphereSight(paint=paint.to(normal.dtype), normal=normal, depth2=depth2)
+    paint = paint_seen(texture, normal, R, smooth=smooth).to(normal.dtype)
+    return SphereSight(paint=paint, normal=normal, depth2=depth2)
 
 
 def lambert(normal: Tensor, towards: Tensor, strength: Tensor | float, corner: float = 0.0) -> Tensor:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.errors import check_tail
-from sphereorient.sphere.texture import sample_texture
+from sphereorient.sphere.texture import sample_spline, sample_texture
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -23,12 +23,20 @@ class DiskView:
 
     def paint(self, texture: Tensor, R_view_body: Tensor) -> Tensor:
         """Return the paint (..., P) of a map (H, 2 H) at orientations (..., 3, 3); differentiable."""
-        check_tail("R_view_body", R_view_body, 3, 3)
-        return sample_texture(texture.to(R_view_body.dtype), self.normal_view.to(R_view_body.dtype) @ R_view_body)
+        return paint_seen(texture.to(R_view_body.dtype), self.normal_view.to(R_view_body.dtype), R_view_body)
 
     def render(self, texture: Tensor, R_view_body: Tensor, outside: float = 0.0) -> Tensor:
         """Return pictures (..., S, S), one sample per pixel; `SphereRenderer` integrates over pixels."""
         return self.picture(self.paint(texture, R_view_body), outside)
+
+
+def paint_seen(texture: Tensor, normal_view: Tensor, R_view_body: Tensor, *, smooth: bool = False) -> Tensor:
+    """Return the paint (..., P) of a map (H, 2 H) at outward normals (..., P, 3); all pictures use this function.
+
+    `R_view_body` (..., 3, 3) takes body components to the frame of the normals; `smooth`: spline, otherwise bilinear.
+    """
+    check_tail("R_view_body", R_view_body, 3, 3)
+    return (sample_spline if smooth else sample_texture)(texture, (normal_view @ R_view_body).to(texture.dtype))
 
 
 def disk_offsets(size_px: int, dtype: torch.dtype = torch.float64) -> Tensor:
