@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from paper_table import Measured, whole_in_picture
 from torch import Tensor
-from torch.nn import functional as F
 
 from sphereorient import so3
 from sphereorient.cameras import Camera
@@ -27,9 +26,8 @@ from sphereorient.methods.paper import in_the_lab
 from sphereorient.report import plots
 from sphereorient.report.plots import style as look
 from sphereorient.report.plots.track import tait_bryan_deg
-from sphereorient.search import Candidates, OrientSettings, crop_disk, extract_paint
+from sphereorient.search import Candidates, TemplateBank, crop_disk
 from sphereorient.sphere import load_texture, orthographic_view
-from sphereorient.sphere.view import disk_offsets
 from sphereorient.statistics.cameras import camera_distances, without_perspective
 from sphereorient.statistics.summary import Distributions
 from sphereorient.trajectory import Reason, Trajectory
@@ -40,7 +38,6 @@ CAMERA = "cam1"
 SHOWN_FRAMES = 80  # of the path through the candidates
 WANTED = 5  # candidates of the example
 OUTSIDE = 0.5  # grey beside a rendering
-SETTINGS = OrientSettings()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,16 +103,6 @@ def example_of(found: Measured) -> Example:
         texture=load_texture(experiment.texture_path),
         R_lab_view=view[0],
     )
-
-
-def coarse_quality(paint: Tensor, texture: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the coarse grid (K, 3, 3) and the quality T (K,) of its templates for extracted paint (S, S)."""
-    half = F.avg_pool2d(paint[None], 2)[0]
-    view = orthographic_view(SIZE_PX // 2)
-    used = (disk_offsets(SIZE_PX // 2).norm(dim=-1) <= SETTINGS.disk_share)[view.inside]
-    grid = so3.lattman_grid(math.radians(SETTINGS.coarse_step_deg)).float()
-    parts = [(2 * view.paint(texture, part) - 1)[:, used] for part in grid.split(1000)]
-    return grid, 0.5 + torch.cat(parts) @ half[view.inside][used] / (2 * used.sum())
 
 
 def blank(axes: Axes, words: str = "", below: str = "") -> None:
@@ -294,20 +281,20 @@ def renderings(example: Example) -> Figure:
 def extraction(example: Example) -> Figure:
     """Figure 4: grey disk, paint of three values, rendering, and their product, whose mean gives T."""
     figure = look.new_figure(look.WIDTH_IN, 2.25)
-    view = orthographic_view(SIZE_PX)
-    inside = view.inside & (disk_offsets(SIZE_PX).norm(dim=-1) <= SETTINGS.disk_share)
-    paint = extract_paint(example.disk[None], view.inside, SETTINGS)[0]
+    bank = TemplateBank(example.texture, SIZE_PX)
+    paint = bank.paint(example.disk)
     R, _ = example.candidates
-    synthetic = torch.where(view.inside, 2 * view.render(example.texture, R[0].float()) - 1, 0.0)
-    product = paint * synthetic
-    quality = 0.5 + float(product[inside].mean()) / 2
+    synthetic = 2 * bank.renderer(R[0].float()) - 1
+    quality = float(bank.quality(paint, R[0].float()))
     panels = figure.subplots(1, 4)
-    grey = np.where(view.inside, example.disk, np.nan)
+    grey = np.where(orthographic_view(SIZE_PX).inside, example.disk, np.nan)
     show(panels[0], grey, "grey disk G", f"{2 * example.place[2]:.0f} px across")
     three = {"vmin": -1, "vmax": 1}
     show(panels[1], paint, "paint I", "−1 black, 0 undecided, +1 white", **three)
     show(panels[2], synthetic, "rendering S", "of the best candidate", **three)
-    show(panels[3], product, "product I · S", f"T = ½ + mean / 2 = {quality:.3f}", **(three | {"cmap": "PRGn"}))
+    show(
+        panels[3], paint * synthetic, "product I · S", f"T = ½ + mean / 2 = {quality:.3f}", **(three | {"cmap": "PRGn"})
+    )
     return figure
 
 
@@ -324,25 +311,25 @@ def candidates(example: Example) -> Figure:
     show(axes, example.picture, f"{CAMERA}, frame {example.frame}")
     reach = 1.4 * radius
     axes.set(xlim=(u - reach, u + reach), ylim=(v + reach, v - reach))
-    view = orthographic_view(SIZE_PX)
-    grid, quality = coarse_quality(extract_paint(example.disk[None], view.inside, SETTINGS)[0], example.texture)
+    bank = TemplateBank(example.texture, SIZE_PX)
+    grid, quality = bank.grid, bank.score(bank.paint(example.disk))
+    possible = grid[bank.groups(quality[None])[0] >= 0]
+    near = so3.geodesic_distance(possible[:, None].double(), R[None, :shown]).argmin(1)  # the candidate of its group
     sphere = right.add_subplot(projection="mollweide")
     order = quality.argsort()
     points = sphere.scatter(*facing(grid[order]), c=quality[order], s=9, cmap="viridis", linewidth=0)
-    possible = quality > quality.max() - SETTINGS.score_margin
-    near = so3.geodesic_distance(grid[possible][:, None].double(), R[None, :shown]).argmin(1)
     colours = [colormaps["tab10"](k) for k in range(shown)]
     outlined = [patheffects.withStroke(linewidth=2.5, foreground="white")]
     for k in range(shown):
         rings = {"facecolor": "none", "edgecolor": [colours[k]], "linewidth": 1.3}
-        sphere.scatter(*facing(grid[possible][near == k]), s=30, **rings)
+        sphere.scatter(*facing(possible[near == k]), s=30, **rings)
         at = [float(x) for x in facing(R[k])]
         words = {"color": colours[k], "fontsize": 11, "fontweight": "bold", "ha": "center", "va": "center"}
         sphere.annotate(str(k + 1), at, path_effects=outlined, **words)
     sphere.set(xticklabels=[], yticklabels=[])
     sphere.set_title(
         f"T of the {len(grid):,} templates by the body's side that faces the camera (best roll on top);\n"
-        f"rings: the {int(possible.sum())} possible orientations, coloured by group; numbers: candidates",
+        f"rings: the {len(possible)} possible orientations, coloured by group; numbers: candidates",
         fontsize=7.5,
     )
     right.colorbar(points, ax=sphere, shrink=0.7, label="T")
@@ -419,7 +406,7 @@ def sample_track(example: Example) -> Figure:
     pair = [torch.from_numpy(track.cameras[name].orientation) for name in names[:2]]
     apart = np.rad2deg(so3.geodesic_distance(*pair).numpy())
     panels[2].plot(time_ms, apart, ".", color="black", markersize=2.5)
-    panels[0].set_ylabel("position, lab (mm)")
+    panels[0].set(ylabel="position, lab (mm)", ylim=(-110, 110))  # the tank; one camera alone may say more
     panels[1].set(ylabel="angles (degrees)", ylim=(-185, 185), yticks=range(-180, 181, 90))
     panels[2].set(yscale="log", ylabel="distance of the\ncameras (degrees)", xlabel="time (ms)")
     look.plain_logarithms(panels[2].yaxis)

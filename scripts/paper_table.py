@@ -70,7 +70,7 @@ def measured(folders: Sequence[Path], tracks: Sequence[Path], settings: Statisti
     if not there:
         do = "read above why the movies could not be tracked"
         raise TrackError(refusal(str(tracks[0].parent), expected="tracks", got="none", do=do))
-    loaded = [with_smooth(Trajectory.load(path)) for _, path in there]
+    loaded = [Trajectory.load(path) for _, path in there]
     experiments = [load_experiment(folder / "experiment.yaml") for folder, _ in there]
     truths = []
     for folder, _ in there:
@@ -84,13 +84,6 @@ def measured(folders: Sequence[Path], tracks: Sequence[Path], settings: Statisti
         scores=[score_track(track, folder / "truth.h5") for track, (folder, _) in zip(loaded, there, strict=True)],
         summary=summarise(loaded, settings, Surroundings(diameter_mm=18.0)),
     )
-
-
-def with_smooth(track: Trajectory) -> Trajectory:
-    """Return a track with smooth poses: the measured ones where a track of an older version has none at all."""
-    if np.isfinite(track.orientation_smooth).any():
-        return track
-    return replace(track, position_smooth=track.position, orientation_smooth=track.orientation)
 
 
 def whole_in_picture(centre_px: Floats, camera: Camera) -> NDArray[np.bool_]:
