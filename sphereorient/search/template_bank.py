@@ -19,7 +19,7 @@ from sphereorient.trajectory import Reason
 
 # Disks searched at once. Fixed, filled up with empty disks: the last bits of Otsu's sums depend on their number.
 BATCH = 32
-RENDERED = 1024  # templates rendered at once
+RENDERED = 4096  # templates rendered at once
 FINALISTS = 4  # best of the fine grid by the table; the renderer chooses among them
 REAL = Sampling(outside=0.5, supersampling=1)  # blurred as by usual optics; 0 outside, as the paint
 HALF = Sampling(outside=0.5, blur_px=0.0, supersampling=1)  # sharp: in blurred templates more orientations are possible
