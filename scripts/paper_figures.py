@@ -34,7 +34,7 @@ from sphereorient.trajectory import Reason, Trajectory
 
 Floats = NDArray[np.float64]
 SIZE_PX = 80  # of the disks that are compared
-CAMERA = "cam1"
+CAMERA = "cam2"  # its lamps leave more candidates
 SHOWN_FRAMES = 80  # of the path through the candidates
 WANTED = 5  # candidates of the example
 OUTSIDE = 0.5  # grey beside a rendering

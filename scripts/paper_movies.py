@@ -29,8 +29,8 @@ Floats = NDArray[np.float64]
 TEXTURE_SEED = 2011  # one painted sphere in all movies
 LAWS = EnsembleSpec()  # of the paper's Table I, with docs/errata.md E6
 NEAR_MM = 40.0  # each coordinate of the centre is within this at one instant of every movie
-LAMPS = {"uneven_light": 3.0, "highlights": 100.0}  # severities as in docs/degradations.md
-MOST_BUBBLES = 5  # in front of the disk
+LAMPS = {"uneven_light": 2.5, "highlights": 80.0}  # severities as in docs/degradations.md
+MOST_BUBBLES = 4  # in front of the disk
 IMPELLER_HZ, BLADES, BAND_PX = 3.0, 8, 30.0
 
 

@@ -179,7 +179,7 @@ stopped. Processor time per movie: {costs}.
 sphere of 18 mm that is 70 to 90 px wide. The motion is random with known statistics: velocity, acceleration, omega and
 alpha have the rms values of the paper's Table I; omega and alpha are intermittent, with flatness 4 and 7.6. The sphere
 passes near the middle once in each movie, so it enters and leaves the field. Behind it the driving disks turn, and
-their reflections move. Lamps light the sphere from one side and are mirrored in it; up to five bubbles are before it.
+their reflections move. Lamps light the sphere from one side and are mirrored in it; up to four bubbles are before it.
 No background pictures are given: the methods learn the background from the movie, as the paper does.
 
 ## The numbers
