@@ -68,12 +68,12 @@ def physical_path(
     Source: textbook hidden Markov model of second order; unlike the paper's cost, it does not favour candidates at rest
     (docs/errata.md A6).
     """
-    device, chosen = mask.device, Chosen.nothing(mask)
+    device = mask.device
     R, nll, variance, time = (part.detach().cpu().double() for part in (R_lab_body, nll, variance_rad2, time_s))
-    mask = mask.cpu()
-    frames = torch.nonzero(mask.any(1))[:, 0]
+    frames = torch.nonzero(mask.any(1))[:, 0].cpu()
     if not len(frames):
-        return chosen
+        return Chosen.nothing(mask)
+    mask = mask.cpu()
     scale = settings.acceleration_rad_s2 or 1.0
     cost = SecondOrderCost.of(settings.model_copy(update={"acceleration_rad_s2": scale}))
     variance = float(cost.sigma_scale) ** 2 * variance[mask]

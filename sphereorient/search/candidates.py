@@ -5,8 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sphereorient.errors import ShapeError, check_tail, refusal
@@ -96,8 +98,7 @@ class Candidates:
 
     def padded_views(self, leading: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return R_view_body (*leading, C, 3, 3) and scores (*leading, C), best first; NaN in unused places."""
-        counts = self.counts
-        mask = torch.arange(max([*counts.tolist(), 1])) < counts[:, None]
+        mask = self._places
         R = torch.full((*mask.shape, 3, 3), torch.nan, dtype=self.R_view_body.dtype)
         score = torch.full(mask.shape, torch.nan, dtype=self.score.dtype)
         R[mask], score[mask] = self.R_view_body, self.score
@@ -108,14 +109,16 @@ class Candidates:
 
         Unused places hold the unit rotation, score 0 and mask False.
         """
-        counts = self.counts
-        width = max(int(counts.max()) if len(counts) else 0, 1)
-        place = torch.arange(width, device=counts.device)
-        mask = place < counts[:, None]
-        R = torch.eye(3, dtype=self.R_view_body.dtype, device=counts.device).repeat(len(self), width, 1, 1)
-        score = torch.zeros(len(self), width, dtype=self.score.dtype, device=counts.device)
+        mask = self._places
+        R = torch.eye(3, dtype=self.R_view_body.dtype).repeat(*mask.shape, 1, 1)
+        score = torch.zeros(mask.shape, dtype=self.score.dtype)
         R[mask], score[mask] = self.R_lab_body, self.score
         return R, score, mask
+
+    @property
+    def _places(self) -> Tensor:
+        """Which of C places of each frame hold a candidate, (N, C) bool."""
+        return torch.arange(max([*self.counts.tolist(), 1])) < self.counts[:, None]
 
 
 class Proposer(Protocol):
@@ -134,6 +137,26 @@ def check_disks(disks: Tensor, height: int, width: int) -> None:
     if disks.shape[1:] != (height, width):
         size = f"(F, {height}, {width})"
         raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
+
+
+class DiskSearch(nn.Module):
+    """A proposer as a module: `propose` is its work, a call accepts disks of any leading shape."""
+
+    size_px: int
+
+    def propose(self, disks: Tensor) -> Candidates:
+        """Propose orientations for (F, S, S) float32 grey disks."""
+        raise NotImplementedError
+
+    def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
+        """Return R_view_body (..., M, 3, 3) and score (..., M) float64 of the candidates, best first, padded with NaN.
+        Disks (..., S, S) are grey levels of any scale, the outline touching the borders.
+
+        Raises:
+            ShapeError: the disks are of another size.
+        """
+        grey = torch.as_tensor(disks).float()
+        return self.propose(grey.reshape(-1, *grey.shape[-2:])).padded_views(grey.shape[:-2])
 
 
 class FallbackProposer:

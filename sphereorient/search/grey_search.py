@@ -5,11 +5,11 @@ import math
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.search.candidates import Candidates, check_disks, distinct
+from sphereorient.search.candidates import Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
@@ -25,7 +25,7 @@ TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest
 DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
 
 
-class GreySearch(nn.Module):
+class GreySearch(DiskSearch):
     """Searches all of SO(3) on the CPU for the views of a texture map that look like a disk, under any smooth light.
     Detail finer than `detail` is removed, so that the nearest template of the Lattman grid still correlates.
 
@@ -58,16 +58,6 @@ class GreySearch(nn.Module):
         self.templates = self._grid.flatten(0, 1)
         self._pixels = int(self._view.inside.sum())
         self._bank = self._templates(paint)
-
-    def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
-        """Return R_view_body (..., K, 3, 3) and score (..., K) float64 of each disk, best first, padded with NaN.
-        Disks (..., S, S) are grey levels of any scale, the outline touching the borders.
-
-        Raises:
-            ShapeError: the disks are of another size.
-        """
-        grey = torch.as_tensor(disks).float()
-        return self.propose(grey.reshape(-1, *grey.shape[-2:])).padded_views(grey.shape[:-2])
 
     def score(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the correlation of disks (..., S, S) with all `templates`, (..., K) float32, -1 .. 1."""

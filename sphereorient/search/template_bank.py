@@ -5,27 +5,27 @@ import math
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.search.candidates import Candidates, check_disks, distinct
+from sphereorient.search.candidates import Candidates, DiskSearch, check_disks, distinct
 from sphereorient.search.extraction import extract_paint
 from sphereorient.search.settings import OrientSettings
-from sphereorient.sphere import DirectionTable, Sampling, SphereRenderer, reduced_texture
+from sphereorient.sphere import DirectionTable, Sampling, SphereRenderer, orthographic_view, reduced_texture
 from sphereorient.sphere.texture_table import STEPS
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.trajectory import Reason
 
 # Disks searched at once. Fixed, filled up with empty disks: the last bits of Otsu's sums depend on their number.
 BATCH = 32
-RENDERED = 4096  # templates rendered at once
+LOOKED_UP = 4096  # templates of the fine grid at once
 FINALISTS = 4  # best of the fine grid by the table; the renderer chooses among them
 REAL = Sampling(outside=0.5, supersampling=1)  # blurred as by usual optics; 0 outside, as the paint
 HALF = Sampling(outside=0.5, blur_px=0.0, supersampling=1)  # sharp: in blurred templates more orientations are possible
 
 
-class TemplateBank(nn.Module):
+class TemplateBank(DiskSearch):
     """Search all of SO(3) for the views of a texture map that look like a disk in black and white.
 
     Source: paper sections III B and C; docs/errata.md A2 (T), E5 (grid), E7 (possible orientations).
@@ -48,6 +48,7 @@ class TemplateBank(nn.Module):
         self._settings = settings = settings or OrientSettings()
         self.size_px = size = size_px + size_px % 2
         self.renderer = SphereRenderer(texture, size_px=size, sampling=REAL)
+        self._view = orthographic_view(size)
         self._real, self._half = _compared(size, settings.disk_share), _compared(size // 2, settings.disk_share)
         self._table = None
         if settings.renderer == "table":
@@ -58,23 +59,14 @@ class TemplateBank(nn.Module):
         half = SphereRenderer(self.renderer.texture, size_px=size // 2, sampling=HALF)
         self.register_buffer("bank", _templates(half, self._half, self.grid), persistent=False)
 
-    def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
-        """Return R_view_body (..., M, 3, 3) and T (..., M) float64 of the candidates, best first, padded with NaN.
-        Disks (..., S, S) are grey levels of any scale, the outline touching the borders.
-
-        Raises:
-            ShapeError: the disks are of another size.
-        """
-        grey = torch.as_tensor(disks).float()
-        return self.propose(grey.reshape(-1, *grey.shape[-2:])).padded_views(grey.shape[:-2])
-
     def paint(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the paint (..., S, S) of grey disks: -1 black, +1 white, 0 undecided or outside."""
         grey = torch.as_tensor(disks).float()
         flat = grey.reshape(-1, *grey.shape[-2:])
         filled = F.pad(flat, (0, 0, 0, 0, 0, -len(flat) % BATCH))
-        inside = disk_offsets(self.size_px).norm(dim=-1) < 1
-        parts = [extract_paint(some, inside, self._settings) for some in torch.split(filled, BATCH) if len(some)]
+        parts = [
+            extract_paint(some, self._view.inside, self._settings) for some in torch.split(filled, BATCH) if len(some)
+        ]
         return torch.cat([flat[:0], *parts])[: len(flat)].reshape(grey.shape)
 
     def quality(self, paint: Tensor, R_view_body: Tensor) -> Tensor:
@@ -160,7 +152,7 @@ class TemplateBank(nn.Module):
         """
         count = min(FINALISTS, len(self._around))
         R, match = [starts[:0]], [seen.new_zeros(0)]
-        batch = max(1, RENDERED // len(self._around))
+        batch = max(1, LOOKED_UP // len(self._around))
         for of, at in zip(torch.split(frame, batch), torch.split(starts, batch), strict=True):
             near = self._around @ at[:, None]  # (q, A, 3, 3)
             template = self._rendered(near.flatten(0, 1)).reshape(*near.shape[:2], int(self._real.sum()))
@@ -173,7 +165,7 @@ class TemplateBank(nn.Module):
         """Return templates (K, P) at real size, whole numbers."""
         if self._table is None:
             return _templates(self.renderer, self._real, R_view_body)
-        return self._table.render(R_view_body, _normals(self.size_px)[self._real]).float()
+        return self._table.render(R_view_body, self._view.normal_view[self._real[self._view.inside]]).float()
 
 
 def best_of_each(group: Tensor, value: Tensor, count: int) -> Tensor:
@@ -190,16 +182,8 @@ def _compared(size_px: int, disk_share: float) -> Tensor:
     return compared
 
 
-def _normals(size_px: int) -> Tensor:
-    """Return the outward normals (S, S, 3) float32, in the view, that the pixels of a disk see."""
-    at = disk_offsets(size_px)
-    depth = (1 - at.square().sum(-1, keepdim=True)).clamp_min(0).sqrt()
-    return torch.cat([at, -depth], -1).float()
-
-
 @torch.no_grad()
 def _templates(renderer: SphereRenderer, compared: Tensor, R_view_body: Tensor) -> Tensor:
     """Return templates (K, P), -STEPS black .. STEPS white, of rotations (K, 3, 3)."""
-    parts = [renderer(R)[:, compared] for R in torch.split(R_view_body, RENDERED)]
-    steps: Tensor = ((2 * torch.cat(parts) - 1) * STEPS).round()
+    steps: Tensor = ((2 * renderer(R_view_body)[:, compared] - 1) * STEPS).round()
     return steps

@@ -147,7 +147,8 @@ class SphereRenderer(nn.Module):
         fine_at = torch.stack([right[reached], down[reached]], dim=-1)
         aperture = aperture_matrix(size, samples, sampling.blur_px).to(R)
         texture = reduced_texture(self.texture.to(R.dtype), samples * 2 * reach / RIM_MARGIN)
-        windows = [R.new_zeros(0, size, size)]
+        across = torch.arange(size, device=R.device)
+        pictures = [R.new_zeros(0, height, width)]
         every = torch.arange(len(R), device=R.device)
         for k in torch.split(every, max(1, SAMPLES // len(fine_at))):
             at = k if len(position) > 1 else every[:1]
@@ -161,13 +162,12 @@ class SphereRenderer(nn.Module):
             share = ((1.0 - distance_radii) * radius[at, None] / fine_mm + 0.5).clamp(0, 1)
             fine = R.new_zeros(len(k), *reached.shape)
             fine[:, reached] = (share * (seen.paint - sampling.outside)).to(R.dtype)
-            windows.append(aperture @ fine @ aperture.mT)
-        canvas = R.new_full((len(R), height + 2 * size, width + 2 * size), sampling.outside)
-        across = torch.arange(size, device=R.device)
-        rows, columns = ((corner[:, axis, None] + size + across).expand(len(R), -1) for axis in (1, 0))
-        place = (every[:, None, None], rows[:, :, None], columns[:, None, :])
-        canvas = canvas.index_put(place, torch.cat(windows), accumulate=True)
-        return canvas[:, size : size + height, size : size + width]
+            canvas = R.new_full((len(k), height + 2 * size, width + 2 * size), sampling.outside)
+            rows, columns = ((corner[at, axis, None] + size + across).expand(len(k), -1) for axis in (1, 0))
+            place = (every[: len(k), None, None], rows[:, :, None], columns[:, None, :])
+            canvas = canvas.index_put(place, aperture @ fine @ aperture.mT, accumulate=True)
+            pictures.append(canvas[:, size : size + height, size : size + width])
+        return torch.cat(pictures)
 
 
 def orthographic_camera(size_px: int, mm_px: float) -> TelecentricCamera:
