@@ -97,6 +97,8 @@ def make_movies(out: Path, plan: Plan) -> list[str]:
         check_movie(place_of(out, number), plan.frames)
     todo = [n for n in range(1, plan.movies + 1) if not all(place_of(out, n, method).exists() for method in METHODS)]
     begin, failed = time.perf_counter(), []
+    # One worker a core: idle threads of their libraries would take the processor from the other workers.
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     context = multiprocessing.get_context("spawn")  # forked children of a process that used torch's threads hang
     workers = max(1, min(len(todo), os.cpu_count() or 1))
     with ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool:
