@@ -129,19 +129,15 @@ def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: flo
         whole = path.covariance[out] + states.covariance[out][:, VALUE, VALUE]
         mahalanobis = np.einsum("ni,nij,nj->n", off, np.linalg.inv(whole), off)
         used[out] = mahalanobis < AGAIN * limit
-    wrong = _stand_out(states.mahalanobis, limit)
+    # beyond the limit, and beyond all near them; those near are tested again without them
+    away = states.mahalanobis
+    wrong = away > limit
+    for k in range(1, min(NEAR, len(away) - 1) + 1):
+        wrong[k:] &= away[k:] >= away[:-k]
+        wrong[:-k] &= away[:-k] > away[k:]
     if (path.seen & ~(used & ~wrong)).sum() <= share * path.seen.sum():
         used &= ~wrong
     return used
-
-
-def _stand_out(mahalanobis: Floats, limit: float) -> Bools:
-    """Return the frames beyond the limit and beyond all near them; those near are tested again without them."""
-    wrong = mahalanobis > limit
-    for k in range(1, min(NEAR, len(mahalanobis) - 1) + 1):
-        wrong[k:] &= mahalanobis[k:] >= mahalanobis[:-k]
-        wrong[:-k] &= mahalanobis[:-k] > mahalanobis[k:]
-    return wrong
 
 
 def _wanted(pole: float) -> Floats:
@@ -203,7 +199,9 @@ def estimate_process(
             return _cost(paths, prior_at(theta), scales)[0]
 
         if before is None:
-            spread = np.clip(_rate_deviation(paths) / sigma, 10 * SPREADS[0], 0.1 * SPREADS[1])
+            rates = [path.rates() for path in paths]
+            usual = 1.48 * np.median(np.concatenate([np.abs(each - np.median(each, axis=0)) for each in rates]))
+            spread = np.clip(usual / sigma, 10 * SPREADS[0], 0.1 * SPREADS[1])
             start, reach = min((np.log([pole, spread]) for pole in FIRST_TRIES), key=cost), 0.4
         else:
             start = np.log([before.prior.pole, before.prior.deviation / before.scale / sigma])
@@ -214,11 +212,6 @@ def estimate_process(
         prior = prior_at(found.x)
     scale = _cost(paths, prior, scales)[1]
     return ProcessPrior(prior=Prior(pole=prior.pole, deviation=prior.deviation * scale), scale=scale)
-
-
-def _rate_deviation(paths: Sequence[SegmentTrack]) -> float:
-    away = np.concatenate([np.abs(rates - np.median(rates, axis=0)) for rates in (path.rates() for path in paths)])
-    return float(1.48 * np.median(away))
 
 
 def _cost(paths: Sequence[SegmentTrack], prior: Prior, scales: tuple[float, float]) -> tuple[float, float]:
