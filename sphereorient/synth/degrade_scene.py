@@ -128,11 +128,6 @@ class Filming:
         """Return the map to write, (H, 2 H), with exchanged patches."""
         return misdrawn(texture, self.values.get("texture_error", 0.0), self._generator("texture_error"))
 
-    def reported_diameter_mm(self) -> float:
-        """Return the diameter to write, with radius_error, mm."""
-        base = self.settings
-        return base.diameter_mm * (1 + self.values.get("radius_error", 0.0) / (base.diameter_px / 2))
-
     def disk(self, name: str, position_lab_mm: Tensor, cover: NDArray[np.float32]) -> Disk:
         """Return the place of the sphere at (3,) in a camera's picture; `cover` (H, W): coverage of each pixel."""
         centre_px, radius_px = picture_of_ball(self.cameras[name], position_lab_mm, self.settings.diameter_mm / 2)
