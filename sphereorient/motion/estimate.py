@@ -66,23 +66,19 @@ def estimate(
     Return the estimates, the ratio of true errors to sigmas of the measurements, and the process.
     """
     if known is None:
-        pieces = _pieces(paths, settings.learn_frames)
+        # pieces of the segments, evenly distributed where there are too many
+        starts = [(path, k) for path in paths for k in range(0, len(path.time), PIECE)]
+        total, most = sum(len(path.time) for path in paths), settings.learn_frames
+        if total > most:
+            count = max(1, round(len(starts) * most / total))
+            starts = [starts[k] for k in np.linspace(0, len(starts) - 1, count).round().astype(int)]
+        pieces = [path.part(slice(k, k + PIECE)) for path, k in starts]
+        pieces = [piece for piece in pieces if piece.used.sum() >= FEWEST]
         if sum(int(path.used.sum()) for path in pieces) < settings.least_frames:
             return [_alone(path) for path in paths], 1.0, None
         known = _learnt(pieces, band, settings)
     whole = known.scale / np.sqrt(1 - settings.slow_share)
     return [_smoothed(path, known, settings) for path in paths], float(whole), known
-
-
-def _pieces(paths: Sequence[SegmentTrack], most: int) -> list[SegmentTrack]:
-    """Return pieces of the segments for the estimation, evenly distributed where there are too many."""
-    starts = [(path, k) for path in paths for k in range(0, len(path.time), PIECE)]
-    total = sum(len(path.time) for path in paths)
-    if total > most:
-        count = max(1, round(len(starts) * most / total))
-        starts = [starts[k] for k in np.linspace(0, len(starts) - 1, count).round().astype(int)]
-    pieces = [path.part(slice(k, k + PIECE)) for path, k in starts]
-    return [piece for piece in pieces if piece.used.sum() >= FEWEST]
 
 
 def _learnt(pieces: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings) -> ProcessPrior:

@@ -2,7 +2,7 @@
 
 import math
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import cast
 
@@ -30,7 +30,7 @@ SMEAR_PX = 1.0  # largest motion between exposure samples
 def degraded_settings(base: SynthSettings, values: Mapping[str, float]) -> SynthSettings:
     """Return the settings with ball_size, spin and motion_blur applied, in this order."""
     settings = base
-    for name, change in SCENE.items():
+    for name, change in (("ball_size", with_ball_size), ("spin", with_spin), ("motion_blur", with_motion_blur)):
         if name in values:
             settings = change(settings, values[name])
     return settings
@@ -62,13 +62,6 @@ def with_motion_blur(base: SynthSettings, degrees_per_exposure: float) -> SynthS
     samples = math.ceil(1.5 * math.hypot(turned_px, moved_px) / SMEAR_PX)
     samples = max(base.exposure_samples, samples)
     return _changed(base, exposure=exposure, omega_rms=omega_rms, exposure_samples=samples)
-
-
-SCENE: Mapping[str, Callable[[SynthSettings, float], SynthSettings]] = {
-    "ball_size": with_ball_size,
-    "spin": with_spin,
-    "motion_blur": with_motion_blur,
-}
 
 
 def _changed(base: SynthSettings, **update: object) -> SynthSettings:
