@@ -12,7 +12,7 @@ import typer
 from sphereorient.cli.app import Advance, app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import ExperimentPath, Overrides, Quiet, SettingsPath, frames_of
 from sphereorient.errors import MovieError, OutputError, refusal
-from sphereorient.files.whole_file import check_ending, put_aside
+from sphereorient.files.whole_file import check_ending
 
 if TYPE_CHECKING:
     import numpy as np
@@ -56,8 +56,7 @@ def check(
     with progress_bar(quiet) as advance:
         result = preflight(experiment, chosen, advance)
         advance("figure", 0, 1)
-        with put_aside(picture) as partial:
-            preflight_figure(result, partial)
+        preflight_figure(result, picture)
         advance("figure", 1, 1)
     _print_findings(result.findings, quiet)
     if not quiet:
@@ -94,7 +93,9 @@ def show_movie(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Print what is in a movie, and draw a contact sheet of it."""
-    sheet = Path(f"{_stem(source)}.contact.png") if out is None else out
+    # the name of the movie without characters that file names cannot have
+    stem = re.sub(r"[^\w.+-]+", "_", Path(source.replace("::", "_").rstrip("/")).name) or "movie"
+    sheet = Path(f"{stem}.contact.png") if out is None else out
     check_ending(sheet, "--out", [".png", ".pdf", ".svg"])  # before the movie is read
     check_writable(sheet)
     from sphereorient.movies import flipped, open_movie
@@ -189,11 +190,6 @@ def _frames(count: int) -> str:
 def _numbers(numbers: Sequence[int], after: str = ": ") -> str:
     more = f" and {len(numbers) - SHOWN} more" if len(numbers) > SHOWN else ""
     return _frames(len(numbers)) + after + ", ".join(map(str, numbers[:SHOWN])) + more
-
-
-def _stem(source: str) -> str:
-    """Return the name of the movie without characters that file names cannot have."""
-    return re.sub(r"[^\w.+-]+", "_", Path(source.replace("::", "_").rstrip("/")).name) or "movie"
 
 
 def _range(text: str, opened: "Movie") -> tuple[int, int]:

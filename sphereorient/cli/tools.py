@@ -164,13 +164,16 @@ def design(
         map_, make, gores, diameter_mm, stroke, diameter_px, noise, 0.0 if diameter_mm is None else diameter_mm
     )
     check_writable(out)
+    from sphereorient.sphere import load_texture, reduced_texture
     from sphereorient.tools.design.gores import Gores, write_gores
     from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture
 
     strips = Gores(count=gores, diameter_mm=diameter_mm) if gores is not None and diameter_mm is not None else None
     settings = DesignSettings(diameter_px=diameter_px, noise_share=noise, views=views)
     if map_ is not None:
-        title, drawn = map_.name, _loaded(map_)
+        title, drawn = map_.name, load_texture(map_)
+        if len(drawn) > HEIGHT_MAX:
+            drawn = reduced_texture(drawn, 2 * HEIGHT_MAX / math.pi)
         judgement = judge_texture(drawn, settings)
     else:
         with progress_bar(quiet or as_json, unit="maps") as advance:
@@ -198,15 +201,6 @@ def _check_design(map_: Path | None, make: bool, gores: int | None, diameter_mm:
     if not all(math.isfinite(number) for number in numbers):
         do = "correct the option"
         raise TextureError(refusal("texture design", expected="numbers", got="nan or infinity", do=do))
-
-
-def _loaded(path: Path) -> "Tensor":
-    """Read a map, averaged down where it is finer than any picture shows."""
-    from sphereorient.sphere import load_texture, reduced_texture
-
-    drawn = load_texture(path)
-    height = drawn.shape[0]
-    return drawn if height <= HEIGHT_MAX else reduced_texture(drawn, 2 * HEIGHT_MAX / math.pi)
 
 
 def _written(out: Path, drawn: "Tensor", judgement: "Judgement", title: str, *, make: bool) -> list[Path]:

@@ -123,12 +123,6 @@ def _checked(tree: Any, name: str) -> Checkpoint:
     absent = dict.fromkeys(Checkpoint.model_fields.keys() - tree.keys(), "absent")
     content = {key: value for key, value in tree.items() if key != "schema"}
     checkpoint = validated(Checkpoint, content | absent, name, CheckpointError)
-    _check_state(checkpoint, name)
-    return checkpoint
-
-
-def _check_state(checkpoint: Checkpoint, name: str) -> None:
-    """Refuse weights that are not finite, or do not fit the network of the settings."""
     state, known = checkpoint.state, Correlator(checkpoint.settings.network).state_dict()
     if state.keys() != known.keys():
         different = ", ".join(sorted(short(key) for key in state.keys() ^ known.keys())[:3])
@@ -141,3 +135,4 @@ def _check_state(checkpoint: Checkpoint, name: str) -> None:
             _refuse(f"{name}, {key}", f"shape {tuple(expected.shape)}", str(tuple(tensor.shape))[:60], DO)
         if not bool(tensor.isfinite().all()):
             _refuse(f"{name}, {key}", "finite numbers", "others", "train it anew")
+    return checkpoint

@@ -2,9 +2,10 @@
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,19 +33,11 @@ EXAMPLES = 7  # random stream of the examples
 BATCH = 32  # pictures at once in the measurement of speed
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Predictions:
+class Predictions(NamedTuple):
     """Output of a network for N pictures; made by `predict`."""
 
     logits: Tensor  # (N, G), on the grid
     R_view_body: Tensor  # (N, 3, 3), the truth
-
-    @classmethod
-    def joined(cls, parts: "Sequence[Predictions]") -> "Predictions":
-        """Join several predictions."""
-        return cls(
-            logits=torch.cat([one.logits for one in parts]), R_view_body=torch.cat([one.R_view_body for one in parts])
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +60,9 @@ def predict(network: Correlator, batch: TrainingBatch) -> Predictions:
     return Predictions(logits=logits, R_view_body=batch.R_view_body.flatten(0, 1))
 
 
-@torch.no_grad()
-def predict_all(network: Correlator, batches: Iterable[TrainingBatch]) -> Predictions:
-    """Apply a network to several batches, without gradients."""
-    return Predictions.joined([predict(network, batch) for batch in batches])
+def joined(parts: Sequence[Predictions]) -> Predictions:
+    """Join several predictions."""
+    return Predictions(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 def cross_entropy(predictions: Predictions, grid: Tensor, spread_rad: float) -> Tensor:
@@ -110,7 +102,7 @@ def fitted_temperature(predictions: Predictions, grid: Tensor) -> float:
 def _ranked(predictions: Predictions, grid: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
     """Return the rank of the right candidate and the probability of the first one, (N,) each."""
     ranks, probabilities = [], []
-    parts = (torch.split(one, 64) for one in (predictions.logits, predictions.R_view_body))
+    parts = (torch.split(one, 64) for one in predictions)
     for logits, R in zip(*parts, strict=True):
         modes = find_modes(logits, grid, CANDIDATES, temperature)
         ranks.append(first_right(modes, R, WITHIN_DEG))
@@ -192,7 +184,7 @@ def benchmark_checkpoint(
         taken_s += time.perf_counter() - began
         mixed.append(Predictions(logits=torch.cat(parts), R_view_body=R))
     progress("evaluate", count, count)
-    predictions = Predictions.joined(mixed)
+    predictions = joined(mixed)
     spread_rad = math.radians(checkpoint.settings.training.spread_deg)
     return ProposerBenchmark(
         families=tuple(_recall(*key, torch.cat(rank)) for key, rank in ranks.items()),

@@ -60,13 +60,6 @@ class PictureNetwork(nn.Module):
 
     def forward(self, disks: Tensor) -> Tensor:
         """Return features (F, C, S/2, S/2) of disks (F, S, S), grey levels of any scale."""
-        fine = self.fine(self.first(self._seen(disks)))
-        wide = F.interpolate(self.up(self.coarse(fine)), scale_factor=2, mode="bilinear", align_corners=False)
-        found: Tensor = self.last(fine + wide)
-        return found
-
-    def _seen(self, disks: Tensor) -> Tensor:
-        """Return normalised grey levels, those without the neighbourhood mean, radius and disk, (F, 4, S, S)."""
         share = self.share / self.share.sum()
         mean = (disks * share).sum((1, 2), keepdim=True)
         deviation = ((disks - mean).square() * share).sum((1, 2), keepdim=True).sqrt().clamp_min(1e-6)
@@ -74,8 +67,12 @@ class PictureNetwork(nn.Module):
         about = self.along @ (even * self.share) @ self.along / self.total
         local = (even - about) * (self.share > 0)
         rim = self.radius.expand_as(even)
+        # grey levels, those without the neighbourhood mean, radius and disk, (F, 4, S, S)
         seen = torch.stack([even.clamp(-4, 4), local.clamp(-3, 3), rim, (rim < 1).to(even)], dim=1)
-        return seen.contiguous(memory_format=torch.channels_last)
+        fine = self.fine(self.first(seen.contiguous(memory_format=torch.channels_last)))
+        wide = F.interpolate(self.up(self.coarse(fine)), scale_factor=2, mode="bilinear", align_corners=False)
+        found: Tensor = self.last(fine + wide)
+        return found
 
 
 class MapNetwork(nn.Module):

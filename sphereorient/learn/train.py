@@ -126,7 +126,7 @@ class ProposerModule(LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Compute the metrics."""
-        self.metrics = metrics.metrics_of(Predictions.joined(self._predictions), self.network.grid, self.spread_rad)
+        self.metrics = metrics.metrics_of(metrics.joined(self._predictions), self.network.grid, self.spread_rad)
         self._predictions = []
         self.log("validation_nll", self.metrics.nll, logger=False)
 
@@ -146,9 +146,7 @@ class ProposerModule(LightningModule):
 
 
 class TrainingTimer(Timer):
-    """Ends training at its time limit; reads the elapsed time of old checkpoints too."""
-
-    state_key = "Clock"  # its name in checkpoints
+    """Ends training at its time limit."""
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Check the time, and pass the elapsed share to the learning rate."""
@@ -157,16 +155,9 @@ class TrainingTimer(Timer):
         if minutes is not None:
             _own(pl_module).share_of_time = self.time_elapsed() / (60 * minutes)
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the elapsed time."""
-        old = state_dict.get("elapsed_s")
-        super().load_state_dict(state_dict if old is None else {"time_elapsed": {"train": old}})
-
 
 class CheckpointCallback(Callback):
     """Keeps the history, the weights of the best validation, and last.ckpt after each epoch, in the folder `out`."""
-
-    state_key = "Keeper"  # its name in checkpoints
 
     def __init__(self, out: Path, progress: Progress) -> None:
         self._out, self._progress = out, progress
@@ -271,7 +262,8 @@ def train_proposer(
         raise SettingsError(refusal("training", expected="finite losses", got="others in the first epoch", do=do))
     network.load_state_dict(kept.best)
     network.cpu().eval()
-    predictions = metrics.predict_all(network, data.validation)
+    with torch.no_grad():
+        predictions = metrics.joined([metrics.predict(network, batch) for batch in data.validation])
     temperature = metrics.fitted_temperature(predictions, network.grid)
     measured = metrics.metrics_of(predictions, network.grid, math.radians(settings.training.spread_deg), temperature)
     own = settings.pictures.texture
@@ -299,22 +291,19 @@ def prepare(settings: ProposerSettings, out: Path, resume: bool = False) -> Corr
     """Check the inputs as `train_proposer`, create the folder, and return the initial network."""
     if resume:
         _check_last(out / LAST, settings)
-    network = _initial_network(settings)
-    make_folder(out, str(out))
-    return network
-
-
-def _initial_network(settings: ProposerSettings) -> Correlator:
-    start = settings.training.start
-    if start is None:
+    if (start := settings.training.start) is None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.training.seed)
-            return Correlator(settings.network)
-    checkpoint = load_checkpoint(Path(start))
-    if checkpoint.settings.network != settings.network:
-        expected, do = "the network of training.start", "copy the branch network of its settings"
-        raise CheckpointError(refusal(f"checkpoint {start}", expected=expected, got="other network settings", do=do))
-    return correlator_of(checkpoint).train().requires_grad_(True)
+            network = Correlator(settings.network)
+    else:
+        checkpoint = load_checkpoint(Path(start))
+        if checkpoint.settings.network != settings.network:
+            expected, got = "the network of training.start", "other network settings"
+            do = "copy the branch network of its settings"
+            raise CheckpointError(refusal(f"checkpoint {start}", expected=expected, got=got, do=do))
+        network = correlator_of(checkpoint).train().requires_grad_(True)
+    make_folder(out, str(out))
+    return network
 
 
 def _check_last(last: Path, settings: ProposerSettings) -> None:

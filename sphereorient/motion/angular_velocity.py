@@ -46,8 +46,6 @@ def omega_from_orientations(
     usable = usable_separations(there, separations, segment)  # (..., N, S)
     # frames that wrap around an end are never used
     turns = torch.stack([R.roll(-m, -3) @ R.roll(m, -3).mT for m in separations], dim=-3)  # (..., N, S, 3, 3)
-    # a turn that is not used may be half a turn, where log has no gradient
-    turns = torch.where(usable[..., None, None], turns, torch.eye(3, dtype=turns.dtype, device=turns.device))
     return mean_over_separations(turns, usable, dt_s, separations, min_separations)
 
 
@@ -82,8 +80,11 @@ def mean_over_separations(
     turns: Tensor, usable: Tensor, dt_s: float, separations: Sequence[int], min_separations: int
 ) -> tuple[Tensor, Tensor]:
     """Return the weighted mean omega of S separations and its standard error, (..., N, 3), rad/s.
-    `turns` (..., N, S, 3, 3) lead from frame k - m to k + m in lab components; unit where not `usable` (..., N, S).
+    `turns` (..., N, S, 3, 3) lead from frame k - m to k + m in lab components; those not `usable` (..., N, S) are left
+    out.
     """
+    # a turn that is not used may be half a turn, where log has no gradient
+    turns = torch.where(usable[..., None, None], turns, torch.eye(3, dtype=turns.dtype, device=turns.device))
     m = torch.as_tensor(separations, dtype=turns.dtype, device=turns.device)
     omega = so3.log(turns) / (2 * dt_s * m[:, None])  # (..., N, S, 3)
     weight = (m**2 * usable)[..., None]
@@ -142,6 +143,4 @@ def omega_from_markers(
         turns.append(kabsch(points.roll(m, -3), points.roll(-m, -3), weights))
         enough.append(common)
     usable = usable & torch.stack(enough, dim=-1)
-    unit = torch.eye(3, dtype=points.dtype, device=points.device)
-    stacked = torch.where(usable[..., None, None], torch.stack(turns, dim=-3), unit)
-    return mean_over_separations(stacked, usable, dt_s, separations, min_separations)
+    return mean_over_separations(torch.stack(turns, dim=-3), usable, dt_s, separations, min_separations)

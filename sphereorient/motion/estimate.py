@@ -66,23 +66,19 @@ def estimate(
     Return the estimates, the ratio of true errors to sigmas of the measurements, and the process.
     """
     if known is None:
-        pieces = _pieces(paths, settings.learn_frames)
+        # pieces of the segments, evenly distributed where there are too many
+        starts = [(path, k) for path in paths for k in range(0, len(path.time), PIECE)]
+        total, most = sum(len(path.time) for path in paths), settings.learn_frames
+        if total > most:
+            count = max(1, round(len(starts) * most / total))
+            starts = [starts[k] for k in np.linspace(0, len(starts) - 1, count).round().astype(int)]
+        pieces = [path.part(slice(k, k + PIECE)) for path, k in starts]
+        pieces = [piece for piece in pieces if piece.used.sum() >= FEWEST]
         if sum(int(path.used.sum()) for path in pieces) < settings.least_frames:
             return [_alone(path) for path in paths], 1.0, None
         known = _learnt(pieces, band, settings)
     whole = known.scale / np.sqrt(1 - settings.slow_share)
     return [_smoothed(path, known, settings) for path in paths], float(whole), known
-
-
-def _pieces(paths: Sequence[SegmentTrack], most: int) -> list[SegmentTrack]:
-    """Return pieces of the segments for the estimation, evenly distributed where there are too many."""
-    starts = [(path, k) for path in paths for k in range(0, len(path.time), PIECE)]
-    total = sum(len(path.time) for path in paths)
-    if total > most:
-        count = max(1, round(len(starts) * most / total))
-        starts = [starts[k] for k in np.linspace(0, len(starts) - 1, count).round().astype(int)]
-    pieces = [path.part(slice(k, k + PIECE)) for path, k in starts]
-    return [piece for piece in pieces if piece.used.sum() >= FEWEST]
 
 
 def _learnt(pieces: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings) -> ProcessPrior:
@@ -129,19 +125,15 @@ def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: flo
         whole = path.covariance[out] + states.covariance[out][:, VALUE, VALUE]
         mahalanobis = np.einsum("ni,nij,nj->n", off, np.linalg.inv(whole), off)
         used[out] = mahalanobis < AGAIN * limit
-    wrong = _stand_out(states.mahalanobis, limit)
+    # beyond the limit, and beyond all near them; those near are tested again without them
+    away = states.mahalanobis
+    wrong = away > limit
+    for k in range(1, min(NEAR, len(away) - 1) + 1):
+        wrong[k:] &= away[k:] >= away[:-k]
+        wrong[:-k] &= away[:-k] > away[k:]
     if (path.seen & ~(used & ~wrong)).sum() <= share * path.seen.sum():
         used &= ~wrong
     return used
-
-
-def _stand_out(mahalanobis: Floats, limit: float) -> Bools:
-    """Return the frames beyond the limit and beyond all near them; those near are tested again without them."""
-    wrong = mahalanobis > limit
-    for k in range(1, min(NEAR, len(mahalanobis) - 1) + 1):
-        wrong[k:] &= mahalanobis[k:] >= mahalanobis[:-k]
-        wrong[:-k] &= mahalanobis[:-k] > mahalanobis[k:]
-    return wrong
 
 
 def _wanted(pole: float) -> Floats:
@@ -203,7 +195,9 @@ def estimate_process(
             return _cost(paths, prior_at(theta), scales)[0]
 
         if before is None:
-            spread = np.clip(_rate_deviation(paths) / sigma, 10 * SPREADS[0], 0.1 * SPREADS[1])
+            rates = [path.rates() for path in paths]
+            usual = 1.48 * np.median(np.concatenate([np.abs(each - np.median(each, axis=0)) for each in rates]))
+            spread = np.clip(usual / sigma, 10 * SPREADS[0], 0.1 * SPREADS[1])
             start, reach = min((np.log([pole, spread]) for pole in FIRST_TRIES), key=cost), 0.4
         else:
             start = np.log([before.prior.pole, before.prior.deviation / before.scale / sigma])
@@ -214,11 +208,6 @@ def estimate_process(
         prior = prior_at(found.x)
     scale = _cost(paths, prior, scales)[1]
     return ProcessPrior(prior=Prior(pole=prior.pole, deviation=prior.deviation * scale), scale=scale)
-
-
-def _rate_deviation(paths: Sequence[SegmentTrack]) -> float:
-    away = np.concatenate([np.abs(rates - np.median(rates, axis=0)) for rates in (path.rates() for path in paths)])
-    return float(1.48 * np.median(away))
 
 
 def _cost(paths: Sequence[SegmentTrack], prior: Prior, scales: tuple[float, float]) -> tuple[float, float]:

@@ -17,14 +17,8 @@ ORDER = 10  # poles; on turbulence-like motion 6 loses 20 % in acceleration, 3 l
 NODES = 8  # of Gauss's quadrature over a step; exact for what Taylor's series of a step can show
 
 
-def _companion() -> Floats:
-    """Return d(state)/dt of w, w', ... with all poles at -1."""
-    M = np.diag(np.ones(ORDER - 1), 1)
-    M[-1] = [-math.comb(ORDER, k) for k in range(ORDER)]
-    return M
-
-
-_M = _companion()
+_M = np.diag(np.ones(ORDER - 1), 1)  # d(state)/dt of w, w', ... with all poles at -1
+_M[-1] = [-math.comb(ORDER, k) for k in range(ORDER)]
 # (M + 1) is nilpotent, so that exp(M tau) is exp(-tau) times a polynomial: no matrix exponential is needed
 _POWERS = np.stack([np.linalg.matrix_power(_M + np.eye(ORDER), k) for k in range(ORDER)])
 

@@ -71,7 +71,8 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     parts = (getattr(measured, name) for name in names)
     t, X, X_cov, R, R_cov = (part.detach().cpu().to(torch.float64).numpy() for part in parts)
     numbers = measured.segment.cpu().numpy()
-    frame_s = _typical_step(t, numbers)
+    steps = np.diff(t)[(numbers[1:] == numbers[:-1]) & (numbers[1:] >= 0)]
+    frame_s = float(np.median(steps)) if len(steps) else 1.0
     rows = [np.flatnonzero(numbers == n) for n in np.unique(numbers[numbers >= 0])]
     if any((np.diff(t[k]) <= 0).any() for k in rows):
         expected, do = "times that increase within a segment", "sort the frames"
@@ -83,7 +84,9 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
         (SegmentTrack, X, X_cov, seen_X, settings.position_band_hz, known and known.place, _put_places),
         (RotationTrack, R, R_cov, seen_R, settings.orientation_band_hz, known and known.turn, _put_turns),
     )
-    out, rejected = _blank(len(t)), np.zeros(len(t), dtype=bool)
+    square = ("position_cov_mm2", "orientation_cov_rad2", "R_lab_body")
+    out = {one.name: np.full((len(t), 3, 3) if one.name in square else (len(t), 3), np.nan) for one in fields(Motion)}
+    rejected = np.zeros(len(t), dtype=bool)
     scales, processes = [], []
     for kind, values, covariance, seen, band_hz, process, put in kinds:
         instants = [_Instants.of(k, t[k] / frame_s, seen[k]) for k in rows if seen[k].any()]
@@ -103,12 +106,6 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
         orientation_scale=scales[1],
         process=ProcessNoise(place=processes[0], turn=processes[1], frame_s=frame_s),
     )
-
-
-def _typical_step(time_s: Floats, numbers: NDArray[np.int64]) -> float:
-    within = (numbers[1:] == numbers[:-1]) & (numbers[1:] >= 0)
-    steps = np.diff(time_s)[within]
-    return float(np.median(steps)) if len(steps) else 1.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,13 +136,6 @@ class _Instants:
 
     def take(self, found: Estimate) -> Estimate:
         return Estimate(**{entry.name: getattr(found, entry.name)[self.frames] for entry in fields(Estimate)})
-
-
-def _blank(frames: int) -> dict[str, Floats]:
-    square = ("position_cov_mm2", "orientation_cov_rad2", "R_lab_body")
-    other = ("extrapolated", "rejected", "position_scale", "orientation_scale", "process")
-    names = [entry.name for entry in fields(Smoothed) if entry.name not in other]
-    return {name: np.full((frames, 3, 3) if name in square else (frames, 3), np.nan) for name in names}
 
 
 def _sigma(covariance: Floats) -> Floats:

@@ -118,7 +118,9 @@ def gap_aware_stencil(
     kept = gauss * paired(there, segment, half)
     share = kept.sum(-1) / gauss.sum()
     # sums of equal terms may differ in their last digits, in float32 by 1e-6
-    enough = (share >= min_share - 1e-5) & (_determinant(kept, step, order) > 0)
+    m0, m2, m4 = ((kept * step**power).sum(-1) for power in (0, 2, 4))
+    determinant = (m0, m2, m0 * m4 - m2**2)[order]  # 0: the remaining weights do not determine the derivative
+    enough = (share >= min_share - 1e-5) & (determinant > 0)
     stencil = _with_exact_moments(torch.where(enough[..., None], kept, gauss), step, order)
     return torch.where(enough[..., None], stencil, torch.nan)
 
@@ -137,12 +139,6 @@ def _gaussian(sigma_frames: float, half: int, like: Tensor) -> tuple[Tensor, Ten
     """Return the Gaussian and its abscissae in units of sigma."""
     step = torch.arange(-half, half + 1, dtype=like.dtype, device=like.device)
     return torch.exp(-0.5 * (step / sigma_frames) ** 2), step
-
-
-def _determinant(gauss: Tensor, step: Tensor, order: int) -> Tensor:
-    """Return a number (...) that is zero where the remaining weights do not determine the derivative."""
-    m0, m2, m4 = ((gauss * step**power).sum(-1) for power in (0, 2, 4))
-    return (m0, m2, m0 * m4 - m2**2)[order]
 
 
 def _with_exact_moments(gauss: Tensor, step: Tensor, order: int) -> Tensor:

@@ -1,7 +1,7 @@
 """Quality of the frames of a track: warnings as text, the worst frames, stretches of bad ones, the data of the page."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, zip_longest
 from typing import Any
@@ -254,6 +254,10 @@ def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStr
     parts = np.split(bad, np.flatnonzero(np.diff(bad) > STRETCH_FRAMES) + 1) if len(bad) else []
     for first, last in ((int(part[0]), int(part[-1])) for part in parts):
         _, doubtful, not_valid = np.bincount(status[first : last + 1], minlength=3).tolist()
+        counted: Counter[str] = Counter()  # the frames of each warning
+        for which, frames in zip(*np.unique(group[first : last + 1], return_counts=True), strict=True):
+            counted.update(dict.fromkeys(warnings[which], int(frames)))
+        del counted["not valid"]  # counted apart
         stretch = BadStretch(
             first=first,
             last=last,
@@ -263,7 +267,7 @@ def bad_stretches(track: Trajectory, numbers: Ints | None = None) -> list[BadStr
             end_s=float(track.time[last]),
             doubtful=doubtful,
             not_valid=not_valid,
-            reasons=_reasons(group[first : last + 1], warnings),
+            reasons=tuple(counted.most_common()),
         )
         found.append(stretch)
     return sorted(found, key=lambda stretch: (-stretch.frames, -stretch.not_valid, stretch.first))
@@ -307,15 +311,6 @@ def _reason_codes(track: Trajectory) -> tuple[dict[str, Ints], list[str]]:
         for name, camera in track.cameras.items()
     }
     return codes, [REASON_WORDS.get(reason, str(reason)) for reason in code]
-
-
-def _reasons(group: Ints, warnings: Sequence[Sequence[str]]) -> tuple[tuple[str, int], ...]:
-    """Count the frames of each warning, without "not valid", which is counted apart."""
-    counted: Counter[str] = Counter()
-    for which, frames in zip(*np.unique(group, return_counts=True), strict=True):
-        counted.update(dict.fromkeys(warnings[which], int(frames)))
-    del counted["not valid"]
-    return tuple(counted.most_common())
 
 
 def _short(values: Floats, digits: int = DIGITS) -> list[float | None]:

@@ -173,7 +173,12 @@ def worst_frames(
         across, down = width + BETWEEN, TITLE + height + LINES * LINE + 10 + BETWEEN  # from tile to tile
         columns = max(1, PICTURES // (2 * len(page.views)))
         canvas = Canvas(columns * across + BETWEEN, HEAD + max(1, math.ceil(len(bad) / columns)) * down)
-        _head(canvas, page, len(bad))
+        names = ", ".join(view.name for view in page.views)
+        title = f"{track.experiment}, {track.method}: the {len(bad)} worst of {len(track)} frames"
+        canvas.text((BETWEEN, 24), f"{title}, worst first; {int(track.valid.sum())} are valid", 17)
+        about = f"of each camera ({names}): the crop with the outline, and the sphere re-rendered at the measured pose "
+        about += "with body axes (x orange, y green, z blue; dotted: away)"
+        canvas.text((BETWEEN, 44), about, 13, ink.FAINT)
         corner = {k: (BETWEEN + i % columns * across, HEAD + i // columns * down) for i, k in enumerate(bad)}
         for done, (k, pictures) in enumerate(pictures_by_row(streams, np.array(sorted(bad), np.int64)), start=1):
             _tile(canvas, page, k, bad[k], pictures, corner[k])
@@ -181,15 +186,6 @@ def worst_frames(
     with put_aside(path) as aside:
         Image.fromarray(canvas.finished()).save(aside)
     return bad
-
-
-def _head(canvas: Canvas, page: Page, count: int) -> None:
-    track, names = page.track, ", ".join(view.name for view in page.views)
-    title = f"{track.experiment}, {track.method}: the {count} worst of {len(track)} frames"
-    canvas.text((BETWEEN, 24), f"{title}, worst first; {int(track.valid.sum())} are valid", 17)
-    about = f"of each camera ({names}): the crop with the outline, and the sphere re-rendered at the measured pose "
-    about += "with body axes (x orange, y green, z blue; dotted: away)"
-    canvas.text((BETWEEN, 44), about, 13, ink.FAINT)
 
 
 def _tile(

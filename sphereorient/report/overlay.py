@@ -89,7 +89,13 @@ def prepared(
     track: Trajectory, experiment: Experiment, cameras: Sequence[str] | None, opened: ExitStack
 ) -> tuple[Page, dict[str, CameraStream]]:
     """Return what all pictures share (light, brightness, sizes), and the streams by camera; `opened` closes them."""
-    names = _names(track, cameras)
+    names = list(track.cameras) if cameras is None else list(cameras)
+    for name in names:
+        if name not in track.cameras:
+            raise ExperimentError(refuse_unknown(name, track.cameras, "cameras of the track"))
+    if not names:
+        got, do = "none", "write --cameras cam1, or leave it out"
+        raise ExperimentError(refusal("--cameras", expected="names of cameras", got=got, do=do))
     texture = None if experiment.texture_path is None else load_texture(experiment.texture_path)
     numbers, streams = streams_of(track, experiment, names, opened)
     where = path_of(track, experiment.radius_mm)
@@ -129,17 +135,6 @@ def streams_of(
         for name, movie in movies.items()
     }
     return known.number[at], streams
-
-
-def _names(track: Trajectory, cameras: Sequence[str] | None) -> list[str]:
-    names = list(track.cameras) if cameras is None else list(cameras)
-    for name in names:
-        if name not in track.cameras:
-            raise ExperimentError(refuse_unknown(name, track.cameras, "cameras of the track"))
-    if not names:
-        got, do = "none", "write --cameras cam1, or leave it out"
-        raise ExperimentError(refusal("--cameras", expected="names of cameras", got=got, do=do))
-    return names
 
 
 def pictures_by_row(streams: Mapping[str, CameraStream], rows: Rows) -> Iterator[tuple[int, dict[str, Grey | None]]]:

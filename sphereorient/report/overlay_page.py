@@ -273,20 +273,17 @@ class Page:
             left += 8 * len(words) + 14
         canvas.text((left, top + 16), "axes solid: towards the camera, dotted: away", 13, FAINT)
         strip = canvas.pixels[height - 26 : height - 14, GAP : width - GAP]
-        strip[:] = self._strip(strip.shape[1])
+        # the states of all frames side by side; a pixel shows the worst of its frames
+        state = np.where(self.track.valid, np.where(shown_flags(self.track) != 0, 1, 0), 2)
+        edges = np.linspace(0, len(state), strip.shape[1] + 1)
+        first = edges[:-1].astype(int)
+        last = np.maximum(np.ceil(edges[1:]).astype(int), first + 1)
+        worst = [int(state[a:b].max()) for a, b in zip(first, last, strict=True)]
+        strip[:] = np.array([GOOD, DOUBT, LOST], np.uint8)[worst]
         at = round((k + 0.5) / len(self.track) * strip.shape[1])
         canvas.pixels[height - 31 : height - 9, GAP + max(0, at - 1) : GAP + at + 1] = 255
         words = f"whole track: green valid, orange in doubt, grey not valid ({int(self.track.valid.sum())} of "
         canvas.text((width - GAP, top + 16), f"{words}{len(self.track)} valid)", 13, FAINT, "rs")
-
-    def _strip(self, width: int) -> NDArray[np.uint8]:
-        """Return the states of all frames side by side, (width, 3); a pixel shows the worst of its frames."""
-        state = np.where(self.track.valid, np.where(shown_flags(self.track) != 0, 1, 0), 2)
-        edges = np.linspace(0, len(state), width + 1)
-        first = edges[:-1].astype(int)
-        last = np.maximum(np.ceil(edges[1:]).astype(int), first + 1)
-        worst = [int(state[a:b].max()) for a, b in zip(first, last, strict=True)]
-        return np.array([GOOD, DOUBT, LOST], np.uint8)[worst]
 
 
 def crop_side(half_px: float) -> int:

@@ -99,7 +99,7 @@ def _noise(summary: Summary) -> Iterator[Verdict]:
         what = "noise" if summary.ensemble.error == "added" else "smoothed away"
         yield _say("Noise", f"at most {100 * max(shares.values()):.2g} % of any variance is {what}", good=True)
     for warning in summary.warnings:
-        yield _say("Noise", f"{warning.words}: trust the corrected values, if any", good=False)
+        yield _say("Noise", f"{warning}: trust the corrected values, if any", good=False)
 
 
 def _apart(distances: Sequence[CameraDistance]) -> Iterator[Verdict]:

@@ -74,7 +74,14 @@ def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | 
     drawn = _by_blocks(lambda rows: at(_weights(len(flat), rows, settings) @ flat), settings.resamples, some)
     some = max(1, AT_ONCE // (len(flat) + flat.shape[1]))
     without = _by_blocks(lambda rows: at(total - flat[rows]), len(flat), some)
-    low, high = _bca(value, drawn, without, settings.level)
+    below = ((drawn < value).mean(0) + (drawn <= value).mean(0)) / 2
+    rest = 0.5 / len(drawn)
+    bias = ndtri(np.clip(below, rest, 1 - rest))
+    pull = without.mean(0) - without
+    with np.errstate(all="ignore"):
+        skew = np.nan_to_num((pull**3).sum(0) / (6 * (pull**2).sum(0) ** 1.5))
+    ends = (bias + ndtri((1 + sign * settings.level) / 2) for sign in (-1, 1))
+    low, high = (_quantiles(drawn, ndtr(bias + z / (1 - skew * z))) for z in ends)
     return Interval(value=value, low=low, high=high, error=np.asarray(drawn.std(0, ddof=1), np.float64))
 
 
@@ -91,18 +98,6 @@ def _weights(segments: int, rows: Rows, settings: BootstrapSettings) -> Floats:
         draw = np.random.default_rng([settings.seed, row]).integers(0, segments, segments)
         weights[place] = np.bincount(draw, minlength=segments)
     return weights
-
-
-def _bca(value: Floats, drawn: Floats, without: Floats, level: float) -> tuple[Floats, Floats]:
-    below = ((drawn < value).mean(0) + (drawn <= value).mean(0)) / 2
-    rest = 0.5 / len(drawn)
-    bias = ndtri(np.clip(below, rest, 1 - rest))
-    pull = without.mean(0) - without
-    with np.errstate(all="ignore"):
-        skew = np.nan_to_num((pull**3).sum(0) / (6 * (pull**2).sum(0) ** 1.5))
-    low, high = (bias + ndtri(tail) for tail in ((1 - level) / 2, (1 + level) / 2))
-    low, high = (_quantiles(drawn, ndtr(bias + z / (1 - skew * z))) for z in (low, high))
-    return low, high
 
 
 def _quantiles(drawn: Floats, share: Floats) -> Floats:

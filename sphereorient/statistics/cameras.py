@@ -41,7 +41,8 @@ def camera_distances(
         for pair in combinations(sorted(own), 2):
             for parts, of in ((apart, own), (rough, other or {})):
                 if set(pair) <= set(of):
-                    parts.setdefault(pair, []).append(_distance(*(of[name] for name in pair)))
+                    apart_rad = geodesic_distance(*(torch.from_numpy(of[name]) for name in pair)).numpy()
+                    parts.setdefault(pair, []).append(apart_rad[np.isfinite(apart_rad)])  # frames with both
     return [_pooled(pair, np.concatenate(parts), rough.get(pair), bins) for pair, parts in apart.items()]
 
 
@@ -78,9 +79,3 @@ def without_perspective(track: Trajectory, cameras: Mapping[str, Camera]) -> dic
 def _pdf(x: Floats, edges: Floats) -> Floats:
     counts, _ = np.histogram(x, edges)
     return np.asarray(counts / max(len(x), 1) / np.diff(edges))
-
-
-def _distance(A: Floats, B: Floats) -> Floats:
-    """Return the geodesic distances of the frames with both orientations."""
-    apart = geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy()
-    return np.asarray(apart[np.isfinite(apart)])

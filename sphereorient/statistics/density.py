@@ -115,17 +115,13 @@ class _Likelihood:
         number = counts.sum(-1)
         log_scale = 0.5 * np.log(second / number - (first / number) ** 2)
         value = counts @ self.table - log_scale[..., None] * (counts @ self.slope)
-        a = self.nodes[0] + _peak(value) * (self.nodes[1] - self.nodes[0])
+        # the largest value, interpolated by a parabola
+        k = np.clip(value.argmax(-1), 1, NODES - 2)[..., None]
+        left, mid, right = (np.take_along_axis(value, k + j, axis=-1)[..., 0] for j in (-1, 0, 1))
+        bend = left - 2 * mid + right
+        shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0)
+        a = self.nodes[0] + np.clip(k[..., 0] + shift, 0, NODES - 1) * (self.nodes[1] - self.nodes[0])
         return np.stack([a, flatness_of(a)], axis=-1)
-
-
-def _peak(value: Floats) -> Floats:
-    """Return the index of the largest value along the last axis, interpolated by a parabola."""
-    k = np.clip(value.argmax(-1), 1, value.shape[-1] - 2)[..., None]
-    left, mid, right = (np.take_along_axis(value, k + j, axis=-1)[..., 0] for j in (-1, 0, 1))
-    bend = left - 2 * mid + right
-    shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0)
-    return np.asarray(np.clip(k[..., 0] + shift, 0, value.shape[-1] - 1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

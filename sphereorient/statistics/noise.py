@@ -20,27 +20,15 @@ WIDTHS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # sigma of the Gaussian, frames
 CENTRAL = np.array([0.5, 0.0, -0.5])  # omega from the rotation of frame k - 1 to k + 1, for np.convolve
 
 
-@dataclass(frozen=True, kw_only=True)
-class NoiseWarning:
-    """A variance of which more than 10 % is noise; made by `noise_warnings`, printed by the report."""
-
-    quantity: str
-    component: str
-    share: float
-    words: str
-
-
-def noise_warnings(table: dict[str, Moments], error: str) -> list[NoiseWarning]:
-    """Return a record for each component with too much noise; `error` is the ensemble's, "added" or "removed"."""
+def noise_warnings(table: dict[str, Moments], error: str) -> list[str]:
+    """Return a sentence for each component with over 10 % of noise; `error` is the ensemble's, "added" or "removed"."""
     what = {"added": "noise", "removed": "smoothed away"}[error]
-    found = []
-    for quantity, part in table.items():
-        for i, component in enumerate("xyz"):
-            share = float(part.noise_share.value[i])
-            if share > WARN_SHARE:
-                words = f"{quantity} {component}: {100 * share:.0f} % of the variance is {what}"
-                found.append(NoiseWarning(quantity=quantity, component=component, share=share, words=words))
-    return found
+    return [
+        f"{quantity} {component}: {100 * share:.0f} % of the variance is {what}"
+        for quantity, part in table.items()
+        for component, share in zip("xyz", part.noise_share.value[:3].tolist(), strict=True)
+        if share > WARN_SHARE
+    ]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -47,7 +47,9 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
         raise ShapeError(refusal("reliability", expected=expected, got=got, do="correct the arguments"))
     order = np.argsort(said, kind="stable")
     said, came = said[order], came[order]
-    edges = _edges(said, bins)
+    wanted = said[np.rint(np.linspace(0, len(said), bins + 1)[1:-1]).astype(np.int64)] if len(said) >= bins else said
+    inner = np.searchsorted(said, wanted, side="left")
+    edges = np.unique(np.concatenate([[0], inner, [len(said)]])).astype(np.int64)
     count = np.diff(edges)
     mean, spread = _means(said, edges), _means(said * (1 - said), edges)
     share = _means(came.astype(np.float64), edges)
@@ -64,12 +66,6 @@ def reliability(probability: ArrayLike, outcome: ArrayLike, bins: int = 10) -> R
         error=float((weight * np.abs(share - mean)).sum()) if len(said) else math.nan,
         chance=by_chance if len(said) else math.nan,
     )
-
-
-def _edges(said: Floats, bins: int) -> Rows:
-    wanted = said[np.rint(np.linspace(0, len(said), bins + 1)[1:-1]).astype(np.int64)] if len(said) >= bins else said
-    inner = np.searchsorted(said, wanted, side="left")
-    return np.unique(np.concatenate([[0], inner, [len(said)]])).astype(np.int64)
 
 
 def _means(values: Floats, edges: Rows) -> Floats:

@@ -50,7 +50,7 @@ class Summary:
     surroundings: Surroundings
     ensemble: Ensemble
     table: Mapping[str, Moments]  # Table I; without intervals for one segment
-    warnings: Sequence[noise.NoiseWarning]
+    warnings: Sequence[str]  # of noise, a sentence each
     comparisons: Sequence[Comparison]
     distributions: Distributions | None  # None with fewer than two segments
 
@@ -84,7 +84,11 @@ def summarise(
     ensemble = ensemble_of(many, settings, name, fewest=0)
     progress(1, STEPS)
     if ensemble.segments >= FEWEST and settings.integral_time_s is None:
-        ensemble, settings = _long_enough(ensemble, settings)
+        measured = float(lags.correlation(ensemble, "velocity", settings=settings).integral_time_s.value[3])
+        if measured > 0:  # leave out segments that are short compared with the integral time of all of them
+            settings = settings.model_copy(update={"integral_time_s": measured})
+            kept = ensemble.span_s >= settings.min_integral_times * measured
+            ensemble = ensemble.at(kept) if kept.sum() >= FEWEST else ensemble
     table = dict(table_of_moments(ensemble, settings))
     progress(2, STEPS)
     more = _distributions(many, ensemble, settings, progress) if ensemble.segments >= FEWEST else None
@@ -98,16 +102,6 @@ def summarise(
         comparisons=comparisons(table, around) if ensemble.segments else [],
         distributions=more,
     )
-
-
-def _long_enough(ensemble: Ensemble, settings: StatisticsSettings) -> tuple[Ensemble, StatisticsSettings]:
-    """Leave out segments that are short compared with the integral time of all of them."""
-    measured = float(lags.correlation(ensemble, "velocity", settings=settings).integral_time_s.value[3])
-    if not measured > 0:
-        return ensemble, settings
-    settings = settings.model_copy(update={"integral_time_s": measured})
-    kept = ensemble.span_s >= settings.min_integral_times * measured
-    return (ensemble.at(kept) if kept.sum() >= FEWEST else ensemble), settings
 
 
 def _distributions(

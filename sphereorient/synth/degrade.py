@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 import torch
 from kornia.filters import filter2d, gaussian_blur2d
+from scipy.optimize import bisect
 from torch import Tensor
 
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
@@ -118,7 +119,7 @@ def occlusion(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) 
         return pictures
     angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]
     radius = disk.radius(pictures)
-    away = _distance_of_overlap(share) * radius
+    away = bisect(lambda apart: _overlap(apart) - share, 0.0, 2.0, xtol=1e-15) * radius
     right, down = disk.offset(pictures)
     hidden = _round(right - away * angle.cos(), down - away * angle.sin(), radius)
     return pictures + hidden * (OCCLUDER - pictures)
@@ -260,14 +261,9 @@ def _round(right: Tensor, down: Tensor, radius_px: Tensor) -> Tensor:
     return (radius_px - distance + 0.5).clamp(0, 1)
 
 
-def _distance_of_overlap(share: float) -> float:
-    """Return the centre distance, in radii, at which a circle hides this share of an equal one."""
-    near, far = 0.0, 2.0
-    for _ in range(50):
-        middle = 0.5 * (near + far)
-        overlap = (2 * math.acos(middle / 2) - middle * math.sqrt(1 - middle**2 / 4)) / math.pi
-        near, far = (middle, far) if overlap > share else (near, middle)
-    return near
+def _overlap(apart: float) -> float:
+    """Return the share of a circle that an equal one hides, whose centre is so many radii away."""
+    return (2 * math.acos(apart / 2) - apart * math.sqrt(1 - apart**2 / 4)) / math.pi
 
 
 def _uniform(pictures: Tensor, rng: torch.Generator, *tail: int) -> Tensor:

@@ -2,7 +2,7 @@
 
 import math
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import cast
 
@@ -30,7 +30,7 @@ SMEAR_PX = 1.0  # largest motion between exposure samples
 def degraded_settings(base: SynthSettings, values: Mapping[str, float]) -> SynthSettings:
     """Return the settings with ball_size, spin and motion_blur applied, in this order."""
     settings = base
-    for name, change in SCENE.items():
+    for name, change in (("ball_size", with_ball_size), ("spin", with_spin), ("motion_blur", with_motion_blur)):
         if name in values:
             settings = change(settings, values[name])
     return settings
@@ -62,13 +62,6 @@ def with_motion_blur(base: SynthSettings, degrees_per_exposure: float) -> SynthS
     samples = math.ceil(1.5 * math.hypot(turned_px, moved_px) / SMEAR_PX)
     samples = max(base.exposure_samples, samples)
     return _changed(base, exposure=exposure, omega_rms=omega_rms, exposure_samples=samples)
-
-
-SCENE: Mapping[str, Callable[[SynthSettings, float], SynthSettings]] = {
-    "ball_size": with_ball_size,
-    "spin": with_spin,
-    "motion_blur": with_motion_blur,
-}
 
 
 def _changed(base: SynthSettings, **update: object) -> SynthSettings:
@@ -127,11 +120,6 @@ class Filming:
     def reported_texture(self, texture: Tensor) -> Tensor:
         """Return the map to write, (H, 2 H), with exchanged patches."""
         return misdrawn(texture, self.values.get("texture_error", 0.0), self._generator("texture_error"))
-
-    def reported_diameter_mm(self) -> float:
-        """Return the diameter to write, with radius_error, mm."""
-        base = self.settings
-        return base.diameter_mm * (1 + self.values.get("radius_error", 0.0) / (base.diameter_px / 2))
 
     def disk(self, name: str, position_lab_mm: Tensor, cover: NDArray[np.float32]) -> Disk:
         """Return the place of the sphere at (3,) in a camera's picture; `cover` (H, W): coverage of each pixel."""

@@ -93,8 +93,7 @@ def _lit(
     )
     rays = Rays(origin_lab_mm=origin, direction_lab=origin.new_tensor([0.0, 0.0, 1.0]))
     seen = see_sphere(rays, torch.zeros(3), _instants(R, values, rng), reduced_texture(texture, 2 * radius), radius)
-    levels = [low + (high - low) * torch.rand((count, 1), generator=rng) for low, high in LEVELS]
-    white, black, behind = levels
+    white, black, behind = (low + (high - low) * torch.rand((count, 1), generator=rng) for low, high in LEVELS)
     grey = (black + (white - black) * seen.paint.mean(0)) * _light(seen.normal, rng)
     grey = grey.reshape(count, side, side)
     return behind[..., None] + disk.covered(grey) * (grey - behind[..., None])

@@ -91,7 +91,10 @@ def write_synthetic_experiment(
     for index, name in enumerate(cameras):
         frames = _frames(scene, filming, name, np.random.default_rng([settings.seed, index]), progress)
         write_ffv1(folder / f"{name}.mkv", frames, settings.frame_rate)
-        write_picture(folder / f"empty_{name}.png", _without_the_ball(filming, name))
+        size = cameras[name].image_size[::-1]
+        disk = filming.disk(name, torch.zeros(3, dtype=torch.float64), np.zeros(size, np.float32))
+        empty = filming.picture(np.full(size, settings.background, np.float32), disk, name, None)
+        write_picture(folder / f"empty_{name}.png", np.clip(np.rint(empty), 0, 255).astype(np.uint8))
     write_picture(folder / "texture.png", _as_file(filming.reported_texture(texture)))
     reported = wrong_cameras(cameras, values)
     exact = "exact cameras" if reported is cameras else "cameras, wrong on purpose"
@@ -142,14 +145,6 @@ def _frames(
         progress(1)
 
 
-def _without_the_ball(filming: Filming, name: str) -> NDArray[np.uint8]:
-    size = filming.cameras[name].image_size[::-1]
-    disk = filming.disk(name, torch.zeros(3, dtype=torch.float64), np.zeros(size, np.float32))
-    empty = filming.picture(np.full(size, filming.settings.background, np.float32), disk, name, None)
-    rounded: NDArray[np.uint8] = np.clip(np.rint(empty), 0, 255).astype(np.uint8)
-    return rounded
-
-
 def write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> None:
     """Write truth.h5 (docs/data-format.md)."""
     body = truth.R_lab_body.mT
@@ -172,6 +167,7 @@ def write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> N
 
 def _experiment(filming: Filming) -> dict[str, Any]:
     settings = filming.settings
+    too_large = filming.values.get("radius_error", 0.0) / (settings.diameter_px / 2)  # share, at the rim of the picture
     # exposure 0 is left out: the key must be above 0.
     exposure = {"exposure": settings.exposure} if settings.exposure > 0 else {}
     return {
@@ -179,7 +175,7 @@ def _experiment(filming: Filming) -> dict[str, Any]:
         "name": settings.name,
         "frame_rate": settings.frame_rate,
         **exposure,
-        "sphere": {"diameter": filming.reported_diameter_mm(), "texture": "texture.png"},
+        "sphere": {"diameter": settings.diameter_mm * (1 + too_large), "texture": "texture.png"},
         "cameras": "cameras.yaml",
         "backgrounds": {name: f"empty_{name}.png" for name in filming.cameras},
         "movies": {name: f"{name}.mkv" for name in filming.cameras},

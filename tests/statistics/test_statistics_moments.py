@@ -130,7 +130,7 @@ def test_a_warning_comes_above_a_tenth_of_the_variance(share, warned):
     _, measured, sigma = noisy(share)
     table = table_of_moments(ensemble([4000] * 100, velocity=measured[:400_000], sigma=sigma), FEW)
     assert table["velocity"].noisy == warned
-    named = {record.quantity for record in noise_warnings({"velocity": table["velocity"]}, "added")}
+    named = {words.split()[0] for words in noise_warnings({"velocity": table["velocity"]}, "added")}
     assert named == ({"velocity"} if warned else set())
 
 

@@ -109,7 +109,14 @@ def increments_figure(distributions: Distributions, table: Mapping[str, Moments]
         right.plot(lag_ms, of.value, marker=style.marker, label=style.name, **style.drawn)
         look.band(right, lag_ms, of.low, of.high, style)
     right.set(xscale="log", xlabel="lag (ms)", ylabel="flatness of increments of ω, lab (–)")
-    _levels(right, table or {})
+    levels = {"Gaussian": (3.0, look.SECOND.line)}
+    for name, key, line in (("ω lab", "omega_lab", (0, (1, 1.5))), ("α lab", "alpha_lab", (0, (8, 2)))):
+        if table and key in table:  # of the three components as one sample, each about its mean
+            var = table[key].rms.value[:3] ** 2
+            levels[name] = float((table[key].flatness.value[:3] * var**2).mean() / var.mean() ** 2), line
+    for name, (level, line) in levels.items():
+        if np.isfinite(level):
+            right.axhline(level, color=look.GREY, linestyle=line, linewidth=1.0, label=f"{name}: {level:.3g}")
     look.plain_logarithms(right.xaxis)
     look.legend_above(right, ncols=2)
     return figure
@@ -135,22 +142,6 @@ def _shifted_densities(axes: Axes, distributions: Distributions) -> None:
     axes.set_ylabel("PDF, shifted by decades (1/standard deviation)")
     bins = look.X.handle("bins with intervals, drawn down to ¼ of the value", marker=look.X.marker, linestyle="none")
     look.legend_above(axes, handles=[bins, look.SECOND.handle("Gaussian")])
-
-
-def _levels(axes: Axes, table: Mapping[str, Moments]) -> None:
-    levels = {"Gaussian": 3.0}
-    names = {"ω lab": "omega_lab", "α lab": "alpha_lab"}
-    levels |= {name: pooled_flatness(table[key]) for name, key in names.items() if key in table}
-    styles = {"Gaussian": look.SECOND.line, "ω lab": (0, (1, 1.5)), "α lab": (0, (8, 2))}
-    for name, level in levels.items():
-        if np.isfinite(level):
-            axes.axhline(level, color=look.GREY, linestyle=styles[name], linewidth=1.0, label=f"{name}: {level:.3g}")
-
-
-def pooled_flatness(of: Moments) -> float:
-    """Return the flatness of the three components as one sample, each about its mean."""
-    var = of.rms.value[:3] ** 2
-    return float((of.flatness.value[:3] * var**2).mean() / var.mean() ** 2)
 
 
 @look.in_style
@@ -183,17 +174,12 @@ def _correlation_panel(axes: Axes, correlation: Correlation) -> None:
         place = np.array([-0.05 * (1 + i)])  # one below the other, since they are close together
         axes.plot([float(time.value)], place, marker=style.marker, linestyle="none", color=style.colour, label="_")
         axes.hlines(place, [float(time.low)], [float(time.high)], color=style.colour, linewidth=0.9)
-    axes.set_xlim(0.0, _longest_ms(correlation))
-    axes.set_ylim(bottom=min(axes.get_ylim()[0], -0.3), top=1.05)
-    look.legend_above(axes, title="integral time")
-
-
-def _longest_ms(correlation: Correlation) -> float:
-    lag_ms = 1e3 * correlation.lag_s
     below = np.flatnonzero((correlation.value.value <= 0).any(1))
     zero = float(lag_ms[below[0]]) if len(below) else float(lag_ms[-1])
     longest = float(np.nanmax(1e3 * correlation.integral_time_s.value, initial=0.0))
-    return max(min(float(lag_ms[-1]), max(SHOWN_TIMES * longest, SHOWN_ZEROS * zero)), 1e-3)
+    axes.set_xlim(0.0, max(min(float(lag_ms[-1]), max(SHOWN_TIMES * longest, SHOWN_ZEROS * zero)), 1e-3))
+    axes.set_ylim(bottom=min(axes.get_ylim()[0], -0.3), top=1.05)
+    look.legend_above(axes, title="integral time")
 
 
 @look.in_style

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sphereorient.report.plots import style as look
-from sphereorient.statistics import Interval, Moments
+from sphereorient.statistics import Moments
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.statistics.isotropy import EulerDensity, Isotropy, Uniformity
 from sphereorient.statistics.moments import WARN_SHARE
@@ -43,18 +43,13 @@ def angles_figure(angles: Sequence[EulerDensity], uniformity: Uniformity) -> Fig
     panels[0].set_ylim(bottom=0.0)
     bins = look.PLAIN.handle("bins with intervals", marker="o", linestyle="none")
     look.legend_of_figure(figure, [bins, look.SECOND.handle("all attitudes equally likely")], ncols=2)
-    look.note(figure, _uniformity_words(uniformity))
+    words = "uniformity of the attitudes could not be tested"
+    if np.isfinite((of := uniformity).p_value):
+        found = "nothing speaks against uniform attitudes" if of.uniform else "the attitudes are not uniform"
+        words = f"{found}: {look.p_value_text(of.p_value)}, test on SO(3) of {of.samples:,} frames "
+        words += f"in {of.segments:,} segments, worth {of.effective:,.0f} independent attitudes"
+    look.note(figure, words)
     return figure
-
-
-def _uniformity_words(of: Uniformity) -> str:
-    if not np.isfinite(of.p_value):
-        return "uniformity of the attitudes could not be tested"
-    found = "nothing speaks against uniform attitudes" if of.uniform else "the attitudes are not uniform"
-    return (
-        f"{found}: {look.p_value_text(of.p_value)}, test on SO(3) of {of.samples:,} frames "
-        f"in {of.segments:,} segments, worth {of.effective:,.0f} independent attitudes"
-    )
 
 
 @look.in_style
@@ -87,7 +82,10 @@ def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"
     figure = look.new_figure(look.WIDTH_IN, 3.2)
     axes = figure.subplots()
     shares = [one.noise_share.part(slice(0, 3)).scaled(100.0) for one in table.values()]
-    floor = _floor(shares)
+    known = np.concatenate([np.empty(0), *(share.value for share in shares)])
+    known = np.log10(known[np.isfinite(known) & (known > 0)])
+    # Where bars begin on a logarithmic axis, a decade below the least; 0: the axis is linear.
+    floor = float(10.0 ** (np.floor(known.min()) - (known.min() % 1 < 0.3))) if len(known) else 0.0
     bars = []
     for i, style in enumerate(look.COMPONENTS):
         at = np.arange(len(shares)) + (i - 1) * BAR
@@ -111,13 +109,6 @@ def noise_figure(table: Mapping[str, Moments], error: Literal["added", "removed"
     if not any(np.isfinite(share.value).any() for share in shares):
         look.say_empty(axes, "the errors of this track are unknown")
     return figure
-
-
-def _floor(shares: list[Interval]) -> float:
-    """Return where bars begin on a logarithmic axis, a decade below the least; 0: the axis is linear."""
-    known = np.concatenate([share.value for share in shares]) if shares else np.empty(0)
-    known = known[np.isfinite(known) & (known > 0)]
-    return float(10.0 ** (np.floor(np.log10(known.min())) - (np.log10(known.min()) % 1 < 0.3))) if len(known) else 0.0
 
 
 @look.in_style
@@ -204,7 +195,11 @@ def _distance_panel(axes: Axes, distance: CameraDistance) -> None:
     if not even:
         edges = np.geomspace(nearest / NEAREST, edges[-1] * (1 + 1e-9), GEOMETRIC_BINS + 1)
     for values, pdf, style, what in laws:
-        pdf = pdf * np.pi / 180 if even else _density(values, edges)
+        if even:
+            pdf = pdf * np.pi / 180
+        else:  # NaN in empty bins
+            counts, _ = np.histogram(values, edges)
+            pdf = np.where(counts > 0, counts / len(values) / np.diff(edges), np.nan)
         median = float(np.median(values))
         label = f"{what}: median {median:.2g}° of {len(values):,} frames"
         axes.stairs(pdf, edges, color=style.colour, linestyle=style.line, linewidth=1.2, label=label)
@@ -217,9 +212,3 @@ def _distance_panel(axes: Axes, distance: CameraDistance) -> None:
         look.plain_logarithms(axes.xaxis)
         look.plain_logarithms(axes.yaxis)
     look.legend_above(axes, title=names)
-
-
-def _density(values_deg: Floats, edges_deg: Floats) -> Floats:
-    """Return the density in bins of any widths, 1/degree; NaN in empty bins."""
-    counts, _ = np.histogram(values_deg, edges_deg)
-    return np.where(counts > 0, counts / len(values_deg) / np.diff(edges_deg), np.nan)

@@ -68,8 +68,13 @@ def track_figure(track: Trajectory) -> Figure:
     for axes, (name, label) in zip(panels[1:].ravel(), RATES.items(), strict=True):
         _curves(axes, time, getattr(track, name), getattr(track, f"{name}_sigma"), part.broken)
         axes.set_ylabel(label)
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], track.valid, [True]]).astype(np.int8)))
+    half = float(np.median(np.diff(time))) / 2 if len(time) > 1 else 0.5
+    runs = [(time[a] - half, time[b - 1] - time[a] + 2 * half) for a, b in edges.reshape(-1, 2)]
     for axes in panels.ravel():
-        _shade(axes, time, track.valid)
+        if len(edges):
+            across = axes.get_xaxis_transform()
+            axes.broken_barh(runs, (0, 1), transform=across, zorder=0, label="not valid", **NOT_VALID)
         axes.margins(x=0.01)
         if not any(np.isfinite(np.asarray(line.get_ydata(), np.float64)).any() for line in axes.lines):
             look.say_empty(axes)
@@ -201,15 +206,6 @@ def _curve(axes: Axes, time: Floats, values: Floats, sigma: Floats, broken: NDAr
 def _dots(axes: Axes, time: Floats, values: Floats) -> None:
     for style, column in zip(look.COMPONENTS, values.T, strict=True):
         axes.plot(time, column, ".", color=style.colour, alpha=0.35, markersize=2.5, markeredgewidth=0, label="_")
-
-
-def _shade(axes: Axes, time: Floats, valid: NDArray[np.bool_]) -> None:
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], valid, [True]]).astype(np.int8)))
-    if len(edges):
-        half = float(np.median(np.diff(time))) / 2 if len(time) > 1 else 0.5
-        runs = [(time[a] - half, time[b - 1] - time[a] + 2 * half) for a, b in edges.reshape(-1, 2)]
-        across = axes.get_xaxis_transform()
-        axes.broken_barh(runs, (0, 1), transform=across, zorder=0, label="not valid", **NOT_VALID)
 
 
 def _tripods(axes: Any, track: Trajectory, there: NDArray[np.int64], size: float) -> None:

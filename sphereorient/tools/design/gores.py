@@ -11,7 +11,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
@@ -108,19 +107,14 @@ def gores_figure(texture: Tensor, gores: Gores, *, filled: bool) -> Figure:
         middle = 0.5 * gores.diameter_mm * middle_rad
         axes.plot([middle, middle], [-meridian / 2, meridian / 2], **FOLD)
     axes.plot([-equator / 2, equator / 2], [0, 0], **FOLD)
-    _draw_rule(axes, gores)
-    return figure
-
-
-def _draw_rule(axes: Axes, gores: Gores) -> None:
-    width, height = gores.size_mm
-    length = RULE_MM[1] if width >= RULE_MM[1] else RULE_MM[0]
-    start, level = -gores.sheet_mm[0] / 2 + MARGIN_MM, -height / 2 - 0.4 * MARGIN_MM
+    length = RULE_MM[1] if equator >= RULE_MM[1] else RULE_MM[0]
+    start, level = -width / 2 + MARGIN_MM, -meridian / 2 - 0.4 * MARGIN_MM
     axes.plot([start, start + length], [level, level], color="black", linewidth=0.8, gid="rule")
     for end in (start, start + length):
         axes.plot([end, end], [level - 1.2, level + 1.2], color="black", linewidth=0.8)
     text = f"{length:g} mm: measure it. Ball {gores.diameter_mm:g} mm, {gores.count} strips, print at 100 %"
     axes.text(start, level - 2.0, text, fontsize=6, va="top", ha="left")
+    return figure
 
 
 def write_gores(texture: Tensor, gores: Gores, folder: Path) -> list[Path]:

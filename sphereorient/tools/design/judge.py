@@ -240,41 +240,38 @@ def design_figure(texture: Tensor, judgement: Judgement, title: str) -> Figure:
     _views_part(rows[1], texture, judgement)
     left, right = rows[2].subplots(1, 2, width_ratios=[1.6, 1.0])
     _information_part(left, judgement)
-    _balance_part(right, judgement)
+    white = 100 * judgement.white.numpy()
+    right.hist(white, bins=list(range(0, 105, 5)), color=SHADE, edgecolor=GREY, linewidth=0.5)
+    right.axvline(float(np.median(white)), color="black", linewidth=1, linestyle="--")
+    right.set(xlim=(0, 100), xlabel="white in a view (%)", ylabel="views")
+    right.set_title(f"balance: {white.min():.0f} to {white.max():.0f} %", fontsize=7.5)
     return figure
 
 
 def _map_part(axes: Axes, texture: Tensor, judgement: Judgement, title: str) -> None:
     axes.imshow(texture.numpy(), cmap="gray", vmin=0, vmax=1, extent=(-180, 180, -90, 90), interpolation="nearest")
     axes.grid(visible=False)
-    for label, direction, colour in _named_views(judgement):
+    at, (first, second) = judgement.direction_body, judgement.alike_views
+    named = {"W": (at[judgement.worst], WORST), "B": (at[judgement.best], BEST)}
+    for label, (direction, colour) in (named | {"1": (-first[2], ALIKE), "2": (-second[2], ALIKE)}).items():
         lon, lat = lon_lat_deg(direction).tolist()
         axes.plot(lon, lat, "o", markersize=9, markerfacecolor="white", markeredgecolor=colour, markeredgewidth=1.4)
-        axes.text(lon, lat, label[0], color=colour, fontsize=7, fontweight="bold", ha="center", va="center")
+        axes.text(lon, lat, label, color=colour, fontsize=7, fontweight="bold", ha="center", va="center")
     axes.set(xticks=range(-180, 181, 60), yticks=range(-90, 91, 30), ylabel="latitude (degrees)")
     axes.set_xlabel("longitude (degrees)", labelpad=1)
     brush = f"brush up to {judgement.stroke_deg:.0f} degrees, borders {judgement.border:.0f} radii long"
     axes.set_title(f"{title}: {brush}", fontsize=8)
 
 
-def _named_views(judgement: Judgement) -> list[tuple[str, Tensor, str]]:
-    at = judgement.direction_body
-    return [
-        ("W worst view", at[judgement.worst], WORST),
-        ("B best view", at[judgement.best], BEST),
-        ("1 most alike", -judgement.alike_views[0, 2], ALIKE),
-        ("2 most alike", -judgement.alike_views[1, 2], ALIKE),
-    ]
-
-
 def _views_part(part: Any, texture: Tensor, judgement: Judgement) -> None:
     size = SIDE_PX
     texture, view = reduced_texture(texture, size), orthographic_view(size)
-    worst = judgement.bound_rad.argsort(descending=True)[:3]
-    at = judgement.direction_body
-    shown = [(("W", "", "")[n], facing(at[k]), judgement.bound_rad[k], WORST) for n, k in enumerate(worst.tolist())]
-    shown.append(("B", facing(at[judgement.best]), judgement.bound_rad[judgement.best], BEST))
-    drawn = [(f"{name + ': ' if name else ''}{_degrees(float(bound))}", R, colour) for name, R, bound, colour in shown]
+    shown = [*judgement.bound_rad.argsort(descending=True)[:3].tolist(), judgement.best]
+    drawn = []
+    for k, name, colour in zip(shown, ("W: ", "", "", "B: "), (WORST, WORST, WORST, BEST), strict=True):
+        angle = math.degrees(float(judgement.bound_rad[k]))
+        text = f"{angle:.3f}°" if math.isfinite(angle) else "open"
+        drawn.append((name + text, facing(judgement.direction_body[k]), colour))
     drawn += [(f"{n + 1}: alike {judgement.alike:.2f}", R, ALIKE) for n, R in enumerate(judgement.alike_views)]
     for axes, (text, R, colour) in zip(part.subplots(1, len(drawn)), drawn, strict=True):
         axes.imshow(
@@ -286,10 +283,6 @@ def _views_part(part: Any, texture: Tensor, judgement: Judgement) -> None:
         axes.add_patch(circle)
         axes.set_axis_off()
         axes.set_title(text, fontsize=7, color=colour)
-
-
-def _degrees(angle_rad: float) -> str:
-    return f"{math.degrees(angle_rad):.3f}°" if math.isfinite(angle_rad) else "open"
 
 
 def _information_part(axes: Axes, judgement: Judgement) -> None:
@@ -307,11 +300,3 @@ def _information_part(axes: Axes, judgement: Judgement) -> None:
     axes.set_title(text, fontsize=7.5)
     bar = axes.figure.colorbar(dots, ax=axes, pad=0.02)
     bar.set_label("degrees", fontsize=7)
-
-
-def _balance_part(axes: Axes, judgement: Judgement) -> None:
-    white = 100 * judgement.white.numpy()
-    axes.hist(white, bins=list(range(0, 105, 5)), color=SHADE, edgecolor=GREY, linewidth=0.5)
-    axes.axvline(float(np.median(white)), color="black", linewidth=1, linestyle="--")
-    axes.set(xlim=(0, 100), xlabel="white in a view (%)", ylabel="views")
-    axes.set_title(f"balance: {white.min():.0f} to {white.max():.0f} %", fontsize=7.5)

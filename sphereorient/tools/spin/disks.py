@@ -52,8 +52,14 @@ class BallOutline:
 def find_disk(picture: Photograph, name: str = "photograph") -> BallOutline:
     """Find the ball, whole or cut, in a photograph (H, W) or (H, W, 3) with a free corner; else raise PaintError."""
     levels = _channels(picture, name)
-    difference = np.asarray(cv2.medianBlur(_unlike_corners(levels), SPECK), np.float32)
-    inside = difference > _otsu(difference)
+    # Each pixel's distance from the corners' median colour; the ball may fill a corner.
+    side = max(2, round(CORNER * min(levels.shape[:2])))
+    ends = (slice(None, side), slice(-side, None))
+    corners = [levels[rows, columns].reshape(-1, levels.shape[2]).mean(0) for rows in ends for columns in ends]
+    away = np.linalg.norm(levels - np.median(corners, axis=0), axis=-1).astype(np.float32)
+    difference = np.asarray(cv2.medianBlur(away, SPECK), np.float32)
+    scale = 255 / max(float(difference.max()), 1e-6)
+    inside = difference > cv2.threshold((difference * scale).astype(np.uint8), 0, 255, cv2.THRESH_OTSU)[0] / scale
     if not inside.any():
         raise _nothing(name, "nothing that stands out")
     fine = np.asarray(cv2.resize(difference, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR), np.float32)
@@ -116,22 +122,6 @@ def _channels(picture: Photograph, name: str) -> NDArray[np.float32]:
         raise PaintError(refusal(name, expected=expected, got=str(picture.shape), do=do))
     levels = picture.astype(np.float32)
     return levels[..., None] if picture.ndim == 2 else levels
-
-
-def _unlike_corners(levels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return each pixel's distance from the corners' median colour, (H, W); the ball may fill a corner."""
-    side = max(2, round(CORNER * min(levels.shape[:2])))
-    ends = (slice(None, side), slice(-side, None))
-    corners = [levels[rows, columns] for rows in ends for columns in ends]
-    behind = np.median([corner.reshape(-1, levels.shape[2]).mean(0) for corner in corners], axis=0)
-    away: NDArray[np.float32] = np.linalg.norm(levels - behind, axis=-1).astype(np.float32)
-    return away
-
-
-def _otsu(values: NDArray[np.float32]) -> float:
-    top = max(float(values.max()), 1e-6)
-    threshold, _ = cv2.threshold((values * (255 / top)).astype(np.uint8), 0, 255, cv2.THRESH_OTSU)
-    return float(threshold) * top / 255
 
 
 def _outlined(fine: NDArray[np.float32], level: float) -> tuple[float, float, float, float]:

@@ -77,21 +77,17 @@ class DotTable:
         used = (facing.gather(1, nearest) > LIMB) & (away < math.radians(REACH * guess_deg))
         bins = (away[used] / BIN_RAD).long()
         profile = torch.bincount(bins, even[used]) / torch.bincount(bins).clamp_min(1)
-        return replace(self, radius_deg=_half_width_deg(profile, guess_deg))
-
-
-def _half_width_deg(profile: Tensor, guess_deg: float) -> float:
-    outer = profile[round(2 * guess_deg) :]
-    around = float(outer.median()) if len(outer) else math.nan
-    middle = float(profile[0]) if len(profile) else math.nan
-    half = 0.5 * (middle + around)
-    above = torch.nonzero(profile > half)[:, 0]
-    if not around > middle or not len(above) or int(above[0]) == 0:
-        do = "check that the attitudes and the table belong to the pictures"
-        raise PaintError(refusal("dots", expected="dark dots where the table has them", got="none", do=do))
-    k = int(above[0])
-    low, high = float(profile[k - 1]), float(profile[k])
-    return math.degrees(BIN_RAD) * (k - 0.5 + (half - low) / (high - low))
+        outer = profile[round(2 * guess_deg) :]
+        around = float(outer.median()) if len(outer) else math.nan
+        middle = float(profile[0]) if len(profile) else math.nan
+        half = 0.5 * (middle + around)
+        above = torch.nonzero(profile > half)[:, 0]
+        if not around > middle or not len(above) or int(above[0]) == 0:
+            do = "check that the attitudes and the table belong to the pictures"
+            raise PaintError(refusal("dots", expected="dark dots where the table has them", got="none", do=do))
+        k = int(above[0])
+        low, high = float(profile[k - 1]), float(profile[k])
+        return replace(self, radius_deg=math.degrees(BIN_RAD) * (k - 0.5 + (half - low) / (high - low)))
 
 
 class DotSearch:

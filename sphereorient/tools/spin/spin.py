@@ -89,7 +89,14 @@ def spin_of(
     _, reflected = _searched(disks, time_s, mirrored, settings, progress, "mirror image")
     spins = fit_spins(seen, settings.omega_max_rad_s)
     mirrored_evidence = _greatest(fit_spins(reflected, settings.omega_max_rad_s))
-    _check_explained(_greatest(spins), mirrored_evidence)
+    best = _greatest(spins)
+    got = f"evidence {best:.0f}, and {mirrored_evidence:.0f} for its mirror image"
+    if mirrored_evidence > best + AS_EVIDENT:
+        do = "flip the map left to right, or change the sign of one column of the table"
+        raise PaintError(refusal("texture", expected="that of the ball, not of its mirror image", got=got, do=do))
+    if mirrored_evidence > best - AS_EVIDENT:
+        do = "check that texture, times and pictures belong together and that the ball spins uniformly, or add pictures"
+        raise PaintError(refusal("spin", expected="one that explains more than chance", got=got, do=do))
     drawn = texture.texture() if isinstance(texture, DotTable) else texture
     view = orthographic_view(settings.search.size_px)
     level = detail_level(view, texture_table(drawn.float(), FINEST), FINEST, every=1)
@@ -147,17 +154,6 @@ def _refined(level: DetailLevel, disks: Tensor, R_view_body: Tensor, steps: int)
     ]
     R = torch.cat([R for R, _ in each]).double()
     return so3.nearest_rotation(R), torch.cat([score for _, score in each]).double()
-
-
-def _check_explained(best: float, mirror: float) -> None:
-    """Refuse a spin no better than chance, which the mirrored texture shows."""
-    got = f"evidence {best:.0f}, and {mirror:.0f} for its mirror image"
-    if mirror > best + AS_EVIDENT:
-        do = "flip the map left to right, or change the sign of one column of the table"
-        raise PaintError(refusal("texture", expected="that of the ball, not of its mirror image", got=got, do=do))
-    if mirror > best - AS_EVIDENT:
-        do = "check that texture, times and pictures belong together and that the ball spins uniformly, or add pictures"
-        raise PaintError(refusal("spin", expected="one that explains more than chance", got=got, do=do))
 
 
 @in_style

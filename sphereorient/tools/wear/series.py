@@ -123,8 +123,11 @@ def _wear(texture: Tensor, first: Tensor, turned: bool) -> Wear:
     known = torch.isfinite(off)
     # The median ignores worn places and borders of displaced ones.
     scatter = 1.4826 * float(off[known].median()) if known.any() else math.nan
-    worn = _large_enough(change.abs() > max(CHANGED, BEYOND * scatter))  # an unknown texel is not
-    return Wear(comparison=without_changed(comparison, change, CHANGED), change=change, scatter=scatter, worn=worn)
+    number = _places(change.abs() > max(CHANGED, BEYOND * scatter))  # an unknown texel is in no place
+    large = _sizes(number) >= 0.5 * (1 - math.cos(math.radians(LEAST_DEG)))  # area of a cap over that of the sphere
+    large[0] = False
+    comparison = without_changed(comparison, change, CHANGED)
+    return Wear(comparison=comparison, change=change, scatter=scatter, worn=large[number])
 
 
 def _figures(now: Wear, before: Wear | None) -> WearFigures:
@@ -156,14 +159,6 @@ def _place(inside: Tensor, wear: Sequence[Wear]) -> WornPlace:
         latitude_deg=math.degrees(math.atan2(z, math.hypot(x, y))),
         share=tuple(shares),
     )
-
-
-def _large_enough(worn: Tensor) -> Tensor:
-    number = _places(worn)
-    kept = _sizes(number) >= 0.5 * (1 - math.cos(math.radians(LEAST_DEG)))  # area of a cap over that of the sphere
-    kept[0] = False
-    found: Tensor = kept[number]
-    return found
 
 
 def _places(worn: Tensor) -> Tensor:
