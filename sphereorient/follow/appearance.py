@@ -9,10 +9,11 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
+from sphereorient.calibration.consistency import Limits, Seen, compare_cameras
 from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses, best_poses
+from sphereorient.follow.poses import Poses, best_poses, pose_table
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
@@ -33,6 +34,8 @@ ENOUGH = 1400  # pixels of each disk that are used: more of them changed nothing
 WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
 ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the texture locates the sphere
 
+GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may differ, in any light
+TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
 FINER = 1.25  # ratio of the blurs that are tried, from FINEST_PX on
 WIDEST = 0.3  # of the radius: wider ones remove all paint
 LIGHT_ROUNDS, SOFT_ROUNDS = 2, 4
@@ -82,6 +85,7 @@ def estimate_appearance(
         alone = [replace(first, fitter=fitter.of(k)) for k in range(len(fitter.views))]
         each = [one.all_poses([[frame[k]] for frame in frames]) for k, one in enumerate(alone)]
         looked = [poses for of_camera in each for poses in of_camera]
+        _check_cameras(fitter, each)
         seen = [(frame, camera) for camera, of_camera in enumerate(each) for frame in _clear(of_camera)]
         X, R, _ = best_poses([each[camera][frame] for frame, camera in seen])
         use = torch.nn.functional.one_hot(torch.tensor([camera for _, camera in seen]), len(each)).bool()
@@ -112,6 +116,38 @@ def estimate_appearance(
     return Appearance(
         fitter=fitter, score_min=score_min, right_score=right, usual_apart_rad=apart_rad, together=together
     )
+
+
+def limits_of(seen: Seen, covariance_rad2: Tensor) -> Limits:
+    """Return how far apart cameras that agree may be; covariance (N, C, 3, 3) of each camera's rotation."""
+    sigma_deg = math.degrees(float(covariance_rad2.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().nanmedian()))
+    return Limits(
+        gap_px=GAP_PX,
+        turn_deg=max(TURN_DEG, math.sqrt(2) * TURN_SIGMAS * sigma_deg if math.isfinite(sigma_deg) else 0.0),
+        size=max(SIZE, EDGE_PX / float(seen.radius_px.nanmedian())),
+    )
+
+
+def _check_cameras(fitter: Fitter, alone: Sequence[Sequence[Poses]]) -> None:
+    """Raise ExperimentError if the cameras contradict each other in a way that nothing can be measured."""
+    parts = []
+    for view, of_camera in zip(fitter.views, alone, strict=True):
+        clear = torch.tensor([0 if k in _clear(of_camera) else -1 for k in range(len(of_camera))])
+        best = pose_table([of_camera], 1).rows(clear)
+        X, R = best["position_lab_mm"], best["R_lab_body"]
+        parts.append((view.camera.project(X), view.radius_px(X, fitter.radius_mm), R, best["covariance"][:, :3, :3]))
+    centre_px, radius_px, R, covariance = (torch.stack(part, 1) for part in zip(*parts, strict=True))
+    seen = Seen(
+        cameras={view.name: view.camera for view in fitter.views},
+        centre_px=centre_px,
+        radius_px=radius_px,
+        R_lab_body=R,
+        diameter_mm=2 * fitter.radius_mm,
+    )
+    found = compare_cameras(seen, limits_of(seen, covariance))
+    if found.deadly:
+        expected = "cameras that agree"
+        raise ExperimentError(refusal("movies", expected=expected, got=str(found), do=found.advice))
 
 
 def _usual_apart(fit: FittedPoses, use: Tensor) -> float:

@@ -11,16 +11,20 @@ from torch import Tensor
 
 from sphereorient.assemble import Chosen, Fused, Path
 from sphereorient.calibration import systematic_errors
+from sphereorient.calibration.consistency import Consistency, Seen, compare_cameras, gaps_between
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.experiment import Experiment
 from sphereorient.follow import Appearance
+from sphereorient.follow.appearance import limits_of
 from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of
 from sphereorient.search import Candidates
-from sphereorient.so3 import exp, geodesic_distance
+from sphereorient.so3 import exp, geodesic_distance, log, solve_damped
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
+
+CONTRADICTS_SIGMAS = 5.0  # of the difference of what two cameras say alone: no noise
 
 
 def paper_camera(sightings: Sightings, candidates: Candidates, path: Path) -> CameraTrack:
@@ -206,3 +210,48 @@ def with_systematic_errors(
             left = systematic_errors({name: cameras[name] for name in some}, covariance, position[rows], radius_mm)
             place[rows], turn[rows] = left.position_mm2, left.orientation_rad2
     return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())
+
+
+def with_contradictions(
+    track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool
+) -> tuple[Trajectory, Consistency]:
+    """Mark frames in which two cameras contradict each other, and add the contradiction to the stated covariances.
+    Return also how well the cameras agree in the whole movie.
+    """
+    seen = Seen(
+        cameras=cameras,
+        centre_px=_of_cameras(track, "centre_px"),
+        radius_px=_of_cameras(track, "radius_px"),
+        R_lab_body=_of_cameras(track, "orientation"),
+        diameter_mm=diameter_mm,
+        consecutive=consecutive,
+    )
+    covariance = _of_cameras(track, "orientation_cov").nan_to_num()
+    limits = limits_of(seen, covariance)
+    believed = np.array([[why == Reason.OK for why in camera.reason] for camera in track.cameras.values()])
+    wrong = np.any([[why == Reason.CONTRADICTS for why in camera.reason] for camera in track.cameras.values()], axis=0)
+    place_cov, turn_cov = torch.from_numpy(track.position_cov).clone(), torch.from_numpy(track.orientation_cov).clone()
+    for k, m in combinations(range(len(cameras)), 2):
+        # The mean of two is off by half of the contradiction if either is wrong, a single one by all of it.
+        share = torch.from_numpy(np.where(believed[k] & believed[m], 0.5, 1.0))[:, None]
+        turn = log(seen.R_lab_body[:, k] @ seen.R_lab_body[:, m].mT).nan_to_num()
+        spread = covariance[:, k] + covariance[:, m]
+        turned = (turn * solve_damped(spread, turn)).sum(-1) > CONTRADICTS_SIGMAS**2
+        gaps = gaps_between([list(cameras.values())[c] for c in (k, m)], [seen.centre_px[:, c] for c in (k, m)])
+        across, gap_mm = gaps.across_lab.nan_to_num(), gaps.signed_mm.nan_to_num()
+        # Two lines of sight that are known equally well are apart by twice the deviation of their middle.
+        usual_mm = 2 * (across[:, None] @ place_cov.nan_to_num() @ across[..., None])[:, 0, 0].sqrt()
+        apart = gap_mm.abs() > CONTRADICTS_SIGMAS * usual_mm
+        wrong |= (turned | (gaps.signed_px.abs() > limits.gap_px)).numpy()
+        for whole, off in ((turn_cov, turned[:, None] * turn), (place_cov, (apart * gap_mm)[:, None] * across)):
+            whole += (share * off)[:, :, None] * (share * off)[:, None]
+    flags = track.flags | np.where(wrong & track.valid, np.uint32(Flag.CONTRADICTION), np.uint32(0))
+    marked = replace(track, flags=flags, orientation_cov=turn_cov.numpy(), position_cov=place_cov.numpy())
+    return marked, compare_cameras(seen, limits)
+
+
+def _of_cameras(track: Trajectory, name: str) -> Tensor:
+    """Return a dataset of all cameras, (N, C, ...); NaN where a camera has no orientation."""
+    whole = np.stack([getattr(camera, name) for camera in track.cameras.values()], 1)
+    whole[np.isnan([camera.orientation[:, 0, 0] for camera in track.cameras.values()]).T] = np.nan
+    return torch.from_numpy(whole)

@@ -188,9 +188,15 @@ def finished(track: Trajectory, job: Job, request: Request) -> Trajectory:
     track = results.with_systematic_errors(
         track, recording.cameras, recording.covariance, recording.experiment.radius_mm
     )
+    remarks = list(recording.remarks)
+    if len(recording.cameras) > 1:
+        diameter_mm, even = 2 * recording.experiment.radius_mm, recording.timeline.even
+        track, found = results.with_contradictions(track, recording.cameras, diameter_mm, even)
+        if found.contradicts:
+            remarks.append(f"the cameras contradict each other ({found}): {found.advice}")
     inputs = input_files(recording.experiment, list(recording.cameras))
     origin = provenance(inputs, recording.experiment.folder, request.command)
-    origin["remarks"] = list(recording.remarks)
+    origin["remarks"] = remarks
     if settings.propose.checkpoint is not None:
         origin["proposer_sha256"] = sha256(checkpoint_path(settings.propose.checkpoint))
     return replace(track, method=request.method, settings=settings_yaml(settings), provenance=origin)

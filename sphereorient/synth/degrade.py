@@ -221,10 +221,10 @@ OPERATIONS: Mapping[str, Operation] = MappingProxyType(
 
 
 def lost_frames(like: Tensor, share: float, rng: torch.Generator) -> Tensor:
-    """Draw the lost frames, (..., N) bool, for a tensor (..., N): round(share N) per row."""
+    """Draw the lost frames, (..., N) bool, for a tensor (..., N): round(share N) per row, one at least."""
     count = like.shape[-1]
     draw = torch.rand(like.shape, generator=rng, dtype=torch.float64, device=rng.device).to(like.device)
-    return draw.argsort(-1).argsort(-1) < round(share * count)
+    return draw.argsort(-1).argsort(-1) < max(round(share * count), share > 0)
 
 
 def centre_error(disk: Disk, error_px: float, rng: torch.Generator) -> Disk:

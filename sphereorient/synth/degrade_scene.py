@@ -173,10 +173,11 @@ def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -
     return centre_px, (rim_px - centre_px[..., None, :]).norm(dim=-1).mean(-1)
 
 
-def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float]) -> Mapping[str, Camera]:
+def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float], seed: int = 0) -> Mapping[str, Camera]:
     """Return cameras whose principal points are off in opposite directions, along the diagonal.
 
-    The second is also rotated about the lab origin, whose pixel stays, and shifted along its own x.
+    One is also rotated about the lab origin, whose pixel stays, and shifted along its own x: the second with an even
+    seed, the first with an odd one.
     """
     off_px, degrees, shift_mm = (values.get(key, 0.0) for key in ("centre_error", "camera_rotation", "camera_shift"))
     if not (off_px or degrees or shift_mm):
@@ -185,8 +186,9 @@ def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float]) ->
     for k, (name, camera) in enumerate(cameras.items()):
         assert isinstance(camera, TsaiCamera)
         wrong[name] = replace(camera, centre_px=camera.centre_px + (1 - 2 * k) * off_px / math.sqrt(2))
-    second = wrong[name]
+    name = list(cameras)[1 - seed % 2]
+    moved = wrong[name]
     turn = so3.exp(torch.full((3,), math.radians(degrees) / math.sqrt(3), dtype=torch.float64))
     right = torch.tensor([shift_mm, 0.0, 0.0], dtype=torch.float64)
-    wrong[name] = replace(second, R_cam_lab=turn @ second.R_cam_lab, T_cam_lab_mm=second.T_cam_lab_mm + right)
+    wrong[name] = replace(moved, R_cam_lab=turn @ moved.R_cam_lab, T_cam_lab_mm=moved.T_cam_lab_mm + right)
     return wrong

@@ -133,12 +133,12 @@ _ROWS: tuple[tuple[tuple[str, Place, float | None, str, Values], str, str], ...]
     ),
     (
         ("camera_rotation", "reported", 0.0, "degrees", (0.05, 0.15, 0.5, 1.5, 5.0)),
-        "The second camera is reported rotated about the lab's origin, by equal parts of pan, tilt and roll.",
+        "One camera (even seeds: the second) is reported rotated about the lab's origin by equal pan, tilt and roll.",
         "0.05 is a fair calibration; at 5 the cameras disagree by more than the paper's grid step of 3",
     ),
     (
         ("camera_shift", "reported", 0.0, "mm", (0.05, 0.1, 0.3, 1.0, 3.0)),
-        "The second camera is reported shifted along its own x, which both cameras of the default scene see.",
+        "One camera (even seeds: the second) is reported shifted along its own x, which both cameras see.",
         "someone touched the tripod; at 3 lines of sight pass each other by a third of a radius",
     ),
     (

@@ -96,7 +96,7 @@ def write_synthetic_experiment(
         empty = filming.picture(np.full(size, settings.background, np.float32), disk, name, None)
         write_picture(folder / f"empty_{name}.png", np.clip(np.rint(empty), 0, 255).astype(np.uint8))
     write_picture(folder / "texture.png", _as_file(filming.reported_texture(texture)))
-    reported = wrong_cameras(cameras, values)
+    reported = wrong_cameras(cameras, values, settings.seed)
     exact = "exact cameras" if reported is cameras else "cameras, wrong on purpose"
     save_cameras(folder / "cameras.yaml", reported, comment=f"{exact}; X_cam = R X_lab + T, mm")
     write_truth(folder / "truth.h5", motion_of(settings).at(frame_times_s(settings)), cameras)

@@ -13,6 +13,7 @@ class Flag(IntFlag):
     RECOVERED = 64
     SPIKE = 128
     EXTRAPOLATED = 256
+    CONTRADICTION = 512
 
 
 class Reason(StrEnum):

@@ -352,6 +352,7 @@ def test_as_many_frames_are_lost_as_said_others_in_each_movie():
     assert (lost.sum(-1) == 6).all()
     assert not torch.equal(lost[0], lost[1])
     assert not lost_frames(torch.empty(40), 0.0, seeded()).any()
+    assert int(lost_frames(torch.empty(24), 0.02, seeded()).sum()) == 1  # before: none
 
 
 def test_a_wrong_disk_is_wrong_by_what_is_said():

@@ -362,6 +362,17 @@ def test_told_principal_points_are_off_in_opposite_directions_and_lines_of_sight
     assert (miss_mm * 40 / 18).tolist() == pytest.approx([2 * math.sqrt(2)] * 10, rel=0.05)
 
 
+def test_an_odd_seed_turns_the_first_camera():
+    """Before: only the second, and the first is believed where they contradict each other."""
+    true = default_cameras(SETTINGS)
+    for seed, turned, kept in ((1, "cam1", "cam2"), (2, "cam2", "cam1")):
+        told = wrong_cameras(true, {"camera_rotation": 5.0}, seed)
+        assert math.degrees(float(so3.log(told[turned].R_cam_lab @ true[turned].R_cam_lab.mT).norm())) == pytest.approx(
+            5
+        )
+        assert torch.equal(told[kept].R_cam_lab, true[kept].R_cam_lab)
+
+
 @pytest.mark.slow
 def test_the_told_second_camera_is_turned_by_degrees_about_the_origin_and_moved_by_mm(plain, tmp_path):
     path = write_synthetic_experiment(tmp_path, SETTINGS, values={"camera_rotation": 1.5, "camera_shift": 0.3})

@@ -23,7 +23,7 @@ class BenchSettings(BaseModel, frozen=True, extra="forbid"):
         tuple(DEGRADATIONS), description="one at a time; names of docs/degradations.md"
     )
     levels: tuple[int, ...] = Field((1, 3, 5), description="severities, of 1 .. 5")
-    seeds: tuple[int, ...] = Field((0,), description="each gives another ball, motion and noise")
+    seeds: tuple[int, ...] = Field((0, 1, 2), description="each gives another ball, motion and noise")
     together: int = Field(1, ge=0, description="scenes by level and seed with several degradations at once")
     at_once: int = Field(3, ge=2, description="number of these degradations, drawn by the seed")
     frames: int = Field(24, ge=12, description="of each movie")

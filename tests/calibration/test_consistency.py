@@ -1,0 +1,162 @@
+"""Cameras that contradict each other: planted faults are found and named; cameras that agree are left in peace."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sphereorient import so3
+from sphereorient.calibration.consistency import Limits, Seen, compare_cameras, expected_radius_px
+from sphereorient.cameras import Camera, R_cam_view, TsaiCamera
+from sphereorient.synth import SynthSettings
+from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
+
+LIMITS = Limits(gap_px=1.0, turn_deg=0.75, size=0.01)
+MM = 18.0
+
+
+def seen_by(
+    cameras: dict[str, Camera], frames: int = 40, diameter_mm: float = MM, seed: int = 1, noise: float = 1.0
+) -> Seen:
+    """Return what cameras see of a moving sphere, with the noise of fits in unkind light."""
+    settings = SynthSettings(frames=frames, seed=seed)
+    motion = motion_of(settings).at(frame_times_s(settings))
+    rng = torch.Generator().manual_seed(seed)
+
+    def error(*shape: int) -> torch.Tensor:
+        return noise * torch.randn(*shape, generator=rng, dtype=torch.float64)
+
+    X, R = motion.position_lab_mm, motion.R_lab_body
+    pixels = [camera.project(X) + 0.1 * error(frames, 2) for camera in cameras.values()]
+    radii = [expected_radius_px(c, X, diameter_mm / 2) * (1 + 0.002 * error(frames)) for c in cameras.values()]
+    turns = [so3.exp(math.radians(0.1) * error(frames, 3)) @ R for _ in cameras]
+    return Seen(
+        cameras=cameras,
+        centre_px=torch.stack(pixels, 1),
+        radius_px=torch.stack(radii, 1),
+        R_lab_body=torch.stack(turns, 1),
+        diameter_mm=MM,
+    )
+
+
+def reported(seen: Seen, cameras: dict[str, Camera]) -> Seen:
+    """Return the same pictures as fits with other cameras read them: the view of the sphere stays."""
+    R = torch.empty_like(seen.R_lab_body)
+    for k, (true, told) in enumerate(zip(seen.cameras.values(), cameras.values(), strict=True)):
+        view = [
+            c.R_cam_lab.mT @ R_cam_view(c.rays(seen.centre_px[:, k]).direction_lab @ c.R_cam_lab.mT)
+            for c in (true, told)
+        ]
+        R[:, k] = view[1] @ view[0].mT @ seen.R_lab_body[:, k]
+    return replace(seen, cameras=cameras, R_lab_body=R)
+
+
+def turned(camera: Camera, deg: float, axis: int) -> Camera:
+    """Turn a camera about its own centre."""
+    turn = so3.exp(math.radians(deg) * torch.eye(3, dtype=torch.float64)[axis])
+    assert isinstance(camera, TsaiCamera)
+    return replace(camera, R_cam_lab=turn @ camera.R_cam_lab, T_cam_lab_mm=turn @ camera.T_cam_lab_mm)
+
+
+CAMERAS = default_cameras(SynthSettings())
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("consecutive", [False, True])
+def test_cameras_that_agree_are_left_in_peace(seed, consecutive):
+    found = compare_cameras(replace(seen_by(CAMERAS, seed=seed), consecutive=consecutive), LIMITS)
+    assert not found.contradicts
+    assert found.gap_px < 0.3
+    assert found.turn_deg < 0.4
+
+
+def test_two_frames_are_not_judged():
+    found = compare_cameras(seen_by(CAMERAS, frames=2, diameter_mm=30.0), LIMITS)
+    assert (found.frames, found.contradicts) == (2, False)
+
+
+@pytest.mark.parametrize("percent", [-5, 2, 5])
+def test_a_wrong_diameter_is_named_with_the_right_one(percent):
+    """Before: 30 of 30 frames valid, 25 mm off, and no word."""
+    found = compare_cameras(seen_by(CAMERAS, diameter_mm=MM * (1 + percent / 100)), LIMITS)
+    assert found.contradicts
+    assert not found.deadly
+    assert found.advice.startswith(f"sphere.diameter 18 explains the pictures if it is {MM * (1 + percent / 100):.4g}")
+    assert found.gap_px < 0.3
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("name", ["cam1", "cam2"])
+@pytest.mark.parametrize("deg", [1.5, 5.0])
+def test_a_turned_camera_is_named(name, axis, deg):
+    """Before: 30 of 30 frames valid with 0.03 degrees stated, whichever camera was turned."""
+    found = compare_cameras(reported(seen_by(CAMERAS), CAMERAS | {name: turned(CAMERAS[name], deg, axis)}), LIMITS)
+    assert found.contradicts
+    assert f"{name} turned by {deg:.2g} degrees" in found.advice
+
+
+def test_a_moved_camera_is_named():
+    one = CAMERAS["cam2"]
+    assert isinstance(one, TsaiCamera)
+    moved = replace(one, T_cam_lab_mm=one.T_cam_lab_mm + torch.tensor([4.0, 0.0, 0.0]))
+    found = compare_cameras(reported(seen_by(CAMERAS), CAMERAS | {"cam2": moved}), LIMITS)
+    assert found.contradicts
+    assert "cam2 turned by 0.4" in found.advice  # 4 mm at 520 mm: this noise does not tell one from the other
+
+
+def test_swapped_movies_are_deadly():
+    """Before: 30 of 30 frames valid, 90 degrees off."""
+    seen = reported(seen_by(CAMERAS), dict(zip(CAMERAS, list(CAMERAS.values())[::-1], strict=True)))
+    found = compare_cameras(replace(seen, cameras=dict(zip(CAMERAS, seen.cameras.values(), strict=True))), LIMITS)
+    assert found.deadly
+    assert found.advice == "swap cam1 and cam2 in movies:"
+
+
+def test_a_movie_turned_by_half_a_turn_is_deadly():
+    seen = seen_by(CAMERAS)
+    centre, R = seen.centre_px.clone(), seen.R_lab_body.clone()
+    half = torch.tensor([-1.0, -1.0, 1.0]).double()
+    camera = CAMERAS["cam2"]
+    before = camera.R_cam_lab.mT @ R_cam_view(camera.rays(centre[:, 1]).direction_lab @ camera.R_cam_lab.mT)
+    centre[:, 1] = torch.tensor(camera.image_size).double() - 1 - centre[:, 1]
+    after = camera.R_cam_lab.mT @ R_cam_view(camera.rays(centre[:, 1]).direction_lab @ camera.R_cam_lab.mT)
+    R[:, 1] = after @ (half[:, None] * (before.mT @ R[:, 1]))
+    found = compare_cameras(replace(seen, centre_px=centre, R_lab_body=R), LIMITS)
+    assert found.deadly
+    assert found.advice == "write flip: {cam2: both}"
+
+
+@pytest.mark.parametrize("share", [-0.03, 0.03])
+def test_wide_pixels_are_named(share):
+    """Before: all frames valid, 0.5 degrees and 7.5 mm off, sigma 6 and 25 times too small."""
+    wide = {name: replace(c, sx=c.sx * (1 + share)) for name, c in CAMERAS.items() if isinstance(c, TsaiCamera)}
+    seen = seen_by(wide)  # type: ignore[arg-type]
+    seen = replace(seen, radius_px=seen.radius_px * (1 + share / 2) / (1 + share))  # of the circle about the ellipse
+    found = compare_cameras(reported(seen, CAMERAS), LIMITS)
+    assert found.contradicts
+    assert f"pixels of cam1 and cam2 {100 * share:+.1f} % wider" in found.advice
+
+
+@pytest.mark.parametrize("late", [-3, 1, 2, 7])
+def test_a_late_movie_is_named(late):
+    whole = seen_by(CAMERAS, frames=48, noise=0.2)
+    parts = {}
+    for name in ("centre_px", "radius_px", "R_lab_body"):
+        first, second = getattr(whole, name)[:, :1], getattr(whole, name)[:, 1:]
+        second = torch.roll(second, late, 0)
+        parts[name] = torch.cat([first, second], 1)[8:-8]
+    found = compare_cameras(replace(whole, **parts, consecutive=True), replace(LIMITS, turn_deg=0.2))
+    assert found.contradicts
+    assert f"the movie of cam2 {abs(late)} frames {'late' if late > 0 else 'early'}" in found.advice
+
+
+def test_a_camera_that_says_nothing_in_some_frames_does_not_matter():
+    seen = seen_by(CAMERAS, diameter_mm=1.05 * MM)
+    for name in ("centre_px", "radius_px", "R_lab_body"):
+        getattr(seen, name)[::2, 1] = torch.nan
+    found = compare_cameras(seen, LIMITS)
+    assert found.frames == 20
+    assert "18.9" in found.advice
