@@ -252,7 +252,7 @@ class _Comparison:
                 places = [*range(count)]
                 places[k], places[m] = m, k
                 left = _misfit(self(self.sights(places=places), sized=False)) / unsized
-                yield Cause(words=f"swap {names[k]} and {names[m]} in movies:", left=left, parameters=0, deadly=True)
+                yield Cause(words=f"swap {names[k]} and {names[m]} under movies:", left=left, parameters=0, deadly=True)
         for k, name in enumerate(names):
             left = _misfit(self(self._upside_down(k), sized=False)) / unsized
             yield Cause(words=f"write flip: {{{name}: both}}", left=left, parameters=0, deadly=True)

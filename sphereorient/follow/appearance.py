@@ -26,6 +26,7 @@ TRIED = 6  # frames
 APART_GAIN = 1.5  # cameras that leave this many times more unexplained together than alone are followed one by one
 APART_PX = 0.4  # a larger distance of lines of sight: estimate light from each camera alone
 FAR_APART_PX = 1.5  # and by more than this, no pose fits all cameras
+RIVALS = 0.1  # share of the frames with two claimants, two frames at least: there is a second ball
 FEWEST_BOTH = 4  # frames of two cameras from which their usual disagreement is measured
 TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees the sphere elsewhere than the other
 NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses by less than this
@@ -51,6 +52,7 @@ class Appearance:
     right_score: float  # typical of right poses
     usual_apart_rad: float = math.inf  # typical angle between the orientations that two cameras alone give
     together: bool = True  # whether the cameras see the sphere at one position
+    second_ball: bool = False  # whether another sphere with this texture is in view
 
     @property
     def clear_score(self) -> float:
@@ -112,9 +114,14 @@ def estimate_appearance(
     score_min = 0.5 * (right + min(highest, right))
     if defocus_radii(fitter.optics.blur_px, diameter_px):  # wrong poses explain nearly as much, and right ones scatter
         score_min = min(score_min, _clear_of(right))
-    apart_rad = _usual_apart(fit, use)
+    rivals = sum(first.claimants(shots) > 1 for shots in frames)
     return Appearance(
-        fitter=fitter, score_min=score_min, right_score=right, usual_apart_rad=apart_rad, together=together
+        fitter=fitter,
+        score_min=score_min,
+        right_score=right,
+        usual_apart_rad=_usual_apart(fit, use),
+        together=together,
+        second_ball=rivals >= max(2, RIVALS * len(frames)),
     )
 
 

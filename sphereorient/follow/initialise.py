@@ -1,9 +1,11 @@
 """The pose of a single frame without history: outlines, search over all rotations, fits from coarse to fine."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,7 +13,7 @@ from sphereorient import so3
 from sphereorient.cameras import R_cam_view
 from sphereorient.follow.poses import Poses, no_pose, poses_of
 from sphereorient.locate import Found, Frame, LocateSettings, Positions, find_ball, find_positions, sightings_of
-from sphereorient.locate.outline import Outline, find_blobs
+from sphereorient.locate.outline import Outline, find_blobs, fit_outline
 from sphereorient.pose.fitter import CameraView, Fitter, Picture
 from sphereorient.search.candidates import Proposer
 from sphereorient.search.normalisation import crop_disk
@@ -25,6 +27,7 @@ CLEARLY_LESS = 0.1  # of a picture's variance: a pose that explains so much less
 SURE_NLL = 20.0  # by so much less likely
 GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance see different things
 STEP, REACH = 0.2, 2  # of `relocalise`: step, radii, and steps to each side of the blob
+RIVAL_BLOB, RIVAL_SCORE = 0.3, 0.8  # of the best blob's merit, of the best score: could be the sphere as well
 LOOSE = 0.15  # of the radius: error of a position from `relocalise`
 
 
@@ -91,6 +94,28 @@ class Initialiser:
         best = int(torch.searchsorted(proposals.offset, int(proposals.score.argmax()), right=True)) - 1
         u, v = places[best]
         return Outline(u_px=u, v_px=v, radius_px=radius, rms_px=LOOSE * radius, coverage=0.0), Reason.OK
+
+    def claimants(self, shots: Sequence[Frame]) -> int:
+        """Return how many disks wear the texture map about equally well, in the camera that shows most of them."""
+        pairs = zip(self.fitter.views, shots, strict=True)
+        return max((self._claimants(shot.picture, view) for view, shot in pairs if shot.usable), default=0)
+
+    def _claimants(self, picture: Picture, view: CameraView) -> int:
+        difference, scene, settings = view.background.difference(picture), view.background, self.locating
+        blobs = find_blobs(difference, scene.noise, view.diameter_px, settings)
+        blobs = [blob for blob in blobs if blob.merit > RIVAL_BLOB * blobs[0].merit]
+        outlines: list[Outline] = []
+        for blob in blobs if len(blobs) > 1 else []:
+            one = fit_outline(difference, scene.typical_noise, blob, view.diameter_px, settings, scene.shown)
+            if one is not None and one.painted and one.coverage >= settings.coverage_min:
+                apart = (math.hypot(one.u_px - other.u_px, one.v_px - other.v_px) for other in outlines)
+                outlines += [one] if all(gap > one.radius_px for gap in apart) else []
+        if len(outlines) < 2:
+            return 1
+        proposer = self.proposers[view.name]
+        disks = [crop_disk(picture, one.u_px, one.v_px, one.radius_px, proposer.size_px) for one in outlines]
+        best = [float(own.score[:1].sum()) for own in proposer.propose(torch.from_numpy(np.stack(disks))).each()]
+        return sum(score > RIVAL_SCORE * max(best) for score in best)
 
     def _found(self, shots: Sequence[Frame], find: Callable[[Picture, CameraView], Found]) -> list[Found]:
         return [

@@ -27,6 +27,7 @@ from sphereorient.trajectory import Trajectory
 
 SCHEMA = "sphereorient-learnt/1"
 OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
+WHETHER = ("together", "second_ball")
 NUMBERS = ("blur_px", "widest_px", *OF_SCORES)
 
 
@@ -42,6 +43,7 @@ class Learnt:
     right_score: float
     usual_apart_rad: float
     together: bool
+    second_ball: bool = False
     process: ProcessNoise | None = None  # None: no track yet, or too short a one
     acceleration_rad_s2: float | None = None  # that the path was chosen with
 
@@ -60,7 +62,7 @@ class Learnt:
             light=fitter.light,
             blur_px=fitter.optics.blur_px,
             widest_px=fitter.widest_px,
-            **{name: getattr(study, name) for name in (*OF_SCORES, "together")},
+            **{name: getattr(study, name) for name in (*OF_SCORES, *WHETHER)},
             process=process,
             acceleration_rad_s2=acceleration_rad_s2 if told else None,
         )
@@ -84,7 +86,7 @@ class Learnt:
             light=self.light,
             widest_px=self.widest_px,
         )
-        return Appearance(fitter=fitter, **{name: getattr(self, name) for name in (*OF_SCORES, "together")})
+        return Appearance(fitter=fitter, **{name: getattr(self, name) for name in (*OF_SCORES, *WHETHER)})
 
     def save(self, path: Path) -> None:
         """Write everything as HDF5, atomically; raise OutputError if the file cannot be written."""
@@ -142,7 +144,8 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
     file.attrs["schema"] = SCHEMA
     for name in NUMBERS:
         file.attrs[name] = getattr(learnt, name)
-    file.attrs["together"] = learnt.together
+    for name in WHETHER:
+        file.attrs[name] = getattr(learnt, name)
     if learnt.acceleration_rad_s2 is not None:
         file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
     file.attrs["cameras"] = list(learnt.scenes)
@@ -183,6 +186,7 @@ def _read(file: h5py.File) -> Learnt:
         scenes=scenes,
         light=Light(known=bool(light.attrs["known"]), **parts),
         together=bool(file.attrs["together"]),
+        second_ball=bool(file.attrs.get("second_ball", False)),
         process=_process(file["process"]) if "process" in file else None,
         acceleration_rad_s2=None if acceleration is None else float(acceleration),
         **{name: float(file.attrs[name]) for name in NUMBERS},

@@ -24,6 +24,10 @@ from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance, log, solve_damped
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
+TWO_BALLS = (
+    "two balls wear this texture map: it is not certain which one is tracked, and frames are marked as ambiguous; "
+    "hide one by `masks:`"
+)
 CONTRADICTS_SIGMAS = 5.0  # of the difference of what two cameras say alone: no noise
 
 
@@ -112,6 +116,7 @@ def precise_track(
     margin, angle = _margin(table, chosen.choice)
     flags = chosen.flags | _fit_flags(table, chosen, picked, learnt)
     flags |= torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
+    remarks = [TWO_BALLS] if learnt.second_ball else []
     return replace(
         empty,
         valid=(chosen.choice >= 0).numpy(),
@@ -122,6 +127,7 @@ def precise_track(
         **datasets_of(smoothed),
         segment=chosen.segment.numpy(),
         flags=flags.numpy().astype(np.uint32),
+        provenance={"remarks": remarks},
         confidence=chosen.probability.numpy(),
         margin=margin.numpy(),
         margin_angle=angle.numpy(),
@@ -192,7 +198,12 @@ def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], l
     poor = 0.5 * (learnt.score_min + learnt.right_score)
     best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
     doubtful = found & (best < poor)
-    return torch.where(one, int(Flag.ONE_CAMERA), 0) | torch.where(doubtful, int(Flag.DOUBTFUL_FIT), 0)
+    ambiguous = found & learnt.second_ball
+    return (
+        torch.where(one, int(Flag.ONE_CAMERA), 0)
+        | torch.where(doubtful, int(Flag.DOUBTFUL_FIT), 0)
+        | (torch.where(ambiguous, int(Flag.AMBIGUOUS), 0))
+    )
 
 
 def with_systematic_errors(
@@ -233,18 +244,24 @@ def with_contradictions(
     place_cov, turn_cov = torch.from_numpy(track.position_cov).clone(), torch.from_numpy(track.orientation_cov).clone()
     for k, m in combinations(range(len(cameras)), 2):
         # The mean of two is off by half of the contradiction if either is wrong, a single one by all of it.
-        share = torch.from_numpy(np.where(believed[k] & believed[m], 0.5, 1.0))[:, None]
+        both = torch.from_numpy(believed[k] & believed[m])[:, None]
         turn = log(seen.R_lab_body[:, k] @ seen.R_lab_body[:, m].mT).nan_to_num()
         spread = covariance[:, k] + covariance[:, m]
         turned = (turn * solve_damped(spread, turn)).sum(-1) > CONTRADICTS_SIGMAS**2
         gaps = gaps_between([list(cameras.values())[c] for c in (k, m)], [seen.centre_px[:, c] for c in (k, m)])
         across, gap_mm = gaps.across_lab.nan_to_num(), gaps.signed_mm.nan_to_num()
+        shift_mm = (gaps.position_lab_mm - torch.from_numpy(track.position)).nan_to_num()
         # Two lines of sight that are known equally well are apart by twice the deviation of their middle.
         usual_mm = 2 * (across[:, None] @ place_cov.nan_to_num() @ across[..., None])[:, 0, 0].sqrt()
         apart = gap_mm.abs() > CONTRADICTS_SIGMAS * usual_mm
         wrong |= (turned | (gaps.signed_px.abs() > limits.gap_px)).numpy()
-        for whole, off in ((turn_cov, turned[:, None] * turn), (place_cov, (apart * gap_mm)[:, None] * across)):
-            whole += (share * off)[:, :, None] * (share * off)[:, None]
+        turn = torch.where(both, 0.5, 1.0) * turned[:, None] * turn
+        for whole, off in (
+            (turn_cov, turn),
+            (place_cov, (0.5 * apart * gap_mm)[:, None] * across),
+            (place_cov, torch.where(both, 0.0, shift_mm)),
+        ):
+            whole += off[:, :, None] * off[:, None]
     flags = track.flags | np.where(wrong & track.valid, np.uint32(Flag.CONTRADICTION), np.uint32(0))
     marked = replace(track, flags=flags, orientation_cov=turn_cov.numpy(), position_cov=place_cov.numpy())
     return marked, compare_cameras(seen, limits)

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sphereorient.cameras import Camera, triangulate
+from sphereorient.calibration.consistency import Gaps, gaps_between
+from sphereorient.cameras import Camera
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
 from sphereorient.preflight.sample import MovieSample, pair_starts
 from sphereorient.sphere.renderer import rim_directions
@@ -30,38 +31,6 @@ CLEARLY = 2.0  # an offset is reported as a fault if it reduces the gap by this 
 IN_STEP = 0.25  # frames; a larger part of a frame is a warning
 FEW = 8  # frames with a ball in both cameras
 SEE_BALL = "see the finding on the ball"
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Gaps:
-    """Distances between the lines of sight to n points; made by `gaps_between`."""
-
-    signed_mm: Tensor  # (n,), along the common perpendicular; NaN where a point is missing
-    per_mm_px: Tensor  # (n,), px of the first camera for a millimetre along it
-    position_lab_mm: Tensor  # (n, 3), the middle of the shortest segment
-    across_lab: Tensor  # (n, 3), unit, the common perpendicular
-
-    @property
-    def signed_px(self) -> Tensor:
-        """The gaps in px of the first camera, (n,): the epipolar residual."""
-        return self.signed_mm * self.per_mm_px
-
-
-def gaps_between(cameras: Sequence[Camera], centre_px: Sequence[Tensor]) -> Gaps:
-    """Return the gaps (common perpendiculars) of two cameras' lines of sight to centres (n, 2), px; NaN: no ball."""
-    a, b = (camera.rays(uv) for camera, uv in zip(cameras, centre_px, strict=True))
-    position, _ = triangulate(a, b)
-    across = torch.linalg.cross(a.direction_lab, b.direction_lab)
-    across = across / across.norm(dim=-1, keepdim=True)
-    signed = ((b.origin_lab_mm - a.origin_lab_mm) * across).sum(-1)
-    half = 0.5 * across
-    seen = cameras[0].project(torch.cat([position - half, position + half])).chunk(2)
-    return Gaps(
-        signed_mm=torch.where(torch.isfinite(position).all(-1), signed, torch.nan),
-        per_mm_px=(seen[1] - seen[0]).norm(dim=-1),
-        position_lab_mm=position,
-        across_lab=across,
-    )
 
 
 def sample_gaps(samples: Sequence[MovieSample]) -> Gaps:

@@ -22,6 +22,7 @@ FLAG_WORDS = {
     Flag.RECOVERED: "found again after a loss",
     Flag.SPIKE: "the orientation jumps",
     Flag.EXTRAPOLATED: "not measured; the smoother's value",
+    Flag.CONTRADICTION: "the cameras contradict each other",
 }
 REASON_WORDS: dict[str, str] = {
     Reason.OK: "measured",

@@ -112,7 +112,7 @@ def test_swapped_movies_are_deadly():
     seen = reported(seen_by(CAMERAS), dict(zip(CAMERAS, list(CAMERAS.values())[::-1], strict=True)))
     found = compare_cameras(replace(seen, cameras=dict(zip(CAMERAS, seen.cameras.values(), strict=True))), LIMITS)
     assert found.deadly
-    assert found.advice == "swap cam1 and cam2 in movies:"
+    assert found.advice == "swap cam1 and cam2 under movies:"
 
 
 def test_a_movie_turned_by_half_a_turn_is_deadly():

@@ -14,6 +14,7 @@ from conftest import assert_close
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sphereorient.calibration.consistency import gaps_between
 from sphereorient.cameras import PinholeCamera, Port, PortCamera, triangulate
 from sphereorient.cameras.ideal import TelecentricCamera
 from sphereorient.experiment.stream import pictures_of
@@ -24,7 +25,6 @@ from sphereorient.preflight.cameras import (
     REACH,
     OffsetScan,
     expected_outline_px,
-    gaps_between,
     scan_offsets,
     starts_in_step,
 )

@@ -119,9 +119,11 @@ def test_the_smoother_recovers_a_quiet_ensemble_and_warns_of_a_loud_one():
     true = draw_ensemble(EnsembleSpec(segments=30, mean_frames=100), 10)
     clean = ensemble_of(true)
     quiet, loud = (ensemble_of(smoothed_track(true, deg, 0.05, 11)[0]) for deg in (0.1, 2.0))
+    same = np.isin(clean.time_s.round(7), quiet.time_s.round(7))  # the ends of segments do not count after smoothing
+    assert same.sum() == len(quiet)
     for name in clean.values:
         found = moments(quiet, name, FEW)
-        np.testing.assert_allclose(found.corrected_rms.value[:3], clean.values[name].std(0), rtol=0.03)
+        np.testing.assert_allclose(found.corrected_rms.value[:3], clean.values[name][same].std(0), rtol=0.01)
         assert not found.noisy
     found = moments(loud, "alpha_lab", FEW)
     assert found.noisy
