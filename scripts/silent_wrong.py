@@ -43,6 +43,7 @@ from sphereorient.trajectory import Flag, Trajectory
 Floats = NDArray[np.float64]
 Grey = NDArray[Any]
 Cameras = dict[str, Camera]
+LEAD_S, FINE = 0.1, 48  # s of motion before the first and after the last frame; poses a frame
 WRONG_DEG, WRONG_SIGMAS = 1.0, 5.0
 MARKS = Flag.AMBIGUOUS | Flag.DOUBTFUL_FIT | Flag.CONTRADICTION
 SIZE = (330, 330)  # px of the pictures, unless a case says otherwise
@@ -329,7 +330,7 @@ def passing(mm: float) -> Callable[[Motion6D], Motion6D]:
     """The ball crosses the field along x."""
 
     def change(motion: Motion6D) -> Motion6D:
-        along = (motion.time_s / motion.time_s.max() * 2 - 1) * mm
+        along = (motion.time_s - motion.time_s.max() / 2) * (600 / 15) * mm  # 30 frames from -mm to mm
         position = motion.position_lab_mm.clone()
         position[:, 0] += along
         return replace(motion, position_lab_mm=position)
@@ -432,13 +433,12 @@ def film(folder: Path, case: Case) -> Path:
         found = motion.at(times)
         return found if case.move is None else case.move(found)
 
-    # Times around each frame are taken from one fine clock, so that every change of the motion sees the same times.
-    clock = torch.linspace(0, float(times_s[-1]) + 0.1, int((float(times_s[-1]) + 0.1) * 600 * 48) + 1).double()
-    shift = float(times_s[-1]) if case.move is not None else None
-    whole = at(clock if shift is None else clock[clock <= shift + 1e-9])
+    # One fine clock for all pictures, from before the first exposure to after the last.
+    step_s = 1 / (settings.frame_rate * FINE)
+    whole = at(torch.arange(0, 2 * LEAD_S + float(times_s[-1]), step_s, dtype=torch.float64))
 
     def poses(now_s: Tensor) -> tuple[Tensor, Tensor]:
-        index = (now_s.clamp(0, float(whole.time_s[-1])) / whole.time_s[1]).round().long()
+        index = ((now_s + LEAD_S) / step_s).round().long()
         return whole.position_lab_mm[index], whole.R_lab_body[index]
 
     for index, (name, camera) in enumerate(cameras.items()):

@@ -120,7 +120,7 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
     # Unsynchronised movies or ambiguous views would be reported as camera errors.
     in_step = seen.scan is None or seen.scan.shift == 0
     if len(seen.matches) == 2 and in_step and similar.severity is not FAULT:
-        yield texture_map.one_orientation(seen.matches)
+        yield texture_map.cameras_agree(seen.matches, 2 * seen.experiment.radius_mm)
 
 
 def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[str, float | None], list[Finding]]:

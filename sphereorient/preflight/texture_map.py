@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.calibration.consistency import FEWEST, Limits, Seen, compare_cameras
 from sphereorient.cameras import Camera, R_cam_view
 from sphereorient.experiment.stream import spread_frames
 from sphereorient.mapping.compare import fibonacci_directions
@@ -36,7 +37,8 @@ ALIKE, SAME = 0.85, 0.97  # share of one view explained by another: single frame
 FRAMES = 8  # of each camera, compared with the map
 FITS, POOR = 0.7, 0.55  # share of the picture that the best view of the map explains
 CLEARLY = 0.08  # difference of this share between the picture and its mirror image
-ONE_DEG = 5.0  # largest difference of the orientations from two cameras
+GAP_PX, TURN_DEG, SIZE = 1.5, 1.0, 0.02  # cameras that agree differ by less: lines of sight, attitudes, sizes
+OUTLINE_PX = 0.4  # error of an outline's radius, by blur and a dark rim
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,6 +67,7 @@ class TextureMatch:
     name: str
     camera: Camera
     centre_px: Tensor  # (n, 2)
+    radius_px: Tensor  # (n,)
     R_view_body: Tensor  # (n, 3, 3), the best; NaN: none found
     score: Tensor  # (n,), 0: none found
     mirrored: Tensor  # (n,), score of the mirrored pictures
@@ -199,7 +202,13 @@ def _matched(search: GreySearch, sample: MovieSample, chosen: list[int]) -> Text
     R, score = _best(search, disks)
     _, mirrored = _best(search, disks.flip(-1))
     return TextureMatch(
-        name=sample.name, camera=sample.camera, centre_px=centre, R_view_body=R, score=score, mirrored=mirrored
+        name=sample.name,
+        camera=sample.camera,
+        centre_px=centre,
+        radius_px=radius,
+        R_view_body=R,
+        score=score,
+        mirrored=mirrored,
     )
 
 
@@ -230,25 +239,22 @@ def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
     )
 
 
-def one_orientation(matches: Sequence[TextureMatch]) -> Finding:
-    """Judge whether two cameras show the same orientation."""
-    title, (first, second) = "one orientation", matches
-    angle = _median_angle_deg(matches, (first.camera, second.camera))
-    measured = f"the orientations from {first.name} and {second.name} differ by {angle:.1f} degrees (median)"
-    if math.isnan(angle):
-        return warning(title, "unknown: the map is not found in the pictures", "see the findings on the map")
-    swapped = _median_angle_deg(matches, (second.camera, first.camera))
-    if swapped <= ONE_DEG:
-        advice = f"swap {first.name} and {second.name} in movies: (then they differ by {swapped:.1f} degrees)"
-    else:
-        advice = "check R of both cameras in cameras.yaml, flip:, and whether the movies are of one experiment"
-    return judged(title, measured, (angle > ONE_DEG, FAULT, advice))
-
-
-def _median_angle_deg(matches: Sequence[TextureMatch], cameras: tuple[Camera, Camera]) -> float:
-    """Return the median angle between the lab orientations, degrees; NaN: no common frame."""
-    lab = []
-    for match, camera in zip(matches, cameras, strict=True):
-        direction_cam = camera.rays(match.centre_px).direction_lab @ camera.R_cam_lab.mT
-        lab.append(camera.R_cam_lab.mT @ R_cam_view(direction_cam) @ match.R_view_body)
-    return float(torch.rad2deg(so3.geodesic_distance(lab[0], lab[1])).nanmedian())
+def cameras_agree(matches: Sequence[TextureMatch], diameter_mm: float) -> Finding:
+    """Judge whether the cameras show one sphere in one orientation, and name what would explain a contradiction."""
+    title, R = "cameras agree", []
+    for match in matches:
+        R_cam_lab, sight = match.camera.R_cam_lab, match.camera.rays(match.centre_px).direction_lab
+        R.append(R_cam_lab.mT @ R_cam_view(sight @ R_cam_lab.mT) @ match.R_view_body)
+    seen = Seen(
+        cameras={match.name: match.camera for match in matches},
+        centre_px=torch.stack([match.centre_px for match in matches], 1),
+        radius_px=torch.stack([match.radius_px for match in matches], 1),
+        R_lab_body=torch.stack(R, 1),
+        diameter_mm=diameter_mm,
+    )
+    size = SIZE + OUTLINE_PX / float(seen.radius_px.min())
+    found = compare_cameras(seen, Limits(gap_px=GAP_PX, turn_deg=TURN_DEG, size=size))
+    if found.frames < FEWEST or math.isnan(found.turn_deg):
+        measured = f"cannot tell: both cameras show the ball and its paint in {found.frames} of the frames compared"
+        return warning(title, measured, "see the findings on the ball and on the map")
+    return judged(title, f"{found} (median of {found.frames} frames)", (found.contradicts, FAULT, found.advice))

@@ -86,8 +86,28 @@ def test_a_bumped_camera_is_not_taken_for_a_late_movie(clean, tmp_path, deg):
 def test_swapped_movies_are_named(clean, tmp_path):
     movies = {"cam1": clean.pictures["cam2"], "cam2": clean.pictures["cam1"]}
     result = checked(replace(clean, pictures=movies), tmp_path, sphere=PAINTED)
-    assert of(result, "one orientation").severity is FAULT
-    assert "swap cam1 and cam2" in of(result, "one orientation").advice
+    assert of(result, "cameras agree").severity is FAULT
+    assert "swap cam1 and cam2" in of(result, "cameras agree").advice
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("keys", "named"), [({"diameter": 18.9}, "diameter 18.9 explains"), ({}, "")])
+def test_what_explains_a_contradiction_is_named(clean, tmp_path, keys, named):
+    """Before: a diameter 5 % off gave a warning of the size only."""
+    found = of(checked(clean, tmp_path, sphere=PAINTED | keys), "cameras agree")
+    assert found.severity is (FAULT if named else OK), found.measured
+    assert named in found.advice
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cam1", "cam2"])
+def test_a_turned_camera_is_named_with_its_angle(clean, tmp_path, name):
+    """Before: `calibrate again`, of either camera."""
+    path = write(clean, tmp_path, sphere=PAINTED)
+    turned(tmp_path, name, 1.5)
+    found = of(preflight(path), "cameras agree")
+    assert found.severity is FAULT
+    assert f"{name} turned by 1.5 degrees" in found.advice
 
 
 @pytest.mark.slow
