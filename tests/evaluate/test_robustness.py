@@ -215,7 +215,7 @@ def never(experiment: Path) -> Trajectory:
 
 
 def test_what_a_method_refuses_is_an_outcome(tmp_path):
-    (scene,) = scenes_of(BenchSettings(degradations=(), frames=12, together=0))
+    (scene,) = scenes_of(BenchSettings(degradations=(), seeds=(0,), frames=12, together=0))
     found = track_scene(tmp_path / "experiment.yaml", scene, "never", never)
     assert found.refused.startswith("movies: expected a ball")
     assert found.lost == 12
@@ -223,7 +223,7 @@ def test_what_a_method_refuses_is_an_outcome(tmp_path):
 
 @pytest.mark.slow
 def test_a_run_goes_on_and_another_run_is_left_alone(tmp_path):
-    settings = BenchSettings(degradations=(), frames=12, together=0)
+    settings = BenchSettings(degradations=(), seeds=(0,), frames=12, together=0)
     (scene,) = scenes_of(settings)
     (tmp_path / "run" / "scenes").mkdir(parents=True)
     run_scene(tmp_path / "run", scene, {"never": never})
@@ -233,12 +233,14 @@ def test_a_run_goes_on_and_another_run_is_left_alone(tmp_path):
     assert (tmp_path / "run" / "scenes" / "clean-0-0-0.never.json").read_bytes() == kept
     assert load_results(tmp_path / "run" / "results.json").outcomes[0].frames == 12
     with pytest.raises(OutputError, match="another run's"):
-        run_benchmark(tmp_path / "run", BenchSettings(degradations=(), frames=13, together=0), {"never": never})
+        run_benchmark(
+            tmp_path / "run", BenchSettings(degradations=(), seeds=(0,), frames=13, together=0), {"never": never}
+        )
 
 
 @pytest.mark.slow
 def test_the_papers_method_on_a_small_run(tmp_path):
-    settings = BenchSettings(degradations=("read_noise",), levels=(1,), frames=12, together=0)
+    settings = BenchSettings(degradations=("read_noise",), levels=(1,), seeds=(0,), frames=12, together=0)
     seen = []
     found = run_benchmark(tmp_path, settings, trackers_of(["paper"]), jobs=2, progress=lambda *at: seen.append(at))
     assert seen[0] == (0, 2)
@@ -275,7 +277,7 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, words):
 
 def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, capsys):
     config = tmp_path / "bench.yaml"
-    config.write_text("degradations: [defocus]\nlevels: [2]\ntogether: 0\nframes: 12\n")
+    config.write_text("degradations: [defocus]\nlevels: [2]\nseeds: [0]\ntogether: 0\nframes: 12\n")
     seen = []
     monkeypatch.setattr("sphereorient.evaluate.robustness.write_scene", lambda folder, scene: seen.append(scene))
     out = tmp_path / "scenes"

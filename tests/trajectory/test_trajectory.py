@@ -127,7 +127,7 @@ def test_the_root_and_the_flags_are_named_as_in_the_design(tmp_path: Path) -> No
         assert json.loads(file.attrs["provenance"])["command"] == ["sphereorient", "track"]
         bits = json.loads(file["flags"].attrs["bits"])
         assert bits["SPIKE"] == 128
-        assert sorted(bits.values()) == [2**k for k in range(9)]
+        assert sorted(bits.values()) == [2**k for k in range(10)]
         assert file["cameras/cam1/reason"].asstr()[1] == "dark"
 
 
