@@ -8,6 +8,7 @@ import numpy as np
 from sphereorient.statistics.bootstrap import Floats, Interval, segment_sums, studentized
 from sphereorient.statistics.segments import UNITS, Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
+from sphereorient.trajectory.datasets import in_length
 
 COMPONENTS = ("x", "y", "z", "norm")
 STATISTICS = ("mean", "rms", "skewness", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
@@ -60,7 +61,8 @@ def moments(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | Non
     for k, name in enumerate(STATISTICS):  # back to the quantity's own units
         factor = scale if name in ("mean", "rms", "corrected_rms") else 1.0
         parts[name] = found.part((slice(None), k)).scaled(factor, centre if name == "mean" else 0.0)
-    return Moments(quantity=quantity, units=UNITS[quantity], **parts, samples=len(ensemble), segments=ensemble.segments)
+    units = in_length(UNITS[quantity], ensemble.length_unit)
+    return Moments(quantity=quantity, units=units, **parts, samples=len(ensemble), segments=ensemble.segments)
 
 
 def _statistics(totals: Floats, sign: float) -> Floats:

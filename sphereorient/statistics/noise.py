@@ -12,9 +12,9 @@ from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap,
 from sphereorient.statistics.moments import WARN_SHARE, Moments, without_noise
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory.datasets import stored_fields
 
-SI = 1e-3  # m per mm
-RATES = {"acceleration": ("position", SI), "alpha_lab": ("orientation", 1.0)}  # source, and its unit in SI
+RATES = {"acceleration": "position", "alpha_lab": "orientation"}  # source
 LAGS = (1, 2, 3, 4, 5, 6)  # frames; on Table I's motion the fit does not hold for longer ones
 WIDTHS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # sigma of the Gaussian, frames
 CENTRAL = np.array([0.5, 0.0, -0.5])  # omega from the rotation of frame k - 1 to k + 1, for np.convolve
@@ -97,7 +97,7 @@ def multi_lag(
 
 def _second_differences(track: Trajectory, quantity: str, n: int, step_s: float) -> Floats:
     """Return by segment (S, 3, 2) the sum of squared second differences over n frames, and their number."""
-    source, unit = RATES[quantity]
+    source = RATES[quantity]
     values = getattr(track, source)
     k = np.arange(n, len(track) - n)
     segments = int(track.segment.max(initial=-1)) + 1
@@ -108,7 +108,7 @@ def _second_differences(track: Trajectory, quantity: str, n: int, step_s: float)
     if source == "orientation":
         difference = _rotation(values, k, k + n) - _rotation(values, k - n, k)
     else:
-        difference = np.asarray(values[k + n] - 2 * values[k] + values[k - n]) * unit
+        difference = np.asarray(values[k + n] - 2 * values[k] + values[k - n]) * track.rate_scale
     there = np.isfinite(difference).all(1)
     square, segment = np.square(difference[there]), track.segment[k[there]]
     order = np.argsort(segment, kind="stable")
@@ -140,6 +140,7 @@ class WidthCurve:
     """Rms and flatness by kernel width; made by `width_curve`, drawn by the report. Columns: x, y, z."""
 
     quantity: str
+    units: str  # of rms
     width_s: Floats  # (W,), sigma of the Gaussian
     rms: Interval  # (W, 3)
     flatness: Interval  # (W, 3)
@@ -169,6 +170,7 @@ def width_curve(
     rows = np.arange(3 * len(widths_frames)).reshape(-1, 3)
     return WidthCurve(
         quantity=quantity,
+        units=next(spec.units for name, spec in stored_fields(many[0]) if name == quantity),
         width_s=np.array(widths_frames) * _step(many[0]),
         **{name: found.part((rows, k)) for k, name in enumerate(names)},
     )
@@ -184,7 +186,7 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
         return np.zeros((0, len(widths), 3, 6))
     rows, place, number = _grid(track)
     rotating = quantity == "alpha_lab"
-    cov = (track.orientation_cov if rotating else track.position_cov * SI**2)[rows]
+    cov = (track.orientation_cov if rotating else track.position_cov * track.rate_scale**2)[rows]
     noise, values = np.full((2, len(number), 3), np.nan)
     noise[place] = np.diagonal(cov, axis1=1, axis2=2)
     if rotating:
@@ -193,7 +195,7 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
         there = np.flatnonzero((row[:-2] >= 0) & (row[2:] >= 0))
         values[there] = _rotation(track.orientation[rows], row[there], row[there + 2]) / 2  # omega
     else:
-        values[place] = track.position[rows] * SI
+        values[place] = track.position[rows] * track.rate_scale
     order: Literal[1, 2] = 2 if quantity == "acceleration" else 1
     scale = _step(track) ** -(2 if quantity != "velocity" else 1)
     parts = []

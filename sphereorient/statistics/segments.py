@@ -33,6 +33,7 @@ class Ensemble:
     values: Mapping[str, Floats]  # (M, 3) by name, UNITS
     sigmas: Mapping[str, Floats]  # (M, 3), standard deviations of the same; NaN where unknown
     error: Literal["added", "removed"]  # sigma is noise that a kernel let through, or motion that a smoother removed
+    length_unit: str = "mm"  # of the tracks
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -76,10 +77,11 @@ def ensemble_of(
     """
     settings = settings or SegmentSettings()
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
-    methods = {track.method for track in many}
-    if "paper" in methods and len(methods) > 1:
-        got, do = ", ".join(sorted(methods)), "report each kind by itself"
-        raise TrackError(refusal(name, expected="tracks of one method", got=got, do=do))
+    methods, units = ({getattr(track, key) for track in many} for key in ("method", "length_unit"))
+    for kinds, of in ((methods if "paper" in methods else (), "method"), (units, "unit of length")):
+        if len(kinds) > 1:
+            got, do = ", ".join(sorted(kinds)), "report each kind by itself"
+            raise TrackError(refusal(name, expected=f"tracks of one {of}", got=got, do=do))
     pieces = [_usable(track, number, settings) for number, track in enumerate(many)]
     there = [len(piece["time_s"]) if fewest else track.valid.any() for piece, track in zip(pieces, many, strict=True)]
     if not any(there):
@@ -110,6 +112,7 @@ def ensemble_of(
         R_lab_body=whole["R_lab_body"][rows],
         values={quantity: whole[quantity][rows] for quantity in UNITS},
         sigmas={quantity: whole[f"{quantity}_sigma"][rows] for quantity in UNITS},
+        length_unit=many[0].length_unit,
         error="added" if many[0].method == "paper" else "removed",
     )
 

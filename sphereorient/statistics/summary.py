@@ -1,7 +1,7 @@
 """All statistics of the paper's section IV; a new one needs a field of `Distributions`, a call in `_distributions`."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
 
@@ -82,6 +82,8 @@ def summarise(
     if settings.integral_time_s is None:
         settings = settings.model_copy(update={"integral_time_s": around.integral_time_s})
     ensemble = ensemble_of(many, settings, name, fewest=0)
+    if ensemble.length_unit != "mm":  # not comparable with a flow in m
+        around = replace(around, diameter_mm=None)
     progress(1, STEPS)
     if ensemble.segments >= FEWEST and settings.integral_time_s is None:
         ensemble, settings = _long_enough(ensemble, settings)
