@@ -41,7 +41,7 @@ class Moments:
 
 def table_of_moments(ensemble: Ensemble, settings: BootstrapSettings | None = None) -> Mapping[str, Moments]:
     """Return the moments of v, a, omega and alpha in lab and body, by name; the paper's Table I."""
-    return {quantity: moments(ensemble, quantity, settings) for quantity in UNITS}
+    return {quantity: moments(ensemble, quantity, settings) for quantity in ensemble.values}
 
 
 def moments(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Moments:

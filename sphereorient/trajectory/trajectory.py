@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "sphereorient-track/1"
 TEXTS = ("method", "settings", "experiment")
+HELD = 0.1  # of the position's stated error
 LONGEST_NAME = 100  # characters
 AGAIN = "write the track again"
 REASON = datasets.DatasetSpec("1", "why this camera has no orientation in the frame; ok where it has one")
@@ -149,6 +150,14 @@ class Trajectory:
     def rate_scale(self) -> float:
         """Lengths of velocity per length of position: m per mm, or 1."""
         return 1e-3 if self.length_unit == "mm" else 1.0
+
+    @property
+    def held(self) -> bool:
+        """Whether the centre is fixed: over the track it moves by less than a tenth of its stated error."""
+        there = self.valid & np.isfinite(self.position).all(1)
+        error = np.sqrt(np.diagonal(self.position_cov[there], axis1=1, axis2=2))
+        usual = np.nan_to_num(np.median(error, axis=0)) if there.any() else np.zeros(3)
+        return int(there.sum()) > 1 and bool((self.position[there].std(0) <= HELD * usual).all())
 
     def __repr__(self) -> str:
         return "\n".join(["Trajectory", *(f"  {title:8} {text}" for title, text in self._facts())])

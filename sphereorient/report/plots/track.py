@@ -67,7 +67,8 @@ def track_figure(track: Trajectory) -> Figure:
     panels[0, 0].set_ylabel(in_length("position, lab (mm)", track.length_unit))
     _angles(panels[0, 1], time, part)
     for axes, (name, label) in zip(panels[1:].ravel(), RATES.items(), strict=True):
-        _curves(axes, time, getattr(track, name), getattr(track, f"{name}_sigma"), part.broken)
+        if name in ("omega_lab", "alpha_lab") or not track.held:
+            _curves(axes, time, getattr(track, name), getattr(track, f"{name}_sigma"), part.broken)
         axes.set_ylabel(in_length(label, track.length_unit))
     for axes in panels.ravel():
         _shade(axes, time, track.valid)
