@@ -155,9 +155,10 @@ class Trajectory:
     def held(self) -> bool:
         """Whether the centre is fixed: over the track it moves by less than a tenth of its stated error."""
         there = self.valid & np.isfinite(self.position).all(1)
-        error = np.sqrt(np.diagonal(self.position_cov[there], axis1=1, axis2=2))
-        usual = np.nan_to_num(np.median(error, axis=0)) if there.any() else np.zeros(3)
-        return int(there.sum()) > 1 and bool((self.position[there].std(0) <= HELD * usual).all())
+        if there.sum() < 2:
+            return False
+        usual = np.median(np.sqrt(np.diagonal(self.position_cov[there], axis1=1, axis2=2)), axis=0)
+        return bool((self.position[there].std(0) < HELD * usual).all())
 
     def __repr__(self) -> str:
         return "\n".join(["Trajectory", *(f"  {title:8} {text}" for title, text in self._facts())])

@@ -32,7 +32,7 @@ def fitted(missed_px, used=None, **lens):
         reports.append(PictureReport(picture=picture, pose=row, view=view, residual_px=missed, used=kept, reason=""))
     return Calibrated(
         cameras={"cam1": replace(cameras()["cam1"], **lens)},
-        covariance=ParameterCovariance(names=(), matrix=torch.zeros(0, 0)),
+        covariance=ParameterCovariance(names=("cam1.f",), matrix=torch.ones(1, 1)),
         R_lab_plate=torch.eye(3).expand(len(missed_px), 3, 3),
         T_lab_plate_mm=torch.zeros(len(missed_px), 3),
         pictures=tuple(reports),
@@ -47,7 +47,7 @@ def noise(pictures=10, seed=0):
 def structure(size_px, pictures=10):
     """A smooth field over the plate, of this rms, as refraction leaves it."""
     x, y = (PLATE.indices / 3.0).T
-    field = np.stack([x * x - x * y, y**3 - x], axis=1)
+    field = np.stack([x * x - x * y, y * y - x], axis=1)
     field -= field.mean(0)
     return np.tile(size_px * field / np.sqrt((field**2).sum(1).mean()), (pictures, 1, 1))
 
@@ -62,8 +62,9 @@ def test_noise_is_no_structure():
 @pytest.mark.parametrize("size_px", [0.03, 0.1])
 def test_structure_is_measured_beside_the_noise(size_px):
     (words,) = doubts(fitted(noise() + structure(size_px)))["cam1"].words
-    numbers = [float(word) for word in words.split() if word[0].isdigit()]
-    assert numbers == pytest.approx([size_px, 0.03 * 2**0.5], rel=0.25)
+    found, rest = (float(word) for word in words.split() if word[0].isdigit())
+    assert found == pytest.approx(size_px, rel=0.2)
+    assert 0.03 * 2**0.5 < rest < 0.03 * 2**0.5 + 0.3 * size_px  # what varies from dot to dot counts as noise
 
 
 def test_dropped_points_are_counted_and_with_structure_over_the_noise_nothing_is_trusted():
