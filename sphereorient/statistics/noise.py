@@ -12,7 +12,6 @@ from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap,
 from sphereorient.statistics.moments import WARN_SHARE, Moments, without_noise
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import Trajectory
-from sphereorient.trajectory.datasets import stored_fields
 
 RATES = {"acceleration": "position", "alpha_lab": "orientation"}  # source
 LAGS = (1, 2, 3, 4, 5, 6)  # frames; on Table I's motion the fit does not hold for longer ones
@@ -140,13 +139,13 @@ class WidthCurve:
     """Rms and flatness by kernel width; made by `width_curve`, drawn by the report. Columns: x, y, z."""
 
     quantity: str
-    units: str  # of rms
     width_s: Floats  # (W,), sigma of the Gaussian
     rms: Interval  # (W, 3)
     flatness: Interval  # (W, 3)
     corrected_rms: Interval  # (W, 3), without the noise expected from the measurements' sigmas
     corrected_flatness: Interval  # (W, 3)
     noise_share: Interval  # (W, 3), of the variance
+    length_unit: str = "mm"
 
 
 def width_curve(
@@ -170,8 +169,8 @@ def width_curve(
     rows = np.arange(3 * len(widths_frames)).reshape(-1, 3)
     return WidthCurve(
         quantity=quantity,
-        units=next(spec.units for name, spec in stored_fields(many[0]) if name == quantity),
         width_s=np.array(widths_frames) * _step(many[0]),
+        length_unit=many[0].length_unit,
         **{name: found.part((rows, k)) for k, name in enumerate(names)},
     )
 

@@ -21,6 +21,7 @@ from sphereorient.report.export import columns, export_track, to_xarray
 from sphereorient.report.recording import series_of
 from sphereorient.report.verdicts import verdicts
 from sphereorient.statistics import StatisticsSettings, summarise
+from sphereorient.statistics.noise import width_curve
 from sphereorient.statistics.segments import ensemble_of
 from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble
 from sphereorient.trajectory import Trajectory
@@ -73,6 +74,18 @@ def test_figures_and_recordings_say_radii(track):
     labels += [path.get_xlabel(), path.get_zlabel(), *series_of(track)]
     assert {"position, lab (radii)", "velocity, lab (radii/s)", "x, lab (radii)", "position, radii"} <= set(labels)
     assert not lengths_in(" ".join(labels))
+
+
+def test_statistics_and_their_figures_say_radii():
+    tracks = replace(draw_ensemble(EnsembleSpec(segments=4, mean_frames=90.0), 1), length_unit="radii")
+    table = summarise(tracks, FEW).table
+    assert [table[name].units for name in ("velocity", "acceleration", "omega_lab")] == [
+        "radii/s",
+        "radii/s^2",
+        "rad/s",
+    ]
+    widths = {"acceleration": width_curve(tracks, "acceleration", settings=FEW)}
+    assert "(radii/s²)" in plots.widths_figure(widths).axes[0].get_ylabel()
 
 
 def test_velocities_are_lengths_of_the_position_a_second():
