@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from sphereorient.calibration.boards import see_plate
 from sphereorient.calibration.bundle import Fitted, Problem, Rig, adjust, fitted_parameters, gathered
+from sphereorient.calibration.calibrated import Calibrated, PictureReport, doubts
 from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
 from sphereorient.calibration.guess import guess_from_points, guess_rig
 from sphereorient.calibration.targets import PlateView, placed
-from sphereorient.cameras import Camera, ParameterCovariance, PortCamera, TsaiCamera
+from sphereorient.cameras import Camera, ParameterCovariance, Port, PortCamera, TsaiCamera
 from sphereorient.cameras.checks import camera_error, named
+from sphereorient.cameras.parameters import PORT_TILT
 from sphereorient.errors import CameraError
 from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
@@ -26,50 +28,13 @@ from sphereorient.files.whole_file import read_whole
 LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a plate
 Progress = Callable[[str, int, int], None]
 SIGMA_PX = 0.05  # of points in tables; only ratios matter, because the residuals give the scale
+WALL = 0.3  # of the way from the plates to the camera: where the search for a wall starts
 CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tied where one placement fits this well
 # Sigmas from which a parameter counts as undetermined, by the begin of its name: shares of focal length, distance and
 # picture's width; mm, rad and indices. The others, of the distortion, show in these.
 LOOSE_SHARE = {"f": 0.01, "T_": 0.01, "centre": 0.02, "cx": 0.02, "cy": 0.02}
 LOOSE_PORT = {"port_offset": 5.0, "port_thickness": 5.0, "port_n_glass": 0.1, "port_n_fluid": 0.05, "port_tilt": 0.05}
 LOOSE = {"rotation": 0.01} | LOOSE_PORT
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PictureReport:
-    """The result of one picture."""
-
-    picture: Picture
-    pose: int
-    view: PlateView
-    residual_px: NDArray[np.float64]  # (n, 2), measured minus expected
-    used: NDArray[np.bool_]  # (n,), False for outliers
-    reason: str  # why it was not used; empty where it was
-
-    @property
-    def rms_px(self) -> float:
-        """Rms distance between measured and expected points without outliers; NaN without points."""
-        return _rms_px([self])
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Calibrated:
-    """Cameras with covariances."""
-
-    cameras: Mapping[str, Camera]  # each with its own covariance
-    covariance: ParameterCovariance  # of all cameras together, names such as cam1.f
-    R_lab_plate: Tensor  # (P, 3, 3)
-    T_lab_plate_mm: Tensor  # (P, 3)
-    pictures: tuple[PictureReport, ...]
-    scale: float  # residuals over their expected standard deviations
-
-    def rms_px(self, camera: str) -> float:
-        """Rms distance between one camera's measured and expected points."""
-        return _rms_px([one for one in self.pictures if one.picture.camera == camera])
-
-
-def _rms_px(pictures: Sequence[PictureReport]) -> float:
-    missed = np.concatenate([one.residual_px[one.used] for one in pictures])
-    return float(np.sqrt((missed**2).sum(1).mean())) if len(missed) else float("nan")
 
 
 def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: Progress | None = None) -> Calibrated:
@@ -94,7 +59,7 @@ def calibrate_cameras(calibration: CalibrationDocument | Path | str, progress: P
         fitted = adjust(_problem(document, fitted.rig, tied))
     _check_determined(document, fitted)
     progress("fit", 1, 1)
-    return _collected(document, views, tied, fitted)
+    return _judged(document, tied, _collected(document, views, tied, fitted), progress)
 
 
 def _read_tables(document: CalibrationDocument) -> dict[Picture, PlateView]:
@@ -253,3 +218,63 @@ def _collected(
         pictures=tuple(reports),
         scale=fitted.scale,
     )
+
+
+def _judged(
+    document: CalibrationDocument, tied: Mapping[Picture, PlateView], result: Calibrated, progress: Progress
+) -> Calibrated:
+    """Add what contradicts the calibration, with its most likely cause; CameraError where nothing can be trusted."""
+    found = doubts(result)
+    lines = [f"{name}: {'; '.join(doubt.words)}" for name, doubt in found.items()]
+    structured = [name for name, doubt in found.items() if doubt.structured]
+    if structured:
+        progress("cause", 0, 1)
+        lines.append(_cause(document, tied, result, structured))
+        progress("cause", 1, 1)
+    if any(doubt.hopeless for doubt in found.values()):
+        *faults, do = lines
+        raise camera_error(str(document.path), "points that are missed by their noise only", "; ".join(faults), do)
+    return replace(result, verdict=tuple(lines))
+
+
+def _cause(
+    document: CalibrationDocument, tied: Mapping[Picture, PlateView], result: Calibrated, structured: Sequence[str]
+) -> str:
+    """Return advice: the change of lens or wall after which no residuals have structure, if there is one."""
+    ports = {name: _wall_before(result, name) for name in structured} | dict(document.ports)
+    wall = {"fit_ports": ("port_offset", "port_n_fluid", *PORT_TILT)}
+    trials: dict[Callable[[Any], str], CalibrationDocument] = {
+        lambda _: "`model: brown`": replace(document, keys=document.keys.model_copy(update={"model": "brown"})),
+        _wall_words: replace(document, keys=document.keys.model_copy(update=wall), ports=ports),
+    }
+    name, causes = max(structured, key=result.rms_px), []
+    for cause, other in trials.items():
+        with suppress(CameraError):
+            again = _collected(other, tied, tied, adjust(_problem(other, _first_rig(other, tied), tied)))
+            if not any(doubt.structured for doubt in doubts(again).values()):
+                causes.append((again.scale, f"{cause(again.cameras[name])} (rms {again.rms_px(name):.3f} px)"))
+    if not causes:
+        return "check the plate (flat? pitch?), the focus of the pictures, and the walls under `ports`"
+    words = ", or ".join(text for _, text in sorted(causes))
+    return f"{name} (rms {result.rms_px(name):.3f} px) is explained by {words}"
+
+
+def _wall_words(camera: PortCamera) -> str:
+    offset, n_fluid = float(camera.port.offset_mm), float(camera.port.n_fluid)
+    return f"a flat wall: describe it under `ports`, about {{offset: {offset:.0f}, n_fluid: {n_fluid:.2f}}}"
+
+
+def _wall_before(result: Calibrated, name: str) -> Port:
+    """Return a thin wall across a camera's axis between the camera and its plates, before water."""
+    camera = result.cameras[name]
+    normal = -camera.R_cam_lab[2]
+    middle = -(camera.R_cam_lab.mT @ camera.T_cam_lab_mm)
+    placed = [
+        result.R_lab_plate[one.picture.row] @ torch.from_numpy(one.view.points_plate_mm).mean(0)
+        + result.T_lab_plate_mm[one.picture.row]
+        for one in result.pictures
+        if one.picture.camera == name and not one.reason
+    ]
+    plates, lens = float(torch.stack(placed).mean(0) @ normal), float(middle @ normal)
+    numbers: dict[str, Any] = {"offset_mm": plates + WALL * (lens - plates), "thickness_mm": 0.0}
+    return Port(normal=normal / normal.norm(), **numbers, n_glass=torch.tensor(1.5), n_fluid=torch.tensor(1.33))

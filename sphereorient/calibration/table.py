@@ -7,7 +7,7 @@ import torch
 from rich.table import Column, Table
 from torch import Tensor
 
-from sphereorient.calibration.plates import Calibrated
+from sphereorient.calibration.calibrated import Calibrated
 from sphereorient.calibration.self_calibration import MOVED, OBSERVED, CameraCheck, Repaired
 from sphereorient.cameras import Camera, PortCamera
 from sphereorient.cameras.parameters import PORT_NUMBERS, TRANSLATION
@@ -43,12 +43,12 @@ def pictures_table(result: Calibrated) -> Table:
 
 
 def summary(result: Calibrated) -> list[str]:
-    """Return the rms of each camera and the angles between the cameras' axes, one line each."""
+    """Return the rms of each camera, the angles between the cameras' axes, and the verdict, one line each."""
     lines = [f"{name}: rms {result.rms_px(name):.3f} px" for name in result.cameras]
     for (one, a), (other, b) in combinations(result.cameras.items(), 2):
         cosine = float(torch.dot(a.R_cam_lab[2], b.R_cam_lab[2]).clamp(-1, 1))
         lines.append(f"{one} and {other}: axes at {math.degrees(math.acos(cosine)):.2f} degrees")
-    return lines
+    return [*lines, *(f"doubtful: {line}" for line in result.verdict)]
 
 
 def repair_lines(result: Repaired) -> list[str]:

@@ -44,8 +44,11 @@ def calibrate(
     picture = out.with_suffix(".png")
     with put_aside(picture) as partial:
         calibration_figure(result, partial)
-        save_cameras(out, result.cameras, f"{MADE_BY} {command_line()}", result.covariance)
+        doubtful = "".join(f"\ndoubtful: {line}" for line in result.verdict)
+        save_cameras(out, result.cameras, f"{MADE_BY} {command_line()}{doubtful}", result.covariance)
     if quiet:
+        for line in result.verdict:
+            typer.echo(f"doubtful: {line}", err=True)
         return
     from rich.console import Console
 

@@ -48,6 +48,11 @@ class Experiment:
         return self.path.parent
 
     @property
+    def length_unit(self) -> str:
+        """Unit of all lengths of a track: mm, or radii of a sphere of unknown diameter."""
+        return "radii" if self.diameter_mm is None else "mm"
+
+    @property
     def radius_mm(self) -> float:
         """Radius of the sphere; 1 if its diameter is unknown and lengths are in radii."""
         return 1.0 if self.diameter_mm is None else self.diameter_mm / 2

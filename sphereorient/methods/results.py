@@ -69,7 +69,7 @@ def paper_track(
         position_cov=positions.covariance_mm2.numpy(),
         orientation=fused.R_lab_body.numpy(),
         orientation_cov=variance.numpy(),
-        **datasets_of(moved),
+        **datasets_of(moved, experiment.length_unit),
         segment=fused.segment.numpy(),
         flags=(fused.flags | positions.flags).numpy().astype(np.uint32),
         cameras=dict(tracks),
@@ -124,7 +124,7 @@ def precise_track(
         position_cov=(covariance[:, 3:, 3:] * smoothed.position_scale**2).numpy(),
         orientation=picked["R_lab_body"].numpy(),
         orientation_cov=(covariance[:, :3, :3] * smoothed.orientation_scale**2).numpy(),
-        **datasets_of(smoothed),
+        **datasets_of(smoothed, experiment.length_unit),
         segment=chosen.segment.numpy(),
         flags=flags.numpy().astype(np.uint32),
         provenance={"remarks": remarks},
@@ -173,7 +173,8 @@ def map_track(
 
 
 def _empty(experiment: Experiment, clock: Tensor, cameras: Iterable[str], **about: Any) -> Trajectory:
-    known = {"frame_rate": experiment.frame_rate_hz, "experiment": experiment.name} | about
+    known = {"frame_rate": experiment.frame_rate_hz, "experiment": experiment.name}
+    known |= {"length_unit": experiment.length_unit} | about
     return Trajectory.empty(clock.numpy(), cameras=tuple(cameras), **known)
 
 

@@ -195,8 +195,12 @@ POSES = {
 }
 
 
-def datasets_of(found: Motion) -> dict[str, Any]:
-    """Return smooth poses, velocity to alpha_body, and the errors of all, under the names of a track."""
+def datasets_of(found: Motion, length_unit: str = "mm") -> dict[str, Any]:
+    """Return smooth poses, velocity to alpha_body, and the errors of all, under the names of a track and in its units.
+    Lengths of positions in another unit than mm are those of velocities, too.
+    """
     names = POSES | {name: f"{name}_{unit}" for name, unit in RATE_UNITS.items()}
     names |= {f"{name}_sigma": f"{name}_sigma_{unit}" for name, unit in RATE_UNITS.items()}
-    return {name: getattr(found, own).numpy() for name, own in names.items()}
+    parts = {name: getattr(found, own).numpy() for name, own in names.items()}
+    rates = ("velocity", "acceleration") if length_unit != "mm" else ()
+    return {name: part / M_PER_MM if name.startswith(rates) else part for name, part in parts.items()}

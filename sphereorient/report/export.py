@@ -212,7 +212,7 @@ class Dataset:
 
 def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
     """Yield the datasets of a track or camera that have a row for each frame, in the order of the file."""
-    for name, column in stored_fields(type(record)):
+    for name, column in stored_fields(record):
         if column.rows == "frames":
             values = np.asarray(getattr(record, name))
             yield Dataset(name=name, units=column.units, description=column.description, values=values)
@@ -270,6 +270,7 @@ def metadata(track: Trajectory) -> dict[str, Any]:
         "experiment": track.experiment,
         "method": track.method,
         "frame_rate_hz": track.frame_rate,
+        "length_unit": track.length_unit,
         "cameras": list(track.cameras),
         "flags": {flag.name: flag.value for flag in Flag},
         "provenance": dict(track.provenance),

@@ -112,10 +112,11 @@ def _kinds(track: Trajectory) -> Iterator[Ranked]:
     )
     off = distance_deg(track.orientation, track.orientation_smooth)
     yield _outliers(off, "{:.2g}\u00b0 off the smooth motion, usually {:.2g}\u00b0")
-    degrees, mm = np.rad2deg(stated_error(track.orientation_cov)), stated_error(track.position_cov)
+    unit = track.length_unit
+    degrees, lengths = np.rad2deg(stated_error(track.orientation_cov)), stated_error(track.position_cov)
     yield chain(
         _outliers(degrees, "stated error of the orientation {:.2g}\u00b0, usually {:.2g}\u00b0"),
-        _outliers(mm, "stated error of the position {:.2g} mm, usually {:.2g} mm"),
+        _outliers(lengths, f"stated error of the position {{:.2g}} {unit}, usually {{:.2g}} {unit}"),
     )
 
 
@@ -227,7 +228,8 @@ def strip_of(track: Trajectory, numbers: Ints | None = None) -> dict[str, Any]:
         "status": status[row].tolist(),  # index in status_words
         # Stated, one standard deviation about or along an axis; the largest of the bin.
         "orientation_error_deg": _short(largest(np.rad2deg(stated_error(track.orientation_cov)))),
-        "position_error_mm": _short(largest(stated_error(track.position_cov))),
+        "length_unit": track.length_unit,
+        "position_error": _short(largest(stated_error(track.position_cov))),
         "cameras": [
             {
                 "name": name,

@@ -77,6 +77,8 @@ def calibration_figure(result: Calibrated, path: Path) -> None:
     """Draw the pictures, read again, with points found and expected, and all residuals; into a PNG or PDF."""
     names = list(result.cameras)
     figure = new_figure(4.2 * (SHOWN + 2), 4.3 * len(names))
+    if result.verdict:
+        figure.suptitle("\n".join(["doubtful", *result.verdict]), color=OUTLIER)
     axes = figure.subplots(len(names), SHOWN + 2, squeeze=False)
     for row, name in zip(axes, names, strict=True):
         used = [one for one in result.pictures if one.picture.camera == name and not one.reason]

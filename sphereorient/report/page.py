@@ -121,7 +121,7 @@ def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str
         (f"{summary.ensemble.segments:,}", "segment" if summary.ensemble.segments == 1 else "segments"),
         (median, "stated error of the orientation, median"),
     ]
-    for quantity in ("velocity", "omega_lab"):
+    for quantity in (name for name in ("velocity", "omega_lab") if name in summary.table):
         part = summary.table[quantity]
         rms = float(np.sqrt(np.square(part.rms.value[:3]).sum()))
         known = f"{rms:.3g} {_unit(part.units)}" if math.isfinite(rms) else "unknown"

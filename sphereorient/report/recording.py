@@ -1,5 +1,8 @@
 """A track as a Rerun recording: cameras, pictures, the sphere along its path, and time series (docs/export.md)."""
 
+import os
+import shutil
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from itertools import pairwise
@@ -22,6 +25,7 @@ from sphereorient.report.overlay_model import Path3D, finite_rows, path_of
 from sphereorient.report.overlay_page import AXES, OUTLINE, TRAIL
 from sphereorient.sphere import load_texture, reduced_texture
 from sphereorient.trajectory import Trajectory, quaternions_wxyz
+from sphereorient.trajectory.datasets import in_length
 
 with suppress(ImportError):  # an extra: `view_track` says how to install it
     import rerun as rr
@@ -38,6 +42,7 @@ MESH = 64  # facets around the sphere
 MAP_PX = 512  # diameter of the disk whose map is on the mesh
 JPEG_QUALITY = 88
 AXIS_REACH = 1.6  # radii, length of the arrows
+VIEWER_S = 10.0  # until the viewer answers
 FADED = 90  # opacity of the lines a standard deviation above and below, of 255
 # dataset of each plot; position has a covariance, the others a standard deviation *_sigma
 SERIES = {
@@ -46,7 +51,6 @@ SERIES = {
     "omega lab, rad per s": "omega_lab",
     "alpha lab, rad per s2": "alpha_lab",
 }
-PLOTS = ("position, mm", *SERIES, "state")
 
 
 def view_track(
@@ -72,7 +76,7 @@ def view_track(
     recording: Any = rr.RecordingStream("sphereorient", recording_id=None)
     layout = _layout(track, experiment)
     if save is None:
-        recording.spawn(default_blueprint=layout)
+        _open_viewer(recording, layout)
     else:
         try:
             recording.save(save, default_blueprint=layout)
@@ -86,11 +90,28 @@ def view_track(
         recording.disconnect()
 
 
+def _open_viewer(recording: Any, layout: Any) -> None:
+    """Start the viewer that is installed beside this Python; OutputError where it cannot open a window."""
+    do = "write a recording with --save track.rrd, and open it where there is a display"
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise OutputError(refusal("view", expected="a display", got="none (DISPLAY is not set)", do=do))
+    try:
+        viewer = shutil.which("rerun", path=str(Path(sys.executable).parent))  # PATH may not lead there
+        rr.spawn(executable_path=viewer, default_blueprint=layout, recording=recording)
+        recording.flush(timeout_sec=VIEWER_S)
+    except (OSError, RuntimeError) as error:
+        recording.disconnect()
+        raise OutputError(refusal("view", expected="a viewer that opens", got=error_words(error), do=do)) from error
+
+
 def _layout(track: Trajectory, experiment: Experiment | None) -> Any:
     space = rrb.Spatial3DView(origin="lab", name="lab")
     names = [] if experiment is None else [name for name in experiment.cameras if name in track.cameras]
     shown = [rrb.Spatial2DView(origin=f"lab/{name}/picture", name=name) for name in names]
-    plots = [rrb.TimeSeriesView(origin=rr.new_entity_path(["plots", name]), name=name) for name in PLOTS]
+    plots = [
+        rrb.TimeSeriesView(origin=rr.new_entity_path(["plots", name]), name=name)
+        for name in (*series_of(track), "state")
+    ]
     log = rrb.TextLogView(origin="warnings", name="warnings")
     above = rrb.Horizontal(space, rrb.Vertical(*shown), column_shares=[2, 1]) if shown else space
     return rrb.Blueprint(rrb.Vertical(above, rrb.Tabs(*plots, log), row_shares=[2, 1]), collapse_panels=True)
@@ -100,7 +121,8 @@ def _log(recording: Any, track: Trajectory, experiment: Experiment | None, every
     def when(rows: NDArray[np.int64]) -> list[Any]:
         return [rr.TimeColumn(TIME, duration=track.time[rows]), rr.TimeColumn(FRAME, sequence=rows)]
 
-    path = path_of(track, PLAIN_RADIUS_MM if experiment is None else experiment.radius_mm)
+    radius = PLAIN_RADIUS_MM if experiment is None else experiment.radius_mm
+    path = path_of(track, radius if track.length_unit == "mm" else 1.0)
     recording.log("lab", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if experiment is not None:
         there = path.position_mm[finite_rows(path.position_mm)]
@@ -198,7 +220,8 @@ def series_of(track: Trajectory) -> dict[str, tuple[Floats, Floats]]:
     """Return values and standard deviations, (N, 3) each, by the name of their plot."""
     spread = np.sqrt(np.diagonal(track.position_cov, axis1=1, axis2=2))
     found = {"position, mm": (track.position, spread)}
-    return found | {name: (getattr(track, key), getattr(track, f"{key}_sigma")) for name, key in SERIES.items()}
+    found |= {name: (getattr(track, key), getattr(track, f"{key}_sigma")) for name, key in SERIES.items()}
+    return {in_length(name, track.length_unit): part for name, part in found.items()}
 
 
 def _log_series(recording: Any, track: Trajectory, when: Callable[[Any], Any]) -> None:

@@ -371,7 +371,7 @@
         const score = camera.score[bin] === null ? "no score" : `score ${camera.score[bin].toFixed(3)}`;
         facts.push([camera.name, `${strip.reason_words[camera.reason[bin]]}, ${score}`]);
       }
-      const [turn, shift] = [short(strip.orientation_error_deg[bin], "°"), short(strip.position_error_mm[bin], " mm")];
+      const [turn, shift] = [short(strip.orientation_error_deg[bin], "°"), short(strip.position_error[bin], ` ${strip.length_unit}`)];
       facts.push(["stated error", `orientation ${turn}, position ${shift}`]);
       if (strip.apart_deg) facts.push(["cameras apart", short(strip.apart_deg[bin], "°")]);
       return facts;

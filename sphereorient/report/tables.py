@@ -230,4 +230,5 @@ def _multi_lag(more: Distributions) -> Iterator[Row]:
 
 
 def _lift(more: Distributions) -> Iterator[Row]:
-    return _rows(component=VECTOR, correlation=more.lift.correlation, coefficient=more.lift.coefficient)
+    if more.lift is not None:
+        yield from _rows(component=VECTOR, correlation=more.lift.correlation, coefficient=more.lift.coefficient)

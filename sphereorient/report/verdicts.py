@@ -58,6 +58,8 @@ def _measured(tracks: Mapping[str, Trajectory]) -> Iterator[Verdict]:
     if len(tracks) > 1 and valid < frames:
         words += f"; fewest in {worst}, {100 * float(tracks[worst].valid.mean()):.4g} %"
     yield _say("Measured", words, share >= 1 - LOST_SHARE)
+    if all(track.held for track in tracks.values()):
+        yield _say("Place", "the centre is fixed: nothing is said of its translation")
     remarks = dict.fromkeys(remark for track in tracks.values() for remark in track.provenance.get("remarks", ()))
     for remark in list(remarks)[:5]:
         yield _say("Remark", str(remark), good=False)
@@ -81,7 +83,7 @@ def _segments(summary: Summary, tracks: Mapping[str, Trajectory]) -> Iterator[Ve
         return
     words = f"{count:,} segments, {len(summary.ensemble):,} samples"
     if np.isfinite(least_s):
-        whose = "flow" if summary.integral_time_s == summary.surroundings.integral_time_s else "velocity"
+        whose = "flow" if summary.integral_time_s == summary.surroundings.integral_time_s else next(iter(summary.table))
         words += f", each longer than {least_s:.3g} s (integral time of the {whose} {summary.integral_time_s:.3g} s)"
     if count < FEW_SEGMENTS:
         words += "; with so few, tails are not well known and intervals of the flatness are too narrow"
@@ -116,7 +118,7 @@ def _apart(distances: Sequence[CameraDistance]) -> Iterator[Verdict]:
 
 
 def _tails(summary: Summary, more: Distributions) -> Iterator[Verdict]:
-    for quantity in ("velocity", "acceleration", "omega_lab", "alpha_lab"):
+    for quantity in more.correlations:
         flat = summary.table[quantity].corrected_flatness
         flat = flat if np.isfinite(flat.value[:3]).all() else summary.table[quantity].flatness
         fits = more.densities[quantity]
@@ -174,6 +176,8 @@ def _isotropy(more: Distributions) -> Iterator[Verdict]:
 
 
 def _lift(more: Distributions) -> Iterator[Verdict]:
+    if more.lift is None:
+        return
     found = more.lift.correlation
     clear = bool(found.low[3] > 0 or found.high[3] < 0)
     seen = "the acceleration follows omega x v" if clear else "no correlation of the acceleration with omega x v"

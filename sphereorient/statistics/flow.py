@@ -62,10 +62,10 @@ class Comparison:
 def comparisons(table: Mapping[str, Moments], around: Surroundings) -> list[Comparison]:
     """Return the dimensionless numbers that the surroundings allow, from the moments by quantity.
 
-    Rms values are of one component; the sphere's are corrected for noise. Without a diameter there are none.
+    Rms values are of one component; the sphere's are corrected for noise. Needs a diameter and a moving centre.
     Source: the paper, section IV: omega_rms against u_rms / D; docs/errata.md A5.
     """
-    if around.diameter_mm is None:
+    if around.diameter_mm is None or "velocity" not in table:
         return []
     diameter_m, u_rms_m_s = around.diameter_mm * M_PER_MM, around.u_rms_m_s
     v, a, omega, alpha = (_component_rms(table[q]) for q in ("velocity", "acceleration", "omega_lab", "alpha_lab"))

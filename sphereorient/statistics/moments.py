@@ -8,6 +8,7 @@ import numpy as np
 from sphereorient.statistics.bootstrap import Floats, Interval, segment_sums, studentized
 from sphereorient.statistics.segments import UNITS, Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
+from sphereorient.trajectory.datasets import in_length
 
 COMPONENTS = ("x", "y", "z", "norm")
 STATISTICS = ("mean", "rms", "skewness", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
@@ -40,7 +41,7 @@ class Moments:
 
 def table_of_moments(ensemble: Ensemble, settings: BootstrapSettings | None = None) -> Mapping[str, Moments]:
     """Return the moments of v, a, omega and alpha in lab and body, by name; the paper's Table I."""
-    return {quantity: moments(ensemble, quantity, settings) for quantity in UNITS}
+    return {quantity: moments(ensemble, quantity, settings) for quantity in ensemble.values}
 
 
 def moments(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Moments:
@@ -60,7 +61,8 @@ def moments(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | Non
     for k, name in enumerate(STATISTICS):  # back to the quantity's own units
         factor = scale if name in ("mean", "rms", "corrected_rms") else 1.0
         parts[name] = found.part((slice(None), k)).scaled(factor, centre if name == "mean" else 0.0)
-    return Moments(quantity=quantity, units=UNITS[quantity], **parts, samples=len(ensemble), segments=ensemble.segments)
+    units = in_length(UNITS[quantity], ensemble.length_unit)
+    return Moments(quantity=quantity, units=units, **parts, samples=len(ensemble), segments=ensemble.segments)
 
 
 def _statistics(totals: Floats, sign: float) -> Floats:

@@ -13,8 +13,7 @@ from sphereorient.statistics.moments import WARN_SHARE, Moments, without_noise
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import Trajectory
 
-SI = 1e-3  # m per mm
-RATES = {"acceleration": ("position", SI), "alpha_lab": ("orientation", 1.0)}  # source, and its unit in SI
+RATES = {"acceleration": "position", "alpha_lab": "orientation"}  # source
 LAGS = (1, 2, 3, 4, 5, 6)  # frames; on Table I's motion the fit does not hold for longer ones
 WIDTHS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # sigma of the Gaussian, frames
 CENTRAL = np.array([0.5, 0.0, -0.5])  # omega from the rotation of frame k - 1 to k + 1, for np.convolve
@@ -85,7 +84,7 @@ def multi_lag(
 
 def _second_differences(track: Trajectory, quantity: str, n: int, step_s: float) -> Floats:
     """Return by segment (S, 3, 2) the sum of squared second differences over n frames, and their number."""
-    source, unit = RATES[quantity]
+    source = RATES[quantity]
     values = getattr(track, source)
     k = np.arange(n, len(track) - n)
     segments = int(track.segment.max(initial=-1)) + 1
@@ -96,7 +95,7 @@ def _second_differences(track: Trajectory, quantity: str, n: int, step_s: float)
     if source == "orientation":
         difference = _rotation(values, k, k + n) - _rotation(values, k - n, k)
     else:
-        difference = np.asarray(values[k + n] - 2 * values[k] + values[k - n]) * unit
+        difference = np.asarray(values[k + n] - 2 * values[k] + values[k - n]) * track.rate_scale
     there = np.isfinite(difference).all(1)
     square, segment = np.square(difference[there]), track.segment[k[there]]
     order = np.argsort(segment, kind="stable")
@@ -134,6 +133,7 @@ class WidthCurve:
     corrected_rms: Interval  # (W, 3), without the noise expected from the measurements' sigmas
     corrected_flatness: Interval  # (W, 3)
     noise_share: Interval  # (W, 3), of the variance
+    length_unit: str = "mm"
 
 
 def width_curve(
@@ -158,6 +158,7 @@ def width_curve(
     return WidthCurve(
         quantity=quantity,
         width_s=np.array(widths_frames) * _step(many[0]),
+        length_unit=many[0].length_unit,
         **{name: found.part((rows, k)) for k, name in enumerate(names)},
     )
 
@@ -172,7 +173,7 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
         return np.zeros((0, len(widths), 3, 6))
     rows, place, number = _grid(track)
     rotating = quantity == "alpha_lab"
-    cov = (track.orientation_cov if rotating else track.position_cov * SI**2)[rows]
+    cov = (track.orientation_cov if rotating else track.position_cov * track.rate_scale**2)[rows]
     noise, values = np.full((2, len(number), 3), np.nan)
     noise[place] = np.diagonal(cov, axis1=1, axis2=2)
     if rotating:
@@ -181,7 +182,7 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
         there = np.flatnonzero((row[:-2] >= 0) & (row[2:] >= 0))
         values[there] = _rotation(track.orientation[rows], row[there], row[there + 2]) / 2  # omega
     else:
-        values[place] = track.position[rows] * SI
+        values[place] = track.position[rows] * track.rate_scale
     order: Literal[1, 2] = 2 if quantity == "acceleration" else 1
     scale = _step(track) ** -(2 if quantity != "velocity" else 1)
     parts = []

@@ -15,6 +15,7 @@ from sphereorient.trajectory import Flag, Trajectory
 from sphereorient.trajectory.datasets import stored_fields
 
 UNITS = {name: spec.units for name, spec in stored_fields(Trajectory) if name in RATE_UNITS}  # of the six quantities
+TRANSLATION = ("velocity", "acceleration")
 COLUMNS = {"time_s": "time", "R_lab_body": "orientation_smooth", "label": "segment"}
 COLUMNS |= {name: name for quantity in UNITS for name in (quantity, f"{quantity}_sigma")}
 
@@ -30,9 +31,10 @@ class Ensemble:
     span_s: Floats  # (S,), from a segment's first frame to its last, one step included
     step_s: float  # typical time between frames
     R_lab_body: Floats  # (M, 3, 3), smooth
-    values: Mapping[str, Floats]  # (M, 3) by name, UNITS
+    values: Mapping[str, Floats]  # (M, 3) by name, UNITS; without TRANSLATION where the centre is fixed
     sigmas: Mapping[str, Floats]  # (M, 3), standard deviations of the same; NaN where unknown
     error: Literal["added", "removed"]  # sigma is noise that a kernel let through, or motion that a smoother removed
+    length_unit: str = "mm"  # of the tracks
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -76,10 +78,11 @@ def ensemble_of(
     """
     settings = settings or SegmentSettings()
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
-    methods = {track.method for track in many}
-    if "paper" in methods and len(methods) > 1:
-        got, do = ", ".join(sorted(methods)), "report each kind by itself"
-        raise TrackError(refusal(name, expected="tracks of one method", got=got, do=do))
+    methods, units = ({getattr(track, key) for track in many} for key in ("method", "length_unit"))
+    for kinds, of in ((methods if "paper" in methods else (), "method"), (units, "unit of length")):
+        if len(kinds) > 1:
+            got, do = ", ".join(sorted(kinds)), "report each kind by itself"
+            raise TrackError(refusal(name, expected=f"tracks of one {of}", got=got, do=do))
     pieces = [_usable(track, number, settings) for number, track in enumerate(many)]
     there = [len(piece["time_s"]) if fewest else track.valid.any() for piece, track in zip(pieces, many, strict=True)]
     if not any(there):
@@ -100,6 +103,7 @@ def ensemble_of(
     which = "with frames whose errors are not larger than usual (statistics.max_sigma)"
     _refuse_few(int(kept.sum()), name, which, fewest)
     rows = kept[number] & whole["sure"]
+    told = [quantity for quantity in UNITS if quantity not in TRANSLATION or not all(track.held for track in many)]
     return Ensemble(
         time_s=time_s[rows],
         frame=np.rint((time_s - time_s[begin][number]) / step_s).astype(np.int64)[rows],
@@ -108,8 +112,9 @@ def ensemble_of(
         span_s=span_s[kept],
         step_s=step_s,
         R_lab_body=whole["R_lab_body"][rows],
-        values={quantity: whole[quantity][rows] for quantity in UNITS},
-        sigmas={quantity: whole[f"{quantity}_sigma"][rows] for quantity in UNITS},
+        values={quantity: whole[quantity][rows] for quantity in told},
+        sigmas={quantity: whole[f"{quantity}_sigma"][rows] for quantity in told},
+        length_unit=many[0].length_unit,
         error="added" if many[0].method == "paper" else "removed",
     )
 

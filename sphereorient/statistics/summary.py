@@ -1,7 +1,7 @@
 """All statistics of the paper's section IV; a new one needs a field of `Distributions`, a call in `_distributions`."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
 
@@ -37,7 +37,7 @@ class Distributions:
     uniformity: isotropy.Uniformity
     isotropies: Mapping[str, isotropy.Isotropy]  # by quantity
     rows: Mapping[str, isotropy.FrameOfRow]  # omega_lab, omega_body: the frame of their components
-    lift: Lift
+    lift: Lift | None  # None where the centre is fixed
     multi_lag: Mapping[str, noise.MultiLag]  # acceleration, alpha_lab; without those that cannot be fitted
     widths: Mapping[str, noise.WidthCurve]  # velocity, acceleration, alpha_lab
 
@@ -82,9 +82,13 @@ def summarise(
     if settings.integral_time_s is None:
         settings = settings.model_copy(update={"integral_time_s": around.integral_time_s})
     ensemble = ensemble_of(many, settings, name, fewest=0)
+    if ensemble.length_unit != "mm":  # not comparable with a flow in m
+        around = replace(around, diameter_mm=None)
     progress(1, STEPS)
     if ensemble.segments >= FEWEST and settings.integral_time_s is None:
-        measured = float(lags.correlation(ensemble, "velocity", settings=settings).integral_time_s.value[3])
+        measured = float(
+            lags.correlation(ensemble, next(iter(ensemble.values)), settings=settings).integral_time_s.value[3]
+        )
         if measured > 0:  # leave out segments that are short compared with the integral time of all of them
             settings = settings.model_copy(update={"integral_time_s": measured})
             kept = ensemble.span_s >= settings.min_integral_times * measured
@@ -110,7 +114,7 @@ def _distributions(
     steps = count(4)
 
     def each(of: Callable[[str], Any], quantities: Iterable[str] = UNITS) -> dict[str, Any]:
-        found = {quantity: of(quantity) for quantity in quantities}
+        found = {quantity: of(quantity) for quantity in quantities if quantity in ensemble.values}
         progress(next(steps), STEPS)
         return found
 
@@ -130,7 +134,7 @@ def _distributions(
         uniformity=isotropy.uniformity(ensemble.R_lab_body, ensemble.segment),
         isotropies=each(lambda q: isotropy.isotropy(ensemble, q, settings)),
         rows=each(lambda q: isotropy.frame_of_omega(ensemble, ensemble.values[q]), ("omega_lab", "omega_body")),
-        lift=lift(ensemble, settings),
+        lift=lift(ensemble, settings) if "velocity" in ensemble.values else None,
         multi_lag=_multi_lag(tracks, settings),
         widths=each(lambda q: noise.width_curve(tracks, q, settings=settings), WIDTHS_OF),
     )
@@ -149,7 +153,7 @@ def _durations(tracks: Sequence[Trajectory], ensemble: Ensemble, settings: Stati
 
 def _multi_lag(tracks: Sequence[Trajectory], settings: StatisticsSettings) -> dict[str, noise.MultiLag]:
     found = {}
-    for quantity in noise.RATES:
+    for quantity in ("alpha_lab",) if all(track.held for track in tracks) else noise.RATES:
         try:
             found[quantity] = noise.multi_lag(list(tracks), quantity, settings=settings)
         except TrackError:  # too few neighbouring frames: left out, and the page says so

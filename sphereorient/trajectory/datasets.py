@@ -1,7 +1,8 @@
 """Datasets of a track file: axes, unit, description and type of each record field."""
 
+import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,18 @@ def stored(units: str, description: str, *tail: int, **more: Any) -> Any:
     return field(metadata={KEY: DatasetSpec(units, description, tail, **more)})
 
 
-def stored_fields(record: type[Any]) -> Iterator[tuple[str, DatasetSpec]]:
-    """Yield name and specification of every dataset of a record, in order."""
-    return ((entry.name, entry.metadata[KEY]) for entry in fields(record) if KEY in entry.metadata)
+def in_length(text: str, length_unit: str) -> str:
+    """Return a unit or label with the lengths that it writes in mm or m: mm^2, velocity (m/s)."""
+    return text if length_unit == "mm" else re.sub(r"\bmm?\b", length_unit, text)
+
+
+def stored_fields(record: Any) -> Iterator[tuple[str, DatasetSpec]]:
+    """Yield name and specification of every dataset of a record (or its class: in mm), in order."""
+    unit = getattr(record, "length_unit", "mm")
+    for entry in fields(record):
+        if KEY in entry.metadata:
+            spec = entry.metadata[KEY]
+            yield entry.name, spec if unit == "mm" else replace(spec, units=in_length(spec.units, unit))
 
 
 def blank_datasets(record: type[Any], frames: int) -> dict[str, NDArray[Any]]:
@@ -56,7 +66,7 @@ def check_shapes(record: object, rows: Mapping[str, int]) -> None:
 
 def write_datasets(record: Any, group: h5py.Group) -> None:
     """Write all datasets of a record."""
-    for name, c in stored_fields(type(record)):
+    for name, c in stored_fields(record):
         write_dataset(group, _place(name), np.asarray(getattr(record, name), c.dtype), c)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sphereorient.errors import OutputError, ShapeError, TrackError, refusal
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
 from sphereorient.trajectory import datasets
-from sphereorient.trajectory.datasets import stored, stored_fields
+from sphereorient.trajectory.datasets import in_length, stored, stored_fields
 from sphereorient.trajectory.reasons import Flag, Reason
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "sphereorient-track/1"
 TEXTS = ("method", "settings", "experiment")
+HELD = 0.1  # of the position's stated error
 LONGEST_NAME = 100  # characters
 AGAIN = "write the track again"
 REASON = datasets.DatasetSpec("1", "why this camera has no orientation in the frame; ok where it has one")
@@ -83,7 +84,9 @@ class CameraTrack:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """All results on one sphere in N frames; mm, s, rad, m/s, m/s^2; NaN if not measured; `track[10:50]` is a part."""
+    """All results on one sphere in N frames; NaN if not measured; `track[10:50]` is a part.
+    Units: s, rad, mm, m/s, m/s^2; with `length_unit` "radii" radii, radii/s, radii/s^2.
+    """
 
     time: Floats = stored("s", "frame number of the experiment / frame rate; middle of the exposure")
     valid: NDArray[np.bool_] = stored("1", "orientation and position measured in this frame", dtype="bool", fill=0)
@@ -130,6 +133,7 @@ class Trajectory:
     settings: str  # YAML text
     experiment: str
     provenance: Mapping[str, Any]  # versions, command, sha256 of inputs; JSON types
+    length_unit: str = "mm"  # or radii, of a sphere of unknown diameter
 
     def __post_init__(self) -> None:
         frames = np.size(self.time)
@@ -141,6 +145,20 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def rate_scale(self) -> float:
+        """Lengths of velocity per length of position: m per mm, or 1."""
+        return 1e-3 if self.length_unit == "mm" else 1.0
+
+    @property
+    def held(self) -> bool:
+        """Whether the centre is fixed: over the track it moves by less than a tenth of its stated error."""
+        there = self.valid & np.isfinite(self.position).all(1)
+        if there.sum() < 2:
+            return False
+        usual = np.median(np.sqrt(np.diagonal(self.position_cov[there], axis1=1, axis2=2)), axis=0)
+        return bool((self.position[there].std(0) < HELD * usual).all())
 
     def __repr__(self) -> str:
         return "\n".join(["Trajectory", *(f"  {title:8} {text}" for title, text in self._facts())])
@@ -185,7 +203,7 @@ class Trajectory:
         with whole_hdf5(path) as file:
             file.attrs["schema"] = SCHEMA
             file.attrs["provenance"] = json.dumps(self.provenance, sort_keys=True)
-            for name in (*TEXTS, "frame_rate"):
+            for name in (*TEXTS, "frame_rate", "length_unit"):
                 file.attrs[name] = getattr(self, name)
             datasets.write_datasets(self, file)
             file["flags"].attrs["bits"] = json.dumps({flag.name: flag.value for flag in Flag})
@@ -247,7 +265,7 @@ class Trajectory:
             raise OutputError(refusal("to_pandas", expected="the package pandas", got="none", do=do)) from error
         table: dict[str, NDArray[Any]] = {"time_s": self.time}
         table |= {name: getattr(self, name) for name in ("valid", "segment", "flags", "confidence")}
-        for name, c in stored_fields(Trajectory):
+        for name, c in stored_fields(self):
             if c.tail == (3,):
                 unit = c.units.replace("^", "").replace("/", "_")
                 table |= {f"{name}_{axis}_{unit}": getattr(self, name)[:, i] for i, axis in enumerate("xyz")}
@@ -268,7 +286,7 @@ class Trajectory:
                 for axis, part in zip("wxyz"[-values.shape[1] :], values.T, strict=True):
                     line = {"lw": 1.2, "label": axis} if name == smoothed else {"ls": "", "marker": ".", "ms": 3}
                     axes.plot(self.time, part, color=COLOURS[axis], **line)
-            axes.set_ylabel(label)
+            axes.set_ylabel(in_length(label, self.length_unit))
             axes.legend(loc="upper right", ncols=4, fontsize="small")
             axes.grid(alpha=0.3)
         axes.set_xlabel("time (s)")
@@ -319,6 +337,7 @@ def _read(file: h5py.File) -> dict[str, Any]:
         "cameras": {name: read_camera(cameras, name) for name in cameras or ()},
         "frame_rate": float(file.attrs["frame_rate"]),
         "provenance": json.loads(file.attrs["provenance"]),
+        "length_unit": str(file.attrs.get("length_unit", "mm")),
         **{name: str(file.attrs[name]) for name in TEXTS},
     }
 

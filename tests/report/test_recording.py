@@ -13,7 +13,7 @@ from overlay_examples import changed, command, excerpt, true_track
 
 from sphereorient.cameras import load_cameras
 from sphereorient.errors import OutputError
-from sphereorient.report.recording import PLOTS, pinhole_near, series_of, view_track
+from sphereorient.report.recording import SERIES, pinhole_near, series_of, view_track
 from sphereorient.trajectory import Trajectory
 
 HEAD = "schema: sphereorient-cameras/1\ncameras:\n"
@@ -63,7 +63,7 @@ def test_every_series_is_there_with_its_standard_deviation():
     track = true_track()
     cov = np.broadcast_to(np.diag([0.01, 0.04, 0.09]), (40, 3, 3))
     series = series_of(replace(track, position_cov=np.array(cov)))
-    assert set(series) | {"state"} == set(PLOTS)
+    assert set(series) == {"position, mm", *SERIES}
     np.testing.assert_array_equal(series["omega lab, rad per s"][0], track.omega_lab)
     np.testing.assert_allclose(series["position, mm"][1], np.broadcast_to([0.1, 0.2, 0.3], (40, 3)))
 
@@ -122,3 +122,36 @@ def test_the_command_writes_a_recording_without_a_window(tmp_path, monkeypatch, 
     assert code == 0
     assert "40 frames" in printed
     assert sorted(path.name for path in tmp_path.iterdir()) == ["track.h5", "v.rrd"]
+
+
+def test_without_a_display_one_line_says_so(tmp_path, monkeypatch, capsys):
+    """Before: no end. After: refused before a viewer is started."""
+    pytest.importorskip("rerun")
+    monkeypatch.setattr(sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    true_track().save(tmp_path / "track.h5")
+    code, _, said = command(monkeypatch, capsys, "view", tmp_path / "track.h5")
+    assert code == 2
+    assert "expected a display, got none" in said
+    assert said.strip().count("\n") == 0
+
+
+def test_the_viewer_is_the_one_beside_the_interpreter(tmp_path, monkeypatch):
+    """Before: a traceback where the environment is not on PATH. After: found; one that does not answer is refused."""
+    rerun = pytest.importorskip("rerun")
+    (tmp_path / "rerun").write_text("#!/bin/sh\n")
+    (tmp_path / "rerun").chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setenv("PATH", "")
+    started = []
+
+    def spawn(**given):
+        started.append(given["executable_path"])
+        raise RuntimeError("the viewer died")
+
+    monkeypatch.setattr(rerun, "spawn", spawn)
+    with pytest.raises(OutputError, match="expected a viewer that opens, got 'the viewer died'"):
+        view_track(true_track())
+    assert started == [str(tmp_path / "rerun")]

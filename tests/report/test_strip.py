@@ -101,7 +101,7 @@ def test_the_strip_says_of_every_frame_what_was_planted():
     assert strip["cameras"][0]["score"][5] == 0.6
     assert strip["cameras"][0]["score"][61] is None
     assert strip["orientation_error_deg"][0] == 0.1
-    assert strip["position_error_mm"][0] == 0.2
+    assert strip["position_error"][0] == 0.2
     assert strip["orientation_error_deg"][61] is None
     assert strip["apart_deg"] is not None
     assert strip["apart_deg"][7] == pytest.approx(np.rad2deg(0.1), rel=1e-3)

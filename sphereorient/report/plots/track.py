@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sphereorient import so3
 from sphereorient.report.plots import style as look
 from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory.datasets import in_length
 
 Floats = NDArray[np.float64]
 
@@ -63,11 +64,12 @@ def track_figure(track: Trajectory) -> Figure:
     panels = figure.subplots(3, 2, sharex=True)
     _dots(panels[0, 0], time, track.position)
     _curves(panels[0, 0], time, track.position_smooth, _sigma(track.position_smooth_cov), part.broken)
-    panels[0, 0].set_ylabel("position, lab (mm)")
+    panels[0, 0].set_ylabel(in_length("position, lab (mm)", track.length_unit))
     _angles(panels[0, 1], time, part)
     for axes, (name, label) in zip(panels[1:].ravel(), RATES.items(), strict=True):
-        _curves(axes, time, getattr(track, name), getattr(track, f"{name}_sigma"), part.broken)
-        axes.set_ylabel(label)
+        if name in ("omega_lab", "alpha_lab") or not track.held:
+            _curves(axes, time, getattr(track, name), getattr(track, f"{name}_sigma"), part.broken)
+        axes.set_ylabel(in_length(label, track.length_unit))
     edges = np.flatnonzero(np.diff(np.concatenate([[True], track.valid, [True]]).astype(np.int8)))
     half = float(np.median(np.diff(time))) / 2 if len(time) > 1 else 0.5
     runs = [(time[a] - half, time[b - 1] - time[a] + 2 * half) for a, b in edges.reshape(-1, 2)]
@@ -102,7 +104,7 @@ def path_figure(track: Trajectory) -> Figure:
     part = shown_part(track)
     figure = look.new_figure(look.WIDTH_IN, 5.6)
     axes: Any = figure.add_subplot(projection="3d")
-    axes.set(xlabel="x, lab (mm)", ylabel="y, lab (mm)", zlabel="z, lab (mm)")
+    axes.set(**{f"{axis}label": f"{axis}, lab ({track.length_unit})" for axis in "xyz"})
     position = part.track.position_smooth
     there = np.flatnonzero(np.isfinite(position).all(1))
     if len(there):

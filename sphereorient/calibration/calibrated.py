@@ -1,0 +1,121 @@
+"""The result of a calibration, and what contradicts it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from sphereorient.calibration.document import Picture
+from sphereorient.calibration.targets import PlateView
+from sphereorient.cameras import Camera, ParameterCovariance, PortCamera, TsaiCamera
+
+NEIGHBOURS = 4  # of a point on the plate
+SHARED = 0.1  # share of the residuals' variance common to neighbours from which it is structure, beside 4 sigma
+FINE_PX = 0.01  # structure below it does no harm
+DROPPED, DROPPED_HERE = 0.05, 0.2  # share of the points of a camera, or of one picture, from which it counts
+OFF_CENTRE = 0.1  # of the picture's longer side
+FIELD_DEG = (1.0, 150.0)  # of view, along the longer side
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PictureReport:
+    """The result of one picture."""
+
+    picture: Picture
+    pose: int
+    view: PlateView
+    residual_px: NDArray[np.float64]  # (n, 2), measured minus expected
+    used: NDArray[np.bool_]  # (n,), False for outliers
+    reason: str  # why it was not used; empty where it was
+
+    @property
+    def rms_px(self) -> float:
+        """Rms distance between measured and expected points without outliers; NaN without points."""
+        return _rms_px([self])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Calibrated:
+    """Cameras with covariances."""
+
+    cameras: Mapping[str, Camera]  # each with its own covariance
+    covariance: ParameterCovariance  # of all cameras together, names such as cam1.f
+    R_lab_plate: Tensor  # (P, 3, 3)
+    T_lab_plate_mm: Tensor  # (P, 3)
+    pictures: tuple[PictureReport, ...]
+    scale: float  # residuals over their expected standard deviations
+    verdict: tuple[str, ...] = ()  # what contradicts the calibration, one line each
+
+    def rms_px(self, camera: str) -> float:
+        """Rms distance between one camera's measured and expected points."""
+        return _rms_px([one for one in self.pictures if one.picture.camera == camera])
+
+
+def _rms_px(pictures: Sequence[PictureReport]) -> float:
+    missed = np.concatenate([one.residual_px[one.used] for one in pictures])
+    return float(np.sqrt((missed**2).sum(1).mean())) if len(missed) else float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doubt:
+    """What contradicts one camera."""
+
+    words: tuple[str, ...]
+    structured: bool  # neighbouring points miss alike: the model is incomplete
+    hopeless: bool  # by more than the noise, and many points were dropped
+
+
+def doubts(result: Calibrated) -> dict[str, Doubt]:
+    """Return the cameras that something contradicts."""
+    found = {name: _doubt(result, name) for name in result.cameras}
+    return {name: doubt for name, doubt in found.items() if doubt.words}
+
+
+def _doubt(result: Calibrated, name: str) -> Doubt:
+    pictures = [one for one in result.pictures if one.picture.camera == name and not one.reason]
+    rms, share = result.rms_px(name), _shared(pictures)
+    structure, noise = rms * math.sqrt(share), rms * math.sqrt(1 - share)
+    points, lost = (sum(part) for part in zip(*((len(one.used), _lost(one)) for one in pictures), strict=True))
+    worst = max(pictures, key=lambda one: _lost(one) / len(one.used))
+    dropped = lost > DROPPED * points or _lost(worst) > DROPPED_HERE * len(worst.used)
+    structured = structure > FINE_PX and share > SHARED + 2 / math.sqrt(points)  # of noise, sigma is 0.5 / sqrt(points)
+    words = []
+    if structured:
+        words.append(f"neighbouring points miss alike, by {structure:.3f} px rms beside {noise:.3f} px of noise")
+    if dropped:
+        most = f"{_lost(worst)} of {len(worst.used)} in {worst.picture.path.name}"
+        words.append(f"{lost} of {points} points were dropped, {most}")
+    words += _lens_words(result.cameras[name])
+    return Doubt(words=tuple(words), structured=structured, hopeless=structured and structure > noise and dropped)
+
+
+def _lost(one: PictureReport) -> int:
+    return int((~one.used).sum())
+
+
+def _shared(pictures: Sequence[PictureReport]) -> float:
+    """Return the share of the residuals' variance that neighbouring points have in common, 0 to 1."""
+    common = total = 0.0
+    for one in pictures:
+        missed, points = one.residual_px[one.used], one.view.points_plate_mm[one.used]
+        if len(missed) > NEIGHBOURS:
+            near = np.asarray(cKDTree(points).query(points, k=NEIGHBOURS + 1)[1])[:, 1:]
+            common += float((missed[:, None] * missed[near]).sum()) / NEIGHBOURS
+            total += float((missed**2).sum())
+    return min(max(common / max(total, 1e-300), 0.0), 1.0)
+
+
+def _lens_words(camera: Camera) -> list[str]:
+    lens: Any = camera.camera if isinstance(camera, PortCamera) else camera
+    f_px = float((lens.f_mm / lens.pixel_pitch_mm[1] if isinstance(lens, TsaiCamera) else lens.f_px).max())
+    longer, sigmas = max(camera.image_size), camera.covariance.sigmas if camera.covariance else {}
+    unsure = max((sigma for name, sigma in sigmas.items() if name.startswith("c")), default=0.0)
+    off = math.dist(lens.centre_px.tolist(), [(size - 1) / 2 for size in camera.image_size])
+    field = math.degrees(2 * math.atan(longer / 2 / f_px))
+    words = [f"the lens's centre lies {off:.0f} px off the picture's"] if off - 3 * unsure > OFF_CENTRE * longer else []
+    return words if FIELD_DEG[0] < field < FIELD_DEG[1] else [*words, f"its field of view is {field:.3g} degrees"]
