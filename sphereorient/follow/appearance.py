@@ -4,11 +4,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import combinations
+from itertools import combinations, permutations
 
 import torch
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.calibration.consistency import Limits, Seen, compare_cameras
 from sphereorient.cameras import triangulate
 from sphereorient.errors import ExperimentError, refusal
@@ -170,7 +171,8 @@ def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
     """Measure on a few frames whether the cameras see one sphere at one position.
     Return, for the worst quarter of frames, the unexplained variance of all cameras together over that of each alone,
-    and the distance between the lines of sight, px.
+    and the distance between the lines of sight, px. The first is 1 where the cameras differ by less than `APART_PX` in
+    lines of sight, rotation and size, px of the picture: alone, each camera fits what its model lacks as well.
     """
     cameras = len(fitter.views)
     whole = [k for k, poses in enumerate(found) if len(poses) and bool(poses.use.all())]
@@ -182,7 +184,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     if not whole:
         return 1.0, 0.0
     tried = [whole[int(k)] for k in torch.linspace(0, len(whole) - 1, min(TRIED, len(whole))).round()]
-    gains, rays = [], []
+    gains, rays, alone = [], [], []
     for camera, view in enumerate(fitter.views):
         only = torch.zeros(len(tried), cameras, dtype=torch.bool)
         only[:, camera] = True
@@ -194,9 +196,19 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
         joint = torch.cat([found[k].score[:1, camera] for k in tried])
         gains.append((1 - joint) / (1 - fit.score[:, camera]).clamp_min(1e-6))
         rays.append(view.camera.rays(view.camera.project(X)))
+        alone.append((view.camera, X, R))
     gap_mm = torch.stack([triangulate(one, other)[1] for one, other in combinations(rays, 2)]).amax(0)
-    px_mm = widest_px(fitter.views) / (2 * fitter.radius_mm)
-    return float(torch.stack(gains).amax(0).quantile(0.75)), float(gap_mm.quantile(0.75) * px_mm)
+    radius_px = widest_px(fitter.views) / 2
+    gap_px = gap_mm * (radius_px / fitter.radius_mm)
+    others_px = [so3.geodesic_distance(one[2], other[2]) * radius_px for one, other in combinations(alone, 2)]
+    for (one_camera, X, _), (_, Y, _) in permutations(alone, 2):
+        centre = -one_camera.R_cam_lab.mT @ one_camera.T_cam_lab_mm
+        sight = torch.nn.functional.normalize(X - centre, dim=-1)
+        # The other camera knows the distance by its line of sight; this one by the size of its picture.
+        others_px.append((((Y - X) * sight).sum(-1) / (X - centre).norm(dim=-1)).abs() * radius_px)
+    differ_px = float(torch.stack([gap_px, *others_px]).amax(0).quantile(0.75))
+    gain = float(torch.stack(gains).amax(0).quantile(0.75)) if differ_px > APART_PX else 1.0
+    return gain, float(gap_px.quantile(0.75))
 
 
 def _scores(found: Sequence[Poses]) -> tuple[float, float]:
