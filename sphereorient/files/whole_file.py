@@ -158,6 +158,7 @@ def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()
     aside = unfinished(path)
     try:
         aside.touch(exist_ok=False)  # exclusively: a link planted here is not followed
+        _made[aside.absolute()] = _state(aside.stat())
         yield aside
         if path.suffix.lower() == ".png":
             _add_mark(aside)
@@ -168,8 +169,8 @@ def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()
         expected = "a file that can be written"
         raise OutputError(refusal(str(path), expected=expected, got=error_words(error), do=do)) from error
     finally:
-        with suppress(OSError):
-            aside.unlink()
+        if _made.pop(aside.absolute(), None) is not None:
+            aside.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

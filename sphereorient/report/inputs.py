@@ -150,7 +150,7 @@ def preflight_figure(result: Preflight, path: Path) -> None:
         _draw_pair(pair, result)
     _list_part(bottom, lines, heights[2])
     figure.suptitle(str(result.experiment.path), fontsize=10)
-    figure.savefig(path, dpi=110)
+    write_figure(figure, path, dpi=110)
 
 
 def _cameras_part(part: Any, result: Preflight) -> None:

@@ -81,7 +81,7 @@ def test_what_was_not_measured_is_nan(table):
 def test_the_csv_begins_with_what_the_track_says_of_itself(track, tmp_path):
     export_track(track, tmp_path / "t.csv", "csv")
     head = [line for line in (tmp_path / "t.csv").read_text().splitlines() if line.startswith("#")]
-    assert head[0] == "# experiment: of May"
+    assert head[:2] == ["# made by sphereorient", "# experiment: of May"]
     assert "# method: precise" in head
     assert "# frame_rate_hz: 600.0" in head
     assert '# provenance: {"versions": {"x": "1"}}' in head
