@@ -55,14 +55,13 @@ def _guarded(function: Callable[..., None], textured: bool) -> Callable[..., Non
 
     @wraps(function)
     def guarded(*, force: bool, **given: Any) -> None:
-        told = [each for name, each in given.items() if name not in OUTPUTS]
-        paths = [path for each in told for path in (each if isinstance(each, list) else [each])]
-        with writing((file for path in paths if isinstance(path, Path) for file in _read(path, textured)), force=force):
+        told = [each if isinstance(each, list) else [each] for name, each in given.items() if name not in OUTPUTS]
+        paths = [path for each in told for path in each if isinstance(path, Path)]
+        with writing((file for path in paths for file in _read(path, textured)), force=force):
             function(**given)
 
     added = inspect.Parameter("force", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, FORCE])
-    parts = {"parameters": [*signature.parameters.values(), added]}
-    vars(guarded)["__signature__"] = signature.replace(**parts)
+    vars(guarded)["__signature__"] = signature.replace(parameters=[*signature.parameters.values(), added])
     guarded.__annotations__ = function.__annotations__ | {"force": added.annotation}
     return guarded
 
@@ -80,15 +79,12 @@ def _read(path: Path, textured: bool) -> Iterator[Path]:
                     yield from movie_files(path.parent / text)
 
 
-def _texts(document: Any, textured: bool) -> Iterator[str]:
-    if isinstance(document, str):
-        yield document
-    elif isinstance(document, dict):
-        for key, value in document.items():
-            yield from _texts(value if textured or key != "texture" else None, textured)
-    elif isinstance(document, list):
-        for value in document:
-            yield from _texts(value, textured)
+def _texts(document: Any, textured: bool) -> list[str]:
+    if isinstance(document, dict):
+        document = [value for key, value in document.items() if textured or key != "texture"]
+    if isinstance(document, list):
+        return [text for value in document for text in _texts(value, textured)]
+    return [document] if isinstance(document, str) else []
 
 
 app = Commands(
@@ -223,17 +219,15 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         code = EXIT_INTERRUPTED
     except Exception as error:
-        show = getattr(error, "show", None)
+        show, code = getattr(error, "show", None), int(getattr(error, "exit_code", EXIT_REFUSED))
         if isinstance(error, MemoryError) or NO_MEMORY.search(str(error)):
             do = "close other programs, use fewer --jobs, or set frames: in the experiment"
             words = refusal("memory", expected="room for the data", got=error_words(error), do=do)
             typer.echo(f"sphereorient: {words}", err=True)
-            code = EXIT_REFUSED
         elif show is None:
             raise
         else:
             show()  # an error of the arguments, in the parser's words
-            code = int(getattr(error, "exit_code", EXIT_REFUSED))
     if code == EXIT_INTERRUPTED:
         typer.echo("sphereorient: interrupted; no result was written.", err=True)
     sys.exit(code)

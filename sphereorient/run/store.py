@@ -186,15 +186,17 @@ class FolderStore:
             if self._fingerprint() is None and not all(TRACES.fullmatch(path.name) for path in self.folder.iterdir()):
                 expected, do = "the parts of a run, or no such folder", "move it away, or choose another --out"
                 raise OutputError(refusal(name, expected=expected, got="a folder of something else", do=do))
-            with suppress(NotImplementedError):  # file systems without locks
-                lock.acquire()
+        except OSError as error:
+            do = "check the space left and the permissions of the folder"
+            raise OutputError(refusal(name, expected="a folder to write", got=error_words(error), do=do)) from error
+        try:
+            lock.acquire()
             (self.folder / PROCESS).write_text(str(os.getpid()), encoding="utf-8")
         except Timeout:
             writer, do = self._writer(), "wait for it, or stop it"
             raise OutputError(f"{name} is being written by another run{writer}; {do}.") from None
-        except OSError as error:
-            do = "check the space left and the permissions of the folder"
-            raise OutputError(refusal(name, expected="a folder to write", got=error_words(error), do=do)) from error
+        except OSError:  # file systems without locks; a full one is told by the next file
+            pass
         try:
             yield
         finally:
@@ -283,6 +285,8 @@ def read_poses(path: Path) -> list[Poses] | None:
             count, use = file["count"][()].tolist(), torch.from_numpy(file["use"][()])
             reason = [[Reason(why.decode()) for why in row] for row in file["reason"][()].tolist()]
             parts = {name: torch.split(torch.from_numpy(file[name][()]), count) for name in POSE_PARTS}
+    except MemoryError:
+        raise
     except DAMAGE:
         return None
     return [
