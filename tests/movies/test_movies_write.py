@@ -76,6 +76,7 @@ def test_a_full_disk_is_one_line_and_the_old_movie_stays(tmp_path, suffix):
     import subprocess
     import sys
 
+    pytest.importorskip("resource")
     path = tmp_path / f"movie.{suffix}"
     path.write_bytes(b"the old one")
     code = (
