@@ -40,7 +40,7 @@ def train(
     from sphereorient.report.plots.style import write_figure
 
     prepare(settings, out, resume)
-    with writing(force=resume), progress_bar(quiet, unit="steps") as advance:  # its last.ckpt says whose folder it is
+    with writing(force=resume), progress_bar(quiet, unit="steps") as advance:  # last.ckpt says whose folder it is
         for name in (CHECKPOINT, LAST, "metrics.csv"):
             check_target(out / name)
         if config.resolve() != (out / "settings.yaml").resolve():

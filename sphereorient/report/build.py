@@ -186,19 +186,19 @@ def _strips(
 def _folder(out: Path) -> Iterator[Path]:
     """Yield a temporary folder that becomes the report at the end, or is removed after an error."""
     out = out.resolve()  # a linked folder is followed
-    if out.exists() and (not out.is_dir() or not _is_report(out)):
-        do = "choose a new folder"
-        expected = "a new folder, or one that holds an older report only"
-        raise OutputError(refusal(f"--out {out}", expected=expected, got="something else in it", do=do))
+    _check_folder(out)
     aside, old = unfinished(out), unfinished(out)
     try:
         for part in KINDS:
             (aside / part).mkdir(parents=True)
         yield aside
+        _check_folder(out)  # again: it may have changed meanwhile
         if out.exists():
             out.replace(old)
         aside.replace(out)
     except OSError as error:
+        if old.exists() and not out.exists():
+            old.replace(out)
         expected, got = "a folder that can be written", error_words(error)
         raise OutputError(refusal(f"--out {out}", expected=expected, got=got, do=ROOM)) from error
     finally:
@@ -206,8 +206,11 @@ def _folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _is_report(folder: Path) -> bool:
-    """Return whether a folder is empty or contains an older report, which carries the mark, and nothing else."""
-    page, found = folder / "index.html", set(folder.rglob("*"))
-    ours = {path for part, kinds in KINDS.items() for kind in kinds for path in (folder / part).glob(f"*{kind}")}
-    return not found or (has_mark(page) and found <= ours | {page, *(folder / part for part in KINDS)})
+def _check_folder(out: Path) -> None:
+    """Raise OutputError if a folder has more in it than an older report, whose page carries the mark."""
+    page, found = out / "index.html", set(out.rglob("*"))
+    ours = {path for part, kinds in KINDS.items() for kind in kinds for path in (out / part).glob(f"*{kind}")}
+    whole = has_mark(page) and found <= ours | {page, *(out / part for part in KINDS)}
+    if (out.exists() and not out.is_dir()) or (found and not whole):
+        expected, do = "a new folder, or one that holds an older report only", "choose a new folder"
+        raise OutputError(refusal(f"--out {out}", expected=expected, got="something else in it", do=do))

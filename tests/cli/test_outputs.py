@@ -150,7 +150,7 @@ def test_every_command_that_writes_has_force():
     ids=["numpy", "torch", "python", "torch on Windows"],
 )
 def test_memory_that_is_not_there_is_one_line(command, monkeypatch, ask):
-    """Before: a traceback of 20 lines and exit code 1."""
+    """Before: a traceback and exit code 1; so `track` of the excerpt with 1.3 GB (ulimit -v 1300000)."""
     monkeypatch.setattr("sphereorient.files.provenance.versions", lambda: ask() and {})
     code, said = command("info")
     assert code == 2
