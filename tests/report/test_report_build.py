@@ -192,7 +192,7 @@ def test_names_of_tracks_are_as_short_as_they_can_be(place):
 
 @pytest.mark.parametrize("name", ["notes.txt", "tables/mine.txt", "figures/a.txt"])
 def test_a_file_of_the_users_in_a_report_stays(tmp_path, name):
-    """Before: only the names in the folder itself were looked at; tables/ and figures/ were deleted with all in them."""
+    """Before: only the names in the folder itself were looked at; tables/ and figures/ went with all in them."""
     out = tmp_path / "report"
     (out / name).parent.mkdir(parents=True)
     (out / "index.html").write_text('<!doctype html>\n<meta name="generator" content="made by sphereorient">')
