@@ -1,4 +1,4 @@
-# make setup | demo | test | test-all | mutants | lint | types
+# make setup | demo | test | test-all | test-portable | mutants | lint | types
 # TORCH_INDEX: on a machine without a GPU, give pip the address of torch's CPU builds here to avoid the CUDA packages.
 PYTHON ?= python3
 TORCH_INDEX ?=
@@ -8,7 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INDEX := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
 
-.PHONY: setup demo test test-all mutants lint types clean
+.PHONY: setup demo test test-all test-portable mutants lint types clean
 
 setup: $(VENV)/.ready
 
@@ -28,6 +28,10 @@ test: setup
 
 test-all: setup
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal
+
+# tests/portable/sitecustomize.py hides them from every process.
+test-portable: setup
+	PYTHONPATH=tests/portable $(BIN)/python -m pytest -q -m "not slow" -n 2 --dist worksteal
 
 mutants: setup
 	$(BIN)/python scripts/mutants.py

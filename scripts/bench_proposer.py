@@ -30,6 +30,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cli.app import progress_bar
+from sphereorient.files.whole_file import writing
 from sphereorient.learn.checkpoint import correlator_of, load_checkpoint
 from sphereorient.learn.network import DEFAULT_CHECKPOINT, LearnedProposer, probability_of
 from sphereorient.report.plots.style import write_figure
@@ -295,7 +296,8 @@ def write_docs(found: Mapping[str, Mapping[str, Found]]) -> None:
     page.write_text(f"{head}{BEGIN}\n" + "\n".join(lines) + said + f"{END}{tail}", "utf-8")
     place = DOCS.parent / "out" / "proposer-bench"
     place.parent.mkdir(exist_ok=True)
-    write_figure(figure(found), place)
+    with writing(force=True):
+        write_figure(figure(found), place)
     (DOCS / "proposer.png").write_bytes(place.with_suffix(".png").read_bytes())
 
 

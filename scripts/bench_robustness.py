@@ -20,6 +20,7 @@ from sphereorient.cli.app import progress_bar
 from sphereorient.evaluate.robustness import BenchSettings, Results, SceneResult, run_benchmark
 from sphereorient.evaluate.robustness.results import WRONG_DEG, ResultSummary, save_results, summaries
 from sphereorient.evaluate.robustness.scenes import CLEAN, FULL, TOGETHER
+from sphereorient.files.whole_file import writing
 from sphereorient.report.plots.style import write_figure
 from sphereorient.report.robustness import level_labels, robustness_figure, unit_of, write_table
 from sphereorient.statistics.reliability import reliability
@@ -39,9 +40,10 @@ def main() -> None:
     settings = FULL if options.full else BenchSettings()
     with progress_bar(unit="") as advance:
         found = run_benchmark(options.out, settings, jobs=options.jobs, progress=lambda *at: advance("scenes", *at))
-    write_table(found, options.out / "results.csv")
     figure = robustness_figure(found)
-    write_figure(figure, options.out / "robustness")
+    with writing(force=True):
+        write_table(found, options.out / "results.csv")
+        write_figure(figure, options.out / "robustness")
     (DOCS / "robustness.png").write_bytes((options.out / "robustness.png").read_bytes())
     save_results(found, DOCS / "robustness-baseline.json")
     page = DOCS / "robustness.md"

@@ -24,6 +24,7 @@ from sphereorient import so3
 from sphereorient.calibration import DotPlate, calibrate_cameras
 from sphereorient.calibration.table import summary
 from sphereorient.cameras import Port, PortCamera, TsaiCamera, triangulate
+from sphereorient.files.whole_file import writing
 from sphereorient.report import calibration_figure
 
 REPO = Path(__file__).resolve().parents[1]
@@ -130,7 +131,8 @@ def main() -> None:
         folder = given.folder or Path(aside)
         folder.mkdir(parents=True, exist_ok=True)
         result = calibrate_cameras(written(folder))
-        calibration_figure(result, given.out)
+        with writing(force=True):
+            calibration_figure(result, given.out)
     large = cv2.imread(str(given.out))
     small = cv2.resize(large, (WIDTH, round(WIDTH * large.shape[0] / large.shape[1])), interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(given.out), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])

@@ -18,6 +18,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from sphereorient.files.whole_file import writing
 from sphereorient.report.plots.style import COMPONENTS, WIDTH_IN, in_style, new_figure, write_figure
 from sphereorient.sphere import orthographic_view
 from sphereorient.tools.design.judge import DesignSettings, Judgement, judge_texture
@@ -65,7 +66,8 @@ def main() -> None:
         )[0]
         gain = 1 - own[0].bound_deg[0] / own[-1].bound_deg[0]
         print(f"{kind}: bound ~ border length^{slope:.2f}; {100 * gain:.0f} % less from the coarsest to the finest")
-    write_figure(figure(rows), out)
+    with writing(force=True):
+        write_figure(figure(rows), out)
 
 
 def judged(kind: str, size_deg: float) -> Row:

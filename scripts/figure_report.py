@@ -35,7 +35,7 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     sphereorient("track", experiment, "--out", out / "track.h5")
     sphereorient("report", out / "track.h5", "--experiment", experiment, "--out", out / "report")
-    sphereorient("overlay", experiment, out / "track.h5", "--out", out / "overlay.mp4")
+    sphereorient("overlay", experiment, out / "track.h5", "--out", out / "overlay.mp4", "--force")
     photograph(out / "report" / "index.html", REPO / "docs" / "report.png")
     frame(out / "overlay.mp4", REPO / "docs" / "overlay.png")
 

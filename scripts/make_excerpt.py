@@ -21,6 +21,7 @@ import numpy as np
 from sphereorient import locate
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.experiment.stream import spread_frames
+from sphereorient.files.whole_file import writing
 from sphereorient.locate import LocateSettings
 from sphereorient.movies import write_ffv1
 
@@ -47,7 +48,8 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     experiment = load_experiment(source / "experiment.yaml")
     for name, movie in open_movies(experiment).items():
-        write_ffv1(out / f"{name}.mkv", movie.frames(first, last), experiment.frame_rate_hz)
+        with writing(force=True):
+            write_ffv1(out / f"{name}.mkv", movie.frames(first, last), experiment.frame_rate_hz)
         diameter_px = locate.expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
         spread = spread_frames(range(len(movie)), 100)
         empty = locate.learn_background(movie.sample(spread), diameter_px, LocateSettings())

@@ -27,7 +27,7 @@ from paper_movies import film
 from paper_table import markdown, measured, single_views, table
 
 from sphereorient.errors import BenchError, OutputError, SphereOrientError, refusal
-from sphereorient.files.whole_file import make_folder, write_text
+from sphereorient.files.whole_file import MARK, make_folder, write_text
 from sphereorient.report.plots import style as look
 from sphereorient.run import MemoryStore, Request, run
 from sphereorient.run.many import end_with_parent
@@ -155,7 +155,7 @@ def write_page(out: Path, plan: Plan, failed: list[str]) -> list[Path]:
         table=markdown(table(found, views, plan.statistics)),
         figures="\n".join(parts),
     )
-    write_text(out / "paper.md", text)
+    write_text(out / "paper.md", f"<!-- {MARK} -->\n{text}")
     return pictures
 
 

@@ -1,10 +1,13 @@
 """The application of the command line, the helpers of its commands, `settings`, `info`, and the end of errors."""
 
+import inspect
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,8 +15,8 @@ import typer
 from typer.core import TyperGroup
 
 from sphereorient import __version__
-from sphereorient.errors import OutputError, SettingsError, SphereOrientError, refusal
-from sphereorient.files.whole_file import write_text
+from sphereorient.errors import OutputError, SettingsError, SphereOrientError, error_words, refusal
+from sphereorient.files.whole_file import check_target, write_text, writing
 
 
 class InOrder(TyperGroup):
@@ -32,7 +35,59 @@ class InOrder(TyperGroup):
         return sorted(super().list_commands(ctx), key=lambda name: known.get(name, len(known)))
 
 
-app = typer.Typer(
+OUTPUTS = {"out", "target", "save", "save_learnt", "worst"}  # parameters; all other paths are inputs
+FORCE = typer.Option("--force", help="Replace files that sphereorient did not make, but never an input.")
+
+
+class Commands(typer.Typer):
+    """Commands; those that write take --force, and replace none of their inputs."""
+
+    def command(self, name: str | None = None, **more: Any) -> Callable[[Any], Any]:
+        """Register a command as `typer.Typer.command`."""
+        return lambda function: super(Commands, self).command(name, **more)(_guarded(function, name != "map"))
+
+
+def _guarded(function: Callable[..., None], textured: bool) -> Callable[..., None]:
+    """Add --force to a command that writes; `textured`: whether the texture of its experiment is an input."""
+    signature = inspect.signature(function)
+    if not OUTPUTS & signature.parameters.keys():
+        return function
+
+    @wraps(function)
+    def guarded(*, force: bool, **given: Any) -> None:
+        told = [each if isinstance(each, list) else [each] for name, each in given.items() if name not in OUTPUTS]
+        paths = [path for each in told for path in each if isinstance(path, Path)]
+        with writing((file for path in paths for file in _read(path, textured)), force=force):
+            function(**given)
+
+    added = inspect.Parameter("force", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, FORCE])
+    vars(guarded)["__signature__"] = signature.replace(parameters=[*signature.parameters.values(), added])
+    guarded.__annotations__ = function.__annotations__ | {"force": added.annotation}
+    return guarded
+
+
+def _read(path: Path, textured: bool) -> Iterator[Path]:
+    """Yield a file that is read and those that it names, if it is YAML; movies with all their pictures."""
+    yield path
+    if path.suffix.lower() in (".yaml", ".yml"):
+        from sphereorient.files.yaml_file import read_yaml
+        from sphereorient.movies import movie_files
+
+        with suppress(SphereOrientError):  # the command tells what is wrong
+            for text in _texts(read_yaml(path, SettingsError), textured):
+                with suppress(SphereOrientError, OSError, ValueError):
+                    yield from movie_files(path.parent / text)
+
+
+def _texts(document: Any, textured: bool) -> list[str]:
+    if isinstance(document, dict):
+        document = [value for key, value in document.items() if textured or key != "texture"]
+    if isinstance(document, list):
+        return [text for value in document for text in _texts(value, textured)]
+    return [document] if isinstance(document, str) else []
+
+
+app = Commands(
     cls=InOrder,
     name="sphereorient",
     help="Measure position and absolute orientation of a painted sphere from high-speed movies.",
@@ -43,6 +98,7 @@ app = typer.Typer(
 )
 
 EXIT_REFUSED = 2  # an error that the user can correct
+NO_MEMORY = re.compile("(not enough|out of|insufficient|n't allocate|not allocate|to allocate) memory|bad_alloc", re.I)
 EXIT_INTERRUPTED = 130  # Ctrl-C, as in shells
 
 
@@ -56,14 +112,16 @@ def common(
         raise typer.Exit
 
 
-def check_writable(out: Path) -> None:
-    """Check that the output folder exists and can be written, before hours of work."""
+def check_writable(out: Path, *, folder_made: bool = False) -> None:
+    """Check before hours of work that a file can be written and replaces none of the user's; or a folder be made."""
     folder, name = out.parent, f"--out {out}"
     if not folder.is_dir():
         raise OutputError(refusal(name, expected=f"an existing folder {folder}", got="none", do="make it first"))
     if not os.access(folder, os.W_OK):
         do = "choose another --out"
         raise OutputError(refusal(name, expected="a writable folder", got=f"{folder}, which is not", do=do))
+    if not folder_made:
+        check_target(out)
 
 
 def command_line() -> str:
@@ -161,11 +219,15 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         code = EXIT_INTERRUPTED
     except Exception as error:
-        show = getattr(error, "show", None)
-        if show is None:
+        show, code = getattr(error, "show", None), int(getattr(error, "exit_code", EXIT_REFUSED))
+        if isinstance(error, MemoryError) or NO_MEMORY.search(str(error)):
+            do = "close other programs, use fewer --jobs, or set frames: in the experiment"
+            words = refusal("memory", expected="room for the data", got=error_words(error), do=do)
+            typer.echo(f"sphereorient: {words}", err=True)
+        elif show is None:
             raise
-        show()  # an error of the arguments, in the parser's words
-        code = int(getattr(error, "exit_code", EXIT_REFUSED))
+        else:
+            show()  # an error of the arguments, in the parser's words
     if code == EXIT_INTERRUPTED:
         typer.echo("sphereorient: interrupted; no result was written.", err=True)
     sys.exit(code)

@@ -8,12 +8,13 @@ import typer
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
 from sphereorient.cli.options import ExperimentPath, cameras_of
-from sphereorient.errors import CameraError, ExperimentError, OutputError, refusal
-from sphereorient.files.whole_file import put_aside
+from sphereorient.errors import CameraError, ExperimentError, refusal
+from sphereorient.files.whole_file import check_ending, put_aside
 
 if TYPE_CHECKING:
     from sphereorient.cameras import Camera
 
+YAML = (".yaml", ".yml")
 OPENCV = (".yml", ".yaml", ".xml", ".json")
 MADE_BY = "X_cam = R X_lab + T, mm; made by"
 
@@ -30,18 +31,19 @@ def calibrate(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no tables.")] = False,
 ) -> None:
     """Calibrate cameras from pictures of a plate, or repair cameras that moved, from a track of both."""
+    check_ending(out, "--out", YAML)
     check_writable(out)
-    check_other_yaml(out, source)
+    picture = out.with_suffix(".png")
     if refine_with is not None:
         _repair(source, refine_with, out, quiet)
         return
+    check_writable(picture)
     from sphereorient.calibration import calibrate_cameras
     from sphereorient.cameras import save_cameras
     from sphereorient.report import calibration_figure
 
     with progress_bar(quiet) as advance:
         result = calibrate_cameras(source, advance)
-    picture = out.with_suffix(".png")
     with put_aside(picture) as partial:
         calibration_figure(result, partial)
         doubtful = "".join(f"\ndoubtful: {line}" for line in result.verdict)
@@ -99,15 +101,6 @@ def check_cameras_command(
     echo_lines([*lines, *contradiction_lines(result)])
 
 
-def check_other_yaml(out: Path, source: Path) -> None:
-    """Refuse to write cameras over their source, or to a name that does not end in .yaml."""
-    do = "choose another --out, such as cameras.yaml"
-    if out.suffix not in (".yaml", ".yml"):
-        raise OutputError(refusal(f"--out {out}", expected="a name that ends in .yaml", got=f"'{out.name}'", do=do))
-    if out.resolve() == source.resolve():
-        raise OutputError(refusal(f"--out {out}", expected="another file than the input", got="the input", do=do))
-
-
 @app.command("convert-cameras")
 def convert_cameras(
     sources: Annotated[
@@ -128,9 +121,8 @@ def convert_cameras(
     ] = None,
 ) -> None:
     """Convert cameras of OpenCV or OpenPTV to cameras.yaml. A .addpar beside its .ori is read too."""
+    check_ending(out, "--out", YAML)
     check_writable(out)
-    for source in sources:
-        check_other_yaml(out, source)
     known = _names(sources, names)
     size = _size(image_size)
     from sphereorient.cameras import save_cameras

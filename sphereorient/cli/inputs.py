@@ -11,8 +11,8 @@ import typer
 
 from sphereorient.cli.app import Advance, app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import ExperimentPath, Overrides, Quiet, SettingsPath, frames_of
-from sphereorient.errors import MovieError, OutputError, refusal
-from sphereorient.files.whole_file import check_ending
+from sphereorient.errors import MovieError, refusal
+from sphereorient.files.whole_file import check_ending, writing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -122,14 +122,11 @@ def convert(
     quiet: Quiet = False,
 ) -> None:
     """Write a movie of any format as FFV1 (.mkv) or HDF5 (.h5), grey values unchanged."""
-    check_writable(target)
     from sphereorient.movies import flipped, movie_files, open_movie, write_movie
     from sphereorient.movies.write import times_path
 
-    if target.resolve() in [file.resolve() for file in movie_files(source)]:
-        do = "choose another name"
-        raise OutputError(refusal(str(target), expected="another file than the movie", got="the movie", do=do))
-    with flipped(open_movie(source), flip) as opened:
+    with writing(movie_files(source)), flipped(open_movie(source), flip) as opened:
+        check_writable(target)
         first, last = _range(frames, opened)
         times_s = None if opened.times_s is None else opened.times_s[first:last]
         dead: list[int] = []

@@ -43,7 +43,8 @@ def map_(
 ) -> None:
     """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed."""
     check_ending(out, "--out", [".png", ".tif", ".tiff"])  # other formats lose grey values
-    check_writable(out)
+    for path in _files_of(out):
+        check_writable(path)
     from sphereorient.methods.map import learn_map
     from sphereorient.sphere import load_texture
 
@@ -69,13 +70,17 @@ def map_(
         typer.echo(f"next: write texture: {out.name} under sphere: in the experiment, then `sphereorient track`")
 
 
+def _files_of(out: Path) -> list[Path]:
+    """Return the names of the map, its counts, all results, its figure, and that of what moved."""
+    return [out, *(out.with_name(out.stem + end) for end in ("_seen.png", "_map.h5", "_map.png", "_moved.png"))]
+
+
 def _write(result: "MapResult", old: "Tensor | None", out: Path) -> "tuple[list[Path], list[MapExample]]":
     """Write all files beside the map; return them, and how well re-rendered pictures match."""
     from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
 
-    endings = ("_seen.png", "_map.h5", "_map.png", "_moved.png")
-    seen, learnt, figure, moved = (out.with_name(out.stem + ending) for ending in endings)
+    _, seen, learnt, figure, moved = _files_of(out)
     texture_map.write_texture(result.texture, out)
     texture_map.write_seen(result.seen, seen)
     texture_map.write_learnt(result.learnt, result.track, learnt)

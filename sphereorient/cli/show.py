@@ -1,6 +1,5 @@
 """`sphereorient report`, `overlay`, `export` and `view`: what a track is looked at with."""
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +8,6 @@ import typer
 from sphereorient.cli.app import app, check_writable, command_line, progress_bar
 from sphereorient.cli.options import ExperimentPath, Quiet, SettingsPath, TrackPath, cameras_of, frames_of, settings_of
 from sphereorient.errors import OutputError, SettingsError, TrackError, refusal
-from sphereorient.files.whole_file import put_aside
 
 if TYPE_CHECKING:
     from sphereorient.trajectory import Trajectory
@@ -30,7 +28,7 @@ def report(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, only warnings.")] = False,
 ) -> None:
     """Write statistics of tracks with error bars, figures, and a page with the findings."""
-    check_writable(out)
+    check_writable(out, folder_made=True)
     from sphereorient.experiment import load_experiment
     from sphereorient.report.build import write_report
 
@@ -152,11 +150,11 @@ def view(
 
     measured = Trajectory.load(track)
     seen = None if experiment is None else load_experiment(experiment)
-    with progress_bar(quiet) as advance, ExitStack() as opened:
+    with progress_bar(quiet) as advance:
         view_track(
             measured,
             experiment=seen,
-            save=None if save is None else opened.enter_context(put_aside(save)),
+            save=save,
             every=every,
             pictures=pictures,
             progress=lambda *at: advance("pictures", *at),

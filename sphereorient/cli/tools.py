@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
+from sphereorient.cli.app import Commands, app, check_writable, command_line, echo_lines, progress_bar
 from sphereorient.cli.options import Quiet, names_in
 from sphereorient.errors import TextureError, refusal
 from sphereorient.files.whole_file import check_ending, make_folder, write_text
@@ -42,6 +42,7 @@ def spin(
     """Measure angular velocity and attitudes of a spinning ball from photographs (docs/photographs.md)."""
     check_ending(out, "--out", [".json"])
     check_writable(out)
+    check_writable(out.with_suffix(".png"))
     from sphereorient.report.plots.style import write_figure
     from sphereorient.tools.spin.disks import load_ball, load_photographs
     from sphereorient.tools.spin.dots import DotTable
@@ -123,7 +124,7 @@ def _print_spin(result: dict[str, Any]) -> None:
         typer.echo(f"dots: radius {result['dot_radius_deg']:.1f}°")
 
 
-texture_app = typer.Typer(help="Judge, make and print a texture map (docs/paint-design.md).", no_args_is_help=True)
+texture_app = Commands(help="Judge, make and print a texture map (docs/paint-design.md).", no_args_is_help=True)
 app.add_typer(texture_app, name="texture")
 
 
@@ -163,7 +164,7 @@ def design(
     _check_design(
         map_, make, gores, diameter_mm, stroke, diameter_px, noise, 0.0 if diameter_mm is None else diameter_mm
     )
-    check_writable(out)
+    check_writable(out, folder_made=True)
     from sphereorient.sphere import load_texture, reduced_texture
     from sphereorient.tools.design.gores import Gores, write_gores
     from sphereorient.tools.design.judge import DesignSettings, design_texture, judge_texture

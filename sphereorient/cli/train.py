@@ -29,23 +29,26 @@ def train(
     quiet: Quiet = False,
 ) -> None:
     """Train a network that proposes orientations (docs/proposer.md)."""
-    check_writable(out)
-    from sphereorient.files.whole_file import write_text
+    check_writable(out, folder_made=True)
+    from sphereorient.files.whole_file import check_target, write_text, writing
     from sphereorient.methods.settings import load_proposer_settings, proposer_settings_yaml
 
     settings = load_proposer_settings(config, set_ or [])
     from sphereorient.learn.metrics import make_examples
-    from sphereorient.learn.train import CHECKPOINT, prepare, train_proposer
+    from sphereorient.learn.train import CHECKPOINT, LAST, prepare, train_proposer
     from sphereorient.report.learning import examples_figure, learning_curve_figure
     from sphereorient.report.plots.style import write_figure
 
     prepare(settings, out, resume)
-    write_text(out / "settings.yaml", proposer_settings_yaml(settings))
-    with progress_bar(quiet, unit="steps") as advance:
+    with writing(force=resume), progress_bar(quiet, unit="steps") as advance:  # last.ckpt says whose folder it is
+        for name in (CHECKPOINT, LAST, "metrics.csv"):
+            check_target(out / name)
+        if config.resolve() != (out / "settings.yaml").resolve():
+            write_text(out / "settings.yaml", proposer_settings_yaml(settings))
         trained = train_proposer(settings, out, resume=resume, progress=advance)
-    curve = learning_curve_figure(trained.rows, int(trained.checkpoint.about["best_step"]))
-    write_figure(curve, out / "learning_curve.png")
-    write_figure(examples_figure(make_examples(trained.checkpoint, EXAMPLES)), out / "examples.png")
+        curve = learning_curve_figure(trained.rows, int(trained.checkpoint.about["best_step"]))
+        write_figure(curve, out / "learning_curve.png")
+        write_figure(examples_figure(make_examples(trained.checkpoint, EXAMPLES)), out / "examples.png")
     if not quiet:
         metrics = trained.metrics
         typer.echo(

@@ -1,3 +1,4 @@
+import hashlib
 import io
 import os
 from collections.abc import Iterator
@@ -5,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
+import numpy as np
 
 from sphereorient.files.whole_file import ROOM, put_aside
 
@@ -18,9 +20,24 @@ def whole_hdf5(path: Path, do: str = ROOM) -> Iterator[h5py.File]:
     # HDF5 reports a full disk as either error.
     with put_aside(path, do, also=(RuntimeError,)) as aside, GuardedFile(aside) as guarded:
         with h5py.File(guarded, "w", track_order=False) as file:
+            file.attrs["made_by"] = "sphereorient"
             yield file
         guarded.check()
         os.fsync(guarded.fileno())
+
+
+def digest(file: h5py.File) -> str:
+    """Return the SHA-256 of all data sets and attributes of a file but the attribute `sha256`."""
+    total = hashlib.sha256()
+
+    def add(name: str, thing: h5py.Group | h5py.Dataset) -> None:
+        told = {key: np.asarray(value).tolist() for key, value in thing.attrs.items() if key != "sha256"}
+        values = np.asarray(thing[()]) if isinstance(thing, h5py.Dataset) else np.zeros(0)
+        total.update(f"{name} {values.dtype} {values.shape} {sorted(told.items())}".encode() + values.tobytes())
+
+    add("", file)
+    file.visititems(add)
+    return total.hexdigest()
 
 
 class GuardedFile(io.FileIO):

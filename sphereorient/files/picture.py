@@ -1,3 +1,6 @@
+import itertools
+import math
+import struct
 import warnings
 from io import BytesIO
 from pathlib import Path
@@ -7,23 +10,36 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from tifffile import TiffFile
 
 from sphereorient.files.whole_file import put_aside
 
+TIFF_SIZE = (256, 257)  # the tags of width and height
 FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF")
 GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 BOMBS = (Image.DecompressionBombError, Image.DecompressionBombWarning)  # the warning where warnings are errors
-FAULTS = (OSError, ValueError, ArithmeticError, LookupError, MemoryError, SyntaxError)  # of damaged headers
+FAULTS = (  # of damaged headers
+    *(OSError, ValueError, ArithmeticError, LookupError, MemoryError, SyntaxError, TypeError, AttributeError),
+    *(RuntimeError, struct.error),
+)
 BOMB_PIXELS = 1 << 40  # reported for pictures that Pillow refuses by their size
 
 warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # callers compare the size with their own limit
 
 
 def claimed_pixels(content: bytes) -> int | None:
-    """Return how many pixels a PNG, JPEG, BMP, PNM or TIFF file claims to have; None for other files."""
+    """Return how many pixels a PNG, JPEG, BMP, PNM or TIFF file claims to have; None for other files.
+    Of sizes that a TIFF file gives twice the largest count: Pillow takes the last, the decoder the first.
+    """
     try:
         with Image.open(BytesIO(content), formats=FORMATS) as picture:
-            return picture.width * picture.height
+            pixels = picture.width * picture.height
+            if picture.format != "TIFF":
+                return pixels
+        with TiffFile(BytesIO(content)) as file:
+            page: Any = file.pages[0]
+            sizes = [[int(tag.value) for tag in page.tags.getall(code)] for code in TIFF_SIZE]
+        return max(pixels, *map(math.prod, itertools.product(*sizes)))
     except BOMBS:
         return BOMB_PIXELS
     except FAULTS:

@@ -1,9 +1,13 @@
-"""Files that are read whole, or written whole or not at all."""
+"""Files that are read whole, or written whole or not at all, and never over a file that is not this program's."""
 
 import os
+import re
+import secrets
 import stat
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+import zlib
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 
 from sphereorient.errors import OutputError, SphereOrientError, error_words, refusal
@@ -11,6 +15,21 @@ from sphereorient.errors import OutputError, SphereOrientError, error_words, ref
 TEXT_BYTES = 1_000_000  # of a text file written by hand: a hundred times the usual size
 TABLE_BYTES = 5_000_000  # of a table of points: 100,000 of them
 ROOM = "choose a folder that exists, may be written and has room"
+MARK = "made by sphereorient"  # of files that a later run may replace
+HEAD_BYTES = 512  # of a file, where the mark is
+# What texts begin with: a first comment, also of older versions, or keys of JSON. A schema is no mark: users write it.
+TEXT_MARK = re.compile(
+    rb"(?:#|<!--).*made by sphereorient|# repaired by sphereorient |# experiment: .*\n# method: .*\n# frame_rate_hz: "
+    rb'|\{\s*(?:"map": .*,\s*)?(?:"command": ?"sphereorient |"schema": ?"sphereorient-robustness)'
+)
+OLD_PAGE = b'<footer class="faint">sphereorient '
+PNG, PNG_HEAD = b"\x89PNG\r\n\x1a\n", 33  # signature; bytes of it and of the first chunk
+HDF5 = b"\x89HDF\r\n\x1a\n"
+Identity = tuple[int, int]  # of a file, whatever its name: device and number
+
+_inputs: ContextVar[frozenset[Identity]] = ContextVar("inputs", default=frozenset())
+_forced: ContextVar[bool] = ContextVar("forced", default=False)
+_made: dict[Path, tuple[int, int, int]] = {}  # files that this process made, as it left them
 
 
 def read_whole(path: Path, largest: int, expected: str, error: type[SphereOrientError], do: str) -> bytes:
@@ -45,26 +64,121 @@ def read_text(path: Path, largest: int, expected: str, error: type[SphereOrientE
 
 
 @contextmanager
+def writing(inputs: Iterable[Path] = (), *, force: bool = False) -> Iterator[None]:
+    """Within this context `inputs` are not replaced; with `force` all other plain files may be."""
+    found = set()
+    for path in inputs:
+        with suppress(OSError, ValueError):  # whoever reads it tells what is wrong
+            status = path.stat()
+            found.add((status.st_dev, status.st_ino))
+    known, forced = _inputs.set(_inputs.get() | found), _forced.set(_forced.get() or force)
+    try:
+        yield
+    finally:
+        _inputs.reset(known)
+        _forced.reset(forced)
+
+
+def is_forced() -> bool:
+    """Return whether files without the mark may be replaced here."""
+    return _forced.get()
+
+
+def check_target(path: Path) -> None:
+    """Raise OutputError if a file may not take the place of `path`: an input, a link, a device, a file of others."""
+    do = "choose another name"
+    try:
+        found = path.lstat()
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+        raise OutputError(refusal(str(path), expected="a name to write to", got=error_words(error), do=do)) from None
+    if stat.S_ISLNK(found.st_mode):
+        got = "a link"
+    elif stat.S_ISDIR(found.st_mode):
+        got, do = "a folder", "name a file in it"
+    elif not stat.S_ISREG(found.st_mode):
+        got = "a pipe, a socket or a device"
+    elif (found.st_dev, found.st_ino) in _inputs.get():
+        got = "an input of the same command"
+    elif is_forced() or _made.get(path.absolute()) == _state(found) or has_mark(path):
+        return
+    else:
+        got, do = "a file without its mark", f"{do}, or add --force to replace it"
+    raise OutputError(refusal(str(path), expected="a new file, or one made by sphereorient", got=got, do=do))
+
+
+def has_mark(path: Path) -> bool:
+    """Return whether a file says that this program made it: HDF5 attribute, PNG text, first comment, tag of a page."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+            if head.startswith(b"<!doctype html>"):
+                return MARK.encode() in head or OLD_PAGE in file.read()
+        if head.startswith(HDF5):
+            return _hdf5_has_mark(path)
+        return MARK.encode() in head if head.startswith(PNG) else TEXT_MARK.match(head) is not None
+    except (OSError, RuntimeError, ValueError, TypeError, LookupError):  # of damaged HDF5
+        return False
+
+
+def _hdf5_has_mark(path: Path) -> bool:
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        told = [file.attrs.get(name) for name in ("made_by", "schema")]  # the second of older versions
+    return any(isinstance(one, str) and one.startswith("sphereorient") for one in told)
+
+
+def _add_mark(path: Path) -> None:
+    """Add the mark to a PNG file, as its first text."""
+    content = path.read_bytes()
+    if content.startswith(PNG) and MARK.encode() not in content[:HEAD_BYTES]:
+        chunk = b"tEXtSoftware\0" + MARK.encode()
+        text = (len(chunk) - 4).to_bytes(4) + chunk + zlib.crc32(chunk).to_bytes(4)
+        path.write_bytes(content[:PNG_HEAD] + text + content[PNG_HEAD:])
+
+
+def _state(found: os.stat_result) -> tuple[int, int, int]:
+    return found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def unfinished(path: Path) -> Path:
+    """Return a name beside `path`, with its suffix, that nobody can guess, for what is not finished."""
+    return path.with_name(f".{path.stem[:40]}.{secrets.token_hex(8)}.partial{path.suffix}")
+
+
+@contextmanager
 def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()) -> Iterator[Path]:
-    """Give a temporary name with the same suffix; the file replaces `path` at the end, or is deleted after an error.
+    """Give an empty file with the same suffix that replaces `path` at the end (`check_target`), or goes after an error.
     OutputError with the remedy `do` for OSError or an error of `also`; the old file is kept.
     """
-    aside = path.with_name(f".{path.stem}.partial{path.suffix}")
     failures: tuple[type[Exception], ...] = (OSError, *also)
+    check_target(path)
+    aside = unfinished(path)
     try:
+        aside.touch(exist_ok=False)  # exclusively: a link planted here is not followed
+        _made[aside.absolute()] = _state(aside.stat())
         yield aside
+        if path.suffix.lower() == ".png":
+            _add_mark(aside)
+        check_target(path)  # again: hours may have passed
         aside.replace(path)
+        _made[path.absolute()] = _state(path.stat())
     except failures as error:
         expected = "a file that can be written"
         raise OutputError(refusal(str(path), expected=expected, got=error_words(error), do=do)) from error
     finally:
-        aside.unlink(missing_ok=True)
+        if _made.pop(aside.absolute(), None) is not None:
+            aside.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text in UTF-8 with `put_aside`."""
-    with put_aside(path) as aside:
-        aside.write_text(text, encoding="utf-8")
+    """Write a text in UTF-8 with `put_aside`; it is on the disk before it gets its name."""
+    with put_aside(path) as aside, aside.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def make_folder(path: Path, name: str) -> None:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.composer import ComposerError
 
 from sphereorient.errors import SphereOrientError, refusal
-from sphereorient.files.whole_file import TEXT_BYTES, read_text, write_text
+from sphereorient.files.whole_file import MARK, TEXT_BYTES, read_text, write_text
 
 Model = TypeVar("Model", bound=BaseModel)
 SHOWN = 20  # known names in a message
@@ -66,9 +66,10 @@ def refuse_unknown(key: object, known: Iterable[str], where: str) -> str:
 
 
 def write_document(path: Path, schema: str, document: Mapping[str, Any], comment: str = "") -> None:
-    """Write YAML with its schema as first key and `comment` above, replacing an old file at once (else OutputError).
+    """Write YAML with its schema as first key, the mark and `comment` above, replacing an old file at once.
     Small numbers are written as 1.0e-05: YAML 1.1 reads 1e-05 as text.
     """
+    comment = comment if MARK in comment.partition("\n")[0] else f"{MARK}\n{comment}"
     lines = "".join(f"# {line}\n" for line in comment.splitlines())
     content = {"schema": schema, **document}
     text = lines + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)

@@ -45,8 +45,9 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "about": dict(checkpoint.about),
     }
     _checked(tree, str(path))
-    with put_aside(path, also=(RuntimeError,)) as aside:
-        torch.save(tree, aside)
+    # A stream, not a name: torch writes the name into the file.
+    with put_aside(path, also=(RuntimeError,)) as aside, aside.open("wb") as file:
+        torch.save(tree, file)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

@@ -15,7 +15,7 @@ import torch
 
 from sphereorient.errors import TrackError, error_words, refusal
 from sphereorient.experiment.recording import Progress, Recording
-from sphereorient.files.hdf5 import whole_hdf5
+from sphereorient.files.hdf5 import digest, whole_hdf5
 from sphereorient.follow import Appearance
 from sphereorient.follow.follower import Follower
 from sphereorient.follow.poses import Poses
@@ -92,6 +92,7 @@ class Learnt:
         """Write everything as HDF5, atomically; raise OutputError if the file cannot be written."""
         with whole_hdf5(path) as file:
             _write(self, file)
+            file.attrs["sha256"] = digest(file)
 
     @classmethod
     def load(cls, path: Path) -> "Learnt":
@@ -104,6 +105,8 @@ class Learnt:
                 schema = file.attrs.get("schema")
                 if schema != SCHEMA:
                     raise TrackError(refusal(f"{path}: schema", expected=SCHEMA, got=str(schema), do=do))
+                if file.attrs.get("sha256") not in (None, digest(file)):  # None: of an older version
+                    raise ValueError("a checksum that does not fit")
                 return _read(file)
         except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
             expected, got = "a whole file of what was learnt", error_words(error)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sphereorient.errors import error_words
 from sphereorient.files.hdf5 import DAMAGE
-from sphereorient.movies.movie import LARGEST_RATIO, Grey, Movie, refused
+from sphereorient.movies.movie import LARGEST_RATIO, MOST_MISSING, Grey, Movie, refused
 
 KIND = "data set (N, H, W) of uint8 or uint16"
 SEPARATOR = "::"  # between the file and the data set in it
@@ -159,7 +159,10 @@ def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int
 
     data.id.chunk_iter(note)
     whole = frozenset(place for place, count in there.items() if count == tiles)
-    return min(stated, (max(whole, default=-1) + 1) * block), whole
+    count = min(stated, (max(whole, default=-1) + 1) * block)
+    if count > MOST_MISSING * (len(whole) + 1) * block:
+        raise refused(path, "frames", f"{len(whole) * block} among {count} that were never written", "record it again")
+    return count, whole
 
 
 def _times(data: Any, stated: int, count: int) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:

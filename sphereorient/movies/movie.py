@@ -1,3 +1,4 @@
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -10,6 +11,8 @@ from sphereorient.errors import MovieError, refusal
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
 FRAMES_A_MAP = 64
 OTHERS = "ask for frames that the movie has"
+MOST_PIXELS = 1 << 26  # more than any movie camera has
+MOST_MISSING = 100  # times the pictures that are there: with more gaps the numbers are not frame numbers
 LARGEST_RATIO = 1200  # largest compression ratio of a picture of one grey value; no real picture exceeds it
 # Thousandths that add up to 1000: R = G = B keeps its value.
 RED, GREEN, BLUE = 299, 587, 114
@@ -28,6 +31,9 @@ class Movie:
     remarks: tuple[str, ...] = ()  # warnings for the user: truncated, colour converted to grey, lossy codec
 
     def __init__(self, path: Path, form: str, count: int, frame_shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        if math.prod(frame_shape) > MOST_PIXELS:
+            expected, got = (f"{pixels / 1e6:.3g} million pixels" for pixels in (MOST_PIXELS, math.prod(frame_shape)))
+            raise refused(path, f"at most {expected} a frame", got, "cut out the part where the ball is")
         self.path, self.format, self._count = path, form, count
         self.frame_shape, self.dtype = frame_shape, dtype
 

@@ -11,7 +11,16 @@ import numpy as np
 
 from sphereorient.errors import MovieError
 from sphereorient.files.picture import claimed_pixels, decoded
-from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, Grey, Movie, luma, refused
+from sphereorient.movies.movie import (
+    COLOUR_REMARK,
+    LARGEST_RATIO,
+    MOST_MISSING,
+    MOST_PIXELS,
+    Grey,
+    Movie,
+    luma,
+    refused,
+)
 from sphereorient.movies.tiff import TiffMovie
 
 TIFF = (".tif", ".tiff")
@@ -19,10 +28,8 @@ LOSSY = (".jpg", ".jpeg")
 PICTURES = (".png", ".bmp", ".pgm", ".ppm", *LOSSY, *TIFF)
 WILD = re.compile(r"(\*|%0?\d*d)")
 DIGITS = re.compile(r"(\d+)")
-MOST_MISSING = 100  # times the pictures in the folder: with more gaps the numbers are not frame numbers
 SHOWN = 5  # gaps named in a remark
 ENOUGH, TRIED = 5, 64  # pictures that determine the size, and how many are tried if the first ones are damaged
-MOST_PIXELS = 1 << 26  # more than any movie camera has
 LARGEST_BYTES = 1 << 28  # of a picture file, which is read whole
 
 

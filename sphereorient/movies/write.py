@@ -77,6 +77,7 @@ def _write_hdf5(aside: Path, path: Path, frames: Iterable[Grey | None], times_s:
     count, first, checked = _checked(path, frames)
     with GuardedFile(aside) as guarded:
         with h5py.File(guarded, "w") as file:
+            file.attrs["made_by"] = "sphereorient"
             data = file.create_dataset(
                 "frames",
                 shape=(0, *first.shape),

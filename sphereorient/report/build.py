@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from sphereorient.errors import ExperimentError, OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.files.whole_file import ROOM
+from sphereorient.files.whole_file import ROOM, has_mark, unfinished
 from sphereorient.report import plots
 from sphereorient.report.frame_warnings import bad_stretches
 from sphereorient.report.gallery import gallery
@@ -22,7 +22,7 @@ from sphereorient.statistics import StatisticsSettings, Summary, Surroundings, s
 from sphereorient.statistics.cameras import CameraDistance, camera_distances, without_perspective
 from sphereorient.trajectory import Trajectory
 
-PARTS = ("index.html", "figures", "tables")
+KINDS = {"figures": (".png", ".pdf"), "tables": (".csv", ".parquet")}  # folders of a report, and what is in them
 MOST_STRIPS = 8  # tracks shown frame by frame
 PICTURES = 120  # frames of a report with pictures
 HALF = ("path", "camera_distance", "noise", "isotropy", "durations")  # figures that stand two beside each other
@@ -185,23 +185,32 @@ def _strips(
 @contextmanager
 def _folder(out: Path) -> Iterator[Path]:
     """Yield a temporary folder that becomes the report at the end, or is removed after an error."""
-    if out.exists() and (not out.is_dir() or {path.name for path in out.iterdir()} - set(PARTS)):
-        do = "choose a new folder"
-        expected = "a new folder, or one that holds an older report only"
-        raise OutputError(refusal(f"--out {out}", expected=expected, got="something else in it", do=do))
-    aside, old = (out.with_name(f".{out.name}.{word}") for word in ("partial", "old"))
-    shutil.rmtree(aside, ignore_errors=True)
+    out = out.resolve()  # a linked folder is followed
+    _check_folder(out)
+    aside, old = unfinished(out), unfinished(out)
     try:
-        for part in ("figures", "tables"):
+        for part in KINDS:
             (aside / part).mkdir(parents=True)
         yield aside
+        _check_folder(out)  # again: it may have changed meanwhile
         if out.exists():
-            shutil.rmtree(old, ignore_errors=True)
             out.replace(old)
         aside.replace(out)
     except OSError as error:
+        if old.exists() and not out.exists():
+            old.replace(out)
         expected, got = "a folder that can be written", error_words(error)
         raise OutputError(refusal(f"--out {out}", expected=expected, got=got, do=ROOM)) from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
+
+
+def _check_folder(out: Path) -> None:
+    """Raise OutputError if a folder has more in it than an older report, whose page carries the mark."""
+    page, found = out / "index.html", set(out.rglob("*"))
+    ours = {path for part, kinds in KINDS.items() for kind in kinds for path in (out / part).glob(f"*{kind}")}
+    whole = has_mark(page) and found <= ours | {page, *(out / part for part in KINDS)}
+    if (out.exists() and not out.is_dir()) or (found and not whole):
+        expected, do = "a new folder, or one that holds an older report only", "choose a new folder"
+        raise OutputError(refusal(f"--out {out}", expected=expected, got="something else in it", do=do))

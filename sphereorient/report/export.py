@@ -26,6 +26,7 @@ AXES: dict[tuple[int, ...], str] = {(3,): "xyz", (2,): "uv"}  # names of the com
 PAIRS = tuple(combinations_with_replacement(range(3), 2))  # of a symmetric matrix: xx xy xz yy yz zz
 SUFFIXES = {".csv": "csv", ".parquet": "parquet", ".pq": "parquet", ".mat": "mat"}
 ROWS = 50_000  # written at once
+FORMULA = re.compile(r"(^|[,;\t])([=+\-@\t\r])")  # begins a cell that spreadsheet programs compute
 Advance = Callable[[int, int], None]
 
 
@@ -88,11 +89,11 @@ def _write_csv(track: Trajectory, path: Path, progress: Advance) -> None:
     settings = about.pop("settings")
     lines = [f"{key}: {' '.join(as_text(value).split())}" for key, value in about.items()]
     lines += ["quaternions: of R_lab_body, w first; units stand at the end of the names", "settings:"]
-    lines += [f"  {line}" for line in settings.splitlines()]
+    lines = ["made by sphereorient", *lines, *(f"  {line}" for line in settings.splitlines())]
     plain = arrow_csv.WriteOptions(include_header=False, quoting_style="none")
     with path.open("wb") as file:
         for line in lines:
-            file.write(f"# {line}".rstrip().encode() + b"\n")
+            file.write(FORMULA.sub(r"\1'\2", f"# {line}".rstrip()).encode() + b"\n")
         file.write(",".join(table.column_names).encode() + b"\n")
         for first in range(0, len(table), ROWS):
             part = table.slice(first, ROWS)
@@ -281,6 +282,11 @@ def metadata(track: Trajectory) -> dict[str, Any]:
 def as_text(value: Any) -> str:
     """Return text unchanged and anything else as JSON."""
     return value if isinstance(value, str) else json.dumps(value)
+
+
+def plain_cell(value: Any) -> Any:
+    """Return a cell of a table for CSV: a text that a spreadsheet program would compute gets an apostrophe."""
+    return f"'{value}" if isinstance(value, str) and FORMULA.match(value) else value
 
 
 def with_unit(name: str, units: str) -> str:

@@ -4,7 +4,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.files.whole_file import check_ending
+from sphereorient.files.whole_file import check_ending, put_aside
 from sphereorient.report.export import package
 from sphereorient.report.frame_warnings import frame_warnings
 from sphereorient.report.overlay import pictures_by_row, streams_of
@@ -75,19 +75,16 @@ def view_track(
         check_ending(save, "--save", [".rrd"])
     recording: Any = rr.RecordingStream("sphereorient", recording_id=None)
     layout = _layout(track, experiment)
-    if save is None:
-        _open_viewer(recording, layout)
-    else:
+    with nullcontext() if save is None else put_aside(save) as aside:
+        if aside is None:
+            _open_viewer(recording, layout)
+        else:
+            recording.save(aside, default_blueprint=layout)
         try:
-            recording.save(save, default_blueprint=layout)
-        except (OSError, RuntimeError) as error:
-            expected, do = "a file that can be written", "choose a folder that exists and may be written"
-            raise OutputError(refusal(str(save), expected=expected, got=error_words(error), do=do)) from error
-    try:
-        _log(recording, track, experiment, every if pictures else 0, progress)
-    finally:
-        recording.flush()
-        recording.disconnect()
+            _log(recording, track, experiment, every if pictures else 0, progress)
+        finally:
+            recording.flush()
+            recording.disconnect()
 
 
 def _open_viewer(recording: Any, layout: Any) -> None:

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from sphereorient.evaluate.robustness.results import Results, ResultSummary, summaries
 from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
 from sphereorient.files.whole_file import put_aside
+from sphereorient.report.export import plain_cell
 from sphereorient.report.plots.style import new_figure
 from sphereorient.synth.severities import DEGRADATIONS
 
@@ -93,4 +94,4 @@ def write_table(results: Results, path: Path) -> None:
     with put_aside(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: plain_cell(value) for name, value in row.items()} for row in rows)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sphereorient.errors import OutputError
-from sphereorient.report.export import package
+from sphereorient.report.export import package, plain_cell
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.statistics.density import Density, stretched_exponential
@@ -71,7 +71,7 @@ def write_tables(tables: Sequence[Table], folder: Path) -> list[str]:
         with (folder / f"{table.name}.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, table.columns, lineterminator="\n")
             writer.writeheader()
-            writer.writerows(table.rows)
+            writer.writerows({name: plain_cell(value) for name, value in row.items()} for row in table.rows)
     try:
         arrow = package("pyarrow", "table")
     except OutputError:  # the page says so; CSV has the same numbers

@@ -13,6 +13,7 @@ from sphereorient.errors import OutputError, SettingsError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import Progress, open_recording, silent
 from sphereorient.files.provenance import provenance, sha256
+from sphereorient.files.whole_file import check_target
 from sphereorient.follow.follower import Batch, Follower
 from sphereorient.methods import results
 from sphereorient.methods.method import Job, Learnt, Method, one_thread
@@ -20,7 +21,7 @@ from sphereorient.methods.paper import PAPER
 from sphereorient.methods.precise import PRECISE
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, check_settings, settings_yaml
-from sphereorient.run.store import MemoryStore, Request, Store
+from sphereorient.run.store import MemoryStore, Request, Store, writing_of
 from sphereorient.trajectory import Trajectory
 
 METHODS: dict[str, Method] = {"precise": PRECISE, "paper": PAPER}
@@ -122,10 +123,11 @@ class Work:
         self.progress("join", 0, 1)
         track, learnt = self.method.join(self.job, self.follower, measured, self.progress)
         track = finished(track, self.job, self.request)
-        if learnt is not None and self.request.save_learnt is not None:
-            learnt.save(self.request.save_learnt)
-        if self.request.out is not None:
-            track.save(self.request.out)
+        with writing_of(self.request):
+            if learnt is not None and self.request.save_learnt is not None:
+                learnt.save(self.request.save_learnt)
+            if self.request.out is not None:
+                track.save(self.request.out)
         self.store.remove()
         self.progress("join", 1, 1)
         return track
@@ -222,10 +224,13 @@ def check_method(request: Request) -> Method:
 
 
 def check_out(request: Request) -> None:
-    """Check that the output folder exists before starting; raise OutputError if it does not."""
+    """Check before starting that the outputs can be written and replace nothing of the user's; else OutputError."""
     if request.out is not None and not request.out.parent.is_dir():
         expected, do = f"an existing folder {request.out.parent}", "make it first"
         raise OutputError(refusal(str(request.out), expected=expected, got="none", do=do))
+    with writing_of(request):
+        for path in filter(None, (request.out, request.save_learnt)):
+            check_target(path)
 
 
 def torch_device(name: str) -> torch.device:

@@ -1,23 +1,24 @@
 """The request of a run, and where it keeps intermediate results: in memory, or in a folder beside the track."""
 
-import fcntl
 import hashlib
 import json
 import os
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import h5py
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 
 from sphereorient import __version__
-from sphereorient.errors import OutputError, TrackError, refusal
+from sphereorient.errors import OutputError, TrackError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files, load_experiment
-from sphereorient.files.hdf5 import whole_hdf5
+from sphereorient.files.hdf5 import DAMAGE, digest, whole_hdf5
+from sphereorient.files.whole_file import is_forced, write_text, writing
 from sphereorient.follow.follower import Batch
 from sphereorient.follow.poses import Poses
 from sphereorient.methods.method import Learnt
@@ -27,6 +28,9 @@ from sphereorient.pose.fit import POSE_PARTS
 from sphereorient.trajectory import Reason
 
 SCHEMA = "sphereorient-poses/1"
+LOCK, PROCESS = "lock", "process"  # files in the folder of a run
+TRACES = re.compile(rf"{LOCK}|{PROCESS}|\..*\.part.*")  # left by a run that was killed at its beginning
+NO_ROTATION = 1e-6  # of an entry of R R^T: the least deviation from the unit matrix
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +46,7 @@ class Request:
     learnt: Path | Learnt | None = None  # what another run learnt, to measure with
     save_learnt: Path | None = None
     command: str = "sphereorient.run"
+    force: bool = field(default_factory=is_forced)  # whether files without this program's mark may be replaced
 
     @property
     def track(self) -> Path:
@@ -54,6 +59,15 @@ class Request:
     def parts(self) -> Path:
         """The folder beside the track that keeps intermediate results until the track is complete."""
         return self.track.with_name(self.track.name + ".parts")
+
+
+@contextmanager
+def writing_of(request: Request) -> Iterator[None]:
+    """Within this context no input of the request is replaced."""
+    given = request.experiment
+    experiment = given if isinstance(given, Experiment) else load_experiment(given)
+    with writing([experiment.path, *(path for path, _ in _files(request, experiment))], force=request.force):
+        yield
 
 
 def fingerprint(request: Request) -> dict[str, str]:
@@ -146,15 +160,13 @@ class FolderStore:
 
         Raises:
             TrackError: the folder to resume from belongs to a run with other inputs or settings.
-            OutputError: it cannot be written, or another run is writing it.
+            OutputError: it cannot be written, it is not of a run, or another run is writing it.
         """
-        with ExitStack() as locks:
-            if self._run.is_file():
-                self._lock(locks)
+        with self._locked():
             now, before = fingerprint(request), self._fingerprint()
             if before is None or not resume:
-                self._make(now)
-                self._lock(locks)
+                self.remove()
+                write_text(self._run, json.dumps(dict(now), indent=1))
             elif others := sorted(name for name in {*before, *now} if before.get(name) != now.get(name)):
                 do = "run without --resume to start over"
                 got = f"parts of a run with another {', '.join(others)}"
@@ -162,38 +174,42 @@ class FolderStore:
             try:
                 yield
             finally:
-                if self.folder.is_dir() and not any(self.folder.glob("*.h5")):
+                if not any(self.folder.glob("*.h5")):
                     self.remove()  # a run that came to nothing leaves nothing
 
-    def _make(self, now: Mapping[str, str]) -> None:
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Make the folder where there is none, refuse one that is not of a run, and lock it."""
+        name, lock = str(self.folder), FileLock(self.folder / LOCK, blocking=False)
         try:
-            self.remove()
-            self.folder.mkdir()
-            aside = self.folder / ".run.json.part"
-            with aside.open("w", encoding="utf-8") as file:
-                json.dump(dict(now), file, indent=1)
-                file.flush()
-                os.fsync(file.fileno())
-            aside.replace(self._run)
+            self.folder.mkdir(exist_ok=True)
+            if self._fingerprint() is None and not all(TRACES.fullmatch(path.name) for path in self.folder.iterdir()):
+                expected, do = "the parts of a run, or no such folder", "move it away, or choose another --out"
+                raise OutputError(refusal(name, expected=expected, got="a folder of something else", do=do))
         except OSError as error:
             do = "check the space left and the permissions of the folder"
-            raise OutputError(refusal(str(self.folder), expected="a folder to write", got=str(error), do=do)) from error
-
-    def _lock(self, locks: ExitStack) -> None:
-        file = locks.enter_context(self._run.open("rb"))
+            raise OutputError(refusal(name, expected="a folder to write", got=error_words(error), do=do)) from error
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            do = "wait for it, or stop it"
-            writer = self._writer()
-            raise OutputError(f"{self.folder} is being written by another run{writer}; {do}.") from None
-        except OSError:  # file systems without locks
-            return
-        (self.folder / "process").write_text(str(os.getpid()), encoding="utf-8")
+            lock.acquire()
+            (self.folder / PROCESS).write_text(str(os.getpid()), encoding="utf-8")
+        except Timeout:
+            writer, do = self._writer(), "wait for it, or stop it"
+            raise OutputError(f"{name} is being written by another run{writer}; {do}.") from None
+        except OSError:  # file systems without locks; a full one is told by the next file
+            pass
+        try:
+            yield
+        finally:
+            lock.release()  # first: Windows does not delete what is open
+            if not self._run.exists():
+                with suppress(OSError):  # what is not of a run stays
+                    (self.folder / LOCK).unlink(missing_ok=True)
+                    (self.folder / PROCESS).unlink(missing_ok=True)
+                    self.folder.rmdir()
 
     def _writer(self) -> str:
         try:
-            return f" (process {int((self.folder / 'process').read_text(encoding='utf-8'))})"
+            return f" (process {int((self.folder / PROCESS).read_text(encoding='utf-8'))})"
         except (OSError, ValueError):
             return ""
 
@@ -206,7 +222,9 @@ class FolderStore:
             known = json.loads(self._run.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        return {str(name): str(value) for name, value in known.items()} if isinstance(known, dict) else None
+        if not isinstance(known, dict) or not {"version", "method", "settings", "experiment"} <= known.keys():
+            return None
+        return {str(name): str(value) for name, value in known.items()}
 
     @property
     def known(self) -> Learnt | None:
@@ -229,6 +247,7 @@ class FolderStore:
             file["reason"] = np.array([[str(why) for why in one.reason] for one in poses], "S16")
             for name in POSE_PARTS:
                 file[name] = torch.cat([getattr(one, name) for one in poses]).numpy()
+            file.attrs["sha256"] = digest(file)
 
     def read(self, batch: Batch) -> list[Poses]:
         """Return the poses of one batch; raise TrackError and remove the file if it is damaged."""
@@ -245,9 +264,11 @@ class FolderStore:
         return [batch for batch in batches if not self.poses(batch).is_file()]
 
     def remove(self) -> None:
-        """Remove the folder."""
-        if self.folder.exists():
-            shutil.rmtree(self.folder)
+        """Remove what is of a run; `held` removes the empty folder."""
+        if self._fingerprint() is not None:
+            for path in [*self.folder.glob("poses-*.h5"), *self.folder.glob(".*.part*"), self.folder / "learnt.h5"]:
+                path.unlink(missing_ok=True)
+            self._run.unlink()  # last: it says whose folder it is
 
 
 Store = MemoryStore | FolderStore
@@ -257,12 +278,16 @@ def read_poses(path: Path) -> list[Poses] | None:
     """Return what `FolderStore.write` wrote; None if the file is not whole."""
     try:
         with h5py.File(path, "r") as file:
-            if file.attrs.get("schema") != SCHEMA:
+            R = torch.from_numpy(file["R_lab_body"][()])
+            turned = bool(((R @ R.mT - torch.eye(3)).abs() < NO_ROTATION).all() and (torch.linalg.det(R) > 0).all())
+            if file.attrs.get("schema") != SCHEMA or file.attrs.get("sha256") != digest(file) or not turned:
                 return None
             count, use = file["count"][()].tolist(), torch.from_numpy(file["use"][()])
             reason = [[Reason(why.decode()) for why in row] for row in file["reason"][()].tolist()]
             parts = {name: torch.split(torch.from_numpy(file[name][()]), count) for name in POSE_PARTS}
-    except (OSError, KeyError, ValueError, RuntimeError):
+    except MemoryError:
+        raise
+    except DAMAGE:
         return None
     return [
         # Copy: a row would keep the whole array in memory.

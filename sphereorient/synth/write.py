@@ -15,7 +15,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera, TsaiCamera, save_cameras
 from sphereorient.files.hdf5 import whole_hdf5
 from sphereorient.files.picture import write_picture
-from sphereorient.files.whole_file import make_folder
+from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.movies import write_ffv1
 from sphereorient.synth.degrade_scene import Filming, degraded_settings, wrong_cameras
 from sphereorient.synth.motion import Motion6D, RandomMotion, random_motion
@@ -101,7 +101,7 @@ def write_synthetic_experiment(
     save_cameras(folder / "cameras.yaml", reported, comment=f"{exact}; X_cam = R X_lab + T, mm")
     write_truth(folder / "truth.h5", motion_of(settings).at(frame_times_s(settings)), cameras)
     path = folder / "experiment.yaml"
-    path.write_text(yaml.safe_dump(_experiment(filming), sort_keys=False), encoding="utf-8")
+    write_text(path, yaml.safe_dump(_experiment(filming), sort_keys=False))
     return path
 
 

@@ -57,7 +57,9 @@ def test_cameras_come_back_to_the_last_bit(tmp_path):
         assert back[name].image_size == camera.image_size
         assert torch.equal(back[name].R_cam_lab, camera.R_cam_lab)
         assert torch.equal(back[name].rays(uv_px).direction_lab, camera.rays(uv_px).direction_lab)
-    assert path.read_text().startswith("# two lines\n# of comment\nschema: sphereorient-cameras/1\n")
+    assert path.read_text().startswith(
+        "# made by sphereorient\n# two lines\n# of comment\nschema: sphereorient-cameras/1\n"
+    )
     assert [file.name for file in tmp_path.iterdir()] == ["cameras.yaml"]
 
 

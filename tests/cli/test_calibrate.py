@@ -128,7 +128,7 @@ def test_a_fault_while_writing_leaves_the_old_files(tmp_path, monkeypatch, capsy
         raise CameraError("no room left on the disk")
 
     monkeypatch.setattr("sphereorient.cameras.save_cameras", full)
-    code, _, err = run(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / "cameras.yaml", "-q")
+    code, _, err = run(monkeypatch, capsys, "calibrate", source, "--out", tmp_path / "cameras.yaml", "-q", "--force")
     assert code == 2
     assert "no room" in err
     assert (tmp_path / "cameras.png").read_text() == (tmp_path / "cameras.yaml").read_text() == "old"
@@ -137,7 +137,7 @@ def test_a_fault_while_writing_leaves_the_old_files(tmp_path, monkeypatch, capsy
 
 @pytest.mark.parametrize(
     ("out", "words"),
-    [("cameras.png", "ends in .yaml"), ("calibration.yaml", "another file"), ("nowhere/cameras.yaml", "folder")],
+    [("cameras.png", "expected .yaml"), ("calibration.yaml", "an input"), ("nowhere/cameras.yaml", "folder")],
 )
 def test_an_output_that_would_harm_is_refused_before_any_work(tmp_path, monkeypatch, capsys, out, words):
     source = tables(tmp_path)

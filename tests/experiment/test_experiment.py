@@ -59,7 +59,7 @@ def test_a_written_experiment_is_read_back_the_same(folder, text):
     for part in dataclasses.fields(Experiment):
         if part.name not in ("path", "cameras"):
             assert getattr(again, part.name) == getattr(experiment, part.name), part.name
-    assert path.read_text().startswith("# made by a test\nschema: sphereorient-experiment/1\n")
+    assert path.read_text().startswith("# made by sphereorient\n# made by a test\nschema: sphereorient-experiment/1\n")
     assert str(folder) not in path.read_text()
 
 

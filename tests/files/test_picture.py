@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+
 import cv2
 import numpy as np
 import pytest
 
+from sphereorient.errors import TextureError
 from sphereorient.files.picture import BOMB_PIXELS, claimed_pixels, decoded, decoded_grey
+from sphereorient.sphere import load_texture
 
 GREY = (np.arange(12 * 17) % 251).astype(np.uint8).reshape(12, 17)
 
@@ -40,3 +45,30 @@ def test_sixteen_bits_come_out_as_they_are(suffix):
     deep = GREY.astype(np.uint16) * 257
     np.testing.assert_array_equal(decoded_grey(content(suffix, deep)), deep)
     np.testing.assert_array_equal(decoded(content(suffix, deep), cv2.IMREAD_UNCHANGED), deep)
+
+
+def sized_twice(kind: int, large: tuple[int, int], small: tuple[int, int]) -> bytes:
+    """A TIFF that gives width and height twice: first `large` as `kind`, 4 (LONG) or 17 (SLONG8), then `small`."""
+    packed = zlib.compress(bytes(large[0] * large[1]), 1) if large[0] * large[1] < 10**6 else b"none"
+    sizes = [
+        (code, each, value) for k, code in enumerate((256, 257)) for each, value in ((kind, large[k]), (4, small[k]))
+    ]
+    after = 8 + 2 + 12 * 11 + 4
+    more = b"".join(struct.pack("<q", value) for _, each, value in sizes if each == 17)
+    rest = [(258, 3, 8), (259, 3, 8), (262, 3, 1), (273, 4, after + len(more)), (277, 3, 1)]
+    rest += [(278, 4, large[1]), (279, 4, len(packed))]
+    places = iter(range(after, after + len(more), 8))
+    entries = [(code, each, next(places) if each == 17 else value) for code, each, value in sizes] + rest
+    table = b"".join(struct.pack("<HHII", code, each, 1, value) for code, each, value in entries)
+    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + table + bytes(4) + more + packed
+
+
+@pytest.mark.parametrize("kind", [4, 17])
+def test_of_sizes_given_twice_that_of_the_decoder_counts(kind, tmp_path):
+    """Before: 2048 pixels claimed, 10,000 decoded; 450 million passed the limit of 33.6 million and took 3.9 GB."""
+    twice = sized_twice(kind, (100, 100), (64, 32))
+    assert decoded_grey(twice).size == 10_000
+    assert claimed_pixels(twice) >= 10_000
+    (tmp_path / "map.tif").write_bytes(sized_twice(kind, (30_000, 15_000), (64, 32)))
+    with pytest.raises(TextureError, match=r"expected a picture of at most 33\.6 million pixels"):
+        load_texture(tmp_path / "map.tif")

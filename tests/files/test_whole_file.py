@@ -10,13 +10,13 @@ import pytest
 
 from sphereorient.errors import OutputError
 from sphereorient.files.hdf5 import GuardedFile, whole_hdf5
-from sphereorient.files.whole_file import put_aside
+from sphereorient.files.whole_file import put_aside, write_text
 from sphereorient.files.yaml_file import read_yaml, write_document
 
 
 def test_a_file_takes_its_place_at_the_end(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
-    path.write_text("old")
+    write_text(path, "old")
     with put_aside(path) as aside:
         aside.write_text("new")
         assert path.read_text() == "old"
@@ -28,7 +28,7 @@ def test_a_file_takes_its_place_at_the_end(tmp_path: Path) -> None:
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyError("other")])
 def test_after_an_error_the_old_file_is_kept(tmp_path: Path, error: Exception) -> None:
     path = tmp_path / "a.txt"
-    path.write_text("old")
+    write_text(path, "old")
     wanted = OutputError if isinstance(error, OSError) else KeyError
 
     def fail() -> None:
@@ -67,7 +67,7 @@ def test_writes_after_an_error_are_ignored_and_the_error_is_kept(tmp_path: Path)
 def test_a_document_can_be_read_by_others(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     write_document(path, "sphereorient-test/1", {"small": 1.0e-7}, "two\nlines")
-    assert path.read_text().startswith("# two\n# lines\n{schema: sphereorient-test/1")
+    assert path.read_text().startswith("# made by sphereorient\n# two\n# lines\n{schema: sphereorient-test/1")
     assert read_yaml(path, OutputError)["small"] == 1.0e-7
     umask = os.umask(0)
     os.umask(umask)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import signal
 import socket
 import time
@@ -14,7 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from sphereorient.errors import SphereOrientError
+
+resource = pytest.importorskip("resource")  # limits of memory, which Windows lacks, as named pipes
 
 PATIENCE_S = 8  # a load that takes longer hangs
 LONGEST = 500  # characters of a message, without the folder of the test

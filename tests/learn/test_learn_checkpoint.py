@@ -6,7 +6,7 @@ import pickle
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -290,8 +290,8 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch)
     save_checkpoint(path, example())
     before = path.read_bytes()
 
-    def full(tree: Any, aside: Path) -> None:
-        aside.write_bytes(b"some")
+    def full(tree: Any, aside: IO[bytes]) -> None:
+        aside.write(b"some")
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(module.torch, "save", full)

@@ -109,7 +109,7 @@ def test_convert_goes_on_after_frames_that_cannot_be_decoded(tmp_path, monkeypat
     ("arguments", "message"),
     [
         (["movie.npy", "out.mp4"], r"expected .mkv .h5 .hdf5, got '.mp4'"),
-        (["movie.npy", "movie.npy"], "expected another file than the movie"),
+        (["movie.npy", "movie.npy"], "got an input of the same command"),
         (["movie.npy", "none/out.mkv"], "expected an existing folder none"),
         (["movie.npy", "out.mkv", "--frames", "5:5"], "expected A:B within 0:30"),
         (["movie.npy", "out.mkv", "--frames", "5:99"], "expected A:B within 0:30"),

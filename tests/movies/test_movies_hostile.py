@@ -6,6 +6,7 @@ import tracemalloc
 from itertools import islice
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from cine_writer import Cine, write_cine
@@ -133,3 +134,18 @@ def test_no_field_of_a_cine_header_makes_it_allocate(tmp_path, field):
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < MOST_BYTES
+
+
+def test_a_movie_that_claims_far_more_than_was_written_is_refused(tmp_path):
+    """Before: 350 kB of HDF5 were read as a movie of 4e13 pixels, a million frames of 40 Mpx, 9 of them written."""
+    shape = (640, 625)
+    with h5py.File(tmp_path / "movie.h5", "w") as file:
+        data = file.create_dataset("frames", (10**8, *shape), "u1", chunks=(1, *shape), compression="gzip")
+        for k in (*range(8), 10**8 - 1):
+            data[k] = 0
+    with pytest.raises(MovieError, match="expected frames, got 9 among 100000000 that were never written"):
+        open_movie(tmp_path / "movie.h5")
+    with h5py.File(tmp_path / "large.h5", "w") as file:
+        file.create_dataset("frames", (2, 10_000, 7_000), "u1", chunks=(1, 10_000, 7_000), compression="gzip")[1] = 0
+    with pytest.raises(MovieError, match=r"expected at most 67\.1 million pixels a frame, got 70 million pixels"):
+        open_movie(tmp_path / "large.h5")

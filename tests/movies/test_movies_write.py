@@ -8,6 +8,7 @@ from movie_examples import FRAMES, pictures
 
 from sphereorient.errors import MovieError, OutputError
 from sphereorient.experiment.timeline import load_times
+from sphereorient.files.whole_file import writing
 from sphereorient.movies import open_movie, write_movie
 
 
@@ -59,7 +60,7 @@ def test_what_cannot_be_written_leaves_the_old_movie_alone(tmp_path, suffix):
         ([pictures()[0], pictures()[0][:3]], "frame 1: expected"),
         ([np.zeros((3, 4))], "frame 0: expected frames"),
     ):
-        with pytest.raises(MovieError, match=message):
+        with pytest.raises(MovieError, match=message), writing(force=True):
             write_movie(path, frames)
         assert path.read_bytes() == b"the old one"
         assert list(tmp_path.iterdir()) == [path]
@@ -75,16 +76,18 @@ def test_a_full_disk_is_one_line_and_the_old_movie_stays(tmp_path, suffix):
     import subprocess
     import sys
 
+    pytest.importorskip("resource")
     path = tmp_path / f"movie.{suffix}"
     path.write_bytes(b"the old one")
     code = (
         "import resource, signal, sys, numpy as np\n"
         "from sphereorient.errors import OutputError\n"
+        "from sphereorient.files.whole_file import writing\n"
         "from sphereorient.movies import write_movie\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
         "noise = np.random.default_rng(0).integers(0, 256, (40, 200, 200), dtype=np.uint8)\n"
-        "try:\n    write_movie(sys.argv[1], noise)\n"
+        "try:\n  with writing(force=True):\n    write_movie(sys.argv[1], noise)\n"
         "except OutputError as error:\n    print('refused:', error)\n"
     )
     run = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import fields, replace
 
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from sphereorient.errors import OutputError
 from sphereorient.report.export import columns, export_track, format_of, safe_names, to_xarray
+from sphereorient.report.tables import Table, write_tables
 from sphereorient.trajectory import CameraTrack, Trajectory
 
 pd = pytest.importorskip("pandas")
@@ -81,7 +83,7 @@ def test_what_was_not_measured_is_nan(table):
 def test_the_csv_begins_with_what_the_track_says_of_itself(track, tmp_path):
     export_track(track, tmp_path / "t.csv", "csv")
     head = [line for line in (tmp_path / "t.csv").read_text().splitlines() if line.startswith("#")]
-    assert head[0] == "# experiment: of May"
+    assert head[:2] == ["# made by sphereorient", "# experiment: of May"]
     assert "# method: precise" in head
     assert "# frame_rate_hz: 600.0" in head
     assert '# provenance: {"versions": {"x": "1"}}' in head
@@ -204,3 +206,19 @@ def test_the_command_writes_a_whole_file_or_one_line(track, tmp_path, monkeypatc
     assert told.count("\n") == 1
     assert "t.csv: expected an HDF5 file" in told
     assert sorted(path.name for path in tmp_path.iterdir()) == ["t.csv", "track.h5"]
+
+
+@pytest.mark.parametrize("begin", list("=+-@\t\r"))
+def test_no_cell_of_a_table_is_a_formula(track, tmp_path, begin):
+    """Before: the experiment's name stood in the CSV as it is, and spreadsheet programs computed it."""
+    evil = f'{begin}HYPERLINK("http://x","y")'
+    named = replace(track, experiment=f"a,{evil}", settings=f"{evil}\n", method=f"b;{evil}\tc")
+    export_track(named, tmp_path / "t.csv", "csv")
+    with (tmp_path / "t.csv").open(newline="") as file:
+        text = file.read()
+    head = text[: text.index("\ntime_s")]
+    assert begin.isspace() or f"# experiment: a,'{begin}HYPERLINK" in head  # blanks are single spaces there
+    assert not [cell for cell in re.split(r"[,;\t\n]", head) if re.match(r"[=+\-@\r]", cell)]
+    rows = [{"file": evil, "frames": -3, "note": "plain"}]
+    write_tables([Table(name="tracks", about="", rows=rows)], tmp_path)
+    assert pd.read_csv(tmp_path / "tracks.csv").iloc[0].tolist() == [f"'{evil}", -3, "plain"]

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from sphereorient.cli import main
+from sphereorient.errors import OutputError
+from sphereorient.report.build import _check_folder
 from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 from sphereorient.trajectory import Trajectory
 
@@ -186,3 +188,19 @@ def test_names_of_tracks_are_as_short_as_they_can_be(place):
     names = _load([place / "a/track.h5", place / "b/track.h5", place / "precise.h5"])
     assert list(names) == ["a/track.h5", "b/track.h5", "precise.h5"]
     assert replace(names["precise.h5"]).method == "precise"
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "tables/mine.txt", "figures/a.txt"])
+def test_a_file_of_the_users_in_a_report_stays(tmp_path, name):
+    """Before: only the names in the folder itself were looked at; tables/ and figures/ went with all in them."""
+    out = tmp_path / "report"
+    (out / name).parent.mkdir(parents=True)
+    (out / "index.html").write_text('<!doctype html>\n<meta name="generator" content="made by sphereorient">')
+    _check_folder(out)
+    (out / name).write_text("mine")
+    with pytest.raises(OutputError, match="got something else in it"):
+        _check_folder(out)
+    (out / name).unlink()
+    (out / "index.html").write_text("<!doctype html>\n<p>my own page</p>")
+    with pytest.raises(OutputError, match="got something else in it"):
+        _check_folder(out)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import signal
 import subprocess
 import sys
@@ -12,6 +11,9 @@ import pytest
 from run_examples import EXCERPT, SHORT_BLOCKS, datasets, run
 
 COMMAND = [sys.executable, "-c", "from sphereorient.cli import main; main()", "track"]
+
+
+resource = pytest.importorskip("resource")  # not on Windows
 
 
 def limited(size: int):
@@ -25,7 +27,7 @@ def limited(size: int):
 
 
 def track(out: Path, size: int, *more: str) -> subprocess.CompletedProcess[str]:
-    words = [*COMMAND, str(EXCERPT), "--out", str(out), "-q", *SHORT_BLOCKS, *more]
+    words = [*COMMAND, str(EXCERPT), "--out", str(out), "-q", "--force", *SHORT_BLOCKS, *more]
     return subprocess.run(words, capture_output=True, text=True, timeout=300, check=False, preexec_fn=limited(size))
 
 

@@ -41,7 +41,7 @@ def whole(tmp_path_factory, request_of) -> Path:
 
     def keep(stage: str, done: int, total: int) -> None:
         if stage == "track" and 0 < done < total and not (folder / "half").exists():
-            shutil.copytree(request.parts, folder / "half")
+            shutil.copytree(request.parts, folder / "half", ignore=shutil.ignore_patterns("lock"))
 
     tracked(request, progress=keep)
     assert not request.parts.exists()
@@ -140,6 +140,7 @@ def test_knowledge_of_other_cameras_is_refused(whole, tmp_path, request_of):
     with h5py.File(other, "r+") as file:
         file.move("cameras/cam2", "cameras/left")
         file.attrs["cameras"] = ["cam1", "left"]
+        del file.attrs["sha256"]
     with pytest.raises(TrackError, match="expected what was learnt of cam2"):
         tracked(request_of(tmp_path, learnt=other))
 
@@ -169,4 +170,6 @@ def test_ten_kills_at_any_moment_leave_the_same_track(tmp_path):
             out.unlink()
     assert run(*command[len(COMMAND) :]).returncode == 0
     assert datasets(out) == expected
-    assert {path.name for path in tmp_path.iterdir()} == {"clean.h5", "track.h5"}
+    # A kill while the track is written leaves a file of a name that nobody can guess.
+    left = {path.name for path in tmp_path.iterdir() if not path.match(".track.*.partial.h5")}
+    assert left == {"clean.h5", "track.h5"}

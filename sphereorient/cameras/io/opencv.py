@@ -10,8 +10,8 @@ from torch import Tensor
 
 from sphereorient.cameras.brown import BrownCamera
 from sphereorient.cameras.checks import camera_error
-from sphereorient.errors import CameraError, OutputError, refusal
-from sphereorient.files.whole_file import TEXT_BYTES, read_whole
+from sphereorient.errors import CameraError
+from sphereorient.files.whole_file import TEXT_BYTES, check_ending, put_aside, read_whole
 from sphereorient.files.yaml_file import short
 
 SUFFIXES = (".yml", ".yaml", ".xml", ".json")  # OpenCV chooses the format by them
@@ -57,24 +57,18 @@ def save_opencv(path: Path | str, camera: BrownCamera) -> None:
         OutputError: an ending other than .yml, .yaml, .xml or .json, or a file that cannot be written.
     """
     path = Path(path)
-    expected, got, do = f"a name ending in {', '.join(SUFFIXES)}", f"'{path.suffix}'", "rename it"
-    storage = None
-    if path.suffix in SUFFIXES:
-        expected, got, do = "a file in a folder that exists", f"'{path.parent}'", "make the folder first"
-        if path.parent.is_dir():  # checked first: OpenCV prints to the terminal when it fails
-            expected, got, do = "a file that can be written", "one that cannot", "choose a folder that may be written"
-            storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    if storage is None or not storage.isOpened():
-        raise OutputError(refusal(str(path), expected=expected, got=got, do=do))
+    check_ending(path, "OpenCV file", SUFFIXES)
     (fx, fy), (cx, cy) = camera.f_px.tolist(), camera.centre_px.tolist()
     (k1, k2, k3), (p1, p2) = camera.k.tolist(), camera.p.tolist()
-    storage.write("image_width", camera.image_size[0])
-    storage.write("image_height", camera.image_size[1])
-    storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    storage.write("distortion_coefficients", np.array([[k1], [k2], [p1], [p2], [k3]]))
-    storage.write("R", camera.R_cam_lab.detach().numpy())
-    storage.write("T", camera.T_cam_lab_mm.detach().numpy()[:, None])
-    storage.release()
+    with put_aside(path) as aside:
+        storage = cv2.FileStorage(str(aside), cv2.FILE_STORAGE_WRITE)
+        storage.write("image_width", camera.image_size[0])
+        storage.write("image_height", camera.image_size[1])
+        storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+        storage.write("distortion_coefficients", np.array([[k1], [k2], [p1], [p2], [k3]]))
+        storage.write("R", camera.R_cam_lab.detach().numpy())
+        storage.write("T", camera.T_cam_lab_mm.detach().numpy()[:, None])
+        storage.release()
 
 
 def _opened(path: Path) -> cv2.FileStorage:

@@ -1,0 +1,13 @@
+"""In front of PYTHONPATH this hides from every process what Windows and macOS lack: posix modules, and `fork`."""
+
+import multiprocessing
+import os
+import sys
+import warnings
+
+for name in ("fcntl", "grp", "pwd", "resource", "termios", "tty", "pty", "syslog"):
+    sys.modules[name] = None
+for name in ("fork", "forkpty", "mkfifo", "geteuid", "getegid", "sched_getaffinity"):
+    vars(os).pop(name, None)
+warnings.filterwarnings("ignore", "only soft file lock is available")  # Windows has a lock of its own
+multiprocessing.set_start_method("spawn")

@@ -1,0 +1,130 @@
+"""The parts of a run: whose folder it is, checksums, rotations, the lock."""
+
+from __future__ import annotations
+
+import multiprocessing
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from excerpt_examples import EXCERPT
+
+from sphereorient.errors import OutputError, TrackError
+from sphereorient.files.hdf5 import digest
+from sphereorient.follow.follower import Batch
+from sphereorient.follow.poses import Poses
+from sphereorient.methods.settings import load_settings
+from sphereorient.pose.fit import blank_parts
+from sphereorient.run import FolderStore, Request
+from sphereorient.run.store import read_poses
+from sphereorient.trajectory import Reason
+
+BATCH = Batch(first=0, last=3, lengths=(3,))
+
+
+def request_to(out: Path) -> Request:
+    return Request(experiment=EXCERPT / "experiment.yaml", out=out, settings=load_settings(None, []))
+
+
+@pytest.fixture
+def store(tmp_path) -> FolderStore:
+    """Three frames of two poses each, kept."""
+    request = request_to(tmp_path / "track.h5")
+    store = FolderStore(request.parts)
+    parts = blank_parts(2, 2)
+    one = Poses(**parts, use=torch.ones(2, dtype=torch.bool), reason=(Reason.OK, Reason.OK))
+    with store.held(request, resume=False):
+        store.write(BATCH, [one] * 3)
+    return store
+
+
+def test_a_folder_of_the_users_is_refused_and_stays(tmp_path):
+    """Before: deleted with its contents, without a look at whose it is."""
+    request = request_to(tmp_path / "track.h5")
+    request.parts.mkdir()
+    (request.parts / "thesis.txt").write_text("years of work")
+    (request.parts / "run.json").write_text('{"my": "own"}')
+    for resume in (False, True):
+        store = FolderStore(request.parts)
+        with (
+            pytest.raises(OutputError, match="got a folder of something else; move it away") as refused,
+            store.held(request, resume=resume),
+        ):
+            pass
+        assert "\n" not in str(refused.value)
+        store.remove()
+    assert {path.name for path in request.parts.iterdir()} == {"thesis.txt", "run.json"}
+
+
+def test_what_is_not_of_the_run_stays_when_its_folder_is_emptied(store, tmp_path):
+    (store.folder / "notes.txt").write_text("mine")
+    with store.held(request_to(tmp_path / "track.h5"), resume=False):
+        assert store.missing([BATCH]) == [BATCH]
+    assert [path.name for path in store.folder.iterdir() if path.name not in ("lock", "process")] == ["notes.txt"]
+    (store.folder / "notes.txt").unlink()
+    with store.held(request_to(tmp_path / "track.h5"), resume=False):
+        pass
+    assert not store.folder.exists()
+
+
+def test_parts_come_back_as_they_were(store):
+    (one, _, _) = store.read(BATCH)
+    assert torch.equal(one.R_lab_body, torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
+    assert one.use.tolist() == [True, True]
+
+
+def damage(path: Path, name: str, values: object, *, sealed: bool) -> None:
+    with h5py.File(path, "r+") as file:
+        file[name][0] = values
+        if sealed:
+            file.attrs["sha256"] = digest(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "sealed"),
+    [
+        ("position_lab_mm", np.nan, False),
+        ("score", 0.5, False),
+        ("use", False, False),
+        ("R_lab_body", np.nan, True),
+        ("R_lab_body", 2 * np.eye(3), True),
+        ("R_lab_body", -np.eye(3), True),
+        ("count", 99, True),
+    ],
+)
+def test_a_damaged_part_is_measured_again(store, name, values, sealed):
+    """Before: TypeError or IndexError on every try; -I and 2 I were taken over as rotations."""
+    damage(store.poses(BATCH), name, values, sealed=sealed)
+    assert read_poses(store.poses(BATCH)) is None
+    with pytest.raises(TrackError, match=r"got a damaged file; run again with --resume"):
+        store.read(BATCH)
+    assert store.missing([BATCH]) == [BATCH]
+
+
+def _hold(out: Path, held: object, done: object) -> None:
+    request = request_to(out)
+    with FolderStore(request.parts).held(request, resume=False):
+        held.set()
+        done.wait(60)
+
+
+def test_another_process_cannot_write_the_same_track(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    held, done = context.Event(), context.Event()
+    other = context.Process(target=_hold, args=(tmp_path / "track.h5", held, done))
+    other.start()
+    try:
+        assert held.wait(60)
+        request = request_to(tmp_path / "track.h5")
+        with (
+            pytest.raises(OutputError, match=rf"is being written by another run \(process {other.pid}\)"),
+            FolderStore(request.parts).held(request, resume=False),
+        ):
+            pass
+    finally:
+        done.set()
+        other.join(60)
+    assert other.exitcode == 0
+    assert not request.parts.exists()
