@@ -1,8 +1,10 @@
 """The application of the command line, the helpers of its commands, `settings`, `info`, and the end of errors."""
 
+import math
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -42,6 +44,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+LINE_S = 60.0  # from one line of a stage to its next, without a terminal
 EXIT_REFUSED = 2  # an error that the user can correct
 EXIT_INTERRUPTED = 130  # Ctrl-C, as in shells
 
@@ -82,13 +85,20 @@ Advance = Callable[[str, int, int], None]
 
 @contextmanager
 def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]:
-    """Show a line of progress for each stage, with units per second and remaining time; nothing if `quiet`."""
+    """Show a line of progress for each stage, with units per second and remaining time; nothing if `quiet`.
+
+    Without a terminal: print a line as a stage begins, and each minute.
+    """
     if quiet:
         yield lambda stage, done, total: None
         return
     from rich import progress
     from rich.console import Console
 
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines()
+        return
     bar = progress.Progress(
         "{task.description:13}",
         progress.BarColumn(),
@@ -97,7 +107,7 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
         progress.TimeElapsedColumn(),
         "left",
         progress.TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=console,
     )
     tasks: dict[str, Any] = {}
     with ExitStack() as shown:
@@ -112,6 +122,19 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
             bar.update(tasks[stage], completed=done, total=total, rate=rate)
 
         yield advance
+
+
+def _lines() -> Advance:
+    begun = time.monotonic()
+    told: dict[str, float] = {}  # by stage, when its last line was printed
+
+    def advance(stage: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        if now - told.get(stage, -math.inf) >= LINE_S:
+            told[stage] = now
+            typer.echo(f"{now - begun:6.0f} s  {stage}: {done}" + (f" of {total}" if total else ""), err=True)
+
+    return advance
 
 
 @app.command()

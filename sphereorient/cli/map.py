@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from sphereorient.mapping import LearntMap
     from sphereorient.mapping.compare import MapComparison
     from sphereorient.methods.map import MapResult
-    from sphereorient.report.texture_map import MapExample
     from sphereorient.tools.wear.series import WearSeries
 
 OFTEN = 10  # pictures from which on a texel counts as well seen
+PAINT_MIN = 0.7  # correlation of held-out pictures below which a map is doubted
 PLACES_PRINTED = 10  # worn places that are printed; JSON has all
 
 
@@ -54,12 +54,12 @@ def map_(
     with progress_bar(quiet) as advance:
         result = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, command=command)
         advance("figure", 0, 1)
-        files, compared = _write(result, old, out)
+        files = _write(result, old, out)
         advance("figure", 1, 1)
     if quiet:
         return
     echo_lines(f"note: {remark}" for remark in result.remarks)
-    _print(result.learnt, compared)
+    _print(result.learnt)
     if result.comparison is not None:
         _print_moved(result.comparison, f"against {init}")
         typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
@@ -69,8 +69,8 @@ def map_(
         typer.echo(f"next: write texture: {out.name} under sphere: in the experiment, then `sphereorient track`")
 
 
-def _write(result: "MapResult", old: "Tensor | None", out: Path) -> "tuple[list[Path], list[MapExample]]":
-    """Write all files beside the map; return them, and how well re-rendered pictures match."""
+def _write(result: "MapResult", old: "Tensor | None", out: Path) -> list[Path]:
+    """Write all files beside the map, and return them."""
     from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
 
@@ -79,18 +79,16 @@ def _write(result: "MapResult", old: "Tensor | None", out: Path) -> "tuple[list[
     texture_map.write_texture(result.texture, out)
     texture_map.write_seen(result.seen, seen)
     texture_map.write_learnt(result.learnt, result.track, learnt)
-    compared = texture_map.compare_pictures(result.track, result.experiment, out)
+    compared = texture_map.compare_pictures(result.learnt, result.track, result.experiment, out)
     write_figure(texture_map.map_figure(result.learnt, compared), figure)
     if result.comparison is None or old is None:
-        return [out, seen, learnt, figure], compared
+        return [out, seen, learnt, figure]
     write_figure(texture_map.moved_figure(old, result.comparison), moved)
-    return [out, seen, learnt, figure, moved], compared
+    return [out, seen, learnt, figure, moved]
 
 
-def _print(learnt: "LearntMap", compared: "list[MapExample]") -> None:
+def _print(learnt: "LearntMap") -> None:
     """Print from what the map was learnt, and how well it explains the pictures."""
-    import numpy as np
-
     from sphereorient.report.texture_map import shares_seen
 
     seen, often = shares_seen(learnt.seen, (1, OFTEN))
@@ -108,10 +106,14 @@ def _print(learnt: "LearntMap", compared: "list[MapExample]") -> None:
     if alone.any():
         named = ", ".join(str(k) for k in alone.nonzero()[:, 0].tolist())
         lines.append(f"without an attitude, because they share too little with the others: frames {named}")
-    alike = np.array([example.correlation for example in compared])
-    if np.isfinite(alike).any():
-        middle, low = np.nanmedian(alike), np.nanpercentile(alike, 5)
-        lines.append(f"pictures against re-rendered: correlation {middle:.3f} (median), {low:.3f} (worst twentieth)")
+    paint = learnt.paint[learnt.paint.isfinite()]
+    if len(paint):
+        middle, low = paint.quantile(0.5), paint.quantile(0.05)
+        said = f"paint in pictures held out of the map: correlation {middle:.3f} (median), {low:.3f} (worst twentieth)"
+        lines.append(said if middle > PAINT_MIN else f"doubt: {said}; do not trust the map")
+    if len(learnt.jumps):
+        named = ", ".join(str(k) for k in learnt.jumps[:PLACES_PRINTED].tolist())
+        lines.append(f"doubt: the rate jumps at {len(learnt.jumps)} frames: {named}")
     echo_lines(lines)
 
 

@@ -85,6 +85,11 @@ class State:
         cameras = self.use.shape[1]
         return self.pixels.where((cameras * rows[:, None] + torch.arange(cameras)).reshape(-1))
 
+    def where(self, rows: Tensor, use: Tensor) -> "State":
+        """Return some instants, seen as in `use` (n, C)."""
+        parts = {name: getattr(self, name)[rows] for name in ("frames", "position_lab_mm", "R_lab_body")}
+        return replace(self, **parts, pixels=self.disks(rows), use=use[rows])
+
     def linearised(self) -> Iterator[Linearisation]:
         """Yield the linearisation of all disks in batches; unseen disks have weight 0."""
         for rows, pixels in self.batches():
@@ -151,7 +156,7 @@ def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iterati
         state = _with_light(state)
     if k >= SEPARATE_ITERATIONS:
         state = _with_joint_step(state, smooth)
-    state, chi2 = _with_map(state, smooth)
+    state, chi2 = with_map(state, smooth)
     if k < LIGHT_ITERATIONS:
         state = _rescaled(state)
     if SEPARATE_ITERATIONS <= k < LIGHT_ITERATIONS and settings.blur_px is None:
@@ -231,7 +236,7 @@ def _better_blur(state: State) -> float:
 
 
 def _with_joint_step(state: State, smooth: float) -> State:
-    """Move all poses by one joint step, without its map: `_with_map` solves for that exactly."""
+    """Move all poses by one joint step, without its map: `with_map` solves for that exactly."""
     height = len(state.texture)
     parts, weight = [], np.zeros(2 * height * height)
     for at in state.linearised():
@@ -247,8 +252,8 @@ def _with_joint_step(state: State, smooth: float) -> State:
     )
 
 
-def _with_map(state: State, smooth: float) -> tuple[State, float]:
-    """Solve for the map at the present poses; return also chi2 per pixel before."""
+def with_map(state: State, smooth: float) -> tuple[State, float]:
+    """Return the state with its best map at the present poses, and chi2 per pixel before."""
     height = len(state.texture)
     parts, right = [], np.zeros(2 * height * height)
     squares = expected = 0.0

@@ -27,6 +27,7 @@ from sphereorient.mapping.iterations import (
 from sphereorient.mapping.pairs import Closure
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.mapping.settings import MapSettings
+from sphereorient.mapping.verdict import check_fixed, jumps, paint_correlation
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, widest_px
 from sphereorient.pose.model import Light
@@ -62,6 +63,8 @@ class LearntMap:
     valid: Tensor  # (N,) bool, frames with an orientation
     fitted: Tensor  # (N,) bool, frames that the map was fitted to; the others follow them
     score: Tensor  # (N, C), share of each picture's variance that the map explains; NaN where not fitted
+    paint: Tensor  # (N, C), correlation with the paint in pictures held out of the map for it; NaN elsewhere
+    jumps: Tensor  # (J,) int64, frames from which the ball turns unlike before and after
     views: Sequence[CameraView]  # with the scenes without the ball
     light: Light
     blur_px: float  # estimated with the map
@@ -97,7 +100,7 @@ def fit_map(crops: Crops, settings: MapSettings, progress: Progress) -> LearntMa
         if k >= LIGHT_ITERATIONS and iteration.moved_rad < arrived_rad:
             break
     progress("map", settings.rounds, settings.rounds)
-    return _finished(start, state, tuple(done), arrived=done[-1].moved_rad < arrived_rad)
+    return _finished(start, state, settings, tuple(done), arrived=done[-1].moved_rad < arrived_rad)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,6 +122,7 @@ def _start_from_movie(crops: Crops, settings: MapSettings, progress: Progress) -
         progress("place", k, POSITION_ITERATIONS)
         state, _ = iterate(state, settings, k)
     progress("place", POSITION_ITERATIONS, POSITION_ITERATIONS)
+    check_fixed(state, fitted(state, 1, crops)[1])
     known = torch.isfinite(crops.position_lab_mm).all(1)[:, None]
     X = torch.where(known, state.position_lab_mm[0], torch.nan)
     return _from_chain(replace(crops, position_lab_mm=X), settings, progress)
@@ -183,7 +187,9 @@ def _coarse(
     return state.R_lab_body, state.position_lab_mm
 
 
-def _finished(start: _Start, state: State, iterations: tuple[Iteration, ...], arrived: bool) -> LearntMap:
+def _finished(
+    start: _Start, state: State, settings: MapSettings, iterations: tuple[Iteration, ...], arrived: bool
+) -> LearntMap:
     """Fit the final poses, and express all in the body frame of the first orientation."""
     crops, frames, rows, chain = start.crops, start.frames, start.rows, start.chain
     state, fit = fitted(state, POSE_ITERATIONS, crops)
@@ -196,17 +202,20 @@ def _finished(start: _Start, state: State, iterations: tuple[Iteration, ...], ar
         whole = torch.full((len(crops), *values.shape[1:]), torch.nan, dtype=torch.float64)
         return whole.index_put((at,), values)
 
+    attitudes = spread(so3.nearest_rotation(all_R @ Q.mT), frames)
     used, numbers = frames[rows], torch.arange(len(crops))
     found = crops.frames_with_ball()  # photographs without an orientation have a position all the same
     return LearntMap(
         texture=texture,
         seen=seen,
         sigma=sigma,
-        R_lab_body=spread(so3.nearest_rotation(all_R @ Q.mT), frames),
+        R_lab_body=attitudes,
         position_lab_mm=spread(crops.position_lab_mm[found], found).index_put((used,), state.position_lab_mm),
         valid=torch.isin(numbers, frames),
         fitted=torch.isin(numbers, used),
         score=spread(torch.where(state.use, fit.score, torch.nan), used),
+        paint=spread(paint_correlation(crops, state, settings), used),
+        jumps=torch.empty(0).long() if settings.unordered else jumps(attitudes),
         views=crops.views,
         light=state.fitter.light,
         blur_px=state.blur_px,
