@@ -37,6 +37,9 @@ def map_(
     photographs: Annotated[
         bool, typer.Option("--photographs", help="Pictures in any order, no movie: --set paint.unordered=true.")
     ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with what a run that was cut off has left beside --out.")
+    ] = False,
     settings: SettingsPath = None,
     set_: Overrides = None,
     quiet: Quiet = False,
@@ -45,17 +48,23 @@ def map_(
     check_ending(out, "--out", [".png", ".tif", ".tiff"])  # other formats lose grey values
     check_writable(out)
     from sphereorient.methods.map import learn_map
+    from sphereorient.run.store import FolderStore, Request
     from sphereorient.sphere import load_texture
 
     overrides = [*(set_ or []), *(["paint.unordered=true"] if photographs else [])]
     chosen, begun = settings_of(settings, overrides, "map"), time.perf_counter()
     old = None if init is None else load_texture(init)
-    names, command = cameras_of(cameras), command_line()
-    with progress_bar(quiet) as advance:
-        result = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, command=command)
+    named, command = cameras_of(cameras), command_line()
+    names = None if named is None else tuple(named)
+    request = Request(experiment=experiment, out=out, method="map", settings=chosen, cameras=names)
+    store = FolderStore(request.parts)
+    with store.held(request, resume=resume), progress_bar(quiet) as advance:
+        kept = store.folder / "map.h5"
+        result = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, kept=kept, command=command)
         advance("figure", 0, 1)
         files = _write(result, old, out)
         advance("figure", 1, 1)
+        store.remove()
     if quiet:
         return
     echo_lines(f"note: {remark}" for remark in result.remarks)

@@ -24,6 +24,7 @@ from sphereorient.mapping.grid import (
 from sphereorient.mapping.joint import Linearisation, joint_step, linear_system, linearise
 from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
+from sphereorient.mapping.threads import side_by_side
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curve
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
 from sphereorient.pose.model import Light
@@ -92,8 +93,7 @@ class State:
 
     def linearised(self) -> Iterator[Linearisation]:
         """Yield the linearisation of all disks in batches; unseen disks have weight 0."""
-        for rows, pixels in self.batches():
-            yield self.linearised_at(rows, pixels, self.blur_px)
+        return side_by_side(lambda batch: self.linearised_at(*batch, self.blur_px), self.batches())
 
     def linearised_at(self, rows: Tensor, pixels: Pixels, blur_px: float) -> Linearisation:
         """Linearise the disks of some instants for the blur `blur_px`."""
@@ -175,13 +175,16 @@ def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[S
     fitter = state.map_fitter()
     fine = fitter.optics.fine
     held = HELD * torch.eye(3, dtype=torch.float64) if state.fixed and crops is not None else None
-    parts = []
-    for rows, pixels in state.batches():
+
+    def one(batch: tuple[Tensor, Pixels]) -> FittedPoses:
+        rows, pixels = batch
         X, R, use = state.position_lab_mm[rows], state.R_lab_body[rows], state.use[rows]
         if crops is not None:
             pixels = fitter.pixels(crops.pictures(state.frames[rows]), X, fine)
         precision = None if held is None else held.expand(len(rows), 3, 3)
-        parts.append(fitter.fit(pixels, X, R, use, fine, iterations, precision))
+        return fitter.fit(pixels, X, R, use, fine, iterations, precision)
+
+    parts = list(side_by_side(one, state.batches()))
     fit = FittedPoses(**{name: torch.cat([getattr(part, name) for part in parts]) for name in POSE_PARTS})
     X = fit.position_lab_mm
     if state.fixed:
@@ -239,9 +242,10 @@ def _with_joint_step(state: State, smooth: float) -> State:
     """Move all poses by one joint step, without its map: `with_map` solves for that exactly."""
     height = len(state.texture)
     parts, weight = [], np.zeros(2 * height * height)
-    for at in state.linearised():
-        parts.append(linear_system(at, height))
-        weight += texel_sums(parts[-1].by_texel)
+    batches = state.batches()
+    for part in side_by_side(lambda batch: linear_system(state.linearised_at(*batch, state.blur_px), height), batches):
+        parts.append(part)
+        weight += texel_sums(part.by_texel)
     tie = smooth * _typical(weight)
     pose = joint_step(parts, state.use, state.texture, tie, state.fitter.radius_mm, state.fixed)
     pose = pose * (LONGEST_RAD / pose[:, :3].norm(dim=1).max().clamp_min(1e-9)).clamp_max(1.0)

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -24,6 +25,7 @@ from sphereorient.mapping.iterations import (
     map_height,
     map_weight,
 )
+from sphereorient.mapping.kept import read_kept, write_kept
 from sphereorient.mapping.pairs import Closure
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.mapping.settings import MapSettings
@@ -46,6 +48,7 @@ PIXELS_A_TEXEL = 3.0
 # Blur (radii) and number of the first iterations of photographs. Errors: 0.8 degrees before, 0.06 after, 0.05 at the
 # end (12 pictures of 200 px); without them 0.09 after twice as many others.
 COARSE, COARSE_ITERATIONS = 0.015, 5
+STATE_PARTS, LIGHT_PARTS = ("position_lab_mm", "R_lab_body", "texture"), ("difference", "black", "noise")  # kept
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,26 +82,35 @@ class LearntMap:
         return float((areas * (self.seen > 0)).sum() / areas.sum())
 
 
-def fit_map(crops: Crops, settings: MapSettings, progress: Progress) -> LearntMap:
+def fit_map(crops: Crops, settings: MapSettings, progress: Progress, kept: Path | None = None) -> LearntMap:
     """Learn the texture map, all orientations and the light from the crops of opened movies.
 
+    `kept`: file of the state after each iteration, from which an interrupted run goes on to the same result.
+
     Raises:
-        PaintError: too few frames, no rotation, no common patch, or different spheres.
+        PaintError: too few frames, no rotation, no common patch, a fixed ball that wanders, or different spheres.
+        OutputError: `kept` cannot be written.
 
     Source: direct alignment (Lucas and Kanade 1981), a pose graph, bundle adjustment on grey values.
     """
-    start = (_start_from_photographs if settings.unordered else _start_from_movie)(crops, settings, progress)
-    state, chain = start.state, start.chain.R_lab_body[start.rows]
+    before = None if kept is None else read_kept(kept)
+    if before is None:
+        start = (_start_from_photographs if settings.unordered else _start_from_movie)(crops, settings, progress)
+        state, done = start.state, []
+    else:
+        start, state, done = _resumed(crops, before, settings)
+    chain = start.chain.R_lab_body[start.rows]
     arrived_rad = math.radians(settings.arrived_deg)
-    done: list[Iteration] = []
-    for k in range(settings.rounds):
-        progress("map", k, settings.rounds)
-        state, iteration = iterate(state, settings, k)
-        done.append(iteration)
-        if k in RECOVERY_AFTER:
+    while len(done) < settings.rounds and not (len(done) > LIGHT_ITERATIONS and done[-1].moved_rad < arrived_rad):
+        if kept is not None:
+            write_kept(kept, _parts(start, state, done))
+        progress("map", len(done), settings.rounds)
+        state, iteration = iterate(state, settings, len(done))
+        if len(done) in RECOVERY_AFTER:
             state = recovered(start.crops, state, chain)
-        if k >= LIGHT_ITERATIONS and iteration.moved_rad < arrived_rad:
-            break
+        done.append(iteration)
+    if kept is not None:
+        write_kept(kept, _parts(start, state, done))
     progress("map", settings.rounds, settings.rounds)
     return _finished(start, state, settings, tuple(done), arrived=done[-1].moved_rad < arrived_rad)
 
@@ -110,6 +122,44 @@ class _Start:
     rows: Tensor  # (n,) int64, of those, that the map is fitted to
     chain: PairwiseAttitudes  # of the M frames
     state: State  # of the n
+
+
+def _parts(start: _Start, state: State, done: Sequence[Iteration]) -> dict[str, Tensor]:
+    """Return what `_resumed` needs beside the crops."""
+    light = state.fitter.light
+    return {
+        "place": start.crops.position_lab_mm,
+        **{name: getattr(start, name) for name in ("frames", "rows")},
+        "chain_rows": start.chain.rows,
+        "chain": start.chain.R_lab_body,
+        "closure": torch.tensor(astuple(start.chain.closure), dtype=torch.float64),
+        "first_map": start.state.texture,
+        **{name: getattr(state, name) for name in STATE_PARTS},
+        **{name: getattr(light, name) for name in LIGHT_PARTS},
+        "known": torch.tensor(light.known),
+        "blur_px": torch.tensor(state.blur_px, dtype=torch.float64),
+        "done": torch.tensor([astuple(one) for one in done], dtype=torch.float64).reshape(-1, 3),
+    }
+
+
+def _resumed(crops: Crops, kept: dict[str, Tensor], settings: MapSettings) -> tuple[_Start, State, list[Iteration]]:
+    """Return start, state and iterations of an interrupted run."""
+    crops = replace(crops, position_lab_mm=kept["place"])
+    frames, rows = kept["frames"], kept["rows"]
+    *counts, before, after, moved = kept["closure"].tolist()
+    closure = Closure(**dict(zip(Closure.__dataclass_fields__, [*map(int, counts), before, after, moved], strict=True)))
+    chain = PairwiseAttitudes(rows=kept["chain_rows"], R_lab_body=kept["chain"], closure=closure)
+    few = _settings_of_few(settings, crops, frames) if settings.unordered else settings
+    first = first_state(crops, frames[rows], chain.R_lab_body[rows], kept["first_map"], few)
+    light = Light(**{name: kept[name] for name in LIGHT_PARTS}, known=bool(kept["known"]))
+    state = replace(
+        first,
+        **{name: kept[name] for name in STATE_PARTS},
+        blur_px=float(kept["blur_px"]),
+        fitter=replace(first.fitter, light=light),
+    )
+    done = [Iteration(**dict(zip(Iteration.__dataclass_fields__, row, strict=True))) for row in kept["done"].tolist()]
+    return _Start(crops=crops, frames=frames, rows=rows, chain=chain, state=first), state, done
 
 
 def _start_from_movie(crops: Crops, settings: MapSettings, progress: Progress) -> _Start:
