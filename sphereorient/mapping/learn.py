@@ -29,7 +29,7 @@ from sphereorient.mapping.kept import read_kept, write_kept
 from sphereorient.mapping.pairs import Closure
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.mapping.verdict import check_fixed, jumps, paint_correlation
+from sphereorient.mapping.verdict import jumps, paint_correlation
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, widest_px
 from sphereorient.pose.model import Light
@@ -88,7 +88,7 @@ def fit_map(crops: Crops, settings: MapSettings, progress: Progress, kept: Path 
     `kept`: file of the state after each iteration, from which an interrupted run goes on to the same result.
 
     Raises:
-        PaintError: too few frames, no rotation, no common patch, a fixed ball that wanders, or different spheres.
+        PaintError: too few frames, no rotation, no common patch, or different spheres.
         OutputError: `kept` cannot be written.
 
     Source: direct alignment (Lucas and Kanade 1981), a pose graph, bundle adjustment on grey values.
@@ -172,7 +172,6 @@ def _start_from_movie(crops: Crops, settings: MapSettings, progress: Progress) -
         progress("place", k, POSITION_ITERATIONS)
         state, _ = iterate(state, settings, k)
     progress("place", POSITION_ITERATIONS, POSITION_ITERATIONS)
-    check_fixed(state, fitted(state, 1, crops)[1])
     known = torch.isfinite(crops.position_lab_mm).all(1)[:, None]
     X = torch.where(known, state.position_lab_mm[0], torch.nan)
     return _from_chain(replace(crops, position_lab_mm=X), settings, progress)

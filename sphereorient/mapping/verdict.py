@@ -1,4 +1,4 @@
-"""Whether a learnt map is to be believed: pictures held out of it, a fixed ball that wanders, rates that jump."""
+"""Whether a learnt map is to be believed: pictures held out of it, rates that jump."""
 
 import math
 from dataclasses import replace
@@ -8,18 +8,15 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sphereorient import so3
-from sphereorient.errors import PaintError, refusal
 from sphereorient.mapping.disks import Crops, disks_of, normalised_disks
 from sphereorient.mapping.grid import look_up
 from sphereorient.mapping.iterations import State, fitted, map_weight, with_map
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.fit import FittedPoses
 from sphereorient.sphere.view import perspective_view
 
 HELD_EVERY = 5  # instants; the map of the others is compared with this one
 SEEN_MIN = 0.99  # share of a pixel on texels that other pictures show, below which it is not compared
 ITERATIONS = 2  # of the held poses with that map
-WANDER_PX, WANDER_SHARE = 1.0, 0.02  # rms of a fixed ball's places that is refused: px, and of its radius
 JUMP_RAD, JUMPS = math.radians(3.0), 10.0  # rotations so far off their neighbours', and so many times the usual
 WINDOW = 5  # rotations whose median is usual
 
@@ -51,20 +48,6 @@ def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tens
         power = (weight * a * a).sum(1) * (weight * b * b).sum(1)
         found[rows, c] = torch.where(power > 0, (weight * a * b).sum(1) / power.sqrt(), torch.nan).double()
     return found
-
-
-def check_fixed(state: State, fit: FittedPoses) -> None:
-    """Raise PaintError if the pictures of a ball declared fixed show that it wanders; `fit` holds it in its place."""
-    for c, view in enumerate(state.fitter.views):
-        use, X = state.use[:, c], state.position_lab_mm[:1]
-        sideways = (fit.own_move[use, c] @ view.camera.R_cam_lab.mT)[:, :2]
-        radius_px = float(view.radius_px(X, state.fitter.radius_mm))
-        px = (sideways - sideways.median(0).values) * (radius_px / state.fitter.radius_mm)
-        wander = float(px.square().sum(1).mean().sqrt())
-        if wander > max(WANDER_PX, WANDER_SHARE * radius_px):
-            got = f"one that wanders by {wander:.1f} px (rms) in {view.name}"
-            do = "write `fixed: false`, and the diameter"
-            raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
 
 
 def jumps(R_lab_body: Tensor) -> Tensor:
