@@ -21,7 +21,7 @@ from sphereorient.mapping.grid import (
     texel_areas,
     texel_sums,
 )
-from sphereorient.mapping.joint import Linearisation, joint_step, linear_system, linearise
+from sphereorient.mapping.joint import Linearisation, LinearSystem, joint_step, linear_system, linearise
 from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.mapping.threads import side_by_side
@@ -88,12 +88,12 @@ class State:
 
     def where(self, rows: Tensor, use: Tensor) -> "State":
         """Return some instants, seen as in `use` (n, C)."""
-        parts = {name: getattr(self, name)[rows] for name in ("frames", "position_lab_mm", "R_lab_body")}
-        return replace(self, **parts, pixels=self.disks(rows), use=use[rows])
+        frames, X, R = self.frames[rows], self.position_lab_mm[rows], self.R_lab_body[rows]
+        return replace(self, frames=frames, pixels=self.disks(rows), use=use[rows], position_lab_mm=X, R_lab_body=R)
 
     def linearised(self) -> Iterator[Linearisation]:
         """Yield the linearisation of all disks in batches; unseen disks have weight 0."""
-        return side_by_side(lambda batch: self.linearised_at(*batch, self.blur_px), self.batches())
+        return side_by_side(lambda batch: self.linearised_at(batch[0], batch[1], self.blur_px), self.batches())
 
     def linearised_at(self, rows: Tensor, pixels: Pixels, blur_px: float) -> Linearisation:
         """Linearise the disks of some instants for the blur `blur_px`."""
@@ -242,8 +242,11 @@ def _with_joint_step(state: State, smooth: float) -> State:
     """Move all poses by one joint step, without its map: `with_map` solves for that exactly."""
     height = len(state.texture)
     parts, weight = [], np.zeros(2 * height * height)
-    batches = state.batches()
-    for part in side_by_side(lambda batch: linear_system(state.linearised_at(*batch, state.blur_px), height), batches):
+
+    def system(batch: tuple[Tensor, Pixels]) -> LinearSystem:
+        return linear_system(state.linearised_at(batch[0], batch[1], state.blur_px), height)
+
+    for part in side_by_side(system, state.batches()):
         parts.append(part)
         weight += texel_sums(part.by_texel)
     tie = smooth * _typical(weight)

@@ -96,7 +96,7 @@ def fit_map(crops: Crops, settings: MapSettings, progress: Progress, kept: Path 
     before = None if kept is None else read_kept(kept)
     if before is None:
         start = (_start_from_photographs if settings.unordered else _start_from_movie)(crops, settings, progress)
-        state, done = start.state, []
+        state, done = start.state, list[Iteration]()
     else:
         start, state, done = _resumed(crops, before, settings)
     chain = start.chain.R_lab_body[start.rows]
@@ -154,7 +154,9 @@ def _resumed(crops: Crops, kept: dict[str, Tensor], settings: MapSettings) -> tu
     light = Light(**{name: kept[name] for name in LIGHT_PARTS}, known=bool(kept["known"]))
     state = replace(
         first,
-        **{name: kept[name] for name in STATE_PARTS},
+        position_lab_mm=kept["position_lab_mm"],
+        R_lab_body=kept["R_lab_body"],
+        texture=kept["texture"],
         blur_px=float(kept["blur_px"]),
         fitter=replace(first.fitter, light=light),
     )
