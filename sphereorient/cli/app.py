@@ -84,10 +84,10 @@ Advance = Callable[[str, int, int], None]
 
 
 @contextmanager
-def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]:
+def progress_bar(quiet: bool = False, unit: str = "frames", *, lines: bool = False) -> Iterator[Advance]:
     """Show a line of progress for each stage, with units per second and remaining time; nothing if `quiet`.
 
-    Without a terminal: print a line as a stage begins, and each minute.
+    With `lines`, where there is no terminal: print a line as a stage begins, and each minute.
     """
     if quiet:
         yield lambda stage, done, total: None
@@ -96,7 +96,7 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
     from rich.console import Console
 
     console = Console(stderr=True)
-    if not console.is_terminal:
+    if lines and not console.is_terminal:
         yield _lines()
         return
     bar = progress.Progress(
