@@ -109,8 +109,6 @@ def fit_map(crops: Crops, settings: MapSettings, progress: Progress, kept: Path 
         if len(done) in RECOVERY_AFTER:
             state = recovered(start.crops, state, chain)
         done.append(iteration)
-    if kept is not None:
-        write_kept(kept, _parts(start, state, done))
     progress("map", settings.rounds, settings.rounds)
     return _finished(start, state, settings, tuple(done), arrived=done[-1].moved_rad < arrived_rad)
 
@@ -126,20 +124,14 @@ class _Start:
 
 def _parts(start: _Start, state: State, done: Sequence[Iteration]) -> dict[str, Tensor]:
     """Return what `_resumed` needs beside the crops."""
-    light = state.fitter.light
-    return {
-        "place": start.crops.position_lab_mm,
-        **{name: getattr(start, name) for name in ("frames", "rows")},
-        "chain_rows": start.chain.rows,
-        "chain": start.chain.R_lab_body,
-        "closure": torch.tensor(astuple(start.chain.closure), dtype=torch.float64),
-        "first_map": start.state.texture,
-        **{name: getattr(state, name) for name in STATE_PARTS},
-        **{name: getattr(light, name) for name in LIGHT_PARTS},
-        "known": torch.tensor(light.known),
-        "blur_px": torch.tensor(state.blur_px, dtype=torch.float64),
-        "done": torch.tensor([astuple(one) for one in done], dtype=torch.float64).reshape(-1, 3),
-    }
+    chain, light = start.chain, state.fitter.light
+    closure, iterations = astuple(chain.closure), [astuple(one) for one in done]
+    numbers = {"closure": closure, "blur_px": state.blur_px, "done": iterations}
+    parts = {"place": start.crops.position_lab_mm, "frames": start.frames, "rows": start.rows, "known": light.known}
+    parts |= {"chain_rows": chain.rows, "chain": chain.R_lab_body, "first_map": start.state.texture}
+    parts |= {name: getattr(state, name) for name in STATE_PARTS} | {name: getattr(light, name) for name in LIGHT_PARTS}
+    parts |= {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
+    return {name: torch.as_tensor(part) for name, part in parts.items()}
 
 
 def _resumed(crops: Crops, kept: dict[str, Tensor], settings: MapSettings) -> tuple[_Start, State, list[Iteration]]:
@@ -152,14 +144,9 @@ def _resumed(crops: Crops, kept: dict[str, Tensor], settings: MapSettings) -> tu
     few = _settings_of_few(settings, crops, frames) if settings.unordered else settings
     first = first_state(crops, frames[rows], chain.R_lab_body[rows], kept["first_map"], few)
     light = Light(**{name: kept[name] for name in LIGHT_PARTS}, known=bool(kept["known"]))
-    state = replace(
-        first,
-        position_lab_mm=kept["position_lab_mm"],
-        R_lab_body=kept["R_lab_body"],
-        texture=kept["texture"],
-        blur_px=float(kept["blur_px"]),
-        fitter=replace(first.fitter, light=light),
-    )
+    X, R, texture = (kept[name] for name in STATE_PARTS)
+    state = replace(first, position_lab_mm=X, R_lab_body=R, texture=texture, blur_px=float(kept["blur_px"]))
+    state = replace(state, fitter=replace(first.fitter, light=light))
     done = [Iteration(**dict(zip(Iteration.__dataclass_fields__, row, strict=True))) for row in kept["done"].tolist()]
     return _Start(crops=crops, frames=frames, rows=rows, chain=chain, state=first), state, done
 
