@@ -218,13 +218,13 @@ def print_drift(learnt: LearntMap, chain: torch.Tensor) -> None:
     )
 
 
-def print_correlation(track: Trajectory, experiment_path: Path, texture: Path, words: str) -> list[Any]:
-    """Print how well the re-rendered pictures match."""
-    compared = compare_pictures(track, load_experiment(experiment_path), texture)
-    alike = np.array([example.correlation for example in compared])
-    middle, low = np.median(alike), np.percentile(alike, 5)
-    print(f"re-rendered pictures, {words}: correlation {middle:.3f} (median of {len(alike)}), {low:.3f} (5 %)")
-    return compared
+def print_paint(learnt: LearntMap) -> None:
+    """Print how well pictures held out of the map match it."""
+    alike = learnt.paint[learnt.paint.isfinite()]
+    middle, low = alike.quantile(0.5), alike.quantile(0.05)
+    print(f"paint in {len(alike)} pictures held out of the map: correlation {middle:.3f} (median), {low:.3f} (5 %)")
+    state = f"{'' if learnt.arrived else 'not '}arrived after {len(learnt.rounds)} iterations"
+    print(f"frames at which the rate jumps: {learnt.jumps.tolist()}; {state}")
 
 
 def main() -> None:
@@ -247,8 +247,9 @@ def main() -> None:
         print_drift(learnt, chain)
         write_texture(learnt.texture, folder / "texture.png")
         write_learnt(learnt, track, folder / "texture_map.h5")
-        compared = print_correlation(track, path, folder / "texture.png", "attitudes as learnt")
+        print_paint(learnt)
         if options.work is not None:
+            compared = compare_pictures(learnt, track, load_experiment(path), folder / "texture.png")
             write_figure(map_figure(learnt, compared), folder / "texture_map.png")
         print("the attitudes learnt with the map:")
         compare_turns(turns_of(learnt.R_lab_body), options.folder)
@@ -269,7 +270,6 @@ def tracked(folder: Path, source: Path) -> None:
     valid = f"{int(track.valid.sum())} of {len(track)} frames valid"
     print(f"`sphereorient track` with the learnt map: {valid}, {seconds:.0f} s")
     if track.valid.any():
-        print_correlation(track, path, folder / "texture.png", "tracked")
         R = torch.from_numpy(track.orientation)
         compare_turns(turns_of(R), source)
         compare_attitudes(R, source)

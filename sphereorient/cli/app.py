@@ -1,10 +1,12 @@
 """The application of the command line, the helpers of its commands, `settings`, `info`, and the end of errors."""
 
 import inspect
+import math
 import os
 import re
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import wraps
@@ -97,6 +99,7 @@ app = Commands(
     rich_markup_mode=None,
 )
 
+LINE_S = 60.0  # from one line of a stage to its next, without a terminal
 EXIT_REFUSED = 2  # an error that the user can correct
 NO_MEMORY = re.compile("(not enough|out of|insufficient|n't allocate|not allocate|to allocate) memory|bad_alloc", re.I)
 EXIT_INTERRUPTED = 130  # Ctrl-C, as in shells
@@ -139,14 +142,21 @@ Advance = Callable[[str, int, int], None]
 
 
 @contextmanager
-def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]:
-    """Show a line of progress for each stage, with units per second and remaining time; nothing if `quiet`."""
+def progress_bar(quiet: bool = False, unit: str = "frames", *, lines: bool = False) -> Iterator[Advance]:
+    """Show a line of progress for each stage, with units per second and remaining time; nothing if `quiet`.
+
+    With `lines`, where there is no terminal: print a line as a stage begins, and each minute.
+    """
     if quiet:
         yield lambda stage, done, total: None
         return
     from rich import progress
     from rich.console import Console
 
+    console = Console(stderr=True)
+    if lines and not console.is_terminal:
+        yield _lines()
+        return
     bar = progress.Progress(
         "{task.description:13}",
         progress.BarColumn(),
@@ -155,7 +165,7 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
         progress.TimeElapsedColumn(),
         "left",
         progress.TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=console,
     )
     tasks: dict[str, Any] = {}
     with ExitStack() as shown:
@@ -170,6 +180,19 @@ def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]
             bar.update(tasks[stage], completed=done, total=total, rate=rate)
 
         yield advance
+
+
+def _lines() -> Advance:
+    begun = time.monotonic()
+    told: dict[str, float] = {}  # by stage, when its last line was printed
+
+    def advance(stage: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        if now - told.get(stage, -math.inf) >= LINE_S:
+            told[stage] = now
+            typer.echo(f"{now - begun:6.0f} s  {stage}: {done}" + (f" of {total}" if total else ""), err=True)
+
+    return advance
 
 
 @app.command()

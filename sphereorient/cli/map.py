@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from sphereorient.mapping import LearntMap
     from sphereorient.mapping.compare import MapComparison
     from sphereorient.methods.map import MapResult
-    from sphereorient.report.texture_map import MapExample
     from sphereorient.tools.wear.series import WearSeries
 
 OFTEN = 10  # pictures from which on a texel counts as well seen
+PAINT_MIN = 0.7  # correlation of held-out pictures below which a map is doubted
 PLACES_PRINTED = 10  # worn places that are printed; JSON has all
 
 
@@ -37,6 +37,9 @@ def map_(
     photographs: Annotated[
         bool, typer.Option("--photographs", help="Pictures in any order, no movie: --set paint.unordered=true.")
     ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with what a run that was cut off has left beside --out.")
+    ] = False,
     settings: SettingsPath = None,
     set_: Overrides = None,
     quiet: Quiet = False,
@@ -46,21 +49,27 @@ def map_(
     for path in _files_of(out):
         check_writable(path)
     from sphereorient.methods.map import learn_map
+    from sphereorient.run.store import FolderStore, Request
     from sphereorient.sphere import load_texture
 
     overrides = [*(set_ or []), *(["paint.unordered=true"] if photographs else [])]
     chosen, begun = settings_of(settings, overrides, "map"), time.perf_counter()
     old = None if init is None else load_texture(init)
-    names, command = cameras_of(cameras), command_line()
-    with progress_bar(quiet) as advance:
-        result = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, command=command)
+    named, command = cameras_of(cameras), command_line()
+    names = None if named is None else tuple(named)
+    request = Request(experiment=experiment, out=out, method="map", settings=chosen, cameras=names)
+    store = FolderStore(request.parts)
+    with store.held(request, resume=resume), progress_bar(quiet, lines=True) as advance:
+        kept = store.folder / "map.h5"
+        result = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, kept=kept, command=command)
         advance("figure", 0, 1)
-        files, compared = _write(result, old, out)
+        files = _write(result, old, out)
         advance("figure", 1, 1)
+        store.remove()
     if quiet:
         return
     echo_lines(f"note: {remark}" for remark in result.remarks)
-    _print(result.learnt, compared)
+    _print(result.learnt)
     if result.comparison is not None:
         _print_moved(result.comparison, f"against {init}")
         typer.echo(f"kept of the old map, never seen here: {100 * result.kept_share:.0f} % of the sphere")
@@ -75,8 +84,8 @@ def _files_of(out: Path) -> list[Path]:
     return [out, *(out.with_name(out.stem + end) for end in ("_seen.png", "_map.h5", "_map.png", "_moved.png"))]
 
 
-def _write(result: "MapResult", old: "Tensor | None", out: Path) -> "tuple[list[Path], list[MapExample]]":
-    """Write all files beside the map; return them, and how well re-rendered pictures match."""
+def _write(result: "MapResult", old: "Tensor | None", out: Path) -> list[Path]:
+    """Write all files beside the map, and return them."""
     from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
 
@@ -84,18 +93,16 @@ def _write(result: "MapResult", old: "Tensor | None", out: Path) -> "tuple[list[
     texture_map.write_texture(result.texture, out)
     texture_map.write_seen(result.seen, seen)
     texture_map.write_learnt(result.learnt, result.track, learnt)
-    compared = texture_map.compare_pictures(result.track, result.experiment, out)
+    compared = texture_map.compare_pictures(result.learnt, result.track, result.experiment, out)
     write_figure(texture_map.map_figure(result.learnt, compared), figure)
     if result.comparison is None or old is None:
-        return [out, seen, learnt, figure], compared
+        return [out, seen, learnt, figure]
     write_figure(texture_map.moved_figure(old, result.comparison), moved)
-    return [out, seen, learnt, figure, moved], compared
+    return [out, seen, learnt, figure, moved]
 
 
-def _print(learnt: "LearntMap", compared: "list[MapExample]") -> None:
+def _print(learnt: "LearntMap") -> None:
     """Print from what the map was learnt, and how well it explains the pictures."""
-    import numpy as np
-
     from sphereorient.report.texture_map import shares_seen
 
     seen, often = shares_seen(learnt.seen, (1, OFTEN))
@@ -113,10 +120,14 @@ def _print(learnt: "LearntMap", compared: "list[MapExample]") -> None:
     if alone.any():
         named = ", ".join(str(k) for k in alone.nonzero()[:, 0].tolist())
         lines.append(f"without an attitude, because they share too little with the others: frames {named}")
-    alike = np.array([example.correlation for example in compared])
-    if np.isfinite(alike).any():
-        middle, low = np.nanmedian(alike), np.nanpercentile(alike, 5)
-        lines.append(f"pictures against re-rendered: correlation {middle:.3f} (median), {low:.3f} (worst twentieth)")
+    paint = learnt.paint[learnt.paint.isfinite()]
+    if len(paint):
+        middle, low = paint.quantile(0.5), paint.quantile(0.05)
+        said = f"paint in pictures held out of the map: correlation {middle:.3f} (median), {low:.3f} (worst twentieth)"
+        lines.append(said if middle > PAINT_MIN else f"doubt: {said}; do not trust the map")
+    if len(learnt.jumps):
+        named = ", ".join(str(k) for k in learnt.jumps[:PLACES_PRINTED].tolist())
+        lines.append(f"doubt: the rate jumps at {len(learnt.jumps)} frames: {named}")
     echo_lines(lines)
 
 

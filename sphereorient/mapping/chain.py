@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
-from sphereorient.mapping.disks import Disks, evenly_spread, reduced, too_few
+from sphereorient.mapping.disks import Disks, evenly_spread, reduced, too_few, without_static
 from sphereorient.mapping.pairs import (
     Closure,
     RelativeRotations,
@@ -53,6 +53,10 @@ def find_chain(disks: Disks, settings: MapSettings) -> PairwiseAttitudes:
         raise too_few(len(disks))
     R, pairs = _chained_pairs(disks, settings)
     check_turned(R, settings)
+    cleaned = without_static(disks, R)
+    if cleaned is not disks:
+        disks = cleaned
+        R, pairs = _chained_pairs(disks, settings)
     _check_one_ball(disks, R)
     return close_loops(disks, R, pairs, settings)
 

@@ -3,6 +3,7 @@
 The disks compare pictures before there is a map.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -40,6 +41,11 @@ Picture = NDArray[Any]
 REACH = 1.35  # half the side of a crop, in radii of the disk
 GAP_SHARE = 0.3  # of the radius: a larger median distance between lines of sight means two different balls
 SHOWN_MIN = 0.99  # visible share of a disk's pixel below which it does not count
+OUTLINES_MIN, SIGMA_MAD = 8, 1.4826  # outlines that can show a scatter; its median times this is the sigma of noise
+# Scatter of a fixed ball's outlines that is refused: px, of the radius, and of that of their size. Where outlines are
+# found badly, both scatter alike.
+WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 4.0
+PLACES = 2  # per radius: places that far apart have paint of their own
 DEEPEST = 1e6  # radii: from there a perspective view is an orthographic one
 
 
@@ -104,6 +110,8 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
             empty = given_scene(experiment, stream.name, stream.movie.frame_shape)
             outline, background = fixed_ball(pictures, locating, empty, stream.shown)
             scene = CameraScene(background=background, diameter_px=2 * outline.radius_px)
+            each = [find_ball(picture, background, scene.diameter_px, locating)[0] for picture in pictures]
+            _check_still([(one.u_px, one.v_px, one.radius_px) for one in each if one is not None], stream.name)
         else:
             scene = find_scene(recording, stream, settings.background_frames, locating)
         found: list[Found] = []
@@ -140,6 +148,19 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
         radius_mm=recording.experiment.radius_mm,
         fixed=experiment.fixed,
     )
+
+
+def _check_still(outlines: list[tuple[float, float, float]], name: str) -> None:
+    """Raise PaintError if a fixed ball's outlines (u, v, radius), px, scatter far more in place than in size."""
+    if len(outlines) < OUTLINES_MIN:
+        return
+    seen = torch.tensor(outlines, dtype=torch.float64)
+    middle = seen.median(0).values
+    u, v, size = (SIGMA_MAD * (seen - middle).abs().median(0).values).tolist()
+    wander = math.hypot(u, v)
+    if wander > max(WANDER_PX, WANDER_SHARE * float(middle[2]), WANDER_SURE * size):
+        got, do = f"one that wanders by {wander:.1f} px in {name}", "write `fixed: false`, and the diameter"
+        raise PaintError(refusal("sphere.fixed", expected="a ball that stays in its place", got=got, do=do))
 
 
 def evenly_spread(rows: Tensor, count: int) -> Tensor:
@@ -289,6 +310,33 @@ def _with_slopes(grey: Tensor) -> Tensor:
     right = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) * (size / 4)
     down = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) * (size / 4)
     return torch.stack([grey, right, down], dim=2)
+
+
+def without_static(disks: Disks, R_lab_body: Tensor) -> Disks:
+    """Take off what stays with the camera (shading, sensor pattern), at rough orientations (N, 3, 3).
+
+    It is each pixel's mean over the places of the ball that it has shown, as far as paint cannot explain it: the mean
+    of n places keeps 1/n of the paint's power. Where paint explains all, the disks come back as they are.
+    """
+    side = 2 * PLACES + 1
+    grey = disks.layers[:, :, 0].flatten(2).clone()
+    found = False
+    for c in range(grey.shape[1]):
+        view = perspective_view(disks.size_px, float(disks.distance_radii[:, c].median()))
+        inside, normal = view.inside.reshape(-1), view.normal_view.float()
+        sums = torch.zeros(3, len(normal), side**3)
+        for k, R in enumerate(R_lab_body.float()):
+            x, y, z = ((PLACES * (normal @ disks.R_lab_view[k, c].mT @ R)).round().long() + PLACES).unbind(1)
+            value, weight = grey[k, c, inside], disks.weight(slice(k, k + 1), c)[0, inside]
+            products = torch.stack([weight, weight * value, weight * value.square()])
+            sums[:, torch.arange(len(normal)), (side * x + y) * side + z] += products
+        count = (sums[0] > 0).sum(1).clamp_min(1)
+        mean, power = (sums[1:] / sums[0].clamp_min(1e-6)).sum(2) / count
+        share = float(1 - (power / count).sum() / mean.square().sum().clamp_min(1e-9))
+        if share > 0:
+            grey[:, c, inside] -= share * mean
+            found = True
+    return replace(disks, layers=_with_slopes(grey.reshape(disks.layers[:, :, 0].shape))) if found else disks
 
 
 def reduced(disks: Disks, factor: int) -> Disks:

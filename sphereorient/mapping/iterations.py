@@ -21,9 +21,10 @@ from sphereorient.mapping.grid import (
     texel_areas,
     texel_sums,
 )
-from sphereorient.mapping.joint import Linearisation, joint_step, linear_system, linearise
+from sphereorient.mapping.joint import Linearisation, LinearSystem, joint_step, linear_system, linearise
 from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
+from sphereorient.mapping.threads import side_by_side
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curve
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
 from sphereorient.pose.model import Light
@@ -85,10 +86,14 @@ class State:
         cameras = self.use.shape[1]
         return self.pixels.where((cameras * rows[:, None] + torch.arange(cameras)).reshape(-1))
 
+    def where(self, rows: Tensor, use: Tensor) -> "State":
+        """Return some instants, seen as in `use` (n, C)."""
+        frames, X, R = self.frames[rows], self.position_lab_mm[rows], self.R_lab_body[rows]
+        return replace(self, frames=frames, pixels=self.disks(rows), use=use[rows], position_lab_mm=X, R_lab_body=R)
+
     def linearised(self) -> Iterator[Linearisation]:
         """Yield the linearisation of all disks in batches; unseen disks have weight 0."""
-        for rows, pixels in self.batches():
-            yield self.linearised_at(rows, pixels, self.blur_px)
+        return side_by_side(lambda batch: self.linearised_at(batch[0], batch[1], self.blur_px), self.batches())
 
     def linearised_at(self, rows: Tensor, pixels: Pixels, blur_px: float) -> Linearisation:
         """Linearise the disks of some instants for the blur `blur_px`."""
@@ -151,7 +156,7 @@ def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iterati
         state = _with_light(state)
     if k >= SEPARATE_ITERATIONS:
         state = _with_joint_step(state, smooth)
-    state, chi2 = _with_map(state, smooth)
+    state, chi2 = with_map(state, smooth)
     if k < LIGHT_ITERATIONS:
         state = _rescaled(state)
     if SEPARATE_ITERATIONS <= k < LIGHT_ITERATIONS and settings.blur_px is None:
@@ -170,13 +175,16 @@ def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[S
     fitter = state.map_fitter()
     fine = fitter.optics.fine
     held = HELD * torch.eye(3, dtype=torch.float64) if state.fixed and crops is not None else None
-    parts = []
-    for rows, pixels in state.batches():
+
+    def one(batch: tuple[Tensor, Pixels]) -> FittedPoses:
+        rows, pixels = batch
         X, R, use = state.position_lab_mm[rows], state.R_lab_body[rows], state.use[rows]
         if crops is not None:
             pixels = fitter.pixels(crops.pictures(state.frames[rows]), X, fine)
         precision = None if held is None else held.expand(len(rows), 3, 3)
-        parts.append(fitter.fit(pixels, X, R, use, fine, iterations, precision))
+        return fitter.fit(pixels, X, R, use, fine, iterations, precision)
+
+    parts = list(side_by_side(one, state.batches()))
     fit = FittedPoses(**{name: torch.cat([getattr(part, name) for part in parts]) for name in POSE_PARTS})
     X = fit.position_lab_mm
     if state.fixed:
@@ -231,12 +239,16 @@ def _better_blur(state: State) -> float:
 
 
 def _with_joint_step(state: State, smooth: float) -> State:
-    """Move all poses by one joint step, without its map: `_with_map` solves for that exactly."""
+    """Move all poses by one joint step, without its map: `with_map` solves for that exactly."""
     height = len(state.texture)
     parts, weight = [], np.zeros(2 * height * height)
-    for at in state.linearised():
-        parts.append(linear_system(at, height))
-        weight += texel_sums(parts[-1].by_texel)
+
+    def system(batch: tuple[Tensor, Pixels]) -> LinearSystem:
+        return linear_system(state.linearised_at(batch[0], batch[1], state.blur_px), height)
+
+    for part in side_by_side(system, state.batches()):
+        parts.append(part)
+        weight += texel_sums(part.by_texel)
     tie = smooth * _typical(weight)
     pose = joint_step(parts, state.use, state.texture, tie, state.fitter.radius_mm, state.fixed)
     pose = pose * (LONGEST_RAD / pose[:, :3].norm(dim=1).max().clamp_min(1e-9)).clamp_max(1.0)
@@ -247,8 +259,8 @@ def _with_joint_step(state: State, smooth: float) -> State:
     )
 
 
-def _with_map(state: State, smooth: float) -> tuple[State, float]:
-    """Solve for the map at the present poses; return also chi2 per pixel before."""
+def with_map(state: State, smooth: float) -> tuple[State, float]:
+    """Return the state with its best map at the present poses, and chi2 per pixel before."""
     height = len(state.texture)
     parts, right = [], np.zeros(2 * height * height)
     squares = expected = 0.0

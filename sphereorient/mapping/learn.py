@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -24,9 +25,11 @@ from sphereorient.mapping.iterations import (
     map_height,
     map_weight,
 )
+from sphereorient.mapping.kept import read_kept, write_kept
 from sphereorient.mapping.pairs import Closure
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.mapping.settings import MapSettings
+from sphereorient.mapping.verdict import jumps, paint_correlation
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, widest_px
 from sphereorient.pose.model import Light
@@ -45,6 +48,7 @@ PIXELS_A_TEXEL = 3.0
 # Blur (radii) and number of the first iterations of photographs. Errors: 0.8 degrees before, 0.06 after, 0.05 at the
 # end (12 pictures of 200 px); without them 0.09 after twice as many others.
 COARSE, COARSE_ITERATIONS = 0.015, 5
+STATE_PARTS, LIGHT_PARTS = ("position_lab_mm", "R_lab_body", "texture"), ("difference", "black", "noise")  # kept
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,6 +66,8 @@ class LearntMap:
     valid: Tensor  # (N,) bool, frames with an orientation
     fitted: Tensor  # (N,) bool, frames that the map was fitted to; the others follow them
     score: Tensor  # (N, C), share of each picture's variance that the map explains; NaN where not fitted
+    paint: Tensor  # (N, C), correlation with the paint in pictures held out of the map for it; NaN elsewhere
+    jumps: Tensor  # (J,) int64, frames from which the ball turns unlike before and after
     views: Sequence[CameraView]  # with the scenes without the ball
     light: Light
     blur_px: float  # estimated with the map
@@ -76,28 +82,35 @@ class LearntMap:
         return float((areas * (self.seen > 0)).sum() / areas.sum())
 
 
-def fit_map(crops: Crops, settings: MapSettings, progress: Progress) -> LearntMap:
+def fit_map(crops: Crops, settings: MapSettings, progress: Progress, kept: Path | None = None) -> LearntMap:
     """Learn the texture map, all orientations and the light from the crops of opened movies.
+
+    `kept`: file of the state after each iteration, from which an interrupted run goes on to the same result.
 
     Raises:
         PaintError: too few frames, no rotation, no common patch, or different spheres.
+        OutputError: `kept` cannot be written.
 
     Source: direct alignment (Lucas and Kanade 1981), a pose graph, bundle adjustment on grey values.
     """
-    start = (_start_from_photographs if settings.unordered else _start_from_movie)(crops, settings, progress)
-    state, chain = start.state, start.chain.R_lab_body[start.rows]
+    before = None if kept is None else read_kept(kept)
+    if before is None:
+        start = (_start_from_photographs if settings.unordered else _start_from_movie)(crops, settings, progress)
+        state, done = start.state, list[Iteration]()
+    else:
+        start, state, done = _resumed(crops, before, settings)
+    chain = start.chain.R_lab_body[start.rows]
     arrived_rad = math.radians(settings.arrived_deg)
-    done: list[Iteration] = []
-    for k in range(settings.rounds):
-        progress("map", k, settings.rounds)
-        state, iteration = iterate(state, settings, k)
-        done.append(iteration)
-        if k in RECOVERY_AFTER:
+    while len(done) < settings.rounds and not (len(done) > LIGHT_ITERATIONS and done[-1].moved_rad < arrived_rad):
+        if kept is not None:
+            write_kept(kept, _parts(start, state, done))
+        progress("map", len(done), settings.rounds)
+        state, iteration = iterate(state, settings, len(done))
+        if len(done) in RECOVERY_AFTER:
             state = recovered(start.crops, state, chain)
-        if k >= LIGHT_ITERATIONS and iteration.moved_rad < arrived_rad:
-            break
+        done.append(iteration)
     progress("map", settings.rounds, settings.rounds)
-    return _finished(start, state, tuple(done), arrived=done[-1].moved_rad < arrived_rad)
+    return _finished(start, state, settings, tuple(done), arrived=done[-1].moved_rad < arrived_rad)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,6 +120,35 @@ class _Start:
     rows: Tensor  # (n,) int64, of those, that the map is fitted to
     chain: PairwiseAttitudes  # of the M frames
     state: State  # of the n
+
+
+def _parts(start: _Start, state: State, done: Sequence[Iteration]) -> dict[str, Tensor]:
+    """Return what `_resumed` needs beside the crops."""
+    chain, light = start.chain, state.fitter.light
+    closure, iterations = astuple(chain.closure), [astuple(one) for one in done]
+    numbers = {"closure": closure, "blur_px": state.blur_px, "done": iterations}
+    parts = {"place": start.crops.position_lab_mm, "frames": start.frames, "rows": start.rows, "known": light.known}
+    parts |= {"chain_rows": chain.rows, "chain": chain.R_lab_body, "first_map": start.state.texture}
+    parts |= {name: getattr(state, name) for name in STATE_PARTS} | {name: getattr(light, name) for name in LIGHT_PARTS}
+    parts |= {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
+    return {name: torch.as_tensor(part) for name, part in parts.items()}
+
+
+def _resumed(crops: Crops, kept: dict[str, Tensor], settings: MapSettings) -> tuple[_Start, State, list[Iteration]]:
+    """Return start, state and iterations of an interrupted run."""
+    crops = replace(crops, position_lab_mm=kept["place"])
+    frames, rows = kept["frames"], kept["rows"]
+    *counts, before, after, moved = kept["closure"].tolist()
+    closure = Closure(**dict(zip(Closure.__dataclass_fields__, [*map(int, counts), before, after, moved], strict=True)))
+    chain = PairwiseAttitudes(rows=kept["chain_rows"], R_lab_body=kept["chain"], closure=closure)
+    few = _settings_of_few(settings, crops, frames) if settings.unordered else settings
+    first = first_state(crops, frames[rows], chain.R_lab_body[rows], kept["first_map"], few)
+    light = Light(**{name: kept[name] for name in LIGHT_PARTS}, known=bool(kept["known"]))
+    X, R, texture = (kept[name] for name in STATE_PARTS)
+    state = replace(first, position_lab_mm=X, R_lab_body=R, texture=texture, blur_px=float(kept["blur_px"]))
+    state = replace(state, fitter=replace(first.fitter, light=light))
+    done = [Iteration(**dict(zip(Iteration.__dataclass_fields__, row, strict=True))) for row in kept["done"].tolist()]
+    return _Start(crops=crops, frames=frames, rows=rows, chain=chain, state=first), state, done
 
 
 def _start_from_movie(crops: Crops, settings: MapSettings, progress: Progress) -> _Start:
@@ -183,7 +225,9 @@ def _coarse(
     return state.R_lab_body, state.position_lab_mm
 
 
-def _finished(start: _Start, state: State, iterations: tuple[Iteration, ...], arrived: bool) -> LearntMap:
+def _finished(
+    start: _Start, state: State, settings: MapSettings, iterations: tuple[Iteration, ...], arrived: bool
+) -> LearntMap:
     """Fit the final poses, and express all in the body frame of the first orientation."""
     crops, frames, rows, chain = start.crops, start.frames, start.rows, start.chain
     state, fit = fitted(state, POSE_ITERATIONS, crops)
@@ -196,17 +240,20 @@ def _finished(start: _Start, state: State, iterations: tuple[Iteration, ...], ar
         whole = torch.full((len(crops), *values.shape[1:]), torch.nan, dtype=torch.float64)
         return whole.index_put((at,), values)
 
+    attitudes = spread(so3.nearest_rotation(all_R @ Q.mT), frames)
     used, numbers = frames[rows], torch.arange(len(crops))
     found = crops.frames_with_ball()  # photographs without an orientation have a position all the same
     return LearntMap(
         texture=texture,
         seen=seen,
         sigma=sigma,
-        R_lab_body=spread(so3.nearest_rotation(all_R @ Q.mT), frames),
+        R_lab_body=attitudes,
         position_lab_mm=spread(crops.position_lab_mm[found], found).index_put((used,), state.position_lab_mm),
         valid=torch.isin(numbers, frames),
         fitted=torch.isin(numbers, used),
         score=spread(torch.where(state.use, fit.score, torch.nan), used),
+        paint=spread(paint_correlation(crops, state, settings), used),
+        jumps=torch.empty(0).long() if settings.unordered else jumps(attitudes),
         views=crops.views,
         light=state.fitter.light,
         blur_px=state.blur_px,

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.mapping.disks import Disks, disk_places
+from sphereorient.mapping.threads import side_by_side
 from sphereorient.so3 import cross_first_axis
 
 STEP_RAD = 0.15  # longest step of a refinement
@@ -129,8 +130,8 @@ def refine_pairs(
     disks: Disks, first: Tensor, second: Tensor, R_ji: Tensor, iterations: int, every: int = 1
 ) -> RelativeRotations:
     """Refine R_ji (E, 3, 3) on each n-th pixel (Lucas and Kanade 1981; weights: Geman and McClure 1987)."""
-    parts = []
-    for rows in torch.split(torch.arange(len(first)), BATCH):
+
+    def refined(rows: Tensor) -> RelativeRotations:
         i, j, R = first[rows], second[rows], R_ji[rows].float()
         views = _first_views(disks, i, every)
         for _ in range(iterations):
@@ -141,12 +142,11 @@ def refine_pairs(
             R = so3.exp(turn) @ R
         normal, _, score, overlap = _normal_equations(disks, j, R, views, slopes=True)
         R = so3.nearest_rotation(R.double())
-        parts.append(
-            RelativeRotations(
-                first=i, second=j, R_ji=R, information=normal.double(), score=score.double(), overlap=overlap.double()
-            )
+        return RelativeRotations(
+            first=i, second=j, R_ji=R, information=normal.double(), score=score.double(), overlap=overlap.double()
         )
-    return all_rotations(parts)
+
+    return all_rotations(list(side_by_side(refined, torch.split(torch.arange(len(first)), BATCH))))
 
 
 def _normal_equations(
@@ -185,11 +185,12 @@ def _correlation(w: Tensor, a: Tensor, b: Tensor, aa: Tensor, bb: Tensor, ab: Te
 
 def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, grid: Tensor, every: int = 1) -> Tensor:
     """Return the best of all rotations grid[m] @ about[e], (E, 3, 3), for pairs (E,); the disks should be small."""
-    best = []
     grid = grid.float()
     places = math.pi / 4 * disks.size_px**2 / every
     chunk = max(1, int(LOOKS / places))
-    for i, j, R in zip(first, second, about.float(), strict=True):
+
+    def best(pair: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+        i, j, R = pair
         scores = []
         for some in torch.split(grid, chunk):
             tried = some @ R
@@ -197,8 +198,9 @@ def search_pairs(disks: Disks, first: Tensor, second: Tensor, about: Tensor, gri
             _, _, score, overlap = _normal_equations(disks, j.expand(len(tried)), tried, views, slopes=False)
             # A correlation over a small overlap proves little.
             scores.append(score * (overlap / (overlap + OVERLAP_MIN)))
-        best.append(grid[int(torch.cat(scores).argmax())] @ R)
-    return torch.stack(best).double()
+        return grid[int(torch.cat(scores).argmax())] @ R
+
+    return torch.stack(list(side_by_side(best, zip(first, second, about.float(), strict=True)))).double()
 
 
 def search_views(disks: Disks, cameras: tuple[int, int], second: int, grid: Tensor, every: int) -> Tensor:

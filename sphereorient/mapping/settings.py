@@ -34,8 +34,8 @@ class MapSettings(BaseModel, frozen=True, extra="forbid"):
         None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null estimates it"
     )
     smooth: float = Field(4.0e-3, gt=0, description="smoothness penalty, relative to the weight of a typical texel")
-    rounds: int = Field(14, ge=1, description="iterations of attitudes, light and map, at most")
+    rounds: int = Field(40, ge=1, description="iterations of attitudes, light and map, at most")
     arrived_deg: float = Field(
-        0.005, gt=0, description="stop when an iteration moves the attitudes by less, degrees rms"
+        0.01, gt=0, description="stop when an iteration moves the attitudes by less, degrees rms"
     )
     turned_min_deg: float = Field(8.0, gt=0, description="refuse a movie in which the sphere turns by less")

@@ -47,6 +47,7 @@ def learn_map(
     init: Tensor | str | Path | None = None,
     cameras: Sequence[str] | None = None,
     progress: Progress = silent,
+    kept: Path | None = None,
     command: str = "sphereorient.learn_map",
 ) -> MapResult:
     """Learn the texture map and the orientations of a sphere from movies or photographs, without a known map.
@@ -57,6 +58,7 @@ def learn_map(
         init: an old map (H, 2 H) or its file: gives the body frame, and the texture of what is never seen.
         cameras: names of the cameras to use; None: all.
         progress: called with stage, steps done, and all steps.
+        kept: file of an unfinished map, from which an interrupted run goes on.
         command: recorded in the track's provenance.
 
     Raises:
@@ -68,7 +70,7 @@ def learn_map(
     comparison, kept_share = None, 0.0
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         crops = take_crops(recording, settings.paint, settings.locate, progress)
-        learnt = fit_map(crops, settings.paint, progress)
+        learnt = fit_map(crops, settings.paint, progress, kept)
         if old is not None:
             learnt, comparison, kept_share = corrected(learnt, old)
         opened = recording.experiment

@@ -33,10 +33,8 @@ from sphereorient.trajectory import Trajectory
 UNSEEN_GREY = 128  # of texels that no picture shows, in the file
 MOST = 255  # counts beyond are written as this
 EXAMPLES = 6  # frames that are shown
-COMPARED = 200  # frames at most whose pictures are compared with the model
 UNSEEN = "#C9B48A"  # sand colour: differs from any paint
 REACH = 0.5  # of the contrast of white and black paint: the ends of the residual's scale
-SLANT = 0.3  # cosine of the angle of sight below which pixels are not compared: the light is unknown there
 LEAST_ARROW_DEG = 4.0  # length on the page of the largest arrow, in degrees of the map
 ARROW = "#D0021B"
 CHANGE_REACH = 0.3  # of the contrast of white and black paint: ends of the scale of the change
@@ -82,6 +80,8 @@ def _write_map(learnt: LearntMap, group: h5py.Group) -> None:
     _put(group, "texture", learnt.texture.numpy(), "1", "paint, 0 black .. 1 white; NaN where never seen")
     _put(group, "seen", learnt.seen.numpy(), "1", "pictures that show the texel")
     _put(group, "sigma", learnt.sigma.numpy(), "1", "standard deviation of the paint by noise alone; inf: never seen")
+    _put(group, "paint", learnt.paint.numpy(), "1", "correlation of the paint in pictures held out of the map for it")
+    _put(group, "jumps", learnt.jumps.numpy(), "1", "frames from which the ball turns unlike before and after")
     _put(group, "fitted", learnt.fitted.numpy(), "1", "frames that the map was fitted to; the others follow them")
     if learnt.rounds:
         names = [field.name for field in fields(learnt.rounds[0])]
@@ -111,36 +111,33 @@ class MapExample:
     filmed: NDArray[np.float32]  # (S, S), grey levels
     model: NDArray[np.float32]  # (S, S), NaN outside the sphere
     contrast: float  # white minus black paint, grey levels
-    correlation: float  # over the sphere
+    correlation: float  # `LearntMap.paint`
 
 
-def compare_pictures(track: Trajectory, experiment: Experiment, texture: Path) -> list[MapExample]:
-    """Render frames spread over the movie with a texture map file, and compare them, without hidden places."""
+def compare_pictures(learnt: LearntMap, track: Trajectory, experiment: Experiment, texture: Path) -> list[MapExample]:
+    """Render frames spread over the movie, held out of the map where there are any, with a texture map file."""
     compared = []
+    column = {view.name: c for c, view in enumerate(learnt.views)}
     with ExitStack() as opened:
         page, streams = prepared(track, replace(experiment, texture_path=texture), None, opened)
-        rows = np.flatnonzero(track.valid)
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(COMPARED, len(rows))).round().astype(int))]
+        rows = np.flatnonzero(learnt.paint.isfinite().any(1).numpy() & track.valid)
+        rows = rows if len(rows) else np.flatnonzero(track.valid)
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(EXAMPLES, len(rows))).round().astype(int))]
         for k, pictures in pictures_by_row(streams, rows):
             for view in page.views:
                 picture = pictures[view.name]
                 if picture is not None and view.light is not None:
                     title = f"{view.name}, frame {int(page.numbers[k])}"
-                    compared.append(_compared(view, k, picture, streams[view.name].shown, title))
+                    compared.append(_compared(view, k, picture, title, float(learnt.paint[k, column[view.name]])))
     return compared
 
 
-def _compared(view: OverlayView, k: int, picture: Grey, shown: NDArray[np.bool_] | None, title: str) -> MapExample:
+def _compared(view: OverlayView, k: int, picture: Grey, title: str, correlation: float) -> MapExample:
     assert view.light is not None
     window = view.model.window(k, view.half_px, crop_side(view.half_px))
     seen, filmed = view.model.look(k, window), crop(picture, window)
-    model = view.light.picture(seen, filmed)
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(model) & np.isfinite(filmed) & (seen.basis[..., 3] > SLANT)
-    if shown is not None:
-        good &= crop((255 * shown).astype(np.uint8), window) > 254
-    alike = float(np.corrcoef(filmed[good], model[good])[0, 1]) if good.sum() > 8 else float("nan")
-    return MapExample(title=title, filmed=filmed, model=model, contrast=view.light.contrast, correlation=alike)
+    model, contrast = view.light.picture(seen, filmed), view.light.contrast
+    return MapExample(title=title, filmed=filmed, model=model, contrast=contrast, correlation=correlation)
 
 
 @in_style
@@ -172,7 +169,8 @@ def map_figure(learnt: LearntMap, compared: Sequence[MapExample]) -> Figure:
         figure,
         "Map: longitude to the right, latitude upwards, as seen from outside; sand: no picture shows the place. "
         "Examples: as filmed, as rendered with the map, and the difference, red where the picture is "
-        f"brighter; full colour is {REACH:g} of the step from black to white paint.",
+        f"brighter; full colour is {REACH:g} of the step from black to white paint. Below: the correlation "
+        "of the paint, for which the picture was held out of the map.",
     )
     return figure
 
@@ -189,7 +187,7 @@ def _draw_example(rows: Sequence[Axes], example: MapExample, first: bool) -> Non
     rows[1].set_facecolor(UNSEEN)
     rows[1].imshow(np.ma.masked_invalid(example.model), cmap="gray", vmin=low, vmax=high)
     rows[2].imshow(np.ma.masked_invalid(residual), cmap="RdBu_r", vmin=-REACH, vmax=REACH)
-    rows[2].set_xlabel(f"correlation {example.correlation:.3f}", fontsize=7)
+    rows[2].set_xlabel(f"paint: {example.correlation:.3f}", fontsize=7)
 
 
 def equirectangular(axes: Axes) -> None:

@@ -266,7 +266,8 @@ class FolderStore:
     def remove(self) -> None:
         """Remove what is of a run; `held` removes the empty folder."""
         if self._fingerprint() is not None:
-            for path in [*self.folder.glob("poses-*.h5"), *self.folder.glob(".*.part*"), self.folder / "learnt.h5"]:
+            known = (self.folder / name for name in ("learnt.h5", "map.h5"))
+            for path in [*self.folder.glob("poses-*.h5"), *self.folder.glob(".*.part*"), *known]:
                 path.unlink(missing_ok=True)
             self._run.unlink()  # last: it says whose folder it is
 

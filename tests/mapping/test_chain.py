@@ -6,11 +6,12 @@ import math
 
 import pytest
 import torch
-from renders import disks_of_pictures, error_deg, pictures, turning
+from renders import SIZE, disks_of_pictures, error_deg, pictures, turning
 
 from sphereorient import so3
 from sphereorient.errors import PaintError
-from sphereorient.mapping.chain import chained, close_loops, find_chain
+from sphereorient.mapping.chain import _chained_pairs, chained, close_loops, find_chain
+from sphereorient.mapping.disks import without_static
 from sphereorient.mapping.pairs import RelativeRotations, all_rotations, solve_graph
 from sphereorient.mapping.settings import MapSettings
 
@@ -76,6 +77,37 @@ def test_a_movie_of_two_cameras_is_followed_without_a_map():
     chain = find_chain(disks_of_pictures(pictures(R, 2)), MapSettings())
     assert error_deg(chain.R_lab_body, R).max() < 0.8
     torch.testing.assert_close(chain.R_lab_body[0], torch.eye(3, dtype=torch.float64))
+
+
+def tumbling(count, step_deg):
+    """Attitudes that show each pixel many places of the ball."""
+    k = torch.arange(count, dtype=torch.float64)
+    wobble = so3.exp(0.4 * torch.stack([torch.sin(0.3 * k), torch.zeros_like(k), torch.cos(0.17 * k)], dim=1))
+    return wobble @ turning(count, step_deg)
+
+
+@pytest.mark.slow
+def test_a_pattern_of_the_sensor_does_not_pull_turns_towards_zero():
+    """Before: turns 0.80 of the true ones, the chain 7.4 degrees off (median); now 0.96 and 1.7."""
+    R = tumbling(90, 4.0)
+    dirt = 60 * torch.randn(SIZE, SIZE, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    disks = disks_of_pictures(pictures(R, 1, "dots") + dirt)
+    rough, _ = _chained_pairs(disks, MapSettings())
+    found, pairs = _chained_pairs(without_static(disks, rough), MapSettings())
+    neighbours = pairs.where(pairs.second - pairs.first == 1)
+    true = so3.log(R[1:] @ R[:-1].mT)
+    assert float((so3.log(neighbours.R_ji) * true).sum() / true.square().sum()) > 0.94
+    assert float(error_deg(found, R).median()) < 2.5
+    assert float(error_deg(find_chain(disks, MapSettings()).R_lab_body, R).median()) < 2.0
+
+
+@pytest.mark.parametrize("count", [6, 60])
+def test_paint_alone_is_not_taken_for_a_pattern_of_the_sensor(count):
+    """The plain mean over all instants holds paint: it takes 3 % off the turns of 60 clean pictures."""
+    R = tumbling(count, 4.0)
+    disks = disks_of_pictures(pictures(R, 2, "dots"))
+    taken = (without_static(disks, R).layers - disks.layers)[0, :, 0].square().mean()
+    assert float(taken) < 0.01 * float(disks.layers[:, :, 0].square().mean())
 
 
 def test_the_same_pictures_give_the_same_bytes():
