@@ -90,7 +90,7 @@ def test_a_wrong_diameter_is_named_with_the_right_one(percent):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("name", ["cam1", "cam2"])
-@pytest.mark.parametrize("deg", [1.5, 5.0])
+@pytest.mark.parametrize("deg", [1.5])
 def test_a_turned_camera_is_named(name, axis, deg):
     """Before: 30 of 30 frames valid with 0.03 degrees stated, whichever camera was turned."""
     found = compare_cameras(reported(seen_by(CAMERAS), CAMERAS | {name: turned(CAMERAS[name], deg, axis)}), LIMITS)
