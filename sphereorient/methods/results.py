@@ -259,10 +259,10 @@ def with_contradictions(
         turn = torch.where(both, 0.5, 1.0) * turned[:, None] * turn
         for whole, off in (
             (turn_cov, turn),
-            (place_cov, (0.5 * apart * gap_mm)[:, None] * across),
+            (place_cov, (0.5 * apart * gap_mm)[:, None]),
             (place_cov, torch.where(both, 0.0, shift_mm)),
-        ):
-            whole += off[:, :, None] * off[:, None]
+        ):  # in all directions: that of the error is not known as well as its size
+            whole += off.square().sum(-1)[:, None, None] * torch.eye(3, dtype=torch.float64)
     flags = track.flags | np.where(wrong & track.valid, np.uint32(Flag.CONTRADICTION), np.uint32(0))
     marked = replace(track, flags=flags, orientation_cov=turn_cov.numpy(), position_cov=place_cov.numpy())
     return marked, compare_cameras(seen, limits)
