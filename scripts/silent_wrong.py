@@ -467,7 +467,7 @@ CASES = (
     Case(name="spin_60", what="60 degrees a frame", move=spinning(60), scene={"exposure_samples": 1}),
     Case(name="spin_110", what="110 degrees a frame", move=spinning(110), scene={"exposure_samples": 1}),
     Case(name="spin_170", what="170 degrees a frame", move=spinning(170), scene={"exposure_samples": 1}),
-    Case(name="frame_2", what="2 frames", scene={"frames": 2}),
+    Case(name="frames_2", what="2 frames", scene={"frames": 2}),
     Case(name="frames_5", what="5 frames", scene={"frames": 5}),
     Case(name="frames_10", what="10 frames", scene={"frames": 10}),
 )
