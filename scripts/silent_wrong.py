@@ -608,7 +608,7 @@ def judge(track: Trajectory, folder: Path, late_frames: int = 0) -> dict[str, An
         "valid": int(shown.sum()),
         "silent": int((shown & wrong & ~marked).sum()),
         "right": int((there & ~wrong).sum()),
-        "right_marked": int((there & ~wrong & marked).sum() + (~there).sum()),
+        "right_marked": int((there & ~wrong & marked).sum()),
         "error_deg": float(np.median(deg[shown])) if shown.any() else float("nan"),
         "error_mm": float(np.median(np.linalg.norm(off[shown], axis=1))) if shown.any() else float("nan"),
         "sigmas": float(np.median(sigmas[shown])) if shown.any() else float("nan"),
