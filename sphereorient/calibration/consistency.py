@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.cameras import Camera, R_cam_view, Rays, triangulate
+from sphereorient.cameras import Camera, R_lab_view, Rays, centre_lab_mm, sphere_radius_px, triangulate
 
 Floats = NDArray[np.float64]
 MOST = 60  # frames in which causes are tried
@@ -50,13 +50,6 @@ class Seen:
         """Return some frames, which are not consecutive."""
         parts = {name: getattr(self, name)[rows] for name in ("centre_px", "radius_px", "R_lab_body")}
         return replace(self, **parts, consecutive=False)
-
-
-def expected_radius_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
-    """Return the radius (...), px, of a sphere's picture at positions (..., 3), mm, lab, along the camera's x."""
-    rim = position_lab_mm + camera.R_cam_lab[0] * radius_mm
-    radius_px: Tensor = (camera.project(rim) - camera.project(position_lab_mm)).norm(dim=-1)
-    return radius_px
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,13 +154,13 @@ def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
     )
     if not known.contradicts:
         return known
-    causes = [cause for cause in compare.causes(found) if cause.left < EXPLAINS]
-    causes.sort(key=lambda cause: (cause.parameters, cause.left))
+    causes = sorted((c for c in compare.causes(found) if c.left < EXPLAINS), key=lambda cause: cause.left)
     if causes:
-        least = min(cause.left for cause in causes)
-        fewest = min(cause.parameters for cause in causes if cause.left < EQUALLY * least + compare.simpler)
-        causes = [c for c in causes if c.parameters == fewest and c.left < EQUALLY * least + compare.simpler]
-    return replace(known, causes=tuple(sorted(causes, key=lambda cause: cause.left)))
+        enough = EQUALLY * causes[0].left + SIMPLER / max(_misfit(found), 1e-9)
+        causes = [cause for cause in causes if cause.left < enough]
+        fewest = min(cause.parameters for cause in causes)
+        causes = [cause for cause in causes if cause.parameters == fewest]
+    return replace(known, causes=tuple(causes))
 
 
 class _Comparison:
@@ -181,18 +174,9 @@ class _Comparison:
         self.seen, self.limits = seen, limits
         self.cameras, self.names = list(seen.cameras.values()), list(seen.cameras)
         self.pairs = list(combinations(range(len(self.cameras)), 2))
-        self.centres = [-camera.R_cam_lab.mT @ camera.T_cam_lab_mm for camera in self.cameras]
-        looks = [
-            camera.rays(seen.centre_px[:, k]).direction_lab @ camera.R_cam_lab.mT
-            for k, camera in enumerate(self.cameras)
-        ]
-        self.R_view_body = torch.stack(
-            [
-                R_cam_view(look).mT @ camera.R_cam_lab @ seen.R_lab_body[:, k]
-                for k, (camera, look) in enumerate(zip(self.cameras, looks, strict=True))
-            ],
-            1,
-        )
+        self.centres = [centre_lab_mm(camera) for camera in self.cameras]
+        views = [R_lab_view(camera, seen.centre_px[:, k]) for k, camera in enumerate(self.cameras)]
+        self.R_view_body = torch.stack(views, 1).mT @ seen.R_lab_body
         gaps = [
             gaps_between((self.cameras[k], self.cameras[m]), (seen.centre_px[:, k], seen.centre_px[:, m]))
             for k, m in self.pairs
@@ -202,13 +186,12 @@ class _Comparison:
         self.by_size = [
             [
                 (gap.position_lab_mm - self.centres[c]).norm(dim=-1)
-                * expected_radius_px(self.cameras[c], gap.position_lab_mm, seen.diameter_mm / 2)
+                * sphere_radius_px(self.cameras[c], gap.position_lab_mm, seen.diameter_mm / 2)
                 / seen.radius_px[:, c]
                 for c in pair
             ]
             for gap, pair in zip(gaps, self.pairs, strict=True)
         ]
-        self.simpler = 0.0
 
     def sights(
         self,
@@ -221,9 +204,9 @@ class _Comparison:
         R_view_body = self.R_view_body if R_view_body is None else R_view_body
         found = []
         for k, place in enumerate(places or range(len(self.cameras))):
-            rays, R = self.cameras[place].rays(pixels[:, k]), self.cameras[place].R_cam_lab
-            R_lab_view = R.mT @ R_cam_view(rays.direction_lab @ R.mT)
-            found.append(_Sight(rays=rays, R_lab_body=R_lab_view @ R_view_body[:, k]))
+            camera, pixel = self.cameras[place], pixels[:, k]
+            R_lab_body = R_lab_view(camera, pixel) @ R_view_body[:, k]
+            found.append(_Sight(rays=camera.rays(pixel), R_lab_body=R_lab_body))
         return found
 
     def __call__(self, sights: Sequence[_Sight], larger: Tensor | float = 0.0, sized: bool = True) -> Tensor:
@@ -246,7 +229,6 @@ class _Comparison:
         """Yield what may be wrong, with the share of the misfit that it leaves."""
         names, count = self.names, len(self.names)
         whole, unsized = _misfit(found), _misfit(found[:, :4])
-        self.simpler = SIMPLER / max(whole, 1e-9)
         for k, m in self.pairs:
             if self.cameras[k].image_size == self.cameras[m].image_size:
                 places = [*range(count)]
@@ -263,7 +245,7 @@ class _Comparison:
         yield self._best(
             lambda p: self(self.sights(), larger=float(p[0])), 1, words, lambda p: [mm * math.exp(p[0])], whole
         )
-        for some in [list(range(count)), *([k] for k in range(count))] if count > 1 else []:
+        for some in [list(range(count)), *([k] for k in range(count))]:
             words = f"pixels of {' and '.join(names[k] for k in some)} {{:+.1f}} % wider than calibrated: check sx, "
             words += "pixel_pitch, and whether the movie was resized"
             yield self._best(partial(self._wide, some), 1, words, lambda p: [100 * p[0]], whole)
@@ -338,7 +320,7 @@ class _Comparison:
             left = [_misfit(self(self._shifted(k, float(shift)))) / whole for shift in shifts]
             best = int(np.nanargmin(left))
             words = f"the movie of {name} {abs(shifts[best]):g} frames {'late' if shifts[best] > 0 else 'early'}"
-            yield Cause(words=f"{words}: check start:", left=left[best], parameters=1, deadly=False)
+            yield Cause(words=f"{words}: check start:", left=left[best], parameters=1)
 
     def _shifted(self, camera: int, frames: float) -> list[_Sight]:
         sights = self.sights()

@@ -18,7 +18,7 @@ from sphereorient.calibration.calibrated import Calibrated, PictureReport, doubt
 from sphereorient.calibration.document import CalibrationDocument, Picture, load_calibration, read_points
 from sphereorient.calibration.guess import guess_from_points, guess_rig
 from sphereorient.calibration.targets import PlateView, placed
-from sphereorient.cameras import Camera, ParameterCovariance, Port, PortCamera, TsaiCamera
+from sphereorient.cameras import Camera, ParameterCovariance, Port, PortCamera, TsaiCamera, centre_lab_mm
 from sphereorient.cameras.checks import camera_error, named
 from sphereorient.cameras.parameters import PORT_TILT
 from sphereorient.errors import CameraError
@@ -268,7 +268,7 @@ def _wall_before(result: Calibrated, name: str) -> Port:
     """Return a thin wall across a camera's axis between the camera and its plates, before water."""
     camera = result.cameras[name]
     normal = -camera.R_cam_lab[2]
-    middle = -(camera.R_cam_lab.mT @ camera.T_cam_lab_mm)
+    middle = centre_lab_mm(camera)
     placed = [
         result.R_lab_plate[one.picture.row] @ torch.from_numpy(one.view.points_plate_mm).mean(0)
         + result.T_lab_plate_mm[one.picture.row]

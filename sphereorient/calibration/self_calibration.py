@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.calibration.solve import inverse_information, least_squares, slopes_along
-from sphereorient.cameras import Camera, ParameterCovariance, R_cam_view, load_cameras, triangulate
+from sphereorient.cameras import Camera, ParameterCovariance, R_lab_view, load_cameras, triangulate
 from sphereorient.cameras.checks import camera_error
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, with_parameters
 from sphereorient.errors import TrackError
@@ -153,7 +153,7 @@ class _Pair:
         self.centre_px = seen_loose.centre_px[both]
         self.R_still = seen.R_lab_body[both]
         # The body's orientation relative to the camera, independent of the camera's pose in the lab.
-        self.R_view_body = _R_lab_view(loose, self.centre_px).mT @ seen_loose.R_lab_body[both]
+        self.R_view_body = R_lab_view(loose, self.centre_px).mT @ seen_loose.R_lab_body[both]
 
     def gaps(self, change: Tensor) -> Tensor:
         """Signed distances (N,) between the two lines of sight, mm."""
@@ -165,7 +165,7 @@ class _Pair:
     def rotations(self, change: Tensor) -> Tensor:
         """Rotation vectors (N, 3), rad, lab, from the loose camera's orientation of the body to the still one's."""
         camera = with_parameters(self.loose, MOVED, change)
-        return so3.log(self.R_still @ (_R_lab_view(camera, self.centre_px) @ self.R_view_body).mT)
+        return so3.log(self.R_still @ (R_lab_view(camera, self.centre_px) @ self.R_view_body).mT)
 
     def solved(self) -> tuple[Tensor, Tensor]:
         """Return the motion (6,) and its sigmas from the scatter of frames at the solution."""
@@ -192,11 +192,6 @@ class _Pair:
 
     def _slopes(self, at: Tensor, spread: Tensor, kept: Tensor) -> Tensor:
         return slopes_along(lambda x: self._residuals(x, spread, kept), at, torch.eye(9, dtype=torch.float64))
-
-
-def _R_lab_view(camera: Camera, uv_px: Tensor) -> Tensor:
-    """Return frames (N, 3, 3) at pixels: z along the line of sight."""
-    return camera.R_cam_lab.mT @ R_cam_view(camera.rays(uv_px).direction_lab @ camera.R_cam_lab.mT)
 
 
 def _with_spread(camera: Camera, known: ParameterCovariance, spread: Tensor) -> Camera:

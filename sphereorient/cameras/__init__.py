@@ -1,6 +1,15 @@
 """Cameras: their models and files; projection, lines of sight, triangulation."""
 
-from sphereorient.cameras.camera import Camera, ParameterCovariance, R_cam_view, Rays, triangulate
+from sphereorient.cameras.camera import (
+    Camera,
+    ParameterCovariance,
+    R_cam_view,
+    R_lab_view,
+    Rays,
+    centre_lab_mm,
+    sphere_radius_px,
+    triangulate,
+)
 from sphereorient.cameras.ideal import PinholeCamera
 from sphereorient.cameras.io.cameras_yaml import load_cameras, load_covariance, save_cameras
 from sphereorient.cameras.port import Port, PortCamera

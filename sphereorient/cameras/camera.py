@@ -137,6 +137,24 @@ def R_cam_view(direction_cam: Tensor) -> Tensor:
     return torch.where(defined[..., None, None], R, torch.full_like(R, torch.nan))
 
 
+def R_lab_view(camera: Camera, uv_px: Tensor) -> Tensor:
+    """Return rotations (..., 3, 3) from view to lab components at pixels (..., 2): z of a view is the line of sight."""
+    return camera.R_cam_lab.mT @ R_cam_view(camera.rays(uv_px).direction_lab @ camera.R_cam_lab.mT)
+
+
+def centre_lab_mm(camera: Camera) -> Tensor:
+    """Return the origin (3,) of the camera's frame, lab, mm: the projection centre of a central camera."""
+    return -(camera.R_cam_lab.mT @ camera.T_cam_lab_mm)
+
+
+def sphere_radius_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
+    """Return the radius (...), px, of a sphere's picture at positions (..., 3), mm, lab, along the camera's x."""
+    right = camera.R_cam_lab[0] * radius_mm
+    centre, rim = camera.project(torch.stack([position_lab_mm, position_lab_mm + right]))
+    radius_px: Tensor = (rim - centre).norm(dim=-1)
+    return radius_px
+
+
 def _cross(a: Tensor, b: Tensor) -> Tensor:
     product: Tensor = torch.linalg.cross(*torch.broadcast_tensors(a, b))  # type: ignore[no-untyped-call]
     return product

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from sphereorient.cameras.camera import ParameterCovariance, Rays
+from sphereorient.cameras.camera import ParameterCovariance, Rays, centre_lab_mm
 from sphereorient.cameras.checks import as_parameter, check_image_size, check_points, check_positive, check_rotation
 
 
@@ -98,7 +98,7 @@ class CentralCamera(CameraModel):
     @property
     def centre_lab_mm(self) -> Tensor:
         """(3,), lab, mm: the projection centre."""
-        return -(self.R_cam_lab.mT @ self.T_cam_lab_mm)
+        return centre_lab_mm(self)
 
     @property
     @abstractmethod

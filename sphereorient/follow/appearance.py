@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.calibration.consistency import Limits, Seen, compare_cameras
-from sphereorient.cameras import triangulate
+from sphereorient.cameras import centre_lab_mm, triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, best_poses, pose_table
@@ -202,7 +202,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     gap_px = gap_mm * (radius_px / fitter.radius_mm)
     others_px = [so3.geodesic_distance(one[2], other[2]) * radius_px for one, other in combinations(alone, 2)]
     for (one_camera, X, _), (_, Y, _) in permutations(alone, 2):
-        centre = -one_camera.R_cam_lab.mT @ one_camera.T_cam_lab_mm
+        centre = centre_lab_mm(one_camera)
         sight = torch.nn.functional.normalize(X - centre, dim=-1)
         # The other camera knows the distance by its line of sight; this one by the size of its picture.
         others_px.append((((Y - X) * sight).sum(-1) / (X - centre).norm(dim=-1)).abs() * radius_px)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.cameras import centre_lab_mm
 from sphereorient.experiment.recording import Progress
 from sphereorient.mapping.chain import PairwiseAttitudes, find_chain
 from sphereorient.mapping.disks import Crops, Disks, disks_of, evenly_spread
@@ -321,8 +322,7 @@ def _counts(state: State, direction_body: Tensor) -> Tensor:
         for c, view in enumerate(state.fitter.views):
             if not bool(state.use[k, c]):
                 continue
-            camera = view.camera
-            middle = -(camera.R_cam_lab.mT @ camera.T_cam_lab_mm) - state.position_lab_mm[k]
+            middle = centre_lab_mm(view.camera) - state.position_lab_mm[k]
             far = float(middle.norm())
             towards = (direction_body @ (R.mT @ (middle / far))).float()
             # Cosine of the slant where the line of sight meets the ball: (D n.e - r) / |D e - r n|.

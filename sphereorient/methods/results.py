@@ -192,19 +192,15 @@ def _margin(table: PoseTable, choice: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], learnt: Appearance) -> Tensor:
-    """Return flags (N,) int64 of frames that one camera alone measured, and of poor fits."""
+    """Return flags (N,) int64 of frames that one camera alone measured, of poor fits, and of a movie of two balls."""
     found = chosen.choice >= 0
     one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)
     # Halfway between the least and the usual score of a right pose.
     poor = 0.5 * (learnt.score_min + learnt.right_score)
     best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
     doubtful = found & (best < poor)
-    ambiguous = found & learnt.second_ball
-    return (
-        torch.where(one, int(Flag.ONE_CAMERA), 0)
-        | torch.where(doubtful, int(Flag.DOUBTFUL_FIT), 0)
-        | (torch.where(ambiguous, int(Flag.AMBIGUOUS), 0))
-    )
+    bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: found & learnt.second_ball}
+    return torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0)
 
 
 def with_systematic_errors(

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from sphereorient.cameras import Camera
+from sphereorient.cameras import Camera, sphere_radius_px
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene, Frame, LocateSettings
 from sphereorient.locate.outline import find_blobs
@@ -58,10 +58,7 @@ class CameraView:
 
     def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
         """Return the radius (...), px, of the sphere's picture at positions (..., 3), mm, along the camera's x."""
-        right = self.camera.R_cam_lab[0] * radius_mm
-        centre, rim = self.camera.project(torch.stack([position_lab_mm, position_lab_mm + right]))
-        radius_px: Tensor = (rim - centre).norm(dim=-1)
-        return radius_px
+        return sphere_radius_px(self.camera, position_lab_mm, radius_mm)
 
 
 def widest_px(views: Sequence[CameraView]) -> float:

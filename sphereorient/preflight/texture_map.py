@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.calibration.consistency import FEWEST, Limits, Seen, compare_cameras
-from sphereorient.cameras import Camera, R_cam_view
+from sphereorient.cameras import Camera, R_lab_view
 from sphereorient.experiment.stream import spread_frames
 from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.mapping.grid import texel_areas
@@ -241,10 +241,8 @@ def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
 
 def cameras_agree(matches: Sequence[TextureMatch], diameter_mm: float) -> Finding:
     """Judge whether the cameras show one sphere in one orientation, and name what would explain a contradiction."""
-    title, R = "cameras agree", []
-    for match in matches:
-        R_cam_lab, sight = match.camera.R_cam_lab, match.camera.rays(match.centre_px).direction_lab
-        R.append(R_cam_lab.mT @ R_cam_view(sight @ R_cam_lab.mT) @ match.R_view_body)
+    title = "cameras agree"
+    R = [R_lab_view(match.camera, match.centre_px) @ match.R_view_body for match in matches]
     seen = Seen(
         cameras={match.name: match.camera for match in matches},
         centre_px=torch.stack([match.centre_px for match in matches], 1),

@@ -1,6 +1,7 @@
 """Candidate orientations without history, and who proposes them."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, Self
@@ -139,14 +140,14 @@ def check_disks(disks: Tensor, height: int, width: int) -> None:
         raise ShapeError(refusal("disks", expected=size, got=str(tuple(disks.shape)), do="crop anew"))
 
 
-class DiskSearch(nn.Module):
+class DiskSearch(nn.Module, ABC):
     """A proposer as a module: `propose` is its work, a call accepts disks of any leading shape."""
 
     size_px: int
 
+    @abstractmethod
     def propose(self, disks: Tensor) -> Candidates:
         """Propose orientations for (F, S, S) float32 grey disks."""
-        raise NotImplementedError
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> tuple[Tensor, Tensor]:
         """Return R_view_body (..., M, 3, 3) and score (..., M) float64 of the candidates, best first, padded with NaN.

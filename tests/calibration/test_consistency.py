@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from sphereorient import so3
-from sphereorient.calibration.consistency import Limits, Seen, compare_cameras, expected_radius_px
-from sphereorient.cameras import Camera, R_cam_view, TsaiCamera
+from sphereorient.calibration.consistency import Limits, Seen, compare_cameras
+from sphereorient.cameras import Camera, R_cam_view, TsaiCamera, sphere_radius_px
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
 
@@ -31,7 +31,7 @@ def seen_by(
 
     X, R = motion.position_lab_mm, motion.R_lab_body
     pixels = [camera.project(X) + 0.1 * error(frames, 2) for camera in cameras.values()]
-    radii = [expected_radius_px(c, X, diameter_mm / 2) * (1 + 0.002 * error(frames)) for c in cameras.values()]
+    radii = [sphere_radius_px(c, X, diameter_mm / 2) * (1 + 0.002 * error(frames)) for c in cameras.values()]
     turns = [so3.exp(math.radians(0.1) * error(frames, 3)) @ R for _ in cameras]
     return Seen(
         cameras=cameras,
@@ -80,7 +80,7 @@ def test_two_frames_are_not_judged():
 
 @pytest.mark.parametrize("percent", [-5, 2, 5])
 def test_a_wrong_diameter_is_named_with_the_right_one(percent):
-    """Before: 30 of 30 frames valid, 25 mm off, and no word."""
+    """Before: 30 of 30 frames valid, 25 mm off, without a message."""
     found = compare_cameras(seen_by(CAMERAS, diameter_mm=MM * (1 + percent / 100)), LIMITS)
     assert found.contradicts
     assert not found.deadly

@@ -106,7 +106,7 @@ def rig_and_views(walls, seed=3, model="tsai"):
 
 @pytest.mark.slow
 def test_a_plate_behind_a_wall_that_nobody_described_is_told_with_its_cause(monkeypatch):
-    """Before: f 48.4 for 35, the centre 169 px off, no word. After: structure of 0.07 px, and the wall behind it."""
+    """Before: f 48.4 for 35, centre 169 px off, without a message. After: structure of 0.07 px, and its wall."""
     rig, seen = rig_and_views(walls=True)
     *words, cause = calibrated(monkeypatch, seen, document(rig)).verdict
     assert [line[:35] for line in words] == [f"cam{k}: neighbouring points miss alike"[:35] for k in (1, 2)]

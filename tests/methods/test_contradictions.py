@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from sphereorient import so3
-from sphereorient.calibration.consistency import expected_radius_px
+from sphereorient.cameras import sphere_radius_px
 from sphereorient.methods.results import with_contradictions
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
@@ -31,7 +31,7 @@ def track_of(turn_deg: dict[str, float], shift_px: dict[str, float], contradicts
         cameras[name] = replace(
             track.cameras[name],
             centre_px=(camera.project(X) + off).numpy(),
-            radius_px=expected_radius_px(camera, X, MM / 2).numpy(),
+            radius_px=sphere_radius_px(camera, X, MM / 2).numpy(),
             orientation=(turn @ R).numpy(),
             orientation_cov=np.broadcast_to(SIGMA_RAD**2 * np.eye(3), (FRAMES, 3, 3)).copy(),
             reason=(Reason.CONTRADICTS if contradicts and name == "cam2" else Reason.OK,) * FRAMES,
