@@ -30,8 +30,8 @@ from sphereorient import so3
 from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment, write_experiment
 from sphereorient.mapping.compare import compare_maps
-from sphereorient.report.texture_map import read_seen, seen_path, shares_seen
-from sphereorient.sphere import load_texture
+from sphereorient.report.texture_map import shares_seen
+from sphereorient.sphere import load_texture, read_seen, seen_path
 from sphereorient.synth import SynthSettings
 from sphereorient.synth import write_synthetic_experiment as render
 from sphereorient.trajectory import Trajectory

@@ -38,8 +38,7 @@ from sphereorient.mapping.disks import disks_of
 from sphereorient.mapping.photographs import find_photographs, finer_settings
 from sphereorient.methods.settings import Settings
 from sphereorient.pose.fitter import widest_px
-from sphereorient.report.texture_map import read_seen, seen_path
-from sphereorient.sphere import load_texture
+from sphereorient.sphere import load_texture, read_seen, seen_path
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.scene import make_scene, render_frame
 from sphereorient.synth.textures import KINDS, random_texture

@@ -279,13 +279,8 @@ def _or_none(value: float) -> float | None:
 
 
 def _known_map(path: Path) -> "Tensor":
-    """Read a map, NaN where the counts beside it are 0."""
-    import torch
+    """Read a map, NaN where it is no paint."""
+    from sphereorient.sphere import load_texture, load_unseen
 
-    from sphereorient.report.texture_map import read_seen, seen_path
-    from sphereorient.sphere import load_texture
-
-    texture, seen = load_texture(path), read_seen(seen_path(path))
-    if seen is None or seen.shape != texture.shape:
-        return texture
-    return torch.where(seen > 0, texture, torch.nan)
+    texture, unseen = load_texture(path), load_unseen(path)
+    return texture if unseen is None else texture.masked_fill(unseen, math.nan)

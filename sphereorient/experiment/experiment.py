@@ -10,6 +10,7 @@ from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load
 from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.files.yaml_file import read_document, refuse_unknown, validated, write_document
 from sphereorient.movies import Movie, flipped, movie_files, open_movie
+from sphereorient.sphere import seen_path
 
 SCHEMA = "sphereorient-experiment/1"
 MAX_CAMERAS = 2
@@ -201,7 +202,8 @@ def input_files(experiment: Experiment, names: Sequence[str] | None = None) -> d
     for paths in (experiment.background_paths, experiment.mask_paths):
         single += [paths[name] for name in used if name in paths]
     if experiment.texture_path is not None:
-        single.append(experiment.texture_path)
+        counts = seen_path(experiment.texture_path)
+        single += [experiment.texture_path, *([counts] if counts.is_file() else [])]
     if experiment.times not in (None, MOVIES_OWN):
         single.append(Path(str(experiment.times)))
     movies = [experiment.movie_paths[name] for name in used if name in experiment.movie_paths]

@@ -11,7 +11,9 @@ from sphereorient.errors import ExperimentError, refusal
 from sphereorient.experiment.experiment import Experiment, load_experiment, open_movies, outside_paths
 from sphereorient.experiment.stream import CameraStream, given_mask
 from sphereorient.experiment.timeline import Rows, Timeline, timeline
-from sphereorient.sphere import load_texture
+from sphereorient.sphere import load_texture, load_unseen, unseen_share
+
+UNKNOWN = 0.5  # grey of texels that are no paint, for searches
 
 Progress = Callable[[str, int, int], None]  # (stage, frames done, all frames); the command line draws a bar
 
@@ -28,6 +30,7 @@ class Recording:
     streams: Sequence[CameraStream]
     timeline: Timeline
     texture: Tensor  # (H, 2 H); (0, 0) if it is to be estimated
+    unseen: Tensor | None  # (H, 2 H) bool, texels that are no paint; None: all are
     remarks: tuple[str, ...]
 
     @property
@@ -72,7 +75,9 @@ def open_recording(
     if textured and experiment.texture_path is None:
         do = "learn it with `sphereorient map`, then write sphere.texture: the file that this gives"
         raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
-    texture = load_texture(experiment.texture_path) if textured and experiment.texture_path else torch.empty(0, 0)
+    texture, unseen = torch.empty(0, 0), None
+    if textured and experiment.texture_path is not None:
+        texture, unseen = load_texture(experiment.texture_path), load_unseen(experiment.texture_path)
     names = _chosen(experiment, cameras)
     movies = open_movies(experiment, names)
     frames = timeline(experiment, movies)
@@ -87,9 +92,17 @@ def open_recording(
         for name, movie in movies.items()
     ]
     remarks = [f"{experiment.path}: reads outside of its folder: {path}" for path in outside_paths(experiment)]
+    if unseen is not None:
+        texture = texture.masked_fill(unseen, UNKNOWN)
+        remarks += [f"{experiment.texture_path}: {100 * unseen_share(unseen):.0f} % of the ball is unseen and no paint"]
     remarks += [f"{movie.path}: {remark}" for movie in movies.values() for remark in movie.remarks]
     yield Recording(
-        experiment=experiment, streams=streams, timeline=frames, texture=texture, remarks=(*remarks, *frames.remarks)
+        experiment=experiment,
+        streams=streams,
+        timeline=frames,
+        texture=texture,
+        unseen=unseen,
+        remarks=(*remarks, *frames.remarks),
     )
 
 

@@ -14,6 +14,7 @@ from sphereorient.cameras import R_cam_view
 from sphereorient.follow.poses import Poses, no_pose, poses_of
 from sphereorient.locate import Found, Frame, LocateSettings, Positions, find_ball, find_positions, sightings_of
 from sphereorient.locate.outline import Outline, find_blobs, fit_outline
+from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import CameraView, Fitter, Picture
 from sphereorient.search.candidates import Proposer
 from sphereorient.search.normalisation import crop_disk
@@ -175,19 +176,26 @@ class Initialiser:
             one = fitter.pixels([pictures], place, level).thinned(every)
             pixels = one.where(torch.arange(len(one)).repeat(len(R)))
             fit = fitter.fit(pixels, X, R, use.expand(len(R), -1), level, iterations, held)
-            fit = replace(fit, nll=explaining_first(fit.nll, fit.score[:, use].mean(-1)))
+            fit = replace(fit, nll=explaining_first(fit, use))
             chosen = distinct_indices(fit.R_lab_body, fit.nll, keep)
             X, R = fit.position_lab_mm[chosen], fit.R_lab_body[chosen]
             place = X[:1]
-        return poses_of(fit, chosen, use, frame.reason)
+        shown = (fit.score[chosen[0]] != 0) | ~use if len(chosen) else torch.ones_like(use)
+        reason = [why if known else Reason.UNSEEN for why, known in zip(frame.reason, shown.tolist(), strict=True)]
+        return poses_of(fit, chosen, use & shown, reason)
 
 
 def _best_score(poses: Poses) -> float:
     return float(poses.score[0, poses.use].max()) if len(poses) else -1.0
 
 
-def explaining_first(nll: Tensor, score: Tensor) -> Tensor:
-    """Return nll (M,) with poses of clearly lower score (M,) behind the others: likelihood forgives wide scatter."""
+def explaining_first(fit: FittedPoses, use: Tensor) -> Tensor:
+    """Return nll (M,) with poses of clearly lower score in the cameras of `use` (C,) bool behind the others:
+    likelihood forgives wide scatter. A disk of unknown paint has no score.
+    """
+    nll, known = fit.nll, use & (fit.score != 0)
+    score = torch.where(known, fit.score, 0.0).sum(-1) / known.sum(-1)
+    score = torch.where(known.any(-1), score, -1.0)
     behind = score < score.nan_to_num(-1.0).max() - CLEARLY_LESS
     if not bool((~behind & torch.isfinite(nll)).any()):
         return nll

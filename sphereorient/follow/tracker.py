@@ -273,7 +273,7 @@ class ChunkTracker:
         if self.centre is not None:
             optics = self.fitter.optics
             fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 3), (optics.fine, 4)))
-            order = explaining_first(fit.nll, fit.score[:, poses.use].mean(-1)).argsort(stable=True)
+            order = explaining_first(fit, poses.use).argsort(stable=True)
             poses = poses_of(fit, order, poses.use, poses.reason)
         if bool((usable & ~poses.use).any()):
             poses = self._all_seeing(poses, frames, usable)

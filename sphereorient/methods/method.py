@@ -78,7 +78,7 @@ class Learnt:
             raise TrackError(refusal("learnt", expected=f"what was learnt of {expected}", got=got, do=do))
         views = [CameraView.of(stream.name, stream.camera, self.scenes[stream.name]) for stream in recording.streams]
         widest = max(scene.diameter_px for scene in self.scenes.values())
-        optics = Optics(base_table(recording.texture, widest), self.blur_px, widest)
+        optics = Optics(base_table(recording.texture, widest, recording.unseen), self.blur_px, widest)
         fitter = Fitter(
             views=views,
             radius_mm=recording.experiment.radius_mm,

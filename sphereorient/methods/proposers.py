@@ -56,7 +56,7 @@ def open_views(
         known = [known_diameter_px(recording, stream.name, settings.locate) for stream in recording.streams]
         widest = max(px or view.result().diameter_px for px, view in zip(known, opening, strict=True))
         search = BlurMatchedSearch(recording.texture, settings, widest)
-        base = pool.submit(base_table, recording.texture, widest)
+        base = pool.submit(base_table, recording.texture, widest, recording.unseen)
         sharp = pool.submit(search.of, settings.refine.blur_px or 0.0)
         views = [view.result() for view in opening]
         sharp.result()

@@ -91,6 +91,10 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
         Reason.LOW_SCORE if why[place] is Reason.OK and not shown[k] else why[place]
         for k, why in enumerate(table.reason)
     ]
+    failed = [k for k, why in enumerate(reason) if why is Reason.LOW_SCORE]
+    unknown = learnt.fitter.shows_unknown(place, picked["position_lab_mm"][failed], R[failed])
+    for k in torch.tensor(failed)[unknown].tolist():
+        reason[k] = Reason.UNSEEN
     return replace(
         CameraTrack.empty(frames),
         centre_px=centre_px.numpy(),

@@ -3,6 +3,7 @@
 `learn_light` estimates the light and the noise that all frames share from their fits.
 """
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -17,6 +18,7 @@ from sphereorient.so3 import inverse_damped, solve_damped
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
 EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
+KNOWN = 0.3  # least share of a disk that shows known paint
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 
@@ -31,7 +33,7 @@ class FittedPoses:
     own_covariance: Tensor  # (L, C, 3, 3), rad^2
     own_move: Tensor  # (L, C, 3), mm, lab: how each camera alone would move the sphere, distance by size included
     deviation: Tensor  # (L, C), robust standard deviation of the residuals over the noise expected
-    score: Tensor  # (L, C), 1 less the share of the picture's variance that is left
+    score: Tensor  # (L, C), 1 less the share of the picture's variance that is left; 0 of hardly any known paint
     nll: Tensor  # (L), negative log-likelihood of all pixels, as if they were independent
     step: Tensor  # (L, 6), the last one of the fit
 
@@ -72,6 +74,7 @@ class Residuals:
     model: Tensor  # (L, P), grey levels
     variance: Tensor  # (L, P), expected
     weight: Tensor  # (L, P), robust and inside, 0 .. 1
+    inside: Tensor  # (L, P) bool, the pixels that count: of known paint
     deviation: Tensor  # (L,), robust standard deviation of the residuals over the noise expected
     lit: Tensor  # (L, P), grey levels from black to white paint, the frame's own light included, coverage too
     over: Tensor  # (L, P), grey levels of the sphere above the background
@@ -146,7 +149,7 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         own_move=by_pose(alone[:, 3:], cameras),
         own_covariance=own_bread @ shared[..., :3, :3] @ own_bread,
         deviation=by_pose(at.deviation.double(), cameras),
-        score=by_pose(_score(at, pixels.inside).double(), cameras),
+        score=by_pose(_score(at).double(), cameras),
         nll=(loss * seen).sum(1),
         step=step,
     )
@@ -166,9 +169,10 @@ def residuals(
     columns = torch.cat([learnt * tints[:, :n], view.coverage[:, None] * tints[:, :n_black]], dim=1)
     beyond = (1.0 - view.coverage) * pixels.behind
     noise = model.light.noise.repeat(len(X), 1)
+    inside = pixels.inside if view.known is None else pixels.inside & view.known
     target = pixels.grey - beyond
     # The first weights come from the picture itself, bubbles included; a second round does without it.
-    rounds = (pixels.grey, pixels.inside.to(columns.dtype)) if state is None else state
+    rounds = (pixels.grey, inside.to(columns.dtype)) if state is None else state
     for _ in range(1 if state is not None else 2):
         expected, weight = rounds
         weighted = columns * (weight / _variance(expected, noise))[:, None]
@@ -178,9 +182,9 @@ def residuals(
         painted = (coefficients[:, None] @ columns)[:, 0]
         grey, residual = painted + beyond, target - painted
         variance = _variance(grey, noise)
-        deviation = _deviation(residual, variance, pixels.inside)
+        deviation = _deviation(residual, variance, inside)
         variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
-        weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * pixels.inside
+        weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * inside
         rounds = grey, weight
     gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
     offset = (coefficients[:, None, n:] @ tints[:, :n_black])[:, 0]
@@ -194,6 +198,7 @@ def residuals(
         model=grey,
         variance=variance,
         weight=weight,
+        inside=inside,
         deviation=deviation,
         lit=lit,
         over=over,
@@ -262,21 +267,26 @@ def _shared_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor
 
 
 def _loss(at: Residuals, inside: Tensor) -> Tensor:
-    """Return Tukey's loss (L,) with the normalisation of its scale, nats."""
+    """Return Tukey's loss (L,) with the normalisation of its scale, nats; unknown paint may have any grey level."""
     share = (at.residual.square() / (TUKEY**2 * at.variance)).clamp_max(1.0)
     loss = (TUKEY**2 / 6.0) * (1.0 - (1.0 - share) ** 3) + at.deviation.clamp_min(1.0).log()[:, None]
+    if at.view.known is not None:
+        loss = torch.where(at.view.known, loss, (at.lit / (2 * math.pi * at.variance).sqrt()).clamp_min(1.0).log())
     return (loss * inside).sum(-1).double()
 
 
-def _score(at: Residuals, inside: Tensor) -> Tensor:
-    """Return the share of the disk's variance that the model explains, (L,); outliers count up to a limit."""
-    share = at.view.coverage * inside
+def _score(at: Residuals) -> Tensor:
+    """Return the share of the disk's variance that the model explains, (L,); outliers count up to a limit.
+    0 for a disk that shows hardly any known paint.
+    """
+    share = at.view.coverage * at.inside
+    known = share.sum(-1) > KNOWN * at.view.coverage.sum(-1)
     share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)
     grey = at.model + at.residual
     spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
     left = (share * torch.minimum(at.residual.square(), 4.0 * spread[:, None])).sum(-1)
     explained = 1.0 - left / spread.clamp_min(1e-9)
-    return torch.where(spread > 1e-6, explained, torch.zeros_like(explained))
+    return torch.where((spread > 1e-6) & known, explained, torch.zeros_like(explained))
 
 
 def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Light:
@@ -287,7 +297,7 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
     at = residuals(pixels, X, R, (at.model, at.weight), model, cameras)
     normal, right = light_sums(at.view, pixels, at.weight / at.variance * use.reshape(-1, 1))
     difference, black = light_maps(by_pose(normal, cameras).sum(0), by_pose(right, cameras).sum(0))
-    counted = pixels.inside & use.reshape(-1, 1)
+    counted = at.inside & use.reshape(-1, 1)
     noise = torch.stack(
         [noise_curve(at.model[c::cameras], at.residual[c::cameras], counted[c::cameras]) for c in range(cameras)]
     )

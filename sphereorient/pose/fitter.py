@@ -12,13 +12,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from sphereorient.cameras import Camera, sphere_radius_px
+from sphereorient.cameras import Camera, R_lab_view, sphere_radius_px
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene, Frame, LocateSettings
 from sphereorient.locate.outline import find_blobs
-from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
-from sphereorient.pose.model import FIRST, LATER, Light, SphereModel
+from sphereorient.pose.fit import KNOWN, FittedPoses, PoseStart, learn_light, refine
+from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
+from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
 
 Picture = NDArray[np.generic]
@@ -37,6 +38,7 @@ CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and
 STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
 
 STEPS = (("coarse", 4), ("middle", 3), ("fine", 4))  # pyramid levels, and iterations at each
+DISK_PX = 32  # of the disk on which the share of known paint is counted
 NOISE = 1.0  # grey levels, of a background of one grey
 
 
@@ -146,6 +148,15 @@ class Fitter:
         radii = torch.stack([view.radius_px(position_lab_mm, self.radius_mm) for view in self.views])
         return radii.nan_to_num().amax(0)
 
+    def shows_unknown(self, camera: int, position_lab_mm: Tensor, R_lab_body: Tensor) -> Tensor:
+        """Return which poses (B, 3), mm, (B, 3, 3) turn hardly any known paint to a camera, (B,) bool."""
+        unseen, there = self.optics.fine.paint.unseen, self.views[camera].camera
+        if unseen is None:
+            return torch.zeros(len(R_lab_body), dtype=torch.bool)
+        R_body_view = R_lab_body.mT @ R_lab_view(there, there.project(position_lab_mm))
+        normal_body = R_body_view @ orthographic_view(DISK_PX, torch.float64).normal_view.mT
+        return (unseen.sample(normal_body.float())[0] < UNSEEN).double().mean(-1) < KNOWN
+
     def pixels(
         self,
         pictures: Sequence[Sequence[Picture]],
@@ -192,9 +203,11 @@ def moved_to(device: torch.device, record: Record) -> Record:
     return replace(record, **moved)
 
 
-def base_table(texture: Tensor, diameter_px: float) -> TextureTable:
-    """Return the finest table of a map that disks of some diameter resolve; all others are blurred from it."""
-    return texture_table(texture, max(BASE_RAD, FINEST_PX * 2 / diameter_px))
+def base_table(texture: Tensor, diameter_px: float, unseen: Tensor | None = None) -> TextureTable:
+    """Return the finest table of a map that disks of some diameter resolve; all others are blurred from it.
+    `unseen` (H, 2 H) bool: texels that are no paint.
+    """
+    return texture_table(texture, max(BASE_RAD, FINEST_PX * 2 / diameter_px), unseen=unseen)
 
 
 def first_fitter(views: Sequence[CameraView], radius_mm: float, base: TextureTable, blur_px: float) -> Fitter:

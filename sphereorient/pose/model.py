@@ -18,6 +18,7 @@ from sphereorient.sphere.view import nearest_approach
 
 SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself
 RIM_NODES = 4  # look-ups along the radius near the limb, where the paint is compressed
+UNSEEN = 0.02  # a pixel that looks at a larger share of unknown paint counts for nothing
 DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of the paint is infinite on the limb
 MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
 ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)
@@ -119,6 +120,7 @@ class SphereView:
     paint_by_rotation: Tensor  # (L, 3, P), derivative by delta in exp([delta]x) R, 1/rad
     paint_by_position: Tensor  # (L, 3, P), derivative by the centre, lab, 1/mm
     coverage_by_position: Tensor  # (L, 3, P), 1/mm
+    known: Tensor | None  # (L, P) bool, whether all paint that the pixel looks at is known; None: everywhere
 
 
 def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model: SphereModel) -> SphereView:
@@ -155,7 +157,7 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
         outer = slice(inner, None)
         at, moves = _rim_nodes(q0[:, outer], blur, coverage[:, outer], density[:, outer], q[:, outer])
         parts.append(_sample(at, moves, [part[..., outer] for part in line], R, model))
-    body, turn, shift = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
+    body, turn, shift, *known = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
     return SphereView(
         paint=body,
         coverage=coverage,
@@ -163,6 +165,7 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
         paint_by_rotation=turn,
         paint_by_position=shift,
         coverage_by_position=(density / (blur * radius_mm))[:, None] * outward,
+        known=known[0] if known else None,
     )
 
 
@@ -176,10 +179,9 @@ def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, midd
     return middle + middle * (q0[:, None] + blur[:, None] * z - middle), moves.clamp(0.0, 1.0)
 
 
-def _sample(
-    at: Tensor, moves: Tensor, line: Sequence[Tensor], R: Tensor, model: SphereModel
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean paint of look-ups (L, P) and derivatives (L, 3, P); `at` in radii, `moves` per pixel moved.
+def _sample(at: Tensor, moves: Tensor, line: Sequence[Tensor], R: Tensor, model: SphereModel) -> tuple[Tensor, ...]:
+    """Return the mean paint of look-ups (L, P), derivatives (L, 3, P), and, if not everywhere, where the paint is
+    known, (L, P) bool; `at` in radii, `moves` per pixel moved.
     `line`: direction and outward, unit (L, 3, P), and the distance from the centre (L, P), mm, of lines of sight.
     """
     d, outward, nearest = line
@@ -190,6 +192,8 @@ def _sample(
     normal_b = qt[:, None] * outward_b - depth[:, None] * sight_b
     value, slope = model.paint.sample(normal_b.flatten(2))
     value, slope = value.reshape(qt.shape), slope.reshape(normal_b.shape)
+    shares = [] if model.paint.unseen is None else [model.paint.unseen.sample(normal_b.flatten(2))[0]]
+    known = [share.reshape(qt.shape).amax(1) < UNSEEN for share in shares]
     # Moving the centre along -outward lets the look-up slide outwards over the sphere.
     slide = (slope * outward_b).sum(1) + qt / depth * (slope * sight_b).sum(1)
     radial = (moves * slide).mean(1)
@@ -198,4 +202,4 @@ def _sample(
     # Across the radius a look-up stays at its share of it, q / q0.
     flat = R @ flat_b - by_sight[:, None] * d - by_outward[:, None] * outward
     shift = flat * (-1.0 / nearest)[:, None] - (radial / model.radius_mm)[:, None] * outward
-    return value.mean(1), R @ cross_first_axis(slope, normal_b).mean(2), shift
+    return value.mean(1), R @ cross_first_axis(slope, normal_b).mean(2), shift, *known

@@ -16,7 +16,7 @@ from sphereorient.preflight import cameras, movies, texture_map
 from sphereorient.preflight.finding import FAULT, Finding, Severity, judged, warning, worst
 from sphereorient.preflight.sample import MovieSample, sample_more, sample_movie
 from sphereorient.search import GreySearch
-from sphereorient.sphere import load_texture
+from sphereorient.sphere import load_texture, load_unseen
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,6 +29,7 @@ class Preflight:
     closer: tuple[tuple[MovieSample, ...], ...]  # consecutive frames: by stretch, then by camera
     scan: cameras.OffsetScan | None  # None with one camera
     texture: Tensor | None  # (H, 2 H)
+    unseen: Tensor | None  # (H, 2 H) bool, texels that are no paint; None: all are
     measures: texture_map.TextureMeasures | None
     similar: texture_map.ViewPair | None
     matches: tuple[texture_map.TextureMatch, ...]
@@ -54,7 +55,9 @@ def preflight(
     with open_recording(experiment, textured=False) as recording, ThreadPoolExecutor(3) as pool:
         # Threads: decoding, outlines and products release the interpreter.
         experiment = recording.experiment
-        image = None if experiment.texture_path is None else load_texture(experiment.texture_path)
+        image, unseen = None, None
+        if experiment.texture_path is not None:
+            image, unseen = load_texture(experiment.texture_path), load_unseen(experiment.texture_path)
         sizes, wrong_sizes = _expected_sizes(experiment, settings)
         progress("frames", 0, len(recording.streams))
         sampling = [
@@ -75,6 +78,7 @@ def preflight(
             closer=closer,
             scan=scan,
             texture=image,
+            unseen=unseen,
             matches=tuple(texture_map.match_texture(search.result(), samples) if search else ()),
             measures=measures.result() if measures else None,
             similar=similar.result() if similar else None,
@@ -116,6 +120,8 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
     if paint.severity is FAULT:  # other checks of a map of one colour mean nothing
         return
     yield (similar := texture_map.look_alikes(seen.similar))
+    if seen.unseen is not None:
+        yield texture_map.unknown_paint(seen.unseen)
     yield from (texture_map.map_fits(match, seen.matches) for match in seen.matches)
     # Unsynchronised movies or ambiguous views would be reported as camera errors.
     in_step = seen.scan is None or seen.scan.shift == 0

@@ -19,7 +19,7 @@ from sphereorient.search import GreySearch, crop_disk
 from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
-from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture
+from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture, unseen_share
 from sphereorient.sphere.texture_table import texture_table
 from sphereorient.synth.textures import map_directions
 
@@ -88,6 +88,12 @@ def measure_texture(texture: Tensor) -> TextureMeasures:
         view_brightness=brightness.reshape(ROWS, 2 * ROWS),
         patch_rad=_patch_rad(fine.float(), float(mean)),
     )
+
+
+def unknown_paint(unseen: Tensor) -> Finding:
+    """Report texels (H, 2 H) bool that are no paint."""
+    measured = f"{100 * unseen_share(unseen):.0f} % of the ball is unseen: it weighs nothing"
+    return warning("unseen paint", measured, "learn the map from movies that show all of it, with `sphereorient map`")
 
 
 def _patch_rad(texture: Tensor, mean: float) -> float:

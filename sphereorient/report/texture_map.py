@@ -16,9 +16,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sphereorient.errors import TextureError, refusal
 from sphereorient.experiment import Experiment
-from sphereorient.files.picture import decoded_grey, write_picture
+from sphereorient.files.picture import write_picture
 from sphereorient.files.whole_file import put_aside
 from sphereorient.mapping import LearntMap
 from sphereorient.mapping.compare import MapComparison
@@ -40,11 +39,6 @@ ARROW = "#D0021B"
 CHANGE_REACH = 0.3  # of the contrast of white and black paint: ends of the scale of the change
 
 
-def seen_path(texture: Path) -> Path:
-    """Return the path of the counts of a texture map: texture_seen.png beside texture.png."""
-    return texture.with_name(f"{texture.stem}_seen.png")
-
-
 def write_texture(texture: Tensor, path: Path) -> None:
     """Write a texture map (H, 2 H), 0 .. 1 or NaN (mid-grey), as 8-bit picture; may raise OutputError."""
     grey = torch.where(torch.isfinite(texture), 255 * texture, float(UNSEEN_GREY))
@@ -54,18 +48,6 @@ def write_texture(texture: Tensor, path: Path) -> None:
 def write_seen(seen: Tensor, path: Path) -> None:
     """Write counts (H, 2 H) as 8-bit picture, limited to 255; may raise OutputError."""
     write_picture(path, seen.clamp(0, MOST).byte().numpy())
-
-
-def read_seen(path: Path) -> Tensor | None:
-    """Read the counts beside a texture map, (H, 2 H); None without a file. A file of another form: TextureError."""
-    if not path.is_file():
-        return None
-    counts = decoded_grey(path.read_bytes())
-    if counts is None or counts.dtype != np.uint8 or counts.shape[1] != 2 * counts.shape[0]:
-        got = "no picture" if counts is None else f"{counts.shape[1]} x {counts.shape[0]} of {counts.dtype}"
-        do = "take the one that `sphereorient map` wrote, or move it away"
-        raise TextureError(refusal(str(path), expected="8-bit counts, twice as wide as high", got=got, do=do))
-    return torch.from_numpy(counts.astype(np.int64))
 
 
 def write_learnt(learnt: LearntMap, track: Trajectory, path: Path) -> None:

@@ -1,6 +1,14 @@
 """The painted sphere: its map, the views of it, and the renderer."""
 
 from sphereorient.sphere.renderer import Sampling, SphereRenderer, see_sphere
-from sphereorient.sphere.texture import load_texture, reduced_texture, sample_texture
+from sphereorient.sphere.texture import (
+    load_texture,
+    load_unseen,
+    read_seen,
+    reduced_texture,
+    sample_texture,
+    seen_path,
+    unseen_share,
+)
 from sphereorient.sphere.texture_table import DirectionTable
 from sphereorient.sphere.view import DiskView, orthographic_view, perspective_view, sphere_normals

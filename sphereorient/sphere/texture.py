@@ -4,6 +4,7 @@ from pathlib import Path
 import kornia.geometry.transform as kornia_transform
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -13,6 +14,7 @@ from sphereorient.files.whole_file import read_whole
 
 PICTURE_BYTES = 100_000_000
 MOST_PIXELS = 2**25  # 8192 x 4096: enough for a disk of 2600 px
+OPAQUE = 128  # of 255: texels of less alpha are no paint
 SPLINE_TEXELS = 2  # reach of a cubic spline beyond the map's edges
 WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}  # grey level of white paint
 
@@ -47,6 +49,49 @@ def load_texture(path: Path) -> Tensor:
     if int(picture.min()) == int(picture.max()):
         raise refused("a pattern of paint", "one single grey", "check that the map was saved")
     return torch.from_numpy(picture.astype(np.float32) / white)
+
+
+def seen_path(texture: Path) -> Path:
+    """Return the path of the counts of a texture map: texture_seen.png beside texture.png."""
+    return texture.with_name(f"{texture.stem}_seen.png")
+
+
+def read_seen(path: Path) -> Tensor | None:
+    """Read the counts beside a texture map, (H, 2 H); None without a file. A file of another form: TextureError."""
+    if not path.is_file():
+        return None
+    do = "take the one that `sphereorient map` wrote, or move it away"
+    content = read_whole(path, PICTURE_BYTES, "a picture file", TextureError, do)
+    counts = decoded_grey(content) if (claimed_pixels(content) or math.inf) <= MOST_PIXELS else None
+    if counts is None or counts.dtype != np.uint8 or counts.shape[1] != 2 * counts.shape[0]:
+        got = "no picture" if counts is None else f"{counts.shape[1]} x {counts.shape[0]} of {counts.dtype}"
+        raise TextureError(refusal(str(path), expected="8-bit counts, twice as wide as high", got=got, do=do))
+    return torch.from_numpy(counts.astype(np.int64))
+
+
+def load_unseen(texture: Path) -> Tensor | None:
+    """Return which texels (H, 2 H) of a map that `load_texture` read are no paint: of no picture (0 in the counts
+    beside it, see `seen_path`) or transparent. None: all are paint. Raise TextureError for counts of another size.
+    """
+    with Image.open(texture) as picture:
+        size = picture.height, picture.width
+        alpha = np.asarray(picture.getchannel("A")) if "A" in picture.getbands() else np.full(size, 255)
+    unseen, counts = torch.from_numpy(alpha < OPAQUE), read_seen(seen_path(texture))
+    if counts is not None and counts.shape != unseen.shape:
+        expected, got = (f"{shape[1]} x {shape[0]}" for shape in (size, counts.shape))
+        do = f"take the one that was written with {texture.name}, or move it away"
+        raise TextureError(refusal(str(seen_path(texture)), expected=expected, got=got, do=do))
+    unseen |= counts == 0 if counts is not None else False
+    if bool(unseen.all()):
+        do = "learn the map anew, or correct its alpha channel"
+        raise TextureError(refusal(f"texture {texture}", expected="paint that some picture shows", got="none", do=do))
+    return unseen if bool(unseen.any()) else None
+
+
+def unseen_share(unseen: Tensor) -> float:
+    """Return the share of the sphere that texels (H, 2 H) bool cover."""
+    latitude = (torch.arange(len(unseen)) + 0.5) * (math.pi / len(unseen))
+    return float((unseen.double().mean(1) * latitude.sin()).sum() / latitude.sin().sum())
 
 
 def reduced_texture(texture: Tensor, diameter_px: float) -> Tensor:

@@ -87,10 +87,12 @@ class TextureTable:
     """Texture map blurred by a Gaussian on the sphere (sigma `blur_rad`), as tangent planes in cells of directions.
 
     `rows` (side^2, 4) float32 come from `texture_table`; the value's error is of second order in cell size over blur.
+    `unseen` is the table of the share of texels that are no paint, blurred alike; None: all are paint.
     """
 
-    def __init__(self, rows: Tensor, blur_rad: float) -> None:
+    def __init__(self, rows: Tensor, blur_rad: float, unseen: "TextureTable | None" = None) -> None:
         self.rows = rows
+        self.unseen = unseen
         self.side = math.isqrt(len(rows))
         self.blur_rad = blur_rad
 
@@ -105,7 +107,7 @@ class TextureTable:
 
     def to(self, device: torch.device) -> "TextureTable":
         """Return the table on another device for `sample`; `blurred` needs the CPU."""
-        return TextureTable(self.rows.to(device), self.blur_rad)
+        return TextureTable(self.rows.to(device), self.blur_rad, self.unseen and self.unseen.to(device))
 
     def blurred(self, blur_rad: float) -> "TextureTable":
         """Return a table whose total blur is `blur_rad`, or itself if that is not wider."""
@@ -123,12 +125,16 @@ class TextureTable:
                 v, g = self.sample(at.T[None])
                 value, slope = value + share * v[0], slope + share * g[0].T
             parts.append(_rows(value, slope, centre.float()))
-        return TextureTable(torch.cat(parts), target).blurred(blur_rad)
+        unseen = self.unseen and self.unseen.blurred(target)
+        return TextureTable(torch.cat(parts), target, unseen).blurred(blur_rad)
 
 
-def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE) -> TextureTable:
-    """Return the table of a map (H, 2 H) for a Gaussian blur, rad; `side` counts cells per axis."""
+def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Tensor | None = None) -> TextureTable:
+    """Return the table of a map (H, 2 H) for a Gaussian blur, rad; `side` counts cells per axis.
+    `unseen` (H, 2 H) bool: texels that are no paint.
+    """
     finest = min(blur_rad, BASE_RAD)
+    hidden = None if unseen is None else texture_table(unseen.float(), finest, side)
     reduced = reduced_texture(texture.float(), 2.0 / finest)  # pixels as wide as the blur: no steps
     parts = [torch.zeros(0, 4)]
     for centre in torch.split(octahedral_directions(side), CHUNK):
@@ -138,7 +144,7 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE) -> Texture
             value = value + share * v
             slope = slope + share * v[:, None] * offset / finest**2
         parts.append(_rows(value, slope, centre.float()))
-    return TextureTable(torch.cat(parts), finest).blurred(blur_rad)
+    return TextureTable(torch.cat(parts), finest, hidden).blurred(blur_rad)
 
 
 def _disk_nodes(

@@ -27,6 +27,7 @@ class Reason(StrEnum):
     REPEATED = "repeated"
     RUNAWAY = "runaway"
     LOW_SCORE = "low_score"
+    UNSEEN = "unseen"  # it shows paint that the texture map does not know
     AMBIGUOUS = "ambiguous"
     CONTRADICTS = "contradicts"  # its line of sight misses the other camera's sphere
     UNDECODABLE = "undecodable"

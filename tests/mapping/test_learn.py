@@ -43,7 +43,7 @@ def opened(path, cameras=None, frames=None):
         for name in names
     ]
     grey = torch.full((8, 16), 0.5)
-    yield Recording(experiment=experiment, streams=streams, timeline=lines, texture=grey, remarks=())
+    yield Recording(experiment=experiment, streams=streams, timeline=lines, texture=grey, unseen=None, remarks=())
 
 
 def truth(path):

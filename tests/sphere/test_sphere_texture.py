@@ -12,7 +12,7 @@ from conftest import assert_close
 from sphere_examples import body_direction, f64, looked_up, random_map
 
 from sphereorient.errors import ShapeError, TextureError
-from sphereorient.sphere import load_texture, reduced_texture, sample_texture
+from sphereorient.sphere import load_texture, load_unseen, reduced_texture, sample_texture, unseen_share
 from sphereorient.sphere.texture import sample_spline, texture_coordinates
 from sphereorient.synth.textures import map_directions
 
@@ -251,3 +251,33 @@ def test_date_line_and_poles_are_no_edges(rng):
     assert_close(*sample_spline(texture, over), 1e-7)
     with pytest.raises(ShapeError, match="texture"):
         sample_spline(texture[:, :8], over)
+
+
+# --- texels that are no paint
+
+
+def pattern(height: int = 16) -> np.ndarray:
+    return np.random.default_rng(3).integers(0, 255, (height, 2 * height)).astype(np.uint8)
+
+
+def test_counts_of_zero_beside_a_map_and_transparent_texels_are_no_paint(tmp_path):
+    path = saved(tmp_path, pattern())
+    assert load_unseen(path) is None
+    counts = np.full((16, 32), 7, np.uint8)
+    counts[:4] = 0
+    saved(tmp_path, counts, "texture_seen.png")
+    expected = torch.arange(16)[:, None].expand(-1, 32) < 4
+    assert torch.equal(load_unseen(path), expected)
+    assert unseen_share(expected) == pytest.approx(0.5 * (1 - math.cos(math.pi / 4)), abs=2e-3)
+    colour = np.dstack([pattern()] * 3 + [np.where(expected, 0, 255).astype(np.uint8)])
+    assert torch.equal(load_unseen(saved(tmp_path, colour, "clear.png")), expected)
+
+
+def test_counts_of_another_size_and_a_map_without_paint_are_refused(tmp_path):
+    path = saved(tmp_path, pattern())
+    saved(tmp_path, np.full((8, 16), 7, np.uint8), "texture_seen.png")
+    with pytest.raises(TextureError, match=r"texture_seen.png: expected 32 x 16, got 16 x 8"):
+        load_unseen(path)
+    saved(tmp_path, np.zeros((16, 32), np.uint8), "texture_seen.png")
+    with pytest.raises(TextureError, match="expected paint that some picture shows, got none"):
+        load_unseen(path)
