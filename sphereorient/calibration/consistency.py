@@ -17,7 +17,7 @@ from sphereorient import so3
 from sphereorient.cameras import Camera, R_lab_view, Rays, centre_lab_mm, sphere_radius_px, triangulate
 
 Floats = NDArray[np.float64]
-MOST = 60  # frames in which causes are tried
+RUNS, RUN = 3, 20  # causes are tried in some runs of frames that follow each other
 FEWEST = 3  # frames from which cameras are judged
 LATEST = 8  # frames by which a movie may be late
 PLAUSIBLE = 0.2  # largest deviation: relative, rad, 100 mm
@@ -44,12 +44,12 @@ class Seen:
     radius_px: Tensor  # (N, C), of the sphere's picture, along the camera's x
     R_lab_body: Tensor  # (N, C, 3, 3)
     diameter_mm: float
-    consecutive: bool = False  # all frames of a movie, in order
+    frame: Tensor | None = None  # (N,) int64, increasing, at even times; None: no camera is tested for being late
 
     def at(self, rows: Tensor) -> "Seen":
-        """Return some frames, which are not consecutive."""
+        """Return some frames."""
         parts = {name: getattr(self, name)[rows] for name in ("centre_px", "radius_px", "R_lab_body")}
-        return replace(self, **parts, consecutive=False)
+        return replace(self, **parts, frame=None if self.frame is None else self.frame[rows])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,9 +168,10 @@ class _Comparison:
 
     def __init__(self, seen: Seen, limits: Limits) -> None:
         rows = torch.nonzero(torch.isfinite(seen.centre_px).all(-1).sum(-1) > 1)[:, 0]
-        if not seen.consecutive or len(rows) > MOST:
-            some = rows[torch.linspace(0, max(len(rows) - 1, 0), min(MOST, len(rows))).round().long()]
-            seen = seen.at(some)
+        if len(rows) > RUNS * RUN:
+            starts = torch.linspace(0, len(rows) - RUN, RUNS).round().long()
+            rows = rows[(starts[:, None] + torch.arange(RUN)).flatten()]
+        seen = seen.at(rows)
         self.seen, self.limits = seen, limits
         self.cameras, self.names = list(seen.cameras.values()), list(seen.cameras)
         self.pairs = list(combinations(range(len(self.cameras)), 2))
@@ -260,8 +261,8 @@ class _Comparison:
                 lambda p: [_degrees(p[:3]), 100 * float(np.linalg.norm(p[3:]))],
                 whole,
             )
-        if self.seen.consecutive:
-            yield from self._late(whole)
+        if self.seen.frame is not None:
+            yield from self._late(self.seen.frame, whole)
 
     def _best(
         self,
@@ -313,25 +314,25 @@ class _Comparison:
         sights[camera] = _Sight(rays=rays, R_lab_body=turn @ one.R_lab_body)
         return self(sights)
 
-    def _late(self, whole: float) -> Iterator[Cause]:
+    def _late(self, frame: Tensor, whole: float) -> Iterator[Cause]:
         """Each movie some frames late; between frames all is interpolated."""
+        shifts = np.arange(-LATEST, LATEST + 0.5, 0.5)
         for k, name in enumerate(self.names[1:], 1):
-            shifts = np.arange(-LATEST, LATEST + 0.5, 0.5)
-            left = [_misfit(self(self._shifted(k, float(shift)))) / whole for shift in shifts]
+            left = [_misfit(self(self._shifted(k, frame, float(shift)))) / whole for shift in shifts]
+            if np.isnan(left).all():
+                continue
             best = int(np.nanargmin(left))
             words = f"the movie of {name} {abs(shifts[best]):g} frames {'late' if shifts[best] > 0 else 'early'}"
             yield Cause(words=f"{words}: check start:", left=left[best], parameters=1)
 
-    def _shifted(self, camera: int, frames: float) -> list[_Sight]:
+    def _shifted(self, camera: int, frame: Tensor, late: float) -> list[_Sight]:
+        """Return what the cameras say if one shows each frame `late` frames later."""
         sights = self.sights()
         one = sights[camera]
-        count = len(one.R_lab_body)
-        at = torch.arange(count) + frames
-        low = at.floor().long()
-        share = (at - low).double()[:, None]
-        inside = (low >= 0) & (low + 1 < count)
-        low = low.clamp(0, max(count - 2, 0))
-        high = (low + 1).clamp(max=count - 1)
+        first = math.floor(late)
+        share = torch.full((len(frame), 1), late - first, dtype=torch.float64)
+        low, high = (torch.searchsorted(frame, frame + k).clamp(max=len(frame) - 1) for k in (first, first + 1))
+        inside = (frame[low] == frame + first) & (frame[high] == frame + first + 1)
         direction = torch.lerp(one.rays.direction_lab[low], one.rays.direction_lab[high], share)
         origin = torch.lerp(one.rays.origin_lab_mm[low], one.rays.origin_lab_mm[high], share)
         before, after = one.R_lab_body[low], one.R_lab_body[high]

@@ -183,6 +183,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
         return math.inf, math.inf  # outlines that miss each other already
     if not whole:
         return 1.0, 0.0
+    whole = [k for k in whole if _in_view(fitter, found[k].position_lab_mm[:1])] or whole
     tried = [whole[int(k)] for k in torch.linspace(0, len(whole) - 1, min(TRIED, len(whole))).round()]
     gains, rays, alone = [], [], []
     for camera, view in enumerate(fitter.views):
@@ -209,6 +210,18 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     differ_px = float(torch.stack([gap_px, *others_px]).amax(0).quantile(0.75))
     gain = float(torch.stack(gains).amax(0).quantile(0.75)) if differ_px > APART_PX else 1.0
     return gain, float(gap_px.quantile(0.75))
+
+
+def _in_view(fitter: Fitter, position_lab_mm: Tensor) -> bool:
+    """Return whether all cameras show the whole disk of a sphere at a position (1, 3), mm."""
+    inside = []
+    for view in fitter.views:
+        uv, radius_px = view.camera.project(position_lab_mm), view.radius_px(position_lab_mm, fitter.radius_mm)
+        inside += [
+            (uv >= radius_px[:, None]).all(),
+            (uv + radius_px[:, None] < uv.new_tensor(view.camera.image_size)).all(),
+        ]
+    return bool(torch.stack(inside).all())
 
 
 def _scores(found: Sequence[Poses]) -> tuple[float, float]:

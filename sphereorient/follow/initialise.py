@@ -180,9 +180,14 @@ class Initialiser:
             chosen = distinct_indices(fit.R_lab_body, fit.nll, keep)
             X, R = fit.position_lab_mm[chosen], fit.R_lab_body[chosen]
             place = X[:1]
-        shown = (fit.score[chosen[0]] != 0) | ~use if len(chosen) else torch.ones_like(use)
-        reason = [why if known else Reason.UNSEEN for why, known in zip(frame.reason, shown.tolist(), strict=True)]
-        return poses_of(fit, chosen, use & shown, reason)
+        unknown = torch.cat([fitter.shows_unknown(k, X[:1], R[:1]) for k in range(len(use))]) if len(X) else ~use
+        if not bool((use & unknown).any()) or not bool((use & ~unknown).any()):
+            return poses_of(fit, chosen, use, frame.reason)
+        reason = [
+            Reason.UNSEEN if was and hidden else why
+            for was, hidden, why in zip(use.tolist(), unknown.tolist(), frame.reason, strict=True)
+        ]
+        return poses_of(fit, chosen, use & ~unknown, reason)
 
 
 def _best_score(poses: Poses) -> float:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient.assemble import Chosen, Fused, Path
 from sphereorient.calibration import systematic_errors
-from sphereorient.calibration.consistency import Consistency, Seen, compare_cameras, gaps_between
+from sphereorient.calibration.consistency import Consistency, Limits, Seen, compare_cameras, gaps_between
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.experiment import Experiment
 from sphereorient.follow import Appearance
@@ -230,16 +230,8 @@ def with_contradictions(
     """Mark frames in which two cameras contradict each other, and add the contradiction to the stated covariances.
     Return also how well the cameras agree in the whole movie.
     """
-    seen = Seen(
-        cameras=cameras,
-        centre_px=_of_cameras(track, "centre_px"),
-        radius_px=_of_cameras(track, "radius_px"),
-        R_lab_body=_of_cameras(track, "orientation"),
-        diameter_mm=diameter_mm,
-        consecutive=consecutive,
-    )
+    seen, limits = said_alone(track, cameras, diameter_mm, consecutive)
     covariance = _of_cameras(track, "orientation_cov").nan_to_num()
-    limits = limits_of(seen, covariance)
     believed = np.array([[why == Reason.OK for why in camera.reason] for camera in track.cameras.values()])
     wrong = np.any([[why == Reason.CONTRADICTS for why in camera.reason] for camera in track.cameras.values()], axis=0)
     place_cov, turn_cov = torch.from_numpy(track.position_cov).clone(), torch.from_numpy(track.orientation_cov).clone()
@@ -266,6 +258,21 @@ def with_contradictions(
     flags = track.flags | np.where(wrong & track.valid, np.uint32(Flag.CONTRADICTION), np.uint32(0))
     marked = replace(track, flags=flags, orientation_cov=turn_cov.numpy(), position_cov=place_cov.numpy())
     return marked, compare_cameras(seen, limits)
+
+
+def said_alone(
+    track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool
+) -> tuple[Seen, Limits]:
+    """Return what each camera of a track alone says, and how far apart cameras that agree may be."""
+    seen = Seen(
+        cameras=cameras,
+        centre_px=_of_cameras(track, "centre_px"),
+        radius_px=_of_cameras(track, "radius_px"),
+        R_lab_body=_of_cameras(track, "orientation"),
+        diameter_mm=diameter_mm,
+        frame=torch.arange(len(track)) if consecutive else None,
+    )
+    return seen, limits_of(seen, _of_cameras(track, "orientation_cov").nan_to_num())
 
 
 def _of_cameras(track: Trajectory, name: str) -> Tensor:

@@ -12,11 +12,13 @@ from sphereorient.experiment.recording import Progress, open_recording, silent
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.locate import expected_diameter_px
 from sphereorient.methods.settings import Settings
-from sphereorient.preflight import cameras, movies, texture_map
-from sphereorient.preflight.finding import FAULT, Finding, Severity, judged, warning, worst
+from sphereorient.preflight import agreement, cameras, movies, texture_map
+from sphereorient.preflight.finding import FAULT, OK, Finding, Severity, judged, warning, worst
 from sphereorient.preflight.sample import MovieSample, sample_more, sample_movie
 from sphereorient.search import GreySearch
 from sphereorient.sphere import load_texture, load_unseen
+
+BRIEF = {"appearance_frames": 8, "chunks": 1}  # of the settings: enough for a short stretch
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,6 +34,7 @@ class Preflight:
     unseen: Tensor | None  # (H, 2 H) bool, texels that are no paint; None: all are
     measures: texture_map.TextureMeasures | None
     similar: texture_map.ViewPair | None
+    agreement: tuple[Finding, ...]  # of a short stretch tracked; none with one camera or without a map
     matches: tuple[texture_map.TextureMatch, ...]
     findings: tuple[Finding, ...] = ()
 
@@ -60,6 +63,10 @@ def preflight(
             image, unseen = load_texture(experiment.texture_path), load_unseen(experiment.texture_path)
         sizes, wrong_sizes = _expected_sizes(experiment, settings)
         progress("frames", 0, len(recording.streams))
+        planned = Settings(locate=settings.locate, search=settings.search, refine=settings.refine)
+        planned = planned.model_copy(update={"refine": planned.refine.model_copy(update=BRIEF)})
+        both = image is not None and len(recording.streams) > 1
+        learning = pool.submit(agreement.study, experiment, planned) if both else None
         sampling = [
             pool.submit(sample_movie, stream, experiment, sizes[stream.name], settings.locate)
             for stream in recording.streams
@@ -70,6 +77,7 @@ def preflight(
         samples = tuple(one.result() for one in sampling)
         progress("frames", len(samples), len(samples))
         closer, scan = _offsets(samples, settings, pool)
+        stretch = [int(recording.timeline.number[k]) for one in closer[:1] for k in one[0].frame[[0, -1]]]
         progress("paint", 0, 1)
         checked = Preflight(
             experiment=experiment,
@@ -82,6 +90,9 @@ def preflight(
             matches=tuple(texture_map.match_texture(search.result(), samples) if search else ()),
             measures=measures.result() if measures else None,
             similar=similar.result() if similar else None,
+            agreement=tuple(agreement.cameras_agree(experiment, planned, learning, (stretch[0], stretch[1] + 1)))
+            if learning is not None and stretch
+            else (),
         )
         progress("paint", 1, 1)
         return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))
@@ -96,6 +107,20 @@ def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Findi
         yield movies.pictures([sample, *(stretch[k] for stretch in seen.closer)])
         yield movies.background(sample, seen.experiment)
         yield movies.ball(sample)
+    by_outlines = list(_outline_findings(seen))
+    if any(one.title == agreement.TITLE and "a run stops" not in one.measured for one in seen.agreement):
+        # Poses fitted to the paint tell more than outlines, which jump where a short movie has to give its background.
+        by_outlines = [replace(one, severity=OK, advice="") for one in by_outlines]
+    yield from by_outlines
+    yield from seen.agreement
+    yield from _texture_findings(seen)
+    for sample in seen.samples:
+        yield movies.exposure(sample)
+        yield movies.sharpness(sample)
+        yield movies.motion_blur(sample, seen.experiment.exposure_s, seen.timeline.frame_s)
+
+
+def _outline_findings(seen: Preflight) -> Iterator[Finding]:
     if seen.scan is not None:
         yield cameras.lines_of_sight(seen.samples, seen.scan.in_step_px if seen.scan.shift else None)
         yield cameras.in_step(seen.scan, seen.experiment.start)
@@ -103,11 +128,6 @@ def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Findi
         yield cameras.ball_size(seen.samples, seen.experiment.diameter_mm)
     else:
         yield from (cameras.ball_size_px(sample) for sample in seen.samples)
-    yield from _texture_findings(seen)
-    for sample in seen.samples:
-        yield movies.exposure(sample)
-        yield movies.sharpness(sample)
-        yield movies.motion_blur(sample, seen.experiment.exposure_s, seen.timeline.frame_s)
 
 
 def _texture_findings(seen: Preflight) -> Iterator[Finding]:
@@ -119,14 +139,10 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
     yield (paint := texture_map.contrast(seen.measures, min((r for r in radii if not math.isnan(r)), default=default)))
     if paint.severity is FAULT:  # other checks of a map of one colour mean nothing
         return
-    yield (similar := texture_map.look_alikes(seen.similar))
+    yield texture_map.look_alikes(seen.similar)
     if seen.unseen is not None:
         yield texture_map.unknown_paint(seen.unseen)
     yield from (texture_map.map_fits(match, seen.matches) for match in seen.matches)
-    # Unsynchronised movies or ambiguous views would be reported as camera errors.
-    in_step = seen.scan is None or seen.scan.shift == 0
-    if len(seen.matches) == 2 and in_step and similar.severity is not FAULT:
-        yield texture_map.cameras_agree(seen.matches, 2 * seen.experiment.radius_mm)
 
 
 def _expected_sizes(experiment: Experiment, settings: Settings) -> tuple[dict[str, float | None], list[Finding]]:

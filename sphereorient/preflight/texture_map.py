@@ -8,8 +8,6 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.consistency import FEWEST, Limits, Seen, compare_cameras
-from sphereorient.cameras import Camera, R_lab_view
 from sphereorient.experiment.stream import spread_frames
 from sphereorient.mapping.compare import fibonacci_directions
 from sphereorient.mapping.grid import texel_areas
@@ -37,8 +35,6 @@ ALIKE, SAME = 0.85, 0.97  # share of one view explained by another: single frame
 FRAMES = 8  # of each camera, compared with the map
 FITS, POOR = 0.7, 0.55  # share of the picture that the best view of the map explains
 CLEARLY = 0.08  # difference of this share between the picture and its mirror image
-GAP_PX, TURN_DEG, SIZE = 1.5, 1.0, 0.02  # cameras that agree differ by less: lines of sight, attitudes, sizes
-OUTLINE_PX = 0.4  # error of an outline's radius, by blur and a dark rim
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,10 +61,6 @@ class TextureMatch:
     """The match of the map with n pictures of one camera; made by `match_texture`."""
 
     name: str
-    camera: Camera
-    centre_px: Tensor  # (n, 2)
-    radius_px: Tensor  # (n,)
-    R_view_body: Tensor  # (n, 3, 3), the best; NaN: none found
     score: Tensor  # (n,), 0: none found
     mirrored: Tensor  # (n,), score of the mirrored pictures
 
@@ -205,27 +197,15 @@ def _matched(search: GreySearch, sample: MovieSample, chosen: list[int]) -> Text
         assert picture is not None  # there is an outline
         crops.append(torch.from_numpy(crop_disk(picture, u, v, r, search.size_px)))
     disks = torch.stack(crops)
-    R, score = _best(search, disks)
-    _, mirrored = _best(search, disks.flip(-1))
-    return TextureMatch(
-        name=sample.name,
-        camera=sample.camera,
-        centre_px=centre,
-        radius_px=radius,
-        R_view_body=R,
-        score=score,
-        mirrored=mirrored,
-    )
+    return TextureMatch(name=sample.name, score=_best(search, disks), mirrored=_best(search, disks.flip(-1)))
 
 
-def _best(search: GreySearch, disks: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the best proposal for each disk (n, S, S): R_view_body (n, 3, 3) and score (n,)."""
+def _best(search: GreySearch, disks: Tensor) -> Tensor:
+    """Return the best score for each disk (n, S, S), (n,)."""
     found = search.propose(disks)
-    R, score = torch.full((len(disks), 3, 3), math.nan, dtype=torch.float64), torch.zeros(len(disks)).double()
-    there = found.counts > 0
-    first = found.offset[:-1][there]
-    R[there], score[there] = found.R_view_body[first], found.score[first]
-    return R, score
+    there, score = found.counts > 0, torch.zeros(len(disks), dtype=torch.float64)
+    score[there] = found.score[found.offset[:-1][there]]
+    return score
 
 
 def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
@@ -243,22 +223,3 @@ def map_fits(match: TextureMatch, matches: Sequence[TextureMatch]) -> Finding:
         (score < POOR, FAULT, "check sphere.texture: the movie does not show this map"),
         (score < FITS or score < mirrored + CLEARLY, WARNING, unsure),
     )
-
-
-def cameras_agree(matches: Sequence[TextureMatch], diameter_mm: float) -> Finding:
-    """Judge whether the cameras show one sphere in one orientation, and name what would explain a contradiction."""
-    title = "cameras agree"
-    R = [R_lab_view(match.camera, match.centre_px) @ match.R_view_body for match in matches]
-    seen = Seen(
-        cameras={match.name: match.camera for match in matches},
-        centre_px=torch.stack([match.centre_px for match in matches], 1),
-        radius_px=torch.stack([match.radius_px for match in matches], 1),
-        R_lab_body=torch.stack(R, 1),
-        diameter_mm=diameter_mm,
-    )
-    size = SIZE + OUTLINE_PX / float(seen.radius_px.min())
-    found = compare_cameras(seen, Limits(gap_px=GAP_PX, turn_deg=TURN_DEG, size=size))
-    if found.frames < FEWEST or math.isnan(found.turn_deg):
-        measured = f"cannot tell: both cameras show the ball and its paint in {found.frames} of the frames compared"
-        return warning(title, measured, "see the findings on the ball and on the map")
-    return judged(title, f"{found} (median of {found.frames} frames)", (found.contradicts, FAULT, found.advice))

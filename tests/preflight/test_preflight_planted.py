@@ -20,6 +20,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
     return clean_example(tmp_path_factory)
 
 
+@pytest.mark.slow
 def test_a_clean_experiment_raises_no_complaint(clean, tmp_path):
     result = checked(clean, tmp_path, sphere=PAINTED)
     assert complaints(result) == []
@@ -83,6 +84,7 @@ def test_a_bumped_camera_is_not_taken_for_a_late_movie(clean, tmp_path, deg):
     assert of(result, "movies in step").severity is not FAULT
 
 
+@pytest.mark.slow
 def test_swapped_movies_are_named(clean, tmp_path):
     movies = {"cam1": clean.pictures["cam2"], "cam2": clean.pictures["cam1"]}
     result = checked(replace(clean, pictures=movies), tmp_path, sphere=PAINTED)
