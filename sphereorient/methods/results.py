@@ -28,6 +28,7 @@ TWO_BALLS = (
     "two balls wear this texture map: it is not certain which one is tracked, and frames are marked as ambiguous; "
     "hide one by `masks:`"
 )
+ELSEWHERE = [str(Reason.CONTRADICTS), str(Reason.SECOND_BALL)]  # a camera that measures the sphere at another place
 CONTRADICTS_SIGMAS = 5.0  # of the difference of what two cameras say alone: no noise
 
 
@@ -91,6 +92,8 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
         Reason.LOW_SCORE if why[place] is Reason.OK and not shown[k] else why[place]
         for k, why in enumerate(table.reason)
     ]
+    if learnt.second_ball:
+        reason = [Reason.SECOND_BALL if why is Reason.CONTRADICTS else why for why in reason]
     failed = [k for k, why in enumerate(reason) if why is Reason.LOW_SCORE]
     unknown = learnt.fitter.shows_unknown(place, picked["position_lab_mm"][failed], R[failed])
     for k in torch.tensor(failed)[unknown].tolist():
@@ -233,7 +236,7 @@ def with_contradictions(
     seen, limits = said_alone(track, cameras, diameter_mm, consecutive)
     covariance = _of_cameras(track, "orientation_cov").nan_to_num()
     believed = np.array([[why == Reason.OK for why in camera.reason] for camera in track.cameras.values()])
-    wrong = np.any([[why == Reason.CONTRADICTS for why in camera.reason] for camera in track.cameras.values()], axis=0)
+    wrong = np.any([np.isin(camera.reason, ELSEWHERE) for camera in track.cameras.values()], axis=0)
     place_cov, turn_cov = torch.from_numpy(track.position_cov).clone(), torch.from_numpy(track.orientation_cov).clone()
     for k, m in combinations(range(len(cameras)), 2):
         # The mean of two is off by half of the contradiction if either is wrong, a single one by all of it.

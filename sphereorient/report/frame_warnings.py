@@ -34,7 +34,9 @@ REASON_WORDS: dict[str, str] = {
     Reason.RUNAWAY: "too many possible orientations",
     Reason.LOW_SCORE: "no orientation explains the picture",
     Reason.AMBIGUOUS: "orientation ambiguous",
+    Reason.UNSEEN: "shows paint that the map does not know",
     Reason.CONTRADICTS: "contradicts the other camera",
+    Reason.SECOND_BALL: "may show the second ball",
     Reason.UNDECODABLE: "picture damaged",
     Reason.MISSING: "no picture",
 }

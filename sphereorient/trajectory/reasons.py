@@ -30,5 +30,6 @@ class Reason(StrEnum):
     UNSEEN = "unseen"  # it shows paint that the texture map does not know
     AMBIGUOUS = "ambiguous"
     CONTRADICTS = "contradicts"  # its line of sight misses the other camera's sphere
+    SECOND_BALL = "second_ball"  # likewise, in a movie with two balls: it may show the other one
     UNDECODABLE = "undecodable"
     MISSING = "missing"

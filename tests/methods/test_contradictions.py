@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from sphereorient import so3
@@ -19,8 +20,8 @@ CAMERAS = default_cameras(SynthSettings())
 FRAMES, MM, SIGMA_RAD = 12, 18.0, math.radians(0.02)
 
 
-def track_of(turn_deg: dict[str, float], shift_px: dict[str, float], contradicts: bool = False) -> Trajectory:
-    """Return a track whose cameras alone are off by rotations about x, and by pixels along v."""
+def track_of(turn_deg: dict[str, float], shift_px: dict[str, float], why: Reason = Reason.OK) -> Trajectory:
+    """Return a track whose cameras alone are off by rotations about x, by pixels along v; `why`: of cam2."""
     motion = motion_of(SynthSettings()).at(frame_times_s(SynthSettings(frames=FRAMES)))
     X, R = motion.position_lab_mm, motion.R_lab_body
     track = Trajectory.empty(motion.time_s.numpy(), cameras=tuple(CAMERAS))
@@ -34,7 +35,7 @@ def track_of(turn_deg: dict[str, float], shift_px: dict[str, float], contradicts
             radius_px=sphere_radius_px(camera, X, MM / 2).numpy(),
             orientation=(turn @ R).numpy(),
             orientation_cov=np.broadcast_to(SIGMA_RAD**2 * np.eye(3), (FRAMES, 3, 3)).copy(),
-            reason=(Reason.CONTRADICTS if contradicts and name == "cam2" else Reason.OK,) * FRAMES,
+            reason=(why if name == "cam2" else Reason.OK,) * FRAMES,
         )
     return replace(
         track,
@@ -64,8 +65,9 @@ def test_a_rotation_beyond_five_sigmas_is_marked_and_half_of_it_stated():
     assert found.contradicts
 
 
-def test_a_camera_that_was_believed_alone_may_be_off_by_all_of_it():
-    marked, _ = with_contradictions(track_of({"cam2": 1.0}, {}, contradicts=True), CAMERAS, MM, True)
+@pytest.mark.parametrize("why", [Reason.CONTRADICTS, Reason.SECOND_BALL])
+def test_a_camera_that_was_believed_alone_may_be_off_by_all_of_it(why):
+    marked, _ = with_contradictions(track_of({"cam2": 1.0}, {}, why), CAMERAS, MM, True)
     assert (marked.flags == Flag.CONTRADICTION).all()
     np.testing.assert_allclose(np.degrees(np.sqrt(marked.orientation_cov[:, 1, 1])), 1.0, rtol=1e-3)
 
