@@ -34,7 +34,7 @@ FAULTS = {  # of a piece, and how its cause begins
     "swapped": "swap cam1 and cam2",
     "diameter": "sphere.diameter",
     "turned": r"cam\d turned by 1\.[3-7] degrees",
-    "wide": r"pixels of .* \+[2-4]",
+    "wide": "pixels of cam1 and cam2 -[2-4]",  # of what is reported: pixels as wide as high
 }
 JUDGED = ("lines of sight", "movies in step", "size of the ball", "cameras agree", "one ball")
 
@@ -54,9 +54,9 @@ class Piece:
         document: dict[str, Any] = yaml.safe_load(self.source.read_text())
         there = self.source.parent.resolve()
         cameras = load_cameras(there / document["cameras"])
-        document["movies"] = {name: str(there / movie) for name, movie in document["movies"].items()}
+        for kind in ("movies", "backgrounds"):
+            document[kind] = {name: str(there / path) for name, path in document.get(kind, {}).items()}
         document["sphere"]["texture"] = str(there / document["sphere"]["texture"])
-        document.pop("backgrounds", None)
         document["frames"] = [self.first, self.last]
         if self.fault == "late":
             document["start"] = {"cam1": 0, "cam2": LATE}

@@ -19,6 +19,7 @@ from sphereorient.cameras import Camera, R_lab_view, Rays, centre_lab_mm, sphere
 Floats = NDArray[np.float64]
 RUNS, RUN = 3, 20  # causes are tried in some runs of frames that follow each other
 FEWEST = 3  # frames from which cameras are judged
+STRETCH = 0.01  # by how much outlines may be wider than high, where nothing is wrong
 LATEST = 8  # frames by which a movie may be late
 PLAUSIBLE = 0.2  # largest deviation: relative, rad, 100 mm
 EXPLAINS = 0.3  # a cause leaves at most this share of the misfit
@@ -44,12 +45,19 @@ class Seen:
     radius_px: Tensor  # (N, C), of the sphere's picture, along the camera's x
     R_lab_body: Tensor  # (N, C, 3, 3)
     diameter_mm: float
+    outline_stretch: Tensor | None = None  # (N, C), by how much outlines are wider than the cameras say, relative
     frame: Tensor | None = None  # (N,) int64, increasing, at even times; None: no camera is tested for being late
 
     def at(self, rows: Tensor) -> "Seen":
         """Return some frames."""
         parts = {name: getattr(self, name)[rows] for name in ("centre_px", "radius_px", "R_lab_body")}
+        parts["outline_stretch"] = self.stretch[rows]
         return replace(self, **parts, frame=None if self.frame is None else self.frame[rows])
+
+    @property
+    def stretch(self) -> Tensor:
+        """(N, C): `outline_stretch`, NaN if unknown."""
+        return torch.full_like(self.radius_px, torch.nan) if self.outline_stretch is None else self.outline_stretch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +147,7 @@ def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
     """
     compare = _Comparison(seen, limits)
     found = compare(compare.sights())
-    gap, turn, size = found[:, 0].abs(), found[:, 1:4].norm(dim=-1), found[:, 4:]
+    gap, turn, size = found[:, 0].abs(), found[:, 1:4].norm(dim=-1), found[:, 4:6]
     count = int(torch.isfinite(gap).sum())
     if count < FEWEST:
         return Consistency(frames=count)
@@ -210,10 +218,18 @@ class _Comparison:
             found.append(_Sight(rays=camera.rays(pixel), R_lab_body=R_lab_body))
         return found
 
-    def __call__(self, sights: Sequence[_Sight], larger: Tensor | float = 0.0, sized: bool = True) -> Tensor:
-        """Return gap, turn (3) and log sizes (2) of all frames and pairs, (M, 6), in units of the limits.
-        `larger`: logarithm of the factor by which pictures of the sphere are larger than the cameras say, () or (C,).
+    def __call__(
+        self,
+        sights: Sequence[_Sight],
+        larger: Tensor | float = 0.0,
+        sized: bool = True,
+        wider: Tensor | None = None,
+    ) -> Tensor:
+        """Return gap, turn (3), log sizes (2) and stretches (2) of all frames and pairs, (M, 8), in units of limits.
+        `larger`: logarithm of the factor by which pictures of the sphere are larger than the cameras say, () or (C,);
+        `wider`: by how much wider than high, relative, (C,).
         """
+        stretch = self.seen.stretch if wider is None else self.seen.stretch - wider
         growth = torch.as_tensor(larger, dtype=torch.float64).expand(len(self.names))
         parts = []
         for (k, m), px_mm, by_size in zip(self.pairs, self.px_mm, self.by_size, strict=True):
@@ -221,9 +237,10 @@ class _Comparison:
             turn = so3.log(sights[k].R_lab_body @ sights[m].R_lab_body.mT)
             far = [(position - self.centres[c]).norm(dim=-1) for c in (k, m)]
             size = torch.stack([(a / b).log() for a, b in zip(far, by_size, strict=True)], -1) - growth[[k, m]]
-            parts.append(torch.cat([(gap_mm * px_mm)[:, None], turn, size if sized else size * torch.nan], -1))
+            size = size if sized else size * torch.nan
+            parts.append(torch.cat([(gap_mm * px_mm)[:, None], turn, size, stretch[:, [k, m]]], -1))
         limits = self.limits
-        scale = [limits.gap_px, *[math.radians(limits.turn_deg)] * 3, limits.size, limits.size]
+        scale = [limits.gap_px, *[math.radians(limits.turn_deg)] * 3, *[limits.size] * 2, *[STRETCH] * 2]
         return torch.cat(parts) / torch.tensor(scale, dtype=torch.float64)
 
     def causes(self, found: Tensor) -> Iterator[Cause]:
@@ -300,7 +317,7 @@ class _Comparison:
             middle = 0.5 * (self.cameras[k].image_size[0] - 1)
             pixels[:, k, 0] = middle + (pixels[:, k, 0] - middle) / (1 + float(p[0]))
             larger[k] = math.log1p(0.5 * float(p[0]))
-        return self(self.sights(pixels), larger)
+        return self(self.sights(pixels), larger, wider=2 * larger)
 
     def _moved(self, camera: int, p: Floats) -> Tensor:
         """The camera turned about its centre by p[:3], rad, lab, and moved by p[3:], in 100 mm."""

@@ -1,5 +1,6 @@
 """The circle of the sphere in a picture: a blob of its size, then the outline near the blob."""
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -103,6 +104,7 @@ class Outline:
     radius_px: float
     rms_px: float  # distance of supporting edges from the circle
     coverage: float  # share of the visible directions with a supporting edge
+    stretch: float = math.nan  # by how much it is wider than high, relative
     painted: bool = True  # more than one grey inside
 
 
@@ -308,12 +310,19 @@ def _fit_circle(
             residual = offset - design @ move
         circle = circle + move
     used = weight > 0
+    ellipse = np.column_stack([design, outward[:, 0] ** 2 - outward[:, 1] ** 2, 2 * outward[:, 0] * outward[:, 1]])
+    wider = np.linalg.lstsq(ellipse * root[:, None], offset * root, rcond=None)[0][3]
     rms = float(np.sqrt((residual[used] ** 2).mean()))
     angle = np.arctan2(outward[used, 1], outward[used, 0])
     direction = ((angle + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
     coverage = min(len(np.unique(direction)) / _rim_in_the_clear(circle, clear), 1.0)
     return Outline(
-        u_px=float(circle[0]), v_px=float(circle[1]), radius_px=float(circle[2]), rms_px=rms, coverage=coverage
+        u_px=float(circle[0]),
+        v_px=float(circle[1]),
+        radius_px=float(circle[2]),
+        rms_px=rms,
+        coverage=coverage,
+        stretch=float(2 * wider / circle[2]),
     )
 
 

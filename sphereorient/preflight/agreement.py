@@ -1,9 +1,11 @@
 """Do the cameras agree, and is there one ball? A short stretch is tracked, and judged as `track` judges a movie."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
+
+import torch
 
 from sphereorient.calibration.consistency import FEWEST, compare_cameras
 from sphereorient.errors import SphereOrientError
@@ -11,7 +13,9 @@ from sphereorient.experiment import Experiment
 from sphereorient.methods.method import Learnt
 from sphereorient.methods.results import TWO_BALLS, said_alone
 from sphereorient.methods.settings import Settings
+from sphereorient.preflight.cameras import outline_stretch
 from sphereorient.preflight.finding import FAULT, Finding, judged, warning
+from sphereorient.preflight.sample import MovieSample
 from sphereorient.run import MemoryStore, Request, run
 from sphereorient.run.stages import opened
 
@@ -26,13 +30,20 @@ def study(experiment: Experiment, settings: Settings) -> Learnt:
 
 
 def cameras_agree(
-    experiment: Experiment, settings: Settings, learning: Future[Learnt], frames: tuple[int, int]
+    experiment: Experiment, settings: Settings, learning: Future[Learnt], stretch: Sequence[MovieSample], first: int
 ) -> Iterator[Finding]:
-    """Track the frames first .. last - 1 with what was learnt; yield the findings on cameras and balls."""
+    """Track a stretch of consecutive frames from the first one on with what was learnt; yield findings on cameras and
+    balls. `stretch` holds the frames of each camera.
+    """
     try:
         learnt = learning.result()
-        some = replace(experiment, frames=frames)
-        track = run(Request(experiment=some, settings=settings, learnt=learnt), MemoryStore())
+        # Each camera alone: a pose of both lies between what they say.
+        request = Request(
+            experiment=replace(experiment, frames=(first, first + len(stretch[0].frame))),
+            settings=settings,
+            learnt=replace(learnt, together=False),
+        )
+        track = run(request, MemoryStore())
     except SphereOrientError as error:
         measured, _, do = str(error).rpartition("; ")
         yield judged(TITLE, f"a run stops: {measured}", (True, FAULT, do.rstrip(".")))
@@ -40,7 +51,10 @@ def cameras_agree(
     if learnt.second_ball:
         measured, _, do = TWO_BALLS.rpartition("; ")
         yield judged("one ball", measured, (True, FAULT, do))
-    found = compare_cameras(*said_alone(track, experiment.cameras, 2 * experiment.radius_mm, consecutive=True))
+    seen, limits = said_alone(track, experiment.cameras, 2 * experiment.radius_mm, consecutive=True)
+    position = torch.from_numpy(track.position)
+    wider = [outline_stretch(sample, position, experiment.radius_mm) for sample in stretch]
+    found = compare_cameras(replace(seen, outline_stretch=torch.stack(wider, 1)), limits)
     if found.frames < FEWEST or math.isnan(found.turn_deg):
         measured = f"cannot tell: both cameras show the ball and its paint in {found.frames} of {len(track)} frames"
         yield warning(TITLE, measured, "see the findings on the ball and on the map")

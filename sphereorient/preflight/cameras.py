@@ -92,6 +92,14 @@ def expected_outline_px(camera: Camera, position_lab_mm: Tensor, radius_mm: floa
     return camera.project(position_lab_mm[..., None, :] + radius_mm * toward)
 
 
+def outline_stretch(sample: MovieSample, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
+    """Return by how much wider the outlines (n,) are than those of a sphere at positions (n, 3), mm, relative."""
+    measured = [math.nan if outline is None else outline.stretch for outline, _ in sample.found]
+    rim = expected_outline_px(sample.camera, position_lab_mm, radius_mm)
+    width, height = (rim - rim.mean(-2, keepdim=True)).square().mean(-2).sqrt().unbind(-1)
+    return torch.tensor(measured, dtype=torch.float64) - (width / height - 1)
+
+
 def ball_size(samples: Sequence[MovieSample], diameter_mm: float) -> Finding:
     """Compare the size of the ball in the pictures of two cameras with the expected size."""
     title, position, ratios = "size of the ball", sample_gaps(samples).position_lab_mm, {}

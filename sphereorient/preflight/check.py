@@ -77,7 +77,6 @@ def preflight(
         samples = tuple(one.result() for one in sampling)
         progress("frames", len(samples), len(samples))
         closer, scan = _offsets(samples, settings, pool)
-        stretch = [int(recording.timeline.number[k]) for one in closer[:1] for k in one[0].frame[[0, -1]]]
         progress("paint", 0, 1)
         checked = Preflight(
             experiment=experiment,
@@ -90,9 +89,14 @@ def preflight(
             matches=tuple(texture_map.match_texture(search.result(), samples) if search else ()),
             measures=measures.result() if measures else None,
             similar=similar.result() if similar else None,
-            agreement=tuple(agreement.cameras_agree(experiment, planned, learning, (stretch[0], stretch[1] + 1)))
-            if learning is not None and stretch
-            else (),
+            agreement=tuple(
+                finding
+                for one in closer[:1]
+                if learning is not None
+                for finding in agreement.cameras_agree(
+                    experiment, planned, learning, one, int(recording.timeline.number[one[0].frame[0]])
+                )
+            ),
         )
         progress("paint", 1, 1)
         return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))

@@ -141,6 +141,15 @@ def test_wide_pixels_are_named(share):
     assert f"pixels of cam1 and cam2 {100 * share:+.1f} % wider" in found.advice
 
 
+def test_outlines_that_are_wider_than_high_tell_wide_pixels_from_a_wrong_diameter():
+    """A ball in the middle of the picture: its size alone fits either."""
+    seen = seen_by(CAMERAS, diameter_mm=0.985 * MM)
+    round_, wide = torch.zeros_like(seen.radius_px), torch.full_like(seen.radius_px, -0.03)
+    assert compare_cameras(replace(seen, outline_stretch=round_), LIMITS).advice.startswith("sphere.diameter")
+    found = compare_cameras(replace(seen, outline_stretch=wide), LIMITS)
+    assert found.advice.startswith("pixels of cam1 and cam2 -3")
+
+
 @pytest.mark.parametrize(("late", "frames"), [(-3, 48), (1, 48), (2, 48), (7, 48), (2, 240)])
 def test_a_late_movie_is_named(late, frames):
     """Before: not in movies of more than 60 frames."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from locate_examples import (
@@ -231,3 +232,13 @@ def test_what_passes_before_the_ball_as_round_and_as_large_is_not_taken_for_it(a
 def test_a_ball_of_one_colour_is_found_as_long_as_nothing_painted_is_there():
     outline = outline_of(filmed(plant(white, *PLACES[0])), *PLACES[0])
     assert distance_px(outline, PLACES[0]) < 0.1
+
+
+@pytest.mark.parametrize("wider", [-0.03, 0.0, 0.03])
+def test_a_disk_that_is_wider_than_high_says_by_how_much(wider):
+    u, v = 40.3, 38.7
+    picture = plant(white, u, v)
+    turn = np.float32([[1 + wider / 2, 0, -u * wider / 2], [0, 1 - wider / 2, v * wider / 2]])
+    stretched = cv2.warpAffine(picture, turn, picture.shape[::-1], borderValue=BACK)
+    found = outline_of(filmed(stretched), u, v)
+    assert found.stretch == pytest.approx(wider, abs=0.006)
