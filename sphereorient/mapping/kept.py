@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from sphereorient.files.hdf5 import DAMAGE, whole_hdf5
+from sphereorient.files.whole_file import writing
 
 SCHEMA = "sphereorient-unfinished-map/1"
 
 
 def write_kept(path: Path, parts: dict[str, Tensor]) -> None:
-    """Write tensors by name; may raise OutputError."""
-    with whole_hdf5(path, "check the space left, then run again with --resume") as file:
+    """Write tensors by name, over a damaged file too: it lies in the run's own folder; may raise OutputError."""
+    with writing(force=True), whole_hdf5(path, "check the space left, then run again with --resume") as file:
         file.attrs["schema"] = SCHEMA
         for name, part in parts.items():
             file.create_dataset(name, data=part.numpy(), fletcher32=bool(part.numel() and part.ndim), track_times=False)

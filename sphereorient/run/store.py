@@ -236,11 +236,13 @@ class FolderStore:
 
     def keep(self, learnt: Learnt) -> None:
         """Write what was learnt."""
-        learnt.save(self.folder / "learnt.h5")
+        with writing(force=True):  # over a damaged one, too: the folder is of this run
+            learnt.save(self.folder / "learnt.h5")
 
     def write(self, batch: Batch, poses: list[Poses]) -> None:
         """Write the poses of one batch."""
-        with whole_hdf5(self.poses(batch), "check the space left, then run again with --resume") as file:
+        do = "check the space left, then run again with --resume"
+        with writing(force=True), whole_hdf5(self.poses(batch), do) as file:
             file.attrs["schema"] = SCHEMA
             file["count"] = np.array([len(one) for one in poses])
             file["use"] = np.stack([one.use.numpy() for one in poses])
