@@ -124,10 +124,15 @@ def film(folder: Path, number: int, frames: int) -> None:
         rng = np.random.default_rng([number, index])
         for k, time_s in enumerate(times_s.tolist()):
             row = slice(k * count, (k + 1) * count)
-            lit, cover = expose(scene, camera, now.position_lab_mm[row], now.R_lab_body[row])
+            middle_mm, size = now.position_lab_mm[row].mean(0), torch.tensor(camera.image_size)
+            at = camera.project(middle_mm)
+            near = bool(((at > -size) & (at < 2 * size)).all())  # the lens's distortion is defined nearby only
+            shown = row if near else slice(0)
+            lit, cover = expose(scene, camera, now.position_lab_mm[shown], now.R_lab_body[shown])
             lit += (1 - cover) * impellers(camera.image_size, index, time_s)
-            centre_px, radius_px = picture_of_ball(camera, now.position_lab_mm[row].mean(0), settings.diameter_mm / 2)
-            disturb(lit, cover, Disk(centre_px=centre_px, radius_px=radius_px), (index, number, k))
+            if near:
+                centre_px, radius_px = picture_of_ball(camera, middle_mm, settings.diameter_mm / 2)
+                disturb(lit, cover, Disk(centre_px=centre_px, radius_px=radius_px), (index, number, k))
             yield digitise(lit, settings, rng)
 
     for index, (name, camera) in enumerate(cameras.items()):

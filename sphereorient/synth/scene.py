@@ -44,7 +44,7 @@ def expose(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return one exposure without noise, and the coverage, (H, W) float32 each, blurred by the optics.
 
-    `position_lab_mm` (E, 3) and `R_lab_body` (E, 3, 3) are the poses at E instants of the exposure.
+    `position_lab_mm` (E, 3) and `R_lab_body` (E, 3, 3) are the poses at E instants of the exposure; no instants: empty.
 
     Raises:
         CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
@@ -53,7 +53,7 @@ def expose(
     width, height = camera.image_size
     picture = np.full((height, width), settings.background, np.float32)
     cover = np.zeros((height, width), np.float32)
-    share = 1.0 / len(position_lab_mm)
+    share = 1.0 / max(1, len(position_lab_mm))
     for position, R in zip(position_lab_mm, R_lab_body, strict=True):
         u, v = camera.project(position).tolist()
         reach = math.ceil(reach_px(camera, position[None], settings.diameter_mm / 2)) + 2
