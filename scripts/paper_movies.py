@@ -23,7 +23,7 @@ from sphereorient.synth.degrade import Disk
 from sphereorient.synth.degrade_scene import picture_of_ball
 from sphereorient.synth.ensemble import Draw, Law
 from sphereorient.synth.scene import digitise, expose
-from sphereorient.synth.write import default_cameras, frame_times_s, write_truth
+from sphereorient.synth.write import default_cameras, experiment_document, frame_times_s, write_truth
 
 Floats = NDArray[np.float64]
 TEXTURE_SEED = 2011  # one painted sphere in all movies
@@ -140,14 +140,7 @@ def film(folder: Path, number: int, frames: int) -> None:
     save_cameras(aside / "cameras.yaml", cameras, comment="exact cameras; X_cam = R X_lab + T, mm")
     write_truth(aside / "truth.h5", motion.at(times_s), cameras)
     # Without backgrounds: the mean of the movie is used, as in the paper.
-    document = {
-        "schema": "sphereorient-experiment/1",
-        "name": settings.name,
-        "frame_rate": settings.frame_rate,
-        "exposure": settings.exposure,
-        "sphere": {"diameter": settings.diameter_mm, "texture": "texture.png"},
-        "cameras": "cameras.yaml",
-        "movies": {name: f"{name}.mkv" for name in cameras},
-    }
+    document = experiment_document(settings, cameras)
+    del document["backgrounds"]
     (aside / "experiment.yaml").write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
     aside.rename(folder)

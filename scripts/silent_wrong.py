@@ -37,7 +37,7 @@ from sphereorient.run import MemoryStore, Request, run
 from sphereorient.synth import SynthSettings, make_scene, random_texture
 from sphereorient.synth.motion import Motion6D
 from sphereorient.synth.scene import RenderedScene, digitise, expose
-from sphereorient.synth.write import default_cameras, frame_times_s, motion_of, write_truth
+from sphereorient.synth.write import default_cameras, experiment_document, frame_times_s, motion_of, write_truth
 from sphereorient.trajectory import Flag, Trajectory
 
 Floats = NDArray[np.float64]
@@ -510,16 +510,7 @@ def film(folder: Path, case: Case) -> Path:
     save_cameras(folder / "cameras.yaml", case.reported(cameras) if case.reported else cameras, comment="of a case")
     X, R = poses(times_s)
     write_truth(folder / "truth.h5", replace(motion.at(times_s), position_lab_mm=X, R_lab_body=R), cameras)
-    document: dict[str, Any] = {
-        "schema": "sphereorient-experiment/1",
-        "name": case.name,
-        "frame_rate": settings.frame_rate,
-        "exposure": settings.exposure,
-        "sphere": {"diameter": settings.diameter_mm, "texture": "texture.png"},
-        "cameras": "cameras.yaml",
-        "movies": {name: f"{name}.npy" for name in cameras},
-        "backgrounds": {name: f"empty_{name}.png" for name in cameras},
-    }
+    document = experiment_document(settings, cameras, ".npy")
     if case.document:
         case.document(document)
     if case.told:

@@ -180,14 +180,12 @@ class Initialiser:
             chosen = distinct_indices(fit.R_lab_body, fit.nll, keep)
             X, R = fit.position_lab_mm[chosen], fit.R_lab_body[chosen]
             place = X[:1]
-        unknown = torch.cat([fitter.shows_unknown(k, X[:1], R[:1]) for k in range(len(use))]) if len(X) else ~use
-        if not bool((use & unknown).any()) or not bool((use & ~unknown).any()):
+        hidden = [bool(used) and bool(fitter.shows_unknown(k, X[:1], R[:1]).any()) for k, used in enumerate(use)]
+        shown = use & ~torch.tensor(hidden)
+        if not bool(shown.any()):  # no camera is better than another
             return poses_of(fit, chosen, use, frame.reason)
-        reason = [
-            Reason.UNSEEN if was and hidden else why
-            for was, hidden, why in zip(use.tolist(), unknown.tolist(), frame.reason, strict=True)
-        ]
-        return poses_of(fit, chosen, use & ~unknown, reason)
+        reason = [Reason.UNSEEN if unknown else why for unknown, why in zip(hidden, frame.reason, strict=True)]
+        return poses_of(fit, chosen, shown, reason)
 
 
 def _best_score(poses: Poses) -> float:

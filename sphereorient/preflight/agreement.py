@@ -19,7 +19,7 @@ from sphereorient.preflight.sample import MovieSample
 from sphereorient.run import MemoryStore, Request, run
 from sphereorient.run.stages import opened
 
-TITLE = "cameras agree"
+TITLE, STOPS = "cameras agree", "a run stops"
 ENOUGH = 50  # frames of a movie that gives its own background
 
 
@@ -47,7 +47,7 @@ def cameras_agree(
         track = run(request, MemoryStore())
     except SphereOrientError as error:
         measured, _, do = str(error).rpartition("; ")
-        yield judged(TITLE, f"a run stops: {measured}", (True, FAULT, do.rstrip(".")))
+        yield judged(TITLE, f"{STOPS}: {measured}", (True, FAULT, do.rstrip(".")))
         return
     if learnt.second_ball:
         measured, _, do = TWO_BALLS.rpartition("; ")

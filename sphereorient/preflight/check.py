@@ -63,8 +63,8 @@ def preflight(
             image, unseen = load_texture(experiment.texture_path), load_unseen(experiment.texture_path)
         sizes, wrong_sizes = _expected_sizes(experiment, settings)
         progress("frames", 0, len(recording.streams))
-        planned = Settings(locate=settings.locate, search=settings.search, refine=settings.refine)
-        planned = planned.model_copy(update={"refine": planned.refine.model_copy(update=BRIEF)})
+        refine = settings.refine.model_copy(update=BRIEF)
+        planned = Settings(locate=settings.locate, search=settings.search, refine=refine)
         both = image is not None and len(recording.streams) > 1
         learning = pool.submit(agreement.study, experiment, planned) if both else None
         sampling = [
@@ -78,6 +78,10 @@ def preflight(
         progress("frames", len(samples), len(samples))
         closer, scan = _offsets(samples, settings, pool)
         progress("paint", 0, 1)
+        tracked: tuple[Finding, ...] = ()
+        if learning is not None and closer:
+            first = int(recording.timeline.number[closer[0][0].frame[0]])
+            tracked = tuple(agreement.cameras_agree(experiment, planned, learning, closer[0], first))
         checked = Preflight(
             experiment=experiment,
             timeline=recording.timeline,
@@ -89,14 +93,7 @@ def preflight(
             matches=tuple(texture_map.match_texture(search.result(), samples) if search else ()),
             measures=measures.result() if measures else None,
             similar=similar.result() if similar else None,
-            agreement=tuple(
-                finding
-                for one in closer[:1]
-                if learning is not None
-                for finding in agreement.cameras_agree(
-                    experiment, planned, learning, one, int(recording.timeline.number[one[0].frame[0]])
-                )
-            ),
+            agreement=tracked,
         )
         progress("paint", 1, 1)
         return replace(checked, findings=tuple(_findings(checked, wrong_sizes)))
@@ -112,7 +109,7 @@ def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Findi
         yield movies.background(sample, seen.experiment)
         yield movies.ball(sample)
     by_outlines = list(_outline_findings(seen))
-    if any(one.title == agreement.TITLE and "a run stops" not in one.measured for one in seen.agreement):
+    if any(one.title == agreement.TITLE and agreement.STOPS not in one.measured for one in seen.agreement):
         # Poses fitted to the paint tell more than outlines, which jump where a short movie has to give its background.
         by_outlines = [replace(one, severity=OK, advice="") for one in by_outlines]
     yield from by_outlines

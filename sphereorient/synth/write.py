@@ -1,6 +1,6 @@
 """Write synthetic experiments in the format that `sphereorient track` reads."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -168,15 +168,23 @@ def write_truth(path: Path, truth: Motion6D, cameras: Mapping[str, Camera]) -> N
 def _experiment(filming: Filming) -> dict[str, Any]:
     settings = filming.settings
     too_large = filming.values.get("radius_error", 0.0) / (settings.diameter_px / 2)  # share, at the rim of the picture
+    document = experiment_document(settings, filming.cameras)
+    document["sphere"]["diameter"] *= 1 + too_large
+    return document
+
+
+def experiment_document(settings: SynthSettings, cameras: Iterable[str], suffix: str = ".mkv") -> dict[str, Any]:
+    """Return what experiment.yaml says of movies NAME.mkv (or another suffix) and backgrounds empty_NAME.png."""
     # exposure 0 is left out: the key must be above 0.
     exposure = {"exposure": settings.exposure} if settings.exposure > 0 else {}
+    names = list(cameras)
     return {
         "schema": "sphereorient-experiment/1",
         "name": settings.name,
         "frame_rate": settings.frame_rate,
         **exposure,
-        "sphere": {"diameter": settings.diameter_mm * (1 + too_large), "texture": "texture.png"},
+        "sphere": {"diameter": settings.diameter_mm, "texture": "texture.png"},
         "cameras": "cameras.yaml",
-        "backgrounds": {name: f"empty_{name}.png" for name in filming.cameras},
-        "movies": {name: f"{name}.mkv" for name in filming.cameras},
+        "backgrounds": {name: f"empty_{name}.png" for name in names},
+        "movies": {name: f"{name}{suffix}" for name in names},
     }

@@ -10,10 +10,12 @@ import torch
 import yaml
 from torch import Tensor
 
-from sphereorient.experiment.recording import Recording, silent
+from sphereorient.experiment.recording import Recording, open_recording, silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import LearntMap, MapSettings, fit_map, take_crops
-from sphereorient.sphere import sample_texture
+from sphereorient.mapping.disks import Crops
+from sphereorient.mapping.iterations import State, first_state, iterate
+from sphereorient.sphere import load_texture, reduced_texture, sample_texture
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 from sphereorient.synth.textures import map_directions
 
@@ -82,3 +84,14 @@ def save_map(texture: Tensor, path: Path) -> Path:
 def mapped(recording: Recording, settings: MapSettings) -> LearntMap:
     """Learn a map from an opened recording."""
     return fit_map(take_crops(recording, settings, LocateSettings(), silent), settings, silent)
+
+
+def settled(path: Path, R: Tensor, settings: MapSettings) -> tuple[Crops, State]:
+    """Return the crops of a rendered movie, and the state after two iterations from its true map and attitudes."""
+    texture = reduced_texture(load_texture(path.parent / "texture.png"), 64.0)
+    with open_recording(path, textured=False) as recording:
+        crops = take_crops(recording, settings, LocateSettings(), silent)
+    state = first_state(crops, torch.arange(len(R)), R, texture, settings)
+    for k in range(2):
+        state, _ = iterate(state, settings, k)
+    return crops, state

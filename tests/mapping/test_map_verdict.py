@@ -11,17 +11,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from map_examples import SMALL, rewrite, unpainted
+from map_examples import SMALL, rewrite, settled, unpainted
 
 from sphereorient import so3
 from sphereorient.errors import PaintError
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.locate import LocateSettings
 from sphereorient.mapping import MapSettings, take_crops
-from sphereorient.mapping.iterations import first_state, iterate
 from sphereorient.mapping.verdict import jumps, paint_correlation
 from sphereorient.movies import open_movie
-from sphereorient.sphere import load_texture, reduced_texture
 
 QUICK = MapSettings(rounds=4, pixels=600, height=64)
 FRAMES = 48
@@ -92,12 +90,7 @@ def test_held_out_pictures_contradict_a_map_of_wrong_attitudes(tmp_path):
     path = unpainted(tmp_path / "scene", frames=25)
     with h5py.File(path.parent / "truth.h5") as file:
         R = torch.from_numpy(file["orientation"][()])
-    texture = reduced_texture(load_texture(path.parent / "texture.png"), 64.0)
-    with open_recording(path, textured=False) as recording:
-        crops = take_crops(recording, QUICK, LocateSettings(), silent)
-    state = first_state(crops, torch.arange(len(R)), R, texture, QUICK)
-    for k in range(2):
-        state, _ = iterate(state, QUICK, k)
+    crops, state = settled(path, R, QUICK)
     paint = paint_correlation(crops, state, QUICK)
     assert paint.isfinite().any(1).nonzero()[:, 0].tolist() == [2, 7, 12, 17, 22]
     assert float(paint.nanmedian()) > 0.9

@@ -12,17 +12,14 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from map_examples import SMALL, mapped, rewrite, unpainted
+from map_examples import SMALL, mapped, rewrite, settled, unpainted
 
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.recording import open_recording, silent
-from sphereorient.locate import LocateSettings
-from sphereorient.mapping import MapSettings, take_crops
-from sphereorient.mapping.iterations import first_state, iterate
+from sphereorient.experiment.recording import open_recording
+from sphereorient.mapping import MapSettings
 from sphereorient.mapping.learn import interpolated, recovered
 from sphereorient.movies import open_movie
-from sphereorient.sphere import load_texture, reduced_texture
 
 # Two turns and a half: over half a turn without a loop nothing tells a ball that is 1 % too large from a shorter turn.
 FRAMES = 120
@@ -52,12 +49,7 @@ def test_instants_between_are_turned_as_their_neighbours_were():
 def test_instants_that_do_not_fit_are_found_again_and_the_others_stay(tmp_path):
     path = unpainted(tmp_path / "scene", frames=24)
     R, _ = truth_of(path)
-    texture = reduced_texture(load_texture(path.parent / "texture.png"), 64.0)
-    with open_recording(path, textured=False) as recording:
-        crops = take_crops(recording, QUICK, LocateSettings(), silent)
-    state = first_state(crops, torch.arange(len(R)), R, texture, QUICK)
-    for k in range(2):
-        state, _ = iterate(state, QUICK, k)
+    crops, state = settled(path, R, QUICK)
     lost = torch.tensor([0, 1, 9, 23])
     turn = torch.tensor([[0.5, 0.3, -0.2], [-0.4, 0.3, 0.5], [0.1, -0.7, 0.2], [0.6, 0.0, 0.4]], dtype=torch.float64)
     spoilt = state.R_lab_body.clone()
