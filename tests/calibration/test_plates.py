@@ -42,6 +42,7 @@ def cube_error_mm(found, true, half_mm=30.0):
     return float((triangulate(*rays)[0] - points).norm(dim=-1).square().mean().sqrt())
 
 
+@pytest.mark.slow
 def test_cameras_come_out_of_pictures(result):
     true = true_cameras()
     assert result.rms_px("cam1") < 0.03
@@ -50,6 +51,7 @@ def test_cameras_come_out_of_pictures(result):
     assert math.degrees(float(so3.geodesic_distance(*between))) < 0.03
 
 
+@pytest.mark.slow
 def test_every_dot_is_used_and_every_picture_accounted_for(result):
     assert len(result.pictures) == len(pictures())
     for one in result.pictures:
@@ -59,6 +61,7 @@ def test_every_dot_is_used_and_every_picture_accounted_for(result):
         assert one.rms_px < 0.03
 
 
+@pytest.mark.slow
 def test_errors_of_the_cameras_are_those_that_the_sigmas_promise(result):
     for name, camera in result.cameras.items():
         true = true_cameras()[name]
@@ -82,6 +85,7 @@ def test_table_and_figure_show_all_of_it(result, tmp_path):
     assert min(drawn.shape[:2]) > 400
 
 
+@pytest.mark.slow
 def test_the_file_of_cameras_keeps_the_covariance_of_all_together(result, tmp_path):
     path = tmp_path / "cameras.yaml"
     save_cameras(path, result.cameras, covariance=result.covariance)
@@ -98,6 +102,7 @@ def test_the_file_of_cameras_keeps_the_covariance_of_all_together(result, tmp_pa
     assert torch.allclose(own.matrix, alone.matrix)
 
 
+@pytest.mark.slow
 def test_without_the_joint_covariance_those_of_the_cameras_stand_side_by_side(result, tmp_path):
     path = tmp_path / "cameras.yaml"
     save_cameras(path, result.cameras)
@@ -109,6 +114,7 @@ def test_without_the_joint_covariance_those_of_the_cameras_stand_side_by_side(re
     assert load_covariance(path, load_cameras(path)) is None
 
 
+@pytest.mark.slow
 def test_a_covariance_of_unknown_parameters_is_refused(result, tmp_path):
     path = tmp_path / "cameras.yaml"
     names = tuple(name.replace("cam2.f", "cam2.focus") for name in result.covariance.names)
@@ -188,14 +194,23 @@ def test_a_grid_of_another_size_is_refused_or_does_no_harm(source, tmp_path, col
         assert cube_error_mm(calibrate_cameras(path).cameras, true_cameras()) < 0.01
 
 
+def write_empty(folder):
+    """Write calibration.yaml and black pictures, which take no time to draw."""
+    path = write(folder, drawn=False)
+    for entry in document()["pictures"]:
+        for camera in entry.keys() - {"pose"}:
+            cv2.imwrite(str(folder / entry[camera]), np.zeros(SIZE[::-1], np.uint8))
+    return path
+
+
 def test_pictures_of_another_size_are_refused_before_any_work(tmp_path):
-    path = write(tmp_path)
+    path = write_empty(tmp_path)
     cv2.imwrite(str(tmp_path / "cam2_03.png"), np.zeros((200, 300), np.uint8))
     refused(path, r"cam2_03.png: expected 480 x 400 px, got 300 x 200 px; correct image_size")
 
 
 def test_pictures_that_are_missing_or_none_are_refused(tmp_path):
-    path = write(tmp_path)
+    path = write_empty(tmp_path)
     (tmp_path / "cam1_01.png").unlink()
     refused(path, r"cam1_01.png: expected a picture, got no such file")
     (tmp_path / "cam1_01.png").write_text("no picture")
@@ -275,6 +290,7 @@ def _rig(result):
     return Rig(cameras=result.cameras, R_lab_plate=result.R_lab_plate, T_lab_plate_mm=result.T_lab_plate_mm)
 
 
+@pytest.mark.slow
 def test_pixel_pitch_scales_the_focal_length_only(result):
     assert float(result.cameras["cam1"].f_mm) / PITCH[0] == pytest.approx(900.0, rel=1e-3)
 

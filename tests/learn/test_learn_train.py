@@ -80,6 +80,7 @@ def test_the_log_has_a_row_an_epoch(trained):
         assert row == pytest.approx(kept)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_weights_and_another_does_not(short, tmp_path):
     torch.manual_seed(99)  # what was drawn before does not matter
     again = train_proposer(tiny(**SHORT), tmp_path / "again")

@@ -46,6 +46,7 @@ def test_turning_a_map_to_and_fro_changes_nothing_but_a_little_sharpness(paint):
     assert float((there - paint).abs().mean()) < 0.02
 
 
+@pytest.mark.slow
 def test_a_planted_rotation_is_found(paint):
     # What the reference shows at d, the turned map shows at R d.
     found = compare_maps(turned_map(paint, TURN.mT), paint)

@@ -44,6 +44,7 @@ from sphereorient.sphere.texture_table import texture_table
 SIGMA = 8.0  # grey levels, 5 % of the step from black to white
 COUNT = 10
 DIAMETER_PX = 48.0
+SLOW = pytest.mark.slow
 RIGS = {"two": ("pinhole", "tsai"), "one": ("pinhole",)}
 # rms over poses of the noise and of what the model simplifies: rotation in degrees, place across the sight in mm
 ROTATION_RMS = {"two": 0.075, "one": 0.14}
@@ -105,7 +106,7 @@ def rms(values: Tensor) -> float:
 # --- planted poses
 
 
-@pytest.mark.parametrize("kind", ["patches", "dots", "blobs"])
+@pytest.mark.parametrize("kind", ["patches", pytest.param("dots", marks=SLOW), pytest.param("blobs", marks=SLOW)])
 @pytest.mark.parametrize("cameras", RIGS)
 def test_the_planted_pose_is_found(cameras, kind):
     fit = from_truth(cameras, kind)
@@ -576,7 +577,7 @@ def check_coverage(cameras: str, scaled: Tensor, in_sigmas: Tensor) -> None:
         assert 0.7 < rms(part) < 1.3
 
 
-@pytest.mark.parametrize("cameras", RIGS)
+@pytest.mark.parametrize("cameras", [pytest.param("two", marks=SLOW), "one"])
 def test_errors_are_as_large_as_the_covariance_says(cameras):
     check_coverage(cameras, *drawn(64.0, cameras, "patches", 20, 6))
 

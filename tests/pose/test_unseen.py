@@ -30,30 +30,34 @@ def fit(pixels, fill: float, known: bool, start=None):
     return fitted(RIG, "patches", pixels, X, turned(R, 1.0, 5) if start is None else start, SIGMA, paint=table)
 
 
+@pytest.fixture(scope="module")
+def known(pixels):
+    """The fit that knows which paint was never seen."""
+    return fit(pixels, 0.5, known=True)
+
+
 def rms_deg(found) -> float:
     return math.degrees(float(turn_errors(found, R).square().sum(-1).mean().sqrt()))
 
 
-def test_what_the_map_holds_there_moves_nothing(pixels):
-    grey, white = fit(pixels, 0.5, known=True), fit(pixels, 1.0, known=True)
-    apart = so3.geodesic_distance(grey.R_lab_body, white.R_lab_body)
+def test_what_the_map_holds_there_moves_nothing(pixels, known):
+    white = fit(pixels, 1.0, known=True)
+    apart = so3.geodesic_distance(known.R_lab_body, white.R_lab_body)
     assert float(apart.max()) < math.radians(0.03)  # a fiftieth of the fill reaches over the border
 
 
-def test_the_pose_is_as_good_as_the_known_paint_and_its_error_says_so(pixels):
-    found = fit(pixels, 0.5, known=True)
-    assert rms_deg(found) < 0.15
-    assert rms_deg(fit(pixels, 0.5, known=False)) > 3 * rms_deg(found)
-    error = torch.cat([turn_errors(found, R), X - found.position_lab_mm], -1)
-    away = (error * torch.linalg.solve(found.covariance, error)).sum(-1)
+def test_the_pose_is_as_good_as_the_known_paint_and_its_error_says_so(pixels, known):
+    assert rms_deg(known) < 0.15
+    assert rms_deg(fit(pixels, 0.5, known=False)) > 3 * rms_deg(known)
+    error = torch.cat([turn_errors(known, R), X - known.position_lab_mm], -1)
+    away = (error * torch.linalg.solve(known.covariance, error)).sum(-1)
     assert float(away.mean()) < 12  # 6 expected
 
 
-def test_a_disk_of_unknown_paint_has_no_score_and_the_other_camera_measures(pixels):
-    found = fit(pixels, 0.5, known=True)
-    unknown = found.score == 0
+def test_a_disk_of_unknown_paint_has_no_score_and_the_other_camera_measures(known):
+    unknown = known.score == 0
     assert bool(unknown.any()) == bool((share_known() < 0.3).any())
-    assert float(found.score[~unknown].min()) > 0.9
+    assert float(known.score[~unknown].min()) > 0.9
 
 
 def share_known() -> torch.Tensor:
@@ -68,12 +72,12 @@ def share_known() -> torch.Tensor:
     return torch.stack(rows, -1)
 
 
-def test_a_wrong_pose_does_not_hide_behind_unknown_paint(pixels):
+@pytest.mark.slow
+def test_a_wrong_pose_does_not_hide_behind_unknown_paint(pixels, known):
     """A pose that turns unknown paint to the cameras is less likely than one that explains the pictures."""
-    found = fit(pixels, 0.5, known=True)
     for sign in (1, -1):  # body z along lab -y, to the first camera, and away from it
         north = R[:1].new_tensor([[1.0, 0, 0], [0, 0, -sign], [0, sign, 0]])
         wrong = fit(pixels, 0.5, known=True, start=north.expand(len(R), 3, 3))
         astray = so3.geodesic_distance(wrong.R_lab_body, R) > 0.2
         assert int(astray.sum()) >= 5
-        assert bool((wrong.nll > found.nll)[astray].all())
+        assert bool((wrong.nll > known.nll)[astray].all())

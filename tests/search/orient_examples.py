@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import cache
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -14,12 +15,14 @@ from sphereorient.sphere import orthographic_view, reduced_texture
 from sphereorient.synth import random_texture
 
 SIZE = 48
-KINDS = {"blobs": 1, "patches": 2, "dots": 3}
+SEEDS = {"blobs": 1, "patches": 2, "dots": 3}
+# One paint in the quick tests; each of them fills tables of seconds.
+KINDS = ["dots", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("blobs", "patches"))]
 
 
 @cache
 def texture_of(kind: str) -> Tensor:
-    return random_texture(kind, KINDS[kind], 128)
+    return random_texture(kind, SEEDS[kind], 128)
 
 
 @cache

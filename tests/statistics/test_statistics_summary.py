@@ -26,6 +26,7 @@ def whole(planted):
     return summarise(planted[1], FEW, Surroundings(diameter_mm=18.0, viscosity_m2_s=8e-6, dissipation_w_kg=1.7))
 
 
+@pytest.mark.slow
 def test_everything_is_there_and_belongs_to_the_same_samples(whole):
     more = whole.distributions
     assert whole.table.keys() == more.densities.keys() == more.isotropies.keys() == UNITS.keys()
