@@ -300,10 +300,10 @@ def map_of(change: Callable[[Grey], Grey]) -> Callable[[Path], None]:
 
 
 def warped(grey: Grey) -> Grey:
-    """Latitudes off by up to 3 degrees, as a map painted by hand is."""
+    """Latitudes off by up to 3 degrees, as a map painted by hand is; one wave only would be a turned body frame."""
     height, width = grey.shape
     v, u = np.indices(grey.shape, dtype=np.float32)
-    off = 3 / 180 * height * np.sin(2 * np.pi * u / width).astype(np.float32)
+    off = 3 / 180 * height * np.sin(4 * np.pi * u / width).astype(np.float32)
     return np.asarray(cv2.remap(grey, u, v + off, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 

@@ -14,7 +14,7 @@ from sphereorient.calibration.consistency import Limits, Seen, compare_cameras
 from sphereorient.cameras import centre_lab_mm, triangulate
 from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.initialise import Initialiser
-from sphereorient.follow.poses import Poses, best_poses, pose_table
+from sphereorient.follow.poses import Poses, best_poses, pose_table, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
@@ -77,7 +77,7 @@ def estimate_appearance(
     if defocus_radii(fitter.optics.blur_px, diameter_px):
         first = replace(first, score_min=ALWAYS)
 
-    found = first.all_poses(frames)
+    found = [_seen_by_all(fitter, *one) for one in zip(frames, first.all_poses(frames), strict=True)]
     pictures = [[shot.picture for shot in frame] for frame in frames]
     if not _clear(found):
         raise _nothing(found)
@@ -210,6 +210,22 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     differ_px = float(torch.stack([gap_px, *others_px]).amax(0).quantile(0.75))
     gain = float(torch.stack(gains).amax(0).quantile(0.75)) if differ_px > APART_PX else 1.0
     return gain, float(gap_px.quantile(0.75))
+
+
+def _seen_by_all(fitter: Fitter, shots: Sequence[Frame], poses: Poses) -> Poses:
+    """Let cameras without an outline count too where one pose explains all pictures: black paint may hide a rim."""
+    usable = torch.tensor([shot.usable for shot in shots])
+    if not len(poses) or bool((poses.use == usable).all()):
+        return poses
+    X, R, optics = poses.position_lab_mm, poses.R_lab_body, fitter.optics
+    for level, iterations in ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)):
+        pixels = fitter.pixels([[shot.picture for shot in shots]] * len(poses), X, level)
+        fit = fitter.fit(pixels, X, R, usable.expand(len(poses), -1), level, iterations)
+        X, R = fit.position_lab_mm, fit.R_lab_body
+    order = fit.nll.argsort(stable=True)
+    if float(fit.score[order[0], usable].min()) < _clear_of(float(poses.score[0, poses.use].min())):
+        return poses
+    return poses_of(fit, order, usable, [Reason.OK if shot.usable else shot.reason for shot in shots])
 
 
 def _in_view(fitter: Fitter, position_lab_mm: Tensor) -> bool:

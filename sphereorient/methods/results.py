@@ -1,7 +1,7 @@
 """From the stages' results to the trajectory, one function for each method."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain, combinations
 from typing import Any
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient.assemble import Chosen, Fused, Path
 from sphereorient.calibration import systematic_errors
-from sphereorient.calibration.consistency import Consistency, Limits, Seen, compare_cameras, gaps_between
+from sphereorient.calibration.consistency import Consistency, Gaps, Limits, Seen, compare_cameras, gaps_between
 from sphereorient.cameras import Camera, ParameterCovariance
 from sphereorient.experiment import Experiment
 from sphereorient.follow import Appearance
@@ -63,6 +63,9 @@ def paper_track(
     empty = _empty(experiment, clock, tracks)
     oriented = torch.isfinite(fused.R_lab_body).all(-1).all(-1)
     variance = fused.sigma_rad.square()[:, None, None] * torch.eye(3, dtype=torch.float64)
+    # The weights are inverse variances. A repaired camera says something else than what counts.
+    share = {name: torch.where(fused.repaired[name], 0.0, weight) for name, weight in fused.weight.items()}
+    own = {name: torch.where(one > 0, 1 / one, torch.nan)[:, None, None] * variance for name, one in share.items()}
     return replace(
         empty,
         valid=(oriented & positions.measured).numpy(),
@@ -73,7 +76,7 @@ def paper_track(
         **datasets_of(moved, experiment.length_unit),
         segment=fused.segment.numpy(),
         flags=(fused.flags | positions.flags).numpy().astype(np.uint32),
-        cameras=dict(tracks),
+        cameras={name: replace(track, orientation_cov=own[name].numpy()) for name, track in tracks.items()},
     )
 
 
@@ -230,37 +233,75 @@ def with_systematic_errors(
 def with_contradictions(
     track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool
 ) -> tuple[Trajectory, Consistency]:
-    """Mark frames in which two cameras contradict each other, and add the contradiction to the stated covariances.
-    Return also how well the cameras agree in the whole movie.
+    """Mark frames in which two cameras contradict each other, and make the covariances hold what they disagree by.
+    A contradiction is added to those of its frame; all are scaled where cameras disagree more than they state in most
+    frames. Return also how well the cameras agree in the whole movie.
     """
     seen, limits = said_alone(track, cameras, diameter_mm, consecutive)
-    covariance = _of_cameras(track, "orientation_cov").nan_to_num()
-    believed = np.array([[why == Reason.OK for why in camera.reason] for camera in track.cameras.values()])
-    wrong = np.any([np.isin(camera.reason, ELSEWHERE) for camera in track.cameras.values()], axis=0)
-    place_cov, turn_cov = torch.from_numpy(track.position_cov).clone(), torch.from_numpy(track.orientation_cov).clone()
-    for k, m in combinations(range(len(cameras)), 2):
+    pairs = [_compared(track, seen, *two) for two in combinations(range(len(cameras)), 2)]
+    wrong = torch.from_numpy(np.any([np.isin(one.reason, ELSEWHERE) for one in track.cameras.values()], axis=0))
+    for pair in pairs:
+        wrong |= pair.turned | (pair.gaps.signed_px.abs() > limits.gap_px)
+    turns = torch.cat([pair.away[pair.both & ~wrong] for pair in pairs])
+    places = torch.cat([pair.apart[pair.both & ~wrong] for pair in pairs])
+    turn_scale, place_scale = _excess(turns, 3), _excess(places, 1)
+    scaled = {
+        f"{name}{kind}_cov": getattr(track, f"{name}{kind}_cov") * scale**2
+        for name, scale in (("orientation", turn_scale), ("position", place_scale))
+        for kind in ("", "_smooth")
+    }
+    place_cov, turn_cov = torch.from_numpy(scaled["position_cov"]), torch.from_numpy(scaled["orientation_cov"])
+    for pair in pairs:
         # The mean of two is off by half of the contradiction if either is wrong, a single one by all of it.
-        both = torch.from_numpy(believed[k] & believed[m])[:, None]
-        turn = log(seen.R_lab_body[:, k] @ seen.R_lab_body[:, m].mT).nan_to_num()
-        spread = covariance[:, k] + covariance[:, m]
-        turned = (turn * solve_damped(spread, turn)).sum(-1) > CONTRADICTS_SIGMAS**2
-        gaps = gaps_between([list(cameras.values())[c] for c in (k, m)], [seen.centre_px[:, c] for c in (k, m)])
-        across, gap_mm = gaps.across_lab.nan_to_num(), gaps.signed_mm.nan_to_num()
-        shift_mm = (gaps.position_lab_mm - torch.from_numpy(track.position)).nan_to_num()
-        # Two lines of sight that are known equally well are apart by twice the deviation of their middle.
-        usual_mm = 2 * (across[:, None] @ place_cov.nan_to_num() @ across[..., None])[:, 0, 0].sqrt()
-        apart = gap_mm.abs() > CONTRADICTS_SIGMAS * usual_mm
-        wrong |= (turned | (gaps.signed_px.abs() > limits.gap_px)).numpy()
-        turn = torch.where(both, 0.5, 1.0) * turned[:, None] * turn
-        for whole, off in (
-            (turn_cov, turn),
-            (place_cov, (0.5 * apart * gap_mm)[:, None]),
-            (place_cov, torch.where(both, 0.0, shift_mm)),
-        ):  # in all directions: that of the error is not known as well as its size
+        turn = torch.where(pair.both, 0.5, 1.0)[:, None] * pair.turned[:, None] * pair.turn.nan_to_num()
+        gap_mm = 0.5 * (pair.apart > CONTRADICTS_SIGMAS * place_scale) * pair.gaps.signed_mm.nan_to_num()
+        shift_mm = (pair.gaps.position_lab_mm - torch.from_numpy(track.position)).nan_to_num()
+        shift_mm = torch.where(pair.both[:, None], 0.0, shift_mm)
+        for whole, off in ((turn_cov, turn), (place_cov, gap_mm[:, None]), (place_cov, shift_mm)):
+            # In all directions: that of the error is not known as well as its size.
             whole += off.square().sum(-1)[:, None, None] * torch.eye(3, dtype=torch.float64)
-    flags = track.flags | np.where(wrong & track.valid, np.uint32(Flag.CONTRADICTION), np.uint32(0))
-    marked = replace(track, flags=flags, orientation_cov=turn_cov.numpy(), position_cov=place_cov.numpy())
-    return marked, compare_cameras(seen, limits)
+    flags = track.flags | np.where(wrong.numpy() & track.valid, np.uint32(Flag.CONTRADICTION), np.uint32(0))
+    return replace(track, flags=flags, **scaled), compare_cameras(seen, limits)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Compared:
+    """What two cameras alone say of each frame, compared; distances in units of what they state, NaN: unknown."""
+
+    both: Tensor  # (N,) bool, both are believed
+    turn: Tensor  # (N, 3), rad, from the second camera's rotation to the first one's
+    away: Tensor  # (N,), Mahalanobis distance of the rotations
+    gaps: Gaps
+    apart: Tensor  # (N,), the gap over its standard deviation
+
+    @property
+    def turned(self) -> Tensor:
+        return self.away > CONTRADICTS_SIGMAS
+
+
+def _compared(track: Trajectory, seen: Seen, k: int, m: int) -> _Compared:
+    """Compare the cameras k and m of a track."""
+    own, spread = list(track.cameras.values()), _of_cameras(track, "orientation_cov")[:, [k, m]].sum(1)
+    believed = [np.array([why == Reason.OK for why in own[c].reason]) for c in (k, m)]
+    turn = log(seen.R_lab_body[:, k] @ seen.R_lab_body[:, m].mT)
+    gaps = gaps_between([list(seen.cameras.values())[c] for c in (k, m)], [seen.centre_px[:, c] for c in (k, m)])
+    place_cov = torch.from_numpy(track.position_cov + np.nan_to_num(track.position_systematic_cov))
+    across = gaps.across_lab[..., None]
+    # Two lines of sight that are known equally well are apart by twice the deviation of their middle.
+    sigma_mm = 2 * (across.mT @ place_cov @ across)[:, 0, 0].sqrt()
+    return _Compared(
+        both=torch.from_numpy(believed[0] & believed[1]),
+        turn=turn,
+        away=(turn * solve_damped(spread, turn)).sum(-1).sqrt(),
+        gaps=gaps,
+        apart=gaps.signed_mm.abs() / sigma_mm,
+    )
+
+
+def _excess(distance: Tensor, dimensions: int) -> float:
+    """Return the rms of distances (n,) over the expected one, at least 1; without those of over five medians."""
+    kept = distance[distance <= CONTRADICTS_SIGMAS * distance.nanmedian()]
+    return max(1.0, float((kept.square().mean() / dimensions).sqrt().nan_to_num(1.0)))
 
 
 def said_alone(
@@ -275,7 +316,7 @@ def said_alone(
         diameter_mm=diameter_mm,
         frame=torch.arange(len(track)) if consecutive else None,
     )
-    return seen, limits_of(seen, _of_cameras(track, "orientation_cov").nan_to_num())
+    return seen, limits_of(seen, _of_cameras(track, "orientation_cov"))
 
 
 def _of_cameras(track: Trajectory, name: str) -> Tensor:

@@ -78,6 +78,9 @@ def test_the_excerpt_meets_the_bars_of_the_paper_method(tracked):
     assert p95 <= 3.0
     assert p99 <= 5.0
     assert largest < 10
+    track = Trajectory.load(out)
+    assert (track.flags & Flag.CONTRADICTION > 0).sum() <= 2
+    assert track.provenance["remarks"] == []
     p50, p95, _, _ = score.percentiles_mm()
     assert p50 <= 0.10
     assert p95 <= 0.30

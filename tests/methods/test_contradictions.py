@@ -85,3 +85,29 @@ def test_frames_that_are_not_valid_get_no_flag():
     track = replace(track_of({"cam1": 1.0}, {}), valid=np.arange(FRAMES) % 2 == 0)
     marked, _ = with_contradictions(track, CAMERAS, MM, True)
     np.testing.assert_array_equal(marked.flags > 0, track.valid)
+
+
+def test_cameras_that_scatter_more_than_they_state_scale_all_errors_but_for_a_frame_of_their_own():
+    track = track_of({}, {})
+    rng = np.random.default_rng(3)
+    turned = so3.exp(torch.from_numpy(rng.normal(0, 1.4 * math.sqrt(2) * SIGMA_RAD, (FRAMES, 3))))
+    off = rng.normal(0, 0.06, FRAMES)
+    off[5] = 3.0  # a frame apart: marked, and without effect on the others
+    cam1 = track.cameras["cam1"]
+    shifted = cam1.centre_px + off[:, None] * np.array([1.0, 0.0])
+    cam1 = replace(cam1, orientation=(turned @ torch.from_numpy(cam1.orientation)).numpy(), centre_px=shifted)
+    marked, _ = with_contradictions(replace(track, cameras=track.cameras | {"cam1": cam1}), CAMERAS, MM, True)
+    usual = np.delete(np.arange(FRAMES), 5)
+    assert not marked.flags[usual].any()
+    assert marked.flags[5] == Flag.CONTRADICTION
+    sigma_rad, sigma_mm = np.sqrt(marked.orientation_cov[usual, 0, 0]), np.sqrt(marked.position_cov[usual, 0, 0])
+    np.testing.assert_allclose(sigma_rad / (SIGMA_RAD / math.sqrt(2)), 1.4, rtol=0.2)
+    np.testing.assert_allclose(sigma_mm, 0.5 * 0.06 * MM / (2 * cam1.radius_px[usual]), rtol=0.4)
+
+
+def test_cameras_that_state_no_error_of_their_own_do_not_contradict_each_other():
+    track = track_of({"cam1": 3.0}, {})
+    silent = {name: replace(one, orientation_cov=one.orientation_cov * np.nan) for name, one in track.cameras.items()}
+    marked, _ = with_contradictions(replace(track, cameras=silent), CAMERAS, MM, True)
+    assert not marked.flags.any()
+    np.testing.assert_array_equal(marked.orientation_cov, track.orientation_cov)
