@@ -58,9 +58,12 @@ class Appearance:
     @property
     def clear_score(self) -> float:
         """Score of a typical right pose; out of reach for blurred pictures."""
-        optics = self.fitter.optics
-        soft = defocus_radii(optics.blur_px, widest_px(self.fitter.views))
-        return ALWAYS if soft else max(self.score_min, _clear_of(self.right_score))
+        return ALWAYS if self.soft else max(self.score_min, _clear_of(self.right_score))
+
+    @property
+    def soft(self) -> bool:
+        """Whether the pictures are out of focus; the model of blur then errs by more than noise, and is not stated."""
+        return defocus_radii(self.fitter.optics.blur_px, widest_px(self.fitter.views)) > 0
 
 
 def estimate_appearance(

@@ -178,6 +178,9 @@ class Initialiser:
             fit = fitter.fit(pixels, X, R, use.expand(len(R), -1), level, iterations, held)
             fit = replace(fit, nll=explaining_first(fit, use))
             chosen = distinct_indices(fit.R_lab_body, fit.nll, keep)
+            if not len(chosen):
+                lost = [Reason.LOW_SCORE if used else why for used, why in zip(use, frame.reason, strict=True)]
+                return no_pose(len(use), lost)
             X, R = fit.position_lab_mm[chosen], fit.R_lab_body[chosen]
             place = X[:1]
         hidden = [bool(used) and bool(fitter.shows_unknown(k, X[:1], R[:1]).any()) for k, used in enumerate(use)]

@@ -20,6 +20,7 @@ from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of
+from sphereorient.pose.fit import trace
 from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance, log, solve_damped
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
@@ -30,6 +31,7 @@ TWO_BALLS = (
 )
 ELSEWHERE = [str(Reason.CONTRADICTS), str(Reason.SECOND_BALL)]  # a camera that measures the sphere at another place
 CONTRADICTS_SIGMAS = 5.0  # of the difference of what two cameras say alone: no noise
+EXCESS = 6.0  # of an error over that of noise alone; 1.3 of rendered pictures, 4 after compression (crf 28)
 
 
 def paper_camera(sightings: Sightings, candidates: Candidates, path: Path) -> CameraTrack:
@@ -87,7 +89,7 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
     tells = torch.tensor([why[place] in (Reason.OK, Reason.CONTRADICTS) for why in table.reason], dtype=torch.bool)
     position, R = picked["position_lab_mm"] + picked["own_move"][:, place], picked["R_lab_body"]
     position = torch.where(tells[:, None], position, picked["position_lab_mm"])
-    centre_px = view.camera.project(position)
+    centre_px, radius_px = view.camera.project(position), view.radius_px(position, learnt.fitter.radius_mm)
     counts = table.mask.sum(-1)
     shown = tells & torch.isfinite(position[:, 0])
     where = shown[:, None, None]
@@ -104,7 +106,8 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
     return replace(
         CameraTrack.empty(frames),
         centre_px=centre_px.numpy(),
-        radius_px=view.radius_px(position, learnt.fitter.radius_mm).numpy(),
+        centre_sigma_px=(picked["own_sigma_mm"][:, place] * radius_px / learnt.fitter.radius_mm).numpy(),
+        radius_px=radius_px.numpy(),
         orientation=torch.where(where, exp(picked["own_turn"][:, place]) @ R, torch.nan).numpy(),
         orientation_cov=torch.where(where, picked["own_covariance"][:, place], torch.nan).numpy(),
         score=picked["score"][:, place].numpy(),
@@ -208,7 +211,9 @@ def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], l
     # Halfway between the least and the usual score of a right pose.
     poor = 0.5 * (learnt.score_min + learnt.right_score)
     best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
-    doubtful = found & (best < poor)
+    # Errors that scatter by this much more than noise lets them come from a model that is wrong, the map for example.
+    excess = torch.where(table.use, picked["excess"], torch.inf).amin(-1)
+    doubtful = found & ((best < poor) | (excess > EXCESS) | learnt.soft)
     bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: found & learnt.second_ball}
     return torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0)
 
@@ -245,23 +250,28 @@ def with_contradictions(
     turns = torch.cat([pair.away[pair.both & ~wrong] for pair in pairs])
     places = torch.cat([pair.apart[pair.both & ~wrong] for pair in pairs])
     turn_scale, place_scale = _excess(turns, 3), _excess(places, 1)
-    scaled = {
-        f"{name}{kind}_cov": getattr(track, f"{name}{kind}_cov") * scale**2
-        for name, scale in (("orientation", turn_scale), ("position", place_scale))
-        for kind in ("", "_smooth")
-    }
-    place_cov, turn_cov = torch.from_numpy(scaled["position_cov"]), torch.from_numpy(scaled["orientation_cov"])
+    unit = torch.eye(3, dtype=torch.float64)
+    scaled: dict[str, Tensor] = {}
+    for kind in ("_cov", "_smooth_cov"):
+        place, turn = (torch.from_numpy(getattr(track, name + kind)) for name in ("position", "orientation"))
+        # Where the place is off, the same paint is seen with the sphere turned by as much.
+        rolled = (place_scale**2 - 1) * trace(place) / 3 / (diameter_mm / 2) ** 2
+        scaled["position" + kind] = place_scale**2 * place
+        scaled["orientation" + kind] = turn_scale**2 * turn + rolled[:, None, None] * unit
+    place_cov, turn_cov = scaled["position_cov"], scaled["orientation_cov"]
     for pair in pairs:
         # The mean of two is off by half of the contradiction if either is wrong, a single one by all of it.
         turn = torch.where(pair.both, 0.5, 1.0)[:, None] * pair.turned[:, None] * pair.turn.nan_to_num()
         gap_mm = 0.5 * (pair.apart > CONTRADICTS_SIGMAS * place_scale) * pair.gaps.signed_mm.nan_to_num()
         shift_mm = (pair.gaps.position_lab_mm - torch.from_numpy(track.position)).nan_to_num()
         shift_mm = torch.where(pair.both[:, None], 0.0, shift_mm)
-        for whole, off in ((turn_cov, turn), (place_cov, gap_mm[:, None]), (place_cov, shift_mm)):
+        rolled = gap_mm[:, None] / (diameter_mm / 2)
+        for whole, off in ((turn_cov, turn), (turn_cov, rolled), (place_cov, gap_mm[:, None]), (place_cov, shift_mm)):
             # In all directions: that of the error is not known as well as its size.
-            whole += off.square().sum(-1)[:, None, None] * torch.eye(3, dtype=torch.float64)
+            whole += off.square().sum(-1)[:, None, None] * unit
     flags = track.flags | np.where(wrong.numpy() & track.valid, np.uint32(Flag.CONTRADICTION), np.uint32(0))
-    return replace(track, flags=flags, **scaled), compare_cameras(seen, limits)
+    stated: dict[str, Any] = {name: whole.numpy() for name, whole in scaled.items()}
+    return replace(track, flags=flags, **stated), compare_cameras(seen, limits)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -281,20 +291,22 @@ class _Compared:
 
 def _compared(track: Trajectory, seen: Seen, k: int, m: int) -> _Compared:
     """Compare the cameras k and m of a track."""
+    radius_mm = seen.diameter_mm / 2
     own, spread = list(track.cameras.values()), _of_cameras(track, "orientation_cov")[:, [k, m]].sum(1)
     believed = [np.array([why == Reason.OK for why in own[c].reason]) for c in (k, m)]
     turn = log(seen.R_lab_body[:, k] @ seen.R_lab_body[:, m].mT)
     gaps = gaps_between([list(seen.cameras.values())[c] for c in (k, m)], [seen.centre_px[:, c] for c in (k, m)])
-    place_cov = torch.from_numpy(track.position_cov + np.nan_to_num(track.position_systematic_cov))
-    across = gaps.across_lab[..., None]
+    across, known = gaps.across_lab[..., None], torch.from_numpy(np.nan_to_num(track.position_systematic_cov))
     # Two lines of sight that are known equally well are apart by twice the deviation of their middle.
-    sigma_mm = 2 * (across.mT @ place_cov @ across)[:, 0, 0].sqrt()
+    variance = 4 * (across.mT @ known @ across)[:, 0, 0]
+    for c in (k, m):
+        variance = variance + (_of_cameras(track, "centre_sigma_px") / seen.radius_px)[:, c].square() * radius_mm**2
     return _Compared(
         both=torch.from_numpy(believed[0] & believed[1]),
         turn=turn,
         away=(turn * solve_damped(spread, turn)).sum(-1).sqrt(),
         gaps=gaps,
-        apart=gaps.signed_mm.abs() / sigma_mm,
+        apart=gaps.signed_mm.abs() / variance.sqrt(),
     )
 
 

@@ -32,7 +32,8 @@ class FittedPoses:
     own_turn: Tensor  # (L, C, 3), rad: rotation of the pose by each camera alone, position held
     own_covariance: Tensor  # (L, C, 3, 3), rad^2
     own_move: Tensor  # (L, C, 3), mm, lab: how each camera alone would move the sphere, distance by size included
-    deviation: Tensor  # (L, C), robust standard deviation of the residuals over the noise expected
+    own_sigma_mm: Tensor  # (L, C), of the sphere's place by each camera alone, across its line of sight
+    excess: Tensor  # (L, C), standard deviation of the own rotation over that of independent noise; 1 of a right model
     score: Tensor  # (L, C), 1 less the share of the picture's variance that is left; 0 of hardly any known paint
     nll: Tensor  # (L), negative log-likelihood of all pixels, as if they were independent
     step: Tensor  # (L, 6), the last one of the fit
@@ -58,7 +59,12 @@ POSE_PARTS = tuple(field.name for field in fields(FittedPoses))
 def blank_parts(cameras: int, *shape: int) -> dict[str, Tensor]:
     """Return arrays of `FittedPoses` of a leading shape: zeros, and the unit rotation."""
     tails = {"position_lab_mm": (3,), "R_lab_body": (3, 3), "covariance": (6, 6), "own_turn": (cameras, 3)}
-    tails |= {"own_covariance": (cameras, 3, 3), "own_move": (cameras, 3), "deviation": (cameras,)}
+    tails |= {
+        "own_covariance": (cameras, 3, 3),
+        "own_move": (cameras, 3),
+        "own_sigma_mm": (cameras,),
+        "excess": (cameras,),
+    }
     tails |= {"score": (cameras,), "nll": (), "step": (6,)}
     parts = {name: torch.zeros(*shape, *tails[name], dtype=torch.float64) for name in POSE_PARTS}
     return parts | {"R_lab_body": parts["R_lab_body"] + torch.eye(3, dtype=torch.float64)}
@@ -125,7 +131,8 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         information[..., :3, :3], pull[..., :3] - (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
     )
     own = own - step[:, None, :3]
-    freed = (solve_damped(information, pull) - step[:, None]).flatten(0, 1)
+    freely = inverse_damped(information)
+    freed = ((freely @ pull[..., None])[..., 0] - step[:, None]).flatten(0, 1)
     alone = _bounded(freed, to_centre.flatten(0, 1)[:, None], freed.new_ones(len(freed), 1), radius_mm)
     shared = by_pose(_shared_scores(at, precision, mixed, pixels.tile), cameras)
     meat = (shared * seen[..., None, None]).sum(1)
@@ -133,11 +140,15 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         meat[:, 3:, 3:] += place_precision
     bread = inverse_damped(whole)
     own_bread = inverse_damped(information[..., :3, :3])
+    own_covariance = own_bread @ shared[..., :3, :3] @ own_bread
     # An edge that is EDGE_PX off moves the sphere along each line of sight.
     px_mm = pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * to_centre.flatten(0, 1).norm(dim=-1, keepdim=True)
     edge = to_centre * (EDGE_PX * by_pose(px_mm, cameras) / radius_mm) * seen[..., None]
     lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
     covariance = bread @ meat @ bread + lured.mT @ lured
+    sight = torch.nn.functional.normalize(to_centre, dim=-1)[..., None]
+    place = (freely @ shared @ freely)[..., 3:, 3:]
+    across = trace(place) - (sight.mT @ place @ sight)[..., 0, 0]
     told = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge
     covariance = torch.where(told[:, None, None], 0.5 * (covariance + covariance.mT), bread)
     loss = by_pose(_loss(at, pixels.inside), cameras)
@@ -147,8 +158,9 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         covariance=covariance,
         own_turn=own,
         own_move=by_pose(alone[:, 3:], cameras),
-        own_covariance=own_bread @ shared[..., :3, :3] @ own_bread,
-        deviation=by_pose(at.deviation.double(), cameras),
+        own_covariance=own_covariance,
+        own_sigma_mm=(across.clamp_min(0) / 2).sqrt(),
+        excess=(trace(own_covariance) / trace(own_bread).clamp_min(1e-30)).sqrt(),
         score=by_pose(_score(at).double(), cameras),
         nll=(loss * seen).sum(1),
         step=step,
@@ -241,6 +253,11 @@ def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Te
     mixed = torch.linalg.solve(light, normal[:, 6:, :6])
     information = normal[:, :6, :6] - normal[:, :6, 6:] @ mixed
     return information, gradient[:, :6] - (mixed.mT @ gradient[:, 6:, None])[..., 0], mixed
+
+
+def trace(matrix: Tensor) -> Tensor:
+    """Return the traces (...) of matrices (..., n, n)."""
+    return matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
 
 
 def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) -> Tensor:

@@ -44,6 +44,9 @@ class CameraTrack:
     """Results of one camera in N frames; candidates of frame k are rows offset[k] .. offset[k + 1]."""
 
     centre_px: Floats = stored("px", "projection of the sphere's centre, (u, v)", 2)
+    centre_sigma_px: Floats = stored(
+        "px", "standard deviation of centre_px in any direction, of noise and paint", since="0.3"
+    )
     radius_px: Floats = stored("px", "radius of the outline")
     outline_rms_px: Floats = stored("px", "rms distance of the edge points from the fitted outline")
     orientation: Floats = stored("1", "R_lab_body of this camera's own best candidate", 3, 3)

@@ -29,10 +29,13 @@ def track_of(turn_deg: dict[str, float], shift_px: dict[str, float], why: Reason
     for name, camera in CAMERAS.items():
         turn = so3.exp(torch.tensor([math.radians(turn_deg.get(name, 0.0)), 0.0, 0.0]).double())
         off = torch.tensor([shift_px.get(name, 0.0), 0.0]).double()
+        radius_px = sphere_radius_px(camera, X, MM / 2).numpy()
         cameras[name] = replace(
             track.cameras[name],
             centre_px=(camera.project(X) + off).numpy(),
-            radius_px=sphere_radius_px(camera, X, MM / 2).numpy(),
+            # The middle of two sights of equal error is known to 1e-3 mm.
+            centre_sigma_px=math.sqrt(2) * 1e-3 * radius_px / (MM / 2),
+            radius_px=radius_px,
             orientation=(turn @ R).numpy(),
             orientation_cov=np.broadcast_to(SIGMA_RAD**2 * np.eye(3), (FRAMES, 3, 3)).copy(),
             reason=(why if name == "cam2" else Reason.OK,) * FRAMES,
@@ -101,7 +104,8 @@ def test_cameras_that_scatter_more_than_they_state_scale_all_errors_but_for_a_fr
     assert not marked.flags[usual].any()
     assert marked.flags[5] == Flag.CONTRADICTION
     sigma_rad, sigma_mm = np.sqrt(marked.orientation_cov[usual, 0, 0]), np.sqrt(marked.position_cov[usual, 0, 0])
-    np.testing.assert_allclose(sigma_rad / (SIGMA_RAD / math.sqrt(2)), 1.4, rtol=0.2)
+    rolled_rad = np.sqrt(sigma_mm**2 - 1e-6) / (MM / 2)  # the same paint at another place
+    np.testing.assert_allclose(sigma_rad, np.hypot(1.4 * SIGMA_RAD / math.sqrt(2), rolled_rad), rtol=0.1)
     np.testing.assert_allclose(sigma_mm, 0.5 * 0.06 * MM / (2 * cam1.radius_px[usual]), rtol=0.4)
 
 

@@ -33,7 +33,8 @@ FORMAT_SHAPES |= {
 }
 MOTIONS = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
 FORMAT_SHAPES |= {f"{name}{end}": (3,) for name in MOTIONS for end in ("", "_sigma")}
-FORMAT_CAMERA = {"centre_px", "radius_px", "outline_rms_px", "orientation", "orientation_cov", "score", "xi", "reason"}
+FORMAT_CAMERA = {"centre_px", "centre_sigma_px", "radius_px", "outline_rms_px", "orientation", "orientation_cov"}
+FORMAT_CAMERA |= {"score", "xi", "reason"}
 FORMAT_CAMERA |= {"candidates/offset", "candidates/orientation", "candidates/score"}
 
 
@@ -61,6 +62,7 @@ def full_trajectory() -> Trajectory:
     camera = replace(
         CameraTrack.empty(FRAMES),
         centre_px=rng.standard_normal((FRAMES, 2)),
+        centre_sigma_px=rng.random(FRAMES),
         reason=(Reason.OK, Reason.DARK, Reason.OK, Reason.NOT_FOUND, Reason.DARK, Reason.UNDECODABLE, Reason.OK),
         candidate_offset=np.array([0, 2, 2, 3, 3, 3, 3, 5]),
         candidate_orientation=rng.standard_normal((5, 3, 3)),
