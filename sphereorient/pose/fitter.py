@@ -20,7 +20,7 @@ from sphereorient.pose.fit import KNOWN, FittedPoses, PoseStart, learn_light, re
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
 from sphereorient.sphere import orthographic_view
-from sphereorient.sphere.texture_table import BASE_RAD, TextureTable, texture_table
+from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 
 Picture = NDArray[np.generic]
 Record = TypeVar("Record", Pixels, PoseStart, FittedPoses, Light)
@@ -31,6 +31,7 @@ CPU = torch.device("cpu")
 FINEST_PX = 0.4  # least blur of any picture, px: a pixel alone has 0.29
 COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
 SOFT, SOFT_PX = 0.06, 1.5  # radii, px: templates of pictures that are blurred by more than both are blurred as well
+FINER_SIDES = 2  # of the usual table, for disks of over 100 px: 16 MB
 FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a good lens
 CALM_PX = 1.0  # blur that is laid over pictures first, against noise
 AROUND = 1.2  # of the radius: the sphere and its rim
@@ -207,7 +208,9 @@ def base_table(texture: Tensor, diameter_px: float, unseen: Tensor | None = None
     """Return the finest table of a map that disks of some diameter resolve; all others are blurred from it.
     `unseen` (H, 2 H) bool: texels that are no paint.
     """
-    return texture_table(texture, max(BASE_RAD, FINEST_PX * 2 / diameter_px), unseen=unseen)
+    blur_rad = max(FINEST_PX * 2 / diameter_px, BASE_RAD / FINER_SIDES)
+    finer = 1 << max(0, math.ceil(math.log2(BASE_RAD / blur_rad)))  # large disks resolve smaller cells
+    return texture_table(texture, blur_rad, finer * SIDE, unseen)
 
 
 def first_fitter(views: Sequence[CameraView], radius_mm: float, base: TextureTable, blur_px: float) -> Fitter:
