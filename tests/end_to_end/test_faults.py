@@ -30,7 +30,7 @@ EXPECTED: dict[str, tuple[dict[str, dict[str, int]], int]] = {
 
 def rows_of(*more: str) -> dict[str, dict[str, Any]]:
     words = [sys.executable, REPO / "scripts" / "faults.py", "--json", *more]
-    run = subprocess.run(words, capture_output=True, text=True, timeout=560, check=False)
+    run = subprocess.run(words, capture_output=True, text=True, timeout=1500, check=False)
     assert run.returncode == 0, run.stderr
     told = json.loads(run.stdout)
     return {row["fault"]: row | {"clean_worst_deg": told["clean_worst_deg"]} for row in told["rows"]}
