@@ -37,7 +37,7 @@ BLOCK = 16  # frames; short, so that a short movie has blocks without the fault
 RATE = 600.0
 CAMERAS = ("cam1", "cam2")
 Pictures = dict[str, NDArray[np.uint8]]
-OWN = ("position", "position_cov", "orientation", "orientation_cov")
+OWN = ("position", "orientation")  # stated errors follow the disagreement of the cameras in the whole movie
 SEEN = ("score", "centre_px", "orientation", "orientation_cov")
 
 

@@ -257,7 +257,7 @@ def with_contradictions(
         # Where the place is off, the same paint is seen with the sphere turned by as much.
         rolled = (place_scale**2 - 1) * trace(place) / 3 / (diameter_mm / 2) ** 2
         scaled["position" + kind] = place_scale**2 * place
-        scaled["orientation" + kind] = turn_scale**2 * turn + rolled[:, None, None] * unit
+        scaled["orientation" + kind] = turn_scale**2 * turn + rolled.nan_to_num()[:, None, None] * unit
     place_cov, turn_cov = scaled["position_cov"], scaled["orientation_cov"]
     for pair in pairs:
         # The mean of two is off by half of the contradiction if either is wrong, a single one by all of it.

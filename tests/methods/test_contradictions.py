@@ -115,3 +115,11 @@ def test_cameras_that_state_no_error_of_their_own_do_not_contradict_each_other()
     marked, _ = with_contradictions(replace(track, cameras=silent), CAMERAS, MM, True)
     assert not marked.flags.any()
     np.testing.assert_array_equal(marked.orientation_cov, track.orientation_cov)
+
+
+def test_a_frame_without_a_place_keeps_the_errors_of_its_orientation():
+    track = track_of({}, {"cam1": 0.1})
+    lost = replace(track, position_cov=np.where(np.arange(FRAMES)[:, None, None] < 2, np.nan, track.position_cov))
+    marked, _ = with_contradictions(lost, CAMERAS, MM, True)
+    np.testing.assert_array_equal(marked.orientation_cov[:2], track.orientation_cov[:2])
+    assert (marked.orientation_cov[2:, 0, 0] > track.orientation_cov[2:, 0, 0]).all()
