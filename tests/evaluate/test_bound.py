@@ -70,6 +70,7 @@ def test_rotations_about_view_x_move_a_horizontal_border():  # convention
     assert float(found[4]) > 1.5 * float(found[3])  # v sees the line and the outline, u the outline alone
 
 
+@pytest.mark.slow
 def test_the_scatter_of_least_squares_is_the_bound(patches):  # oracle
     noise, draws, radius_px = 0.05, 300, 12.0
     disk = disk_renderer(patches.double(), 2 * radius_px, COARSE)

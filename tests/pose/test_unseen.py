@@ -40,6 +40,7 @@ def rms_deg(found) -> float:
     return math.degrees(float(turn_errors(found, R).square().sum(-1).mean().sqrt()))
 
 
+@pytest.mark.slow
 def test_what_the_map_holds_there_moves_nothing(pixels, known):
     white = fit(pixels, 1.0, known=True)
     apart = so3.geodesic_distance(known.R_lab_body, white.R_lab_body)
