@@ -17,7 +17,7 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, best_poses, pose_table, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
-from sphereorient.pose.fit import FittedPoses
+from sphereorient.pose.fit import FittedPoses, trace
 from sphereorient.pose.fitter import FINEST_PX, Fitter, Optics, Picture, defocus_radii, level_of, widest_px
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture_table import TextureTable
@@ -131,7 +131,7 @@ def estimate_appearance(
 
 def limits_of(seen: Seen, covariance_rad2: Tensor) -> Limits:
     """Return how far apart cameras that agree may be; covariance (N, C, 3, 3) of each camera's rotation."""
-    sigma_deg = math.degrees(float(covariance_rad2.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().nanmedian()))
+    sigma_deg = math.degrees(float(trace(covariance_rad2).sqrt().nanmedian()))
     return Limits(
         gap_px=GAP_PX,
         turn_deg=max(TURN_DEG, math.sqrt(2) * TURN_SIGMAS * sigma_deg if math.isfinite(sigma_deg) else 0.0),

@@ -30,12 +30,8 @@ CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of differe
 AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
 MOVE_SHARE = 0.3  # of the radius: largest move of the sphere of unknown motion
 ASTRAY_SHARE = 0.01  # of the radius: largest error of an extrapolated position
-OWN = (
-    "own_covariance",
-    "own_sigma_mm",
-    "excess",
-    "score",
-)  # what a camera alone gives, beside rotation and move from the pose
+# What a camera alone gives, beside rotation and move from the pose.
+OWN = ("own_covariance", "own_sigma_mm", "excess", "score")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
