@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -13,12 +14,14 @@ from sphereorient import so3
 from sphereorient.cameras import R_cam_view
 from sphereorient.follow.poses import Poses, no_pose, poses_of
 from sphereorient.locate import Found, Frame, LocateSettings, Positions, find_ball, find_positions, sightings_of
-from sphereorient.locate.outline import Outline, find_blobs, fit_outline
+from sphereorient.locate.outline import Blob, Outline, find_blobs, fit_outline
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import CameraView, Fitter, Picture
 from sphereorient.search.candidates import Proposer
 from sphereorient.search.normalisation import crop_disk
 from sphereorient.trajectory import Reason
+
+Place = TypeVar("Place", Blob, Outline)
 
 DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin
 PLACE_SHARE = 0.03  # of the radius: how far an outline's centre may be off, dark rims included
@@ -104,13 +107,15 @@ class Initialiser:
     def _claimants(self, picture: Picture, view: CameraView) -> int:
         difference, scene, settings = view.background.difference(picture), view.background, self.locating
         blobs = find_blobs(difference, scene.noise, view.diameter_px, settings)
-        blobs = [blob for blob in blobs if blob.merit > RIVAL_BLOB * blobs[0].merit]
-        outlines: list[Outline] = []
-        for blob in blobs if len(blobs) > 1 else []:
-            one = fit_outline(difference, scene.typical_noise, blob, view.diameter_px, settings, scene.shown)
-            if one is not None and one.painted and one.coverage >= settings.coverage_min:
-                apart = (math.hypot(one.u_px - other.u_px, one.v_px - other.v_px) for other in outlines)
-                outlines += [one] if all(gap > one.radius_px for gap in apart) else []
+        blobs = _apart([blob for blob in blobs if blob.merit > RIVAL_BLOB * blobs[0].merit], view.diameter_px / 2)
+        if len(blobs) < 2:
+            return 1
+        fits = (
+            fit_outline(difference, scene.typical_noise, blob, view.diameter_px, settings, scene.shown)
+            for blob in blobs
+        )
+        round_ones = [one for one in fits if one is not None and one.painted and one.coverage >= settings.coverage_min]
+        outlines = _apart(round_ones, view.diameter_px / 2)
         if len(outlines) < 2:
             return 1
         proposer = self.proposers[view.name]
@@ -189,6 +194,15 @@ class Initialiser:
             return poses_of(fit, chosen, use, frame.reason)
         reason = [Reason.UNSEEN if unknown else why for unknown, why in zip(hidden, frame.reason, strict=True)]
         return poses_of(fit, chosen, shown, reason)
+
+
+def _apart(places: Sequence[Place], radius_px: float) -> list[Place]:
+    """Return the places, best first, that lie more than a radius from all better ones."""
+    kept: list[Place] = []
+    for one in places:
+        if all(math.hypot(one.u_px - other.u_px, one.v_px - other.v_px) > radius_px for other in kept):
+            kept.append(one)
+    return kept
 
 
 def _best_score(poses: Poses) -> float:

@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from torch import Tensor
 
 from sphereorient.sphere.texture import spline_weights, texel_coordinates, texture_coordinates
-from sphereorient.sphere.texture_table import CHUNK, FIVE, SIDE, TextureTable, octahedral_directions, tangents
+from sphereorient.sphere.texture_table import CHUNK, SIDE, SQUARE_25, TextureTable, octahedral_directions, tangents
 from sphereorient.synth.textures import map_directions
 
 STEP_RAD = 0.002  # step of a table's finite differences
@@ -186,11 +186,10 @@ def blur_matrix(direction_body: Tensor, blur_rad: float, height: int) -> csr_mat
     right, up = tangents(direction_body)
     start = np.arange(0, len(direction_body) * READS + 1, READS)
     total = csr_matrix((len(direction_body), 2 * height * height))
-    for a, share_a in zip(*FIVE, strict=True):
-        for b, share_b in zip(*FIVE, strict=True):
-            place, weight = texel_weights(direction_body + blur_rad * (a * right + b * up), height)
-            entries = (share_a * share_b * weight).reshape(-1).numpy()
-            total = total + csr_matrix((entries, place.reshape(-1).numpy(), start), shape=total.shape)
+    for a, b, share in SQUARE_25:
+        place, weight = texel_weights(direction_body + blur_rad * (a * right + b * up), height)
+        entries = (share * weight).reshape(-1).numpy()
+        total = total + csr_matrix((entries, place.reshape(-1).numpy(), start), shape=total.shape)
     return total
 
 

@@ -1,7 +1,7 @@
 """Tables of the texture map over directions: paint for banks, value and slope for fits."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -12,10 +12,15 @@ from sphereorient.sphere.texture import reduced_texture, sample_texture
 
 # Nodes and weights of the 5-point and 3-point Gauss-Hermite rules for a unit normal.
 FIVE = (
-    (-2.8569700138728, -1.3556261799742659, 0.0, 1.3556261799742659, 2.8569700138728),
-    (0.011257411327721, 0.22207592200561264, 0.5333333333333333, 0.22207592200561264, 0.011257411327721),
+    (-2.8569700138728, 0.011257411327721),
+    (-1.3556261799742659, 0.22207592200561264),
+    (0.0, 0.5333333333333333),
+    (1.3556261799742659, 0.22207592200561264),
+    (2.8569700138728, 0.011257411327721),
 )
-THREE = ((-math.sqrt(3.0), 0.0, math.sqrt(3.0)), (1 / 6, 2 / 3, 1 / 6))
+THREE = ((-math.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (math.sqrt(3.0), 1 / 6))
+# The same in the plane: right, up and weight of each node.
+SQUARE_25, SQUARE_9 = ([(a, b, p * q) for a, p in rule for b, q in rule] for rule in (FIVE, THREE))
 BASE_RAD = 0.008  # blur of the finest table: below half a pixel for disks up to 160 px
 CHUNK = 1 << 16  # directions per batch while a table is built
 STEPS = 127.0  # of a direction table: white paint; black is its negative
@@ -121,7 +126,7 @@ class TextureTable:
         parts = [torch.zeros(0, 4)]
         for centre in torch.split(octahedral_directions(side), CHUNK):
             value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
-            for share, _, at in _disk_nodes(centre, added, THREE):
+            for share, _, at in _disk_nodes(centre, added, SQUARE_9):
                 v, g = self.sample(at.T[None])
                 value, slope = value + share * v[0], slope + share * g[0].T
             parts.append(_rows(value, slope, centre.float()))
@@ -139,7 +144,7 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Te
     parts = [torch.zeros(0, 4)]
     for centre in torch.split(octahedral_directions(side), CHUNK):
         value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
-        for share, offset, at in _disk_nodes(centre, finest, FIVE):
+        for share, offset, at in _disk_nodes(centre, finest, SQUARE_25):
             v = sample_texture(reduced, at)
             value = value + share * v
             slope = slope + share * v[:, None] * offset / finest**2
@@ -148,15 +153,14 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Te
 
 
 def _disk_nodes(
-    centre: Tensor, width: float, rule: tuple[tuple[float, ...], tuple[float, ...]]
+    centre: Tensor, width: float, rule: Sequence[tuple[float, float, float]]
 ) -> Iterator[tuple[float, Tensor, Tensor]]:
     """Yield weight, tangent offset (M, 3) and direction (M, 3) of the nodes of a Gaussian about directions (M, 3)."""
     right, up = tangents(centre)
-    for a, share_a in zip(*rule, strict=True):
-        for b, share_b in zip(*rule, strict=True):
-            offset = width * (a * right + b * up)
-            at = torch.nn.functional.normalize(centre + offset, dim=-1)
-            yield share_a * share_b, offset.float(), at.float()
+    right, up, centre = (width * right).float(), (width * up).float(), centre.float()
+    for a, b, share in rule:
+        offset = a * right + b * up
+        yield share, offset, (centre + offset) / math.hypot(1.0, width * math.hypot(a, b))
 
 
 def tangents(direction: Tensor) -> tuple[Tensor, Tensor]:
