@@ -175,7 +175,10 @@ def test_the_table_is_pinned_to_the_renderer(kind):
     table = TemplateBank(texture_of(kind), size, settings)
     kornia = TemplateBank(texture_of(kind), size, settings.model_copy(update={"renderer": "kornia"}))
     paint, about = table.paint(disks), so3.random_rotations(20, generator=torch.Generator().manual_seed(3)).float()
-    T = [0.5 + bank._rendered(about) @ paint[:, bank._real].T / (254 * bank._real.sum()) for bank in (table, kornia)]
+    T = [
+        0.5 + bank._rendered(about, bank._real) @ paint[:, bank._real].T / (254 * bank._real.sum())
+        for bank in (table, kornia)
+    ]
     assert (T[0] - T[1]).abs().max() < 0.01
     assert (T[1].T - kornia.quality(paint[:, None], about)).abs().max() < 1e-3
     best = [bank.propose(disks) for bank in (table, kornia)]
