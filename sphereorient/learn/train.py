@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader
 from sphereorient import __version__
 from sphereorient.errors import CheckpointError, SettingsError, refusal
 from sphereorient.experiment.recording import Progress, silent
-from sphereorient.files.whole_file import make_folder, put_aside
+from sphereorient.files.whole_file import make_folder, put_aside, writing
 from sphereorient.learn import metrics
 from sphereorient.learn.checkpoint import Checkpoint, correlator_of, load_checkpoint, save_checkpoint, texture_sha256
 from sphereorient.learn.metrics import WITHIN_DEG, Metrics, Predictions
@@ -240,7 +240,7 @@ def train_proposer(
     progress("draw maps", 0, 1)
     data = TrainingData(settings)
     progress("draw maps", 1, 1)
-    with _quiet_lightning():
+    with _quiet_lightning(), writing(force=resume):  # last.ckpt says whose folder it is
         stop = EarlyStopping("validation_nll", patience=settings.training.patience, mode="min")
         trainer = Trainer(
             accelerator="gpu" if torch.cuda.is_available() else "cpu",
@@ -283,7 +283,8 @@ def train_proposer(
             **{f"validation_{name}": value for name, value in asdict(measured).items() if name != "probability"},
         },
     )
-    save_checkpoint(out / CHECKPOINT, checkpoint)
+    with writing(force=resume):
+        save_checkpoint(out / CHECKPOINT, checkpoint)
     return Trained(checkpoint=checkpoint, metrics=measured, rows=tuple(kept.rows))
 
 

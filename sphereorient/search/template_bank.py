@@ -159,7 +159,7 @@ class TemplateBank(DiskSearch):
         for of, at in zip(torch.split(frame, batch), torch.split(starts, batch), strict=True):
             near = self._around @ at[:, None]  # (q, A, 3, 3)
             for pixels, keep in [*steps, (self._real, count)]:
-                template = self._rendered(near.flatten(0, 1), pixels).reshape(*near.shape[:2], -1)
+                template = self._rendered(near.flatten(0, 1), pixels).reshape(*near.shape[:2], int(pixels.sum()))
                 best = (template @ paint[of][:, pixels, None])[..., 0].topk(keep)
                 near = near[torch.arange(len(near))[:, None], best.indices]
             R.append(near.flatten(0, 1))
