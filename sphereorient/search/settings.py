@@ -39,11 +39,11 @@ class OrientSettings(BaseModel, frozen=True, extra="forbid"):
     )
     fine_step_deg: float = Field(3.0, gt=0.5, le=12, description="step of the fine grid; the paper's 3")
     fine_radius_deg: float = Field(
-        8.5,
+        12.0,
         gt=0,
         le=45,
-        description="reach of the fine grid about each possible orientation of a group: the coarse grid's covering "
-        "radius, 0.704 steps",
+        description="reach of the fine grid about each possible orientation of a group; the coarse grid's covering "
+        "radius is 8.5",
     )
     renderer: Literal["table", "kornia"] = Field(
         "table", description="who makes the fine grid's templates: a table that the renderer fills, or the renderer"
