@@ -127,7 +127,7 @@ def changes() -> dict[str, Change]:
         "leader by continuity": setting(2, "assemble.repair_margin=2.0"),
         "weights not limited": (2, (), limits_off),
         "omega from frame k to k + m": (2, (), lambda: patch.object(measure, "omega_from_orientations", forward)),
-        "fine grid to 12 degrees": setting(1, "orient.fine_radius_deg=12.0"),
+        "fine grid to 8.5 degrees": setting(1, "orient.fine_radius_deg=8.5"),
     }
 
 
