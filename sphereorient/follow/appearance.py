@@ -193,10 +193,9 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
         only = torch.zeros(len(tried), cameras, dtype=torch.bool)
         only[:, camera] = True
         X, R, _ = best_poses([found[k] for k in tried])
-        for level, step in ((fitter.optics.middle, 3), (fitter.optics.fine, 4)):
-            pixels = fitter.pixels([pictures[k] for k in tried], X, level).thinned(step)
-            fit = fitter.fit(pixels, X, R, only, level, 3)
-            X, R = fit.position_lab_mm, fit.R_lab_body
+        steps = ((fitter.optics.middle, 3, 3), (fitter.optics.fine, 4, 3))
+        fit = fitter.fit_through(steps, [pictures[k] for k in tried], X, R, only)
+        X, R = fit.position_lab_mm, fit.R_lab_body
         joint = torch.cat([found[k].score[:1, camera] for k in tried])
         gains.append((1 - joint) / (1 - fit.score[:, camera]).clamp_min(1e-6))
         rays.append(view.camera.rays(view.camera.project(X)))
@@ -220,11 +219,9 @@ def _seen_by_all(fitter: Fitter, shots: Sequence[Frame], poses: Poses) -> Poses:
     usable = torch.tensor([shot.usable for shot in shots])
     if not len(poses) or bool((poses.use == usable).all()):
         return poses
-    X, R, optics = poses.position_lab_mm, poses.R_lab_body, fitter.optics
-    for level, iterations in ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)):
-        pixels = fitter.pixels([[shot.picture for shot in shots]] * len(poses), X, level)
-        fit = fitter.fit(pixels, X, R, usable.expand(len(poses), -1), level, iterations)
-        X, R = fit.position_lab_mm, fit.R_lab_body
+    pictures = [[shot.picture for shot in shots]] * len(poses)
+    X, R, use = poses.position_lab_mm, poses.R_lab_body, usable.expand(len(poses), -1)
+    fit = fitter.fit_through(fitter.optics.steps, pictures, X, R, use)
     order = fit.nll.argsort(stable=True)
     if float(fit.score[order[0], usable].min()) < _clear_of(float(poses.score[0, poses.use].min())):
         return poses

@@ -17,7 +17,7 @@ from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import Fitter, Picture, PyramidLevel
+from sphereorient.pose.fitter import Fitter, Picture, Steps
 from sphereorient.pose.pixels import Pixels
 from sphereorient.trajectory import Reason
 
@@ -273,7 +273,7 @@ class ChunkTracker:
         frames, usable = [shot.picture for shot in shots], torch.tensor([shot.usable for shot in shots])
         if self.centre is not None:
             optics = self.fitter.optics
-            fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 3), (optics.fine, 4)))
+            fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 1, 3), (optics.fine, 1, 4)))
             order = explaining_first(fit, poses.use).argsort(stable=True)
             poses = poses_of(fit, order, poses.use, poses.reason)
         if bool((usable & ~poses.use).any()):
@@ -288,26 +288,20 @@ class ChunkTracker:
         if bool((seen == poses.use).all()) or not bool(seen.any()):
             # Keep all where no camera is sure: the path decides.
             return replace(poses, use=seen, reason=tuple(reason))
-        fit = self._looked_at(frames, poses, seen, ((self.fitter.optics.fine, 4),))
+        fit = self._looked_at(frames, poses, seen, ((self.fitter.optics.fine, 1, 4),))
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 
-    def _looked_at(
-        self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Sequence[tuple[PyramidLevel, int]]
-    ) -> FittedPoses:
-        """Fit M poses to the pictures in use, (C,) or (M, C), level by level with some iterations at each."""
-        X, R, count = poses.position_lab_mm, poses.R_lab_body, len(poses)
+    def _looked_at(self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Steps) -> FittedPoses:
+        """Fit M poses to the pictures in use, (C,) or (M, C), step by step."""
+        X, R, count = self._from(poses.position_lab_mm), poses.R_lab_body, len(poses)
         known = None if self.centre is None else self.centre.precision.expand(count, 3, 3)
-        for level, iterations in steps:
-            X = self._from(X)
-            pixels = self.fitter.pixels([frames] * count, X, level)
-            fit = self.fitter.fit(pixels, X, R, use.expand(count, -1), level, iterations, known)
-            X, R = fit.position_lab_mm, fit.R_lab_body
-        return fit
+        held = self.centre is not None
+        return self.fitter.fit_through(steps, [frames] * count, X, R, use.expand(count, -1), known, held)
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
         """Fit poses to each camera's picture alone; the first that supports one counts, the others contradict."""
         each = seen.expand(len(poses), -1)
-        steps = ((self.fitter.optics.fine, 4),)
+        steps = ((self.fitter.optics.fine, 1, 4),)
         alone = [self._looked_at(frames, poses, _only(each, k), steps) for k in range(len(seen))]
         right = [bool(seen[k]) and bool(self._supported(one, _only(each, k))[0]) for k, one in enumerate(alone)]
         if not any(right):
@@ -324,8 +318,7 @@ class ChunkTracker:
 
     def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
         """Fit poses to all pictures, kept if that explains all: a disk without an outline may be visible."""
-        optics = self.fitter.optics
-        fit = self._looked_at(frames, poses, usable, ((optics.coarse, 4), (optics.middle, 3), (optics.fine, 3)))
+        fit = self._looked_at(frames, poses, usable, self.fitter.optics.steps)
         order = fit.nll.argsort(stable=True)
         if not bool(self._supported(fit, usable.expand(len(poses), -1))[order[0]]):
             return poses

@@ -287,10 +287,10 @@ def recovered(crops: Crops, state: State, chain: Tensor) -> State:
     R = interpolated(chain, torch.nonzero(good)[:, 0], state.R_lab_body[good])[lost]
     X, use = state.position_lab_mm[lost], state.use[lost]
     fitter = state.map_fitter()
-    pictures = crops.pictures(state.frames[lost])
-    for level in (fitter.optics.coarse, fitter.optics.middle, fitter.optics.fine):
-        fit = fitter.fit(fitter.pixels(pictures, X, level), X, R, use, level, RECOVERY_ITERATIONS)
-        R, X = fit.R_lab_body, X if state.fixed else fit.position_lab_mm
+    levels = (fitter.optics.coarse, fitter.optics.middle, fitter.optics.fine)
+    steps = [(level, 1, RECOVERY_ITERATIONS) for level in levels]
+    fit = fitter.fit_through(steps, crops.pictures(state.frames[lost]), X, R, use, held=state.fixed)
+    R, X = fit.R_lab_body, X if state.fixed else fit.position_lab_mm
     better = _scores(fit, use) > score[lost]
     new_R, new_X = state.R_lab_body.clone(), state.position_lab_mm.clone()
     new_R[lost[better]], new_X[lost[better]] = R[better], X[better]

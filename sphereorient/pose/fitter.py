@@ -38,7 +38,6 @@ AROUND = 1.2  # of the radius: the sphere and its rim
 CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and scene lie
 STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
 
-STEPS = (("coarse", 4), ("middle", 3), ("fine", 4))  # pyramid levels, and iterations at each
 DISK_PX = 32  # of the disk on which the share of known paint is counted
 NOISE = 1.0  # grey levels, of a background of one grey
 
@@ -88,6 +87,9 @@ class PyramidLevel:
         return disk_stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)))
 
 
+Steps = Sequence[tuple[PyramidLevel, int, int]]  # of a fit: level, every n-th pixel, iterations
+
+
 class Optics:
     """Texture tables at the levels of blur of the fits: pictures of blur `blur_px` and disks of `diameter_px`, px."""
 
@@ -98,6 +100,11 @@ class Optics:
         self.fine = level_of(base, blur_px, 0.0, radius_px)
         self.middle = level_of(self.fine.paint, blur_px, MIDDLE * radius_px, radius_px)
         self.coarse = level_of(self.middle.paint, blur_px, COARSE * radius_px, radius_px)
+
+    @property
+    def steps(self) -> Steps:
+        """The steps of a fit from poses that are roughly right to all detail."""
+        return (self.coarse, 1, 4), (self.middle, 1, 3), (self.fine, 1, 4)
 
     def to(self, device: torch.device) -> "Optics":
         """Return the same with its tables on another device."""
@@ -195,6 +202,24 @@ class Fitter:
         )
         fit = refine(moved_to(self.device, pixels), moved_to(self.device, begin), self.model(level), iterations)
         return moved_to(CPU, fit)
+
+    def fit_through(
+        self,
+        steps: Steps,
+        pictures: Sequence[Sequence[Picture]],
+        position_lab_mm: Tensor,
+        R_lab_body: Tensor,
+        use: Tensor,
+        place_precision: Tensor | None = None,
+        held: bool = False,
+    ) -> FittedPoses:
+        """Refine B poses step by step; `held`: each from the first position."""
+        X, R = position_lab_mm, R_lab_body
+        for level, every, iterations in steps:
+            pixels = self.pixels(pictures, X, level).thinned(every)
+            fit = self.fit(pixels, X, R, use, level, iterations, place_precision)
+            X, R = X if held else fit.position_lab_mm, fit.R_lab_body
+        return fit
 
 
 def moved_to(device: torch.device, record: Record) -> Record:
@@ -329,9 +354,8 @@ class PoseFitter(nn.Module):
         R, X = R.reshape(-1, 3, 3), X.expand(*lead, 3).reshape(-1, 3)
         use = torch.ones(len(R), len(views), dtype=torch.bool)
         covariance = torch.zeros(len(R), 6, 6, dtype=torch.float64)
-        for name, iterations in STEPS if len(R) else ():
-            level = getattr(fitter.optics, name)
-            fit = fitter.fit(fitter.pixels(frames, X, level), X, R, use, level, iterations)
+        if len(R):
+            fit = fitter.fit_through(fitter.optics.steps, frames, X, R, use)
             R, X, covariance = fit.R_lab_body, fit.position_lab_mm, fit.covariance
         return R.reshape(*lead, 3, 3), X.reshape(*lead, 3), covariance.reshape(*lead, 6, 6)
 
