@@ -3,11 +3,11 @@
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import torch
 
-from sphereorient.calibration.consistency import FEWEST, compare_cameras
+from sphereorient.calibration.consistency import FEWEST, Limits, compare_cameras
 from sphereorient.errors import SphereOrientError
 from sphereorient.experiment import Experiment
 from sphereorient.methods.method import Learnt
@@ -20,7 +20,8 @@ from sphereorient.run import MemoryStore, Request, run
 from sphereorient.run.stages import opened
 
 TITLE, STOPS = "cameras agree", "a run stops"
-ENOUGH = 50  # frames of a movie that gives its own background
+FEW, SOME = 50, 100  # frames of a movie that gives its own background: too few to judge, enough to judge what is large
+LARGE = 2.0  # times what cameras that agree differ by
 
 
 def study(experiment: Experiment, settings: Settings) -> Learnt:
@@ -55,14 +56,17 @@ def cameras_agree(
     seen, limits = said_alone(track, experiment.cameras, 2 * experiment.radius_mm, consecutive=True)
     position = torch.from_numpy(track.position)
     wider = [outline_stretch(sample, position, experiment.radius_mm) for sample in stretch]
-    found = compare_cameras(replace(seen, outline_stretch=torch.stack(wider, 1)), limits)
+    seen = replace(seen, outline_stretch=torch.stack(wider, 1))
+    found = compare_cameras(seen, limits)
     if found.frames < FEWEST or math.isnan(found.turn_deg):
         measured = f"cannot tell: both cameras show the ball and its paint in {found.frames} of {len(track)} frames"
         yield warning(TITLE, measured, "see the findings on the ball and on the map")
         return
     measured = f"{found} (median of {found.frames} frames)"
     total = len(stretch[0].stream)
-    if found.contradicts and total < ENOUGH and not set(experiment.movie_paths) <= set(experiment.background_paths):
+    large = Limits(**{name: LARGE * limit for name, limit in asdict(limits).items()})
+    short = total < FEW or (total < SOME and not compare_cameras(seen, large).contradicts)
+    if found.contradicts and short and not set(experiment.movie_paths) <= set(experiment.background_paths):
         # A short movie leaves a trace of the ball in its own background, which moves poses.
         advice = "give backgrounds:, or check more frames"
         yield warning(TITLE, f"cannot tell: {measured}, but the background is learnt from {total} frames", advice)
