@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.assemble import Chosen, Fused, Path
@@ -21,6 +22,7 @@ from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of
 from sphereorient.pose.fit import trace
+from sphereorient.pose.fitter import CameraView
 from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance, log, solve_damped
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
@@ -30,6 +32,7 @@ TWO_BALLS = (
     "hide one by `masks:`"
 )
 ELSEWHERE = [str(Reason.CONTRADICTS), str(Reason.SECOND_BALL)]  # a camera that measures the sphere at another place
+MISSED = [str(Reason.LOW_SCORE), str(Reason.OUTLINE), str(Reason.NOT_FOUND)]  # a usable picture shows no sphere
 CONTRADICTS_SIGMAS = 5.0  # of the difference of what two cameras say alone: no noise
 EXCESS = 6.0  # of an error over that of noise alone; 1.3 of rendered pictures, 4 after compression (crf 28)
 
@@ -127,7 +130,9 @@ def precise_track(
     picked = table.rows(chosen.choice)
     covariance = picked["covariance"]
     margin, angle = _margin(table, chosen.choice)
-    flags = chosen.flags | _fit_flags(table, chosen, picked, learnt)
+    cameras = {name: precise_camera(k, table, picked, learnt) for k, name in enumerate(names)}
+    missed = [_missed(view, cameras[view.name]) for view in learnt.fitter.views]
+    flags = chosen.flags | _fit_flags(table, chosen, picked, learnt, np.any(missed, axis=0))
     flags |= torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
     remarks = [TWO_BALLS] if learnt.second_ball else []
     return replace(
@@ -144,7 +149,7 @@ def precise_track(
         confidence=chosen.probability.numpy(),
         margin=margin.numpy(),
         margin_angle=angle.numpy(),
-        cameras={name: precise_camera(k, table, picked, learnt) for k, name in enumerate(names)},
+        cameras=cameras,
     )
 
 
@@ -204,8 +209,26 @@ def _margin(table: PoseTable, choice: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(there, best - table.nll[frame, place], torch.nan), torch.where(there, angle, torch.nan)
 
 
-def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], learnt: Appearance) -> Tensor:
-    """Return flags (N,) int64 of frames that one camera alone measured, of poor fits, and of a movie of two balls."""
+def _missed(view: CameraView, track: CameraTrack) -> NDArray[np.bool_]:
+    """Return in which frames, (N,), a camera should show the whole sphere where the others see it, and does not."""
+    low, high = track.centre_px - track.radius_px[:, None], track.centre_px + track.radius_px[:, None]
+    missed = np.isin(track.reason, MISSED) & (low >= 0).all(-1) & (high <= np.array(view.camera.image_size) - 1).all(-1)
+    if view.background.shown is not None:
+        u, v = track.centre_px[missed].round().astype(int).T
+        missed[missed] = view.background.shown[v, u]
+    return missed
+
+
+def _fit_flags(
+    table: PoseTable,
+    chosen: Chosen,
+    picked: Mapping[str, Tensor],
+    learnt: Appearance,
+    missed: NDArray[np.bool_],
+) -> Tensor:
+    """Return flags (N,) int64 of frames that one camera alone measured, of poor fits, and of a movie of two balls.
+    Where another camera should see the sphere and does not (`missed`), half of the poses are wrong.
+    """
     found = chosen.choice >= 0
     one = found & (table.use.sum(-1) == 1) & (table.use.shape[-1] > 1)
     # Halfway between the least and the usual score of a right pose.
@@ -213,7 +236,7 @@ def _fit_flags(table: PoseTable, chosen: Chosen, picked: Mapping[str, Tensor], l
     best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
     # Errors that scatter by this much more than noise lets them come from a model that is wrong, the map for example.
     excess = torch.where(table.use, picked["excess"], torch.inf).amin(-1)
-    doubtful = found & ((best < poor) | (excess > EXCESS) | learnt.soft)
+    doubtful = found & ((best < poor) | (excess > EXCESS) | learnt.soft | torch.from_numpy(missed))
     bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: found & learnt.second_ball}
     return torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0)
 

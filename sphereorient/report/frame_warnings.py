@@ -18,7 +18,7 @@ FLAG_WORDS = {
     Flag.ONE_CAMERA: "one camera only",
     Flag.REPAIRED_FROM_OTHER_CAMERA: "the cameras disagreed; one was repaired from the other",
     Flag.AMBIGUOUS: "another orientation fits nearly as well",
-    Flag.DOUBTFUL_FIT: "picture explained less well than usual",
+    Flag.DOUBTFUL_FIT: "picture explained less well than usual, or another camera does not show the ball",
     Flag.RECOVERED: "found again after a loss",
     Flag.SPIKE: "the orientation jumps",
     Flag.EXTRAPOLATED: "not measured; the smoother's value",

@@ -202,6 +202,7 @@ def test_when_one_camera_is_blind_the_other_goes_on_and_says_so(brisk, tmp_path,
     report(f"{name} blind for 20 frames", track, brisk)
     check_right(track, brisk, np.arange(len(brisk)))
     assert np.flatnonzero(track.flags & Flag.ONE_CAMERA).tolist() == blind.tolist()
+    assert np.flatnonzero(track.flags & Flag.DOUBTFUL_FIT).tolist() == blind.tolist()  # the ball should be seen there
     reasons = track.cameras[name].reason
     assert {reasons[k] for k in blind} <= {Reason.NOT_FOUND, Reason.LOW_SCORE}
     assert {reasons[k] for k in rest(brisk, blind)} == {Reason.OK}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,10 +12,10 @@ import torch
 
 from sphereorient import so3
 from sphereorient.cameras import sphere_radius_px
-from sphereorient.methods.results import with_contradictions
+from sphereorient.methods.results import _missed, with_contradictions
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
-from sphereorient.trajectory import Flag, Reason, Trajectory
+from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 CAMERAS = default_cameras(SynthSettings())
 FRAMES, MM, SIGMA_RAD = 12, 18.0, math.radians(0.02)
@@ -123,3 +124,31 @@ def test_a_frame_without_a_place_keeps_the_errors_of_its_orientation():
     marked, _ = with_contradictions(lost, CAMERAS, MM, True)
     np.testing.assert_array_equal(marked.orientation_cov[:2], track.orientation_cov[:2])
     assert (marked.orientation_cov[2:, 0, 0] > track.orientation_cov[2:, 0, 0]).all()
+
+
+@pytest.mark.parametrize(
+    ("why", "u_px", "shown", "missed"),
+    [
+        (Reason.LOW_SCORE, 300.0, None, True),
+        (Reason.NOT_FOUND, 300.0, None, True),
+        (Reason.OUTLINE, 300.0, np.ones((650, 650), bool), True),
+        (Reason.OUTLINE, 300.0, np.zeros((650, 650), bool), False),  # hidden by what stands there always
+        (Reason.LOW_SCORE, 30.0, None, False),  # the edge cuts the disk
+        (Reason.LOW_SCORE, 615.0, None, False),
+        (Reason.LOW_SCORE, math.nan, None, False),
+        (Reason.UNSEEN, 300.0, None, False),
+        (Reason.MISSING, 300.0, None, False),
+        (Reason.CONTRADICTS, 300.0, None, False),  # which has a flag of its own
+    ],
+)
+def test_a_camera_that_should_show_the_whole_ball_and_does_not_is_noticed(why, u_px, shown, missed):
+    camera = next(iter(CAMERAS.values()))
+    scene = SimpleNamespace(shown=shown)
+    track = replace(
+        CameraTrack.empty(2),
+        centre_px=np.array([[u_px, 250.0], [300.0, 250.0]]),
+        radius_px=np.full(2, 40.0),
+        reason=(str(why), str(Reason.OK)),
+    )
+    assert camera.image_size == (650, 650)
+    assert _missed(SimpleNamespace(camera=camera, background=scene), track).tolist() == [missed, False]
