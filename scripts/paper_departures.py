@@ -120,7 +120,7 @@ def changes() -> dict[str, Change]:
             ),
         ),
         "groups of 45 degrees": setting(1, "orient.group_deg=45.0"),
-        "no runaways": setting(1, "orient.groups_max=100000"),
+        "no runaways": setting(1, "orient.groups_max=1000"),
         "perspective removed after the path": (1, (), perspective_after),
         "spikes of any angle": setting(2, "assemble.spike_min_deg=0.001"),
         "no repair": setting(2, "assemble.repair_deg=180.0"),

@@ -37,6 +37,7 @@ def cameras_agree(
     """Track a stretch of consecutive frames from the first one on with what was learnt; yield findings on cameras and
     balls. `stretch` holds the frames of each camera.
     """
+    total = len(stretch[0].stream)
     try:
         learnt = learning.result()
         # Each camera alone: a pose of both lies between what they say.
@@ -48,7 +49,8 @@ def cameras_agree(
         track = run(request, MemoryStore())
     except SphereOrientError as error:
         measured, _, do = str(error).rpartition("; ")
-        yield judged(TITLE, f"{STOPS}: {measured}", (True, FAULT, do.rstrip(".")))
+        finding = judged(TITLE, f"{STOPS}: {measured}", (True, FAULT, do.rstrip(".")))
+        yield replace(unsure(finding, experiment, total), severity=FAULT)  # the run stops whatever the cause is
         return
     if learnt.second_ball:
         measured, _, do = TWO_BALLS.rpartition("; ")
@@ -63,12 +65,21 @@ def cameras_agree(
         yield warning(TITLE, measured, "see the findings on the ball and on the map")
         return
     measured = f"{found} (median of {found.frames} frames)"
-    total = len(stretch[0].stream)
     large = Limits(**{name: LARGE * limit for name, limit in asdict(limits).items()})
-    short = total < FEW or (total < SOME and not compare_cameras(seen, large).contradicts)
-    if found.contradicts and short and not set(experiment.movie_paths) <= set(experiment.background_paths):
-        # A short movie leaves a trace of the ball in its own background, which moves poses.
-        advice = "give backgrounds:, or check more frames"
-        yield warning(TITLE, f"cannot tell: {measured}, but the background is learnt from {total} frames", advice)
-        return
-    yield judged(TITLE, measured, (found.contradicts, FAULT, found.advice))
+    finding = judged(TITLE, measured, (found.contradicts, FAULT, found.advice))
+    large_enough = SOME if not compare_cameras(seen, large).contradicts else FEW
+    yield unsure(finding, experiment, total, large_enough)
+
+
+def unsure(finding: Finding, experiment: Experiment, total: int, enough: int = FEW) -> Finding:
+    """Return a fault as one that cannot be told where fewer than `enough` frames give their own background.
+    They leave a trace of the ball in it, which moves outlines and poses.
+    """
+    if (
+        finding.severity is not FAULT
+        or total >= enough
+        or experiment.movie_paths.keys() <= experiment.background_paths.keys()
+    ):
+        return finding
+    measured = f"cannot tell: {finding.measured}, but the background is learnt from {total} frames"
+    return warning(finding.title, measured, "give backgrounds:, or check more frames")

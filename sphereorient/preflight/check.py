@@ -112,7 +112,7 @@ def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Findi
     if any(one.title == agreement.TITLE and agreement.STOPS not in one.measured for one in seen.agreement):
         # Poses fitted to the paint tell more than outlines, which jump where a short movie has to give its background.
         by_outlines = [replace(one, severity=OK, advice="") for one in by_outlines]
-    yield from by_outlines
+    yield from (agreement.unsure(one, seen.experiment, len(seen.samples[0].stream)) for one in by_outlines)
     yield from seen.agreement
     yield from _texture_findings(seen)
     for sample in seen.samples:
