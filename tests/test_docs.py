@@ -6,6 +6,7 @@ import contextlib
 import doctest
 import io
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -84,8 +85,11 @@ def test_the_figure_of_the_calibration_is_drawn_by_its_script(tmp_path):
     assert abs(drawn.astype(float) - committed).mean() < 10
 
 
-def test_parameters_and_configs_are_those_of_the_code():
-    subprocess.run([sys.executable, REPO / "scripts" / "make_parameters.py", "--check"], check=True)
+def test_parameters_and_configs_are_those_of_the_code(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["make_parameters.py", "--check"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(REPO / "scripts" / "make_parameters.py"), run_name="__main__")
+    assert (ended.value.code, capsys.readouterr().out) == (0, "")
 
 
 @pytest.mark.slow

@@ -169,6 +169,7 @@ def test_an_experiment_of_another_name_is_refused(place, report, tmp_path):
     assert "the experiment.yaml that the track was measured from" in said
 
 
+@pytest.mark.slow
 def test_half_a_report_never_stands_under_its_name(place, report, tmp_path, monkeypatch):
     from sphereorient.report import build
 

@@ -17,7 +17,7 @@ from sphereorient.trajectory import CameraTrack, Reason
 
 @pytest.fixture(scope="module")
 def tracked():
-    spec = EnsembleSpec(segments=30, mean_frames=90.0)
+    spec = EnsembleSpec(segments=12, mean_frames=90.0)
     whole = filtered_track(draw_ensemble(spec, 8), 0.1, 0.05, 8)
     seen = replace(CameraTrack.empty(len(whole)), reason=(Reason.DARK,) * 7 + (Reason.OK,) * (len(whole) - 7))
     turned = replace(seen, orientation=np.tile(np.diag([1.0, -1.0, -1.0]), (len(whole), 1, 1)))
