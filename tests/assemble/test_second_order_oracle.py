@@ -135,7 +135,7 @@ def short_movie(seed: int) -> tuple[Hypotheses, torch.Tensor]:
     return hypotheses, uneven
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [0, 2, 3, 4, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 5, 6, 7))])
 def test_short_movies_agree_with_the_sum_over_all_histories_one_by_one(seed, monkeypatch):
     monkeypatch.setattr(beam, "BEAM_NATS", 1e9)
     hypotheses, time = short_movie(seed)

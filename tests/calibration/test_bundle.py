@@ -39,7 +39,7 @@ def test_planted_cameras_are_found_to_the_digits_without_noise(model, rng):
     assert triangulated_error_mm(fitted.rig.cameras, rig.cameras, rng) < 1e-5
 
 
-@pytest.mark.parametrize("walls", [False, True], ids=["air", "port"])
+@pytest.mark.parametrize("walls", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["air", "port"])
 def test_planted_cameras_are_found_through_noise(walls, rng):
     rig = planted(rng, walls=walls)
     fitted = calibrated(rig, views(rig, rng), ports=WALLS if walls else None)

@@ -80,6 +80,7 @@ def test_a_ball_declared_fixed_that_wanders_is_refused(tmp_path, reach_px):
         take_crops(recording, QUICK, LocateSettings(), silent)
 
 
+@pytest.mark.slow
 def test_a_ball_in_its_place_is_not_refused(tmp_path):
     with open_recording(wandering(tmp_path / "scene", 0.0), ["cam1"], textured=False) as recording:
         assert take_crops(recording, QUICK, LocateSettings(), silent).fixed

@@ -110,6 +110,7 @@ def _hold(out: Path, held: object, done: object) -> None:
         done.wait(60)
 
 
+@pytest.mark.slow
 def test_another_process_cannot_write_the_same_track(tmp_path):
     context = multiprocessing.get_context("spawn")
     held, done = context.Event(), context.Event()

@@ -59,6 +59,7 @@ def halfway(whole: Path, request: Request) -> FolderStore:
     return FolderStore(request.parts)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_what_is_there(whole, tmp_path, request_of):
     request = request_of(tmp_path)
     parts = halfway(whole, request)

@@ -56,6 +56,7 @@ def test_proposals_are_rotations_of_float64_best_score_first():
     assert found.reason == (Reason.OK,) * 30
 
 
+@pytest.mark.slow
 def test_a_finer_grid_answers_more_exactly():
     R_view_body = attitudes(8)
     disks = clean_disks("blobs", R_view_body, 64)
