@@ -48,6 +48,7 @@ def test_the_toolkit_is_modules(name):
     assert issubclass(getattr(sphereorient, name), torch.nn.Module)
 
 
+@pytest.mark.slow
 def test_names_come_in_a_fresh_process_in_any_order():
     code = f"import sphereorient\nfor name in {NAMES[::-1]!r}: getattr(sphereorient, name)"
     subprocess.run([sys.executable, "-c", code], check=True)

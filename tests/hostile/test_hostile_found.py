@@ -69,7 +69,15 @@ def test_a_device_a_loop_a_long_name_and_a_large_file_are_refused_unread(tmp_pat
 # YAML
 
 
-@pytest.mark.parametrize("name", ["billion laughs", "billion keys", "merged without end", "many items", "many keys"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "billion laughs",
+        "billion keys",
+        "merged without end",
+        *(pytest.param(many, marks=pytest.mark.slow) for many in ("many items", "many keys")),
+    ],
+)
 def test_what_unfolds_or_is_too_much_is_refused(name):
     with pytest.raises(yaml.YAMLError, match="more than 20000 values"):
         parse_yaml(BOMBS[name])

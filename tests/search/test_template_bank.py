@@ -304,6 +304,7 @@ def test_the_members_of_a_group_are_near_its_first_and_the_firsts_are_apart(grou
         assert gap.min() >= group_deg - 0.01
 
 
+@pytest.mark.slow
 def test_more_groups_than_allowed_are_a_runaway():
     disks = clean_disks("dots", attitudes(12))
     many = search_of("dots").propose(disks)
