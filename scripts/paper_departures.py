@@ -181,7 +181,7 @@ def row(track: Trajectory, truth: Path, name: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", nargs="*", help="names of departures; all but the last, which is slow, without it")
+    parser.add_argument("--only", nargs="*", help="names of departures; without it all")
     parser.add_argument("--list", action="store_true", help="print the names")
     options = parser.parse_args()
     names = list(changes())
@@ -191,7 +191,7 @@ def main() -> None:
     heads = "changed, valid, fused p50 / p95 / max °, wrong, own p50 °; wrong, best candidate p50 °; number, omega, mm"
     print("| " + heads.replace(", ", " | ") + " |\n|" + "---|" * len(heads.split(", ")))
     kept: dict[tuple[str, str], Any] = {}
-    for name in [names[0], *(options.only or names[1:-1])]:
+    for name in [names[0], *(options.only or names[1:])]:
         print(row(tracked(options.folder, name, kept), options.folder / "truth.h5", name), flush=True)
 
 

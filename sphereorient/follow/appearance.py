@@ -230,14 +230,10 @@ def _seen_by_all(fitter: Fitter, shots: Sequence[Frame], poses: Poses) -> Poses:
 
 def _in_view(fitter: Fitter, position_lab_mm: Tensor) -> bool:
     """Return whether all cameras show the whole disk of a sphere at a position (1, 3), mm."""
-    inside = []
-    for view in fitter.views:
-        uv, radius_px = view.camera.project(position_lab_mm), view.radius_px(position_lab_mm, fitter.radius_mm)
-        inside += [
-            (uv >= radius_px[:, None]).all(),
-            (uv + radius_px[:, None] < uv.new_tensor(view.camera.image_size)).all(),
-        ]
-    return bool(torch.stack(inside).all())
+    X, radius_mm = position_lab_mm, fitter.radius_mm
+    return all(
+        bool(view.shows_whole(view.camera.project(X), view.radius_px(X, radius_mm)).all()) for view in fitter.views
+    )
 
 
 def _scores(found: Sequence[Poses]) -> tuple[float, float]:

@@ -107,7 +107,9 @@ class Initialiser:
     def _claimants(self, picture: Picture, view: CameraView) -> int:
         difference, scene, settings = view.background.difference(picture), view.background, self.locating
         blobs = find_blobs(difference, scene.noise, view.diameter_px, settings)
-        blobs = _apart([blob for blob in blobs if blob.merit > RIVAL_BLOB * blobs[0].merit], view.diameter_px / 2)
+        blobs = _distinct_places(
+            [blob for blob in blobs if blob.merit > RIVAL_BLOB * blobs[0].merit], view.diameter_px / 2
+        )
         if len(blobs) < 2:
             return 1
         fits = (
@@ -115,7 +117,7 @@ class Initialiser:
             for blob in blobs
         )
         round_ones = [one for one in fits if one is not None and one.painted and one.coverage >= settings.coverage_min]
-        outlines = _apart(round_ones, view.diameter_px / 2)
+        outlines = _distinct_places(round_ones, view.diameter_px / 2)
         if len(outlines) < 2:
             return 1
         proposer = self.proposers[view.name]
@@ -196,7 +198,7 @@ class Initialiser:
         return poses_of(fit, chosen, shown, reason)
 
 
-def _apart(places: Sequence[Place], radius_px: float) -> list[Place]:
+def _distinct_places(places: Sequence[Place], radius_px: float) -> list[Place]:
     """Return the places, best first, that lie more than a radius from all better ones."""
     kept: list[Place] = []
     for one in places:

@@ -211,8 +211,8 @@ def _margin(table: PoseTable, choice: Tensor) -> tuple[Tensor, Tensor]:
 
 def _missed(view: CameraView, track: CameraTrack) -> NDArray[np.bool_]:
     """Return in which frames, (N,), a camera should show the whole sphere where the others see it, and does not."""
-    low, high = track.centre_px - track.radius_px[:, None], track.centre_px + track.radius_px[:, None]
-    missed = np.isin(track.reason, MISSED) & (low >= 0).all(-1) & (high <= np.array(view.camera.image_size) - 1).all(-1)
+    whole = view.shows_whole(torch.from_numpy(track.centre_px), torch.from_numpy(track.radius_px)).numpy()
+    missed: NDArray[np.bool_] = np.isin(track.reason, MISSED) & whole
     if view.background.shown is not None:
         u, v = track.centre_px[missed].round().astype(int).T
         missed[missed] = view.background.shown[v, u]

@@ -62,6 +62,11 @@ class CameraView:
         """Return the radius (...), px, of the sphere's picture at positions (..., 3), mm, along the camera's x."""
         return sphere_radius_px(self.camera, position_lab_mm, radius_mm)
 
+    def shows_whole(self, centre_px: Tensor, radius_px: Tensor) -> Tensor:
+        """Return whether the picture holds the whole disk, (...) bool, of centres (..., 2) and radii (...), px."""
+        low, high = centre_px - radius_px[..., None], centre_px + radius_px[..., None]
+        return ((low >= 0) & (high < centre_px.new_tensor(self.camera.image_size))).all(-1)
+
 
 def widest_px(views: Sequence[CameraView]) -> float:
     """Return the expected diameter of the sphere, px, in the camera that sees it largest."""

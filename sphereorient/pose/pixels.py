@@ -48,6 +48,8 @@ class Pixels:
 
     def thinned(self, step: int) -> "Pixels":
         """Return every `step`-th place of all disks."""
+        if step == 1:
+            return self
         places = torch.arange(0, self.grey.shape[1], step)
         places = places[: whole_vectors(len(places))]
         own = ("origin",) if self.origin.shape[-1] > 1 else ()

@@ -112,7 +112,7 @@ def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Findi
     if any(one.title == agreement.TITLE and agreement.STOPS not in one.measured for one in seen.agreement):
         # Poses fitted to the paint tell more than outlines, which jump where a short movie has to give its background.
         by_outlines = [replace(one, severity=OK, advice="") for one in by_outlines]
-    yield from (agreement.unsure(one, seen.experiment, len(seen.samples[0].stream)) for one in by_outlines)
+    yield from by_outlines
     yield from seen.agreement
     yield from _texture_findings(seen)
     for sample in seen.samples:
@@ -122,12 +122,13 @@ def _findings(seen: Preflight, wrong_sizes: Sequence[Finding]) -> Iterator[Findi
 
 
 def _outline_findings(seen: Preflight) -> Iterator[Finding]:
+    between, diameter_mm = [], seen.experiment.diameter_mm
     if seen.scan is not None:
-        yield cameras.lines_of_sight(seen.samples, seen.scan.in_step_px if seen.scan.shift else None)
-        yield cameras.in_step(seen.scan, seen.experiment.start)
-    if seen.scan is not None and seen.experiment.diameter_mm is not None:
-        yield cameras.ball_size(seen.samples, seen.experiment.diameter_mm)
-    else:
+        between.append(cameras.lines_of_sight(seen.samples, seen.scan.in_step_px if seen.scan.shift else None))
+        between.append(cameras.in_step(seen.scan, seen.experiment.start))
+        between += [] if diameter_mm is None else [cameras.ball_size(seen.samples, diameter_mm)]
+    yield from (agreement.unsure(one, seen.experiment, len(seen.samples[0].stream)) for one in between)
+    if seen.scan is None or diameter_mm is None:
         yield from (cameras.ball_size_px(sample) for sample in seen.samples)
 
 

@@ -43,7 +43,7 @@ class OrientSettings(BaseModel, frozen=True, extra="forbid"):
         gt=0,
         le=45,
         description="reach of the fine grid about each possible orientation of a group; the coarse grid's covering "
-        "radius is 8.5",
+        "radius is 0.704 steps",
     )
     renderer: Literal["table", "kornia"] = Field(
         "table", description="who makes the fine grid's templates: a table that the renderer fills, or the renderer"

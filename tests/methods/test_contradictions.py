@@ -13,6 +13,7 @@ import torch
 from sphereorient import so3
 from sphereorient.cameras import sphere_radius_px
 from sphereorient.methods.results import _missed, with_contradictions
+from sphereorient.pose.fitter import CameraView
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
@@ -151,4 +152,5 @@ def test_a_camera_that_should_show_the_whole_ball_and_does_not_is_noticed(why, u
         reason=(str(why), str(Reason.OK)),
     )
     assert camera.image_size == (650, 650)
-    assert _missed(SimpleNamespace(camera=camera, background=scene), track).tolist() == [missed, False]
+    view = CameraView(name="cam1", camera=camera, background=scene, diameter_px=80.0, sight=None)
+    assert _missed(view, track).tolist() == [missed, False]
