@@ -205,6 +205,7 @@ def test_swapped_cameras_do_not_pass_for_a_measurement(tmp_path):
 def test_a_mirrored_movie_scores_worse_than_the_right_one(copy, tracked):
     """Chirality: the mirror image of a painted sphere is another sphere."""
     for name in ("cam1", "cam2"):
+        (copy / f"{name}.mkv").unlink()
         with open_movie(EXCERPT / f"{name}.mkv") as movie:
             write_ffv1(copy / f"{name}.mkv", (frame[:, ::-1] for frame in movie.frames(0, 8)), 600.0)
     experiment = copy / "experiment.yaml"
