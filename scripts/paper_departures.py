@@ -128,6 +128,7 @@ def changes() -> dict[str, Change]:
         "weights not limited": (2, (), limits_off),
         "omega from frame k to k + m": (2, (), lambda: patch.object(measure, "omega_from_orientations", forward)),
         "fine grid to 8.5 degrees": setting(1, "orient.fine_radius_deg=8.5"),
+        "fine grid with all pixels": (1, (), lambda: patch.object(template_bank, "SEMIFINALISTS", 1)),
     }
 
 
