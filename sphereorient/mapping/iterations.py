@@ -202,7 +202,7 @@ def _with_light(state: State) -> State:
         more_normal, more_right = light_sums(at.view, pixels, at.precision)
         normal += more_normal.reshape(-1, cameras, *normal.shape[1:]).sum(0)
         right += more_right.reshape(-1, cameras, 2 * basis).sum(0)
-        inside = pixels.inside & state.use[rows].reshape(-1, 1)
+        inside = pixels.inside & ~pixels.clipped & state.use[rows].reshape(-1, 1)
         greys.append(((pixels.grey - at.residual)[:, some], at.residual[:, some], inside[:, some]))
     difference, black = light_maps(normal, right)
     model, residual, inside = (torch.cat(part) for part in zip(*greys, strict=True))

@@ -184,7 +184,7 @@ def residuals(
     inside = pixels.inside if view.known is None else pixels.inside & view.known
     target = pixels.grey - beyond
     # The first weights come from the picture itself, bubbles included; a second round does without it.
-    rounds = (pixels.grey, inside.to(columns.dtype)) if state is None else state
+    rounds = (pixels.grey, (inside & ~pixels.clipped).to(columns.dtype)) if state is None else state
     for _ in range(1 if state is not None else 2):
         expected, weight = rounds
         weighted = columns * (weight / _variance(expected, noise))[:, None]
@@ -193,10 +193,14 @@ def residuals(
         ).to(columns.dtype)
         painted = (coefficients[:, None] @ columns)[:, 0]
         grey, residual = painted + beyond, target - painted
+        # A saturated pixel tells only that its grey level is at least this one.
+        residual = torch.where(pixels.clipped, residual.clamp_min(0.0), residual)
         variance = _variance(grey, noise)
         deviation = _deviation(residual, variance, inside)
         variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
-        weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * inside
+        weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * (
+            inside & ~(pixels.clipped & (residual == 0))
+        )
         rounds = grey, weight
     gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
     offset = (coefficients[:, None, n:] @ tints[:, :n_black])[:, 0]
@@ -314,7 +318,7 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
     at = residuals(pixels, X, R, (at.model, at.weight), model, cameras)
     normal, right = light_sums(at.view, pixels, at.weight / at.variance * use.reshape(-1, 1))
     difference, black = light_maps(by_pose(normal, cameras).sum(0), by_pose(right, cameras).sum(0))
-    counted = at.inside & use.reshape(-1, 1)
+    counted = at.inside & ~pixels.clipped & use.reshape(-1, 1)
     noise = torch.stack(
         [noise_curve(at.model[c::cameras], at.residual[c::cameras], counted[c::cameras]) for c in range(cameras)]
     )

@@ -16,7 +16,13 @@ from sphereorient.cameras import Camera
 from sphereorient.locate import Background
 
 VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
-ALONG_PLACES = ("grey", "behind", "inside", "direction")  # parts of `Pixels`, the places along their last axis
+ALONG_PLACES = (
+    "grey",
+    "behind",
+    "inside",
+    "clipped",
+    "direction",
+)  # parts of `Pixels`, the places along their last axis
 OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm")  # and those with an entry for each disk
 INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
 
@@ -30,6 +36,7 @@ class Pixels:
     grey: Tensor  # (L, P), grey levels
     behind: Tensor  # (L, P), grey levels of the scene without the sphere
     inside: Tensor  # (L, P) bool, places that lie in the picture and are not masked
+    clipped: Tensor  # (L, P) bool, saturated: the true grey level is this one or a higher one
     direction: Tensor  # (L, 3, P), unit lines of sight, lab
     origin: Tensor  # (L, 3, 1) or (L, 3, P), where they start, lab, mm
     axes: Tensor  # (L, 2, 3), the camera's x and y in the lab
@@ -148,6 +155,7 @@ def cut_pixels(
     left, top = min(max(u - reach, 0), width - 1), min(max(v - reach, 0), height - 1)
     window = np.s_[top : max(v + reach + 1, top + 1), left : max(u + reach + 1, left + 1)]
     grey, behind = frame[window].astype(np.float32), background.mean[window]
+    clipped = grey >= background.full_scale
     if blur_px > 0:
         grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), blur_px), np.float32)
         behind = np.asarray(cv2.GaussianBlur(behind, (0, 0), blur_px), np.float32)
@@ -159,6 +167,7 @@ def cut_pixels(
         grey=torch.from_numpy(grey.reshape(-1)[place])[None],
         behind=torch.from_numpy(np.ascontiguousarray(behind).reshape(-1)[place])[None],
         inside=torch.from_numpy(inside)[None],
+        clipped=torch.from_numpy(clipped.reshape(-1)[place])[None],
         direction=flat[:, at][None],
         origin=(sight.origin.reshape(3, 1) if sight.one_origin else sight.origin.reshape(3, -1)[:, at])[None],
         axes=sight.axes[None],

@@ -116,15 +116,17 @@ def noisy(pictures: Tensor, sigma: float, seed: int) -> Tensor:
     return pictures + sigma * torch.randn(pictures.shape, generator=torch.Generator().manual_seed(seed))
 
 
-def scene_of(mean: NDArray[np.float32], shown: NDArray[np.bool_] | None = None) -> Background:
+def scene_of(
+    mean: NDArray[np.float32], shown: NDArray[np.bool_] | None = None, full_scale: float = math.inf
+) -> Background:
     """The background with this mean picture."""
-    return Background(mean=mean, noise=np.ones_like(mean), full_scale=255.0, shown=shown)
+    return Background(mean=mean, noise=np.ones_like(mean), full_scale=full_scale, shown=shown)
 
 
-def cut(rig: Rig, pictures: Tensor, X: Tensor, behind: float = BEHIND) -> Pixels:
+def cut(rig: Rig, pictures: Tensor, X: Tensor, behind: float = BEHIND, full_scale: float = math.inf) -> Pixels:
     """The pixels of all disks, cameras of a pose next to each other, about places that need not be exact."""
     stencil = disk_stencil(1.06 * rig.diameter_px / 2 + 2.5 * BLUR_PX)
-    background = scene_of(np.full(pictures.shape[-2:], behind, np.float32))
+    background = scene_of(np.full(pictures.shape[-2:], behind, np.float32), full_scale=full_scale)
     disks = []
     for one, frames in zip(X, pictures, strict=True):
         for camera, sight, frame in zip(rig.cameras, rig.sights, frames, strict=True):

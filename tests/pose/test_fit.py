@@ -35,6 +35,7 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.pose import fit as fit_module
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses
 from sphereorient.pose.fitter import Optics, PyramidLevel
 from sphereorient.pose.model import FIRST
@@ -240,6 +241,33 @@ def test_light_of_low_order_over_the_disk_does_not_matter():
     assert (fit.score > 0.95).all()
     # Second order in the factor, first in the offset, is what this light needs.
     assert apart_deg(fit, fitted(rig(), "patches", pixels, X, R, SIGMA)) < 0.05
+
+
+def test_saturated_pixels_tell_only_that_their_grey_level_is_at_least_that_one():
+    X, R = truth()
+    full = 0.5 * (BLACK + WHITE)  # nearly all white paint is clipped
+    frames = pictures().clamp_max(full)
+    fit, believed = (
+        fitted(rig(), "patches", cut(rig(), frames, X, full_scale=scale), X, R, SIGMA) for scale in (full, math.inf)
+    )
+    off = rms(turn_errors(fit, R).norm(dim=1))
+    assert math.degrees(off) < 2.0 * ROTATION_RMS["two"]
+    assert rms(whitened(fit, errors(fit, X, R))) < 1.6
+    assert rms(turn_errors(believed, R).norm(dim=1)) > 2.0 * off
+    # Where nothing is clipped, nothing changes.
+    same = fitted(rig(), "patches", cut(rig(), pictures(), X, full_scale=1e4), X, R, SIGMA)
+    for name in POSE_PARTS:
+        assert_close(getattr(same, name), getattr(from_truth(), name), atol=0)
+
+
+def test_the_deviation_of_normal_residuals_is_one_whatever_a_few_of_them_are():
+    rng = torch.Generator().manual_seed(0)
+    residual = 3.0 * torch.randn(2, 40000, generator=rng)
+    residual[:, ::9] = 500.0
+    inside = torch.ones_like(residual, dtype=torch.bool)
+    inside[1, ::9] = False
+    found = fit_module._deviation(residual, torch.full_like(residual, 9.0), inside)
+    assert_close(found, torch.tensor([1.15, 1.0]), atol=0.03)  # among a ninth of outliers: the 56 % quantile
 
 
 def test_a_bubble_before_part_of_the_disk_does_not_move_the_pose():
