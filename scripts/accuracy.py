@@ -20,7 +20,6 @@ import h5py
 import numpy as np
 import torch
 
-from sphereorient import so3
 from sphereorient.evaluate import Score, score_track
 from sphereorient.experiment import load_experiment
 from sphereorient.methods.settings import DEFAULT_METHOD
@@ -84,25 +83,12 @@ def row(folder: Path, label: str, cameras: Sequence[str], method: str) -> str:
         f"{_share(score, 'omega_lab')} / {_share(score, 'omega_body')}",
         f"{_share(score, 'alpha_lab')}",
         _share(score, "velocity") if len(cameras) == 2 else "",
-        " / ".join(f"{value:.2f}" for value in over_stated(track, folder / "truth.h5")),
+        " / ".join(f"{value:.2f}" for value in score.over_stated()),
         f"{seconds:.0f}",
     ]
     if method == "paper":
         cells += parts(track, folder / "truth.h5")
     return "| " + " | ".join(cells) + " |"
-
-
-def over_stated(track: Trajectory, truth_path: Path) -> list[float]:
-    """Return the errors of orientation and position over what their covariances state, rms over frames and axes."""
-    with h5py.File(truth_path) as file:
-        place, R = (file[name][: len(track)] for name in ("position", "orientation"))
-    turn = so3.log(torch.from_numpy(R @ track.orientation.transpose(0, 2, 1))).numpy()
-    found = []
-    for error, covariance in ((turn, track.orientation_cov), (place - track.position, track.position_cov)):
-        error, covariance = error[track.valid], covariance[track.valid]
-        squares = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(1)
-        found.append(float(np.sqrt(squares.mean() / 3)))
-    return found
 
 
 def parts(track: Trajectory, truth_path: Path) -> list[str]:

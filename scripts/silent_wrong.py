@@ -32,6 +32,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.cameras import Camera, TsaiCamera, save_cameras
 from sphereorient.errors import SphereOrientError
+from sphereorient.evaluate.score import mahalanobis
 from sphereorient.files.picture import write_picture
 from sphereorient.run import MemoryStore, Request, run
 from sphereorient.synth import SynthSettings, make_scene, random_texture
@@ -605,15 +606,6 @@ def judge(track: Trajectory, folder: Path, late_frames: int = 0) -> dict[str, An
         "sigmas": float(np.median(sigmas[shown])) if shown.any() else float("nan"),
         "flags": int(np.bitwise_or.reduce(track.flags[shown])) if shown.any() else 0,
     }
-
-
-def mahalanobis(error: Floats, covariance: Floats) -> Floats:
-    """Return the distances (N,) of errors (N, 3) in units of their standard deviations."""
-    found = np.full(len(error), np.nan)
-    good = np.isfinite(error).all(1) & np.isfinite(covariance).all((1, 2))
-    solved = np.linalg.solve(covariance[good], error[good][..., None])[..., 0]
-    found[good] = np.sqrt(np.maximum((solved * error[good]).sum(1), 0))
-    return found
 
 
 def tried(name: str, folder: Path) -> Verdict:

@@ -74,6 +74,11 @@ def error_table(found: "Score") -> "Table":
     table.add_row("orientation (degrees)", f"{p50:.3f}", f"{p95:.3f}", f"{largest:.3f}")
     p50, p95, _, largest = found.percentiles_mm()
     table.add_row("position (mm)", f"{p50:.4f}", f"{p95:.4f}", f"{largest:.4f}")
+    turn, place = found.over_stated()
+    inside, stated = found.inside()
+    table.add_section()
+    table.add_row("error / stated sigma, rms", f"{turn:.2f}", f"{place:.2f}", "", style="bold")
+    table.add_row("truths in the stated 95 %", f"{inside} of {stated}", "", "")
     table.add_section()
     table.add_row("quantity", "rms error / rms", "frames", "", style="bold")
     for key, error in found.relative_rms.items():

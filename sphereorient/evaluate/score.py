@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from sphereorient import so3
 from sphereorient.errors import BenchError, TrackError, refusal
@@ -17,6 +18,7 @@ Floats = NDArray[np.float64]
 Frames = NDArray[np.int64]
 RATES = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
 ALIGNMENTS = ("none", "body", "both")
+AXES = 3
 ITERATIONS, CONVERGED = 200, 1e-12  # of the alignment
 FICTRAC_FRAME, FICTRAC_ROTATION = 0, slice(8, 11)  # columns: frame counter, absolute rotation vector (camera axes)
 FICTRAC_COLUMNS = 23  # at least; newer versions have more
@@ -32,6 +34,8 @@ class Score:
     orientation_deg: Floats  # (N,), geodesic distance to the true orientation
     camera_orientation_deg: dict[str, Floats]  # (N,) each, of each camera alone
     position_mm: Floats  # (N,), distance
+    orientation_sigmas: Floats  # (N,), the same error over what its covariance states (Mahalanobis distance)
+    position_sigmas: Floats  # (N,)
     relative_rms: dict[str, float]  # of velocity, acceleration, omega, alpha: rms error over the truth's rms
     coverage: dict[str, float]  # of the same: share of the frames with a value
 
@@ -42,6 +46,20 @@ class Score:
     def percentiles_mm(self) -> Floats:
         """Median, 95th, 99th percentile and maximum of the valid frames' position error."""
         return _percentiles(self.position_mm[self.valid])
+
+    def over_stated(self) -> tuple[float, float]:
+        """Return the rms over valid frames and axes of orientation's and position's errors over their stated sigmas."""
+        return _rms_per_axis(self.orientation_sigmas[self.valid]), _rms_per_axis(self.position_sigmas[self.valid])
+
+    def inside(self, share: float = 0.95) -> tuple[int, int]:
+        """Return in how many valid frames the true orientation lies in the stated region, and how many state one."""
+        stated = self.orientation_sigmas[self.valid & np.isfinite(self.orientation_sigmas)]
+        return int((stated**2 <= chi2.ppf(share, AXES)).sum()), len(stated)
+
+
+def _rms_per_axis(sigmas: Floats) -> float:
+    known = sigmas[np.isfinite(sigmas)]
+    return float(np.sqrt(np.mean(known**2) / AXES)) if len(known) else np.nan
 
 
 def _percentiles(values: Floats) -> Floats:
@@ -60,16 +78,28 @@ def score_track(track: Trajectory, truth_path: str | Path) -> Score:
         coverage[key] = float(have.mean())
         wrong, whole = (np.square(x[have]).sum() for x in (measured - true, true))
         relative[key] = float(np.sqrt(wrong / whole)) if have.any() else np.nan
-    R_true = truth["orientation"][row]
+    R_true, off_mm = truth["orientation"][row], truth["position"][row] - track.position
+    turn = so3.log(torch.from_numpy(R_true @ track.orientation.transpose(0, 2, 1))).numpy()
     return Score(
         frames=len(track),
         valid=track.valid & np.isfinite(track.orientation).all(axis=(1, 2)) & np.isfinite(track.position).all(axis=1),
         orientation_deg=distance_deg(track.orientation, R_true),
         camera_orientation_deg={name: distance_deg(seen.orientation, R_true) for name, seen in track.cameras.items()},
-        position_mm=np.linalg.norm(track.position - truth["position"][row], axis=1),
+        position_mm=np.linalg.norm(off_mm, axis=1),
+        orientation_sigmas=mahalanobis(turn, track.orientation_cov),
+        position_sigmas=mahalanobis(off_mm, track.position_cov),
         relative_rms=relative,
         coverage=coverage,
     )
+
+
+def mahalanobis(error: Floats, covariance: Floats) -> Floats:
+    """Return the lengths (N,) of errors (N, 3) over their covariances (N, 3, 3); NaN where either is unknown."""
+    found = np.full(len(error), np.nan)
+    known = np.isfinite(error).all(1) & np.isfinite(covariance).all((1, 2))
+    whitened = np.linalg.solve(covariance[known], error[known][..., None])[..., 0]
+    found[known] = np.sqrt(np.maximum((whitened * error[known]).sum(1), 0.0))
+    return found
 
 
 def true_orientations(path: Path, time_s: Floats) -> Floats:

@@ -15,9 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
-from scipy.stats import chi2
 
-from sphereorient import so3
 from sphereorient.errors import BenchError, OutputError, SphereOrientError, error_words, refusal
 from sphereorient.evaluate.robustness.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
 from sphereorient.evaluate.robustness.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
@@ -31,7 +29,6 @@ from sphereorient.trajectory import CameraTrack, Trajectory
 Tracker = Callable[[Path], Trajectory]  # experiment.yaml to a track; can be pickled
 Progress = Callable[[int, int], None]
 PLAN, RESULTS, KEPT = "plan.json", "results.json", "scenes"
-INSIDE = 0.95  # probability of the stated region
 DIGITS = 5
 Floats = NDArray[np.float64]
 TRACKERS: dict[str, Tracker] = {
@@ -159,7 +156,7 @@ def measure(track: Trajectory, truth_path: Path) -> dict[str, Any]:
     score = score_track(track, truth_path)
     R_true = true_orientations(truth_path, track.time)
     ranks = np.concatenate([_ranks(seen, R_true) for seen in track.cameras.values()] or [np.zeros(0)])
-    stated, inside = _inside(track, R_true)
+    inside, stated = score.inside()
     orientation, position, confidence = (
         tuple(round(x, DIGITS) if math.isfinite(x) else None for x in np.where(score.valid, values, np.nan).tolist())
         for values in (score.orientation_deg, score.position_mm, track.confidence)
@@ -196,12 +193,3 @@ def _ranks(seen: CameraTrack, R_true: Floats) -> Floats:
     ranks = np.full(len(counts), np.inf)
     np.minimum.at(ranks, frame[right], rank[right])
     return ranks
-
-
-def _inside(track: Trajectory, R_true: Floats) -> tuple[int, int]:
-    """Return the number of frames with a covariance, and of those with the truth in its 95 % region."""
-    known = track.valid & np.isfinite(track.orientation_cov).all((1, 2)) & np.isfinite(track.orientation).all((1, 2))
-    R, cov = torch.from_numpy(track.orientation[known]), track.orientation_cov[known]
-    delta = so3.log(torch.from_numpy(R_true[known]) @ R.mT).numpy()
-    square = np.einsum("ni,ni->n", delta, np.linalg.solve(cov, delta[..., None])[..., 0]) if len(delta) else np.zeros(0)
-    return int(known.sum()), int((square <= chi2.ppf(INSIDE, 3)).sum())
