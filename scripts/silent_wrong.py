@@ -461,7 +461,12 @@ CASES = (
     Case(name="glare", what="a saturated spot of 1/4 radius", picture=glare),
     Case(name="glare_one", what="the same in one camera", picture=only(0, glare)),
     Case(name="blur_3", what="defocus of 3 px", picture=blurred(3.0)),
-    Case(name="blur_one", what="one camera defocused", picture=only(1, blurred(2.5))),
+    Case(
+        name="blur_one",
+        what="one camera defocused: the map explains the other alone",
+        measurable=False,
+        picture=only(1, blurred(2.5)),
+    ),
     Case(name="low_contrast", what="paint from 40 to 62", scene={"black": 40.0, "white": 62.0}),
     Case(name="passing", what="the ball enters and leaves", move=passing(48.0)),
     Case(name="resting", what="the ball rests", move=resting),
