@@ -77,8 +77,10 @@ def error_table(found: "Score") -> "Table":
     turn, place = found.over_stated()
     inside, stated = found.inside()
     table.add_section()
-    table.add_row("error / stated sigma, rms", f"{turn:.2f}", f"{place:.2f}", "", style="bold")
-    table.add_row("truths in the stated 95 %", f"{inside} of {stated}", "", "")
+    table.add_row("errors over stated sigmas", "rms", "", "", style="bold")
+    table.add_row("orientation", f"{turn:.2f}", "", "")
+    table.add_row("position", f"{place:.2f}", "", "")
+    table.add_row("true orientations in the stated 95 %", f"{inside} of {stated}", "", "")
     table.add_section()
     table.add_row("quantity", "rms error / rms", "frames", "", style="bold")
     for key, error in found.relative_rms.items():

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from sphereorient.cli import app
 from sphereorient.errors import TrackError
+from sphereorient.evaluate import score_track
 from sphereorient.trajectory import Trajectory
 
 TRUTH = REPO / "synthetic_data" / "excerpt" / "truth.h5"
@@ -28,6 +29,26 @@ def track(tmp_path: Path) -> Path:
     track = replace(track, orientation=truth["orientation"], position=shifted, velocity=1.1 * truth["velocity"])
     replace(track, valid=np.ones(len(track), bool)).save(tmp_path / "track.h5")
     return tmp_path / "track.h5"
+
+
+def test_errors_over_stated_sigmas_are_printed_and_frames_without_them_left_out(track):
+    loaded = Trajectory.load(track)
+    place = np.tile(np.eye(3) * 0.1**2, (40, 1, 1))  # 0.3 mm along one of three axes
+    place[5] = np.nan
+    turn = np.tile(np.eye(3) * 0.01**2, (40, 1, 1))
+    turn[7] = np.nan
+    about_z = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    orientation = loaded.orientation.copy()
+    orientation[9] = about_z @ orientation[9]  # a quarter turn, out of its region
+    replace(loaded, position_cov=place, orientation_cov=turn, orientation=orientation).save(track)
+    found = score_track(Trajectory.load(track), TRUTH)
+    of_turn, of_place = found.over_stated()
+    assert of_place == pytest.approx(3 / np.sqrt(3))
+    assert of_turn == pytest.approx(np.pi / 2 / 0.01 / np.sqrt(39 * 3), rel=1e-6)
+    assert found.inside() == (38, 39)
+    words = CliRunner().invoke(app, ["score", str(track), str(TRUTH)]).output.split()
+    assert "1.73" in words
+    assert "14.52" in words
 
 
 def test_the_errors_of_a_track_are_printed(track):
