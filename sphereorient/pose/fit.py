@@ -17,7 +17,8 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.so3 import inverse_damped, solve_damped
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
-EDGE_PX = 0.005  # by how much the model's limb may lie off, outwards, and limb and paint aside: no model is any better
+EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
+ASIDE_PX = 0.002  # and by how much its limb and its paint aside: large balls would state less
 KNOWN = 0.3  # least share of a disk that shows known paint
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
@@ -147,7 +148,7 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
     lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
     covariance = bread @ meat @ bread + lured.mT @ lured
     finest_mm = by_pose(px_mm, cameras)[..., 0].masked_fill(~use, math.inf).amin(1).nan_to_num(0.0, 0.0, 0.0)
-    aside_mm = EDGE_PX * finest_mm[:, None].expand(-1, 3)
+    aside_mm = ASIDE_PX * finest_mm[:, None].expand(-1, 3)
     covariance = covariance + torch.diag_embed(torch.cat([aside_mm / radius_mm, aside_mm], dim=1).square())
     sight = torch.nn.functional.normalize(to_centre, dim=-1)[..., None]
     place = (freely @ shared @ freely)[..., 3:, 3:]
