@@ -26,7 +26,7 @@ from sphereorient.movies import write_ffv1
 from sphereorient.run import track_movies
 
 OWN_PX = 0.62  # blur of the experiment itself: optics 0.55, pixel 0.29
-READ, SHOT = 0.7, 0.05  # grey levels, and grey levels^2 per grey level: between frames, where nothing moves
+READ, SHOT = 0.7, 0.05  # grey levels, and grey levels^2 per grey level: assumed, not measured
 REACH = 4  # sigmas of the Gaussian
 
 
@@ -76,8 +76,7 @@ def main() -> None:
             for given in (None, round(math.hypot(OWN_PX, blur_px), 3)):
                 settings = Settings.model_validate({"refine": {"blur_px": given}})
                 found = score_track(track_movies(path, settings=settings), folder / "truth.h5")
-                (turn, *_), (place, *_) = found.percentiles_deg(), found.percentiles_mm()
-                p95 = found.percentiles_deg()[1]
+                (turn, p95, *_), (place, *_) = found.percentiles_deg(), found.percentiles_mm()
                 of_turn, of_place = found.over_stated()
                 cells = [f"{blur_px:g}", "nothing" if given is None else f"{given:.2f} px", f"{turn:.3f}", f"{p95:.3f}"]
                 cells += [f"{of_turn:.2f}", f"{place:.4f}", f"{of_place:.2f}"]

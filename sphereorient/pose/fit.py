@@ -198,13 +198,12 @@ def residuals(
         painted = (coefficients[:, None] @ columns)[:, 0]
         grey, residual = painted + beyond, target - painted
         # A saturated pixel tells only that its grey level is at least this one.
-        residual = torch.where(pixels.clipped, residual.clamp_min(0.0), residual)
+        silent = pixels.clipped & (residual <= 0)
+        residual = residual.masked_fill(silent, 0.0)
         variance = _variance(grey, noise)
         deviation = _deviation(residual, variance, inside)
         variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
-        weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * (
-            inside & ~(pixels.clipped & (residual == 0))
-        )
+        weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * (inside & ~silent)
         rounds = grey, weight
     gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
     offset = (coefficients[:, None, n:] @ tints[:, :n_black])[:, 0]

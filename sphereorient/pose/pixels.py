@@ -16,13 +16,8 @@ from sphereorient.cameras import Camera
 from sphereorient.locate import Background
 
 VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
-ALONG_PLACES = (
-    "grey",
-    "behind",
-    "inside",
-    "clipped",
-    "direction",
-)  # parts of `Pixels`, the places along their last axis
+# Parts of `Pixels`, the places along their last axis.
+ALONG_PLACES = ("grey", "behind", "inside", "clipped", "direction")
 OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm")  # and those with an entry for each disk
 INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
 
