@@ -91,6 +91,8 @@ def join(
         R_lab_body=picked["R_lab_body"],
         orientation_cov_rad2=picked["covariance"][:, :3, :3],
         segment=chosen.segment,
+        # Of a ball held in place all positions are one estimate: its path tells nothing more.
+        coupling=None if job.recording.experiment.fixed else picked["covariance"][:, :3, 3:],
     )
     smoothed = motion.smooth_motion(poses, settings.smooth, None if given is None else given.process)
     track = results.precise_track(job.recording.experiment, clock, table, chosen, smoothed, follower.appearance)

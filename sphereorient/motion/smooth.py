@@ -12,18 +12,21 @@ from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, ProcessNoise, estimate
 from sphereorient.motion.kalman import Bools, Floats
 from sphereorient.motion.measure import M_PER_MM, Motion
-from sphereorient.motion.path import RotationTrack, SegmentTrack
+from sphereorient.motion.path import RotationTrack, SegmentTrack, rotation_of
 from sphereorient.motion.settings import SmoothSettings
 
 LONGEST_STEP = 1.5  # typical steps; longer ones are bridged by instants in between
 MOST_BETWEEN = 300  # instants that bridge one long step
 LOST_RAD = 0.5  # an orientation with a larger sigma is discarded
+ON_PATH = 4.0  # sigmas (of three axes) within which a measured position agrees with the smoothed path
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Smoothed(Motion):
     """Motion of N frames by the smoother, float64; its covariances and sigmas hold what smoothing lost, too."""
 
+    measured_R_lab_body: Tensor  # (N, 3, 3), each frame's own orientation, given the smoothed path of positions
+    measured_cov_rad2: Tensor  # (N, 3, 3), its covariance as the fit states it
     extrapolated: Tensor  # (N,) bool, frames of a segment without a measurement of their own of either kind
     rejected: Tensor  # (N,) bool, frames with a rejected measurement
     position_scale: float  # true errors of the measured positions over their sigmas, slow errors included
@@ -41,12 +44,14 @@ class MeasuredPoses:
     R_lab_body: Tensor  # (N, 3, 3), NaN where not measured
     orientation_cov_rad2: Tensor  # (N, 3, 3), of delta in R_true = exp([delta]x) R_lab_body, lab components
     segment: Tensor  # (N,) int64, number of the segment, -1 outside any
+    coupling: Tensor | None = None  # (N, 3, 3), rad mm, covariance of delta (rows) with the position; None: none
 
     def __post_init__(self) -> None:
         check_tail("position_lab_mm", self.position_lab_mm, 3)
-        for name in ("position_cov_mm2", "R_lab_body", "orientation_cov_rad2"):
-            check_tail(name, getattr(self, name), 3, 3)
-        square = (self.position_cov_mm2, self.R_lab_body, self.orientation_cov_rad2)
+        coupling = () if self.coupling is None else (self.coupling,)
+        square = (self.position_cov_mm2, self.R_lab_body, self.orientation_cov_rad2, *coupling)
+        for name, part in zip(("position_cov_mm2", "R_lab_body", "orientation_cov_rad2", "coupling"), square, strict=False):
+            check_tail(name, part, 3, 3)
         shapes = [self.time_s.shape, self.position_lab_mm.shape[:-1], *(part.shape[:-2] for part in square)]
         shapes.append(self.segment.shape)
         if self.time_s.dim() != 1 or len(set(shapes)) > 1:
@@ -58,7 +63,8 @@ class MeasuredPoses:
 def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: ProcessNoise | None = None) -> Smoothed:
     """Smooth a track, segment by segment, and take its derivatives; the result is on the CPU.
     Velocity and omega_lab are a constant plus a stationary random process, estimated from the whole track unless
-    `known`, with one factor on the sigmas. There is no lag; ends are included, gaps inside a segment filled, outliers
+    `known`, with one factor on the sigmas. Orientations are smoothed as they are given the smoothed positions: the errors
+    of a frame's orientation and position go together (`coupling`). There is no lag; ends are included, gaps inside a segment filled, outliers
     rejected. A segment of one measured frame has no derivatives, of two no accelerations; a track too short for the
     estimation has no derivatives.
     Source: Gaussian-process smoother: Sarkka and Solin 2019, Applied Stochastic Differential Equations, chapter 12; on
@@ -89,6 +95,14 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     rejected = np.zeros(len(t), dtype=bool)
     scales, processes = [], []
     for kind, values, covariance, seen, band_hz, process, put in kinds:
+        if kind is RotationTrack and measured.coupling is not None:
+            # In the fit's own units: what the smoother learnt of its sigmas is added at the end.
+            path_cov = out["position_cov_mm2"] / (scales[0] ** 2 * (1 - settings.slow_share))
+            coupling = measured.coupling.detach().cpu().to(torch.float64).numpy()
+            told = seen_X & seen_R & ~rejected & np.isfinite(out["position_lab_mm"]).all(1)
+            off = out["position_lab_mm"] - X
+            R, R_cov = _given_path(told, R, R_cov, coupling, off, X_cov, path_cov)
+            values, covariance = R, R_cov
         instants = [_Instants.of(k, t[k] / frame_s, seen[k]) for k in rows if seen[k].any()]
         paths = [kind.of(at.time, at.spread(values), at.spread(covariance), at.used) for at in instants]
         band = None if band_hz is None else band_hz * frame_s
@@ -100,12 +114,32 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
         processes.append(process)
     return Smoothed(
         **{name: torch.from_numpy(value) for name, value in out.items()},
+        measured_R_lab_body=torch.from_numpy(R),
+        measured_cov_rad2=torch.from_numpy(R_cov),
         extrapolated=torch.from_numpy((numbers >= 0) & ~(seen_X & seen_R)),
         rejected=torch.from_numpy(rejected),
         position_scale=scales[0],
         orientation_scale=scales[1],
         process=ProcessNoise(place=processes[0], turn=processes[1], frame_s=frame_s),
     )
+
+
+def _given_path(
+    rows: Bools, R: Floats, R_cov: Floats, coupling: Floats, off: Floats, X_cov: Floats, path_cov: Floats
+) -> tuple[Floats, Floats]:
+    """Return orientations and covariances given that positions lie `off` (N, 3), mm, with the path's covariance.
+    Paint that shifts in the picture is a turn or a move of the sphere; the limb alone tells them apart, and the path
+    knows the move better. Frames outside `rows`, or whose position contradicts the path, keep their own.
+    """
+    rows = np.flatnonzero(rows)
+    R, R_cov, off, both, own = R.copy(), R_cov.copy(), off[rows], coupling[rows], X_cov[rows]
+    inverse = np.linalg.inv(own)
+    near = np.einsum("ni,nij,nj->n", off, inverse, off) < ON_PATH**2
+    rows, off, both = rows[near], off[near, :, None], both[near]
+    gain = both @ inverse[near]
+    R[rows] = rotation_of((gain @ off)[..., 0]) @ R[rows]
+    R_cov[rows] += gain @ path_cov[rows] @ gain.mT - gain @ both.mT
+    return R, R_cov
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
