@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
+import torch
+
 from sphereorient import motion
 from sphereorient.assemble import Chosen, PathLayer
 from sphereorient.experiment.recording import Progress
@@ -94,7 +96,12 @@ def join(
         # Of a ball held in place all positions are one estimate: its path tells nothing more.
         coupling=None if job.recording.experiment.fixed else picked["covariance"][:, :3, 3:],
     )
-    smoothed = motion.smooth_motion(poses, settings.smooth, None if given is None else given.process)
+    first, second = torch.combinations(torch.arange(len(job.recording.streams)), 2).unbind(1)
+    turn, spread = picked["own_turn"], picked["own_covariance"]
+    apart, spread = turn[:, first] - turn[:, second], spread[:, first] + spread[:, second]
+    share = motion.lasting_share(apart, spread, chosen.segment, settings.smooth.slow_share)
+    smooth = settings.smooth.model_copy(update={"slow_share": share})
+    smoothed = motion.smooth_motion(poses, smooth, None if given is None else given.process)
     track = results.precise_track(job.recording.experiment, clock, table, chosen, smoothed, follower.appearance)
     return track, Learnt.of(follower.appearance, smoothed.process, float(chosen.acceleration_rad_s2))
 

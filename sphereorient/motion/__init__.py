@@ -6,5 +6,12 @@ from sphereorient.motion.matern import Prior
 from sphereorient.motion.measure import Motion, measure_motion
 from sphereorient.motion.path import rotvec_between
 from sphereorient.motion.settings import MotionSettings, SmoothSettings
-from sphereorient.motion.smooth import RATE_UNITS, MeasuredPoses, Smoothed, datasets_of, smooth_motion
+from sphereorient.motion.smooth import (
+    RATE_UNITS,
+    MeasuredPoses,
+    Smoothed,
+    datasets_of,
+    lasting_share,
+    smooth_motion,
+)
 from sphereorient.motion.stencil import gaussian_derivative, gaussian_kernel

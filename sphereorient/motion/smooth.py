@@ -18,6 +18,10 @@ from sphereorient.motion.settings import SmoothSettings
 LONGEST_STEP = 1.5  # typical steps; longer ones are bridged by instants in between
 MOST_BETWEEN = 300  # instants that bridge one long step
 LOST_RAD = 0.5  # an orientation with a larger sigma is discarded
+LAGS = 3  # frames after which an error that remains is one that lasts
+CLIP = 4.0  # sigmas: a wrong frame is no lasting error
+AS_MANY = 20  # pairs of frames that outweigh the share that is assumed
+MOST_LASTING = 0.9
 ON_PATH = 4.0  # sigmas (of three axes) within which a measured position agrees with the smoothed path
 
 
@@ -140,6 +144,23 @@ def _given_path(
     R[rows] = rotation_of((gain @ off)[..., 0]) @ R[rows]
     R_cov[rows] += gain @ path_cov[rows] @ gain.mT - gain @ both.mT
     return R, R_cov
+
+
+def lasting_share(apart: Tensor, covariance: Tensor, segment: Tensor, assumed: float) -> float:
+    """Return the share of the variance of cameras' disagreements that lasts over frames, at least the one assumed.
+    `apart` (N, P, 3): turns between the orientations of P pairs of cameras, covariance (N, P, 3, 3); NaN where missing.
+    """
+    there = torch.isfinite(apart).all(-1) & torch.isfinite(covariance).all((-1, -2)) & (segment >= 0)[:, None]
+    whole = torch.where(there[..., None, None], covariance, torch.eye(3, dtype=covariance.dtype))
+    z = torch.linalg.solve(torch.linalg.cholesky(whole), apart.nan_to_num()[..., None])[..., 0].clamp(-CLIP, CLIP)
+    shared, both = z.new_zeros(()), 0
+    for lag in range(1, LAGS + 1):
+        pair = there[lag:] & there[:-lag] & (segment[lag:] == segment[:-lag])[:, None]
+        shared = shared + (z[lag:] * z[:-lag]).sum(-1)[pair].sum()
+        both += int(pair.sum())
+    variance = z[there].square().sum(-1).mean() if both else z.new_ones(())
+    found = float(shared / variance) + LAGS * AS_MANY * assumed
+    return min(max(found / (both + LAGS * AS_MANY), assumed), MOST_LASTING)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
