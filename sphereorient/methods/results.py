@@ -141,7 +141,7 @@ def precise_track(
         position=picked["position_lab_mm"].numpy(),
         position_cov=(covariance[:, 3:, 3:] * smoothed.position_scale**2).numpy(),
         orientation=smoothed.measured_R_lab_body.numpy(),
-        orientation_cov=(smoothed.measured_cov_rad2 * smoothed.orientation_scale**2).numpy(),
+        orientation_cov=smoothed.measured_cov_rad2.numpy(),
         **datasets_of(smoothed, experiment.length_unit),
         segment=chosen.segment.numpy(),
         flags=flags.numpy().astype(np.uint32),

@@ -30,7 +30,7 @@ class Smoothed(Motion):
     """Motion of N frames by the smoother, float64; its covariances and sigmas hold what smoothing lost, too."""
 
     measured_R_lab_body: Tensor  # (N, 3, 3), each frame's own orientation, given the smoothed path of positions
-    measured_cov_rad2: Tensor  # (N, 3, 3), its covariance as the fit states it
+    measured_cov_rad2: Tensor  # (N, 3, 3), its covariance, `orientation_scale` and the path's error included
     extrapolated: Tensor  # (N,) bool, frames of a segment without a measurement of their own of either kind
     rejected: Tensor  # (N,) bool, frames with a rejected measurement
     position_scale: float  # true errors of the measured positions over their sigmas, slow errors included
@@ -54,7 +54,9 @@ class MeasuredPoses:
         check_tail("position_lab_mm", self.position_lab_mm, 3)
         coupling = () if self.coupling is None else (self.coupling,)
         square = (self.position_cov_mm2, self.R_lab_body, self.orientation_cov_rad2, *coupling)
-        for name, part in zip(("position_cov_mm2", "R_lab_body", "orientation_cov_rad2", "coupling"), square, strict=False):
+        for name, part in zip(
+            ("position_cov_mm2", "R_lab_body", "orientation_cov_rad2", "coupling"), square, strict=False
+        ):
             check_tail(name, part, 3, 3)
         shapes = [self.time_s.shape, self.position_lab_mm.shape[:-1], *(part.shape[:-2] for part in square)]
         shapes.append(self.segment.shape)
@@ -97,16 +99,15 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     square = ("position_cov_mm2", "orientation_cov_rad2", "R_lab_body")
     out = {one.name: np.full((len(t), 3, 3) if one.name in square else (len(t), 3), np.nan) for one in fields(Motion)}
     rejected = np.zeros(len(t), dtype=bool)
-    scales, processes = [], []
+    scales, processes, by_path = [], [], np.zeros((len(t), 3, 3))
     for kind, values, covariance, seen, band_hz, process, put in kinds:
         if kind is RotationTrack and measured.coupling is not None:
-            # In the fit's own units: what the smoother learnt of its sigmas is added at the end.
-            path_cov = out["position_cov_mm2"] / (scales[0] ** 2 * (1 - settings.slow_share))
             coupling = measured.coupling.detach().cpu().to(torch.float64).numpy()
             told = seen_X & seen_R & ~rejected & np.isfinite(out["position_lab_mm"]).all(1)
-            off = out["position_lab_mm"] - X
-            R, R_cov = _given_path(told, R, R_cov, coupling, off, X_cov, path_cov)
-            values, covariance = R, R_cov
+            values, covariance, by_path = _given_path(
+                told, R, R_cov, coupling, out["position_lab_mm"] - X, X_cov, out["position_cov_mm2"]
+            )
+            R, R_cov = values, covariance
         instants = [_Instants.of(k, t[k] / frame_s, seen[k]) for k in rows if seen[k].any()]
         paths = [kind.of(at.time, at.spread(values), at.spread(covariance), at.used) for at in instants]
         band = None if band_hz is None else band_hz * frame_s
@@ -116,10 +117,11 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
             rejected[at.rows] |= found.rejected[at.frames]
         scales.append(scale)
         processes.append(process)
+    out["orientation_cov_rad2"] += by_path  # the path's error lasts: neighbours share it
     return Smoothed(
         **{name: torch.from_numpy(value) for name, value in out.items()},
         measured_R_lab_body=torch.from_numpy(R),
-        measured_cov_rad2=torch.from_numpy(R_cov),
+        measured_cov_rad2=torch.from_numpy(R_cov * scales[1] ** 2 + by_path),
         extrapolated=torch.from_numpy((numbers >= 0) & ~(seen_X & seen_R)),
         rejected=torch.from_numpy(rejected),
         position_scale=scales[0],
@@ -130,20 +132,22 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
 
 def _given_path(
     rows: Bools, R: Floats, R_cov: Floats, coupling: Floats, off: Floats, X_cov: Floats, path_cov: Floats
-) -> tuple[Floats, Floats]:
-    """Return orientations and covariances given that positions lie `off` (N, 3), mm, with the path's covariance.
-    Paint that shifts in the picture is a turn or a move of the sphere; the limb alone tells them apart, and the path
-    knows the move better. Frames outside `rows`, or whose position contradicts the path, keep their own.
+) -> tuple[Floats, Floats, Floats]:
+    """Return orientations, covariances given the positions of the path, and those that the path's own error adds.
+    `off` (N, 3), mm: path less measured position. Paint that shifts in the picture is a turn or a move of the sphere;
+    the limb alone tells them apart, and the path knows the move better than the limb of one frame. Frames outside
+    `rows`, or whose position contradicts the path, keep their own.
     """
-    rows = np.flatnonzero(rows)
-    R, R_cov, off, both, own = R.copy(), R_cov.copy(), off[rows], coupling[rows], X_cov[rows]
-    inverse = np.linalg.inv(own)
-    near = np.einsum("ni,nij,nj->n", off, inverse, off) < ON_PATH**2
-    rows, off, both = rows[near], off[near, :, None], both[near]
-    gain = both @ inverse[near]
-    R[rows] = rotation_of((gain @ off)[..., 0]) @ R[rows]
-    R_cov[rows] += gain @ path_cov[rows] @ gain.mT - gain @ both.mT
-    return R, R_cov
+    R, R_cov, added = R.copy(), R_cov.copy(), np.zeros_like(R_cov)
+    inverse = np.linalg.inv(np.where(rows[:, None, None], X_cov, np.eye(3)))
+    away = np.einsum("ni,nij,nj->n", off, inverse, off)
+    told = np.flatnonzero(rows & (away < ON_PATH**2))
+    both = coupling[told]
+    gain = both @ inverse[told]
+    R[told] = rotation_of((gain @ off[told][..., None])[..., 0]) @ R[told]
+    R_cov[told] -= gain @ both.mT
+    added[told] = gain @ path_cov[told] @ gain.mT
+    return R, R_cov, added
 
 
 def lasting_share(apart: Tensor, covariance: Tensor, segment: Tensor, assumed: float) -> float:

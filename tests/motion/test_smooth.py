@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError
-from sphereorient.motion import MeasuredPoses, Smoothed, SmoothSettings, smooth_motion
+from sphereorient.motion import MeasuredPoses, Smoothed, SmoothSettings, lasting_share, smooth_motion
 from sphereorient.synth.motion import Motion6D, random_motion
 
 RATE = 600.0
@@ -37,7 +37,12 @@ def measured(truth: Motion6D, rng: torch.Generator, factor: float = 1.0) -> tupl
 
 
 def smoothed(
-    truth: Motion6D, position: Tensor, R: Tensor, segment: Tensor | None = None, settings: SmoothSettings = WHITE
+    truth: Motion6D,
+    position: Tensor,
+    R: Tensor,
+    segment: Tensor | None = None,
+    settings: SmoothSettings = WHITE,
+    coupling: Tensor | None = None,
 ) -> Smoothed:
     frames = len(truth.time_s)
     unit = torch.eye(3, dtype=torch.float64).expand(frames, 3, 3)
@@ -50,6 +55,7 @@ def smoothed(
         R_lab_body=R,
         orientation_cov_rad2=covariances[1],
         segment=segment,
+        coupling=coupling,
     )
     return smooth_motion(poses, settings)
 
@@ -407,3 +413,67 @@ def test_a_slow_share_adds_its_part_of_the_measured_variance_to_the_covariances_
         assert_close(added, share / (1 - share) * scale**2 * sigma**2 * unit, 1e-9 * sigma**2)
     assert with_slow.position_scale == pytest.approx(without.position_scale / math.sqrt(1 - share))
     assert_close(with_slow.velocity_sigma_m_s, without.velocity_sigma_m_s)
+
+
+# what the path of positions says of orientations
+
+SHARED_PART = 0.9  # correlation of the errors of turn and place along each axis
+
+
+def coupled(truth: Motion6D, rng: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Return positions, orientations whose errors go with theirs, and their covariance."""
+    place, own = torch.randn(2, len(truth.time_s), 3, generator=rng, dtype=torch.float64)
+    turn = ORIENTATION_RAD * (SHARED_PART * place + math.sqrt(1 - SHARED_PART**2) * own)
+    unit = torch.eye(3, dtype=torch.float64).expand(len(own), 3, 3)
+    coupling = SHARED_PART * ORIENTATION_RAD * POSITION_MM * unit
+    # R_true = exp([delta]x) R, and the true position is the measured one and its error.
+    return truth.position_lab_mm - POSITION_MM * place, so3.exp(-turn) @ truth.R_lab_body, coupling
+
+
+def turn_of(found: Tensor, truth: Motion6D) -> Tensor:
+    return so3.log(truth.R_lab_body @ found.mT)
+
+
+def test_orientations_are_better_where_the_path_tells_the_error_of_the_position(rng: torch.Generator) -> None:
+    truth = planted()
+    X, R, coupling = coupled(truth, rng)
+    alone, told = (smoothed(truth, X, R, coupling=each) for each in (None, coupling))
+    assert torch.equal(alone.measured_R_lab_body, R)
+    assert torch.equal(told.position_lab_mm, alone.position_lab_mm)
+    rms = [float(turn_of(x.measured_R_lab_body, truth).square().mean().sqrt()) for x in (alone, told)]
+    # Of the shared error the part remains that the smoothed positions have.
+    left = float((told.position_lab_mm - truth.position_lab_mm).square().mean().sqrt()) / POSITION_MM
+    expected = math.hypot(SHARED_PART * left, math.sqrt(1 - SHARED_PART**2)) * ORIENTATION_RAD
+    assert rms[1] == pytest.approx(expected, rel=0.1)
+    assert rms[1] < 0.8 * rms[0]
+    assert 0.85 < over_sigma(turn_of(told.measured_R_lab_body, truth), told.measured_cov_rad2) < 1.15
+    assert 0.8 < over_sigma(turn_of(told.R_lab_body, truth), told.orientation_cov_rad2) < 1.25
+    smooth = [float(turn_of(x.R_lab_body, truth).square().mean()) for x in (told, alone)]
+    assert smooth[0] < smooth[1]
+
+
+def test_a_frame_whose_position_contradicts_the_path_keeps_its_orientation(rng: torch.Generator) -> None:
+    truth = planted()
+    X, R, coupling = coupled(truth, rng)
+    X[50] += 20 * POSITION_MM
+    told = smoothed(truth, X, R, coupling=coupling)
+    assert torch.equal(told.measured_R_lab_body[50], R[50])
+    assert not torch.equal(told.measured_R_lab_body[51], R[51])
+
+
+def test_the_share_of_errors_that_last_is_found_in_the_disagreement_of_cameras(rng: torch.Generator) -> None:
+    frames, unit = 400, torch.eye(3, dtype=torch.float64)
+    white, slow = torch.randn(2, frames, 1, 3, generator=rng, dtype=torch.float64)
+    for k in range(1, frames):
+        slow[k] = 0.98 * slow[k - 1] + math.sqrt(1 - 0.98**2) * slow[k]
+    cov, segment = unit.expand(frames, 1, 3, 3), torch.zeros(frames, dtype=torch.long)
+    for share in (0.0, 0.4, 0.8):
+        apart = math.sqrt(share) * slow + math.sqrt(1 - share) * white
+        assert lasting_share(apart, cov, segment, 0.0) == pytest.approx(share, abs=0.12)
+    assert lasting_share(white, cov, segment, 0.25) == 0.25  # never less than is assumed
+    assert lasting_share(slow[:, :0], cov[:, :0], segment, 0.25) == 0.25  # a single camera
+    assert lasting_share(slow[:4], cov[:4], segment[:4], 0.25) < 0.35  # a few frames tell little
+    gaps = slow.clone()
+    gaps[::7] = torch.nan
+    assert lasting_share(gaps, cov, segment, 0.0) == pytest.approx(0.85, abs=0.12)
+    assert lasting_share(slow, cov, torch.arange(frames), 0.25) == 0.25  # no two frames of one segment
