@@ -90,8 +90,8 @@ class SmoothSettings(BaseModel, frozen=True, extra="forbid"):
         0.25,
         ge=0,
         lt=1,
-        description="least share of the measurements' error variance that lasts over many frames; no smoother can tell it "
-        "from motion, so it is added to the smoothed covariances; more where two cameras' disagreement lasts longer",
+        description="least share of the measurements' error variance that lasts over many frames; no smoother can tell "
+        "it from motion, so it is added to the smoothed covariances; more where two cameras' disagreement lasts longer",
     )
     outlier_sigma: float = Field(
         6.0, gt=0, description="a measurement farther from what all others say is left out, sigmas (of three axes)"

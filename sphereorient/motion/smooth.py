@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.errors import ShapeError, check_tail, refusal
-from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, ProcessNoise, estimate
+from sphereorient.motion.estimate import CHANGE, SPEED, VALUE, Estimate, ProcessNoise, ProcessPrior, estimate
 from sphereorient.motion.kalman import Bools, Floats
 from sphereorient.motion.measure import M_PER_MM, Motion
 from sphereorient.motion.path import RotationTrack, SegmentTrack, rotation_of
@@ -29,8 +29,8 @@ ON_PATH = 4.0  # sigmas (of three axes) within which a measured position agrees 
 class Smoothed(Motion):
     """Motion of N frames by the smoother, float64; its covariances and sigmas hold what smoothing lost, too."""
 
-    measured_R_lab_body: Tensor  # (N, 3, 3), each frame's own orientation, given the smoothed path of positions
-    measured_cov_rad2: Tensor  # (N, 3, 3), its covariance, `orientation_scale` and the path's error included
+    R_given_path: Tensor  # (N, 3, 3), each frame's own orientation, given the smoothed path of positions
+    cov_given_path_rad2: Tensor  # (N, 3, 3), its covariance, `orientation_scale` and the path's error included
     extrapolated: Tensor  # (N,) bool, frames of a segment without a measurement of their own of either kind
     rejected: Tensor  # (N,) bool, frames with a rejected measurement
     position_scale: float  # true errors of the measured positions over their sigmas, slow errors included
@@ -69,10 +69,10 @@ class MeasuredPoses:
 def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: ProcessNoise | None = None) -> Smoothed:
     """Smooth a track, segment by segment, and take its derivatives; the result is on the CPU.
     Velocity and omega_lab are a constant plus a stationary random process, estimated from the whole track unless
-    `known`, with one factor on the sigmas. Orientations are smoothed as they are given the smoothed positions: the errors
-    of a frame's orientation and position go together (`coupling`). There is no lag; ends are included, gaps inside a segment filled, outliers
-    rejected. A segment of one measured frame has no derivatives, of two no accelerations; a track too short for the
-    estimation has no derivatives.
+    `known`, with one factor on the sigmas. The errors of a frame's orientation and position go together (`coupling`):
+    orientations are smoothed as they are given the smoothed positions. There is no lag; ends are included, gaps inside
+    a segment filled, outliers rejected. A segment of one measured frame has no derivatives, of two no accelerations; a
+    track too short for the estimation has no derivatives.
     Source: Gaussian-process smoother: Sarkka and Solin 2019, Applied Stochastic Differential Equations, chapter 12; on
     SO(3): Barfoot 2017, State Estimation for Robotics, chapters 7 and 8.
 
@@ -92,22 +92,17 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     seen_X = np.isfinite(X).all(1) & np.isfinite(X_cov).all((1, 2))
     seen_R = np.isfinite(R).all((1, 2)) & np.isfinite(R_cov).all((1, 2))
     ratio = 1.0 if known is None else frame_s / known.frame_s
-    kinds: tuple[tuple[Any, ...], ...] = (
-        (SegmentTrack, X, X_cov, seen_X, settings.position_band_hz, known and known.place, _put_places),
-        (RotationTrack, R, R_cov, seen_R, settings.orientation_band_hz, known and known.turn, _put_turns),
-    )
     square = ("position_cov_mm2", "orientation_cov_rad2", "R_lab_body")
     out = {one.name: np.full((len(t), 3, 3) if one.name in square else (len(t), 3), np.nan) for one in fields(Motion)}
-    rejected = np.zeros(len(t), dtype=bool)
-    scales, processes, by_path = [], [], np.zeros((len(t), 3, 3))
-    for kind, values, covariance, seen, band_hz, process, put in kinds:
-        if kind is RotationTrack and measured.coupling is not None:
-            coupling = measured.coupling.detach().cpu().to(torch.float64).numpy()
-            told = seen_X & seen_R & ~rejected & np.isfinite(out["position_lab_mm"]).all(1)
-            values, covariance, by_path = _given_path(
-                told, R, R_cov, coupling, out["position_lab_mm"] - X, X_cov, out["position_cov_mm2"]
-            )
-            R, R_cov = values, covariance
+    rejected, by_path = np.zeros(len(t), dtype=bool), np.zeros((len(t), 3, 3))
+
+    def put_smooth(
+        kind: type[SegmentTrack], values: Floats, covariance: Floats, seen: Bools, process: ProcessPrior | None
+    ) -> tuple[float, ProcessPrior | None]:
+        turning = kind is RotationTrack
+        band_hz, put = (
+            (settings.orientation_band_hz, _put_turns) if turning else (settings.position_band_hz, _put_places)
+        )
         instants = [_Instants.of(k, t[k] / frame_s, seen[k]) for k in rows if seen[k].any()]
         paths = [kind.of(at.time, at.spread(values), at.spread(covariance), at.used) for at in instants]
         band = None if band_hz is None else band_hz * frame_s
@@ -115,18 +110,25 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
         for at, found in zip(instants, estimates, strict=True):
             put(out, at.rows, at.take(found), frame_s)
             rejected[at.rows] |= found.rejected[at.frames]
-        scales.append(scale)
-        processes.append(process)
+        return scale, process
+
+    position_scale, place = put_smooth(SegmentTrack, X, X_cov, seen_X, None if known is None else known.place)
+    if measured.coupling is not None:
+        both = measured.coupling.detach().cpu().to(torch.float64).numpy()
+        told = seen_X & seen_R & ~rejected & np.isfinite(out["position_lab_mm"]).all(1)
+        off = out["position_lab_mm"] - X
+        R, R_cov, by_path = _given_path(told, R, R_cov, both, off, X_cov, out["position_cov_mm2"])
+    orientation_scale, turn = put_smooth(RotationTrack, R, R_cov, seen_R, None if known is None else known.turn)
     out["orientation_cov_rad2"] += by_path  # the path's error lasts: neighbours share it
     return Smoothed(
         **{name: torch.from_numpy(value) for name, value in out.items()},
-        measured_R_lab_body=torch.from_numpy(R),
-        measured_cov_rad2=torch.from_numpy(R_cov * scales[1] ** 2 + by_path),
+        R_given_path=torch.from_numpy(R),
+        cov_given_path_rad2=torch.from_numpy(R_cov * orientation_scale**2 + by_path),
         extrapolated=torch.from_numpy((numbers >= 0) & ~(seen_X & seen_R)),
         rejected=torch.from_numpy(rejected),
-        position_scale=scales[0],
-        orientation_scale=scales[1],
-        process=ProcessNoise(place=processes[0], turn=processes[1], frame_s=frame_s),
+        position_scale=position_scale,
+        orientation_scale=orientation_scale,
+        process=ProcessNoise(place=place, turn=turn, frame_s=frame_s),
     )
 
 

@@ -438,15 +438,15 @@ def test_orientations_are_better_where_the_path_tells_the_error_of_the_position(
     truth = planted()
     X, R, coupling = coupled(truth, rng)
     alone, told = (smoothed(truth, X, R, coupling=each) for each in (None, coupling))
-    assert torch.equal(alone.measured_R_lab_body, R)
+    assert torch.equal(alone.R_given_path, R)
     assert torch.equal(told.position_lab_mm, alone.position_lab_mm)
-    rms = [float(turn_of(x.measured_R_lab_body, truth).square().mean().sqrt()) for x in (alone, told)]
+    rms = [float(turn_of(x.R_given_path, truth).square().mean().sqrt()) for x in (alone, told)]
     # Of the shared error the part remains that the smoothed positions have.
     left = float((told.position_lab_mm - truth.position_lab_mm).square().mean().sqrt()) / POSITION_MM
     expected = math.hypot(SHARED_PART * left, math.sqrt(1 - SHARED_PART**2)) * ORIENTATION_RAD
     assert rms[1] == pytest.approx(expected, rel=0.1)
     assert rms[1] < 0.8 * rms[0]
-    assert 0.85 < over_sigma(turn_of(told.measured_R_lab_body, truth), told.measured_cov_rad2) < 1.15
+    assert 0.85 < over_sigma(turn_of(told.R_given_path, truth), told.cov_given_path_rad2) < 1.15
     assert 0.8 < over_sigma(turn_of(told.R_lab_body, truth), told.orientation_cov_rad2) < 1.25
     smooth = [float(turn_of(x.R_lab_body, truth).square().mean()) for x in (told, alone)]
     assert smooth[0] < smooth[1]
@@ -457,8 +457,8 @@ def test_a_frame_whose_position_contradicts_the_path_keeps_its_orientation(rng: 
     X, R, coupling = coupled(truth, rng)
     X[50] += 20 * POSITION_MM
     told = smoothed(truth, X, R, coupling=coupling)
-    assert torch.equal(told.measured_R_lab_body[50], R[50])
-    assert not torch.equal(told.measured_R_lab_body[51], R[51])
+    assert torch.equal(told.R_given_path[50], R[50])
+    assert not torch.equal(told.R_given_path[51], R[51])
 
 
 def test_the_share_of_errors_that_last_is_found_in_the_disagreement_of_cameras(rng: torch.Generator) -> None:
