@@ -28,8 +28,9 @@ def learn(job: Job, progress: Progress) -> Follower:
     progress("appearance", 0, 1)
     frames = sample_frames(recording, views, settings.refine.appearance_frames)
     # Only blurred pictures need blurred templates; sharp ones share one first guess.
-    seen_px = settings.refine.blur_px or estimate_blur_px(views, frames, settings.locate)
-    blur_px = seen_px if defocus_radii(seen_px, search.diameter_px) else FIRST_BLUR_PX
+    blur_px = settings.refine.blur_px or estimate_blur_px(views, frames, settings.locate)
+    if settings.refine.blur_px is None and not defocus_radii(blur_px, search.diameter_px):
+        blur_px = FIRST_BLUR_PX
     first = Initialiser(
         fitter=first_fitter(views, recording.experiment.radius_mm, base, blur_px),
         proposers=search.by_camera(views, blur_px),
