@@ -40,7 +40,9 @@ GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may diffe
 TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
 FINER = 1.25  # ratio of the blurs that are tried, from FINEST_PX on
 WIDEST = 0.3  # of the radius: wider ones remove all paint
-LIGHT_ROUNDS, SOFT_ROUNDS = 2, 4
+LIGHT_ROUNDS, BLUR_ROUNDS = 2, 4
+BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
+BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 
 
@@ -103,6 +105,11 @@ def estimate_appearance(
     pixels = pixels.thinned(max(1, round(pixels.grey.shape[1] / ENOUGH)))
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
     fitter, fit = _light_and_blur(fitter, base, pixels, fit, use, given=settings.blur_px is not None)
+    blur_px = fitter.optics.blur_px
+    if settings.blur_px is None and abs(blur_px / first.fitter.optics.blur_px - 1) > BLUR_FAR_OFF:
+        # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
+        matched = replace(first, fitter=replace(first.fitter, optics=Optics(base, blur_px, diameter_px)))
+        return estimate_appearance(matched, frames, base, settings.model_copy(update={"blur_px": blur_px}))
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
     best, highest = _scores(looked)
@@ -279,17 +286,20 @@ def _clear_of(typical: float) -> float:
 def _light_and_blur(
     fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor, *, given: bool
 ) -> tuple[Fitter, FittedPoses]:
-    """Estimate light, then blur, then light again; return the fitter that has both, and its fit.
-    Light estimated with a wrong blur favours that blur: for blurred pictures they alternate several times.
+    """Estimate light, then blur, then light again, until the blur stays; return the fitter that has both, and its fit.
+    Light estimated with a wrong blur favours that blur: where the first guess is far off, one round is not enough.
     """
     diameter_px = widest_px(fitter.views)
     fitter, fit = _with_light(fitter, pixels, fit, use)
-    soft = not given and defocus_radii(fitter.optics.blur_px, diameter_px) > 0
-    for _ in range(SOFT_ROUNDS if soft else 1):
+    soft = defocus_radii(fitter.optics.blur_px, diameter_px) > 0  # there each round moves it by little
+    for _ in range(1 if given else BLUR_ROUNDS):
+        before_px = fitter.optics.blur_px
         if not given:
             blur_px = best_blur_px(fitter, base, pixels, fit, use)
             fitter = replace(fitter, optics=Optics(base, blur_px, diameter_px))
         fitter, fit = _with_light(fitter, pixels, fit, use)
+        if not soft and abs(fitter.optics.blur_px / before_px - 1) < BLUR_STAYS:
+            break
     return fitter, fit
 
 
