@@ -39,6 +39,7 @@ COLUMNS = (
     "alpha lab",
     "velocity",
     "over the stated errors, rms",
+    "in the stated 95 %",
     "s",
 )
 PARTS = ("velocity", "acceleration", "omega_lab", "alpha_lab")
@@ -84,6 +85,7 @@ def row(folder: Path, label: str, cameras: Sequence[str], method: str) -> str:
         f"{_share(score, 'alpha_lab')}",
         _share(score, "velocity") if len(cameras) == 2 else "",
         " / ".join(f"{value:.2f}" for value in score.over_stated()),
+        "{} of {}".format(*score.inside()),
         f"{seconds:.0f}",
     ]
     if method == "paper":

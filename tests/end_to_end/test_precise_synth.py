@@ -336,6 +336,22 @@ def test_pictures_out_of_focus_by_a_seventh_of_the_radius_are_tracked(brisk, tmp
 
 
 @pytest.mark.slow
+def test_the_blur_of_soft_pictures_is_learnt_as_well_as_told_and_a_told_one_is_used(brisk, tmp_path):
+    movies = soft(brisk, 0.95)
+    told = [() if blur is None else (f"refine.blur_px={blur}",) for blur in (None, 1.13, 0.625)]
+    folders = [tmp_path / str(k) for k in range(len(told))]
+    for folder in folders:
+        folder.mkdir()
+    found = [tracked(movies, folder, *given) for folder, given in zip(folders, told, strict=True)]
+    learnt, right, wrong = (np.median(turned_off(track, movies)) for track in found)
+    print(f"learnt {learnt:.4f}, told {right:.4f}, told wrongly {wrong:.4f} degrees")
+    assert learnt < 1.15 * right
+    assert wrong > 1.5 * right
+    z = in_sigmas(rotation_error(found[0], movies), found[0].orientation_cov)
+    assert 0.6 < np.sqrt((z**2).mean()) < 1.4
+
+
+@pytest.mark.slow
 def test_a_mirrored_map_is_refused_of_soft_pictures_too(brisk, tmp_path):
     """Any pose explains most of a blurred disk: what counts is how much more the best one does."""
     path = write(soft(brisk.frames(slice(0, 40)), 0.14 * 25.0), tmp_path)
