@@ -37,7 +37,8 @@ BLOCK = 16  # frames; short, so that a short movie has blocks without the fault
 RATE = 600.0
 CAMERAS = ("cam1", "cam2")
 Pictures = dict[str, NDArray[np.uint8]]
-OWN = ("position", "orientation")  # stated errors follow the disagreement of the cameras in the whole movie
+# Orientations follow the path of all positions, and stated errors the disagreement of the cameras in the whole movie.
+OWN = ("position",)
 SEEN = ("score", "centre_px", "orientation", "orientation_cov")
 
 

@@ -319,7 +319,8 @@ def test_segments_know_nothing_of_each_other(rng: torch.Generator) -> None:
     for entry in fields(Smoothed):
         values = getattr(one, entry.name)
         if isinstance(values, Tensor) and values.is_floating_point():
-            assert values[85:90].isnan().all(), entry.name
+            if "given_path" not in entry.name:  # a frame outside all segments keeps what it measured
+                assert values[85:90].isnan().all(), entry.name
             assert values[:85].isfinite().all(), entry.name
             # the factor on the sigmas is learnt from all segments, the motion of each from itself
             torch.testing.assert_close(getattr(other, entry.name)[:85], values[:85], rtol=1e-6, atol=1e-9)
@@ -446,7 +447,7 @@ def test_orientations_are_better_where_the_path_tells_the_error_of_the_position(
     expected = math.hypot(SHARED_PART * left, math.sqrt(1 - SHARED_PART**2)) * ORIENTATION_RAD
     assert rms[1] == pytest.approx(expected, rel=0.1)
     assert rms[1] < 0.8 * rms[0]
-    assert 0.85 < over_sigma(turn_of(told.R_given_path, truth), told.cov_given_path_rad2) < 1.15
+    assert 0.9 < over_sigma(turn_of(told.R_given_path, truth), told.cov_given_path_rad2) < 1.1
     assert 0.8 < over_sigma(turn_of(told.R_lab_body, truth), told.orientation_cov_rad2) < 1.25
     smooth = [float(turn_of(x.R_lab_body, truth).square().mean()) for x in (told, alone)]
     assert smooth[0] < smooth[1]
