@@ -447,7 +447,10 @@ def test_orientations_are_better_where_the_path_tells_the_error_of_the_position(
     expected = math.hypot(SHARED_PART * left, math.sqrt(1 - SHARED_PART**2)) * ORIENTATION_RAD
     assert rms[1] == pytest.approx(expected, rel=0.1)
     assert rms[1] < 0.8 * rms[0]
-    assert 0.9 < over_sigma(turn_of(told.R_given_path, truth), told.cov_given_path_rad2) < 1.1
+    assert 0.85 < over_sigma(turn_of(told.R_given_path, truth), told.cov_given_path_rad2) < 1.15
+    own = (1 - SHARED_PART**2) * (ORIENTATION_RAD * told.orientation_scale) ** 2 * torch.eye(3, dtype=torch.float64)
+    by_path = (SHARED_PART * ORIENTATION_RAD / POSITION_MM) ** 2 * told.position_cov_mm2
+    assert_close(told.cov_given_path_rad2, own + by_path, 1e-9 * ORIENTATION_RAD**2)
     assert 0.8 < over_sigma(turn_of(told.R_lab_body, truth), told.orientation_cov_rad2) < 1.25
     smooth = [float(turn_of(x.R_lab_body, truth).square().mean()) for x in (told, alone)]
     assert smooth[0] < smooth[1]
