@@ -119,7 +119,10 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
         off = out["position_lab_mm"] - X
         R, R_cov, by_path = _given_path(told, R, R_cov, both, off, X_cov, out["position_cov_mm2"])
     orientation_scale, turn = put_smooth(RotationTrack, R, R_cov, seen_R, None if known is None else known.turn)
-    out["orientation_cov_rad2"] += by_path  # the path's error lasts: neighbours share it
+    # The path's error lasts: neighbours share it, and frames between them.
+    shared = by_path.any(axis=(1, 2))
+    usual = by_path[shared].mean(0) if shared.any() else np.zeros((3, 3))
+    out["orientation_cov_rad2"] += np.where(shared[:, None, None], by_path, usual)
     return Smoothed(
         **{name: torch.from_numpy(value) for name, value in out.items()},
         R_given_path=torch.from_numpy(R),
