@@ -120,7 +120,7 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
         R, R_cov, by_path = _given_path(told, R, R_cov, both, off, X_cov, out["position_cov_mm2"])
     orientation_scale, turn = put_smooth(RotationTrack, R, R_cov, seen_R, None if known is None else known.turn)
     # The path's error lasts: neighbours share it, and frames between them.
-    shared = by_path.any(axis=(1, 2))
+    shared = np.abs(by_path).sum((1, 2)) > 0
     usual = by_path[shared].mean(0) if shared.any() else np.zeros((3, 3))
     out["orientation_cov_rad2"] += np.where(shared[:, None, None], by_path, usual)
     return Smoothed(
