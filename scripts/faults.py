@@ -3,8 +3,8 @@
     scripts/faults.py [--frames 96] [--turn 3] [--only NAME ...] [--json]
 
 A synthetic movie is spoilt in one way after the other and tracked twice: with what the clean run had learnt (then the
-poses of the blocks without a fault are the same to the last bit) and with everything learnt anew from the spoilt
-movie (then they differ by the tenths of a sigma that the last columns tell).
+positions and the orientations by each camera of the blocks without a fault are the same to the last bit) and with
+everything learnt anew from the spoilt movie (then poses differ by the tenths of a sigma that the last columns tell).
 """
 
 from __future__ import annotations

@@ -68,9 +68,10 @@ def test_each_fault_costs_its_own_frames_only(everything, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in EXPECTED if name != "cam2 a frame late from here on"])
 def test_good_frames_are_the_same_to_a_tenth_of_a_sigma_when_all_is_learnt_anew(everything, name):
-    # The path of positions made the sigmas a sixth smaller, and a frame beside lost ones knows less of it.
-    assert everything[name]["anew_rms_sigma"] <= 0.125
-    assert everything[name]["anew_most_sigma"] <= 0.4
+    # A frame beside lost ones knows less of the path that its orientation follows.
+    rms_sigma, most_sigma = (0.125, 0.4) if name == "out of view" else (0.11, 0.3)
+    assert everything[name]["anew_rms_sigma"] <= rms_sigma
+    assert everything[name]["anew_most_sigma"] <= most_sigma
     assert everything[name]["worst_anew_deg"] < 2 * everything[name]["clean_worst_deg"]
 
 
