@@ -18,7 +18,16 @@ from sphereorient.follow.poses import Poses, best_poses, pose_table, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses, trace
-from sphereorient.pose.fitter import FINEST_PX, Fitter, Optics, Picture, defocus_radii, level_of, widest_px
+from sphereorient.pose.fitter import (
+    FINEST_PX,
+    LEAST_LEFT,
+    Fitter,
+    Optics,
+    Picture,
+    defocus_radii,
+    level_of,
+    widest_px,
+)
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.trajectory import Reason
@@ -43,7 +52,6 @@ WIDEST = 0.3  # of the radius: wider ones remove all paint
 LIGHT_ROUNDS, BLUR_ROUNDS = 2, 4
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
 BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
-LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,6 +118,7 @@ def estimate_appearance(
         # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
         matched = replace(first, fitter=replace(first.fitter, optics=Optics(base, blur_px, diameter_px)))
         return estimate_appearance(matched, frames, base, settings.model_copy(update={"blur_px": blur_px}))
+    fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
     best, highest = _scores(looked)

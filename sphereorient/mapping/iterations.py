@@ -72,6 +72,12 @@ class State:
     fitter: Fitter  # of views and light; its own map is not used
     fixed: bool  # whether all instants share one position
 
+    @property
+    def light(self) -> Light:
+        """The light as maps of each camera's disk."""
+        assert isinstance(self.fitter.light, Light)
+        return self.fitter.light
+
     def map_fitter(self) -> Fitter:
         """Return the fitter of poses to the present map."""
         return replace(self.fitter, optics=optics_of(self.texture, self.fitter.views, self.blur_px))
@@ -193,7 +199,7 @@ def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[S
 
 
 def _with_light(state: State) -> State:
-    cameras, basis = state.use.shape[1], state.fitter.light.difference.shape[-1]
+    cameras, basis = state.use.shape[1], state.light.difference.shape[-1]
     normal = torch.zeros(cameras, 2 * basis, 2 * basis, dtype=torch.float64)
     right = torch.zeros(cameras, 2 * basis, dtype=torch.float64)
     greys: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -217,7 +223,7 @@ def _rescaled(state: State) -> State:
     share = texel_areas(len(state.texture)).reshape(-1)[order].cumsum(0)
     low, high = (float(values[int((share < part * share[-1]).sum())]) for part in (BLACK, WHITE))
     step = max(high - low, 1e-3)
-    light = state.fitter.light
+    light = state.light
     if light.known:  # the light takes over the factor, so no picture changes
         light = replace(light, difference=light.difference * step, black=light.black + light.difference * low)
     return replace(state, texture=(state.texture - low) / step, fitter=replace(state.fitter, light=light))

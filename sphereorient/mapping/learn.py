@@ -33,7 +33,7 @@ from sphereorient.mapping.settings import MapSettings
 from sphereorient.mapping.verdict import jumps, paint_correlation
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, widest_px
-from sphereorient.pose.model import Light
+from sphereorient.pose.model import LIGHT_PARTS, Light
 from sphereorient.synth.textures import map_directions
 
 # Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).
@@ -49,7 +49,7 @@ PIXELS_A_TEXEL = 3.0
 # Blur (radii) and number of the first iterations of photographs. Errors: 0.8 degrees before, 0.06 after, 0.05 at the
 # end (12 pictures of 200 px); without them 0.09 after twice as many others.
 COARSE, COARSE_ITERATIONS = 0.015, 5
-STATE_PARTS, LIGHT_PARTS = ("position_lab_mm", "R_lab_body", "texture"), ("difference", "black", "noise")  # kept
+STATE_PARTS = ("position_lab_mm", "R_lab_body", "texture")  # kept
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,7 +125,7 @@ class _Start:
 
 def _parts(start: _Start, state: State, done: Sequence[Iteration]) -> dict[str, Tensor]:
     """Return what `_resumed` needs beside the crops."""
-    chain, light = start.chain, state.fitter.light
+    chain, light = start.chain, state.light
     closure, iterations = astuple(chain.closure), [astuple(one) for one in done]
     numbers = {"closure": closure, "blur_px": state.blur_px, "done": iterations}
     parts = {"place": start.crops.position_lab_mm, "frames": start.frames, "rows": start.rows, "known": light.known}
@@ -256,7 +256,7 @@ def _finished(
         paint=spread(paint_correlation(crops, state, settings), used),
         jumps=torch.empty(0).long() if settings.unordered else jumps(attitudes),
         views=crops.views,
-        light=state.fitter.light,
+        light=state.light,
         blur_px=state.blur_px,
         closure=chain.closure,
         rounds=iterations,

@@ -22,7 +22,9 @@ from sphereorient.follow.poses import Poses
 from sphereorient.locate import Background, CameraScene
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
-from sphereorient.pose import CameraView, Fitter, Light, Optics, base_table
+from sphereorient.pose import CameraView, Fitter, Optics, base_table
+from sphereorient.pose.lab_light import LAB_PARTS, LabLight
+from sphereorient.pose.model import LIGHT_PARTS, Light, Lighting
 from sphereorient.trajectory import Trajectory
 
 SCHEMA = "sphereorient-learnt/1"
@@ -36,7 +38,7 @@ class Learnt:
     """Everything that the precise method learns from the movies, before and after tracking; made by the pipeline."""
 
     scenes: Mapping[str, CameraScene]  # by camera, in the order of the fit
-    light: Light
+    light: Lighting
     blur_px: float
     widest_px: float
     score_min: float
@@ -160,7 +162,7 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
                 group.create_dataset(part, data=getattr(background, part), track_times=False)
     light = file.create_group("light")
     light.attrs["known"] = learnt.light.known
-    for part in ("difference", "black", "noise"):
+    for part in LAB_PARTS if isinstance(learnt.light, LabLight) else LIGHT_PARTS:
         light.create_dataset(part, data=getattr(learnt.light, part).cpu().numpy(), track_times=False)
     if learnt.process is not None:
         group = file.create_group("process")
@@ -183,11 +185,12 @@ def _read(file: h5py.File) -> Learnt:
         )
         scenes[name] = CameraScene(background=background, diameter_px=float(group.attrs["diameter_px"]))
     light = file["light"]
-    parts = {part: torch.from_numpy(light[part][()]) for part in ("difference", "black", "noise")}
+    parts = {part: torch.from_numpy(light[part][()]) for part in light}
+    kind = LabLight if "gloss" in parts else Light
     acceleration = file.attrs.get("acceleration_rad_s2")
     return Learnt(
         scenes=scenes,
-        light=Light(known=bool(light.attrs["known"]), **parts),
+        light=kind(known=bool(light.attrs["known"]), **parts),
         together=bool(file.attrs["together"]),
         second_ball=bool(file.attrs.get("second_ball", False)),
         process=_process(file["process"]) if "process" in file else None,

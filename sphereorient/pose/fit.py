@@ -43,6 +43,10 @@ class FittedPoses:
         """Return the arrays by name."""
         return {name: getattr(self, name) for name in POSE_PARTS}
 
+    def of(self, rows: Tensor) -> "FittedPoses":
+        """Return some of the poses (B,), by index."""
+        return FittedPoses(**{name: part[rows] for name, part in self.parts().items()})
+
     def where(self, mask: Tensor, other: "FittedPoses") -> "FittedPoses":
         """Return these poses where the mask (B,) holds, the others elsewhere."""
         own, others = self.parts(), other.parts()
@@ -178,7 +182,7 @@ def residuals(
     `state`: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
     """
     view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
-    difference, black = model.light.at(view.across)  # as learnt
+    difference, black = model.light.at(view, pixels)  # as learnt
     tints = polynomials(view.across, max(model.shading.difference, model.shading.black))
     n, n_black = ((order + 1) * (order + 2) // 2 for order in (model.shading.difference, model.shading.black))
     learnt = (view.coverage * (view.paint * difference + black))[:, None]

@@ -17,13 +17,14 @@ from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene, Frame, LocateSettings
 from sphereorient.locate.outline import find_blobs
 from sphereorient.pose.fit import KNOWN, FittedPoses, PoseStart, learn_light, refine
-from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, SphereModel
+from sphereorient.pose.lab_light import learn_lab_light
+from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 
 Picture = NDArray[np.generic]
-Record = TypeVar("Record", Pixels, PoseStart, FittedPoses, Light)
+Record = TypeVar("Record", Pixels, PoseStart, FittedPoses)
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
 SIZES = 1.06  # ratio of neighbouring stencil sizes
@@ -38,6 +39,9 @@ AROUND = 1.2  # of the radius: the sphere and its rim
 CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and scene lie
 STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
 
+FEWEST_LIT = 8  # rows of poses from which the light in the lab is learnt
+MORE_EXPLAINED = 0.05  # share of the variance by which it must leave less
+LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 DISK_PX = 32  # of the disk on which the share of known paint is counted
 NOISE = 1.0  # grey levels, of a background of one grey
 
@@ -133,7 +137,7 @@ class Fitter:
     views: Sequence[CameraView]
     radius_mm: float
     optics: Optics
-    light: Light
+    light: Lighting
     device: torch.device = CPU  # of the fits; inputs and results are on the CPU
     widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
 
@@ -148,9 +152,37 @@ class Fitter:
         """Return a fitter with the light and the noise of fitted pictures; see `learn_light`."""
         return replace(self, light=learn_light(pixels, fit, use, self.model(self.optics.fine)))
 
+    def lit_in_the_lab(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple["Fitter", FittedPoses]:
+        """Return a fitter with one light in the lab for all cameras, and its fit, if maps of the disks explain less.
+        Both are learnt from every other row of `use` (B, C); what counts is what they leave in the rows between.
+        """
+        cameras, fine = use.shape[1], self.optics.fine
+        if len(use) < FEWEST_LIT:
+            return self, fit
+
+        def some(rows: Tensor) -> tuple[Pixels, FittedPoses, Tensor]:
+            disks = (rows[:, None] * cameras + torch.arange(cameras)).reshape(-1)
+            return pixels.where(disks), fit.of(rows), use[rows]
+
+        def in_the_lab(pixels: Pixels, fit: FittedPoses, use: Tensor) -> "Fitter":
+            return replace(self, light=learn_lab_light(pixels, fit, use, self.model(fine)))
+
+        every, left = torch.arange(len(use)), []
+        learning, (shown, there, used) = some(every[::2]), some(every[1::2])
+        for lit in (self.with_light_of(*learning), in_the_lab(*learning)):
+            score = lit.fit(shown, there.position_lab_mm, there.R_lab_body, used, fine, 3).score
+            left.append(float((1.0 - score)[used].clamp_min(LEAST_LEFT).log().mean()))
+        if left[1] > left[0] - MORE_EXPLAINED:
+            return self, fit
+        lit = self
+        for _ in range(2):  # the poses, too, were found with the maps
+            lit = in_the_lab(pixels, fit, use)
+            fit = lit.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
+        return lit, fit
+
     def on(self, device: torch.device) -> "Fitter":
         """Return a fitter that computes on another device."""
-        return replace(self, optics=self.optics.to(device), light=moved_to(device, self.light), device=device)
+        return replace(self, optics=self.optics.to(device), light=self.light.to(device), device=device)
 
     def of(self, camera: int) -> "Fitter":
         """Return the fitter of one camera by itself."""

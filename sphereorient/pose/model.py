@@ -1,12 +1,14 @@
 """The measuring model: the painted sphere in the pixels of a camera, blurred, its derivatives by the pose, its light.
 
-Light: brightness of white and black paint over the disk, low-order maps per camera, estimated from the movie.
+Light: brightness of white and black paint over the disk, low-order maps per camera, estimated from the movie; or
+one light in the lab for all cameras (`lab_light`).
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -53,6 +55,53 @@ def light_basis(across: Tensor) -> Tensor:
     return torch.cat([polynomials(across, ORDER), polynomials(across, DEPTH_ORDER) * depth[..., None, :]], dim=-2)
 
 
+class Lighting(Protocol):
+    """How bright paint appears in the pictures of C cameras, and their noise: `Light`, or `LabLight`."""
+
+    @property
+    def noise(self) -> Tensor:
+        """Coefficients of the noise's variance, (C, 4); see `Light`."""
+
+    @property
+    def known(self) -> bool:
+        """Whether it is estimated from pictures."""
+
+    def at(self, view: "SphereView", pixels: Pixels) -> tuple[Tensor, Tensor]:
+        """Return white less black paint and black paint, grey levels, (L, P) each, of L disks."""
+
+    def of(self, camera: int) -> "Lighting":
+        """Return the light of one camera."""
+
+    def to(self, device: torch.device) -> "Lighting":
+        """Return the light on another device."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SphereModel:
+    """What a picture of the sphere depends on, its pose aside."""
+
+    radius_mm: float
+    paint: TextureTable  # blurred by `blur_px` as seen at the disk's middle
+    blur_px: float  # standard deviation of optics, pixel and whatever was laid over the frame, px
+    light: Lighting  # of the C cameras
+    shading: Shading = LATER  # how far a frame's light may differ from it
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SphereView:
+    """The sphere in the pixels of L disks at one pose each; made by `sphere_view`."""
+
+    paint: Tensor  # (L, P), blurred paint seen, 0 .. 1
+    coverage: Tensor  # (L, P), share of the pixel's blurred aperture that the sphere fills
+    across: Tensor  # (L, 2, P), place on the disk along the camera's x and y, radii
+    outward: Tensor  # (L, 3, P), unit, lab, from the centre to the line of sight
+    aside: Tensor  # (L, P), distance of the place from the line of sight through the centre, radii
+    paint_by_rotation: Tensor  # (L, 3, P), derivative by delta in exp([delta]x) R, 1/rad
+    paint_by_position: Tensor  # (L, 3, P), derivative by the centre, lab, 1/mm
+    coverage_by_position: Tensor  # (L, 3, P), 1/mm
+    known: Tensor | None  # (L, P) bool, whether all paint that the pixel looks at is known; None: everywhere
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Light:
     """Light on the disk and noise of a movie's pictures, one entry per camera; made by `learn_light`.
@@ -76,9 +125,9 @@ class Light:
         basis = light_basis(across)
         return torch.stack([self.difference @ basis, self.black @ basis], dim=-1).reshape(-1, 2)
 
-    def at(self, across: Tensor) -> tuple[Tensor, Tensor]:
-        """Return difference and black, (L, P) each, at places (L, 2, P), the C cameras of a pose side by side."""
-        cameras = len(self.difference)
+    def at(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
+        """Return difference and black, grey levels, (L, P) each, of L disks, the C cameras of a pose side by side."""
+        across, cameras = view.across, len(self.difference)
         column, row = ((across + 1.0) * (0.5 * MAP_SIDE)).to(torch.int32).clamp_(0, MAP_SIDE - 1).unbind(1)
         camera = torch.arange(len(across), device=across.device, dtype=torch.int32) % cameras
         cell = (camera[:, None] * MAP_SIDE + row) * MAP_SIDE + column
@@ -90,6 +139,10 @@ class Light:
         one = slice(camera, camera + 1)
         return replace(self, difference=self.difference[one], black=self.black[one], noise=self.noise[one])
 
+    def to(self, device: torch.device) -> "Light":
+        """Return the light on another device."""
+        return replace(self, **{name: getattr(self, name).to(device) for name in LIGHT_PARTS})
+
     @classmethod
     def unknown(cls, cameras: int, noise: Tensor) -> "Light":
         """Return flat light, for the first fits."""
@@ -99,28 +152,7 @@ class Light:
         return cls(difference=difference, black=torch.zeros(cameras, count), noise=noise, known=False)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SphereModel:
-    """What a picture of the sphere depends on, its pose aside."""
-
-    radius_mm: float
-    paint: TextureTable  # blurred by `blur_px` as seen at the disk's middle
-    blur_px: float  # standard deviation of optics, pixel and whatever was laid over the frame, px
-    light: Light  # of the C cameras
-    shading: Shading = LATER  # how far a frame's light may differ from it
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SphereView:
-    """The sphere in the pixels of L disks at one pose each; made by `sphere_view`."""
-
-    paint: Tensor  # (L, P), blurred paint seen, 0 .. 1
-    coverage: Tensor  # (L, P), share of the pixel's blurred aperture that the sphere fills
-    across: Tensor  # (L, 2, P), place on the disk along the camera's x and y, radii
-    paint_by_rotation: Tensor  # (L, 3, P), derivative by delta in exp([delta]x) R, 1/rad
-    paint_by_position: Tensor  # (L, 3, P), derivative by the centre, lab, 1/mm
-    coverage_by_position: Tensor  # (L, 3, P), 1/mm
-    known: Tensor | None  # (L, P) bool, whether all paint that the pixel looks at is known; None: everywhere
+LIGHT_PARTS = tuple(field.name for field in fields(Light) if field.name != "known")
 
 
 def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model: SphereModel) -> SphereView:
@@ -162,6 +194,8 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
         paint=body,
         coverage=coverage,
         across=q[:, None] * (pixels.axes @ outward),
+        outward=outward,
+        aside=q,
         paint_by_rotation=turn,
         paint_by_position=shift,
         coverage_by_position=(density / (blur * radius_mm))[:, None] * outward,

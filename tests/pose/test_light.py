@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -23,7 +24,7 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient.pose.fit import learn_light, light_maps, light_sums, noise_curve
-from sphereorient.pose.model import FIRST, Light, SphereView, light_basis, polynomials, sphere_view
+from sphereorient.pose.model import FIRST, Light, Lighting, SphereView, light_basis, polynomials, sphere_view
 from sphereorient.pose.pixels import Pixels
 
 KINDS = ("patches",)
@@ -36,6 +37,11 @@ def disk_places(count: int, radius: float = 1.0, seed: int = 1) -> Tensor:
     r = radius * torch.rand(count, generator=rng).sqrt()
     angle = 2 * math.pi * torch.rand(count, generator=rng)
     return torch.stack([r * angle.cos(), r * angle.sin()])[None]
+
+
+def looked_up(light: Lighting, across: Tensor) -> tuple[Tensor, Tensor]:
+    """Difference and black of maps of the disk at places (L, 2, P)."""
+    return light.at(SimpleNamespace(across=across), None)
 
 
 def lamp(across: Tensor, camera: int) -> tuple[Tensor, Tensor]:
@@ -86,7 +92,7 @@ def test_maps_that_are_looked_up_are_the_sums_of_functions():
     )
     across = torch.cat([disk_places(3000, 0.98, seed) for seed in range(4)])
     basis = light_basis(across)
-    for got, coefficients in zip(light.at(across), (light.difference, light.black), strict=True):
+    for got, coefficients in zip(looked_up(light, across), (light.difference, light.black), strict=True):
         expected = torch.stack([coefficients[k % 2] @ basis[k] for k in range(4)])
         # A cell is 1/128 of a radius wide, and by the limb the depth changes over several of them.
         error = (got - expected) / expected.std()
@@ -100,7 +106,7 @@ def test_a_lamp_is_looked_up_to_a_grey_level():
     across = disk_places(5000, 0.98)
     difference, black = maps_of(*lamp_coefficients())
     light = Light(difference=difference[None], black=black[None], noise=NOISE, known=True)
-    for got, expected in zip(light.at(across), lamp(across, 0), strict=True):
+    for got, expected in zip(looked_up(light, across), lamp(across, 0), strict=True):
         assert (got - expected)[across.norm(dim=1) < 0.9].abs().max() < 1.0
         assert (got - expected).square().mean().sqrt() < 0.4
 
@@ -119,7 +125,7 @@ def maps_of(*coefficients: Tensor) -> tuple[Tensor, ...]:
 def test_unknown_light_is_one_and_nothing_everywhere():
     light = Light.unknown(3, NOISE.repeat(3, 1))
     assert not light.known
-    difference, black = light.at(disk_places(500, 1.2).repeat(6, 1, 1))
+    difference, black = looked_up(light, disk_places(500, 1.2).repeat(6, 1, 1))
     assert (difference == 1).all()
     assert (black == 0).all()
     assert difference.shape == (6, 500)
@@ -246,7 +252,7 @@ def test_light_and_noise_of_two_cameras_are_learnt_from_fitted_pictures():
     light = learn_light(pixels, fit, use, model)
     assert light.known
     across = disk_places(3000, 0.9).repeat(2, 1, 1)
-    for k, part in enumerate(light.at(across)):
+    for k, part in enumerate(looked_up(light, across)):
         for camera in range(2):
             error = part[camera] - lamp(across[camera], camera)[k]
             assert error.square().mean().sqrt() < 2.0

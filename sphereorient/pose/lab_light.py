@@ -1,0 +1,231 @@
+"""One light in the lab for all cameras and places: what the paint scatters, and what its gloss mirrors.
+
+`learn_lab_light` estimates it from the fits that `learn_light` estimates maps of the disk from.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+import torch
+from scipy.special import sph_harm_y_all
+from torch import Tensor
+
+from sphereorient.pose.fit import FittedPoses, by_pose, noise_curve, residuals
+from sphereorient.pose.model import LATER, Lighting, SphereModel, SphereView, polynomials
+from sphereorient.pose.pixels import Pixels
+from sphereorient.sphere.texture import sample_texture
+from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
+
+SCATTERED, MIRRORED = 6, 16  # degrees of the harmonics over the normal and over the mirrored direction
+KNOTS = (0.0, 0.12, 0.22, 0.32, 0.45, 0.6, 0.8, 1.0)  # depths, radii, between which the paint's cover is linear
+FRONTAL = 0.04  # share of the light that a smooth cover (refractive index 1.5) mirrors at normal incidence
+SIDE = 256  # cells per axis of a look-up map
+DEPTHS = 1024  # entries of the look-up of the cover's functions
+GRID = 360  # rows of latitude from which the look-up maps are interpolated: half a degree
+ROUNDS = 10  # of Gauss-Newton
+# Standard deviations known beforehand. Of harmonics of degree l, over 1 + l, in units of white less black paint:
+LEVEL, SLOPES, GLOSS = 3.0, 0.2, 0.03  # the mean, all others, those of the mirrored light
+THROUGH, FACE = 0.2, 0.1  # of the cover's two functions at a knot
+TINT = (0.15, 0.08, 0.08)  # of a frame's own light, relative, by order
+SHADE = (0.04, 0.02)  # of its own offset, in units of white less black paint
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LabLight:
+    """Light that depends on directions in the lab only, and the noise of the pictures of C cameras.
+    At depth z below the disk's face, where the normal is n and the line of sight d, a pixel of the sphere shows
+    gain (through(z) (paint difference(n) + black(n)) + mirrored(z) gloss(d + 2 z n)).
+    """
+
+    difference: Tensor  # (K,), harmonics of white less black paint, grey levels
+    black: Tensor  # (K,)
+    gloss: Tensor  # (M,), harmonics of the mirrored surroundings, grey levels
+    through: Tensor  # (n,), share of light that leaves the paint, at KNOTS of the depth; 1 at the disk's middle
+    mirrored: Tensor  # (n,), share of light that the surface mirrors
+    gain: Tensor  # (C,), of the cameras
+    noise: Tensor  # (C, 4), see `Light`
+    known: bool = True
+
+    @cached_property
+    def _map(self) -> Tensor:
+        """Return difference, black and gloss in cells of directions, (SIDE^2, 3)."""
+        scattered = [_cells(part, SCATTERED) for part in (self.difference, self.black)]
+        return torch.stack([*scattered, _cells(self.gloss, MIRRORED)], dim=-1).to(self.gloss.device)
+
+    @cached_property
+    def _cover(self) -> Tensor:
+        """Return through and mirrored at depths from 0 to 1, (DEPTHS, 2)."""
+        at = (torch.arange(DEPTHS, device=self.gloss.device) + 0.5) / DEPTHS
+        return knot_shares(at) @ torch.stack([self.through, self.mirrored], dim=-1)
+
+    def parts(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, ...]:
+        """Return difference, black, gloss (grey levels), through and mirrored of L disks, (L, P) each."""
+        normal, mirror, depth = directions(view, pixels)
+        cells = [octahedral_cells(part[:, 0], part[:, 1], part[:, 2], SIDE).reshape(-1) for part in (normal, mirror)]
+        at = (depth * DEPTHS).to(torch.int32).clamp_(0, DEPTHS - 1).reshape(-1)
+        scattered, gloss = self._map[:, :2].index_select(0, cells[0]), self._map[:, 2].index_select(0, cells[1])
+        found = (*scattered.unbind(-1), gloss, *self._cover.index_select(0, at).unbind(-1))
+        return tuple(part.reshape(depth.shape) for part in found)
+
+    def at(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
+        """Return difference and black, grey levels, (L, P) each, of L disks, the C cameras of a pose side by side."""
+        difference, black, gloss, through, mirrored = self.parts(view, pixels)
+        gain = self.gain.repeat(len(gloss) // len(self.gain))[:, None]
+        return gain * through * difference, gain * (through * black + mirrored * gloss)
+
+    def of(self, camera: int) -> "LabLight":
+        """Return the light as one camera sees it."""
+        one = slice(camera, camera + 1)
+        return replace(self, gain=self.gain[one], noise=self.noise[one])
+
+    def to(self, device: torch.device) -> "LabLight":
+        """Return the light on another device."""
+        return replace(self, **{name: getattr(self, name).to(device) for name in LAB_PARTS})
+
+
+UNKNOWN = ("difference", "black", "gloss", "through", "mirrored")
+LAB_PARTS = tuple(field.name for field in fields(LabLight) if field.name != "known")
+
+
+def directions(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
+    """Return unit normals and mirrored lines of sight, (L, 3, P) each, lab, and the depth (L, P), radii."""
+    depth = (1.0 - view.aside.square()).clamp_min(0.0).sqrt()
+    normal = view.aside[:, None] * view.outward - depth[:, None] * pixels.direction
+    return normal, pixels.direction + 2.0 * depth[:, None] * normal, depth
+
+
+def knot_shares(depth: Tensor) -> Tensor:
+    """Return the shares (..., n) of the knots in a function that is linear between them, at depths (...)."""
+    knots = depth.new_tensor(KNOTS)
+    low, high = knots[:-1], knots[1:]
+    up = ((depth[..., None] - low) / (high - low)).clamp(0.0, 1.0)
+    one = torch.ones_like(up[..., :1])
+    return torch.cat([one, up], dim=-1) - torch.cat([up, 0 * one], dim=-1)
+
+
+def harmonics(direction: Tensor, degree: int) -> Tensor:
+    """Return the real spherical harmonics (..., (degree + 1)^2) float64 at unit directions (..., 3).
+    Their mean square over the sphere is 1; degree l has the places l^2 .. (l + 1)^2, order -l first.
+    """
+    x, y, z = direction.double().cpu().numpy().reshape(-1, 3).T
+    values = sph_harm_y_all(degree, degree, np.arccos(np.clip(z, -1.0, 1.0)), np.arctan2(y, x))
+    columns = []
+    for n in range(degree + 1):
+        whole = math.sqrt(8.0 * math.pi) * values[n]
+        columns += [whole[m].imag for m in range(n, 0, -1)]
+        columns += [whole[0].real / math.sqrt(2.0), *(whole[m].real for m in range(1, n + 1))]
+    return torch.from_numpy(np.stack(columns, axis=-1)).reshape(*direction.shape[:-1], len(columns))
+
+
+@lru_cache(maxsize=2)
+def _meridian(degree: int) -> Tensor:
+    """Return the harmonics at the rows of a grid of latitudes, on the meridian y = 0."""
+    polar = math.pi * (torch.arange(GRID, dtype=torch.float64) + 0.5) / GRID
+    return harmonics(torch.stack([polar.sin(), torch.zeros_like(polar), polar.cos()], dim=-1), degree)
+
+
+def _cells(coefficients: Tensor, degree: int) -> Tensor:
+    """Return a sum of harmonics in cells of directions, (SIDE^2,) float32."""
+    order = torch.tensor([m for n in range(degree + 1) for m in range(-n, n + 1)])
+    meridian, given = _meridian(degree), coefficients.double().cpu()
+    # Of the orders m and -m the meridian y = 0 shows that of the cosine; both have the same latitudes.
+    place = torch.tensor([n * n + n + abs(m) for n in range(degree + 1) for m in range(-n, n + 1)])
+    rows = meridian[:, place] * given
+    longitude = math.pi * (torch.arange(2 * GRID, dtype=torch.float64) + 0.5) / GRID - math.pi
+    turn = order[:, None] * longitude
+    grid = rows @ torch.where(order[:, None] < 0, (-turn).sin(), turn.cos())
+    return sample_texture(grid, octahedral_directions(SIDE)).float()
+
+
+def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> LabLight:
+    """Estimate light and noise from the fits of B * C disks, those of `use` (B, C) bool, the model's light known.
+    Gauss-Newton at the fits' poses; the light of each frame may differ a little, as its tints do in the fit.
+    Source: irradiance as harmonics of the normal, Ramamoorthi and Hanrahan 2001.
+    """
+    cameras, used = use.shape[1], use.reshape(-1, 1)
+    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
+    bases = _bases(at.view, pixels)
+    light = _flat(model.light, at.view, pixels)
+    for _ in range(ROUNDS):
+        light = _better(light, at.view, pixels, at.weight / at.variance * used, bases)
+        state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
+        at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model, cameras)
+    counted = at.inside & ~pixels.clipped & used
+    curves = [noise_curve(at.model[c::cameras], at.residual[c::cameras], counted[c::cameras]) for c in range(cameras)]
+    return replace(light, noise=torch.stack(curves))
+
+
+def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what the light is linear in, (L, n, P) each: harmonics of normal and of mirrored direction, the knots."""
+    normal, mirror, depth = directions(view, pixels)
+    over = [harmonics(part.mT, degree).float().mT for part, degree in ((normal, SCATTERED), (mirror, MIRRORED))]
+    return over[0], over[1], knot_shares(depth).mT
+
+
+def _flat(known: Lighting, view: SphereView, pixels: Pixels) -> LabLight:
+    """Return an even light as bright as a known one, without gloss."""
+    cameras, covered = len(known.noise), view.coverage.sum(1)
+    parts = [by_pose((part * view.coverage).sum(1) / covered, cameras).mean(0) for part in known.at(view, pixels)]
+    mean, knots = torch.zeros((SCATTERED + 1) ** 2), torch.ones(len(KNOTS))
+    mean[0] = 1.0
+    return LabLight(
+        difference=parts[0][0] * mean,
+        black=parts[1][0] * mean,
+        gloss=torch.zeros((MIRRORED + 1) ** 2),
+        through=knots,
+        mirrored=FRONTAL * knots,
+        gain=parts[0] / parts[0][0],
+        noise=known.noise,
+    )
+
+
+def _better(
+    light: LabLight, view: SphereView, pixels: Pixels, precision: Tensor, bases: tuple[Tensor, Tensor, Tensor]
+) -> LabLight:
+    """Return the light after one step of Gauss-Newton; precision (L, P)."""
+    unit = float(light.difference[0])
+    tied = torch.tensor([TINT[0]] + [TINT[1]] * 2 + [TINT[2]] * 3 + [unit * SHADE[0]] + [unit * SHADE[1]] * 2)
+    unknown = [getattr(light, name) for name in UNKNOWN]
+    now, sizes = torch.cat(unknown).double(), [len(part) for part in unknown]
+    normal, right = torch.zeros(len(now), len(now), dtype=torch.float64), torch.zeros(len(now), dtype=torch.float64)
+    difference, black, gloss, through, mirrored = light.parts(view, pixels)
+    shown, ground = light.at(view, pixels)
+    cover = view.coverage * light.gain.repeat(len(gloss) // len(light.gain))[:, None]
+    learnt = view.coverage * (view.paint * shown + ground)
+    left = pixels.grey - (1.0 - view.coverage) * pixels.behind - learnt
+    tints = polynomials(view.across, 2)
+    own = torch.cat([learnt[:, None] * tints, view.coverage[:, None] * tints[:, :3]], dim=1)
+    taken: list[Tensor] = []
+    for k in range(len(left)):  # one disk at a time: the columns of all would fill the memory
+        over_normal, over_mirror, over_depth = (basis[k] for basis in bases)
+        scattered = (cover[k] * through[k]) * over_normal
+        columns = [view.paint[k] * scattered, scattered, (cover[k] * mirrored[k]) * over_mirror]
+        columns += [(cover[k] * part) * over_depth for part in (view.paint[k] * difference[k] + black[k], gloss[k])]
+        whole = torch.cat([*columns, left[k : k + 1]])
+        weighted, own_weighted = whole * precision[k], own[k] * precision[k]
+        sums, mixed = (weighted @ whole.T).double(), (own_weighted @ whole.T).double()
+        taken.append(torch.linalg.solve((own_weighted @ own[k].T).double() + tied.double().pow(-2).diag(), mixed))
+        sums -= mixed.T @ taken[-1]
+        normal += sums[:-1, :-1]
+        right += sums[:-1, -1]
+    expected, deviation = _beforehand(unit)
+    known = deviation.double() ** -2
+    step = torch.linalg.solve(normal + known.diag(), right + known * (expected - now))
+    # What all frames of a camera share of their own factor is the camera's gain.
+    factor = by_pose(torch.stack([one[0, -1] - one[0, :-1] @ step for one in taken]), len(light.gain)).mean(0)
+    gain = light.gain * (1.0 + factor).float()
+    return replace(light, gain=gain, **dict(zip(UNKNOWN, (now + step).float().split(sizes), strict=True)))
+
+
+def _beforehand(unit: float) -> tuple[Tensor, Tensor]:
+    """Return what is expected of the unknowns of the light, and its standard deviation; `unit`: white less black."""
+    degree = [torch.tensor([n for n in range(most + 1) for _ in range(2 * n + 1)]) for most in (SCATTERED, MIRRORED)]
+    scattered = torch.where(degree[0] == 0, LEVEL, SLOPES / (1 + degree[0])) * unit
+    mirrored = GLOSS / (1 + degree[1]) * unit
+    knots = torch.ones(len(KNOTS))
+    free = torch.cat([knots[:-1], 1e-6 * knots[-1:]])  # at the disk's middle both are given
+    deviation = torch.cat([scattered, scattered, mirrored, THROUGH * free, FACE * free])
+    harmonic = torch.zeros(len(deviation) - 2 * len(knots))
+    return torch.cat([harmonic, knots, FRONTAL * knots]), deviation
