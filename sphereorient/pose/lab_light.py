@@ -22,9 +22,10 @@ SCATTERED, MIRRORED = 6, 16  # degrees of the harmonics over the normal and over
 KNOTS = (0.0, 0.12, 0.22, 0.32, 0.45, 0.6, 0.8, 1.0)  # depths, radii, between which the paint's cover is linear
 FRONTAL = 0.04  # share of the light that a smooth cover (refractive index 1.5) mirrors at normal incidence
 SIDE = 256  # cells per axis of a look-up map
+BASIS_SIDE = 128  # the same of the harmonics that light is learnt with: 20 MB
 DEPTHS = 1024  # entries of the look-up of the cover's functions
 GRID = 360  # rows of latitude from which the look-up maps are interpolated: half a degree
-ROUNDS = 10  # of Gauss-Newton
+ROUNDS = 10  # of Gauss-Newton, from an even light
 # Standard deviations known beforehand. Of harmonics of degree l, over 1 + l, in units of white less black paint:
 LEVEL, SLOPES, GLOSS = 3.0, 0.2, 0.03  # the mean, all others, those of the mirrored light
 THROUGH, FACE = 0.2, 0.1  # of the cover's two functions at a knot
@@ -120,6 +121,12 @@ def harmonics(direction: Tensor, degree: int) -> Tensor:
 
 
 @lru_cache(maxsize=2)
+def _harmonic_cells(degree: int) -> Tensor:
+    """Return the harmonics in cells of directions, (BASIS_SIDE^2, K) float32."""
+    return harmonics(octahedral_directions(BASIS_SIDE), degree).float()
+
+
+@lru_cache(maxsize=2)
 def _meridian(degree: int) -> Tensor:
     """Return the harmonics at the rows of a grid of latitudes, on the meridian y = 0."""
     polar = math.pi * (torch.arange(GRID, dtype=torch.float64) + 0.5) / GRID
@@ -160,7 +167,10 @@ def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: Sphere
 def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
     """Return what the light is linear in, (L, n, P) each: harmonics of normal and of mirrored direction, the knots."""
     normal, mirror, depth = directions(view, pixels)
-    over = [harmonics(part.mT, degree).float().mT for part, degree in ((normal, SCATTERED), (mirror, MIRRORED))]
+    over = []
+    for part, degree in ((normal, SCATTERED), (mirror, MIRRORED)):
+        cells = octahedral_cells(part[:, 0], part[:, 1], part[:, 2], BASIS_SIDE)
+        over.append(_harmonic_cells(degree).index_select(0, cells.reshape(-1)).reshape(*cells.shape, -1).mT)
     return over[0], over[1], knot_shares(depth).mT
 
 
