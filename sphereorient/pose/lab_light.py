@@ -154,9 +154,9 @@ def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: Sphere
     cameras, used = use.shape[1], use.reshape(-1, 1)
     at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
     bases = _bases(at.view, pixels)
-    light = _flat(model.light, at.view, pixels)
+    light = _flat(model.light, at.view, pixels, use)
     for _ in range(ROUNDS):
-        light = _better(light, at.view, pixels, at.weight / at.variance * used, bases)
+        light = _better(light, at.view, pixels, (at.weight / at.variance).where(used, 0.0), bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
         at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model, cameras)
     counted = at.inside & ~pixels.clipped & used
@@ -174,19 +174,22 @@ def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
     return over[0], over[1], knot_shares(depth).mT
 
 
-def _flat(known: Lighting, view: SphereView, pixels: Pixels) -> LabLight:
-    """Return an even light as bright as a known one, without gloss."""
-    cameras, covered = len(known.noise), view.coverage.sum(1)
-    parts = [by_pose((part * view.coverage).sum(1) / covered, cameras).mean(0) for part in known.at(view, pixels)]
+def _flat(known: Lighting, view: SphereView, pixels: Pixels, use: Tensor) -> LabLight:
+    """Return an even light as bright as a known one, without gloss; a camera that is never in use has gain 1."""
+    used, cameras = use.reshape(-1, 1), use.shape[1]
+    share = by_pose(view.coverage.where(used, 0.0), cameras)
+    bright = [by_pose(part.where(used, 0.0), cameras) for part in known.at(view, pixels)]
+    difference, black = ((part * share).sum((0, 2)) / share.sum((0, 2)).clamp_min(1e-6) for part in bright)
+    first = int(use.any(0).int().argmax())
     mean, knots = torch.zeros((SCATTERED + 1) ** 2), torch.ones(len(KNOTS))
     mean[0] = 1.0
     return LabLight(
-        difference=parts[0][0] * mean,
-        black=parts[1][0] * mean,
+        difference=difference[first] * mean,
+        black=black[first] * mean,
         gloss=torch.zeros((MIRRORED + 1) ** 2),
         through=knots,
         mirrored=FRONTAL * knots,
-        gain=parts[0] / parts[0][0],
+        gain=torch.where(use.any(0), difference / difference[first], 1.0),
         noise=known.noise,
     )
 
@@ -207,8 +210,9 @@ def _better(
     left = pixels.grey - (1.0 - view.coverage) * pixels.behind - learnt
     tints = polynomials(view.across, 2)
     own = torch.cat([learnt[:, None] * tints, view.coverage[:, None] * tints[:, :3]], dim=1)
-    taken: list[Tensor] = []
-    for k in range(len(left)):  # one disk at a time: the columns of all would fill the memory
+    counts = (precision > 0).any(1)
+    factor = torch.zeros(len(left), len(now) + 1, dtype=torch.float64)
+    for k in counts.nonzero()[:, 0].tolist():  # one disk at a time: the columns of all would fill the memory
         over_normal, over_mirror, over_depth = (basis[k] for basis in bases)
         scattered = (cover[k] * through[k]) * over_normal
         columns = [view.paint[k] * scattered, scattered, (cover[k] * mirrored[k]) * over_mirror]
@@ -216,16 +220,18 @@ def _better(
         whole = torch.cat([*columns, left[k : k + 1]])
         weighted, own_weighted = whole * precision[k], own[k] * precision[k]
         sums, mixed = (weighted @ whole.T).double(), (own_weighted @ whole.T).double()
-        taken.append(torch.linalg.solve((own_weighted @ own[k].T).double() + tied.double().pow(-2).diag(), mixed))
-        sums -= mixed.T @ taken[-1]
+        taken = torch.linalg.solve((own_weighted @ own[k].T).double() + tied.double().pow(-2).diag(), mixed)
+        factor[k] = taken[0]
+        sums -= mixed.T @ taken
         normal += sums[:-1, :-1]
         right += sums[:-1, -1]
     expected, deviation = _beforehand(unit)
     known = deviation.double() ** -2
     step = torch.linalg.solve(normal + known.diag(), right + known * (expected - now))
     # What all frames of a camera share of their own factor is the camera's gain.
-    factor = by_pose(torch.stack([one[0, -1] - one[0, :-1] @ step for one in taken]), len(light.gain)).mean(0)
-    gain = light.gain * (1.0 + factor).float()
+    own_factor, cameras = factor[:, -1] - factor[:, :-1] @ step, len(light.gain)
+    shared = by_pose(own_factor, cameras).sum(0) / by_pose(counts, cameras).sum(0).clamp_min(1)
+    gain = light.gain * (1.0 + shared).float()
     return replace(light, gain=gain, **dict(zip(UNKNOWN, (now + step).float().split(sizes), strict=True)))
 
 

@@ -30,6 +30,7 @@ from sphereorient.pose.fit import FittedPoses, learn_light, residuals
 from sphereorient.pose.fitter import CameraView, Fitter, first_fitter
 from sphereorient.pose.lab_light import (
     KNOTS,
+    LAB_PARTS,
     MIRRORED,
     SCATTERED,
     LabLight,
@@ -175,10 +176,29 @@ def test_rows_not_in_use_change_nothing():
     _, fit = learnt()
     model = replace(model, light=learn_light(pixels, fit, use, model), shading=LATER)
     spoilt = pixels.grey.clone()
-    spoilt[7::2] = 255.0
+    spoilt[7::2] = torch.nan
     one, other = (learn_lab_light(part, fit, use, model) for part in (pixels, replace(pixels, grey=spoilt)))
-    assert one.gloss.equal(other.gloss)
-    assert one.difference.equal(other.difference)
+    for name in LAB_PARTS:
+        assert getattr(one, name).equal(getattr(other, name))
+        assert getattr(one, name).isfinite().all()
+
+
+def test_poses_without_a_camera_may_have_no_place():
+    _, pixels, _, _, model = pictures()
+    use = torch.ones(12, 2, dtype=torch.bool)
+    use[5] = False
+    _, fit = learnt()
+    X = fit.position_lab_mm.clone()
+    X[5] = torch.nan
+    model = replace(model, light=learn_light(pixels, fit, use, model), shading=LATER)
+    light = learn_lab_light(pixels, replace(fit, position_lab_mm=X), use, model)
+    for name in LAB_PARTS:
+        assert getattr(light, name).isfinite().all()
+    one = use.clone()
+    one[:, 0] = False  # a camera that never sees the ball has no light of its own
+    alone = learn_lab_light(pixels, fit, one, model)
+    assert float(alone.gain[0]) == 1
+    assert alone.gloss.isfinite().all()
 
 
 def test_a_disk_alone_is_lit_as_in_a_batch():
