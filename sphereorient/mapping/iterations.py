@@ -25,7 +25,7 @@ from sphereorient.mapping.joint import Linearisation, LinearSystem, joint_step, 
 from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.mapping.threads import side_by_side
-from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curve
+from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curves
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
 from sphereorient.pose.model import Light
 from sphereorient.pose.pixels import Pixels
@@ -212,8 +212,7 @@ def _with_light(state: State) -> State:
         greys.append(((pixels.grey - at.residual)[:, some], at.residual[:, some], inside[:, some]))
     difference, black = light_maps(normal, right)
     model, residual, inside = (torch.cat(part) for part in zip(*greys, strict=True))
-    curves = [noise_curve(model[c::cameras], residual[c::cameras], inside[c::cameras]) for c in range(cameras)]
-    light = Light(difference=difference, black=black, noise=torch.stack(curves), known=True)
+    light = Light(difference=difference, black=black, noise=noise_curves(model, residual, inside, cameras), known=True)
     return replace(state, fitter=replace(state.fitter, light=light))
 
 

@@ -326,9 +326,7 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
     normal, right = light_sums(at.view, pixels, at.weight / at.variance * use.reshape(-1, 1))
     difference, black = light_maps(by_pose(normal, cameras).sum(0), by_pose(right, cameras).sum(0))
     counted = at.inside & ~pixels.clipped & use.reshape(-1, 1)
-    noise = torch.stack(
-        [noise_curve(at.model[c::cameras], at.residual[c::cameras], counted[c::cameras]) for c in range(cameras)]
-    )
+    noise = noise_curves(at.model, at.residual, counted, cameras)
     return Light(difference=difference, black=black, noise=noise, known=True)
 
 
@@ -348,6 +346,12 @@ def light_maps(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     solution = torch.linalg.solve(normal + torch.diag_embed(ridge), right).float()
     difference, black = solution.chunk(2, dim=-1)
     return difference, black
+
+
+def noise_curves(model: Tensor, residual: Tensor, inside: Tensor, cameras: int) -> Tensor:
+    """Return the noise curve of each camera, (C, 4), from B * C disks (L, P); see `noise_curve`."""
+    disks = [slice(camera, None, cameras) for camera in range(cameras)]
+    return torch.stack([noise_curve(model[own], residual[own], inside[own]) for own in disks])
 
 
 def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:

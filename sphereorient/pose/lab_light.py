@@ -12,7 +12,7 @@ import torch
 from scipy.special import sph_harm_y_all
 from torch import Tensor
 
-from sphereorient.pose.fit import FittedPoses, by_pose, noise_curve, residuals
+from sphereorient.pose.fit import FittedPoses, by_pose, noise_curves, residuals
 from sphereorient.pose.model import LATER, Lighting, SphereModel, SphereView, polynomials
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture import sample_texture
@@ -160,8 +160,7 @@ def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: Sphere
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
         at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model, cameras)
     counted = at.inside & ~pixels.clipped & used
-    curves = [noise_curve(at.model[c::cameras], at.residual[c::cameras], counted[c::cameras]) for c in range(cameras)]
-    return replace(light, noise=torch.stack(curves))
+    return replace(light, noise=noise_curves(at.model, at.residual, counted, cameras))
 
 
 def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
