@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations, permutations
@@ -19,6 +20,7 @@ from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses, trace
 from sphereorient.pose.fitter import (
+    FEWEST_LIT,
     FINEST_PX,
     LEAST_LEFT,
     Fitter,
@@ -26,9 +28,11 @@ from sphereorient.pose.fitter import (
     Picture,
     defocus_radii,
     level_of,
+    some_of,
     widest_px,
 )
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.worn import without, worn_cells
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.trajectory import Reason
 
@@ -49,7 +53,8 @@ GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may diffe
 TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
 FINER = 1.25  # ratio of the blurs that are tried, from FINEST_PX on
 WIDEST = 0.3  # of the radius: wider ones remove all paint
-LIGHT_ROUNDS, BLUR_ROUNDS = 2, 4
+LIGHT_ROUNDS, BLUR_ROUNDS, WORN_ROUNDS = 2, 4, 4
+WORN_GAIN = 0.2  # by which the logarithm of the variance left must fall where worn paint is not used
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
 BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
 
@@ -64,6 +69,7 @@ class Appearance:
     usual_apart_rad: float = math.inf  # typical angle between the orientations that two cameras alone give
     together: bool = True  # whether the cameras see the sphere at one position
     second_ball: bool = False  # whether another sphere with this texture is in view
+    worn: Tensor | None = None  # where the paint differs from the map and is not used, see `worn_cells`; None: nowhere
 
     @property
     def clear_score(self) -> float:
@@ -117,7 +123,14 @@ def estimate_appearance(
     if settings.blur_px is None and abs(blur_px / first.fitter.optics.blur_px - 1) > BLUR_FAR_OFF:
         # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
         matched = replace(first, fitter=replace(first.fitter, optics=Optics(base, blur_px, diameter_px)))
-        return estimate_appearance(matched, frames, base, settings.model_copy(update={"blur_px": blur_px}))
+        with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
+            return estimate_appearance(matched, frames, base, settings.model_copy(update={"blur_px": blur_px}))
+    worn = None
+    if settings.learn_paint:
+        fitter, fit, worn = _without_worn(fitter, base, pixels, fit, use)
+        if worn is not None:  # the blur, too, was found with it
+            given = settings.blur_px is not None
+            fitter, fit = _light_and_blur(fitter, without(base, worn), pixels, fit, use, given=given)
     fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
@@ -142,6 +155,7 @@ def estimate_appearance(
         usual_apart_rad=_usual_apart(fit, use),
         together=together,
         second_ball=rivals >= max(2, RIVALS * len(frames)),
+        worn=worn,
     )
 
 
@@ -317,6 +331,32 @@ def _with_light(fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor) -
         fitter = fitter.with_light_of(pixels, fit, use)
         fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
     return fitter, fit
+
+
+def _without_worn(
+    fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor
+) -> tuple[Fitter, FittedPoses, Tensor | None]:
+    """Return a fitter that does not use paint that differs from the map, its fit, and where that is; None: nowhere.
+    Found in one half of the movie, it must leave less in the other half: what differs there, too, turns with the ball.
+    """
+    if len(use) < FEWEST_LIT:
+        return fitter, fit, None
+
+    def found(pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses, Tensor]:
+        now = fitter
+        for _ in range(WORN_ROUNDS):  # worn paint bends the light and the poses that it is found with
+            worn = worn_cells(pixels, fit, use, now.model(now.optics.fine))
+            optics = Optics(without(base, worn), fitter.optics.blur_px, widest_px(fitter.views))
+            now = replace(now, optics=optics).with_light_of(pixels, fit, use)
+            fit = now.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, optics.fine, 3)
+        return now, fit, worn
+
+    every, middle = torch.arange(len(use)), len(use) // 2
+    halves = [some_of(rows, pixels, fit, use) for rows in (every[:middle], every[middle:])]
+    gain = [fitter.left(*held) - found(*half)[0].left(*held) for half, held in permutations(halves, 2)]
+    if sum(gain) / 2 < WORN_GAIN:
+        return fitter, fit, None
+    return found(pixels, fit, use)
 
 
 def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor) -> float:

@@ -13,6 +13,9 @@ class RefineSettings(BaseModel, frozen=True, extra="forbid"):
     blur_px: float | None = Field(
         None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null learns it"
     )
+    learn_paint: bool = Field(
+        True, description="find paint that differs from the map (wear, dirt on the ball), and do not use it"
+    )
     candidates: int = Field(4, ge=1, description="proposals of each camera that are fitted where nothing is known")
     chunk_frames: int = Field(
         32, ge=2, description="frames between full searches; chunks begin at its multiples, each independent"

@@ -25,6 +25,7 @@ from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
 from sphereorient.pose import CameraView, Fitter, Optics, base_table
 from sphereorient.pose.lab_light import LAB_PARTS, LabLight
 from sphereorient.pose.model import LIGHT_PARTS, Light, Lighting
+from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
 
 SCHEMA = "sphereorient-learnt/1"
@@ -46,6 +47,7 @@ class Learnt:
     usual_apart_rad: float
     together: bool
     second_ball: bool = False
+    worn: torch.Tensor | None = None  # see `Appearance`
     process: ProcessNoise | None = None  # None: no track yet, or too short a one
     acceleration_rad_s2: float | None = None  # that the path was chosen with
 
@@ -65,6 +67,7 @@ class Learnt:
             blur_px=fitter.optics.blur_px,
             widest_px=fitter.widest_px,
             **{name: getattr(study, name) for name in (*OF_SCORES, *WHETHER)},
+            worn=study.worn,
             process=process,
             acceleration_rad_s2=acceleration_rad_s2 if told else None,
         )
@@ -80,7 +83,8 @@ class Learnt:
             raise TrackError(refusal("learnt", expected=f"what was learnt of {expected}", got=got, do=do))
         views = [CameraView.of(stream.name, stream.camera, self.scenes[stream.name]) for stream in recording.streams]
         widest = max(scene.diameter_px for scene in self.scenes.values())
-        optics = Optics(base_table(recording.texture, widest, recording.unseen), self.blur_px, widest)
+        base = base_table(recording.texture, widest, recording.unseen)
+        optics = Optics(base if self.worn is None else without(base, self.worn), self.blur_px, widest)
         fitter = Fitter(
             views=views,
             radius_mm=recording.experiment.radius_mm,
@@ -88,7 +92,8 @@ class Learnt:
             light=self.light,
             widest_px=self.widest_px,
         )
-        return Appearance(fitter=fitter, **{name: getattr(self, name) for name in (*OF_SCORES, *WHETHER)})
+        told = {name: getattr(self, name) for name in (*OF_SCORES, *WHETHER, "worn")}
+        return Appearance(fitter=fitter, **told)
 
     def save(self, path: Path) -> None:
         """Write everything as HDF5, atomically; raise OutputError if the file cannot be written."""
@@ -164,6 +169,8 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
     light.attrs["known"] = learnt.light.known
     for part in LAB_PARTS if isinstance(learnt.light, LabLight) else LIGHT_PARTS:
         light.create_dataset(part, data=getattr(learnt.light, part).cpu().numpy(), track_times=False)
+    if learnt.worn is not None:
+        file.create_dataset("worn", data=learnt.worn.numpy(), track_times=False)
     if learnt.process is not None:
         group = file.create_group("process")
         group.attrs["frame_s"] = learnt.process.frame_s
@@ -193,6 +200,7 @@ def _read(file: h5py.File) -> Learnt:
         light=kind(known=bool(light.attrs["known"]), **parts),
         together=bool(file.attrs["together"]),
         second_ball=bool(file.attrs.get("second_ball", False)),
+        worn=torch.from_numpy(file["worn"][()]) if "worn" in file else None,
         process=_process(file["process"]) if "process" in file else None,
         acceleration_rad_s2=None if acceleration is None else float(acceleration),
         **{name: float(file.attrs[name]) for name in NUMBERS},

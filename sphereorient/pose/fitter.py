@@ -156,29 +156,27 @@ class Fitter:
         """Return a fitter with one light in the lab for all cameras, and its fit, if maps of the disks explain less.
         Both are learnt from every other row of `use` (B, C); what counts is what they leave in the rows between.
         """
-        cameras, fine = use.shape[1], self.optics.fine
+        fine = self.optics.fine
         if len(use) < FEWEST_LIT:
             return self, fit
-
-        def some(rows: Tensor) -> tuple[Pixels, FittedPoses, Tensor]:
-            disks = (rows[:, None] * cameras + torch.arange(cameras)).reshape(-1)
-            return pixels.where(disks), fit.of(rows), use[rows]
 
         def in_the_lab(pixels: Pixels, fit: FittedPoses, use: Tensor) -> "Fitter":
             return replace(self, light=learn_lab_light(pixels, fit, use, self.model(fine)))
 
-        every, left = torch.arange(len(use)), []
-        learning, (shown, there, used) = some(every[::2]), some(every[1::2])
-        for lit in (self.with_light_of(*learning), in_the_lab(*learning)):
-            score = lit.fit(shown, there.position_lab_mm, there.R_lab_body, used, fine, 3).score
-            left.append(float((1.0 - score)[used].clamp_min(LEAST_LEFT).log().mean()))
-        if left[1] > left[0] - MORE_EXPLAINED:
+        every = torch.arange(len(use))
+        learning, held = (some_of(rows, pixels, fit, use) for rows in (every[::2], every[1::2]))
+        if in_the_lab(*learning).left(*held) > self.with_light_of(*learning).left(*held) - MORE_EXPLAINED:
             return self, fit
         lit = self
         for _ in range(2):  # the poses, too, were found with the maps
             lit = in_the_lab(pixels, fit, use)
             fit = lit.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
         return lit, fit
+
+    def left(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> float:
+        """Return the mean logarithm of the share of variance that poses fitted anew leave in pictures of `use`."""
+        score = self.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, self.optics.fine, 3).score
+        return float((1.0 - score)[use].clamp_min(LEAST_LEFT).log().mean())
 
     def on(self, device: torch.device) -> "Fitter":
         """Return a fitter that computes on another device."""
@@ -264,6 +262,12 @@ def moved_to(device: torch.device, record: Record) -> Record:
     parts = {field.name: getattr(record, field.name) for field in fields(record)}
     moved: dict[str, Any] = {name: part.to(device) for name, part in parts.items() if isinstance(part, Tensor)}
     return replace(record, **moved)
+
+
+def some_of(rows: Tensor, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Pixels, FittedPoses, Tensor]:
+    """Return some rows of poses, of their B * C disks, and of `use` (B, C), by index."""
+    cameras = use.shape[1]
+    return pixels.where((rows[:, None] * cameras + torch.arange(cameras)).reshape(-1)), fit.of(rows), use[rows]
 
 
 def base_table(texture: Tensor, diameter_px: float, unseen: Tensor | None = None) -> TextureTable:

@@ -1,0 +1,48 @@
+"""Paint that differs from its map (wear, dirt that turns with the ball, a map drawn wrongly): found, and not used."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from sphereorient.pose.fit import FittedPoses, residuals
+from sphereorient.pose.lab_light import directions
+from sphereorient.pose.model import UNSEEN, SphereModel
+from sphereorient.pose.pixels import Pixels
+from sphereorient.sphere.texture_table import TextureTable, octahedral_cells, texture_table
+
+CELLS = 48  # per axis, in which the paint of all pictures is averaged: 2.6 degrees
+CHANGED = 0.15  # of the step from black to white: paint that differs by more is not the map's; right maps differ by 0.1
+SLACK = 0.1  # standard deviation of a cell that hardly any pixel shows
+LIMB = 0.95  # radii, up to which pixels are averaged
+ROWS = 180  # of latitude, of the map of what is not used
+SIDE = 256  # cells per axis of its table
+
+
+def worn_cells(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Tensor:
+    """Return where the paint differs from the map, (CELLS^2,) bool, octahedral cells of the body's directions.
+    From the fits of B * C disks, those of `use` (B, C) bool: what turns with the ball is paint, what stays is light.
+    """
+    cameras = use.shape[1]
+    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
+    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model, cameras)
+    normal_lab, _, _ = directions(at.view, pixels)
+    normal = fit.R_lab_body.to(normal_lab.dtype).repeat_interleave(cameras, 0).mT @ normal_lab
+    cells = octahedral_cells(normal[:, 0], normal[:, 1], normal[:, 2], CELLS).reshape(-1)
+    # Not the robust weights: they give no weight to what is looked for.
+    counted = pixels.inside & ~pixels.clipped & use.reshape(-1, 1) & (at.view.aside < LIMB)
+    slope = at.lit / at.variance * counted
+    sums = [torch.zeros(CELLS**2).index_add(0, cells, (slope * part).reshape(-1)) for part in (at.residual, at.lit)]
+    return (sums[0] / (sums[1] + SLACK**-2)).abs() > CHANGED
+
+
+def without(paint: TextureTable, worn: Tensor) -> TextureTable:
+    """Return a table of paint in which worn cells, as of `worn_cells`, are unknown as well."""
+    latitude = math.pi * (0.5 - (torch.arange(ROWS) + 0.5) / ROWS)
+    longitude = math.pi * ((torch.arange(2 * ROWS) + 0.5) / ROWS - 1.0)
+    lat, lon = torch.meshgrid(latitude, longitude, indexing="ij")
+    x, y, z = lat.cos() * lon.cos(), lat.cos() * lon.sin(), lat.sin()
+    unknown = worn[octahedral_cells(x, y, z, CELLS)]
+    if paint.unseen is not None:
+        unknown = unknown | (paint.unseen.sample(torch.stack([x, y, z]).flatten(1)[None])[0] > UNSEEN).reshape(x.shape)
+    return TextureTable(paint.rows, paint.blur_rad, texture_table(unknown.float(), paint.blur_rad, SIDE))
