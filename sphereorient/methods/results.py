@@ -31,6 +31,10 @@ TWO_BALLS = (
     "two balls wear this texture map: it is not certain which one is tracked, and frames are marked as ambiguous; "
     "hide one by `masks:`"
 )
+WORN = (
+    "the paint differs from the texture map on about {share:.0f} % of the ball: it is not used; "
+    "learn it anew with `sphereorient map --init`"
+)
 ELSEWHERE = [str(Reason.CONTRADICTS), str(Reason.SECOND_BALL)]  # a camera that measures the sphere at another place
 MISSED = [str(Reason.LOW_SCORE), str(Reason.OUTLINE), str(Reason.NOT_FOUND)]  # a usable picture shows no sphere
 CONTRADICTS_SIGMAS = 5.0  # of the difference of what two cameras say alone: no noise
@@ -135,6 +139,8 @@ def precise_track(
     flags = chosen.flags | _fit_flags(table, chosen, picked, learnt, np.any(missed, axis=0))
     flags |= torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
     remarks = [TWO_BALLS] if learnt.second_ball else []
+    if learnt.worn is not None:
+        remarks.append(WORN.format(share=100 * float(learnt.worn.float().mean())))
     return replace(
         empty,
         valid=(chosen.choice >= 0).numpy(),
