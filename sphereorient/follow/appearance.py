@@ -54,6 +54,7 @@ TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or
 FINER = 1.25  # ratio of the blurs that are tried, from FINEST_PX on
 WIDEST = 0.3  # of the radius: wider ones remove all paint
 LIGHT_ROUNDS, BLUR_ROUNDS, WORN_ROUNDS = 2, 4, 4
+FITS = 2.0  # excess of a fit whose map is right once worn paint is not used: 1.4; of a warped map 4.2
 WORN_GAIN = 0.2  # by which the logarithm of the variance left must fall where worn paint is not used
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
 BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
@@ -356,7 +357,10 @@ def _without_worn(
     gain = [fitter.left(*held) - found(*half)[0].left(*held) for half, held in permutations(halves, 2)]
     if sum(gain) / 2 < WORN_GAIN:
         return fitter, fit, None
-    return found(pixels, fit, use)
+    lit, fitted, worn = found(pixels, fit, use)
+    if float(fitted.excess[use].median()) > FITS:  # the paint that is left is not the map's either
+        return fitter, fit, None
+    return lit, fitted, worn
 
 
 def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor) -> float:
