@@ -43,12 +43,13 @@ from sphereorient.search import (
     ProposeSettings,
 )
 from sphereorient.search.candidates import resized
+from sphereorient.sphere.texture import map_directions
 from sphereorient.statistics.reliability import Z95, reliability, wilson
 from sphereorient.synth import random_texture
 from sphereorient.synth.degrade_scene import misdrawn, worn
 from sphereorient.synth.disks import DISK_DEGRADATIONS, DiskSettings, film_disks
 from sphereorient.synth.severities import severity
-from sphereorient.synth.textures import map_directions, random_directions
+from sphereorient.synth.textures import random_directions
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 BEGIN, END = "<!-- table: scripts/bench_proposer.py -->", "<!-- end of the table -->"

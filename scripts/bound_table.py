@@ -27,8 +27,8 @@ from torch.nn.functional import normalize
 from sphereorient import so3
 from sphereorient.evaluate import cramer_rao_bound
 from sphereorient.sphere import Sampling, load_texture
+from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import random_texture
-from sphereorient.synth.textures import map_directions
 
 SEEDS = 5
 HEIGHT = 512  # of the maps

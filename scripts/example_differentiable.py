@@ -28,10 +28,10 @@ from sphereorient.cameras import PinholeCamera, Rays, triangulate
 from sphereorient.cameras.parameters import ROTATION, with_parameters
 from sphereorient.pose.implicit import ImplicitPose, implicit_pose
 from sphereorient.sphere.renderer import PaintedBall, expected_grey
+from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import random_texture
 from sphereorient.synth.scene import LAMPS, make_scene, render_frame
 from sphereorient.synth.settings import SynthSettings
-from sphereorient.synth.textures import map_directions
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt

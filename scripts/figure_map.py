@@ -22,8 +22,8 @@ from torch import Tensor
 
 from sphereorient.report.texture_map import write_texture
 from sphereorient.sphere import load_texture, sample_texture
+from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
-from sphereorient.synth.textures import map_directions
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCENE = SynthSettings(

@@ -24,8 +24,8 @@ from sphereorient.mapping.compare import turned_map
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.report.texture_map import write_texture
 from sphereorient.sphere import sample_texture
+from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import random_texture
-from sphereorient.synth.textures import map_directions
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 HEIGHT = 256

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import combinations, permutations
 
 import torch
@@ -18,16 +17,15 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, best_poses, pose_table, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
+from sphereorient.pose.blur import best_blur_px
 from sphereorient.pose.fit import FittedPoses, trace
 from sphereorient.pose.fitter import (
     FEWEST_LIT,
-    FINEST_PX,
     LEAST_LEFT,
     Fitter,
     Optics,
     Picture,
     defocus_radii,
-    level_of,
     some_of,
     widest_px,
 )
@@ -51,8 +49,6 @@ ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the t
 
 GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may differ, in any light
 TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
-FINER = 1.25  # ratio of the blurs that are tried, from FINEST_PX on
-WIDEST = 0.3  # of the radius: wider ones remove all paint
 LIGHT_ROUNDS, BLUR_ROUNDS, WORN_ROUNDS = 2, 4, 4
 FITS = 2.0  # excess of a fit whose map is right once worn paint is not used: 1.4; of a warped map 4.2
 WORN_GAIN = 0.2  # by which the logarithm of the variance left must fall where worn paint is not used
@@ -340,7 +336,7 @@ def _without_worn(
     """Return a fitter that does not use paint that differs from the map, its fit, and where that is; None: nowhere.
     Found in one half of the movie, it must leave less in the other half: what differs there, too, turns with the ball.
     """
-    if len(use) < FEWEST_LIT:
+    if len(use) < FEWEST_LIT:  # too few views of each patch to tell paint from light
         return fitter, fit, None
 
     def found(pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses, Tensor]:
@@ -361,29 +357,3 @@ def _without_worn(
     if float(fitted.excess[use].median()) > FITS:  # the paint that is left is not the map's either
         return fitter, fit, None
     return lit, fitted, worn
-
-
-def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor) -> float:
-    """Return the blur that leaves the least variance unexplained, interpolated between the tried ones."""
-    radius_px = widest_px(fitter.views) / 2
-    steps = math.log(max(WIDEST * radius_px / FINEST_PX, FINER**7)) / math.log(FINER)
-    blurs = [FINEST_PX * FINER**k for k in range(math.ceil(steps) + 1)]
-
-    @cache
-    def unexplained(k: int) -> float:
-        level = level_of(base, blurs[k], 0.0, radius_px)
-        tried = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, 2)
-        # Of all pictures together: their curves differ in height by much and in shape by little.
-        return float((1.0 - tried.score)[use].clamp_min(LEAST_LEFT).log().mean())
-
-    # Downhill from the first guess: each table of the paint costs a tenth of a second.
-    best, k = min(range(len(blurs)), key=lambda k: abs(blurs[k] - fitter.optics.blur_px)), -1
-    while best != k:
-        k = best
-        best = min((n for n in (k - 1, k, k + 1) if 0 <= n < len(blurs)), key=unexplained)
-    if k in (0, len(blurs) - 1):
-        return blurs[k]
-    below, here, above = (unexplained(n) for n in (k - 1, k, k + 1))
-    bend = below - 2 * here + above
-    shift = 0.5 * (below - above) / bend if bend > 0 else 0.0
-    return float(blurs[k] * FINER**shift)

@@ -11,9 +11,8 @@ from sphereorient import so3
 from sphereorient.errors import PaintError, refusal
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.mapping.learn import LearntMap
-from sphereorient.sphere.texture import check_texture_shape, sample_texture, texture_coordinates
+from sphereorient.sphere.texture import check_texture_shape, map_directions, sample_texture, texture_coordinates
 from sphereorient.sphere.texture_table import TextureTable, texture_table
-from sphereorient.synth.textures import map_directions
 
 SEARCH_DEG = 10.0  # step of the grid of rotations
 SEARCH_BLUR_DEG = 7.0  # detail finer than the step only hides the right place

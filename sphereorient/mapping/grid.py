@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 from torch import Tensor
 
-from sphereorient.sphere.texture import spline_weights, texel_coordinates, texture_coordinates
+from sphereorient.sphere.texture import map_directions, spline_weights, texel_coordinates, texture_coordinates
 from sphereorient.sphere.texture_table import CHUNK, SIDE, SQUARE_25, TextureTable, octahedral_directions, tangents
-from sphereorient.synth.textures import map_directions
 
 STEP_RAD = 0.002  # step of a table's finite differences
 POLE = 1e-3  # least cosine of a latitude: at the pole itself longitude is undefined

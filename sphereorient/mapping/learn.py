@@ -34,7 +34,7 @@ from sphereorient.mapping.verdict import jumps, paint_correlation
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, widest_px
 from sphereorient.pose.model import LIGHT_PARTS, Light
-from sphereorient.synth.textures import map_directions
+from sphereorient.sphere.texture import map_directions
 
 # Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).
 SHOWN_MIN = 0.4

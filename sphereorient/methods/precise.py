@@ -17,7 +17,8 @@ from sphereorient.follow.tracker import ChunkTracker
 from sphereorient.methods import results
 from sphereorient.methods.method import Job, Learnt, Method
 from sphereorient.methods.proposers import BlurMatchedSearch, open_views
-from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, estimate_blur_px, first_fitter, widest_px
+from sphereorient.pose.blur import estimate_blur_px
+from sphereorient.pose.fitter import FIRST_BLUR_PX, defocus_radii, first_fitter, widest_px
 from sphereorient.trajectory import Trajectory
 
 

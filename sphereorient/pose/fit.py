@@ -228,6 +228,12 @@ def residuals(
     )
 
 
+def settled(pixels: Pixels, fit: FittedPoses, model: SphereModel, cameras: int) -> Residuals:
+    """Linearise the pictures of B * C disks about fitted poses, with weights that no bubble has set."""
+    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
+    return residuals(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model, cameras)
+
+
 def grey_by_pose(view: SphereView, lit: Tensor, over: Tensor) -> Tensor:
     """Return the derivatives (L, 6, P) of grey by delta (rad) and position (mm); `lit`, `over` as in `Residuals`."""
     paint, limb = lit[:, None], over[:, None]
@@ -320,9 +326,7 @@ def _score(at: Residuals) -> Tensor:
 def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Light:
     """Estimate the light and the noise of a movie from the fits of B * C disks, those of `use` (B, C) bool."""
     cameras = use.shape[1]
-    X, R = fit.position_lab_mm, fit.R_lab_body
-    at = residuals(pixels, X, R, None, model, cameras)
-    at = residuals(pixels, X, R, (at.model, at.weight), model, cameras)
+    at = settled(pixels, fit, model, cameras)
     normal, right = light_sums(at.view, pixels, at.weight / at.variance * use.reshape(-1, 1))
     difference, black = light_maps(by_pose(normal, cameras).sum(0), by_pose(right, cameras).sum(0))
     counted = at.inside & ~pixels.clipped & use.reshape(-1, 1)

@@ -1,12 +1,12 @@
-"""The fit at three levels of blur, what it needs of each camera, and a first guess of the blur; `PoseFitter`: alone."""
+"""The fit at three levels of blur, and what it needs of each camera; `PoseFitter`: alone."""
 
 import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
@@ -14,8 +14,7 @@ from torch import Tensor, nn
 
 from sphereorient.cameras import Camera, R_lab_view, sphere_radius_px
 from sphereorient.errors import ShapeError, check_tail, refusal
-from sphereorient.locate import Background, CameraScene, Frame, LocateSettings
-from sphereorient.locate.outline import find_blobs
+from sphereorient.locate import Background, CameraScene
 from sphereorient.pose.fit import KNOWN, FittedPoses, PoseStart, learn_light, refine
 from sphereorient.pose.lab_light import learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
@@ -34,10 +33,6 @@ COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in 
 SOFT, SOFT_PX = 0.06, 1.5  # radii, px: templates of pictures that are blurred by more than both are blurred as well
 FINER_SIDES = 2  # of the usual table, for disks of over 100 px: 16 MB
 FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a good lens
-CALM_PX = 1.0  # blur that is laid over pictures first, against noise
-AROUND = 1.2  # of the radius: the sphere and its rim
-CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and scene lie
-STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
 
 FEWEST_LIT = 8  # rows of poses from which the light in the lab is learnt
 MORE_EXPLAINED = 0.05  # share of the variance by which it must leave less
@@ -103,12 +98,20 @@ class Optics:
     """Texture tables at the levels of blur of the fits: pictures of blur `blur_px` and disks of `diameter_px`, px."""
 
     def __init__(self, base: TextureTable, blur_px: float, diameter_px: float) -> None:
-        radius_px = diameter_px / 2
         self.blur_px = blur_px
-        # Each from the one before: a wider blur allows a smaller table.
-        self.fine = level_of(base, blur_px, 0.0, radius_px)
-        self.middle = level_of(self.fine.paint, blur_px, MIDDLE * radius_px, radius_px)
-        self.coarse = level_of(self.middle.paint, blur_px, COARSE * radius_px, radius_px)
+        self._radius_px = diameter_px / 2
+        self.fine = level_of(base, blur_px, 0.0, self._radius_px)
+
+    # Each from the one before: a wider blur allows a smaller table.
+    @cached_property
+    def middle(self) -> PyramidLevel:
+        """The level of a fit that is right to a few degrees."""
+        return level_of(self.fine.paint, self.blur_px, MIDDLE * self._radius_px, self._radius_px)
+
+    @cached_property
+    def coarse(self) -> PyramidLevel:
+        """The level of a fit from a candidate."""
+        return level_of(self.middle.paint, self.blur_px, COARSE * self._radius_px, self._radius_px)
 
     @property
     def steps(self) -> Steps:
@@ -173,9 +176,14 @@ class Fitter:
             fit = lit.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
         return lit, fit
 
-    def left(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> float:
-        """Return the mean logarithm of the share of variance that poses fitted anew leave in pictures of `use`."""
-        score = self.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, self.optics.fine, 3).score
+    def left(
+        self, pixels: Pixels, fit: FittedPoses, use: Tensor, level: PyramidLevel | None = None, iterations: int = 3
+    ) -> float:
+        """Return the mean logarithm of the share of variance that poses fitted anew leave in pictures of `use`.
+        Of all pictures together: those of one may be left ten times as much as those of another.
+        """
+        level = level or self.optics.fine
+        score = self.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, level, iterations).score
         return float((1.0 - score)[use].clamp_min(LEAST_LEFT).log().mean())
 
     def on(self, device: torch.device) -> "Fitter":
@@ -289,42 +297,6 @@ def defocus_radii(blur_px: float, diameter_px: float) -> float:
     """Return the blur of pictures, radii, as the search needs it: 0 unless they are defocused."""
     blur = 2 * blur_px / diameter_px
     return blur if blur > SOFT and blur_px > SOFT_PX else 0.0
-
-
-def estimate_blur_px(views: Sequence[CameraView], shots: Sequence[Sequence[Frame]], locating: LocateSettings) -> float:
-    """Return the standard deviation of the blur, px, of the steepest edges about the sphere: median of n x C frames.
-    A first guess, biased by noise and paint without edges. 0 where no frame shows a blob of the sphere's size.
-    Source: a step of height h under a Gaussian blur sigma is h / (sigma sqrt(2 pi)) steep at most.
-    """
-    found = [
-        _steepest(shot.picture.astype(np.float32), view, locating)
-        for frame in shots
-        for view, shot in zip(views, frame, strict=True)
-        if shot.usable
-    ]
-    told = [blur for blur in found if blur is not None]
-    return float(np.median(told)) if told else 0.0
-
-
-def _steepest(picture: NDArray[np.float32], view: CameraView, locating: LocateSettings) -> float | None:
-    """Return the blur of the steepest edge about the likeliest blob, px; None without one."""
-    blobs = find_blobs(view.background.difference(picture), view.background.noise, view.diameter_px, locating)
-    if not blobs or blobs[0].merit <= 0:
-        return None
-    reach = round(AROUND * view.diameter_px / 2)
-    left, top = max(0, round(blobs[0].u_px) - reach), max(0, round(blobs[0].v_px) - reach)
-    window = picture[top : round(blobs[0].v_px) + reach + 1, left : round(blobs[0].u_px) + reach + 1]
-    return steepest_blur_px(window)
-
-
-def steepest_blur_px(picture: NDArray[np.float32]) -> float:
-    """Return the standard deviation of the blur, px, of the steepest edge between the darkest and the brightest."""
-    calm = cv2.GaussianBlur(picture, (0, 0), CALM_PX)
-    slope = np.hypot(cv2.Scharr(calm, cv2.CV_32F, 1, 0), cv2.Scharr(calm, cv2.CV_32F, 0, 1)) / 32
-    low, high = np.percentile(calm, CONTRAST)
-    steepest = float(np.percentile(slope, STEEPEST))
-    blur = float(high - low) / max(steepest * np.sqrt(2 * np.pi), 1e-9)
-    return float(np.sqrt(max(blur**2 - CALM_PX**2, 0.0)))
 
 
 class PoseFitter(nn.Module):

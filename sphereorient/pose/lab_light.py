@@ -13,7 +13,7 @@ from scipy.special import sph_harm_y_all
 from torch import Tensor
 
 from sphereorient.pose.fit import FittedPoses, by_pose, noise_curves, residuals
-from sphereorient.pose.model import LATER, Lighting, SphereModel, SphereView, polynomials
+from sphereorient.pose.model import LATER, Lighting, SphereModel, SphereView, polynomials, surface_normals
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture import sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
@@ -92,8 +92,7 @@ LAB_PARTS = tuple(field.name for field in fields(LabLight) if field.name != "kno
 
 def directions(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
     """Return unit normals and mirrored lines of sight, (L, 3, P) each, lab, and the depth (L, P), radii."""
-    depth = (1.0 - view.aside.square()).clamp_min(0.0).sqrt()
-    normal = view.aside[:, None] * view.outward - depth[:, None] * pixels.direction
+    normal, depth = surface_normals(view, pixels)
     return normal, pixels.direction + 2.0 * depth[:, None] * normal, depth
 
 

@@ -203,6 +203,12 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
     )
 
 
+def surface_normals(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
+    """Return the unit normals (L, 3, P), lab, where lines of sight meet the sphere, and the depth (L, P), radii."""
+    depth = (1.0 - view.aside.square()).clamp_min(0.0).sqrt()
+    return view.aside[:, None] * view.outward - depth[:, None] * pixels.direction, depth
+
+
 def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
     """Return look-ups near the limb, quantiles of the cut-off Gaussian, and their derivatives, (L, n, P) each."""
     share = ((torch.arange(RIM_NODES, dtype=q0.dtype, device=q0.device) + 0.5) / RIM_NODES)[:, None]

@@ -1,14 +1,12 @@
 """Paint that differs from its map (wear, dirt that turns with the ball, a map drawn wrongly): found, and not used."""
 
-import math
-
 import torch
 from torch import Tensor
 
-from sphereorient.pose.fit import FittedPoses, residuals
-from sphereorient.pose.lab_light import directions
-from sphereorient.pose.model import UNSEEN, SphereModel
+from sphereorient.pose.fit import FittedPoses, settled
+from sphereorient.pose.model import UNSEEN, SphereModel, surface_normals
 from sphereorient.pose.pixels import Pixels
+from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import TextureTable, octahedral_cells, texture_table
 
 CELLS = 48  # per axis, in which the paint of all pictures is averaged: 2.6 degrees
@@ -24,9 +22,8 @@ def worn_cells(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel
     From the fits of B * C disks, those of `use` (B, C) bool: what turns with the ball is paint, what stays is light.
     """
     cameras = use.shape[1]
-    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
-    at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model, cameras)
-    normal_lab, _, _ = directions(at.view, pixels)
+    at = settled(pixels, fit, model, cameras)
+    normal_lab, _ = surface_normals(at.view, pixels)
     normal = fit.R_lab_body.to(normal_lab.dtype).repeat_interleave(cameras, 0).mT @ normal_lab
     cells = octahedral_cells(normal[:, 0], normal[:, 1], normal[:, 2], CELLS).reshape(-1)
     # Not the robust weights: they give no weight to what is looked for.
@@ -38,10 +35,7 @@ def worn_cells(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel
 
 def without(paint: TextureTable, worn: Tensor) -> TextureTable:
     """Return a table of paint in which worn cells, as of `worn_cells`, are unknown as well."""
-    latitude = math.pi * (0.5 - (torch.arange(ROWS) + 0.5) / ROWS)
-    longitude = math.pi * ((torch.arange(2 * ROWS) + 0.5) / ROWS - 1.0)
-    lat, lon = torch.meshgrid(latitude, longitude, indexing="ij")
-    x, y, z = lat.cos() * lon.cos(), lat.cos() * lon.sin(), lat.sin()
+    x, y, z = map_directions(ROWS).float().unbind(-1)
     unknown = worn[octahedral_cells(x, y, z, CELLS)]
     if paint.unseen is not None:
         unknown = unknown | (paint.unseen.sample(torch.stack([x, y, z]).flatten(1)[None])[0] > UNSEEN).reshape(x.shape)

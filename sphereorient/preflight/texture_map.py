@@ -18,8 +18,8 @@ from sphereorient.search.normalisation import LocalNormalisation
 from sphereorient.search.refine_rotation import detail_level, level_reference, refine_rotation
 from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import orthographic_view, reduced_texture, sample_texture, unseen_share
+from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import texture_table
-from sphereorient.synth.textures import map_directions
 
 ROWS = 32  # of the reduced map on which views are averaged: 5.6 degrees
 ONE_COLOUR, FAINT = 0.02, 0.12  # standard deviation of the map, 0 black .. 1 white

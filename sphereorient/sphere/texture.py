@@ -88,6 +88,14 @@ def load_unseen(texture: Path) -> Tensor | None:
     return unseen if bool(unseen.any()) else None
 
 
+def map_directions(height: int) -> Tensor:
+    """Return the body direction of every texel, (H, 2 H, 3) float64 (docs/conventions.md)."""
+    latitude = math.pi / 2 - math.pi * (torch.arange(height, dtype=torch.float64) + 0.5) / height
+    longitude = math.pi * (torch.arange(2 * height, dtype=torch.float64) + 0.5) / height - math.pi
+    lat, lon = torch.meshgrid(latitude, longitude, indexing="ij")
+    return torch.stack([lat.cos() * lon.cos(), lat.cos() * lon.sin(), lat.sin()], dim=-1)
+
+
 def unseen_share(unseen: Tensor) -> float:
     """Return the share of the sphere that texels (H, 2 H) bool cover."""
     latitude = (torch.arange(len(unseen)) + 0.5) * (math.pi / len(unseen))

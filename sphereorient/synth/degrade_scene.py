@@ -15,11 +15,11 @@ from sphereorient import so3
 from sphereorient.cameras import Camera, TsaiCamera
 from sphereorient.sphere import sample_texture
 from sphereorient.sphere.renderer import rim_directions
+from sphereorient.sphere.texture import map_directions
 from sphereorient.synth.degrade import OPERATIONS, Disk, gain_to_clip, lost_frames
 from sphereorient.synth.scene import expose, make_scene
 from sphereorient.synth.settings import SynthSettings
 from sphereorient.synth.severities import DEGRADATIONS, degradation
-from sphereorient.synth.textures import map_directions
 
 BARE = 0.5  # grey of bare patches
 WAVES, WAVE_RATES = 24, (6.0, 12.0)  # patches: waves, and rates for periods of 30 to 60 degrees

@@ -5,13 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-
-def map_directions(height: int) -> Tensor:
-    """Return the body direction of every texel, (H, 2 H, 3) float64 (docs/conventions.md)."""
-    latitude = math.pi / 2 - math.pi * (torch.arange(height, dtype=torch.float64) + 0.5) / height
-    longitude = math.pi * (torch.arange(2 * height, dtype=torch.float64) + 0.5) / height - math.pi
-    lat, lon = torch.meshgrid(latitude, longitude, indexing="ij")
-    return torch.stack([lat.cos() * lon.cos(), lat.cos() * lon.sin(), lat.sin()], dim=-1)
+from sphereorient.sphere.texture import map_directions
 
 
 def random_directions(count: int, rng: torch.Generator) -> Tensor:

@@ -13,8 +13,8 @@ from sphereorient.errors import SettingsError, ShapeError
 from sphereorient.evaluate import Bound, cramer_rao_bound
 from sphereorient.evaluate.bound import disk_renderer, jacobian
 from sphereorient.sphere import Sampling, load_texture
+from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import random_texture
-from sphereorient.synth.textures import map_directions
 
 WHITE = torch.ones(32, 64)
 GREY = {grey: Sampling(outside=grey, supersampling=6) for grey in (0.5, 2.0)}  # backgrounds

@@ -16,8 +16,8 @@ from sphereorient.mapping import LearntMap, MapSettings, fit_map, take_crops
 from sphereorient.mapping.disks import Crops
 from sphereorient.mapping.iterations import State, first_state, iterate
 from sphereorient.sphere import load_texture, reduced_texture, sample_texture
+from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
-from sphereorient.synth.textures import map_directions
 
 # 4.6 degrees a frame: both cameras together have seen the whole ball after a few dozen frames.
 SMALL = {

@@ -10,7 +10,8 @@ from grey_examples import camera_disks, grey_search_of
 from orient_examples import attitudes, texture_of
 
 from sphereorient import so3
-from sphereorient.pose.fitter import defocus_radii, steepest_blur_px
+from sphereorient.pose.blur import steepest_blur_px
+from sphereorient.pose.fitter import defocus_radii
 from sphereorient.search import GreySearch, GreySearchSettings
 
 WIDE = 0.2  # radii

@@ -9,8 +9,8 @@ import torch
 from refine_examples import BLUR_PX, balls, cut, fitted, noisy, paint_of, pictures_of, rig_of, turn_errors, turned
 
 from sphereorient import so3
+from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import texture_table
-from sphereorient.synth.textures import map_directions
 
 DIAMETER_PX, SIGMA = 48.0, 4.0
 RIG = rig_of(DIAMETER_PX)

@@ -13,8 +13,8 @@ from sphereorient import so3
 from sphereorient.pose.fit import learn_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN
 from sphereorient.pose.worn import CELLS, without, worn_cells
+from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import octahedral_directions, texture_table
-from sphereorient.synth.textures import map_directions
 
 DIAMETER_PX, SIGMA, COUNT = 48.0, 3.0, 16
 RIG = rig_of(DIAMETER_PX)

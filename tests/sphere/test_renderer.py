@@ -24,10 +24,9 @@ from sphereorient.sphere.renderer import (
     orthographic_camera,
     smooth_positive,
 )
-from sphereorient.sphere.texture import sample_spline
+from sphereorient.sphere.texture import map_directions, sample_spline
 from sphereorient.synth import SynthSettings, random_texture
 from sphereorient.synth.scene import LAMPS, expose, make_scene
-from sphereorient.synth.textures import map_directions
 
 POSITIONS = ((0.0, 0.0, 0.0), (4.0, 0.0, -9.0), (-12.0, 0.0, 7.0))
 

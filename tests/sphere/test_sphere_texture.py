@@ -13,8 +13,7 @@ from sphere_examples import body_direction, f64, looked_up, random_map
 
 from sphereorient.errors import ShapeError, TextureError
 from sphereorient.sphere import load_texture, load_unseen, reduced_texture, sample_texture, unseen_share
-from sphereorient.sphere.texture import sample_spline, texture_coordinates
-from sphereorient.synth.textures import map_directions
+from sphereorient.sphere.texture import map_directions, sample_spline, texture_coordinates
 
 
 def saved(folder, picture, name="texture.png"):

@@ -17,6 +17,7 @@ from sphereorient.cameras import TsaiCamera
 from sphereorient.errors import SettingsError
 from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.sphere import load_texture
+from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import (
     DEGRADATIONS,
     SynthSettings,
@@ -37,7 +38,6 @@ from sphereorient.synth.degrade_scene import (
     worn,
     wrong_cameras,
 )
-from sphereorient.synth.textures import map_directions
 from sphereorient.synth.write import default_cameras, motion_of
 
 SETTINGS = SynthSettings(

@@ -15,11 +15,11 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import SettingsError
 from sphereorient.search.normalisation import crop_disk
+from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.view import disk_offsets
 from sphereorient.synth import disks, random_texture, render_frame, severity
 from sphereorient.synth.degrade import OPERATIONS
 from sphereorient.synth.disks import DISK_DEGRADATIONS, DiskSettings, film_disks
-from sphereorient.synth.textures import map_directions
 
 EXACT = DiskSettings(centre_sigma_px=0.0, radius_sigma=0.0)  # outlines without error
 AT = disk_offsets(EXACT.size_px).numpy()  # (S, S, 2), right and down of the middle, radii

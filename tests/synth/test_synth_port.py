@@ -12,8 +12,8 @@ from sphereorient import so3
 from sphereorient.errors import CameraError
 from sphereorient.sphere import Sampling, SphereRenderer
 from sphereorient.sphere.renderer import reach_px
+from sphereorient.sphere.texture import map_directions
 from sphereorient.synth import random_texture, render_frame
-from sphereorient.synth.textures import map_directions
 
 RADIUS_MM = 9.0
 LENSES = {

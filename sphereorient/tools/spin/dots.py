@@ -11,7 +11,7 @@ from sphereorient.search import GreySearch, GreySearchSettings
 from sphereorient.search.candidates import Candidates
 from sphereorient.search.normalisation import Blur, rim_share
 from sphereorient.sphere import orthographic_view
-from sphereorient.synth.textures import map_directions
+from sphereorient.sphere.texture import map_directions
 
 HEIGHT = 256  # of maps: 0.7 degree
 LENGTH_TOLERANCE = 0.05  # of the directions of a table

@@ -29,7 +29,7 @@ from sphereorient.mapping.compare import (
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.report.plots.style import ALL, BLACK, GREY, WIDTH_IN, in_style, new_figure, note
 from sphereorient.report.texture_map import CHANGE_REACH, draw_map
-from sphereorient.synth.textures import map_directions
+from sphereorient.sphere.texture import map_directions
 
 BEYOND = 5.0  # times the scatter of the unworn texture: noise alone seldom exceeds this
 LEAST_DEG = 1.5  # radius of the smallest place that is reported

@@ -20,7 +20,8 @@ from sphereorient.errors import PaintError
 from sphereorient.mapping.compare import turned_map
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.report.texture_map import write_seen
-from sphereorient.synth.textures import map_directions, random_texture
+from sphereorient.sphere.texture import map_directions
+from sphereorient.synth.textures import random_texture
 from sphereorient.tools.wear.series import WearSeries, _places, wear_series
 
 HEIGHT = 128

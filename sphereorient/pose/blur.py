@@ -1,0 +1,83 @@
+"""How much pictures are blurred: a first guess from their edges, and the blur that explains them best."""
+
+import math
+from collections.abc import Sequence
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient.locate import Frame, LocateSettings
+from sphereorient.locate.outline import find_blobs
+from sphereorient.pose.fit import FittedPoses
+from sphereorient.pose.fitter import FINEST_PX, CameraView, Fitter, level_of, widest_px
+from sphereorient.pose.pixels import Pixels
+from sphereorient.sphere.texture_table import TextureTable
+
+CALM_PX = 1.0  # blur that is laid over pictures first, against noise
+AROUND = 1.2  # of the radius: the sphere and its rim
+CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and scene lie
+STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
+FINER = 1.25  # ratio of the blurs that are tried, from FINEST_PX on
+WIDEST = 0.3  # of the radius: wider ones remove all paint
+
+
+def estimate_blur_px(views: Sequence[CameraView], shots: Sequence[Sequence[Frame]], locating: LocateSettings) -> float:
+    """Return the standard deviation of the blur, px, of the steepest edges about the sphere: median of n x C frames.
+    A first guess, biased by noise and paint without edges. 0 where no frame shows a blob of the sphere's size.
+    Source: a step of height h under a Gaussian blur sigma is h / (sigma sqrt(2 pi)) steep at most.
+    """
+    found = [
+        _steepest(shot.picture.astype(np.float32), view, locating)
+        for frame in shots
+        for view, shot in zip(views, frame, strict=True)
+        if shot.usable
+    ]
+    told = [blur for blur in found if blur is not None]
+    return float(np.median(told)) if told else 0.0
+
+
+def _steepest(picture: NDArray[np.float32], view: CameraView, locating: LocateSettings) -> float | None:
+    """Return the blur of the steepest edge about the likeliest blob, px; None without one."""
+    blobs = find_blobs(view.background.difference(picture), view.background.noise, view.diameter_px, locating)
+    if not blobs or blobs[0].merit <= 0:
+        return None
+    reach = round(AROUND * view.diameter_px / 2)
+    left, top = max(0, round(blobs[0].u_px) - reach), max(0, round(blobs[0].v_px) - reach)
+    window = picture[top : round(blobs[0].v_px) + reach + 1, left : round(blobs[0].u_px) + reach + 1]
+    return steepest_blur_px(window)
+
+
+def steepest_blur_px(picture: NDArray[np.float32]) -> float:
+    """Return the standard deviation of the blur, px, of the steepest edge between the darkest and the brightest."""
+    calm = cv2.GaussianBlur(picture, (0, 0), CALM_PX)
+    slope = np.hypot(cv2.Scharr(calm, cv2.CV_32F, 1, 0), cv2.Scharr(calm, cv2.CV_32F, 0, 1)) / 32
+    low, high = np.percentile(calm, CONTRAST)
+    steepest = float(np.percentile(slope, STEEPEST))
+    blur = float(high - low) / max(steepest * np.sqrt(2 * np.pi), 1e-9)
+    return float(np.sqrt(max(blur**2 - CALM_PX**2, 0.0)))
+
+
+def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor) -> float:
+    """Return the blur that leaves the least variance unexplained, interpolated between the tried ones."""
+    radius_px = widest_px(fitter.views) / 2
+    steps = math.log(max(WIDEST * radius_px / FINEST_PX, FINER**7)) / math.log(FINER)
+    blurs = [FINEST_PX * FINER**k for k in range(math.ceil(steps) + 1)]
+
+    @cache
+    def unexplained(k: int) -> float:
+        return fitter.left(pixels, fit, use, level_of(base, blurs[k], 0.0, radius_px), 2)
+
+    # Downhill from the first guess: each table of the paint costs a tenth of a second.
+    best, k = min(range(len(blurs)), key=lambda k: abs(blurs[k] - fitter.optics.blur_px)), -1
+    while best != k:
+        k = best
+        best = min((n for n in (k - 1, k, k + 1) if 0 <= n < len(blurs)), key=unexplained)
+    if k in (0, len(blurs) - 1):
+        return blurs[k]
+    below, here, above = (unexplained(n) for n in (k - 1, k, k + 1))
+    bend = below - 2 * here + above
+    shift = 0.5 * (below - above) / bend if bend > 0 else 0.0
+    return float(blurs[k] * FINER**shift)
