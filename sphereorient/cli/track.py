@@ -52,6 +52,9 @@ def track(
         str | None,
         typer.Option(help="A trained network proposes orientations: its checkpoint, or default (docs/proposer.md)."),
     ] = None,
+    no_learn_paint: Annotated[
+        bool, typer.Option("--no-learn-paint", help="Use the whole map, even where the ball wears other paint.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Track the sphere of an experiment, or of many: position and orientation of every frame."""
@@ -66,7 +69,8 @@ def track(
     from sphereorient.run.many import tracks_of
     from sphereorient.run.stages import with_proposer
 
-    chosen = with_proposer(settings_of(settings, set_, method), proposer)
+    overrides = [*(set_ or ()), *(["refine.learn_paint=false"] if no_learn_paint else ())]
+    chosen = with_proposer(settings_of(settings, overrides, method), proposer)
     names = cameras_of(cameras)
     requests = [
         Request(

@@ -23,6 +23,7 @@ from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of
 from sphereorient.pose.fit import trace
 from sphereorient.pose.fitter import CameraView
+from sphereorient.pose.worn import UNUSED_PAINT, worn_share, worn_text
 from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance, log, solve_damped
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
@@ -138,9 +139,10 @@ def precise_track(
     missed = [_missed(view, cameras[view.name]) for view in learnt.fitter.views]
     flags = chosen.flags | _fit_flags(table, chosen, picked, learnt, np.any(missed, axis=0))
     flags |= torch.where(smoothed.extrapolated, int(Flag.EXTRAPOLATED), 0)
-    remarks = [TWO_BALLS] if learnt.second_ball else []
+    told: dict[str, Any] = {"remarks": [TWO_BALLS] if learnt.second_ball else []}
     if learnt.worn is not None:
-        remarks.append(WORN.format(share=100 * float(learnt.worn.float().mean())))
+        told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
+        told[UNUSED_PAINT] = worn_text(learnt.worn)
     return replace(
         empty,
         valid=(chosen.choice >= 0).numpy(),
@@ -151,7 +153,7 @@ def precise_track(
         **datasets_of(smoothed, experiment.length_unit),
         segment=chosen.segment.numpy(),
         flags=flags.numpy().astype(np.uint32),
-        provenance={"remarks": remarks},
+        provenance=told,
         confidence=chosen.probability.numpy(),
         margin=margin.numpy(),
         margin_angle=angle.numpy(),

@@ -1,14 +1,18 @@
 """Paint that differs from its map (wear, dirt that turns with the ball, a map drawn wrongly): found, and not used."""
 
+import math
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from sphereorient.pose.fit import FittedPoses, settled
 from sphereorient.pose.model import UNSEEN, SphereModel, surface_normals
 from sphereorient.pose.pixels import Pixels
-from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.texture import map_directions, unseen_share
 from sphereorient.sphere.texture_table import TextureTable, octahedral_cells, texture_table
 
+UNUSED_PAINT = "unused_paint"  # entry of a track's provenance, see `worn_text`
 CELLS = 48  # per axis, in which the paint of all pictures is averaged: 2.6 degrees
 CHANGED = 0.15  # of the step from black to white: paint that differs by more is not the map's; right maps differ by 0.1
 SLACK = 0.1  # standard deviation of a cell that hardly any pixel shows
@@ -36,7 +40,28 @@ def worn_cells(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel
 def without(paint: TextureTable, worn: Tensor) -> TextureTable:
     """Return a table of paint in which worn cells, as of `worn_cells`, are unknown as well."""
     x, y, z = map_directions(ROWS).float().unbind(-1)
-    unknown = worn[octahedral_cells(x, y, z, CELLS)]
+    unknown = worn_texels(worn, ROWS)
     if paint.unseen is not None:
         unknown = unknown | (paint.unseen.sample(torch.stack([x, y, z]).flatten(1)[None])[0] > UNSEEN).reshape(x.shape)
     return TextureTable(paint.rows, paint.blur_rad, texture_table(unknown.float(), paint.blur_rad, SIDE))
+
+
+def worn_texels(worn: Tensor, height: int) -> Tensor:
+    """Return the texels (H, 2 H) bool of an equirectangular map that lie in worn cells, as of `worn_cells`."""
+    x, y, z = map_directions(height).float().unbind(-1)
+    return worn[octahedral_cells(x, y, z, math.isqrt(len(worn)))]
+
+
+def worn_share(worn: Tensor) -> float:
+    """Return the share of the sphere that worn cells, as of `worn_cells`, cover."""
+    return unseen_share(worn_texels(worn, ROWS))
+
+
+def worn_text(worn: Tensor) -> str:
+    """Return worn cells (CELLS^2,) bool as hexadecimal digits, for a track."""
+    return np.packbits(worn.numpy()).tobytes().hex()
+
+
+def worn_of_text(text: str) -> Tensor:
+    """Return the worn cells of a text that `worn_text` made; raise ValueError for another one."""
+    return torch.from_numpy(np.unpackbits(np.frombuffer(bytes.fromhex(text), np.uint8)).astype(bool))

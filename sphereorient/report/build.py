@@ -4,6 +4,7 @@ import base64
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,15 @@ from matplotlib.figure import Figure
 from sphereorient.errors import ExperimentError, OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.files.whole_file import ROOM, has_mark, unfinished
+from sphereorient.pose.worn import UNUSED_PAINT, worn_of_text
 from sphereorient.report import plots
 from sphereorient.report.frame_warnings import bad_stretches
 from sphereorient.report.gallery import gallery
 from sphereorient.report.page import page_html, strip_html
 from sphereorient.report.tables import tables_of, write_tables
+from sphereorient.report.texture_map import worn_figure
 from sphereorient.report.verdicts import Verdict, verdicts
+from sphereorient.sphere import load_texture
 from sphereorient.statistics import StatisticsSettings, Summary, Surroundings, summarise
 from sphereorient.statistics.cameras import CameraDistance, camera_distances, without_perspective
 from sphereorient.trajectory import Trajectory
@@ -73,7 +77,9 @@ def write_report(
             verdicts=words,
             tables=tables,
             suffixes=write_tables(tables, aside / "tables"),
-            figures=_draw_all(list(_figures(summary, tracks, distances)), aside / "figures", progress),
+            figures=_draw_all(
+                [*_figures(summary, tracks, distances), *_worn(tracks, known)], aside / "figures", progress
+            ),
             strips=list(_strips(tracks, known, progress)),
         )
         (aside / "index.html").write_text(page, "utf-8")
@@ -152,6 +158,20 @@ def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequ
     yield "isotropy", caption, lambda: plots.isotropy_figure(more.isotropies)
     if (found := more.durations) is not None:
         yield "durations", "Durations of the segments.", lambda: plots.durations_figure(found)
+
+
+def _worn(tracks: Mapping[str, Trajectory], experiments: Mapping[str, Experiment | None]) -> Iterator[Plan]:
+    """Yield a figure of the paint that was not used, for each ball on which there is any."""
+    drawn = set()
+    for name, track in tracks.items():
+        text, experiment = track.provenance.get(UNUSED_PAINT), experiments[name]
+        if text is None or text in drawn:
+            continue
+        drawn.add(text)
+        path = None if experiment is None else experiment.texture_path
+        texture, of = None if path is None else load_texture(path), "" if len(tracks) == 1 else f" of {name}"
+        draw = partial(worn_figure, worn_of_text(text), texture)
+        yield f"unused_paint_{len(drawn)}", f"Paint{of} that differs from the map and was not used.", draw
 
 
 def _draw_all(plans: Sequence[Plan], folder: Path, progress: Progress) -> list[dict[str, Any]]:

@@ -23,6 +23,7 @@ from sphereorient.mapping import LearntMap
 from sphereorient.mapping.compare import MapComparison
 from sphereorient.mapping.grid import texel_areas
 from sphereorient.movies import Grey
+from sphereorient.pose.worn import worn_share, worn_texels
 from sphereorient.report.overlay import pictures_by_row, prepared
 from sphereorient.report.overlay_model import crop
 from sphereorient.report.overlay_page import OverlayView, crop_side
@@ -187,6 +188,22 @@ def draw_map(axes: Axes, values: Tensor, title: str, **style: Any) -> Any:
     grey = {} if "norm" in style else {"vmin": 0, "vmax": 1}
     shown = {"cmap": "gray", "extent": (-180, 180, -90, 90)} | grey | style
     return axes.imshow(np.ma.masked_invalid(values.numpy()), **shown)
+
+
+@in_style
+def worn_figure(worn: Tensor, texture: Tensor | None) -> Figure:
+    """Draw where paint was not used, cells as of `worn_cells`, over the texture map (H, 2 H) if it is known."""
+    whole = torch.full((360, 720), 0.6) if texture is None else texture
+    unused = worn_texels(worn, len(whole))
+    figure = new_figure(WIDTH_IN, 4.0)
+    axes = figure.subplots()
+    draw_map(
+        axes, whole.masked_fill(unused, torch.nan), f"{100 * worn_share(worn):.0f} % of the paint differs from the map"
+    )
+    axes.set_ylabel("latitude (degrees)")
+    map_words = "" if texture is not None else " The map itself is not drawn: the report was made without --experiment."
+    note(figure, f"Sand: the paint that the pictures show is not that of the map, and was not used.{map_words}")
+    return figure
 
 
 @in_style

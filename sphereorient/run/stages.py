@@ -197,7 +197,7 @@ def finished(track: Trajectory, job: Job, request: Request) -> Trajectory:
         if found.contradicts:
             remarks.append(f"the cameras contradict each other ({found}): {found.advice}")
     inputs = input_files(recording.experiment, list(recording.cameras))
-    origin = provenance(inputs, recording.experiment.folder, request.command)
+    origin = dict(track.provenance) | provenance(inputs, recording.experiment.folder, request.command)
     origin["remarks"] = remarks
     if settings.propose.checkpoint is not None:
         origin["proposer_sha256"] = sha256(checkpoint_path(settings.propose.checkpoint))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import h5py
 import numpy as np
@@ -10,11 +11,13 @@ import pytest
 import torch
 
 from sphereorient import so3
+from sphereorient.cli import main
 from sphereorient.evaluate.robustness.scenes import BenchmarkScene, write_scene
 from sphereorient.methods.method import Learnt
-from sphereorient.methods.settings import load_settings
+from sphereorient.pose.worn import UNUSED_PAINT, worn_of_text, worn_share
 from sphereorient.run.stages import run
 from sphereorient.run.store import MemoryStore, Request
+from sphereorient.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +34,13 @@ def off_deg(track, experiment) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_worn_paint_is_not_used_told_and_kept(worn, tmp_path):
+def test_worn_paint_is_not_used_told_and_kept(worn, tmp_path, monkeypatch):
     known = tmp_path / "learnt.h5"
     track = run(Request(experiment=worn, save_learnt=known), MemoryStore())
-    asis = run(Request(experiment=worn, settings=load_settings(None, ["refine.learn_paint=false"])), MemoryStore())
+    monkeypatch.setattr(sys, "argv", f"sphereorient track {worn} -o {tmp_path}/asis.h5 -q --no-learn-paint".split())
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main()
+    asis = Trajectory.load(tmp_path / "asis.h5")
     off, before = off_deg(track, worn), off_deg(asis, worn)
     assert np.median(off) < 0.03 < 2 * 0.03 < np.median(before)
     sigma = np.degrees(np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)))
@@ -42,8 +48,10 @@ def test_worn_paint_is_not_used_told_and_kept(worn, tmp_path):
     told = [line for line in track.provenance["remarks"] if "differs from the texture map" in line]
     assert len(told) == 1
     assert not any("differs" in line for line in asis.provenance["remarks"])
-    share = Learnt.load(known).worn.float().mean()
-    assert 0.04 < float(share) < 0.2  # not all of it was in sight
+    cells = Learnt.load(known).worn
+    assert 0.04 < worn_share(cells) < 0.2  # not all of it was in sight
+    assert torch.equal(worn_of_text(track.provenance[UNUSED_PAINT]), cells)
+    assert UNUSED_PAINT not in asis.provenance
     again = run(Request(experiment=worn, learnt=known), MemoryStore())
     assert again.orientation.tobytes() == track.orientation.tobytes()
     assert again.orientation_cov.tobytes() == track.orientation_cov.tobytes()

@@ -12,7 +12,7 @@ from refine_examples import BLUR_PX, balls, cut, fitted, model_of, noisy, paint_
 from sphereorient import so3
 from sphereorient.pose.fit import learn_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN
-from sphereorient.pose.worn import CELLS, without, worn_cells
+from sphereorient.pose.worn import CELLS, without, worn_cells, worn_of_text, worn_share, worn_text
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import octahedral_directions, texture_table
 
@@ -102,3 +102,9 @@ def test_worn_paint_is_unknown_and_what_was_unknown_stays_so(known):
     south = share[at[:, 2] < -0.7]
     assert (south < UNSEEN).all() if known else (south > 0.98).all()
     assert without(paint, worn).rows.equal(paint.rows)
+
+
+def test_worn_cells_survive_as_text_and_their_share_is_one_of_area():
+    worn = CELL_Z > NORTH
+    assert torch.equal(worn_of_text(worn_text(worn)), worn)
+    assert worn_share(worn) == pytest.approx((1 - NORTH) / 2, abs=0.01)

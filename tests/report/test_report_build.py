@@ -13,7 +13,9 @@ import pytest
 
 from sphereorient.cli import main
 from sphereorient.errors import OutputError
+from sphereorient.pose.worn import CELLS, UNUSED_PAINT, worn_text
 from sphereorient.report.build import _check_folder
+from sphereorient.sphere.texture_table import octahedral_directions
 from sphereorient.synth.ensemble import EnsembleSpec, draw_ensemble, filtered_track
 from sphereorient.trajectory import Trajectory
 
@@ -103,6 +105,17 @@ def test_one_segment_has_a_page_and_a_line_that_says_what_is_missing(place, repo
     page = (tmp_path / "page" / "index.html").read_text()
     assert "figure-track" in page
     assert "figure-densities" not in page
+
+
+@pytest.mark.slow
+def test_paint_that_was_not_used_is_drawn(place, report, tmp_path):
+    worn = octahedral_directions(CELLS)[:, 2] > 0.5
+    track = Trajectory.load(place / "one.h5")
+    replace(track, provenance={**track.provenance, UNUSED_PAINT: worn_text(worn)}).save(tmp_path / "worn.h5")
+    code, _, _ = report(tmp_path / "worn.h5", "--out", tmp_path / "page", "--quiet")
+    assert code == 0
+    assert (tmp_path / "page" / "figures" / "unused_paint_1.png").stat().st_size > 2000
+    assert "figure-unused_paint_1" in (tmp_path / "page" / "index.html").read_text()
 
 
 @pytest.mark.slow
