@@ -16,7 +16,9 @@ from sphereorient.sphere.texture_table import CHUNK, SIDE, SQUARE_25, TextureTab
 STEP_RAD = 0.002  # step of a table's finite differences
 POLE = 1e-3  # least cosine of a latitude: at the pole itself longitude is undefined
 READS = 16  # texels that a look-up reads
-NOISE = 1.0e-3  # variance of the blurred map's errors over that of what sharpening may add
+WIDER = 4.0  # times the blur of the map, at which its edges are counted
+SLOPES = 64  # cells per axis of the directions in which their slope is averaged
+FEWEST_EDGES = 0.01  # rad/sr
 SHARPENING_ITERATIONS = 200
 Array = NDArray[Any]
 
@@ -192,13 +194,36 @@ def blur_matrix(direction_body: Tensor, blur_rad: float, height: int) -> csr_mat
     return total
 
 
-def sharpened(blurred: Tensor, blur_rad: float, noise: float = NOISE) -> Tensor:
-    """Remove a Gaussian blur from a map's coefficients (H, 2 H) float64 (Tikhonov 1963); `noise` limits it."""
-    height = len(blurred)
-    direction = map_directions(height).reshape(-1, 3)
-    seen = look_up(blurred.double(), direction).numpy()
-    area = texel_areas(height).reshape(-1).numpy()
-    blur = blur_matrix(direction, blur_rad, height)
-    weighted = blur.multiply(area[:, None]).tocsr()
-    normal, right = (blur.T @ weighted).tocsr(), np.asarray(weighted.T @ seen)
-    return solve_map(normal, right, height, noise * blur_rad**2, SHARPENING_ITERATIONS)
+def paint_tie(texture: Tensor, blur_rad: float) -> float:
+    """Return what the integral of the paint's squared slope weighs against chi^2, from a map of some blur.
+    Paint with edges of length e per sr has the power 2 e / k^3; a map blurred further, where noise is small, tells e.
+    The weight is right for detail of the size of the blur, where pictures and expectation meet (Wiener 1949).
+    """
+    wide = WIDER * blur_rad
+    direction = octahedral_directions(SLOPES).float().T[None]
+    power = map_table(texture, blur_rad).blurred(wide).sample(direction)[1].square().sum(1).mean()
+    edges = 2 * math.sqrt(math.pi) * wide * float(power)
+    return 1 / (2 * max(edges, FEWEST_EDGES) * blur_rad)
+
+
+def coefficients_blur_rad(blur_rad: float, height: int) -> float:
+    """Return the blur of a map's coefficients whose spline has some blur: it adds a third of a squared texel."""
+    return math.sqrt(max(blur_rad**2 - (math.pi / height) ** 2 / 3, (0.1 * blur_rad) ** 2))
+
+
+def sharpened(normal: NormalMatrix, right: Array, blur_rad: float, tie: float, expected: Tensor) -> Tensor:
+    """Return the paint (H, 2 H) float64 that, blurred, solves the normal equations (T, T), (T,) of the blurred map;
+    `tie` weighs the squared slope of its difference from an expected map (H, 2 H). Source: Tikhonov 1963.
+    """
+    height = len(expected)
+    blur = blur_matrix(map_directions(height).reshape(-1, 3), coefficients_blur_rad(blur_rad, height), height)
+    back, known, ties = blur.T.tocsr(), expected.double().numpy().ravel(), tie * stiffness(height)
+    diagonal = blur.multiply(blur).T @ normal.diagonal() + ties.diagonal()
+
+    def apply(p: Array) -> Array:
+        pulled: Array = back @ (normal @ (blur @ p)) + ties @ p
+        return pulled
+
+    left = back @ (right - normal @ (blur @ known))
+    change = conjugate_gradients(apply, lambda p: p / diagonal, left, 1e-12, SHARPENING_ITERATIONS)
+    return torch.from_numpy((known + change).reshape(height, 2 * height))

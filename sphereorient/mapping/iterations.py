@@ -11,11 +11,15 @@ from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.mapping.compare import fit_levels
 from sphereorient.mapping.disks import Crops, Disks, evenly_spread, pixels_of
 from sphereorient.mapping.grid import (
     NormalMatrix,
+    coefficients_blur_rad,
     map_sums,
     map_table,
+    paint_tie,
+    sharpened,
     solve_map,
     stiffness,
     texel_areas,
@@ -27,8 +31,11 @@ from sphereorient.mapping.settings import MapSettings
 from sphereorient.mapping.threads import side_by_side
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curves
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
-from sphereorient.pose.model import Light
+from sphereorient.pose.lab_light import LabLight
+from sphereorient.pose.model import Light, light_basis
 from sphereorient.pose.pixels import Pixels
+from sphereorient.sphere.texture import map_directions
+from sphereorient.sphere.texture_table import texture_table
 
 FIRST_SMOOTH = 0.02  # as the setting `smooth`, of the first map
 CONTRAST = 0.3  # deviation of the first map about mid-grey
@@ -36,7 +43,9 @@ TEXEL_PX = 0.75  # of the widest disk's middle
 ROW, FINEST_ROWS = 32, 512  # the fitted map has a multiple of the one as rows, and at most the other
 SEPARATE_ITERATIONS = 2  # each instant by itself: a joint step would trust the map, which is still blurred
 LIGHT_ITERATIONS = 8  # in which light, noise and blur are estimated anew
-SMOOTHEST = 0.2  # as the setting `smooth`, of the first iteration: orientations must not follow the map's noise
+SMOOTHEST = 0.2  # weight of the map's squared slope over that of a typical texel, in the first iteration: orientations
+# must not follow the map's noise
+LAB_ITERATIONS, LAB_FRAMES = 3, 32  # in which one light in the lab is estimated, and its instants
 BLUR_FRAMES = 32
 BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
 BLUR_PX = (0.25, 3.0)  # narrowest and widest
@@ -71,12 +80,12 @@ class State:
     blur_px: float
     fitter: Fitter  # of views and light; its own map is not used
     fixed: bool  # whether all instants share one position
+    expected: Tensor | None = None  # (H, 2 H), paint without blur from which the map differs as little as it can
 
     @property
-    def light(self) -> Light:
-        """The light as maps of each camera's disk."""
-        assert isinstance(self.fitter.light, Light)
-        return self.fitter.light
+    def blur_rad(self) -> float:
+        """The blur of the pictures, rad of the sphere's directions at the middle of the widest disk."""
+        return 2 * self.blur_px / widest_px(self.fitter.views)
 
     def map_fitter(self) -> Fitter:
         """Return the fitter of poses to the present map."""
@@ -155,15 +164,17 @@ def first_state(
 def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iteration]:
     """Improve orientations, light and map once; k counts the iterations from 0."""
     before = state.R_lab_body
-    smooth = max(settings.smooth, SMOOTHEST * 0.5**k)
+    smoothest = SMOOTHEST * 0.5**k
     if k < SEPARATE_ITERATIONS:
         state, _ = fitted(state, 3 if k == 0 else 2)
     if k < LIGHT_ITERATIONS:
         state = _with_light(state)
+    elif k < LIGHT_ITERATIONS + LAB_ITERATIONS:
+        state = _lit_in_the_lab(state)
     if k >= SEPARATE_ITERATIONS:
-        state = _with_joint_step(state, smooth)
-    state, chi2 = with_map(state, smooth)
-    if k < LIGHT_ITERATIONS:
+        state = _with_joint_step(state, smoothest)
+    state, chi2 = with_map(state, smoothest)
+    if k < LIGHT_ITERATIONS + LAB_ITERATIONS:
         state = _rescaled(state)
     if SEPARATE_ITERATIONS <= k < LIGHT_ITERATIONS and settings.blur_px is None:
         state = replace(state, blur_px=_better_blur(state))
@@ -199,7 +210,7 @@ def fitted(state: State, iterations: int, crops: Crops | None = None) -> tuple[S
 
 
 def _with_light(state: State) -> State:
-    cameras, basis = state.use.shape[1], state.light.difference.shape[-1]
+    cameras, basis = state.use.shape[1], light_basis(torch.zeros(1, 2, 1)).shape[-2]
     normal = torch.zeros(cameras, 2 * basis, 2 * basis, dtype=torch.float64)
     right = torch.zeros(cameras, 2 * basis, dtype=torch.float64)
     greys: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -216,14 +227,25 @@ def _with_light(state: State) -> State:
     return replace(state, fitter=replace(state.fitter, light=light))
 
 
+def _lit_in_the_lab(state: State) -> State:
+    """Return the state with one light in the lab for all cameras, where that explains held-out instants better."""
+    rows = evenly_spread(torch.arange(len(state.use)), LAB_FRAMES)
+    fitter = state.map_fitter()
+    X, R, use = state.position_lab_mm[rows], state.R_lab_body[rows], state.use[rows]
+    pixels = state.disks(rows)
+    fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 1)
+    lit, _ = fitter.lit_in_the_lab(pixels, fit, use)
+    return replace(state, fitter=replace(state.fitter, light=lit.light))
+
+
 def _rescaled(state: State) -> State:
     """Scale the map to black 0 and white 1: pictures alone do not separate a dark light from a dark map."""
     values, order = state.texture.reshape(-1).sort()
     share = texel_areas(len(state.texture)).reshape(-1)[order].cumsum(0)
     low, high = (float(values[int((share < part * share[-1]).sum())]) for part in (BLACK, WHITE))
     step = max(high - low, 1e-3)
-    light = state.light
-    if light.known:  # the light takes over the factor, so no picture changes
+    light = state.fitter.light
+    if isinstance(light, Light | LabLight) and light.known:  # the light takes over the factor, so no picture changes
         light = replace(light, difference=light.difference * step, black=light.black + light.difference * low)
     return replace(state, texture=(state.texture - low) / step, fitter=replace(state.fitter, light=light))
 
@@ -243,7 +265,7 @@ def _better_blur(state: State) -> float:
     return min(max(best, BLUR_PX[0]), BLUR_PX[1])
 
 
-def _with_joint_step(state: State, smooth: float) -> State:
+def _with_joint_step(state: State, smoothest: float) -> State:
     """Move all poses by one joint step, without its map: `with_map` solves for that exactly."""
     height = len(state.texture)
     parts, weight = [], np.zeros(2 * height * height)
@@ -254,8 +276,8 @@ def _with_joint_step(state: State, smooth: float) -> State:
     for part in side_by_side(system, state.batches()):
         parts.append(part)
         weight += texel_sums(part.by_texel)
-    tie = smooth * _typical(weight)
-    pose = joint_step(parts, state.use, state.texture, tie, state.fitter.radius_mm, state.fixed)
+    tie = max(smoothest * _typical(weight), paint_tie(state.texture, state.blur_rad))
+    pose = joint_step(parts, state.use, _unexpected(state), tie, state.fitter.radius_mm, state.fixed)
     pose = pose * (LONGEST_RAD / pose[:, :3].norm(dim=1).max().clamp_min(1e-9)).clamp_max(1.0)
     return replace(
         state,
@@ -264,8 +286,49 @@ def _with_joint_step(state: State, smooth: float) -> State:
     )
 
 
-def with_map(state: State, smooth: float) -> tuple[State, float]:
-    """Return the state with its best map at the present poses, and chi2 per pixel before."""
+def with_map(state: State, smoothest: float = 0.0) -> tuple[State, float]:
+    """Return the state with its best map at the present poses, and chi2 per pixel before.
+    `smoothest`: least weight of its squared slope, over that of a typical texel.
+    """
+    height = len(state.texture)
+    normal, right, chi2 = _map_equations(state)
+    tie = max(smoothest * _typical(normal.diagonal()), paint_tie(state.texture, state.blur_rad))
+    # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
+    right -= tie * (stiffness(height) @ _unexpected(state).double().numpy().ravel())
+    texture = state.texture + solve_map(normal, right, height, tie).float()
+    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND)), chi2
+
+
+def sharp_map(state: State) -> Tensor:
+    """Return the paint without the blur of the pictures, (H, 2 H) float64."""
+    normal, right, _ = _map_equations(state)
+    right += normal @ state.texture.double().numpy().ravel()
+    tie = paint_tie(state.texture, state.blur_rad)
+    expected = torch.zeros_like(state.texture)
+    if state.expected is not None:
+        gain, offset = fit_levels(_as_filmed(state, state.expected), state.texture)
+        expected = gain * state.expected + offset
+    return sharpened(normal, right, state.blur_rad, tie, expected)
+
+
+def _unexpected(state: State) -> Tensor:
+    """Return the map less the expected one, of the same blur and levels; all of it where nothing is expected."""
+    if state.expected is None:
+        return state.texture
+    filmed = _as_filmed(state, state.expected)
+    gain, offset = fit_levels(filmed, state.texture)
+    return state.texture - (gain * filmed + offset)
+
+
+def _as_filmed(state: State, paint: Tensor) -> Tensor:
+    """Return the coefficients (H, 2 H) of paint (H, 2 H) as the pictures blur it."""
+    height = len(paint)
+    table = texture_table(paint, coefficients_blur_rad(state.blur_rad, height))
+    return table.sample(map_directions(height).reshape(-1, 3).float().T[None])[0].reshape(paint.shape)
+
+
+def _map_equations(state: State) -> tuple[NormalMatrix, NDArray[np.float64], float]:
+    """Return the normal equations (T, T), (T,) of a change of the map, and chi2 per pixel before it."""
     height = len(state.texture)
     parts, right = [], np.zeros(2 * height * height)
     squares = expected = 0.0
@@ -274,12 +337,7 @@ def with_map(state: State, smooth: float) -> tuple[State, float]:
         right += parts[-1].T @ (at.residual * at.precision.sqrt()).reshape(-1).numpy()
         squares += float((at.precision * at.residual.square()).sum())
         expected += float((at.precision * at.variance).sum())
-    normal = NormalMatrix(vstack(parts, format="csr"))
-    tie = smooth * _typical(normal.diagonal())
-    # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
-    right -= tie * (stiffness(height) @ state.texture.double().numpy().ravel())
-    texture = state.texture + solve_map(normal, right, height, tie).float()
-    return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND)), squares / max(expected, 1e-9)
+    return NormalMatrix(vstack(parts, format="csr")), right, squares / max(expected, 1e-9)
 
 
 def map_weight(state: State) -> Tensor:

@@ -12,9 +12,11 @@ from sphereorient import so3
 from sphereorient.cameras import centre_lab_mm
 from sphereorient.experiment.recording import Progress
 from sphereorient.mapping.chain import PairwiseAttitudes, find_chain
+from sphereorient.mapping.compare import compare_maps, turned_map
 from sphereorient.mapping.disks import Crops, Disks, disks_of, evenly_spread
-from sphereorient.mapping.grid import look_up, sharpened, texel_areas
+from sphereorient.mapping.grid import look_up, texel_areas
 from sphereorient.mapping.iterations import (
+    LAB_ITERATIONS,
     LIGHT_ITERATIONS,
     ROW,
     Iteration,
@@ -25,6 +27,7 @@ from sphereorient.mapping.iterations import (
     iterate,
     map_height,
     map_weight,
+    sharp_map,
 )
 from sphereorient.mapping.kept import read_kept, write_kept
 from sphereorient.mapping.pairs import Closure
@@ -33,7 +36,8 @@ from sphereorient.mapping.settings import MapSettings
 from sphereorient.mapping.verdict import jumps, paint_correlation
 from sphereorient.pose.fit import FittedPoses
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, widest_px
-from sphereorient.pose.model import LIGHT_PARTS, Light
+from sphereorient.pose.lab_light import light_of, light_parts
+from sphereorient.pose.model import Lighting
 from sphereorient.sphere.texture import map_directions
 
 # Least cosine of the slant at which a picture shows a texel (displacement rms: 0.74 degrees from 0.2, 0.15 from 0.4).
@@ -70,7 +74,7 @@ class LearntMap:
     paint: Tensor  # (N, C), correlation with the paint in pictures held out of the map for it; NaN elsewhere
     jumps: Tensor  # (J,) int64, frames from which the ball turns unlike before and after
     views: Sequence[CameraView]  # with the scenes without the ball
-    light: Light
+    light: Lighting
     blur_px: float  # estimated with the map
     closure: Closure
     rounds: tuple[Iteration, ...]
@@ -83,10 +87,13 @@ class LearntMap:
         return float((areas * (self.seen > 0)).sum() / areas.sum())
 
 
-def fit_map(crops: Crops, settings: MapSettings, progress: Progress, kept: Path | None = None) -> LearntMap:
+def fit_map(
+    crops: Crops, settings: MapSettings, progress: Progress, kept: Path | None = None, old: Tensor | None = None
+) -> LearntMap:
     """Learn the texture map, all orientations and the light from the crops of opened movies.
 
     `kept`: file of the state after each iteration, from which an interrupted run goes on to the same result.
+    `old`: a map (h, 2 h) of the ball as it was, which noise does not change; the body frame is not that of it.
 
     Raises:
         PaintError: too few frames, no rotation, no common patch, or different spheres.
@@ -111,6 +118,16 @@ def fit_map(crops: Crops, settings: MapSettings, progress: Progress, kept: Path 
             state = recovered(start.crops, state, chain)
         done.append(iteration)
     progress("map", settings.rounds, settings.rounds)
+    if old is not None:
+        R_now_old = compare_maps(sharp_map(state).float(), old).R_other_reference
+        state = replace(state, expected=turned_map(old.float(), R_now_old.mT, len(state.texture)))
+        for k in range(settings.rounds):
+            progress("map, with the old one", k, settings.rounds)
+            state, iteration = iterate(state, settings, LIGHT_ITERATIONS + k)
+            done.append(iteration)
+            if k >= LAB_ITERATIONS and iteration.moved_rad < arrived_rad:
+                break
+        progress("map, with the old one", settings.rounds, settings.rounds)
     return _finished(start, state, settings, tuple(done), arrived=done[-1].moved_rad < arrived_rad)
 
 
@@ -125,12 +142,12 @@ class _Start:
 
 def _parts(start: _Start, state: State, done: Sequence[Iteration]) -> dict[str, Tensor]:
     """Return what `_resumed` needs beside the crops."""
-    chain, light = start.chain, state.light
+    chain, light = start.chain, state.fitter.light
     closure, iterations = astuple(chain.closure), [astuple(one) for one in done]
     numbers = {"closure": closure, "blur_px": state.blur_px, "done": iterations}
     parts = {"place": start.crops.position_lab_mm, "frames": start.frames, "rows": start.rows, "known": light.known}
     parts |= {"chain_rows": chain.rows, "chain": chain.R_lab_body, "first_map": start.state.texture}
-    parts |= {name: getattr(state, name) for name in STATE_PARTS} | {name: getattr(light, name) for name in LIGHT_PARTS}
+    parts |= {name: getattr(state, name) for name in STATE_PARTS} | light_parts(light)
     parts |= {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
     return {name: torch.as_tensor(part) for name, part in parts.items()}
 
@@ -144,7 +161,7 @@ def _resumed(crops: Crops, kept: dict[str, Tensor], settings: MapSettings) -> tu
     chain = PairwiseAttitudes(rows=kept["chain_rows"], R_lab_body=kept["chain"], closure=closure)
     few = _settings_of_few(settings, crops, frames) if settings.unordered else settings
     first = first_state(crops, frames[rows], chain.R_lab_body[rows], kept["first_map"], few)
-    light = Light(**{name: kept[name] for name in LIGHT_PARTS}, known=bool(kept["known"]))
+    light = light_of(kept, bool(kept["known"]))
     X, R, texture = (kept[name] for name in STATE_PARTS)
     state = replace(first, position_lab_mm=X, R_lab_body=R, texture=texture, blur_px=float(kept["blur_px"]))
     state = replace(state, fitter=replace(first.fitter, light=light))
@@ -256,7 +273,7 @@ def _finished(
         paint=spread(paint_correlation(crops, state, settings), used),
         jumps=torch.empty(0).long() if settings.unordered else jumps(attitudes),
         views=crops.views,
-        light=state.light,
+        light=state.fitter.light,
         blur_px=state.blur_px,
         closure=chain.closure,
         rounds=iterations,
@@ -305,8 +322,7 @@ def _final_map(state: State, Q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Sharpen the map and rotate it by Q: texture, counts and sigma, (H, 2 H) each."""
     height = FINER * len(state.texture)
     direction = map_directions(height) @ Q  # Q^T d: where the fitted map holds the new texel
-    blur_rad = 2 * state.blur_px / widest_px(state.fitter.views)
-    texture = look_up(sharpened(state.texture, blur_rad), direction).clamp(0, 1)
+    texture = look_up(sharp_map(state), direction).clamp(0, 1)
     weight = look_up(map_weight(state), direction)
     seen = _counts(state, direction)
     unknown = (seen == 0) | (weight <= 0)

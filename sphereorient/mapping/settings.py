@@ -33,7 +33,6 @@ class MapSettings(BaseModel, frozen=True, extra="forbid"):
     blur_px: float | None = Field(
         None, gt=0.2, description="standard deviation of optics, pixel and exposure together, px; null estimates it"
     )
-    smooth: float = Field(4.0e-3, gt=0, description="smoothness penalty, relative to the weight of a typical texel")
     rounds: int = Field(40, ge=1, description="iterations of attitudes, light and map, at most")
     arrived_deg: float = Field(
         0.01, gt=0, description="stop when an iteration moves the attitudes by less, degrees rms"

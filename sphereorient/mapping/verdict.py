@@ -31,7 +31,7 @@ def paint_correlation(crops: Crops, state: State, settings: MapSettings) -> Tens
     if not len(rows):
         return found
     held = torch.zeros(len(state.use), 1, dtype=torch.bool).index_fill(0, rows, True)
-    others, _ = with_map(replace(state, use=state.use & ~held), settings.smooth)
+    others, _ = with_map(replace(state, use=state.use & ~held))
     known = (map_weight(others) > 0).float()
     one, _ = fitted(others.where(rows, state.use), ITERATIONS, crops)
     X = crops.position_lab_mm.index_put((one.frames,), one.position_lab_mm)

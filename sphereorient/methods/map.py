@@ -10,7 +10,8 @@ from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import Progress, open_recording, silent
 from sphereorient.files.provenance import provenance
 from sphereorient.mapping import LearntMap, fit_map, take_crops
-from sphereorient.mapping.compare import MapComparison, corrected
+from sphereorient.mapping.compare import MapComparison
+from sphereorient.mapping.old_map import corrected
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track
 from sphereorient.methods.settings import Settings, check_settings, settings_yaml
@@ -70,7 +71,7 @@ def learn_map(
     comparison, kept_share = None, 0.0
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         crops = take_crops(recording, settings.paint, settings.locate, progress)
-        learnt = fit_map(crops, settings.paint, progress, kept)
+        learnt = fit_map(crops, settings.paint, progress, kept, old)
         if old is not None:
             learnt, comparison, kept_share = corrected(learnt, old)
         opened = recording.experiment

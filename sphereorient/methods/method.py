@@ -23,8 +23,8 @@ from sphereorient.locate import Background, CameraScene
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
 from sphereorient.pose import CameraView, Fitter, Optics, base_table
-from sphereorient.pose.lab_light import LAB_PARTS, LabLight
-from sphereorient.pose.model import LIGHT_PARTS, Light, Lighting
+from sphereorient.pose.lab_light import light_of, light_parts
+from sphereorient.pose.model import Lighting
 from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
 
@@ -167,8 +167,8 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
                 group.create_dataset(part, data=getattr(background, part), track_times=False)
     light = file.create_group("light")
     light.attrs["known"] = learnt.light.known
-    for part in LAB_PARTS if isinstance(learnt.light, LabLight) else LIGHT_PARTS:
-        light.create_dataset(part, data=getattr(learnt.light, part).cpu().numpy(), track_times=False)
+    for part, values in light_parts(learnt.light).items():
+        light.create_dataset(part, data=values.numpy(), track_times=False)
     if learnt.worn is not None:
         file.create_dataset("worn", data=learnt.worn.numpy(), track_times=False)
     if learnt.process is not None:
@@ -193,11 +193,10 @@ def _read(file: h5py.File) -> Learnt:
         scenes[name] = CameraScene(background=background, diameter_px=float(group.attrs["diameter_px"]))
     light = file["light"]
     parts = {part: torch.from_numpy(light[part][()]) for part in light}
-    kind = LabLight if "gloss" in parts else Light
     acceleration = file.attrs.get("acceleration_rad_s2")
     return Learnt(
         scenes=scenes,
-        light=kind(known=bool(light.attrs["known"]), **parts),
+        light=light_of(parts, bool(light.attrs["known"])),
         together=bool(file.attrs["together"]),
         second_ball=bool(file.attrs.get("second_ball", False)),
         worn=torch.from_numpy(file["worn"][()]) if "worn" in file else None,

@@ -41,6 +41,8 @@ RENAMED: dict[str, str] = {
     "refine.lanes": "refine.chunks",
     "refine.study_frames": "refine.appearance_frames",
 }
+# Old keys that nothing reads any more; left aside with a remark, for one version.
+RETIRED = {"paint.smooth": "the pictures' noise and the edges of the paint set it"}
 
 
 class Settings(BaseModel, frozen=True, extra="forbid"):
@@ -101,6 +103,7 @@ def read_settings(path: Path | None = None, overrides: Iterable[str] = (), metho
     """
     remarks: list[str] = []
     parts = [text.partition("=") for text in overrides]
+    parts = [part for part in parts if not _retired(part[0].strip(), "--set", remarks)]
     overrides = [f"{_renamed(key.strip(), '--set', remarks)}{equals}{value}" for key, equals, value in parts]
     for text in overrides if method is not None else ():
         key = text.partition("=")[0]
@@ -109,6 +112,9 @@ def read_settings(path: Path | None = None, overrides: Iterable[str] = (), metho
     tree = _read(path)
     for branch, part in tree.items():
         for name in list(part) if isinstance(part, dict) else ():
+            if _retired(f"{branch}.{name}", f"{path}:", remarks):
+                del part[name]
+                continue
             new = _renamed(f"{branch}.{name}", f"{path}:", remarks).partition(".")[2]
             if new != name:
                 part.setdefault(new, part.pop(name))
@@ -154,6 +160,13 @@ def _renamed(key: str, where: str, remarks: list[str]) -> str:
     if new != key:
         remarks.append(f"{where} {key} is now {new}; the old name goes with the next version")
     return new
+
+
+def _retired(key: str, where: str, remarks: list[str]) -> bool:
+    """Return whether nothing reads a key any more, with a remark."""
+    if key in RETIRED:
+        remarks.append(f"{where} {key} is no longer read: {RETIRED[key]}")
+    return key in RETIRED
 
 
 def read_flat(model: type[Model], path: Path | None, changes: Mapping[str, Any]) -> Model:

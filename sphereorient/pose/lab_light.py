@@ -4,6 +4,7 @@
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 
@@ -13,7 +14,16 @@ from scipy.special import sph_harm_y_all
 from torch import Tensor
 
 from sphereorient.pose.fit import FittedPoses, by_pose, noise_curves, residuals
-from sphereorient.pose.model import LATER, Lighting, SphereModel, SphereView, polynomials, surface_normals
+from sphereorient.pose.model import (
+    LATER,
+    LIGHT_PARTS,
+    Light,
+    Lighting,
+    SphereModel,
+    SphereView,
+    polynomials,
+    surface_normals,
+)
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture import sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
@@ -88,6 +98,18 @@ class LabLight:
 
 UNKNOWN = ("difference", "black", "gloss", "through", "mirrored")
 LAB_PARTS = tuple(field.name for field in fields(LabLight) if field.name != "known")
+
+
+def light_parts(light: Lighting) -> dict[str, Tensor]:
+    """Return the tensors that a light consists of, by name, on the CPU."""
+    names = LAB_PARTS if isinstance(light, LabLight) else LIGHT_PARTS
+    return {name: getattr(light, name).cpu() for name in names}
+
+
+def light_of(parts: Mapping[str, Tensor], known: bool) -> Light | LabLight:
+    """Return the light that consists of some tensors, `light_parts` and others."""
+    kind, names = (LabLight, LAB_PARTS) if "gloss" in parts else (Light, LIGHT_PARTS)
+    return kind(known=known, **{name: parts[name] for name in names})
 
 
 def directions(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,11 +16,11 @@ from sphereorient.mapping.compare import (
     compass,
     fibonacci_directions,
     fit_levels,
-    nearest_texels,
     texture_change,
     turned_map,
     without_changed,
 )
+from sphereorient.mapping.old_map import nearest_texels
 from sphereorient.sphere.texture import map_directions
 from sphereorient.synth.textures import random_texture
 
