@@ -1,10 +1,11 @@
 """Measure what docs/accuracy.md states: errors of a method against exact truth.
 
-    scripts/accuracy.py EXPERIMENT_FOLDER [EXPERIMENT_FOLDER ...] [--method precise] [--no-synth]
+    scripts/accuracy.py EXPERIMENT_FOLDER [...] [--method precise] [--no-synth] [--benchmark RESULTS.json]
 
 Each folder holds experiment.yaml and truth.h5. Tracks it with all cameras and with each alone; then three synthetic
 movies of other paints (seeded). Prints one Markdown table. With `paper` it has more columns, rms values over those of
 the truth: the rates' errors by the kernels, applied to the true poses; the rest, which is noise; its sigmas.
+A second table: are the stated errors honest, in all these movies and in the scenes of a robustness benchmark?
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -21,6 +22,7 @@ import numpy as np
 import torch
 
 from sphereorient.evaluate import Score, score_track
+from sphereorient.evaluate.robustness.results import SceneResult, load_results, summarised
 from sphereorient.experiment import load_experiment
 from sphereorient.methods.settings import DEFAULT_METHOD
 from sphereorient.motion import MotionSettings, datasets_of, measure_motion
@@ -52,26 +54,73 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="*")
     parser.add_argument("--method", default=DEFAULT_METHOD)
     parser.add_argument("--no-synth", action="store_true")
+    parser.add_argument("--benchmark", type=Path, help="results.json of `sphereorient bench robustness`")
     arguments = parser.parse_args()
     columns = COLUMNS + PAPER * (arguments.method == "paper")
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
+    stated = []
     for folder in arguments.folders:
         names = list(load_experiment(folder / "experiment.yaml").cameras)
         for cameras in [names] + ([[name] for name in names] if len(names) > 1 else []):
-            print(row(folder, f"{folder.name}, {' + '.join(cameras)}", cameras, arguments.method), flush=True)
+            stated.append(measured(folder, f"{folder.name}, {' + '.join(cameras)}", cameras, arguments.method))
     if not arguments.no_synth:
         for seed, texture in enumerate(("blobs", "patches", "dots"), 1):
             with tempfile.TemporaryDirectory() as name:
                 write_synthetic_experiment(Path(name), SynthSettings.model_validate({"texture": texture, "seed": seed}))
-                print(row(Path(name), f"synthetic, {texture}", ("cam1", "cam2"), arguments.method), flush=True)
+                stated.append(measured(Path(name), f"synthetic, {texture}", ("cam1", "cam2"), arguments.method))
+    if arguments.benchmark is not None:
+        stated += of_benchmark(arguments.benchmark, arguments.method)
+    print(honesty(stated))
 
 
-def row(folder: Path, label: str, cameras: Sequence[str], method: str) -> str:
-    """Track one movie and word its errors as a row of the table."""
+@dataclass(frozen=True, kw_only=True)
+class Stated:
+    """How honest the errors are that a track states."""
+
+    pictures: str
+    frames: int  # that state an error of the orientation
+    inside: int  # of these, with the truth in the stated 95 % region
+    over: float  # rms error over the stated sigmas
+
+
+def honesty(stated: Sequence[Stated]) -> str:
+    """Word the shares of truths inside, of all pictures together and one by one."""
+    frames, inside = (sum(getattr(one, key) for one in stated) for key in ("frames", "inside"))
+    lines = [f"**{100 * inside / max(frames, 1):.1f} % of {frames} truths lie in the stated 95 %.**\n"]
+    lines += ["| pictures | in the stated 95 % | | errors over the stated ones, rms |", "|---|---|---|---|"]
+    lines += [
+        f"| {one.pictures} | {one.inside} of {one.frames} | {100 * one.inside / one.frames:.0f} % | {one.over:.2f} |"
+        for one in stated
+        if one.frames
+    ]
+    return "\n" + "\n".join(lines)
+
+
+def of_benchmark(results: Path, method: str) -> list[Stated]:
+    """Return the honesty of each degradation at each level, of all seeds together."""
+    found = load_results(results)
+    cells: dict[tuple[str, int], list[SceneResult]] = {}
+    for one in found.outcomes:
+        if one.method == method:
+            cells.setdefault((one.kind, one.level), []).append(one)
+    return [
+        Stated(
+            pictures=f"{kind.replace('_', ' ')}, level {level}",
+            frames=sum(one.stated for one in group),
+            inside=sum(one.inside for one in group),
+            over=summarised(group).over_stated,
+        )
+        for (kind, level), group in cells.items()
+    ]
+
+
+def measured(folder: Path, label: str, cameras: Sequence[str], method: str) -> Stated:
+    """Track one movie, print its errors as a row of the table, and return how honest they are."""
     begin = time.perf_counter()
     track = track_movies(folder / "experiment.yaml", method=method, cameras=cameras)
     seconds = time.perf_counter() - begin
     score = score_track(track, folder / "truth.h5")
+    inside, frames = score.inside()
     error = score.orientation_deg[score.valid]
     position = score.percentiles_mm()
     cells = [
@@ -85,12 +134,13 @@ def row(folder: Path, label: str, cameras: Sequence[str], method: str) -> str:
         f"{_share(score, 'alpha_lab')}",
         _share(score, "velocity") if len(cameras) == 2 else "",
         " / ".join(f"{value:.2f}" for value in score.over_stated()),
-        "{} of {}".format(*score.inside()),
+        f"{inside} of {frames}",
         f"{seconds:.0f}",
     ]
     if method == "paper":
         cells += parts(track, folder / "truth.h5")
-    return "| " + " | ".join(cells) + " |"
+    print("| " + " | ".join(cells) + " |", flush=True)
+    return Stated(pictures=label, frames=frames, inside=inside, over=score.over_stated()[0])
 
 
 def parts(track: Trajectory, truth_path: Path) -> list[str]:

@@ -239,7 +239,9 @@ def _print(found: "Results") -> None:
 
     from sphereorient.evaluate.robustness.results import summaries
 
-    table = Table("degradation", "level", "method", "median", "95 %", "wrong", "lost", "first", "inside", "frames/s")
+    table = Table(
+        "degradation", "level", "method", "median", "95 %", "wrong", "lost", "first", "inside", "over sigma", "frames/s"
+    )
     for line in summaries(found):
         shares = (line.wrong_after, line.lost, line.recall["1"], line.inside)
         table.add_row(
@@ -249,6 +251,7 @@ def _print(found: "Results") -> None:
             f"{line.p50_deg:.3g}\u00b0",
             f"{line.p95_deg:.3g}\u00b0",
             *(f"{100 * share:.0f} %" for share in shares),
+            f"{line.over_stated:.2f}",
             f"{line.frames_per_s:.1f}",
         )
     Console().print(table)

@@ -112,6 +112,7 @@ def test_what_was_planted_is_measured(truth):
     assert found.recall == pytest.approx({"1": 18 / 24, "3": 22 / 24, "10": 23 / 24})
     assert found.stated == 23
     assert found.inside == 21  # 1 degree is two of its sigmas, 4 < 7.81; 30 is not
+    assert found.over_stated == pytest.approx(np.sqrt((21 * 2**2 + 2 * 60**2) / 23 / 3), rel=1e-3)
     assert found.position_mm[0] == pytest.approx(0.1 * np.sqrt(3), abs=1e-4)
     assert found.position_mm[7] is None
 
@@ -124,6 +125,7 @@ def test_the_row_of_a_table_is_that_of_its_frames(truth):
     assert line.wrong_after == pytest.approx(2 / 48)
     assert line.lost == pytest.approx(1 / 48)
     assert line.inside == pytest.approx(44 / 47)
+    assert line.over_stated == one.over_stated  # the other one states none: of an older version
     assert line.wrong_before == pytest.approx((6 + 48) / (24 + 48))
     assert line.frames_per_s == pytest.approx(48 / 3)
 

@@ -1,4 +1,5 @@
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -45,6 +46,7 @@ class SceneResult:
     stated: int  # frames with a covariance of the orientation
     inside: int  # of these, with the truth inside the 95 % region
     seconds: float
+    over_stated: float | None = None  # rms of these frames' errors over their stated sigmas; None: of an older version
 
     @property
     def key(self) -> Key:
@@ -99,6 +101,7 @@ class ResultSummary:
     lost: float  # share of the frames without an orientation
     recall: Mapping[str, float]
     inside: float  # share of the truths within the stated 95 % region; NaN: no region stated
+    over_stated: float  # rms of the errors over the stated sigmas; NaN: not measured
     frames_per_s: float
     refused: str  # message of the first scene that the method refused
 
@@ -117,6 +120,8 @@ def summarised(group: Sequence[SceneResult]) -> ResultSummary:
     distances_mm = np.array([x for one in group for x in one.position_mm if x is not None])
     frames, looks, stated = (sum(getattr(one, key) for one in group) for key in ("frames", "looks", "stated"))
     seen = errors[np.isfinite(errors)]
+    told = [(one.stated, one.over_stated) for one in group if one.over_stated is not None]
+    squares = sum(count * over**2 for count, over in told)
     p50, p95, largest = np.percentile(seen, (50, 95, 100)) if len(seen) else (np.nan,) * 3
     kind, level, method = group[0].key
     return ResultSummary(
@@ -134,6 +139,7 @@ def summarised(group: Sequence[SceneResult]) -> ResultSummary:
         lost=sum(one.lost for one in group) / max(frames, 1),
         recall={str(k): sum(one.recall[str(k)] * one.looks for one in group) / max(looks, 1) for k in FIRST},
         inside=sum(one.inside for one in group) / stated if stated else float("nan"),
+        over_stated=math.sqrt(squares / sum(count for count, _ in told)) if told else float("nan"),
         frames_per_s=frames / max(sum(one.seconds for one in group), 1e-9),
         refused=next((one.refused for one in group if one.refused), ""),
     )

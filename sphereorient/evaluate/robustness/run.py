@@ -172,6 +172,7 @@ def measure(track: Trajectory, truth_path: Path) -> dict[str, Any]:
         "recall": {str(first): float((ranks < first).mean()) if len(ranks) else 0.0 for first in FIRST},
         "stated": stated,
         "inside": inside,
+        "over_stated": round(over, DIGITS) if math.isfinite(over := score.over_stated()[0]) else None,
     }
 
 
