@@ -89,7 +89,9 @@ def honesty(stated: Sequence[Stated]) -> str:
     lines = [f"**{100 * inside / max(frames, 1):.1f} % of {frames} truths lie in the stated 95 %.**\n"]
     lines += ["| pictures | in the stated 95 % | | errors over the stated ones, rms |", "|---|---|---|---|"]
     lines += [
-        f"| {one.pictures} | {one.inside} of {one.frames} | {100 * one.inside / one.frames:.0f} % | {one.over:.2f} |"
+        f"| {one.pictures} | {one.inside} of {one.frames} | {100 * one.inside / one.frames:.0f} % | {one.over:.2f} |".replace(
+            " nan ", " – "
+        )
         for one in stated
         if one.frames
     ]
