@@ -1,6 +1,7 @@
 """Measure what docs/accuracy.md states: errors of a method against exact truth.
 
-    scripts/accuracy.py EXPERIMENT_FOLDER [...] [--method precise] [--no-synth] [--benchmark RESULTS.json]
+    scripts/accuracy.py EXPERIMENT_FOLDER [...] [--method precise] [--no-synth] [--windows 48]
+                        [--benchmark RESULTS.json]
 
 Each folder holds experiment.yaml and truth.h5. Tracks it with all cameras and with each alone; then three synthetic
 movies of other paints (seeded). Prints one Markdown table. With `paper` it has more columns, rms values over those of
@@ -23,7 +24,7 @@ import torch
 
 from sphereorient.evaluate import Score, score_track
 from sphereorient.evaluate.robustness.results import SceneResult, load_results, summarised
-from sphereorient.experiment import load_experiment
+from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.methods.settings import DEFAULT_METHOD
 from sphereorient.motion import MotionSettings, datasets_of, measure_motion
 from sphereorient.run.stages import track_movies
@@ -55,12 +56,17 @@ def main() -> None:
     parser.add_argument("--method", default=DEFAULT_METHOD)
     parser.add_argument("--no-synth", action="store_true")
     parser.add_argument("--benchmark", type=Path, help="results.json of `sphereorient bench robustness`")
+    parser.add_argument("--windows", type=int, help="track so many frames in a row, each by itself, all cameras only")
     arguments = parser.parse_args()
     columns = COLUMNS + PAPER * (arguments.method == "paper")
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
     stated = []
     for folder in arguments.folders:
-        names = list(load_experiment(folder / "experiment.yaml").cameras)
+        experiment = load_experiment(folder / "experiment.yaml")
+        names = list(experiment.cameras)
+        if arguments.windows is not None:
+            stated += windows(folder, experiment, arguments.windows, arguments.method)
+            continue
         for cameras in [names] + ([[name] for name in names] if len(names) > 1 else []):
             stated.append(measured(folder, f"{folder.name}, {' + '.join(cameras)}", cameras, arguments.method))
     if not arguments.no_synth:
@@ -82,6 +88,11 @@ class Stated:
     inside: int  # of these, with the truth in the stated 95 % region
     over: float  # rms error over the stated sigmas
 
+    @property
+    def over_words(self) -> str:
+        """The ratio, or a dash where it was not measured."""
+        return f"{self.over:.2f}" if np.isfinite(self.over) else "–"
+
 
 def honesty(stated: Sequence[Stated]) -> str:
     """Word the shares of truths inside, of all pictures together and one by one."""
@@ -89,9 +100,7 @@ def honesty(stated: Sequence[Stated]) -> str:
     lines = [f"**{100 * inside / max(frames, 1):.1f} % of {frames} truths lie in the stated 95 %.**\n"]
     lines += ["| pictures | in the stated 95 % | | errors over the stated ones, rms |", "|---|---|---|---|"]
     lines += [
-        f"| {one.pictures} | {one.inside} of {one.frames} | {100 * one.inside / one.frames:.0f} % | {one.over:.2f} |".replace(
-            " nan ", " – "
-        )
+        f"| {one.pictures} | {one.inside} of {one.frames} | {100 * one.inside / one.frames:.0f} % | {one.over_words} |"
         for one in stated
         if one.frames
     ]
@@ -116,13 +125,26 @@ def of_benchmark(results: Path, method: str) -> list[Stated]:
     ]
 
 
-def measured(folder: Path, label: str, cameras: Sequence[str], method: str) -> Stated:
+def windows(folder: Path, experiment: Experiment, count: int, method: str) -> list[Stated]:
+    """Measure parts of a movie, each of `count` frames."""
+    with h5py.File(folder / "truth.h5") as file:
+        frames = len(file["time"])
+    return [
+        measured(folder, f"{folder.name}, {a}:{a + count}", list(experiment.cameras), method, (a, a + count))
+        for a in range(0, frames - count + 1, count)
+    ]
+
+
+def measured(
+    folder: Path, label: str, cameras: Sequence[str], method: str, frames: tuple[int, int] | None = None
+) -> Stated:
     """Track one movie, print its errors as a row of the table, and return how honest they are."""
+    experiment = replace(load_experiment(folder / "experiment.yaml"), frames=frames)
     begin = time.perf_counter()
-    track = track_movies(folder / "experiment.yaml", method=method, cameras=cameras)
+    track = track_movies(experiment, method=method, cameras=cameras)
     seconds = time.perf_counter() - begin
     score = score_track(track, folder / "truth.h5")
-    inside, frames = score.inside()
+    inside, told = score.inside()
     error = score.orientation_deg[score.valid]
     position = score.percentiles_mm()
     cells = [
@@ -136,13 +158,13 @@ def measured(folder: Path, label: str, cameras: Sequence[str], method: str) -> S
         f"{_share(score, 'alpha_lab')}",
         _share(score, "velocity") if len(cameras) == 2 else "",
         " / ".join(f"{value:.2f}" for value in score.over_stated()),
-        f"{inside} of {frames}",
+        f"{inside} of {told}",
         f"{seconds:.0f}",
     ]
     if method == "paper":
         cells += parts(track, folder / "truth.h5")
     print("| " + " | ".join(cells) + " |", flush=True)
-    return Stated(pictures=label, frames=frames, inside=inside, over=score.over_stated()[0])
+    return Stated(pictures=label, frames=told, inside=inside, over=score.over_stated()[0])
 
 
 def parts(track: Trajectory, truth_path: Path) -> list[str]:
