@@ -17,7 +17,7 @@ STEP_RAD = 0.002  # step of a table's finite differences
 POLE = 1e-3  # least cosine of a latitude: at the pole itself longitude is undefined
 READS = 16  # texels that a look-up reads
 WIDER = 4.0  # times the blur of the map, at which its edges are counted
-SLOPES = 64  # cells per axis of the directions in which their slope is averaged
+SLOPES, ROUGH_SIDE = 64, 128  # cells per axis: of the directions in which their slope is averaged, of the table
 FEWEST_EDGES = 0.01  # rad/sr
 SHARPENING_ITERATIONS = 200
 Array = NDArray[Any]
@@ -77,10 +77,10 @@ def look_up(texture: Tensor, direction_body: Tensor) -> Tensor:
     return (texture.reshape(-1)[place] * weight.to(texture.dtype)).sum(-1)
 
 
-def map_table(texture: Tensor, blur_rad: float) -> TextureTable:
+def map_table(texture: Tensor, blur_rad: float, side: int = SIDE) -> TextureTable:
     """Return the table of a map (H, 2 H) that already has the blur `blur_rad`, rad."""
     parts = []
-    for some in torch.split(octahedral_directions(SIDE), CHUNK):
+    for some in torch.split(octahedral_directions(side), CHUNK):
         slope = torch.zeros_like(some)
         for axis in tangents(some):
             there, back = (look_up(texture.double(), some + sign * STEP_RAD * axis) for sign in (1, -1))
@@ -201,7 +201,7 @@ def paint_tie(texture: Tensor, blur_rad: float) -> float:
     """
     wide = WIDER * blur_rad
     direction = octahedral_directions(SLOPES).float().T[None]
-    power = map_table(texture, blur_rad).blurred(wide).sample(direction)[1].square().sum(1).mean()
+    power = map_table(texture, blur_rad, ROUGH_SIDE).blurred(wide).sample(direction)[1].square().sum(1).mean()
     edges = 2 * math.sqrt(math.pi) * wide * float(power)
     return 1 / (2 * max(edges, FEWEST_EDGES) * blur_rad)
 
