@@ -31,8 +31,8 @@ from sphereorient.mapping.settings import MapSettings
 from sphereorient.mapping.threads import side_by_side
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curves
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
-from sphereorient.pose.lab_light import LabLight
-from sphereorient.pose.model import Light, light_basis
+from sphereorient.pose.lab_light import LabLight, learn_lab_light
+from sphereorient.pose.model import Light, Lighting, light_basis
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import texture_table
@@ -169,7 +169,7 @@ def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iterati
         state, _ = fitted(state, 3 if k == 0 else 2)
     if k < LIGHT_ITERATIONS:
         state = _with_light(state)
-    elif k < LIGHT_ITERATIONS + LAB_ITERATIONS:
+    elif k == LIGHT_ITERATIONS or (k < LIGHT_ITERATIONS + LAB_ITERATIONS and isinstance(state.fitter.light, LabLight)):
         state = _lit_in_the_lab(state)
     if k >= SEPARATE_ITERATIONS:
         state = _with_joint_step(state, smoothest)
@@ -234,8 +234,11 @@ def _lit_in_the_lab(state: State) -> State:
     X, R, use = state.position_lab_mm[rows], state.R_lab_body[rows], state.use[rows]
     pixels = state.disks(rows)
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 1)
-    lit, _ = fitter.lit_in_the_lab(pixels, fit, use)
-    return replace(state, fitter=replace(state.fitter, light=lit.light))
+    if isinstance(fitter.light, LabLight):  # known to be better
+        light: Lighting = learn_lab_light(pixels, fit, use, fitter.model(fitter.optics.fine))
+    else:
+        light = fitter.lit_in_the_lab(pixels, fit, use)[0].light
+    return replace(state, fitter=replace(state.fitter, light=light))
 
 
 def _rescaled(state: State) -> State:
