@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import astuple
 
 import pytest
@@ -11,10 +12,12 @@ from map_examples import unpainted
 from sphereorient.errors import PaintError
 from sphereorient.experiment.recording import open_recording, silent
 from sphereorient.locate import LocateSettings
-from sphereorient.mapping import MapSettings, fit_map, learn, take_crops
+from sphereorient.mapping import MapSettings, fit_map, iterations, learn, take_crops
 from sphereorient.mapping.kept import read_kept, write_kept
+from sphereorient.pose import fitter
+from sphereorient.pose.lab_light import LabLight
 
-QUICK = MapSettings(rounds=2, pixels=300, height=32, baselines=(1, 2))
+QUICK = MapSettings(rounds=3, pixels=300, height=32, baselines=(1, 2))
 
 
 def test_a_damaged_file_is_no_state(tmp_path):
@@ -36,7 +39,11 @@ def test_a_damaged_file_is_no_state(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
+@pytest.mark.parametrize("of_cameras", [8, 1], ids=["light of each camera", "one light in the lab"])
+def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, monkeypatch, of_cameras):
+    for module in (iterations, learn):
+        monkeypatch.setattr(module, "LIGHT_ITERATIONS", of_cameras)
+    monkeypatch.setattr(fitter, "MORE_EXPLAINED", -math.inf)  # whether it is better or not
     path, kept = unpainted(tmp_path / "scene", frames=16), tmp_path / "map.h5"
     with open_recording(path, ["cam1"], textured=False) as recording:
         crops = take_crops(recording, QUICK, LocateSettings(), silent)
@@ -44,7 +51,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
     iterate = learn.iterate
 
     def interrupted(state, settings, k):
-        if k == 1:
+        if k == 2:
             raise KeyboardInterrupt
         return iterate(state, settings, k)
 
@@ -57,7 +64,8 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
     monkeypatch.setattr(learn, "iterate", iterate)
     monkeypatch.setattr(learn, "_start_from_movie", again)
     resumed = fit_map(crops, QUICK, silent, kept)
-    assert len(resumed.rounds) == 2
+    assert len(resumed.rounds) == 3
+    assert isinstance(resumed.light, LabLight) == (of_cameras == 1)
     for name in ("texture", "R_lab_body", "position_lab_mm", "seen", "sigma", "paint"):
         torch.testing.assert_close(getattr(resumed, name), getattr(whole, name), rtol=0, atol=0, equal_nan=True)
     assert [astuple(one) for one in resumed.rounds] == [astuple(one) for one in whole.rounds]
