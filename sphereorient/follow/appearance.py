@@ -30,7 +30,7 @@ from sphereorient.pose.fitter import (
     widest_px,
 )
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.worn import without, worn_cells
+from sphereorient.pose.worn import without, worn_cells, worn_share
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.trajectory import Reason
 
@@ -52,6 +52,7 @@ TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or
 LIGHT_ROUNDS, BLUR_ROUNDS, WORN_ROUNDS = 2, 4, 4
 FITS = 2.0  # excess of a fit whose map is right once worn paint is not used: 1.4; of a warped map 4.2
 WORN_GAIN = 0.2  # by which the logarithm of the variance left must fall where worn paint is not used
+WORN_LEAST = 0.01  # share of the ball; less paint than this moves no pose by as much as its noise
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
 BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
 
@@ -339,21 +340,28 @@ def _without_worn(
     if len(use) < FEWEST_LIT:  # too few views of each patch to tell paint from light
         return fitter, fit, None
 
-    def found(pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses, Tensor]:
-        now = fitter
+    def found(
+        pixels: Pixels, fit: FittedPoses, use: Tensor, whole: bool = False
+    ) -> tuple[Fitter, FittedPoses, Tensor | None]:
+        now, worn = fitter, None
         for _ in range(WORN_ROUNDS):  # worn paint bends the light and the poses that it is found with
-            worn = worn_cells(pixels, fit, use, now.model(now.optics.fine))
-            optics = Optics(without(base, worn), fitter.optics.blur_px, widest_px(fitter.views))
-            now = replace(now, optics=optics).with_light_of(pixels, fit, use)
-            fit = now.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, optics.fine, 3)
+            if not whole:
+                worn = worn_cells(pixels, fit, use, now.model(now.optics.fine))
+                optics = Optics(without(base, worn), fitter.optics.blur_px, widest_px(fitter.views))
+                now = replace(now, optics=optics)
+            now = now.with_light_of(pixels, fit, use)
+            fit = now.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, now.optics.fine, 3)
         return now, fit, worn
 
     every, middle = torch.arange(len(use)), len(use) // 2
     halves = [some_of(rows, pixels, fit, use) for rows in (every[:middle], every[middle:])]
-    gain = [fitter.left(*held) - found(*half)[0].left(*held) for half, held in permutations(halves, 2)]
+    gain = [
+        found(*half, whole=True)[0].left(*held) - found(*half)[0].left(*held) for half, held in permutations(halves, 2)
+    ]
     if sum(gain) / 2 < WORN_GAIN:
         return fitter, fit, None
     lit, fitted, worn = found(pixels, fit, use)
-    if float(fitted.excess[use].median()) > FITS:  # the paint that is left is not the map's either
+    wrong = float(fitted.excess[use].median()) > FITS  # the paint that is left is not the map's either
+    if wrong or worn is None or worn_share(worn) < WORN_LEAST:
         return fitter, fit, None
     return lit, fitted, worn
