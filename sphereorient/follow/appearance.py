@@ -50,8 +50,10 @@ ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the t
 GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may differ, in any light
 TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
 LIGHT_ROUNDS, BLUR_ROUNDS, WORN_ROUNDS = 2, 4, 4
-FITS = 2.0  # excess of a fit whose map is right once worn paint is not used: 1.4; of a warped map 4.2
-WORN_GAIN = 0.2  # by which the logarithm of the variance left must fall where worn paint is not used
+FITS = 3.0  # excess of a fit whose map is right once worn paint is not used: 1.1 to 2.7; of a warped map 4.2
+# By which the logarithm of the variance left must fall where worn paint is not used: 1.3 to 2.8 in balls that have lost
+# 2 to 45 % of their paint, up to 1.1 where the map is warped, and with highlights or a rod.
+WORN_GAIN = 1.2
 WORN_LEAST = 0.01  # share of the ball; less paint than this moves no pose by as much as its noise
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
 BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
