@@ -46,8 +46,8 @@ LIGHT_ITERATIONS = 8  # in which light, noise and blur are estimated anew
 SMOOTHEST = 0.2  # weight of the map's squared slope over that of a typical texel, in the first iteration: orientations
 # must not follow the map's noise
 LAB_ITERATIONS, LAB_FRAMES = 3, 32  # in which one light in the lab is estimated, and its instants
-# Share of the paint's expected smoothness while poses are sought: a map smoother than the pictures shifts the position of
-# a ball in one place (0.041 degrees with all of it, 0.016 with this), a rougher one lets poses follow noise.
+# Share of the paint's expected smoothness while poses are sought: a smoother map shifts the position of a ball in one
+# place (0.041 degrees with all of it, 0.016 with this), a rougher one lets poses follow noise.
 LOOSE = 0.1
 BLUR_FRAMES = 32
 BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
