@@ -32,7 +32,7 @@ from sphereorient.mapping.threads import side_by_side
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curves
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
 from sphereorient.pose.lab_light import LabLight, learn_lab_light
-from sphereorient.pose.model import Light, Lighting, light_basis
+from sphereorient.pose.model import Light, Lighting, light_basis, no_stray
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import texture_table
@@ -231,7 +231,8 @@ def _with_light(state: State) -> State:
         greys.append(((pixels.grey - at.residual)[:, some], at.residual[:, some], inside[:, some]))
     difference, black = light_maps(normal, right)
     model, residual, inside = (torch.cat(part) for part in zip(*greys, strict=True))
-    light = Light(difference=difference, black=black, noise=noise_curves(model, residual, inside, cameras), known=True)
+    noise = noise_curves(model, residual, inside, cameras)
+    light = Light(difference=difference, black=black, noise=noise, stray=no_stray(cameras), known=True)
     return replace(state, fitter=replace(state.fitter, light=light))
 
 

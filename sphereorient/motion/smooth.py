@@ -161,7 +161,10 @@ def lasting_share(apart: Tensor, covariance: Tensor, segment: Tensor, assumed: f
     """
     there = torch.isfinite(apart).all(-1) & torch.isfinite(covariance).all((-1, -2)) & (segment >= 0)[:, None]
     whole = torch.where(there[..., None, None], covariance, torch.eye(3, dtype=covariance.dtype))
-    z = torch.linalg.solve(torch.linalg.cholesky(whole), apart.nan_to_num()[..., None])[..., 0].clamp(-CLIP, CLIP)
+    factor, failed = torch.linalg.cholesky_ex(whole)  # a picture with few pixels left may have no full covariance
+    there = there & (failed == 0)
+    factor = torch.where(there[..., None, None], factor, torch.eye(3, dtype=factor.dtype))
+    z = torch.linalg.solve(factor, apart.nan_to_num()[..., None])[..., 0].clamp(-CLIP, CLIP)
     shared, both = z.new_zeros(()), 0
     for lag in range(1, LAGS + 1):
         pair = there[lag:] & there[:-lag] & (segment[lag:] == segment[:-lag])[:, None]

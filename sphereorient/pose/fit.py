@@ -4,7 +4,7 @@
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,17 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.model import Light, SphereModel, SphereView, light_basis, polynomials, sphere_view
+from sphereorient.pose.model import (
+    Light,
+    SphereModel,
+    SphereView,
+    light_basis,
+    no_stray,
+    polynomials,
+    scene_beside,
+    sphere_view,
+    stray_basis,
+)
 from sphereorient.pose.pixels import Pixels
 from sphereorient.so3 import inverse_damped, solve_damped
 
@@ -20,6 +30,8 @@ TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfi
 EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
 ASIDE_PX = 0.002  # and by how much its limb and its paint aside: large balls would state less
 KNOWN = 0.3  # least share of a disk that shows known paint
+NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it
+STRAY_ROUNDS, STRAY_TUKEY, FEWEST_BESIDE = 5, 6.0, 200  # rounds, standard deviations, pixels
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 
@@ -187,7 +199,8 @@ def residuals(
     n, n_black = ((order + 1) * (order + 2) // 2 for order in (model.shading.difference, model.shading.black))
     learnt = (view.coverage * (view.paint * difference + black))[:, None]
     columns = torch.cat([learnt * tints[:, :n], view.coverage[:, None] * tints[:, :n_black]], dim=1)
-    beyond = (1.0 - view.coverage) * pixels.behind
+    beside = scene_beside(view, pixels, model.light.stray)
+    beyond = (1.0 - view.coverage) * beside
     noise = model.light.noise.repeat(len(X), 1)
     inside = pixels.inside if view.known is None else pixels.inside & view.known
     target = pixels.grey - beyond
@@ -213,7 +226,7 @@ def residuals(
     offset = (coefficients[:, None, n:] @ tints[:, :n_black])[:, 0]
     step, ground = difference * gain, black * gain + offset
     lit = view.coverage * step
-    over = view.paint * step + ground - pixels.behind
+    over = view.paint * step + ground - beside
     return Residuals(
         view=view,
         design=torch.cat([grey_by_pose(view, lit, over), columns], dim=1),
@@ -327,11 +340,36 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
     """Estimate the light and the noise of a movie from the fits of B * C disks, those of `use` (B, C) bool."""
     cameras = use.shape[1]
     at = settled(pixels, fit, model, cameras)
-    normal, right = light_sums(at.view, pixels, at.weight / at.variance * use.reshape(-1, 1))
+    stray = learn_stray(at, pixels, use)
+    lit = replace(pixels, behind=scene_beside(at.view, pixels, stray))
+    normal, right = light_sums(at.view, lit, at.weight / at.variance * use.reshape(-1, 1))
     difference, black = light_maps(by_pose(normal, cameras).sum(0), by_pose(right, cameras).sum(0))
     counted = at.inside & ~pixels.clipped & use.reshape(-1, 1)
     noise = noise_curves(at.model, at.residual, counted, cameras)
-    return Light(difference=difference, black=black, noise=noise, known=True)
+    return Light(difference=difference, black=black, noise=noise, stray=stray, known=True)
+
+
+def learn_stray(at: Residuals, pixels: Pixels, use: Tensor) -> Tensor:
+    """Estimate the stray light (C, K) from pixels that no sphere covers in B * C disks, those of `use` (B, C) bool.
+    Robust: bubbles and other passers-by count for nothing.
+    """
+    beside = at.inside & ~pixels.clipped & (at.view.coverage < NO_SPHERE) & use.reshape(-1, 1)
+    beside[:, : pixels.inner] = False
+    cameras = use.shape[1]
+    found = no_stray(cameras)
+    for camera in range(cameras):
+        own = slice(camera, None, cameras)
+        basis = stray_basis(at.view.across[own]).mT[beside[own]].double()
+        more = (pixels.grey - pixels.behind)[own][beside[own]].double()
+        weight = torch.ones_like(more)
+        for _ in range(STRAY_ROUNDS if len(more) >= FEWEST_BESIDE else 0):
+            weighted = basis * weight[:, None]
+            coefficients = torch.linalg.solve(weighted.mT @ basis + torch.eye(basis.shape[1]), weighted.mT @ more)
+            left = more - basis @ coefficients
+            scale = (1.4826 * left.abs().median()).clamp_min(math.sqrt(NOISE_MIN))
+            weight = (1.0 - (left / (STRAY_TUKEY * scale)).square()).clamp_min(0.0).square()
+            found[camera] = coefficients.float()
+    return found
 
 
 def light_sums(view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:

@@ -171,7 +171,7 @@ class Fitter:
         if in_the_lab(*learning).left(*held) > self.with_light_of(*learning).left(*held) - MORE_EXPLAINED:
             return self, fit
         lit = self
-        for _ in range(2):  # the poses, too, were found with the maps
+        for _ in range(4):  # the poses, too, were found with the maps
             lit = in_the_lab(pixels, fit, use)
             fit = lit.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
         return lit, fit

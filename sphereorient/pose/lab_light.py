@@ -13,7 +13,7 @@ import torch
 from scipy.special import sph_harm_y_all
 from torch import Tensor
 
-from sphereorient.pose.fit import FittedPoses, by_pose, noise_curves, residuals
+from sphereorient.pose.fit import FittedPoses, by_pose, learn_stray, noise_curves, residuals
 from sphereorient.pose.model import (
     LATER,
     LIGHT_PARTS,
@@ -21,7 +21,9 @@ from sphereorient.pose.model import (
     Lighting,
     SphereModel,
     SphereView,
+    no_stray,
     polynomials,
+    scene_beside,
     surface_normals,
 )
 from sphereorient.pose.pixels import Pixels
@@ -57,6 +59,7 @@ class LabLight:
     mirrored: Tensor  # (n,), share of light that the surface mirrors
     gain: Tensor  # (C,), of the cameras
     noise: Tensor  # (C, 4), see `Light`
+    stray: Tensor  # (C, K), see `Lighting`
     known: bool = True
 
     @cached_property
@@ -89,7 +92,7 @@ class LabLight:
     def of(self, camera: int) -> "LabLight":
         """Return the light as one camera sees it."""
         one = slice(camera, camera + 1)
-        return replace(self, gain=self.gain[one], noise=self.noise[one])
+        return replace(self, gain=self.gain[one], noise=self.noise[one], stray=self.stray[one])
 
     def to(self, device: torch.device) -> "LabLight":
         """Return the light on another device."""
@@ -107,7 +110,8 @@ def light_parts(light: Lighting) -> dict[str, Tensor]:
 
 
 def light_of(parts: Mapping[str, Tensor], known: bool) -> Light | LabLight:
-    """Return the light that consists of some tensors, `light_parts` and others."""
+    """Return the light that consists of some tensors, `light_parts` and others; older files lack stray light."""
+    parts = {"stray": no_stray(len(parts["noise"])), **parts}
     kind, names = (LabLight, LAB_PARTS) if "gloss" in parts else (Light, LIGHT_PARTS)
     return kind(known=known, **{name: parts[name] for name in names})
 
@@ -176,6 +180,7 @@ def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: Sphere
     at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
     bases = _bases(at.view, pixels)
     light = _flat(model.light, at.view, pixels, use)
+    light = replace(light, stray=learn_stray(at, pixels, use))
     for _ in range(ROUNDS):
         light = _better(light, at.view, pixels, (at.weight / at.variance).where(used, 0.0), bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
@@ -211,6 +216,7 @@ def _flat(known: Lighting, view: SphereView, pixels: Pixels, use: Tensor) -> Lab
         mirrored=FRONTAL * knots,
         gain=torch.where(use.any(0), difference / difference[first], 1.0),
         noise=known.noise,
+        stray=known.stray,
     )
 
 
@@ -227,7 +233,7 @@ def _better(
     shown, ground = light.at(view, pixels)
     cover = view.coverage * light.gain.repeat(len(gloss) // len(light.gain))[:, None]
     learnt = view.coverage * (view.paint * shown + ground)
-    left = pixels.grey - (1.0 - view.coverage) * pixels.behind - learnt
+    left = pixels.grey - (1.0 - view.coverage) * scene_beside(view, pixels, light.stray) - learnt
     tints = polynomials(view.across, 2)
     own = torch.cat([learnt[:, None] * tints, view.coverage[:, None] * tints[:, :3]], dim=1)
     counts = (precision > 0).any(1)

@@ -24,6 +24,7 @@ UNSEEN = 0.02  # a pixel that looks at a larger share of unknown paint counts fo
 DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of the paint is infinite on the limb
 MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
 ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)
+STRAY_ORDER = 4  # of the harmonics over the angle about the disk
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,8 +56,38 @@ def light_basis(across: Tensor) -> Tensor:
     return torch.cat([polynomials(across, ORDER), polynomials(across, DEPTH_ORDER) * depth[..., None, :]], dim=-2)
 
 
+def stray_basis(across: Tensor) -> Tensor:
+    """Return the harmonics over the angle about the disk, (..., K, P), at places (..., 2, P): 1, cos, sin, cos 2 .."""
+    cos, sin = torch.nn.functional.normalize(across, dim=-2).unbind(-2)
+    columns = [torch.ones_like(cos), cos, sin]
+    for _ in range(STRAY_ORDER - 1):
+        last_cos, last_sin = columns[-2:]
+        columns += [last_cos * cos - last_sin * sin, last_sin * cos + last_cos * sin]
+    return torch.stack(columns, dim=-2)
+
+
+def scene_beside(view: "SphereView", pixels: Pixels, stray: Tensor) -> Tensor:
+    """Return what L disks show beside the sphere, grey levels (L, P): the empty scene, and stray light (C, K) of the
+    C cameras, which only pixels that the limb may reach are asked for.
+    """
+    outer = slice(pixels.inner, None)
+    more = stray.repeat(len(view.across) // len(stray), 1)[:, None] @ stray_basis(view.across[..., outer])
+    return torch.cat([pixels.behind[:, : pixels.inner], pixels.behind[:, outer] + more[:, 0]], dim=1)
+
+
+def no_stray(cameras: int) -> Tensor:
+    """Return the coefficients of no stray light."""
+    return torch.zeros(cameras, 1 + 2 * STRAY_ORDER)
+
+
 class Lighting(Protocol):
     """How bright paint appears in the pictures of C cameras, and their noise: `Light`, or `LabLight`."""
+
+    @property
+    def stray(self) -> Tensor:
+        """Coefficients of the light beside the sphere that the empty scene lacks, (C, K), grey levels; `stray_basis`.
+        A lens with glare, or light that the sphere throws on a wall, makes it.
+        """
 
     @property
     def noise(self) -> Tensor:
@@ -112,6 +143,7 @@ class Light:
     difference: Tensor  # (C, K), white less black paint, grey levels
     black: Tensor  # (C, K)
     noise: Tensor  # (C, 4), grey levels^2 .. 1 / grey level
+    stray: Tensor  # (C, K), see `Lighting`
     known: bool  # False: difference is 1 everywhere and black 0
 
     @cached_property
@@ -137,7 +169,7 @@ class Light:
     def of(self, camera: int) -> "Light":
         """Return the light of one camera."""
         one = slice(camera, camera + 1)
-        return replace(self, difference=self.difference[one], black=self.black[one], noise=self.noise[one])
+        return replace(self, **{name: getattr(self, name)[one] for name in LIGHT_PARTS})
 
     def to(self, device: torch.device) -> "Light":
         """Return the light on another device."""
@@ -149,7 +181,8 @@ class Light:
         count = light_basis(torch.zeros(1, 2, 1)).shape[-2]
         difference = torch.zeros(cameras, count)
         difference[:, 0] = 1.0
-        return cls(difference=difference, black=torch.zeros(cameras, count), noise=noise, known=False)
+        black, stray = torch.zeros(cameras, count), no_stray(cameras)
+        return cls(difference=difference, black=black, noise=noise, stray=stray, known=False)
 
 
 LIGHT_PARTS = tuple(field.name for field in fields(Light) if field.name != "known")

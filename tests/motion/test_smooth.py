@@ -477,6 +477,9 @@ def test_the_share_of_errors_that_last_is_found_in_the_disagreement_of_cameras(r
     assert lasting_share(white, cov, segment, 0.25) == 0.25  # never less than is assumed
     assert lasting_share(slow[:, :0], cov[:, :0], segment, 0.25) == 0.25  # a single camera
     assert lasting_share(slow[:4], cov[:4], segment[:4], 0.25) < 0.35  # a few frames tell little
+    cov = cov.clone()
+    cov[7] = 0.0  # a picture with few pixels left
+    assert lasting_share(white, cov, segment, 0.25) == 0.25
     gaps = slow.clone()
     gaps[::7] = torch.nan
     assert lasting_share(gaps, cov, segment, 0.0) == pytest.approx(0.85, abs=0.12)

@@ -26,7 +26,7 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient.locate import CameraScene
-from sphereorient.pose.fit import FittedPoses, learn_light, residuals
+from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine, residuals
 from sphereorient.pose.fitter import CameraView, Fitter, first_fitter
 from sphereorient.pose.lab_light import (
     KNOTS,
@@ -38,8 +38,10 @@ from sphereorient.pose.lab_light import (
     harmonics,
     knot_shares,
     learn_lab_light,
+    light_of,
+    light_parts,
 )
-from sphereorient.pose.model import FIRST, LATER, SphereModel, sphere_view
+from sphereorient.pose.model import FIRST, LATER, SphereModel, no_stray, scene_beside, sphere_view, stray_basis
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture_table import octahedral_directions
 
@@ -106,6 +108,7 @@ def planted(cameras: int) -> LabLight:
         mirrored=0.04 + 0.15 * (1 - depth) ** 2,
         gain=torch.tensor([1.0, 0.7])[:cameras],
         noise=torch.tensor([[SIGMA**2, 0.0, 0.0, 0.0]]).repeat(cameras, 1),
+        stray=no_stray(cameras),
     )
 
 
@@ -167,6 +170,47 @@ def test_it_explains_other_frames_better_than_maps_of_each_disk():
         at = residuals(pixels, X, R, None, replace(model, light=lit, shading=LATER), 2)
         left.append(float((at.residual * at.inside).square().mean()))
     assert left[0] < left[1]
+
+
+def with_glare(pixels: Pixels, X: Tensor, R: Tensor, model: SphereModel) -> tuple[Pixels, Tensor]:
+    """The same disks with light beside the sphere, below it to the right in the first camera; a bubble covers some."""
+    stray = no_stray(2)
+    stray[0, :4] = torch.tensor([6.0, 3.0, 4.0, 1.0])
+    view = sphere_view(pixels, X.repeat_interleave(2, 0), R.repeat_interleave(2, 0), model)
+    more = (1 - view.coverage) * (scene_beside(view, pixels, stray) - pixels.behind)
+    grey = pixels.grey + more
+    bubble = (view.across - torch.tensor([0.0, -1.0])[:, None]).norm(dim=1) < 0.3
+    grey[4:6] = torch.where(bubble[4:6], 200.0, grey[4:6])
+    return replace(pixels, grey=grey), stray
+
+
+def test_light_beside_the_sphere_is_found_and_moves_no_pose():
+    rig, pixels, X, R, model = pictures()
+    pixels, planted_stray = with_glare(pixels, X, R, model)
+    use = torch.ones(12, 2, dtype=torch.bool)
+    fit = fitted(rig, "patches", pixels, X, R, SIGMA, shading=FIRST)
+    maps = learn_light(pixels, fit, use, model)
+    lab = learn_lab_light(pixels, fit, use, replace(model, light=maps, shading=LATER))
+    round_it = torch.linspace(0, 6.28, 50)
+    basis = stray_basis(torch.stack([round_it.cos(), round_it.sin()]))
+    for light in (maps, lab):
+        assert ((light.stray - planted_stray) @ basis).abs().max() < 1.0
+    off = []
+    for light in (lab, replace(lab, stray=no_stray(2))):
+        model = replace(model, light=light, shading=LATER)
+        begin = PoseStart(position_lab_mm=X, R_lab_body=R, use=use)
+        off.append(float((refine(pixels, begin, model).position_lab_mm - X).mean(0).norm()))
+    assert off[0] < 0.5 * off[1]
+
+
+def test_no_light_beside_the_sphere_is_invented():
+    light, _ = learnt()
+    assert light.stray.abs().max() < 0.5
+
+
+def test_files_without_stray_light_are_read():
+    parts = {name: part for name, part in light_parts(planted(2)).items() if name != "stray"}
+    assert light_of(parts, True).stray.equal(no_stray(2))
 
 
 def test_rows_not_in_use_change_nothing():

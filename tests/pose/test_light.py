@@ -24,7 +24,16 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient.pose.fit import learn_light, light_maps, light_sums, noise_curve
-from sphereorient.pose.model import FIRST, Light, Lighting, SphereView, light_basis, polynomials, sphere_view
+from sphereorient.pose.model import (
+    FIRST,
+    Light,
+    Lighting,
+    SphereView,
+    light_basis,
+    no_stray,
+    polynomials,
+    sphere_view,
+)
 from sphereorient.pose.pixels import Pixels
 
 KINDS = ("patches",)
@@ -88,6 +97,7 @@ def test_maps_that_are_looked_up_are_the_sums_of_functions():
         difference=50 * torch.randn(2, 25, generator=rng),
         black=20 * torch.randn(2, 25, generator=rng),
         noise=NOISE.repeat(2, 1),
+        stray=no_stray(2),
         known=True,
     )
     across = torch.cat([disk_places(3000, 0.98, seed) for seed in range(4)])
@@ -105,7 +115,7 @@ def test_maps_that_are_looked_up_are_the_sums_of_functions():
 def test_a_lamp_is_looked_up_to_a_grey_level():
     across = disk_places(5000, 0.98)
     difference, black = maps_of(*lamp_coefficients())
-    light = Light(difference=difference[None], black=black[None], noise=NOISE, known=True)
+    light = Light(difference=difference[None], black=black[None], noise=NOISE, stray=no_stray(1), known=True)
     for got, expected in zip(looked_up(light, across), lamp(across, 0), strict=True):
         assert (got - expected)[across.norm(dim=1) < 0.9].abs().max() < 1.0
         assert (got - expected).square().mean().sqrt() < 0.4
