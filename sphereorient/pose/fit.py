@@ -32,6 +32,7 @@ ASIDE_PX = 0.002  # and by how much its limb and its paint aside: large balls wo
 KNOWN = 0.3  # least share of a disk that shows known paint
 NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it
 STRAY_ROUNDS, STRAY_TUKEY, FEWEST_BESIDE = 5, 6.0, 200  # rounds, standard deviations, pixels
+STRAY_LEAST = 0.05  # coefficients, summed, of the step from black to white paint: clean pictures 0.01, glare 0.13
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 
@@ -340,7 +341,7 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
     """Estimate the light and the noise of a movie from the fits of B * C disks, those of `use` (B, C) bool."""
     cameras = use.shape[1]
     at = settled(pixels, fit, model, cameras)
-    stray = learn_stray(at, pixels, use)
+    stray = learn_stray(at, pixels, use, model.light.stray)
     lit = replace(pixels, behind=scene_beside(at.view, pixels, stray))
     normal, right = light_sums(at.view, lit, at.weight / at.variance * use.reshape(-1, 1))
     difference, black = light_maps(by_pose(normal, cameras).sum(0), by_pose(right, cameras).sum(0))
@@ -349,18 +350,20 @@ def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMode
     return Light(difference=difference, black=black, noise=noise, stray=stray, known=True)
 
 
-def learn_stray(at: Residuals, pixels: Pixels, use: Tensor) -> Tensor:
+def learn_stray(at: Residuals, pixels: Pixels, use: Tensor, known: Tensor) -> Tensor:
     """Estimate the stray light (C, K) from pixels that no sphere covers in B * C disks, those of `use` (B, C) bool.
-    Robust: bubbles and other passers-by count for nothing.
+    `known` (C, K) is the one that the residuals hold. Robust: bubbles and other passers-by count for nothing. Light as
+    weak as the errors of the model of the limb is taken for none.
     """
     beside = at.inside & ~pixels.clipped & (at.view.coverage < NO_SPHERE) & use.reshape(-1, 1)
     beside[:, : pixels.inner] = False
     cameras = use.shape[1]
     found = no_stray(cameras)
+    stray_known = scene_beside(at.view, pixels, known) - pixels.behind  # less what the sphere's edge adds
     for camera in range(cameras):
         own = slice(camera, None, cameras)
         basis = stray_basis(at.view.across[own]).mT[beside[own]].double()
-        more = (pixels.grey - pixels.behind)[own][beside[own]].double()
+        more = (at.residual + stray_known)[own][beside[own]].double()
         weight = torch.ones_like(more)
         for _ in range(STRAY_ROUNDS if len(more) >= FEWEST_BESIDE else 0):
             weighted = basis * weight[:, None]
@@ -369,6 +372,9 @@ def learn_stray(at: Residuals, pixels: Pixels, use: Tensor) -> Tensor:
             scale = (1.4826 * left.abs().median()).clamp_min(math.sqrt(NOISE_MIN))
             weight = (1.0 - (left / (STRAY_TUKEY * scale)).square()).clamp_min(0.0).square()
             found[camera] = coefficients.float()
+        step = at.lit[own, : pixels.inner][use[:, camera]].median() if bool(use[:, camera].any()) else math.inf
+        if found[camera].abs().sum() < STRAY_LEAST * step:
+            found[camera] = 0.0
     return found
 
 

@@ -180,7 +180,7 @@ def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: Sphere
     at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
     bases = _bases(at.view, pixels)
     light = _flat(model.light, at.view, pixels, use)
-    light = replace(light, stray=learn_stray(at, pixels, use))
+    light = replace(light, stray=learn_stray(at, pixels, use, model.light.stray))
     for _ in range(ROUNDS):
         light = _better(light, at.view, pixels, (at.weight / at.variance).where(used, 0.0), bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
