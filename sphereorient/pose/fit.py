@@ -165,7 +165,8 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
     lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
     covariance = bread @ meat @ bread + lured.mT @ lured
     finest_mm = by_pose(px_mm, cameras)[..., 0].masked_fill(~use, math.inf).amin(1).nan_to_num(0.0, 0.0, 0.0)
-    aside_mm = ASIDE_PX * finest_mm[:, None].expand(-1, 3)
+    aside_px = ASIDE_PX + (_limb_moved_px(at, pixels.inner, model, cameras) * seen).amax(1)
+    aside_mm = (aside_px * finest_mm)[:, None].expand(-1, 3)
     covariance = covariance + torch.diag_embed(torch.cat([aside_mm / radius_mm, aside_mm], dim=1).square())
     sight = torch.nn.functional.normalize(to_centre, dim=-1)[..., None]
     place = (freely @ shared @ freely)[..., 3:, 3:]
@@ -240,6 +241,16 @@ def residuals(
         lit=lit,
         over=over,
     )
+
+
+def _limb_moved_px(at: Residuals, inner: int, model: SphereModel, cameras: int) -> Tensor:
+    """Return by how much stray light, were it unknown, would move the limbs of B * C disks, (B, C): it is not known
+    much better than that, as it does not end at the limb.
+    """
+    stray = model.light.stray.double()
+    share = stray.square() @ stray.new_tensor([1.0] + [0.5] * (stray.shape[1] - 1))  # mean square over the angle
+    step = by_pose(at.lit[:, :inner].double().median(-1).values, cameras)
+    return model.blur_px * share.sqrt() / step.clamp_min(1.0)
 
 
 def settled(pixels: Pixels, fit: FittedPoses, model: SphereModel, cameras: int) -> Residuals:

@@ -195,12 +195,14 @@ def test_light_beside_the_sphere_is_found_and_moves_no_pose():
     basis = stray_basis(torch.stack([round_it.cos(), round_it.sin()]))
     for light in (maps, lab):
         assert ((light.stray - planted_stray) @ basis).abs().max() < 1.0
-    off = []
+    off, stated = [], []
     for light in (lab, replace(lab, stray=no_stray(2))):
         model = replace(model, light=light, shading=LATER)
-        begin = PoseStart(position_lab_mm=X, R_lab_body=R, use=use)
-        off.append(float((refine(pixels, begin, model).position_lab_mm - X).mean(0).norm()))
+        fit = refine(pixels, PoseStart(position_lab_mm=X, R_lab_body=R, use=use), model)
+        off.append(float((fit.position_lab_mm - X).mean(0).norm()))
+        stated.append(float(fit.covariance[:, 3:, 3:].diagonal(dim1=1, dim2=2).mean().sqrt()))
     assert off[0] < 0.5 * off[1]
+    assert stated[0] > 1.1 * stated[1]  # light that does not end at the limb is not known there
 
 
 def test_no_light_beside_the_sphere_is_invented():
