@@ -206,6 +206,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     Return, for the worst quarter of frames, the unexplained variance of all cameras together over that of each alone,
     and the distance between the lines of sight, px. The first is 1 where the cameras differ by less than `APART_PX` in
     lines of sight, rotation and size, px of the picture: alone, each camera fits what its model lacks as well.
+    Rotations that differ by less than their own errors do not count: a small disk shows little.
     """
     cameras = len(fitter.views)
     whole = [k for k, poses in enumerate(found) if len(poses) and bool(poses.use.all())]
@@ -218,7 +219,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
         return 1.0, 0.0
     whole = [k for k in whole if _in_view(fitter, found[k].position_lab_mm[:1])] or whole
     tried = [whole[int(k)] for k in torch.linspace(0, len(whole) - 1, min(TRIED, len(whole))).round()]
-    gains, rays, alone = [], [], []
+    gains, rays, alone, covariance_rad2 = [], [], [], []
     for camera, view in enumerate(fitter.views):
         only = torch.zeros(len(tried), cameras, dtype=torch.bool)
         only[:, camera] = True
@@ -230,10 +231,15 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
         gains.append((1 - joint) / (1 - fit.score[:, camera]).clamp_min(1e-6))
         rays.append(view.camera.rays(view.camera.project(X)))
         alone.append((view.camera, X, R))
+        covariance_rad2.append(trace(fit.covariance[:, :3, :3]))
     gap_mm = torch.stack([triangulate(one, other)[1] for one, other in combinations(rays, 2)]).amax(0)
     radius_px = widest_px(fitter.views) / 2
     gap_px = gap_mm * (radius_px / fitter.radius_mm)
-    others_px = [so3.geodesic_distance(one[2], other[2]) * radius_px for one, other in combinations(alone, 2)]
+    others_px = []
+    for k, m in combinations(range(cameras), 2):
+        turn = so3.geodesic_distance(alone[k][2], alone[m][2])
+        told = turn > (covariance_rad2[k] + covariance_rad2[m]).sqrt()
+        others_px.append(turn * told * radius_px)
     for (one_camera, X, _), (_, Y, _) in permutations(alone, 2):
         centre = centre_lab_mm(one_camera)
         sight = torch.nn.functional.normalize(X - centre, dim=-1)
