@@ -99,7 +99,7 @@ def prepared(folder: Path) -> Bench:
             list(screened_frames(reel, eye.background, 0, FOLLOWED))
             for reel, eye in zip(recording.streams, eyes, strict=True)
         ]
-        sampled = sample_frames(recording, eyes, settings.refine.appearance_frames)
+        sampled, _ = sample_frames(recording, eyes, settings.refine.appearance_frames)
         for reel in recording.streams:
             decoding = cpu_s(lambda reel=reel: list(reel.pictures(0, 20)), 3) / 20
             say(f"decoding {reel.name}, CPU ms a frame (floor of a movie)", f"{1e3 * decoding:.2f}")

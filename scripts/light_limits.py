@@ -87,7 +87,7 @@ def error_deg(fitter: Fitter, recording: Recording, path: Path) -> float:
     """Return the median error of the orientation of all frames, fitted from the truth on."""
     with h5py.File(path.parent / "truth.h5") as truth:
         X, R = (torch.from_numpy(truth[name][()]) for name in ("position", "orientation"))
-    shots = sample_frames(recording, fitter.views, len(X))
+    shots, _ = sample_frames(recording, fitter.views, len(X))
     use: Tensor = torch.ones(len(X), len(fitter.views), dtype=torch.bool)
     pixels = fitter.pixels([[shot.picture for shot in frame] for frame in shots], X, fitter.optics.fine)
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, STEPS)

@@ -1,7 +1,7 @@
 """Appearance of a movie (light, blur, noise), estimated from a few frames before tracking."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations, permutations
@@ -21,6 +21,7 @@ from sphereorient.pose.blur import best_blur_px
 from sphereorient.pose.fit import FittedPoses, trace
 from sphereorient.pose.fitter import (
     FEWEST_LIT,
+    FINEST_PX,
     LEAST_LEFT,
     Fitter,
     Optics,
@@ -29,6 +30,7 @@ from sphereorient.pose.fitter import (
     some_of,
     widest_px,
 )
+from sphereorient.pose.lasting import Lasting, lasting_errors
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.worn import without, worn_cells, worn_share
 from sphereorient.sphere.texture_table import TextureTable
@@ -56,6 +58,10 @@ FITS = 3.0  # excess of a fit whose map is right once worn paint is not used: 1.
 WORN_GAIN = 1.2
 WORN_LEAST = 0.01  # share of the ball; less paint than this moves no pose by as much as its noise
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
+CLEAR = 3.0  # times the variance that the typical right pose leaves
+LITTLE_MOTION = 0.25  # share of the blur's variance that motion adds while the shutter is open; less counts as blur
+MOST_KNOWN = 0.7  # of the studied frames, whose motion must be measured
+APART_BLURS, MOST_INSTANTS = 3.0, 8  # between neighbouring instants of the exposure, and of these
 BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
 
 
@@ -64,12 +70,23 @@ class Appearance:
     """Light, blur and noise of movies, and how well right and wrong poses explain them."""
 
     fitter: Fitter
+    still: Fitter  # of frames whose motion is not known: the same, or with a blur that holds what motion adds
+    lasting: Lasting  # errors of all poses alike
     score_min: float  # between right and wrong poses
     right_score: float  # typical of right poses
     usual_apart_rad: float = math.inf  # typical angle between the orientations that two cameras alone give
     together: bool = True  # whether the cameras see the sphere at one position
     second_ball: bool = False  # whether another sphere with this texture is in view
     worn: Tensor | None = None  # where the paint differs from the map and is not used, see `worn_cells`; None: nowhere
+
+    def of(self, camera: int) -> "Appearance":
+        """Return the appearance in one camera."""
+        lasting = self.lasting.of(camera)
+        return replace(self, fitter=self.fitter.of(camera), still=self.still.of(camera), lasting=lasting)
+
+    def on(self, device: torch.device) -> "Appearance":
+        """Return an appearance whose fits are computed on another device."""
+        return replace(self, fitter=self.fitter.on(device), still=self.still.on(device))
 
     @property
     def clear_score(self) -> float:
@@ -82,11 +99,24 @@ class Appearance:
         return defocus_radii(self.fitter.optics.blur_px, widest_px(self.fitter.views)) > 0
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Following:
+    """Frames beside those studied, from which the motion while the shutter is open is measured."""
+
+    shots: Callable[[Sequence[int]], Sequence[Sequence[Frame]]]  # by index of the studied frame
+    open_share: Tensor  # (n,), exposure over the time from each studied frame to that beside it; negative: it is before
+
+
 def estimate_appearance(
-    first: Initialiser, frames: Sequence[Sequence[Frame]], base: TextureTable, settings: RefineSettings
+    first: Initialiser,
+    frames: Sequence[Sequence[Frame]],
+    base: TextureTable,
+    settings: RefineSettings,
+    following: Following | None = None,
 ) -> Appearance:
     """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies.
-    `first` finds poses with an assumed blur and light; `base` is the finest table of the texture.
+    `first` finds poses with an assumed blur and light; `base` is the finest table of the texture. Without `following`
+    the motion while the shutter is open counts as blur.
 
     Raises:
         ExperimentError: no frame has a pose, or none is better than wrong poses.
@@ -124,14 +154,26 @@ def estimate_appearance(
         # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
         matched = replace(first, fitter=replace(first.fitter, optics=Optics(base, blur_px, diameter_px)))
         with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
-            return estimate_appearance(matched, frames, base, settings.model_copy(update={"blur_px": blur_px}))
+            settings = settings.model_copy(update={"blur_px": blur_px})
+            return estimate_appearance(matched, frames, base, settings, following)
     worn = None
     if settings.learn_paint:
         fitter, fit, worn = _without_worn(fitter, base, pixels, fit, use)
         if worn is not None:  # the blur, too, was found with it
             given = settings.blur_px is not None
             fitter, fit = _light_and_blur(fitter, without(base, worn), pixels, fit, use, given=given)
-    fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
+    still, moved = fitter, None
+    if following is not None and looked is found:
+        still, moved = _exposed(fitter, fit, use, _clear(found), following)
+    if moved is None:
+        fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
+        still = fitter
+    else:
+        fitter, pixels, use = still, still.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
+        paint = base if worn is None else without(base, worn)
+        fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=False)
+        fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
+        still = replace(still, light=fitter.light, instants=1)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
     best, highest = _scores(looked)
@@ -142,7 +184,8 @@ def estimate_appearance(
     if right < highest + NO_BETTER:
         # Dirt or a hidden rim spoils the estimated light: all poses are explained worse than before.
         highest = right - (best - highest)
-    fitter = replace(fitter, widest_px=widest)
+    limb_px = _limb_px(fitter, fit, use)
+    fitter, still = (replace(one, widest_px=widest, limb_px=limb_px) for one in (fitter, still))
     together = gain <= APART_GAIN and gap_px <= FAR_APART_PX
     score_min = 0.5 * (right + min(highest, right))
     if defocus_radii(fitter.optics.blur_px, diameter_px):  # wrong poses explain nearly as much, and right ones scatter
@@ -150,6 +193,8 @@ def estimate_appearance(
     rivals = sum(first.claimants(shots) > 1 for shots in frames)
     return Appearance(
         fitter=fitter,
+        still=still,
+        lasting=lasting_errors(pixels, fit, use, fitter.model(fitter.optics.fine)),
         score_min=score_min,
         right_score=right,
         usual_apart_rad=_usual_apart(fit, use),
@@ -199,6 +244,20 @@ def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
     ]
     both = torch.cat([torch.zeros(0, dtype=torch.float64), *angles])
     return float(both.median()) if len(both) >= FEWEST_BOTH else math.inf
+
+
+def _limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
+    """Return by how much the limb lies outside of where all cameras together place it, (C,), px: the mean of B poses.
+    A wrong diameter, glare, or glass that the cameras' model lacks. 0 where fewer than `FEWEST_BOTH` poses tell.
+    """
+    found = torch.zeros(len(fitter.views), dtype=torch.float64)
+    for k, view in enumerate(fitter.views):
+        told = use[:, k] & (use.sum(1) > 1)
+        to_centre = fit.position_lab_mm - centre_lab_mm(view.camera)
+        nearer = -(fit.own_move[:, k] * to_centre).sum(-1) / to_centre.square().sum(-1)
+        if int(told.sum()) >= FEWEST_BOTH:
+            found[k] = (nearer * view.radius_px(fit.position_lab_mm, fitter.radius_mm))[told].median()
+    return found
 
 
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
@@ -272,6 +331,48 @@ def _in_view(fitter: Fitter, position_lab_mm: Tensor) -> bool:
     )
 
 
+def _exposed(
+    fitter: Fitter, fit: FittedPoses, use: Tensor, rows: Sequence[int], following: Following
+) -> tuple[Fitter, Tensor | None]:
+    """Return a fitter that renders as many instants of the exposure as B poses need, and their turn and move (B, 6)
+    while the shutter is open, NaN where it is not known; None, and the same fitter, where it hardly blurs the pictures.
+    """
+
+    def measured(some: Tensor) -> Tensor:
+        shots = following.shots([rows[k] for k in some.tolist()])
+        usable = torch.tensor([[shot.usable for shot in frame] for frame in shots])
+        pictures = [[shot.picture for shot in frame] for frame in shots]
+        X, R, seen = fit.position_lab_mm[some], fit.R_lab_body[some], use[some]
+        there = fitter.fit_through(fitter.optics.steps, pictures, X, R, seen & usable)
+        right = ((1 - there.score <= CLEAR * (1 - fit.score[some])) | ~seen).all(1) & (usable | ~seen).all(1)
+        way = torch.cat([so3.log(there.R_lab_body @ R.mT), there.position_lab_mm - X], dim=-1)
+        share = following.open_share[[rows[k] for k in some.tolist()]]
+        return torch.where(right[:, None], share[:, None] * way, torch.nan)
+
+    def smear_px(some: Tensor, moved: Tensor) -> Tensor:
+        return (
+            torch.stack([view.smear_px(fit.position_lab_mm[some], moved, fitter.radius_mm) for view in fitter.views])
+            .square()
+            .mean(0)
+            .sqrt()
+        )
+
+    tried = torch.linspace(0, len(rows) - 1, min(TRIED, len(rows))).round().long()
+    width_px = smear_px(tried, measured(tried))
+    blur_px = fitter.optics.blur_px
+    if not float(width_px.square().nanmean() / 12) > LITTLE_MOTION * blur_px**2:
+        return fitter, None
+    every = torch.arange(len(rows))
+    moved = measured(every)
+    width_px = smear_px(every, moved)
+    if float(width_px.isfinite().double().mean()) < MOST_KNOWN:
+        return fitter, None
+    # What is left of the blur once the motion is taken out sets how far apart instants may be.
+    left_px = math.sqrt(max(blur_px**2 - float(width_px.square().nanmean()) / 12, FINEST_PX**2))
+    instants = 1 + math.ceil(float(width_px.nanquantile(0.9)) / (APART_BLURS * left_px))
+    return replace(fitter, instants=min(max(2, instants), MOST_INSTANTS)), moved
+
+
 def _scores(found: Sequence[Poses]) -> tuple[float, float]:
     """Return the median score of the best poses of clear frames, and the highest typical score of wrong ones."""
     clear = _clear(found)
@@ -309,7 +410,7 @@ def _clear(found: Sequence[Poses]) -> list[int]:
 
 
 def _clear_of(typical: float) -> float:
-    return 1 - 3 * (1 - typical)
+    return 1 - CLEAR * (1 - typical)
 
 
 def _light_and_blur(

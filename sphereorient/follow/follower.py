@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate, islice, pairwise
 
 import torch
@@ -24,8 +24,7 @@ class PerCameraTracker:
     """Tracks the sphere in each camera alone; the first that sees it gives the pose, the others contradict."""
 
     def __init__(self, appearance: Appearance, search: Initialiser, settings: RefineSettings) -> None:
-        fitter = appearance.fitter
-        alone = [replace(appearance, fitter=fitter.of(k)) for k in range(len(fitter.views))]
+        alone = [appearance.of(k) for k in range(len(appearance.fitter.views))]
         self.trackers = [ChunkTracker(one, search, settings) for one in alone]
 
     def batches(self, frames: range) -> list[list[int]]:
@@ -116,21 +115,36 @@ class Follower:
                 yield batch, list(self.tracker.track(read, batch.lengths, times))
 
 
-def sample_frames(recording: Recording, views: Sequence[CameraView], count: int) -> list[tuple[Frame, ...]]:
-    """Return `count` frames of all cameras, spread over the movies; each the first readable one of its stretch."""
+def sample_frames(
+    recording: Recording, views: Sequence[CameraView], count: int
+) -> tuple[list[tuple[Frame, ...]], list[int]]:
+    """Return `count` frames of all cameras, spread over the movies, each the first readable one of its stretch, and
+    their places among the frames in use.
+    """
     total = len(recording.timeline)
     spread = spread_frames(range(total), count)
-    taken = []
+    taken, places = [], []
     for first, last in zip(spread, [*spread[1:], total], strict=True):
         movies = [
             screened_frames(stream, view.background, first, max(last, first + 1))
             for stream, view in zip(recording.streams, views, strict=True)
         ]
         frames = zip(*movies, strict=True)
-        best = next(frames)
-        for shots in frames:
+        best, place = next(frames), first
+        for k, shots in enumerate(frames, first + 1):
             if all(shot.usable for shot in best):
                 break
-            best = max(best, shots, key=lambda each: sum(shot.usable for shot in each))
+            if sum(shot.usable for shot in shots) > sum(shot.usable for shot in best):
+                best, place = shots, k
         taken.append(best)
-    return taken
+        places.append(place)
+    return taken, places
+
+
+def frames_at(recording: Recording, views: Sequence[CameraView], places: Sequence[int]) -> list[tuple[Frame, ...]]:
+    """Return the frames of all cameras at some places among the frames in use."""
+    found = []
+    for k in places:
+        pairs = zip(recording.streams, views, strict=True)
+        found.append(tuple(next(screened_frames(stream, view.background, k, k + 1)) for stream, view in pairs))
+    return found

@@ -42,6 +42,8 @@ class _Expected:
     reason: tuple[Reason, ...]  # C, why the others did not
     place_precision: Tensor  # (3, 3), 1/mm^2
     rough: bool  # from one predecessor alone: the motion is unknown
+    moved: Tensor  # (6,), turn (rad) and move (mm) while the shutter is open; 0 where rough
+    open_share: float  # of the time from the frame before to this one, in which the shutter is open
 
 
 @dataclass(eq=False)
@@ -53,7 +55,7 @@ class _Chunk:
     time_s: Sequence[float]  # of the batch's frames
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
 
-    def expected(self, frame: int, radius_mm: float) -> _Expected | None:
+    def expected(self, frame: int, radius_mm: float, exposure_s: float = 0.0) -> _Expected | None:
         """Extrapolate position and rotation, to second order where three frames are known."""
         rows = [poses for number, poses in self.past if number >= frame - len(self.past)]
         numbers = [number for number, _ in self.past]
@@ -65,6 +67,8 @@ class _Chunk:
             on = (t2 - t1) / (t1 - t0)  # 1 for even frames
         X, R, spread = last.position_lab_mm[0], last.R_lab_body[0], last.covariance[0, 3:, 3:]
         rough, astray_mm = on > LONG_STEP, MOVE_SHARE * radius_mm
+        open_share = exposure_s / (self.time_s[frame] - self.time_s[frame - 1])
+        moved = torch.zeros(6, dtype=torch.float64)
         if not rough:
             *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
             *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
@@ -82,6 +86,7 @@ class _Chunk:
                 if float(further.diagonal().sum()) < astray_mm**2:
                     move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
             X, R = X1 + move, so3.exp(turn) @ R1
+            moved = open_share * torch.cat([turn, move])
         return _Expected(
             position_lab_mm=X,
             R_lab_body=R,
@@ -89,6 +94,8 @@ class _Chunk:
             reason=last.reason,
             place_precision=torch.linalg.inv(spread + astray_mm**2 * torch.eye(3, dtype=torch.float64)),
             rough=rough,
+            moved=moved,
+            open_share=open_share,
         )
 
     def saw(self, frame: int, poses: Poses) -> None:
@@ -104,13 +111,19 @@ class ChunkTracker:
     """
 
     def __init__(
-        self, appearance: Appearance, search: Initialiser, settings: RefineSettings, centre: FixedCentre | None = None
+        self,
+        appearance: Appearance,
+        search: Initialiser,
+        settings: RefineSettings,
+        exposure_s: float = 0.0,
+        centre: FixedCentre | None = None,
     ) -> None:
         self.fitter: Fitter = appearance.fitter
-        self.search = replace(search, fitter=appearance.fitter, score_min=appearance.clear_score)
+        self.search = replace(search, fitter=appearance.still, score_min=appearance.clear_score)
         self.score_min = appearance.score_min
         self.usual_apart_rad = appearance.usual_apart_rad
         self.settings = settings
+        self.exposure_s = exposure_s
         self.centre = centre
 
     def batches(self, frames: range) -> list[list[int]]:
@@ -135,7 +148,9 @@ class ChunkTracker:
 
     def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
         """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
-        expected = {chunk.first: chunk.expected(chunk.first + k, self.fitter.radius_mm) for chunk in chunks}
+        expected = {
+            chunk.first: chunk.expected(chunk.first + k, self.fitter.radius_mm, self.exposure_s) for chunk in chunks
+        }
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
         if self.centre is not None:
             X, precision = self.centre.position_lab_mm, self.centre.precision
@@ -154,14 +169,17 @@ class ChunkTracker:
         expected, shots = [*expected, *[expected[-1]] * missing], [*shots, *[shots[-1]] * missing]
         frames = [[shot.picture for shot in row] for row in shots]
         usable = torch.tensor([[shot.usable for shot in row] for row in shots])
-        X, R, use, precision = (
+        X, R, use, precision, moved = (
             torch.stack([getattr(one, name) for one in expected])
-            for name in ("position_lab_mm", "R_lab_body", "use", "place_precision")
+            for name in ("position_lab_mm", "R_lab_body", "use", "place_precision", "moved")
         )
         use = use & usable
         if any(one.rough for one in expected):
+            was = X, R
             X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
-        fit = self._fitted(frames, X, R, use, precision)
+            share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
+            moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
+        fit = self._fitted(frames, X, R, use, precision, moved)
         good = first = self._supported(fit, use)
         within = self.fitter.largest_px(X) <= self.fitter.widest_px  # others are searched for, frame by frame
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
@@ -169,7 +187,7 @@ class ChunkTracker:
         if not bool((good | ~within).all()):
             # One picture without the sphere spoils the joint fit: try each camera; of two that disagree the nearer one
             # counts.
-            alone = [self._fitted(frames, X, R, _only(usable, k), precision) for k in range(use.shape[1])]
+            alone = [self._fitted(frames, X, R, _only(usable, k), precision, moved) for k in range(use.shape[1])]
             supported = [self._supported(one, _only(usable, k)) for k, one in enumerate(alone)]
             astray = [
                 torch.where(right, so3.geodesic_distance(one.R_lab_body, R), torch.inf)
@@ -184,7 +202,7 @@ class ChunkTracker:
         doubtful = ~first | before.any(1)
         if bool((usable & ~use).any()):
             # A camera without the sphere before may see it again: test it at the joint pose.
-            both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, usable, precision)
+            both = self._fitted(frames, fit.position_lab_mm, fit.R_lab_body, usable, precision, moved)
             unused = good & (usable & ~use).any(1)
             limit = torch.where(before.any(1), AGREES_AGAIN, 1.0)
             contradicts = self._contradictory(both, usable, limit)
@@ -193,7 +211,7 @@ class ChunkTracker:
             fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
         others = (good & doubtful)[:, None] & usable & ~use
         for k in range(use.shape[1] if bool(others.any()) else 0):
-            one = alone[k] if alone else self._fitted(frames, X, R, _only(usable, k), precision)
+            one = alone[k] if alone else self._fitted(frames, X, R, _only(usable, k), precision, moved)
             others[:, k] &= self._supported(one, _only(usable, k))
             fit = _beside(fit, one, others[:, k], k)
         reasons = [
@@ -215,18 +233,18 @@ class ChunkTracker:
         return X, R
 
     def _fitted(
-        self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor
+        self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, moved: Tensor
     ) -> FittedPoses:
         """Fit poses that are nearly right: to some pixels, repeated where that moves them, then to all."""
         if self.centre is None:
             # All cameras together determine the position; for one of two the distance is better known from before.
             precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
         fine, widest = self.fitter.optics.fine, self.fitter.widest_px
-        pixels = self.fitter.pixels(frames, X, fine, widest)
+        pixels = self.fitter.pixels(frames, X, fine, widest, moved)
         fit, far = self._settled(pixels.thinned(FIRST_EVERY), X, R, use, precision, 2)
         if bool(far.any()):
             begin = torch.where(far[:, None], self._from(fit.position_lab_mm), X)
-            pixels = self.fitter.pixels(frames, begin, fine, widest)
+            pixels = self.fitter.pixels(frames, begin, fine, widest, moved)
         return self._settled(pixels, self._from(fit.position_lab_mm), fit.R_lab_body, use, precision, 3)[0]
 
     def _settled(
@@ -272,7 +290,7 @@ class ChunkTracker:
             return poses
         frames, usable = [shot.picture for shot in shots], torch.tensor([shot.usable for shot in shots])
         if self.centre is not None:
-            optics = self.fitter.optics
+            optics = self.search.fitter.optics
             fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 1, 3), (optics.fine, 1, 4)))
             order = explaining_first(fit, poses.use).argsort(stable=True)
             poses = poses_of(fit, order, poses.use, poses.reason)
@@ -288,7 +306,7 @@ class ChunkTracker:
         if bool((seen == poses.use).all()) or not bool(seen.any()):
             # Keep all where no camera is sure: the path decides.
             return replace(poses, use=seen, reason=tuple(reason))
-        fit = self._looked_at(frames, poses, seen, ((self.fitter.optics.fine, 1, 4),))
+        fit = self._looked_at(frames, poses, seen, ((self.search.fitter.optics.fine, 1, 4),))
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 
     def _looked_at(self, frames: Sequence[Picture], poses: Poses, use: Tensor, steps: Steps) -> FittedPoses:
@@ -296,12 +314,12 @@ class ChunkTracker:
         X, R, count = self._from(poses.position_lab_mm), poses.R_lab_body, len(poses)
         known = None if self.centre is None else self.centre.precision.expand(count, 3, 3)
         held = self.centre is not None
-        return self.fitter.fit_through(steps, [frames] * count, X, R, use.expand(count, -1), known, held)
+        return self.search.fitter.fit_through(steps, [frames] * count, X, R, use.expand(count, -1), known, held)
 
     def _by_each(self, poses: Poses, frames: Sequence[Picture], seen: Tensor) -> Poses:
         """Fit poses to each camera's picture alone; the first that supports one counts, the others contradict."""
         each = seen.expand(len(poses), -1)
-        steps = ((self.fitter.optics.fine, 1, 4),)
+        steps = ((self.search.fitter.optics.fine, 1, 4),)
         alone = [self._looked_at(frames, poses, _only(each, k), steps) for k in range(len(seen))]
         right = [bool(seen[k]) and bool(self._supported(one, _only(each, k))[0]) for k, one in enumerate(alone)]
         if not any(right):
@@ -318,7 +336,7 @@ class ChunkTracker:
 
     def _all_seeing(self, poses: Poses, frames: Sequence[Picture], usable: Tensor) -> Poses:
         """Fit poses to all pictures, kept if that explains all: a disk without an outline may be visible."""
-        fit = self._looked_at(frames, poses, usable, self.fitter.optics.steps)
+        fit = self._looked_at(frames, poses, usable, self.search.fitter.optics.steps)
         order = fit.nll.argsort(stable=True)
         if not bool(self._supported(fit, usable.expand(len(poses), -1))[order[0]]):
             return poses

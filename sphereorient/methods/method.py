@@ -5,7 +5,7 @@ From what another run learnt, a run measures the same to the last bit.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from sphereorient.methods.settings import Settings
 from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
 from sphereorient.pose import CameraView, Fitter, Optics, base_table
 from sphereorient.pose.lab_light import light_of, light_parts
+from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.model import Lighting
 from sphereorient.pose.worn import without
 from sphereorient.trajectory import Trajectory
@@ -31,6 +32,7 @@ from sphereorient.trajectory import Trajectory
 SCHEMA = "sphereorient-learnt/1"
 OF_SCORES = ("score_min", "right_score", "usual_apart_rad")
 WHETHER = ("together", "second_ball")
+LASTING = ("covariance", "own_rad2")
 NUMBERS = ("blur_px", "widest_px", *OF_SCORES)
 
 
@@ -40,7 +42,11 @@ class Learnt:
 
     scenes: Mapping[str, CameraScene]  # by camera, in the order of the fit
     light: Lighting
+    limb_px: torch.Tensor | None  # (C,), see `SphereModel`; None: of an older version
+    lasting: Lasting
     blur_px: float
+    still_blur_px: float  # of frames whose motion is not known
+    instants: int  # of the exposure that fits render
     widest_px: float
     score_min: float
     right_score: float
@@ -64,7 +70,11 @@ class Learnt:
                 for view in fitter.views
             },
             light=fitter.light,
+            limb_px=fitter.limb_px,
+            lasting=study.lasting,
             blur_px=fitter.optics.blur_px,
+            still_blur_px=study.still.optics.blur_px,
+            instants=fitter.instants,
             widest_px=fitter.widest_px,
             **{name: getattr(study, name) for name in (*OF_SCORES, *WHETHER)},
             worn=study.worn,
@@ -84,16 +94,19 @@ class Learnt:
         views = [CameraView.of(stream.name, stream.camera, self.scenes[stream.name]) for stream in recording.streams]
         widest = max(scene.diameter_px for scene in self.scenes.values())
         base = base_table(recording.texture, widest, recording.unseen)
-        optics = Optics(base if self.worn is None else without(base, self.worn), self.blur_px, widest)
-        fitter = Fitter(
+        paint = base if self.worn is None else without(base, self.worn)
+        fitter = still = Fitter(
             views=views,
             radius_mm=recording.experiment.radius_mm,
-            optics=optics,
+            optics=Optics(paint, self.still_blur_px, widest),
             light=self.light,
             widest_px=self.widest_px,
+            limb_px=self.limb_px,
         )
+        if self.instants > 1:
+            fitter = replace(still, optics=Optics(paint, self.blur_px, widest), instants=self.instants)
         told = {name: getattr(self, name) for name in (*OF_SCORES, *WHETHER, "worn")}
-        return Appearance(fitter=fitter, **told)
+        return Appearance(fitter=fitter, still=still, lasting=self.lasting, **told)
 
     def save(self, path: Path) -> None:
         """Write everything as HDF5, atomically; raise OutputError if the file cannot be written."""
@@ -156,6 +169,8 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
         file.attrs[name] = getattr(learnt, name)
     for name in WHETHER:
         file.attrs[name] = getattr(learnt, name)
+    if learnt.instants > 1:
+        file.attrs["still_blur_px"], file.attrs["instants"] = learnt.still_blur_px, learnt.instants
     if learnt.acceleration_rad_s2 is not None:
         file.attrs["acceleration_rad_s2"] = learnt.acceleration_rad_s2
     file.attrs["cameras"] = list(learnt.scenes)
@@ -169,6 +184,10 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
     light.attrs["known"] = learnt.light.known
     for part, values in light_parts(learnt.light).items():
         light.create_dataset(part, data=values.numpy(), track_times=False)
+    if learnt.limb_px is not None:
+        file.create_dataset("limb_px", data=learnt.limb_px.numpy(), track_times=False)
+    for part in LASTING:
+        file.create_dataset(f"lasting/{part}", data=getattr(learnt.lasting, part).numpy(), track_times=False)
     if learnt.worn is not None:
         file.create_dataset("worn", data=learnt.worn.numpy(), track_times=False)
     if learnt.process is not None:
@@ -193,10 +212,17 @@ def _read(file: h5py.File) -> Learnt:
         scenes[name] = CameraScene(background=background, diameter_px=float(group.attrs["diameter_px"]))
     light = file["light"]
     parts = {part: torch.from_numpy(light[part][()]) for part in light}
+    lasting = Lasting.none(len(scenes))
+    if "lasting" in file:
+        lasting = Lasting(**{part: torch.from_numpy(file["lasting"][part][()]) for part in LASTING})
     acceleration = file.attrs.get("acceleration_rad_s2")
     return Learnt(
         scenes=scenes,
+        still_blur_px=float(file.attrs.get("still_blur_px", file.attrs["blur_px"])),
+        instants=int(file.attrs.get("instants", 1)),
         light=light_of(parts, bool(light.attrs["known"])),
+        limb_px=torch.from_numpy(file["limb_px"][()]) if "limb_px" in file else None,
+        lasting=lasting,
         together=bool(file.attrs["together"]),
         second_ball=bool(file.attrs.get("second_ball", False)),
         worn=torch.from_numpy(file["worn"][()]) if "worn" in file else None,

@@ -1,16 +1,15 @@
 """The precise method: appearance of the movie, pose after pose, the most likely path, its motion."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import torch
 
 from sphereorient import motion
 from sphereorient.assemble import Chosen, PathLayer
 from sphereorient.experiment.recording import Progress
-from sphereorient.follow.appearance import Appearance, estimate_appearance
+from sphereorient.follow.appearance import Appearance, Following, estimate_appearance
 from sphereorient.follow.fixed_centre import find_fixed_centre
-from sphereorient.follow.follower import Follower, PerCameraTracker, sample_frames
+from sphereorient.follow.follower import Follower, PerCameraTracker, frames_at, sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, pose_table
 from sphereorient.follow.tracker import ChunkTracker
@@ -27,7 +26,7 @@ def learn(job: Job, progress: Progress) -> Follower:
     recording, settings = job.recording, job.settings
     views, base, search = open_views(recording, settings, progress)
     progress("appearance", 0, 1)
-    frames = sample_frames(recording, views, settings.refine.appearance_frames)
+    frames, places = sample_frames(recording, views, settings.refine.appearance_frames)
     # Only blurred pictures need blurred templates; sharp ones share one first guess.
     blur_px = settings.refine.blur_px or estimate_blur_px(views, frames, settings.locate)
     if settings.refine.blur_px is None and not defocus_radii(blur_px, search.diameter_px):
@@ -38,7 +37,14 @@ def learn(job: Job, progress: Progress) -> Follower:
         locating=settings.locate,
         candidates=settings.refine.candidates,
     )
-    appearance = estimate_appearance(first, frames, base, settings.refine)
+    following = None
+    if _exposure_s(job) > 0 and len(recording.clock) > 1:
+        beside = [place + 1 if place + 1 < len(recording.clock) else place - 1 for place in places]
+        following = Following(
+            shots=lambda rows: frames_at(recording, views, [beside[k] for k in rows]),
+            open_share=_exposure_s(job) / (recording.clock[beside] - recording.clock[places]),
+        )
+    appearance = estimate_appearance(first, frames, base, settings.refine, following)
     progress("appearance", 1, 1)
     return follower(job, appearance, search)
 
@@ -55,23 +61,28 @@ def follower(job: Job, appearance: Appearance, search: BlurMatchedSearch) -> Fol
     settings, views = job.settings, appearance.fitter.views
     proposers = search.by_camera(views, appearance.fitter.optics.blur_px)
     begin = Initialiser(
-        fitter=appearance.fitter,
+        fitter=appearance.still,
         proposers=proposers,
         locating=settings.locate,
         candidates=settings.refine.candidates,
         score_min=appearance.clear_score,
     )
-    there = replace(appearance, fitter=appearance.fitter.on(job.device))
+    there = appearance.on(job.device)
     tracker: ChunkTracker | PerCameraTracker
     if appearance.together:
         centre = None
         if job.recording.experiment.fixed:
-            frames = sample_frames(job.recording, views, settings.refine.appearance_frames)
+            frames, _ = sample_frames(job.recording, views, settings.refine.appearance_frames)
             centre = find_fixed_centre(begin, frames, appearance.score_min)
-        tracker = ChunkTracker(there, begin, settings.refine, centre)
+        tracker = ChunkTracker(there, begin, settings.refine, _exposure_s(job), centre)
     else:
         tracker = PerCameraTracker(there, begin, settings.refine)
     return Follower(recording=job.recording, appearance=appearance, tracker=tracker)
+
+
+def _exposure_s(job: Job) -> float:
+    """Return how long the shutter is open, s; 0 where that is not known, or where the given blur holds its motion."""
+    return 0.0 if job.settings.refine.blur_px is not None else job.recording.experiment.exposure_s or 0.0
 
 
 def join(

@@ -23,6 +23,7 @@ from sphereorient.mapping import LearntMap
 from sphereorient.motion import Motion, Smoothed, datasets_of
 from sphereorient.pose.fit import trace
 from sphereorient.pose.fitter import CameraView
+from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.worn import UNUSED_PAINT, worn_share, worn_text
 from sphereorient.search import Candidates
 from sphereorient.so3 import exp, geodesic_distance, log, solve_damped
@@ -117,7 +118,9 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
         centre_sigma_px=(picked["own_sigma_mm"][:, place] * radius_px / learnt.fitter.radius_mm).numpy(),
         radius_px=radius_px.numpy(),
         orientation=torch.where(where, exp(picked["own_turn"][:, place]) @ R, torch.nan).numpy(),
-        orientation_cov=torch.where(where, picked["own_covariance"][:, place], torch.nan).numpy(),
+        orientation_cov=torch.where(
+            where, picked["own_covariance"][:, place] + learnt.lasting.own_rad2[place], torch.nan
+        ).numpy(),
         score=picked["score"][:, place].numpy(),
         reason=tuple(str(why) for why in reason),
         candidate_offset=torch.nn.functional.pad(counts.cumsum(0), (1, 0)).numpy(),
@@ -143,14 +146,22 @@ def precise_track(
     if learnt.worn is not None:
         told["remarks"].append(WORN.format(share=100 * worn_share(learnt.worn)))
         told[UNUSED_PAINT] = worn_text(learnt.worn)
+    known = {
+        "position_cov": (covariance[:, 3:, 3:] * smoothed.position_scale**2).numpy(),
+        "orientation_cov": smoothed.cov_given_path_rad2.numpy(),
+        **datasets_of(smoothed, experiment.length_unit),
+    }
+    # What lasts over all frames, no path averages away.
+    place, turn = learnt.lasting.covariance[3:, 3:].numpy(), _lasting_turns(table.use, learnt.lasting).numpy()
+    for kind in ("_cov", "_smooth_cov"):
+        known["position" + kind] = known["position" + kind] + place
+        known["orientation" + kind] = known["orientation" + kind] + turn
     return replace(
         empty,
         valid=(chosen.choice >= 0).numpy(),
         position=picked["position_lab_mm"].numpy(),
-        position_cov=(covariance[:, 3:, 3:] * smoothed.position_scale**2).numpy(),
         orientation=smoothed.R_given_path.numpy(),
-        orientation_cov=smoothed.cov_given_path_rad2.numpy(),
-        **datasets_of(smoothed, experiment.length_unit),
+        **known,
         segment=chosen.segment.numpy(),
         flags=flags.numpy().astype(np.uint32),
         provenance=told,
@@ -159,6 +170,13 @@ def precise_track(
         margin_angle=angle.numpy(),
         cameras=cameras,
     )
+
+
+def _lasting_turns(use: Tensor, lasting: Lasting) -> Tensor:
+    """Return the covariances (N, 3, 3), rad^2, of what lasts, of frames that the cameras of `use` (N, C) measured."""
+    together = lasting.covariance[:3, :3].expand(len(use), 3, 3)
+    alone = use.to(torch.float64) @ lasting.own_rad2.flatten(1)
+    return torch.where((use.sum(1) == 1)[:, None, None], alone.reshape(-1, 3, 3), together)
 
 
 def map_track(

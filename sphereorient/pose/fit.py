@@ -28,7 +28,6 @@ from sphereorient.so3 import inverse_damped, solve_damped
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
 EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
-ASIDE_PX = 0.002  # and by how much its limb and its paint aside: large balls would state less
 KNOWN = 0.3  # least share of a disk that shows known paint
 NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it
 STRAY_ROUNDS, STRAY_TUKEY, FEWEST_BESIDE = 5, 6.0, 200  # rounds, standard deviations, pixels
@@ -159,13 +158,16 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
     bread = inverse_damped(whole)
     own_bread = inverse_damped(information[..., :3, :3])
     own_covariance = own_bread @ shared[..., :3, :3] @ own_bread
-    # An edge that is EDGE_PX off moves the sphere along each line of sight.
+    # An edge that is a pixel off moves the sphere along each line of sight.
     px_mm = pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * to_centre.flatten(0, 1).norm(dim=-1, keepdim=True)
-    edge = to_centre * (EDGE_PX * by_pose(px_mm, cameras) / radius_mm) * seen[..., None]
+    edge = to_centre * (by_pose(px_mm, cameras) / radius_mm) * seen[..., None]
     lured = (bread[:, None] @ information[..., 3:] @ edge[..., None])[..., 0]
-    covariance = bread @ meat @ bread + lured.mT @ lured
+    covariance = bread @ meat @ bread + EDGE_PX**2 * lured.mT @ lured
+    if model.limb_px is not None:
+        found = (model.limb_px[:, None].to(lured) * lured).sum(1)[..., None]
+        covariance = covariance + found @ found.mT
     finest_mm = by_pose(px_mm, cameras)[..., 0].masked_fill(~use, math.inf).amin(1).nan_to_num(0.0, 0.0, 0.0)
-    aside_px = ASIDE_PX + (_limb_moved_px(at, pixels.inner, model, cameras) * seen).amax(1)
+    aside_px = (_limb_moved_px(at, pixels.inner, model, cameras) * seen).amax(1)
     aside_mm = (aside_px * finest_mm)[:, None].expand(-1, 3)
     covariance = covariance + torch.diag_embed(torch.cat([aside_mm / radius_mm, aside_mm], dim=1).square())
     sight = torch.nn.functional.normalize(to_centre, dim=-1)[..., None]

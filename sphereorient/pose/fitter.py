@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from sphereorient.cameras import Camera, R_lab_view, sphere_radius_px
+from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, sphere_radius_px
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene
 from sphereorient.pose.fit import KNOWN, FittedPoses, PoseStart, learn_light, refine
@@ -60,6 +60,16 @@ class CameraView:
     def radius_px(self, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
         """Return the radius (...), px, of the sphere's picture at positions (..., 3), mm, along the camera's x."""
         return sphere_radius_px(self.camera, position_lab_mm, radius_mm)
+
+    def smear_px(self, position_lab_mm: Tensor, moved: Tensor, radius_mm: float) -> Tensor:
+        """Return how far the middle of the disk moves in the picture, (B,), px, of spheres at (B, 3), mm.
+        `moved` (B, 6): turn (rad) and move (mm) of the sphere while the shutter is open.
+        """
+        sight = torch.nn.functional.normalize(position_lab_mm - centre_lab_mm(self.camera), dim=-1)
+        front = moved[:, 3:] + torch.linalg.cross(moved[:, :3], -radius_mm * sight)
+        across = front - (front * sight).sum(-1, keepdim=True) * sight
+        smear: Tensor = across.norm(dim=-1) * self.radius_px(position_lab_mm, radius_mm) / radius_mm
+        return smear
 
     def shows_whole(self, centre_px: Tensor, radius_px: Tensor) -> Tensor:
         """Return whether the picture holds the whole disk, (...) bool, of centres (..., 2) and radii (...), px."""
@@ -143,12 +153,19 @@ class Fitter:
     light: Lighting
     device: torch.device = CPU  # of the fits; inputs and results are on the CPU
     widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
+    limb_px: Tensor | None = None  # (C,), see `SphereModel`; None: 0
+    instants: int = 1  # of the exposure that fits render; 1: the sphere as if at rest, the blur holds its motion
 
     def model(self, level: PyramidLevel) -> SphereModel:
         """Return what the pictures of a level depend on."""
         shading = LATER if self.light.known or level.extra_px > 0 else FIRST  # high orders while nothing is learnt
         return SphereModel(
-            radius_mm=self.radius_mm, paint=level.paint, blur_px=level.blur_px, light=self.light, shading=shading
+            radius_mm=self.radius_mm,
+            paint=level.paint,
+            blur_px=level.blur_px,
+            light=self.light,
+            shading=shading,
+            limb_px=self.limb_px,
         )
 
     def with_light_of(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> "Fitter":
@@ -192,7 +209,8 @@ class Fitter:
 
     def of(self, camera: int) -> "Fitter":
         """Return the fitter of one camera by itself."""
-        return replace(self, views=[self.views[camera]], light=self.light.of(camera))
+        limb_px = self.limb_px if self.limb_px is None else self.limb_px[camera : camera + 1]
+        return replace(self, views=[self.views[camera]], light=self.light.of(camera), limb_px=limb_px)
 
     def largest_px(self, position_lab_mm: Tensor) -> Tensor:
         """Return the radius (B,), px, of the largest disk that a sphere at positions (B, 3) shows in any picture."""
@@ -214,9 +232,11 @@ class Fitter:
         position_lab_mm: Tensor,
         level: PyramidLevel,
         radius_px: float | None = None,
+        moved: Tensor | None = None,
     ) -> Pixels:
         """Cut the disks of B poses out of the pictures of C views; position_lab_mm (B, 3) is right to a few pixels.
-        Without `radius_px` the largest disk sets it, so that the last bits depend on the batch.
+        Without `radius_px` the largest disk sets it, so that the last bits depend on the batch. `moved` (B, 6): the
+        sphere's turn (rad) and move (mm) while the shutter is open; None: unknown, as if at rest.
         """
         middles = [torch.nan_to_num(view.camera.project(position_lab_mm)).tolist() for view in self.views]
         if radius_px is None:
@@ -227,7 +247,13 @@ class Fitter:
         for b, frames in enumerate(pictures):
             for c, (view, frame) in enumerate(zip(self.views, frames, strict=True)):
                 disks.append(cut_pixels(frame, view.background, view.sight, middles[c][b], stencil, level.extra_px))
-        return stacked(disks)
+        return self.exposed(stacked(disks), moved)
+
+    def exposed(self, pixels: Pixels, moved: Tensor | None) -> Pixels:
+        """Return the pixels of B * C disks with the sphere's motion (B, 6) while the shutter is open; None: at rest."""
+        if moved is None or self.instants == 1:
+            return pixels
+        return replace(pixels, moved=moved.repeat_interleave(len(self.views), 0), instants=self.instants)
 
     def fit(
         self,

@@ -10,9 +10,11 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.pose.pixels import Pixels
 from sphereorient.so3 import cross_first_axis
 from sphereorient.sphere.texture_table import TextureTable
@@ -22,6 +24,7 @@ SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: ke
 RIM_NODES = 4  # look-ups along the radius near the limb, where the paint is compressed
 UNSEEN = 0.02  # a pixel that looks at a larger share of unknown paint counts for nothing
 DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of the paint is infinite on the limb
+COVER_MIN = 1e-4  # of a pixel, so that paint beyond the limb has a value
 MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
 ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)
 STRAY_ORDER = 4  # of the harmonics over the angle about the disk
@@ -116,6 +119,7 @@ class SphereModel:
     blur_px: float  # standard deviation of optics, pixel and whatever was laid over the frame, px
     light: Lighting  # of the C cameras
     shading: Shading = LATER  # how far a frame's light may differ from it
+    limb_px: Tensor | None = None  # (C,), how far the limb lies outside of its place by all cameras: an error; None: 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -190,6 +194,53 @@ LIGHT_PARTS = tuple(field.name for field in fields(Light) if field.name != "know
 
 def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model: SphereModel) -> SphereView:
     """Render the sphere at position_lab_mm (L, 3) and R_lab_body (L, 3, 3) through pixels with a Gaussian aperture.
+    Where it moves during the exposure, the mean of `pixels.instants` instants of it, the pose in the middle.
+    """
+    if pixels.instants == 1:
+        return _view_at(pixels, position_lab_mm, R_lab_body, model)
+    nodes, weights = np.polynomial.legendre.leggauss(pixels.instants)
+    views = []
+    for at in (nodes / 2).tolist():
+        turn, move = (at * pixels.moved).split(3, dim=-1)
+        views.append(_view_at(pixels, position_lab_mm + move, so3.exp(turn) @ R_lab_body, model))
+    return _mean_view(views, (weights / 2).tolist())
+
+
+def _mean_view(views: Sequence[SphereView], shares: Sequence[float]) -> SphereView:
+    """Return the mean of views, each of a share of the exposure; paint counts as far as the sphere covers the pixel."""
+
+    def mean(parts: Sequence[Tensor]) -> Tensor:
+        total = parts[0] * shares[0]
+        for part, share in zip(parts[1:], shares[1:], strict=True):
+            total = total + part * share
+        return total
+
+    coverage = mean([view.coverage for view in views])
+    counts = [view.coverage + COVER_MIN for view in views]
+    whole = mean(counts)
+    told = [view.known for view in views if view.known is not None]
+
+    def painted(name: str) -> Tensor:
+        parts: list[Tensor] = [getattr(view, name) for view in views]
+        return mean(
+            [part * (count if part.ndim == 2 else count[:, None]) for part, count in zip(parts, counts, strict=True)]
+        ) / (whole if parts[0].ndim == 2 else whole[:, None])
+
+    return SphereView(
+        paint=painted("paint"),
+        coverage=coverage,
+        across=painted("across"),
+        outward=torch.nn.functional.normalize(painted("outward"), dim=1),
+        aside=painted("aside"),
+        paint_by_rotation=painted("paint_by_rotation"),
+        paint_by_position=painted("paint_by_position"),
+        coverage_by_position=mean([view.coverage_by_position for view in views]),
+        known=torch.stack(told).all(0) if told else None,
+    )
+
+
+def _view_at(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model: SphereModel) -> SphereView:
+    """Render the sphere at rest, as `sphere_view`.
     Two look-ups per pixel, four near the limb, reproduce mean and width of the Gaussian cut off at the limb, as the
     curvature stretches it over the paint. Derivatives hold their spread fixed. The model's light is not used.
     Source: docs/errata.md A4 (the cap and the ellipse that a perspective camera sees); mean and variance of a cut-off

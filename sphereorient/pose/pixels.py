@@ -18,7 +18,7 @@ from sphereorient.locate import Background
 VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
 # Parts of `Pixels`, the places along their last axis.
 ALONG_PLACES = ("grey", "behind", "inside", "clipped", "direction")
-OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm")  # and those with an entry for each disk
+OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm", "moved")  # and those with an entry for each disk
 INNER = 0.75  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
 
 
@@ -37,8 +37,10 @@ class Pixels:
     axes: Tensor  # (L, 2, 3), the camera's x and y in the lab
     pitch_rad: Tensor  # (L,), angle between neighbouring lines of sight at the disk's middle
     pitch_mm: Tensor  # (L,), how far apart they start; 0 but behind a wall and in parallel light
+    moved: Tensor  # (L, 6) float64, turn (rad) and move (mm, lab) of the sphere while the shutter is open
     tile: Tensor  # (P,) int64, square tile of the disk that a place belongs to, for errors that neighbours share
     inner: int = 0  # number of first places well within the limb
+    instants: int = 1  # of the exposure that are rendered; 1: the sphere as if at rest
 
     def __len__(self) -> int:
         """Return the number of disks."""
@@ -168,6 +170,7 @@ def cut_pixels(
         axes=sight.axes[None],
         pitch_rad=pitch_rad[None],
         pitch_mm=pitch_mm[None],
+        moved=torch.zeros(1, 6, dtype=torch.float64),
         tile=stencil.tile,
         inner=stencil.inner,
     )

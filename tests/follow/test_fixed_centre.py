@@ -134,7 +134,7 @@ def followed_poses(
         begun = learn(Job(recording=recording, settings=settings, device=torch.device("cpu")), silent)
         known, search = begun.appearance, begun.tracker.search
         views = known.fitter.views
-        shots = sample_frames(recording, views, settings.refine.appearance_frames)
+        shots, _ = sample_frames(recording, views, settings.refine.appearance_frames)
         place = find_fixed_centre(search, shots, known.score_min)
         assert place is not None
         movies = [

@@ -62,6 +62,16 @@ def test_the_next_pose_continues_the_motion_whatever_the_times(frames, change):
     assert_close(expected.R_lab_body, so3.exp(angle(3.2, change) * AXIS), 1e-9)
 
 
+def test_the_shutter_sees_its_share_of_the_motion():
+    # From 2 to 3.2: a shutter that is open for 0.3 of these 1.2 sees a quarter of the way.
+    expected = lane([0, 1, 2], 0.0).expected(3, RADIUS_MM, exposure_s=0.3)
+    way = torch.cat([(angle(3.2, 0.0) - angle(TIMES[2], 0.0)) * AXIS, place(3.2, 0.0) - place(TIMES[2], 0.0)])
+    assert_close(expected.moved, 0.3 / (TIMES[3] - TIMES[2]) * way, 1e-9)
+    rough = lane([2], 0.0).expected(3, RADIUS_MM, exposure_s=0.3)
+    assert not rough.moved.any()
+    assert rough.open_share == pytest.approx(0.3 / (TIMES[3] - TIMES[2]))
+
+
 def test_without_a_known_motion_the_ball_is_near_where_it_was():
     after_a_pause = [0.0, 1.0, 2.0, 9.0]
     for one in (lane([2], 0.0), lane([0, 2], 0.0), lane([0, 1, 2], 0.0, after_a_pause)):

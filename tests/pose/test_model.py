@@ -269,6 +269,48 @@ def test_sharp_paint_changes_as_its_derivatives_say_on_the_whole(model):
     assert seen.max() > 0.9
 
 
+# --- while it moves
+
+
+MOVED = f64([[0.04, -0.06, 0.08, 2.0 * PITCH_MM, 0.0, -1.5 * PITCH_MM]])  # turn, rad, and move, mm
+
+
+def exposed(view: SphereView) -> Tensor:
+    return (view.coverage * view.paint)[0]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_moving_sphere_is_the_mean_over_the_exposure(model):
+    one, (X, R) = rig(model, 40.0), ball()
+    pixels = empty(one, X)
+    shares = (torch.arange(40) + 0.5) / 40 - 0.5
+    instants = [looked(pixels, X + s * MOVED[:, 3:], so3.exp(s * MOVED[:, :3]) @ R) for s in shares]
+    mean = torch.stack([exposed(view) for view in instants]).mean(0)
+    moving = looked(replace(pixels, moved=MOVED, instants=4), X, R)
+    still = (exposed(looked(pixels, X, R)) - mean).square().mean().sqrt()
+    assert (exposed(moving) - mean).square().mean().sqrt() < 0.03 * still
+    cover = torch.stack([view.coverage[0] for view in instants]).mean(0)
+    assert (moving.coverage[0] - cover).abs().max() < 0.02
+    at_rest = looked(replace(pixels, instants=3), X, R)
+    assert torch.allclose(exposed(at_rest), exposed(looked(pixels, X, R)), atol=1e-6)
+
+
+def test_a_moving_sphere_changes_as_its_derivatives_say():
+    one, (X, R) = rig("pinhole", 40.0), ball()
+    pixels = replace(empty(one, X), moved=MOVED, instants=3)
+    view = looked(pixels, X, R)
+    by_place = view.coverage * view.paint_by_position[0] + view.paint * view.coverage_by_position[0]
+    by_pose = torch.cat([view.coverage * view.paint_by_rotation[0], by_place])
+    for i, size in enumerate([0.3 * PITCH_MM / RADIUS_MM] * 3 + [0.3 * PITCH_MM] * 3):
+        if i == 4:  # along the line of sight
+            continue
+        step = torch.zeros(6, dtype=torch.float64)
+        step[i] = 0.5 * size
+        both = [looked(pixels, X + s * step[3:], so3.exp(s * step[:3])[None] @ R) for s in (1, -1)]
+        change = exposed(both[0]) - exposed(both[1])
+        assert float((change @ by_pose[i]) / (by_pose[i] @ by_pose[i])) == pytest.approx(size, rel=0.06)
+
+
 # --- in the middle, beyond, in batches
 
 

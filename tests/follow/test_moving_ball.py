@@ -1,0 +1,49 @@
+"""A ball that moves while the shutter is open: its motion is measured, told apart from blur, and rendered."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from sphereorient import so3
+from sphereorient.evaluate.robustness.scenes import BenchmarkScene, write_scene
+from sphereorient.methods.method import Learnt
+from sphereorient.run.stages import run
+from sphereorient.run.store import MemoryStore, Request
+
+
+def off_deg(track, experiment) -> np.ndarray:
+    with h5py.File(experiment.parent / "truth.h5") as truth:
+        R = torch.from_numpy(truth["orientation"][()])
+    return np.degrees(so3.geodesic_distance(torch.from_numpy(track.orientation), R).numpy())
+
+
+@pytest.mark.slow
+def test_motion_while_the_shutter_is_open_is_no_blur(tmp_path):
+    scene = BenchmarkScene(kind="moving", level=3, seed=0, number=0, degradations={"motion_blur": 3}, frames=24)
+    experiment, known = write_scene(tmp_path, scene), tmp_path / "learnt.h5"
+    track = run(Request(experiment=experiment, save_learnt=known), MemoryStore())
+    learnt = Learnt.load(known)
+    # The optics' 0.55 px and the pixel's own 0.29 px; 8 degrees in an exposure are 5 px.
+    assert learnt.blur_px == pytest.approx(0.62, rel=0.1)
+    assert learnt.still_blur_px > 1.3 * learnt.blur_px
+    assert learnt.instants > 2
+    off = off_deg(track, experiment)
+    assert np.median(off) < 0.03
+    sigma = np.degrees(np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)))
+    assert np.sqrt(np.mean((off / sigma) ** 2)) < 1.5
+
+    again = run(Request(experiment=experiment, learnt=known), MemoryStore())
+    assert again.orientation.tobytes() == track.orientation.tobytes()
+    assert again.orientation_cov.tobytes() == track.orientation_cov.tobytes()
+
+    # Without a known exposure all of it counts as blur.
+    keys = yaml.safe_load(experiment.read_text())
+    del keys["exposure"]
+    experiment.write_text(yaml.safe_dump(keys))
+    asis = run(Request(experiment=experiment, save_learnt=tmp_path / "asis.h5"), MemoryStore())
+    assert Learnt.load(tmp_path / "asis.h5").instants == 1
+    assert np.median(off_deg(asis, experiment)) > 2 * np.median(off)

@@ -1,0 +1,62 @@
+"""Errors that all frames share: small where there is noise alone, and as large as they are where light stays wrong."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from refine_examples import RADIUS_MM, balls, cut, fitted, model_of, noisy, pictures_of, rig_of
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.pose.fit import FittedPoses, trace
+from sphereorient.pose.lasting import ASIDE_PX, FEWEST_FRAMES, Lasting, lasting_errors
+
+COUNT, SIGMA = 24, 4.0
+LOBE, LOBE_AT, LOBE_WIDTH = 60.0, (0.45, -0.3), 0.2  # grey levels; radii along the camera's x and y
+RIG = rig_of()
+
+
+def measured(count: int, lobe: float) -> tuple[Tensor, FittedPoses, Lasting]:
+    """Errors (B, 6), rad and mm, of fits to pictures with a reflection that no model knows, and what lasts of them."""
+    X, R = balls(count, 4)
+    pictures = pictures_of(RIG, "patches", X, R)
+    row, column = torch.meshgrid(*(torch.arange(size) for size in pictures.shape[-2:]), indexing="ij")
+    for c, camera in enumerate(RIG.cameras):
+        middle, radius = camera.project(X), RIG.diameter_px / 2
+        right, down = ((grid - at[:, None, None]) / radius for grid, at in zip((column, row), middle.T, strict=True))
+        away2 = (right - LOBE_AT[0]).square() + (down - LOBE_AT[1]).square()
+        pictures[:, c] += lobe * torch.exp(-0.5 * away2 / LOBE_WIDTH**2) * (right.hypot(down) < 0.97)
+    pixels = cut(RIG, noisy(pictures, SIGMA, 7), X)
+    fit = fitted(RIG, "patches", pixels, X, R, SIGMA)
+    model = model_of(RIG.table("patches"), SIGMA)
+    found = lasting_errors(pixels, fit, torch.ones(count, 2, dtype=torch.bool), model)
+    off = torch.cat([so3.log(fit.R_lab_body @ R.mT), fit.position_lab_mm - X], dim=-1)
+    return off, fit, found
+
+
+def test_of_noise_alone_little_lasts():
+    _, fit, found = measured(COUNT, 0.0)
+    frame = trace(fit.covariance[:, :3, :3]).mean()
+    aside = 3 * (ASIDE_PX * RIG.px_mm / RADIUS_MM) ** 2
+    assert trace(found.covariance[:3, :3]) - aside < 0.1 * frame
+    assert bool((torch.linalg.eigvalsh(found.covariance) > 0).all())
+    assert found.own_rad2.shape == (2, 3, 3)
+
+
+def test_what_a_reflection_does_to_all_poses_is_stated():
+    off, _, found = measured(COUNT, LOBE)
+    calm = measured(COUNT, 0.0)[2]
+    assert trace(found.covariance[:3, :3]) > 3 * trace(calm.covariance[:3, :3])
+    mean = off.mean(0)
+    distance2 = mean @ torch.linalg.solve(found.covariance, mean)
+    assert 0.3 < float((distance2 / 6).sqrt()) < 3.0
+
+
+def test_of_few_frames_only_the_limb_is_known_to_be_uncertain():
+    found = measured(FEWEST_FRAMES - 1, LOBE)[2]
+    sigma_mm = found.covariance.diagonal()[3:].sqrt()
+    assert float(sigma_mm.max()) == pytest.approx(ASIDE_PX * RIG.px_mm, rel=0.05)
+    assert float(found.covariance[0, 0].sqrt()) == pytest.approx(float(sigma_mm[0]) / RADIUS_MM, rel=1e-6)
+    alone = found.of(1)
+    assert alone.own_rad2.shape == (1, 3, 3)
+    assert torch.equal(alone.covariance[:3, :3], found.own_rad2[1])
