@@ -118,9 +118,7 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
         centre_sigma_px=(picked["own_sigma_mm"][:, place] * radius_px / learnt.fitter.radius_mm).numpy(),
         radius_px=radius_px.numpy(),
         orientation=torch.where(where, exp(picked["own_turn"][:, place]) @ R, torch.nan).numpy(),
-        orientation_cov=torch.where(
-            where, picked["own_covariance"][:, place] + learnt.lasting.own_rad2[place], torch.nan
-        ).numpy(),
+        orientation_cov=torch.where(where, picked["own_covariance"][:, place], torch.nan).numpy(),
         score=picked["score"][:, place].numpy(),
         reason=tuple(str(why) for why in reason),
         candidate_offset=torch.nn.functional.pad(counts.cumsum(0), (1, 0)).numpy(),

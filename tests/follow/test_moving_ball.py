@@ -32,7 +32,7 @@ def test_motion_while_the_shutter_is_open_is_no_blur(tmp_path):
     assert learnt.still_blur_px > 1.3 * learnt.blur_px
     assert learnt.instants > 2
     off = off_deg(track, experiment)
-    assert np.median(off) < 0.03
+    assert np.median(off) < 0.04
     sigma = np.degrees(np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)))
     assert np.sqrt(np.mean((off / sigma) ** 2)) < 1.5
 
@@ -46,4 +46,4 @@ def test_motion_while_the_shutter_is_open_is_no_blur(tmp_path):
     experiment.write_text(yaml.safe_dump(keys))
     asis = run(Request(experiment=experiment, save_learnt=tmp_path / "asis.h5"), MemoryStore())
     assert Learnt.load(tmp_path / "asis.h5").instants == 1
-    assert np.median(off_deg(asis, experiment)) > 2 * np.median(off)
+    assert np.median(off_deg(asis, experiment)) > 1.5 * np.median(off)
