@@ -156,24 +156,20 @@ def estimate_appearance(
         with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
             settings = settings.model_copy(update={"blur_px": blur_px})
             return estimate_appearance(matched, frames, base, settings, following)
-    worn = None
+    worn, paint = None, base
     if settings.learn_paint:
         fitter, fit, worn = _without_worn(fitter, base, pixels, fit, use)
         if worn is not None:  # the blur, too, was found with it
-            given = settings.blur_px is not None
-            fitter, fit = _light_and_blur(fitter, without(base, worn), pixels, fit, use, given=given)
-    still, moved = fitter, None
+            given, paint = settings.blur_px is not None, without(base, worn)
+            fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=given)
+    blurred, moved = fitter.optics, None
     if following is not None and looked is found:
-        still, moved = _exposed(fitter, fit, use, _clear(found), following)
-    if moved is None:
-        fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
-        still = fitter
-    else:
-        fitter, pixels, use = still, still.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
-        paint = base if worn is None else without(base, worn)
+        fitter, moved = _exposed(fitter, fit, use, _clear(found), following)
+    if moved is not None:
+        pixels, use = fitter.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
         fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=False)
-        fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
-        still = replace(still, light=fitter.light, instants=1)
+    fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
+    still = fitter if moved is None else replace(fitter, optics=blurred, instants=1)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
     best, highest = _scores(looked)
@@ -247,7 +243,7 @@ def _usual_apart(fit: FittedPoses, use: Tensor) -> float:
 
 
 def _limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
-    """Return by how much the limb lies outside of where all cameras together place it, (C,), px: the mean of B poses.
+    """Return by how much the limb lies outside of where all cameras together place it, (C,), px: the median of B poses.
     A wrong diameter, glare, or glass that the cameras' model lacks. 0 where fewer than `FEWEST_BOTH` poses tell.
     """
     found = torch.zeros(len(fitter.views), dtype=torch.float64)

@@ -32,6 +32,7 @@ KNOWN = 0.3  # least share of a disk that shows known paint
 NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it
 STRAY_ROUNDS, STRAY_TUKEY, FEWEST_BESIDE = 5, 6.0, 200  # rounds, standard deviations, pixels
 STRAY_LEAST = 0.05  # coefficients, summed, of the step from black to white paint: clean pictures 0.01, glare 0.13
+RIDGE = 1e-5  # of light maps, relative to the diagonal
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 
@@ -391,10 +392,15 @@ def learn_stray(at: Residuals, pixels: Pixels, use: Tensor, known: Tensor) -> Te
     return found
 
 
+def light_columns(view: SphereView) -> Tensor:
+    """Return what each coefficient of light maps, K of difference and K of black, adds to L disks, (L, 2 K, P)."""
+    basis = light_basis(view.across)
+    return torch.cat([(view.coverage * view.paint)[:, None] * basis, view.coverage[:, None] * basis], dim=1)
+
+
 def light_sums(view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:
     """Return the normal equations of light maps of L disks, (L, 2 K, 2 K) and (L, 2 K); precision (L, P)."""
-    basis = light_basis(view.across)
-    columns = torch.cat([(view.coverage * view.paint)[:, None] * basis, view.coverage[:, None] * basis], dim=1)
+    columns = light_columns(view)
     weighted = columns * precision[:, None]
     target = pixels.grey - (1.0 - view.coverage) * pixels.behind
     return (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double()
@@ -402,8 +408,8 @@ def light_sums(view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Ten
 
 def light_maps(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     """Solve the summed normal equations (C, 2 K, 2 K), (C, 2 K) for the maps of difference and black, (C, K) each."""
-    # The basis is nearly dependent (x^2 + y^2 + depth^2 = 1): a ridge of 1e-5 picks the smallest coefficients.
-    ridge = 1e-5 * normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9)
+    # The basis is nearly dependent (x^2 + y^2 + depth^2 = 1): a ridge picks the smallest coefficients.
+    ridge = RIDGE * normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9)
     solution = torch.linalg.solve(normal + torch.diag_embed(ridge), right).float()
     difference, black = solution.chunk(2, dim=-1)
     return difference, black

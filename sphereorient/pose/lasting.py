@@ -8,15 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sphereorient.pose.fit import FittedPoses, Residuals, by_pose, settled
-from sphereorient.pose.model import Light, SphereModel, light_basis
+from sphereorient.pose.fit import RIDGE, FittedPoses, Residuals, by_pose, light_columns, settled
+from sphereorient.pose.model import Light, SphereModel
 from sphereorient.pose.pixels import Pixels
 from sphereorient.so3 import inverse_damped
 
 FEWEST_FRAMES = 8  # from which it is seen what stays
 TILES = 4  # along each axis of the disk: errors of light are wide
 WHOLE = 0.98  # coverage of a pixel that the limb does not cut: the limb has tiles of its own
-RIDGE = 1e-5  # of `light_maps`
 ASIDE_PX = 0.004  # by how much the model's limb and paint may lie aside: large balls would state less
 
 
@@ -57,10 +56,8 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     if len(use) < FEWEST_FRAMES:
         return Lasting(covariance=aside.square().diag(), own_rad2=aside_rad2)
     at = settled(pixels, fit, model, cameras)
-    basis = light_basis(at.view.across)
-    light = torch.cat([(at.view.coverage * at.view.paint)[:, None] * basis, at.view.coverage[:, None] * basis], dim=1)
     precision = at.weight / at.variance * use.reshape(-1, 1)
-    columns = torch.cat([at.design, light], dim=1)
+    columns = torch.cat([at.design, light_columns(at.view)], dim=1)
     normal = ((columns * precision[:, None]) @ columns.mT).double()
     # The frame's own coefficients of light are eliminated; left are 6 of the pose and 2 K of the light of all frames.
     free = at.design.shape[1]

@@ -7,7 +7,7 @@ one light in the lab for all cameras (`lab_light`).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Protocol
 
 import numpy as np
@@ -198,12 +198,19 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
     """
     if pixels.instants == 1:
         return _view_at(pixels, position_lab_mm, R_lab_body, model)
-    nodes, weights = np.polynomial.legendre.leggauss(pixels.instants)
+    instants, shares = _exposure(pixels.instants)
     views = []
-    for at in (nodes / 2).tolist():
-        turn, move = (at * pixels.moved).split(3, dim=-1)
+    for at in instants:
+        turn, move = at * pixels.moved[:, :3], at * pixels.moved[:, 3:]
         views.append(_view_at(pixels, position_lab_mm + move, so3.exp(turn) @ R_lab_body, model))
-    return _mean_view(views, (weights / 2).tolist())
+    return _mean_view(views, shares)
+
+
+@cache
+def _exposure(instants: int) -> tuple[list[float], list[float]]:
+    """Return instants from -1/2 to 1/2 of the exposure, and their shares of its light: Gauss-Legendre quadrature."""
+    nodes, weights = np.polynomial.legendre.leggauss(instants)
+    return (nodes / 2).tolist(), (weights / 2).tolist()
 
 
 def _mean_view(views: Sequence[SphereView], shares: Sequence[float]) -> SphereView:

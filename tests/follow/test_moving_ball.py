@@ -1,4 +1,4 @@
-"""A ball that moves while the shutter is open: its motion is measured, told apart from blur, and rendered."""
+"""`track` measures how far a ball moves during the exposure, and renders this motion instead of a wider blur."""
 
 from __future__ import annotations
 
