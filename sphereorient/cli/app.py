@@ -219,10 +219,12 @@ def info() -> None:
     import torch
 
     from sphereorient.files.provenance import versions
+    from sphereorient.pose.compiled import library
 
     for package, number in versions().items():
         typer.echo(f"{package:24} {number}")
     typer.echo(f"{'threads':24} {torch.get_num_threads()} of {os.cpu_count()} cores")
+    typer.echo(f"{'fit':24} {'compiled' if library() else 'torch (no compiled code for this machine: slower)'}")
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu (no GPU found)"
     typer.echo(f"{'device':24} {device}")
 

@@ -10,9 +10,9 @@ from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
 from sphereorient.mapping.grid import READS, Array, SplineTable, conjugate_gradients, stiffness
-from sphereorient.pose.fit import Residuals, grey_by_pose, residuals
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.residuals import Residuals, grey_by_pose, residuals
 
 DEPTH_MIN = 0.2  # cosine of the slant below which a pixel is not used for the map
 POSE = 6  # unknowns of a pose

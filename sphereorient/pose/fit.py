@@ -12,28 +12,26 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.pose.compiled import disk_sums
 from sphereorient.pose.model import (
     Light,
+    Shading,
     SphereModel,
     SphereView,
     light_basis,
     no_stray,
-    polynomials,
     scene_beside,
-    sphere_view,
     stray_basis,
 )
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.residuals import NOISE_MIN, Residuals, by_pose, residuals
 from sphereorient.so3 import inverse_damped, solve_damped
 
-TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
 EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
-KNOWN = 0.3  # least share of a disk that shows known paint
 NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it
 STRAY_ROUNDS, STRAY_TUKEY, FEWEST_BESIDE = 5, 6.0, 200  # rounds, standard deviations, pixels
 STRAY_LEAST = 0.05  # coefficients, summed, of the step from black to white paint: clean pictures 0.01, glare 0.13
 RIDGE = 1e-5  # of light maps, relative to the diagonal
-NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,22 +87,6 @@ def blank_parts(cameras: int, *shape: int) -> dict[str, Tensor]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Residuals:
-    """The linear problem at one pose, of L disks; made by `residuals`."""
-
-    view: SphereView
-    design: Tensor  # (L, 6 + K, P), derivatives by pose and by the light's coefficients
-    residual: Tensor  # (L, P), grey levels
-    model: Tensor  # (L, P), grey levels
-    variance: Tensor  # (L, P), expected
-    weight: Tensor  # (L, P), robust and inside, 0 .. 1
-    inside: Tensor  # (L, P) bool, the pixels that count: of known paint
-    deviation: Tensor  # (L,), robust standard deviation of the residuals over the noise expected
-    lit: Tensor  # (L, P), grey levels from black to white paint, the frame's own light included, coverage too
-    over: Tensor  # (L, P), grey levels of the sphere above the background
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class PoseStart:
     """Where the fit of B poses begins."""
 
@@ -127,15 +109,10 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
     origin = by_pose(pixels.origin[..., 0].double(), cameras)
     seen = use.to(X.dtype)
     state: tuple[Tensor, Tensor] | None = None
-    for _ in range(iterations):
-        at = residuals(pixels, X, R, state, model, cameras)
-        state = at.model, at.weight
-        precision = at.weight / at.variance
-        weighted = at.design * precision[:, None]
-        normal = (weighted @ at.design.mT).double()
-        gradient = (weighted @ at.residual[..., None])[..., 0].double()
-        information, pull, mixed = _without_light(normal, gradient)
-        information, pull = (by_pose(part, cameras) for part in (information, pull))
+    for k in range(iterations):
+        sums = disk_sums(pixels, X, R, state, model, cameras, tell=k == iterations - 1)
+        state = sums.state
+        information, pull = by_pose(sums.information, cameras), by_pose(sums.pull, cameras)
         whole = (information * seen[..., None, None]).sum(1)
         force = (pull * seen[..., None]).sum(1)
         if place_precision is not None:
@@ -144,6 +121,8 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         step = _bounded(solve_damped(whole, force), X[:, None] - origin, seen, radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
+    told = sums.told
+    assert told is not None  # of the last step
     to_centre = X[:, None] - origin
     own = solve_damped(
         information[..., :3, :3], pull[..., :3] - (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
@@ -152,7 +131,7 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
     freely = inverse_damped(information)
     freed = ((freely @ pull[..., None])[..., 0] - step[:, None]).flatten(0, 1)
     alone = _bounded(freed, to_centre.flatten(0, 1)[:, None], freed.new_ones(len(freed), 1), radius_mm)
-    shared = by_pose(_shared_scores(at, precision, mixed, pixels.tile), cameras)
+    shared = by_pose(_shared_scores(told.scores, model.shading), cameras)
     meat = (shared * seen[..., None, None]).sum(1)
     if place_precision is not None:  # the prior position has an error of its own
         meat[:, 3:, 3:] += place_precision
@@ -168,15 +147,14 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         found = (model.limb_px[:, None].to(lured) * lured).sum(1)[..., None]
         covariance = covariance + found @ found.mT
     finest_mm = by_pose(px_mm, cameras)[..., 0].masked_fill(~use, math.inf).amin(1).nan_to_num(0.0, 0.0, 0.0)
-    aside_px = (_limb_moved_px(at, pixels.inner, model, cameras) * seen).amax(1)
+    aside_px = (_limb_moved_px(by_pose(told.step, cameras), model) * seen).amax(1)
     aside_mm = (aside_px * finest_mm)[:, None].expand(-1, 3)
     covariance = covariance + torch.diag_embed(torch.cat([aside_mm / radius_mm, aside_mm], dim=1).square())
     sight = torch.nn.functional.normalize(to_centre, dim=-1)[..., None]
     place = (freely @ shared @ freely)[..., 3:, 3:]
     across = trace(place) - (sight.mT @ place @ sight)[..., 0, 0]
-    told = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge
-    covariance = torch.where(told[:, None, None], 0.5 * (covariance + covariance.mT), bread)
-    loss = by_pose(_loss(at, pixels.inside), cameras)
+    any_seen = (whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge
+    covariance = torch.where(any_seen[:, None, None], 0.5 * (covariance + covariance.mT), bread)
     return FittedPoses(
         position_lab_mm=X,
         R_lab_body=R,
@@ -186,118 +164,16 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
         own_covariance=own_covariance,
         own_sigma_mm=(across.clamp_min(0) / 2).sqrt(),
         excess=(trace(own_covariance) / trace(own_bread).clamp_min(1e-30)).sqrt(),
-        score=by_pose(_score(at).double(), cameras),
-        nll=(loss * seen).sum(1),
+        score=by_pose(told.share, cameras),
+        nll=(by_pose(told.loss, cameras) * seen).sum(1),
         step=step,
     )
-
-
-def residuals(
-    pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel, cameras: int
-) -> Residuals:
-    """Linearise the pictures of B * C disks about poses X (B, 3), mm, R_lab_body R (B, 3, 3), the light at its best.
-    `state`: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
-    """
-    view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
-    difference, black = model.light.at(view, pixels)  # as learnt
-    tints = polynomials(view.across, max(model.shading.difference, model.shading.black))
-    n, n_black = ((order + 1) * (order + 2) // 2 for order in (model.shading.difference, model.shading.black))
-    learnt = (view.coverage * (view.paint * difference + black))[:, None]
-    columns = torch.cat([learnt * tints[:, :n], view.coverage[:, None] * tints[:, :n_black]], dim=1)
-    beside = scene_beside(view, pixels, model.light.stray)
-    beyond = (1.0 - view.coverage) * beside
-    noise = model.light.noise.repeat(len(X), 1)
-    inside = pixels.inside if view.known is None else pixels.inside & view.known
-    target = pixels.grey - beyond
-    # The first weights come from the picture itself, bubbles included; a second round does without it.
-    rounds = (pixels.grey, (inside & ~pixels.clipped).to(columns.dtype)) if state is None else state
-    for _ in range(1 if state is not None else 2):
-        expected, weight = rounds
-        weighted = columns * (weight / _variance(expected, noise))[:, None]
-        coefficients = solve_damped(
-            (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double(), ridge=1e-7
-        ).to(columns.dtype)
-        painted = (coefficients[:, None] @ columns)[:, 0]
-        grey, residual = painted + beyond, target - painted
-        # A saturated pixel tells only that its grey level is at least this one.
-        silent = pixels.clipped & (residual <= 0)
-        residual = residual.masked_fill(silent, 0.0)
-        variance = _variance(grey, noise)
-        deviation = _deviation(residual, variance, inside)
-        variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
-        weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * (inside & ~silent)
-        rounds = grey, weight
-    gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
-    offset = (coefficients[:, None, n:] @ tints[:, :n_black])[:, 0]
-    step, ground = difference * gain, black * gain + offset
-    lit = view.coverage * step
-    over = view.paint * step + ground - beside
-    return Residuals(
-        view=view,
-        design=torch.cat([grey_by_pose(view, lit, over), columns], dim=1),
-        residual=residual,
-        model=grey,
-        variance=variance,
-        weight=weight,
-        inside=inside,
-        deviation=deviation,
-        lit=lit,
-        over=over,
-    )
-
-
-def _limb_moved_px(at: Residuals, inner: int, model: SphereModel, cameras: int) -> Tensor:
-    """Return by how much stray light, were it unknown, would move the limbs of B * C disks, (B, C): it is not known
-    much better than that, as it does not end at the limb.
-    """
-    stray = model.light.stray.double()
-    share = stray.square() @ stray.new_tensor([1.0] + [0.5] * (stray.shape[1] - 1))  # mean square over the angle
-    step = by_pose(at.lit[:, :inner].double().median(-1).values, cameras)
-    return model.blur_px * share.sqrt() / step.clamp_min(1.0)
 
 
 def settled(pixels: Pixels, fit: FittedPoses, model: SphereModel, cameras: int) -> Residuals:
     """Linearise the pictures of B * C disks about fitted poses, with weights that no bubble has set."""
     at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
     return residuals(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model, cameras)
-
-
-def grey_by_pose(view: SphereView, lit: Tensor, over: Tensor) -> Tensor:
-    """Return the derivatives (L, 6, P) of grey by delta (rad) and position (mm); `lit`, `over` as in `Residuals`."""
-    paint, limb = lit[:, None], over[:, None]
-    return torch.cat(
-        [paint * view.paint_by_rotation, paint * view.paint_by_position + limb * view.coverage_by_position], dim=1
-    )
-
-
-def by_pose(disks: Tensor, cameras: int) -> Tensor:
-    """Return (B * C, ...) as (B, C, ...)."""
-    return disks.reshape(-1, cameras, *disks.shape[1:])
-
-
-def _variance(grey: Tensor, noise: Tensor) -> Tensor:
-    """Return the noise variance expected at grey levels (L, P) by the curves (L, 4)."""
-    grey = grey.clamp_min(0.0)
-    a, b, c, d = noise[..., None].unbind(1)
-    variance: Tensor = a + grey * (b + grey * (c + grey * d))
-    return variance.clamp_min(NOISE_MIN)
-
-
-def _deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
-    """Return the robust standard deviation of residuals over the noise expected, (L,), at least 1."""
-    # A quarter of the places suffices: they are in order of distance from the middle.
-    residual, variance, inside = residual[:, ::4], variance[:, ::4], inside[:, ::4]
-    scaled = torch.where(inside, residual.abs() * variance.rsqrt(), torch.nan)
-    return 1.4826 * torch.nan_to_num(scaled.nanmedian(-1).values)
-
-
-def _without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Eliminate the light's coefficients: information (L, 6, 6), gradient (L, 6), coupling to the pose."""
-    light = normal[:, 6:, 6:]
-    light = light + 1e-7 * torch.diag_embed(light.diagonal(dim1=-2, dim2=-1) + 1e-12)
-    mixed = torch.linalg.solve(light, normal[:, 6:, :6])
-    information = normal[:, :6, :6] - normal[:, :6, 6:] @ mixed
-    return information, gradient[:, :6] - (mixed.mT @ gradient[:, 6:, None])[..., 0], mixed
 
 
 def trace(matrix: Tensor) -> Tensor:
@@ -316,39 +192,24 @@ def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) ->
     return step * (0.1 / size.clamp_min(0.1))[:, None]
 
 
-def _shared_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:
-    """Sum over tiles the outer products of their scores, (L, 6, 6): errors of neighbours are not independent."""
-    by_pose = at.design[:, :6] - mixed.mT.to(at.design.dtype) @ at.design[:, 6:]
-    score = by_pose * (precision * at.residual)[:, None]
-    tiles = score.new_zeros(*score.shape[:2], int(tile.max()) + 1 if len(tile) else 1)
-    tiles = tiles.index_add(2, tile, score).double()
-    count, fitted = tiles.shape[2], at.design.shape[1]
+def _limb_moved_px(step: Tensor, model: SphereModel) -> Tensor:
+    """Return by how much stray light, were it unknown, would move the limbs of B * C disks, (B, C): it is not known
+    much better than that, as it does not end at the limb. `step` (B, C): grey levels from black to white paint.
+    """
+    stray = model.light.stray.double()
+    share = stray.square() @ stray.new_tensor([1.0] + [0.5] * (stray.shape[1] - 1))  # mean square over the angle
+    return model.blur_px * share.sqrt() / step.clamp_min(1.0)
+
+
+def _shared_scores(tiles: Tensor, shading: Shading) -> Tensor:
+    """Sum over tiles the outer products of their scores (L, 6, T), (L, 6, 6): errors of neighbours are not independent."""
+    count, fitted = (
+        tiles.shape[2],
+        6 + sum((order + 1) * (order + 2) // 2 for order in (shading.difference, shading.black)),
+    )
     # Residuals of a fit are smaller than errors: the correction for few clusters (Cameron and Miller 2015, CR1).
     few = count / max(count - fitted, 1)
     return few * (tiles @ tiles.mT)
-
-
-def _loss(at: Residuals, inside: Tensor) -> Tensor:
-    """Return Tukey's loss (L,) with the normalisation of its scale, nats; unknown paint may have any grey level."""
-    share = (at.residual.square() / (TUKEY**2 * at.variance)).clamp_max(1.0)
-    loss = (TUKEY**2 / 6.0) * (1.0 - (1.0 - share) ** 3) + at.deviation.clamp_min(1.0).log()[:, None]
-    if at.view.known is not None:
-        loss = torch.where(at.view.known, loss, (at.lit / (2 * math.pi * at.variance).sqrt()).clamp_min(1.0).log())
-    return (loss * inside).sum(-1).double()
-
-
-def _score(at: Residuals) -> Tensor:
-    """Return the share of the disk's variance that the model explains, (L,); outliers count up to a limit.
-    0 for a disk that shows hardly any known paint.
-    """
-    share = at.view.coverage * at.inside
-    known = share.sum(-1) > KNOWN * at.view.coverage.sum(-1)
-    share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)
-    grey = at.model + at.residual
-    spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
-    left = (share * torch.minimum(at.residual.square(), 4.0 * spread[:, None])).sum(-1)
-    explained = 1.0 - left / spread.clamp_min(1e-9)
-    return torch.where((spread > 1e-6) & known, explained, torch.zeros_like(explained))
 
 
 def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Light:

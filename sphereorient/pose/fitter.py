@@ -15,10 +15,11 @@ from torch import Tensor, nn
 from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, sphere_radius_px
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene
-from sphereorient.pose.fit import KNOWN, FittedPoses, PoseStart, learn_light, refine
+from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
 from sphereorient.pose.lab_light import learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
+from sphereorient.pose.residuals import KNOWN
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 

@@ -13,12 +13,13 @@ import torch
 from scipy.special import sph_harm_y_all
 from torch import Tensor
 
-from sphereorient.pose.fit import FittedPoses, by_pose, learn_stray, noise_curves, residuals
+from sphereorient.pose.fit import FittedPoses, learn_stray, noise_curves
 from sphereorient.pose.model import (
     LATER,
     LIGHT_PARTS,
     Light,
     Lighting,
+    LightTables,
     SphereModel,
     SphereView,
     no_stray,
@@ -27,6 +28,7 @@ from sphereorient.pose.model import (
     surface_normals,
 )
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.residuals import by_pose, residuals
 from sphereorient.sphere.texture import sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 
@@ -73,6 +75,11 @@ class LabLight:
         """Return through and mirrored at depths from 0 to 1, (DEPTHS, 2)."""
         at = (torch.arange(DEPTHS, device=self.gloss.device) + 0.5) / DEPTHS
         return knot_shares(at) @ torch.stack([self.through, self.mirrored], dim=-1)
+
+    @property
+    def tables(self) -> LightTables:
+        """What `at` looks up."""
+        return LightTables(cells=self._map, side=SIDE, cover=self._cover, gain=self.gain)
 
     def parts(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, ...]:
         """Return difference, black, gloss (grey levels), through and mirrored of L disks, (L, P) each."""

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sphereorient.pose.fit import RIDGE, FittedPoses, Residuals, by_pose, light_columns, settled
+from sphereorient.pose.fit import RIDGE, FittedPoses, light_columns, settled
 from sphereorient.pose.model import Light, SphereModel
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.residuals import Residuals, by_pose
 from sphereorient.so3 import inverse_damped
 
 FEWEST_FRAMES = 8  # from which it is seen what stays

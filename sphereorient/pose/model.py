@@ -103,11 +103,25 @@ class Lighting(Protocol):
     def at(self, view: "SphereView", pixels: Pixels) -> tuple[Tensor, Tensor]:
         """Return white less black paint and black paint, grey levels, (L, P) each, of L disks."""
 
+    @property
+    def tables(self) -> "LightTables":
+        """What `at` looks up."""
+
     def of(self, camera: int) -> "Lighting":
         """Return the light of one camera."""
 
     def to(self, device: torch.device) -> "Lighting":
         """Return the light on another device."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LightTables:
+    """Look-up tables of a light: over the disk, or over directions in the lab."""
+
+    cells: Tensor  # (C * side^2, 2), difference and black on each camera's disk; or (side^2, 3), with gloss, in the lab
+    side: int
+    cover: Tensor | None = None  # (n, 2), shares of light through and mirrored at depths 0 .. 1; None: on the disk
+    gain: Tensor | None = None  # (C,), of light in the lab
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -161,6 +175,11 @@ class Light:
         basis = light_basis(across)
         return torch.stack([self.difference @ basis, self.black @ basis], dim=-1).reshape(-1, 2)
 
+    @property
+    def tables(self) -> LightTables:
+        """What `at` looks up."""
+        return LightTables(cells=self._map, side=MAP_SIDE)
+
     def at(self, view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
         """Return difference and black, grey levels, (L, P) each, of L disks, the C cameras of a pose side by side."""
         across, cameras = view.across, len(self.difference)
@@ -198,7 +217,7 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
     """
     if pixels.instants == 1:
         return _view_at(pixels, position_lab_mm, R_lab_body, model)
-    instants, shares = _exposure(pixels.instants)
+    instants, shares = exposure(pixels.instants)
     views = []
     for at in instants:
         turn, move = at * pixels.moved[:, :3], at * pixels.moved[:, 3:]
@@ -207,7 +226,7 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
 
 
 @cache
-def _exposure(instants: int) -> tuple[list[float], list[float]]:
+def exposure(instants: int) -> tuple[list[float], list[float]]:
     """Return instants from -1/2 to 1/2 of the exposure, and their shares of its light: Gauss-Legendre quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(instants)
     return (nodes / 2).tolist(), (weights / 2).tolist()
@@ -266,19 +285,19 @@ def _view_at(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model:
     blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
     # Half of an aperture on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
     edge = (1.0 - 0.5 * blur * blur - q0) / blur
-    coverage = torch.special.ndtr(edge)
-    density = torch.exp(-0.5 * edge * edge) * (1.0 / math.sqrt(2.0 * math.pi))
-    pull = density / coverage.clamp_min(1e-4)
+    coverage, density, pull, variance = limb_shape(edge)
     q = (q0 - blur * pull).clamp(0.0, 1.0)
     inner = pixels.inner
-    variance = (1.0 - pull * (edge + pull)).clamp(SPREAD_MIN, 1.0)[:, :inner]
+    variance = variance[:, :inner]
     spread = blur * variance.sqrt() * q[:, :inner]
     at = torch.stack([q[:, :inner] - spread, q[:, :inner] + spread], dim=1)
     line = d, outward, nearest
     parts = [_sample(at, variance[:, None], [part[..., :inner] for part in line], R, model)]
     if inner < d.shape[-1]:
         outer = slice(inner, None)
-        at, moves = _rim_nodes(q0[:, outer], blur, coverage[:, outer], density[:, outer], q[:, outer])
+        z, moves = rim_shape(coverage[:, None, outer], density[:, None, outer])
+        middle = q[:, None, outer]
+        at = middle + middle * (q0[:, None, outer] + blur[:, None] * z - middle)
         parts.append(_sample(at, moves, [part[..., outer] for part in line], R, model))
     body, turn, shift, *known = (torch.cat(pieces, dim=-1) for pieces in zip(*parts, strict=True))
     return SphereView(
@@ -300,14 +319,25 @@ def surface_normals(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
     return view.aside[:, None] * view.outward - depth[:, None] * pixels.direction, depth
 
 
-def _rim_nodes(q0: Tensor, blur: Tensor, coverage: Tensor, density: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
-    """Return look-ups near the limb, quantiles of the cut-off Gaussian, and their derivatives, (L, n, P) each."""
-    share = ((torch.arange(RIM_NODES, dtype=q0.dtype, device=q0.device) + 0.5) / RIM_NODES)[:, None]
-    z = torch.special.ndtri((share * coverage[:, None]).clamp(1e-6, 1 - 1e-6))
+def limb_shape(edge: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return how a limb cuts a Gaussian aperture `edge` (...) standard deviations inside of it: the share that is left,
+    the density at the limb, how far the mean of the rest lies inwards (deviations), and its variance.
+    """
+    coverage = torch.special.ndtr(edge)
+    density = torch.exp(-0.5 * edge * edge) * (1.0 / math.sqrt(2.0 * math.pi))
+    pull = density / coverage.clamp_min(1e-4)
+    return coverage, density, pull, (1.0 - pull * (edge + pull)).clamp(SPREAD_MIN, 1.0)
+
+
+def rim_shape(coverage: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
+    """Return look-ups along the radius near the limb, quantiles of the cut-off Gaussian in standard deviations, and how
+    far each moves with the sphere, (L, n, P) each, of coverage and density (L, 1, P).
+    """
+    share = ((torch.arange(RIM_NODES, dtype=coverage.dtype, device=coverage.device) + 0.5) / RIM_NODES)[:, None]
+    z = torch.special.ndtri((share * coverage).clamp(1e-6, 1 - 1e-6))
     # The limb holds a node back the more, the nearer it is.
-    moves = 1.0 - share * density[:, None] / (torch.exp(-0.5 * z * z) * (1.0 / math.sqrt(2.0 * math.pi)))
-    middle = middle[:, None]
-    return middle + middle * (q0[:, None] + blur[:, None] * z - middle), moves.clamp(0.0, 1.0)
+    moves = 1.0 - share * density / (torch.exp(-0.5 * z * z) * (1.0 / math.sqrt(2.0 * math.pi)))
+    return z, moves.clamp(0.0, 1.0)
 
 
 def _sample(at: Tensor, moves: Tensor, line: Sequence[Tensor], R: Tensor, model: SphereModel) -> tuple[Tensor, ...]:

@@ -26,7 +26,7 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient.locate import CameraScene
-from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine, residuals
+from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
 from sphereorient.pose.fitter import CameraView, Fitter, first_fitter
 from sphereorient.pose.lab_light import (
     KNOTS,
@@ -43,6 +43,7 @@ from sphereorient.pose.lab_light import (
 )
 from sphereorient.pose.model import FIRST, LATER, SphereModel, no_stray, scene_beside, sphere_view, stray_basis
 from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.residuals import residuals
 from sphereorient.sphere.texture_table import octahedral_directions
 
 SIGMA = 2.0  # grey levels

@@ -1,0 +1,615 @@
+/* The sums of one step of the fit, disk by disk: what `torch_sums` of residuals.py computes, which defines it.
+
+   Built for several instruction sets without fused or reordered arithmetic: all of them give the same bits. Stages over
+   blocks of pixels keep their data in the first cache. Pictures in single precision, sums in double. */
+
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define BLOCK 256
+#define LANES 16
+#define NODES 4       /* most look-ups of a pixel */
+#define TINTS 15      /* monomials up to order 4 */
+#define COLUMNS 36    /* 6 of the pose, and most coefficients of a frame's own light */
+#define HARMONICS 9
+#define EDGE_COLUMNS 12
+#define TWO_PI 6.283185307179586
+
+typedef struct {
+    const float *rows; /* (side^2, 4): a tangent plane for each cell of directions */
+    int64_t side;
+} Table;
+
+typedef struct {
+    int64_t disks, places, inner, cameras, tiles, instants, origins;
+    /* pictures, (disks, places) */
+    const float *grey, *behind;
+    const uint8_t *inside, *clipped;
+    /* geometry: (disks, 3, places), (disks, 3, origins), (disks, 2, 3), (disks), (disks) */
+    const float *direction, *origin, *axes, *pitch_rad, *pitch_mm;
+    const double *moved;    /* (instants, disks, 3) positions, mm */
+    const double *rotation; /* (instants, disks, 3, 3) */
+    const float *shares;    /* (instants) */
+    const int64_t *tile;    /* (places) */
+    /* the model */
+    float radius_mm, blur_px;
+    Table paint, unseen;
+    float unseen_most, known_least, cover_least, sine_most, noise_least, tukey2;
+    const float *edge; /* (edges, EDGE_COLUMNS) from -edge_most to edge_most */
+    int64_t edges;
+    float edge_most;
+    int64_t lab; /* light: 0 on the disk, (cameras, side, side, 2); 1 in the lab, (side^2, 3) */
+    const float *light;
+    int64_t light_side;
+    const float *cover; /* of light in the lab, (depths, 2) */
+    int64_t depths;
+    const float *gain, *noise, *stray; /* (cameras), (cameras, 4), (cameras, HARMONICS) */
+    int64_t n_difference, n_black;     /* columns of a frame's own light */
+    int64_t first, last;               /* whether the state is unknown; whether `told` and `scores` are asked for */
+    /* results; `expected` and `weight` (disks, places) are the state */
+    float *expected, *weight;
+    double *normal, *gradient; /* (disks, n, n), (disks, n), n = 6 + n_difference + n_black */
+    double *scores;            /* (disks, tiles, n) */
+    double *told;              /* (disks, 3): share of variance explained, loss, median step from black to white */
+} Task;
+
+/* What is known of the places of one disk. */
+typedef struct {
+    float *paint, *cover, *x, *y, *aside, *out[3], *turn[3], *move[3], *limb[3], *count;
+    float *difference, *black, *beside, *residual, *variance, *lit, *sorted;
+    uint8_t *known, *counts;
+} Disk;
+
+enum { FLOATS = 24 };
+
+/* The iterations of the next loop do not depend on each other: no array is reached by two names. */
+#if defined(__clang__)
+#define INDEPENDENT _Pragma("clang loop vectorize(assume_safety)")
+#elif defined(__GNUC__)
+#define INDEPENDENT _Pragma("GCC ivdep")
+#else
+#define INDEPENDENT
+#endif
+
+static inline float least(float a, float b) { return a < b ? a : b; }
+static inline float most(float a, float b) { return a > b ? a : b; }
+
+/* The place of a number within 0 .. count - 1; NaN goes to 0. */
+static inline int32_t placed(float at, float count) {
+    at = at > 0.0f ? at : 0.0f;
+    return (int32_t)(at < count - 1.0f ? at : count - 1.0f);
+}
+
+static inline int32_t octahedral_cell(float x, float y, float z, float side) {
+    const float half = 0.5f * side, scale = half / (fabsf(x) + fabsf(y) + fabsf(z));
+    float u = x * scale, v = y * scale;
+    const float folded_u = copysignf(half - fabsf(v), u), folded_v = copysignf(half - fabsf(u), v);
+    u = z < 0 ? folded_u : u;
+    v = z < 0 ? folded_v : v;
+    return placed(v + half, side) * (int32_t)side + placed(u + half, side);
+}
+
+/* Sum of products of two blocks of places, the same for every width of the processor's vectors. */
+static inline double product(const float *restrict a, const float *restrict b) {
+    float lanes[LANES] = {0};
+    for (int i = 0; i < BLOCK; i += LANES)
+        for (int l = 0; l < LANES; l++) lanes[l] += a[i + l] * b[i + l];
+    double sum = 0;
+    for (int l = 0; l < LANES; l++) sum += lanes[l];
+    return sum;
+}
+
+/* Return the element of rank `rank` of some numbers that are not negative, by their bits, the highest first. */
+static float ranked(const float *at, int64_t count, int64_t rank) {
+    static const int shift[] = {21, 10, 0}, bits[] = {11, 11, 10};
+    uint32_t found = 0, mask = 0;
+    for (int step = 0; step < 3; step++) {
+        int32_t counts[2048] = {0};
+        const uint32_t low = (1u << bits[step]) - 1;
+        for (int64_t i = 0; i < count; i++) {
+            uint32_t word;
+            memcpy(&word, at + i, sizeof word);
+            counts[(word >> shift[step]) & low] += (word & mask) == found;
+        }
+        uint32_t bin = 0;
+        while (rank >= counts[bin]) rank -= counts[bin++];
+        found |= bin << shift[step];
+        mask |= low << shift[step];
+    }
+    float value;
+    memcpy(&value, &found, sizeof value);
+    return value;
+}
+
+/* Solve the damped symmetric system (n, n) in place by elimination; `right` becomes the solution. */
+static void solve(double *matrix, double *right, int n, double ridge) {
+    for (int i = 0; i < n; i++) matrix[i * n + i] += ridge * (matrix[i * n + i] > 0 ? matrix[i * n + i] : 0) + 1e-12;
+    for (int k = 0; k < n; k++)
+        for (int i = k + 1; i < n; i++) {
+            const double factor = matrix[i * n + k] / matrix[k * n + k];
+            for (int j = k; j < n; j++) matrix[i * n + j] -= factor * matrix[k * n + j];
+            right[i] -= factor * right[k];
+        }
+    for (int i = n - 1; i >= 0; i--) {
+        for (int j = i + 1; j < n; j++) right[i] -= matrix[i * n + j] * right[j];
+        right[i] /= matrix[i * n + i];
+    }
+}
+
+/* Render a block of places at one instant, added to the disk with the instant's share; as `sphere_view`. */
+static void render(const Task *t, const Disk *to, int64_t k, int64_t instant, int64_t from, int n, float share) {
+    const double *position = t->moved + (instant * t->disks + k) * 3;
+    const double *turned = t->rotation + (instant * t->disks + k) * 9;
+    const float *d[3], *origin = t->origin + k * 3 * t->origins, *axes = t->axes + k * 6;
+    float R[3][3], centre[3], radius = t->radius_mm;
+    double distance2 = 0;
+    for (int c = 0; c < 3; c++) {
+        const double first = position[c] - (double)origin[c * t->origins];
+        centre[c] = (float)first;
+        distance2 += (double)centre[c] * centre[c];
+        d[c] = t->direction + (k * 3 + c) * t->places + from;
+        for (int b = 0; b < 3; b++) R[c][b] = (float)turned[c * 3 + b];
+    }
+    const float blur = t->blur_px * (t->pitch_mm[k] + t->pitch_rad[k] * (float)sqrt(distance2)) / radius;
+    float nearest[BLOCK], q0[BLOCK], edge[BLOCK], out[3][BLOCK], sight_b[3][BLOCK], out_b[3][BLOCK];
+    float shape[EDGE_COLUMNS][BLOCK], q[BLOCK], at[BLOCK], depth[BLOCK], normal[3][BLOCK];
+    float value[BLOCK], radial[BLOCK], flat[3][BLOCK], turn[3][BLOCK], hidden[BLOCK];
+    int32_t cell[BLOCK];
+    float(*to_centre)[BLOCK] = normal; /* not needed at the same time */
+    for (int c = 0; c < 3; c++)
+        for (int i = 0; i < n; i++)
+            to_centre[c][i] = t->origins == 1 ? centre[c] : (float)(position[c] - (double)origin[c * t->origins + from + i]);
+    INDEPENDENT
+    for (int i = 0; i < n; i++) {
+        const float x = to_centre[0][i], y = to_centre[1][i], z = to_centre[2][i];
+        const float along = x * d[0][i] + y * d[1][i] + z * d[2][i];
+        const float ax = along * d[0][i] - x, ay = along * d[1][i] - y, az = along * d[2][i] - z;
+        nearest[i] = most(sqrtf(ax * ax + ay * ay + az * az), 1e-6f * radius);
+        out[0][i] = ax / nearest[i];
+        out[1][i] = ay / nearest[i];
+        out[2][i] = az / nearest[i];
+        q0[i] = nearest[i] / radius;
+        edge[i] = (1.0f - 0.5f * blur * blur - q0[i]) / blur;
+    }
+    for (int b = 0; b < 3; b++)
+        for (int i = 0; i < n; i++) {
+            sight_b[b][i] = R[0][b] * d[0][i] + R[1][b] * d[1][i] + R[2][b] * d[2][i];
+            out_b[b][i] = R[0][b] * out[0][i] + R[1][b] * out[1][i] + R[2][b] * out[2][i];
+        }
+    int deep = 1;
+    for (int i = 0; i < n; i++) deep &= edge[i] >= t->edge_most;
+    const int outer = from >= t->inner, columns = outer ? EDGE_COLUMNS : 4;
+    const float *table = t->edge, edges = (float)(t->edges - 1);
+    float found[EDGE_COLUMNS];
+    const float per_edge = (float)(t->edges - 1) / (2.0f * t->edge_most);
+    if (deep && !outer) /* far from the limb nothing is cut off */
+        for (int c = 0; c < columns; c++)
+            for (int i = 0; i < n; i++) shape[c][i] = c == 0 || c == 3 ? 1.0f : 0.0f;
+    else
+        for (int i = 0; i < n; i++) {
+            const float exact = (edge[i] + t->edge_most) * per_edge;
+            const int32_t row = placed(exact, edges);
+            const float up = least(most(exact - (float)row, 0.0f), 1.0f);
+            const float *here = table + row * EDGE_COLUMNS;
+            for (int c = 0; c < EDGE_COLUMNS; c++) found[c] = here[c] + up * (here[EDGE_COLUMNS + c] - here[c]);
+            for (int c = 0; c < columns; c++) shape[c][i] = found[c];
+        }
+    for (int i = 0; i < n; i++) q[i] = least(most(q0[i] - blur * shape[2][i], 0.0f), 1.0f);
+    memset(value, 0, sizeof value), memset(radial, 0, sizeof radial), memset(hidden, 0, sizeof hidden);
+    memset(flat, 0, sizeof flat), memset(turn, 0, sizeof turn);
+    const int nodes = outer ? NODES : 2;
+    const float each = 1.0f / (float)nodes, side = (float)t->paint.side;
+    for (int node = 0; node < nodes; node++) {
+        const float *moves = outer ? shape[8 + node] : shape[3], sign = node ? 1.0f : -1.0f;
+        if (outer)
+            for (int i = 0; i < n; i++) at[i] = q[i] + q[i] * (q0[i] + blur * shape[4 + node][i] - q[i]);
+        else
+            for (int i = 0; i < n; i++) at[i] = q[i] + sign * blur * sqrtf(shape[3][i]) * q[i];
+        INDEPENDENT
+        for (int i = 0; i < n; i++) {
+            at[i] = least(most(at[i], 0.0f), t->sine_most);
+            depth[i] = sqrtf(1.0f - at[i] * at[i]);
+            for (int b = 0; b < 3; b++) normal[b][i] = at[i] * out_b[b][i] - depth[i] * sight_b[b][i];
+            cell[i] = octahedral_cell(normal[0][i], normal[1][i], normal[2][i], side);
+        }
+        float plane[4][BLOCK];
+        const float *rows = t->paint.rows;
+        for (int i = 0; i < n; i++) {
+            const float *row = rows + 4 * (int64_t)cell[i];
+            for (int c = 0; c < 4; c++) plane[c][i] = row[c];
+        }
+        INDEPENDENT
+        for (int i = 0; i < n; i++) {
+            const float x = normal[0][i], y = normal[1][i], z = normal[2][i];
+            const float gx = plane[1][i], gy = plane[2][i], gz = plane[3][i];
+            value[i] += each * (plane[0][i] + gx * x + gy * y + gz * z);
+            const float over_out = gx * out_b[0][i] + gy * out_b[1][i] + gz * out_b[2][i];
+            const float over_sight = gx * sight_b[0][i] + gy * sight_b[1][i] + gz * sight_b[2][i];
+            radial[i] += each * moves[i] * (over_out + at[i] / depth[i] * over_sight);
+            flat[0][i] += each * at[i] * gx;
+            flat[1][i] += each * at[i] * gy;
+            flat[2][i] += each * at[i] * gz;
+            turn[0][i] += each * (gy * z - gz * y);
+            turn[1][i] += each * (gz * x - gx * z);
+            turn[2][i] += each * (gx * y - gy * x);
+        }
+        if (t->unseen.rows)
+            for (int i = 0; i < n; i++) {
+                const float *row = t->unseen.rows + 4 * (int64_t)octahedral_cell(normal[0][i], normal[1][i],
+                                                                                 normal[2][i], (float)t->unseen.side);
+                hidden[i] = most(hidden[i], row[0] + row[1] * normal[0][i] + row[2] * normal[1][i] + row[3] * normal[2][i]);
+            }
+    }
+    const float limb = share / (blur * radius), least_cover = t->cover_least;
+    const int whole = t->instants == 1;
+    float counts[BLOCK];
+    /* Paint counts as far as the sphere covers the pixel; at one instant all of it. */
+    for (int i = 0; i < n; i++) counts[i] = whole ? 1.0f : share * (shape[0][i] + least_cover);
+    float *count = to->count + from, *cover = to->cover + from, *paint = to->paint + from, *aside = to->aside + from;
+    float *x = to->x + from, *y = to->y + from;
+    INDEPENDENT
+    for (int i = 0; i < n; i++) {
+        const float at_q = counts[i] * q[i];
+        count[i] += counts[i];
+        cover[i] += share * shape[0][i];
+        paint[i] += counts[i] * value[i];
+        aside[i] += at_q;
+        x[i] += at_q * (axes[0] * out[0][i] + axes[1] * out[1][i] + axes[2] * out[2][i]);
+        y[i] += at_q * (axes[3] * out[0][i] + axes[4] * out[1][i] + axes[5] * out[2][i]);
+    }
+    if (t->unseen.rows)
+        for (int i = 0; i < n; i++) to->known[from + i] &= hidden[i] < t->unseen_most;
+    /* Derivatives: across the radius a look-up stays at its share of it. */
+    float *by_sight = value, *by_out = at;
+    for (int i = 0; i < n; i++) {
+        by_sight[i] = flat[0][i] * sight_b[0][i] + flat[1][i] * sight_b[1][i] + flat[2][i] * sight_b[2][i];
+        by_out[i] = flat[0][i] * out_b[0][i] + flat[1][i] * out_b[1][i] + flat[2][i] * out_b[2][i];
+    }
+    for (int c = 0; c < 3; c++) {
+        float *outward = to->out[c] + from, *turns = to->turn[c] + from, *moves = to->move[c] + from;
+        float *limbs = to->limb[c] + from;
+        const float *there = d[c], *beside = out[c], r0 = R[c][0], r1 = R[c][1], r2 = R[c][2];
+        INDEPENDENT
+        for (int i = 0; i < n; i++) {
+            const float level = r0 * flat[0][i] + r1 * flat[1][i] + r2 * flat[2][i];
+            const float across = level - by_sight[i] * there[i] - by_out[i] * beside[i];
+            outward[i] += counts[i] * beside[i];
+            turns[i] += counts[i] * (r0 * turn[0][i] + r1 * turn[1][i] + r2 * turn[2][i]);
+            moves[i] -= counts[i] * (across / nearest[i] + radial[i] / radius * beside[i]);
+            limbs[i] += shape[1][i] * limb * beside[i];
+        }
+    }
+}
+
+/* Divide sums over instants by what counted. */
+static void mean_of_instants(const Task *t, const Disk *at) {
+    for (int64_t p = 0; p < t->places; p++) {
+        const float share = 1.0f / at->count[p];
+        at->paint[p] *= share, at->aside[p] *= share, at->x[p] *= share, at->y[p] *= share;
+        float length2 = 0;
+        for (int c = 0; c < 3; c++) {
+            at->turn[c][p] *= share, at->move[c][p] *= share;
+            length2 += at->out[c][p] * at->out[c][p];
+        }
+        const float length = most(sqrtf(length2), 1e-12f);
+        for (int c = 0; c < 3; c++) at->out[c][p] /= length;
+    }
+}
+
+/* Look up the learnt light, and what the picture shows beside the sphere. */
+static void shine(const Task *t, const Disk *at, int64_t k) {
+    const int64_t camera = k % t->cameras;
+    const float *behind = t->behind + k * t->places, *stray = t->stray + camera * HARMONICS;
+    const float *d = t->direction + k * 3 * t->places;
+    const float side = (float)t->light_side, half = 0.5f * side;
+    memcpy(at->beside, behind, sizeof(float) * (size_t)t->places);
+    float *difference = at->difference, *black = at->black;
+    const float *x = at->x, *y = at->y, *aside = at->aside, *light = t->light;
+    if (t->lab) {
+        const float gain = t->gain[camera], depths = (float)t->depths;
+        const float *out[3] = {at->out[0], at->out[1], at->out[2]}, *dx = d, *dy = d + t->places, *dz = dy + t->places;
+        INDEPENDENT
+        for (int64_t p = 0; p < t->places; p++) {
+            const float q = aside[p], depth = sqrtf(most(1.0f - q * q, 0.0f));
+            const float nx = q * out[0][p] - depth * dx[p], ny = q * out[1][p] - depth * dy[p];
+            const float nz = q * out[2][p] - depth * dz[p];
+            const float mx = dx[p] + 2.0f * depth * nx, my = dy[p] + 2.0f * depth * ny, mz = dz[p] + 2.0f * depth * nz;
+            const float *scattered = light + 3 * octahedral_cell(nx, ny, nz, side);
+            const float gloss = light[3 * octahedral_cell(mx, my, mz, side) + 2];
+            const float *cover = t->cover + 2 * placed(depth * depths, depths);
+            difference[p] = gain * cover[0] * scattered[0];
+            black[p] = gain * (cover[0] * scattered[1] + cover[1] * gloss);
+        }
+    } else {
+        const float *own = light + 2 * camera * t->light_side * t->light_side;
+        INDEPENDENT
+        for (int64_t p = 0; p < t->places; p++) {
+            const int32_t column = placed((x[p] + 1.0f) * half, side), row = placed((y[p] + 1.0f) * half, side);
+            const float *found = own + 2 * (row * (int32_t)t->light_side + column);
+            difference[p] = found[0];
+            black[p] = found[1];
+        }
+    }
+    int none = 1;
+    for (int h = 0; h < HARMONICS; h++) none &= stray[h] == 0.0f;
+    for (int64_t p = none ? t->places : t->inner; p < t->places; p++) {
+        const float length = most(sqrtf(x[p] * x[p] + y[p] * y[p]), 1e-12f);
+        const float cosine = x[p] / length, sine = y[p] / length;
+        float c = cosine, s = sine, sum = stray[0];
+        for (int h = 1; h < HARMONICS; h += 2) {
+            sum += stray[h] * c + stray[h + 1] * s;
+            const float next = c * cosine - s * sine;
+            s = s * cosine + c * sine;
+            c = next;
+        }
+        at->beside[p] += sum;
+    }
+}
+
+static inline float noise_variance(const float *noise, float grey, float floor_) {
+    grey = most(grey, 0.0f);
+    return most(noise[0] + grey * (noise[1] + grey * (noise[2] + grey * noise[3])), floor_);
+}
+
+/* Return the number of monomials written for a block: 1, x, y, x^2, xy, y^2 .. */
+static void monomials(const float *x, const float *y, int n, int64_t count, float to[TINTS][BLOCK]) {
+    for (int i = 0; i < n; i++) to[0][i] = 1.0f;
+    for (int order = 1, last = 0, next = 1; next < count; order++) {
+        for (int c = 0; c <= order; c++) {
+            const float *from = to[last + (c ? c - 1 : 0)], *by = c ? y : x;
+            for (int i = 0; i < n; i++) to[next + c][i] = from[i] * by[i];
+        }
+        last = next;
+        next += order + 1;
+    }
+}
+
+/* Write what each coefficient of the frame's own light adds in a block; places beyond n become 0. */
+static int lit_columns(const Task *t, const Disk *at, int64_t from, int n, float tints[TINTS][BLOCK],
+                       float to[][BLOCK]) {
+    const int64_t more = t->n_difference > t->n_black ? t->n_difference : t->n_black;
+    monomials(at->x + from, at->y + from, n, more, tints);
+    const float *cover = at->cover + from, *paint = at->paint + from;
+    const float *difference = at->difference + from, *black = at->black + from;
+    float learnt[BLOCK];
+    for (int i = 0; i < n; i++) learnt[i] = cover[i] * (paint[i] * difference[i] + black[i]);
+    for (int c = 0; c < t->n_difference; c++)
+        for (int i = 0; i < n; i++) to[c][i] = learnt[i] * tints[c][i];
+    for (int c = 0; c < t->n_black; c++)
+        for (int i = 0; i < n; i++) to[t->n_difference + c][i] = cover[i] * tints[c][i];
+    const int count = (int)(t->n_difference + t->n_black);
+    for (int c = 0; c < count; c++)
+        for (int i = n; i < BLOCK; i++) to[c][i] = 0.0f;
+    return count;
+}
+
+/* Find the frame's own light, residuals, and weights by an expected picture and weights, as `residuals`. */
+static float light_up(const Task *t, const Disk *at, int64_t k, double *coefficients) {
+    const int64_t P = t->places;
+    const float *grey = t->grey + k * P, *noise = t->noise + (k % t->cameras) * 4, floor_ = t->noise_least;
+    const float own[4] = {noise[0], noise[1], noise[2], noise[3]};
+    const uint8_t *inside = at->counts, *clipped = t->clipped + k * P;
+    float *expected = t->expected + k * P, *weight = t->weight + k * P;
+    float tints[TINTS][BLOCK], column[COLUMNS][BLOCK], weighted[BLOCK], target[BLOCK];
+    double matrix[COLUMNS * COLUMNS] = {0};
+    const int count = (int)(t->n_difference + t->n_black);
+    for (int c = 0; c < count; c++) coefficients[c] = 0;
+    for (int64_t from = 0; from < P; from += BLOCK) {
+        const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
+        lit_columns(t, at, from, n, tints, column);
+        for (int i = 0; i < n; i++) target[i] = grey[from + i] - (1.0f - at->cover[from + i]) * at->beside[from + i];
+        for (int i = n; i < BLOCK; i++) target[i] = weighted[i] = 0.0f;
+        float factor[BLOCK];
+        for (int i = 0; i < n; i++)
+            factor[i] = weight[from + i] / noise_variance(own, expected[from + i], floor_);
+        for (int a = 0; a < count; a++) {
+            for (int i = 0; i < n; i++) weighted[i] = factor[i] * column[a][i];
+            for (int b = a; b < count; b++) matrix[a * count + b] += product(weighted, column[b]);
+            coefficients[a] += product(weighted, target);
+        }
+    }
+    for (int a = 0; a < count; a++)
+        for (int b = 0; b < a; b++) matrix[a * count + b] = matrix[b * count + a];
+    solve(matrix, coefficients, count, 1e-7);
+    float by[COLUMNS];
+    for (int c = 0; c < count; c++) by[c] = (float)coefficients[c];
+    int64_t told = 0;
+    for (int64_t from = 0; from < P; from += BLOCK) {
+        const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
+        lit_columns(t, at, from, n, tints, column);
+        float painted[BLOCK] = {0};
+        for (int c = 0; c < count; c++)
+            for (int i = 0; i < n; i++) painted[i] += by[c] * column[c][i];
+        float *residual = at->residual + from, *variance = at->variance + from, *wanted = expected + from;
+        const float *cover = at->cover + from, *beside = at->beside + from, *seen = grey + from;
+        INDEPENDENT
+        for (int i = 0; i < n; i++) {
+            const float beyond = (1.0f - cover[i]) * beside[i];
+            wanted[i] = painted[i] + beyond;
+            residual[i] = seen[i] - beyond - painted[i];
+            variance[i] = noise_variance(own, wanted[i], floor_);
+        }
+        /* A saturated pixel tells only that its grey level is at least this one. */
+        for (int i = 0; i < n; i++) {
+            const int silent = clipped[from + i] & (residual[i] <= 0.0f);
+            residual[i] = silent ? 0.0f : residual[i];
+            weight[from + i] = (float)(inside[from + i] & !silent);
+        }
+    }
+    for (int64_t p = 0; p < P; p += 4) /* a quarter of the places suffices: they are in order of distance */
+        if (inside[p]) {
+            const float size = fabsf(at->residual[p]) / sqrtf(at->variance[p]);
+            if (size == size) at->sorted[told++] = size;
+        }
+    const float deviation = told ? 1.4826f * ranked(at->sorted, told, (told - 1) / 2) : 0.0f;
+    const float scale = most(deviation, 1.0f) * most(deviation, 1.0f);
+    float *variance = at->variance;
+    const float *residual = at->residual, limit = t->tukey2;
+    INDEPENDENT
+    for (int64_t p = 0; p < P; p++) {
+        variance[p] *= scale;
+        const float near = most(1.0f - residual[p] * residual[p] / (limit * variance[p]), 0.0f);
+        weight[p] *= near * near;
+    }
+    return deviation;
+}
+
+/* Sum the normal equations of pose and light, and where asked for the scores of tiles. */
+static void gather(const Task *t, const Disk *at, int64_t k, const double *coefficients) {
+    const int64_t P = t->places, nd = t->n_difference;
+    const int n_all = 6 + (int)(nd + t->n_black);
+    const float *weight = t->weight + k * P;
+    double *normal = t->normal + k * n_all * n_all, *gradient = t->gradient + k * n_all;
+    double *scores = t->scores + k * n_all * t->tiles;
+    float tints[TINTS][BLOCK], column[COLUMNS][BLOCK], weighted[BLOCK], precision[BLOCK], left[BLOCK];
+    float score[BLOCK][COLUMNS];
+    memset(normal, 0, sizeof(double) * (size_t)(n_all * n_all));
+    memset(gradient, 0, sizeof(double) * (size_t)n_all);
+    if (t->last) memset(scores, 0, sizeof(double) * (size_t)(n_all * t->tiles));
+    for (int64_t from = 0; from < P; from += BLOCK) {
+        const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
+        lit_columns(t, at, from, n, tints, column + 6);
+        float gain[BLOCK] = {0}, offset[BLOCK] = {0};
+        for (int c = 0; c < nd; c++) {
+            const float by = (float)coefficients[c];
+            for (int i = 0; i < n; i++) gain[i] += by * tints[c][i];
+        }
+        for (int c = 0; c < t->n_black; c++) {
+            const float by = (float)coefficients[nd + c];
+            for (int i = 0; i < n; i++) offset[i] += by * tints[c][i];
+        }
+        float *lit = at->lit + from, over[BLOCK];
+        const float *difference = at->difference + from, *black = at->black + from, *beside = at->beside + from;
+        const float *cover = at->cover + from, *paint = at->paint + from, *variance = at->variance + from;
+        INDEPENDENT
+        for (int i = 0; i < n; i++) {
+            const float step = difference[i] * gain[i];
+            lit[i] = cover[i] * step;
+            over[i] = paint[i] * step + black[i] * gain[i] + offset[i] - beside[i];
+            precision[i] = weight[from + i] / variance[i];
+        }
+        memcpy(left, at->residual + from, sizeof(float) * (size_t)n);
+        for (int c = 0; c < 3; c++) {
+            const float *turn = at->turn[c] + from, *move = at->move[c] + from, *limb = at->limb[c] + from;
+            for (int i = 0; i < n; i++) column[c][i] = lit[i] * turn[i];
+            for (int i = 0; i < n; i++) column[3 + c][i] = lit[i] * move[i] + over[i] * limb[i];
+        }
+        for (int i = n; i < BLOCK; i++) {
+            left[i] = weighted[i] = 0.0f;
+            for (int c = 0; c < 6; c++) column[c][i] = 0.0f;
+        }
+        for (int a = 0; a < n_all; a++) {
+            for (int i = 0; i < n; i++) weighted[i] = precision[i] * column[a][i];
+            for (int b = a; b < n_all; b++) normal[a * n_all + b] += product(weighted, column[b]);
+            gradient[a] += product(weighted, left);
+            if (t->last)
+                for (int i = 0; i < n; i++) score[i][a] = weighted[i] * left[i];
+        }
+        if (t->last)
+            for (int i = 0; i < n; i++) {
+                double *tile = scores + t->tile[from + i] * n_all;
+                for (int a = 0; a < n_all; a++) tile[a] += score[i][a];
+            }
+    }
+    for (int a = 0; a < n_all; a++)
+        for (int b = 0; b < a; b++) normal[a * n_all + b] = normal[b * n_all + a];
+}
+
+/* Tell how well the disk is explained: share of its variance, loss, median step from black to white paint. */
+static void tell(const Task *t, const Disk *at, int64_t k, float deviation) {
+    const int64_t P = t->places;
+    const float *expected = t->expected + k * P;
+    const uint8_t *inside = t->inside + k * P;
+    double share = 0, cover = 0, mean = 0, spread = 0, left = 0, loss = 0;
+    float one[BLOCK], counted[BLOCK] = {0}, all[BLOCK] = {0}, part[BLOCK] = {0};
+    for (int i = 0; i < BLOCK; i++) one[i] = 1.0f;
+    const float scale = logf(most(deviation, 1.0f)), sixth = t->tukey2 / 6.0f, limit = t->tukey2;
+    for (int pass = 0; pass < 3; pass++) { /* each needs the sums of the one before */
+        for (int64_t from = 0; from < P; from += BLOCK) {
+            const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
+            const float *residual = at->residual + from, *variance = at->variance + from, *wanted = expected + from;
+            const float middle = (float)mean, most_left = 4.0f * (float)spread;
+            for (int i = 0; i < BLOCK; i++) counted[i] = all[i] = part[i] = 0.0f;
+            for (int i = 0; i < n; i++) all[i] = at->cover[from + i];
+            for (int i = 0; i < n; i++) counted[i] = at->counts[from + i] ? all[i] : 0.0f;
+            if (pass == 0) {
+                for (int i = 0; i < n; i++) part[i] = wanted[i] + residual[i];
+                share += product(counted, one), cover += product(all, one), mean += product(counted, part);
+            } else if (pass == 1) {
+                for (int i = 0; i < n; i++) part[i] = wanted[i] + residual[i] - middle;
+                for (int i = 0; i < n; i++) all[i] = counted[i] * part[i];
+                spread += product(all, part);
+            } else {
+                for (int i = 0; i < n; i++) part[i] = least(residual[i] * residual[i], most_left);
+                left += product(counted, part);
+                for (int i = 0; i < n; i++) {
+                    const float near = most(1.0f - residual[i] * residual[i] / (limit * variance[i]), 0.0f);
+                    part[i] = sixth * (1.0f - near * near * near) + scale;
+                }
+                for (int i = 0; i < n; i++)
+                    if (!at->known[from + i])
+                        part[i] = logf(most(at->lit[from + i] / sqrtf((float)TWO_PI * variance[i]), 1.0f));
+                for (int i = 0; i < n; i++) all[i] = inside[from + i] ? 1.0f : 0.0f;
+                loss += product(all, part);
+            }
+        }
+        if (pass == 0) mean /= share > 1e-6 ? share : 1e-6;
+        if (pass == 1) spread /= share > 1e-6 ? share : 1e-6;
+    }
+    left /= share > 1e-6 ? share : 1e-6;
+    double *told = t->told + k * 3;
+    told[0] = spread > 1e-6 && share > t->known_least * cover ? 1.0 - left / (spread > 1e-9 ? spread : 1e-9) : 0.0;
+    told[1] = loss;
+    for (int64_t p = 0; p < t->inner; p++) at->sorted[p] = most(at->lit[p], 0.0f); /* below 1 all count alike */
+    told[2] = t->inner ? ranked(at->sorted, t->inner, (t->inner - 1) / 2) : 0.0;
+}
+
+/* The size of the record that this code reads: a caller with another one must not call it. */
+int64_t disk_sums_record(void) { return (int64_t)sizeof(Task); }
+
+/* Sum the disks from `begin` to before `end`, each by itself; return 0, or 1 without memory. */
+int disk_sums(const Task *t, int64_t begin, int64_t end) {
+    const int64_t P = (t->places + BLOCK - 1) / BLOCK * BLOCK;
+    float *floats = malloc(sizeof(float) * (size_t)(P * FLOATS)), *next = floats;
+    uint8_t *bytes = malloc((size_t)(2 * P));
+    if (!floats || !bytes) {
+        free(floats), free(bytes);
+        return 1;
+    }
+    Disk at;
+    float **parts[] = {&at.paint,   &at.cover,   &at.x,       &at.y,       &at.aside,      &at.out[0],  &at.out[1],
+                       &at.out[2],  &at.turn[0], &at.turn[1], &at.turn[2], &at.move[0],    &at.move[1], &at.move[2],
+                       &at.limb[0], &at.limb[1], &at.limb[2], &at.count,   &at.difference, &at.black,   &at.beside,
+                       &at.residual, &at.variance, &at.lit};
+    for (int c = 0; c < FLOATS; c++, next += P) *parts[c] = next;
+    at.sorted = at.count; /* not needed at the same time */
+    at.known = bytes, at.counts = bytes + P;
+    for (int64_t k = begin; k < end; k++) {
+        memset(floats, 0, sizeof(float) * (size_t)(P * 18));
+        memset(at.known, 1, (size_t)P);
+        for (int64_t instant = 0; instant < t->instants; instant++)
+            for (int64_t from = 0, n; from < t->places; from += n) {
+                const int64_t end = from < t->inner ? t->inner : t->places; /* a block lies on one side of `inner` */
+                n = end - from < BLOCK ? end - from : BLOCK;
+                render(t, &at, k, instant, from, (int)n, t->shares[instant]);
+            }
+        if (t->instants > 1) mean_of_instants(t, &at);
+        shine(t, &at, k);
+        const uint8_t *inside = t->inside + k * t->places, *clipped = t->clipped + k * t->places;
+        float *expected = t->expected + k * t->places, *weight = t->weight + k * t->places;
+        for (int64_t p = 0; p < t->places; p++) at.counts[p] = inside[p] && at.known[p];
+        if (t->first) { /* the first weights come from the picture itself, bubbles included; a second round does without */
+            memcpy(expected, t->grey + k * t->places, sizeof(float) * (size_t)t->places);
+            for (int64_t p = 0; p < t->places; p++) weight[p] = (float)(at.counts[p] && !clipped[p]);
+        }
+        double coefficients[COLUMNS];
+        float deviation = 0;
+        for (int round = 0; round < (t->first ? 2 : 1); round++) deviation = light_up(t, &at, k, coefficients);
+        gather(t, &at, k, coefficients);
+        if (t->last) tell(t, &at, k, deviation);
+    }
+    free(floats), free(bytes);
+    return 0;
+}

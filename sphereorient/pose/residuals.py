@@ -1,0 +1,203 @@
+"""The linear problem of the fit: residuals of L disks at given poses, and what a step of the fit needs of them, `DiskSums`."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sphereorient.pose.model import SphereModel, SphereView, polynomials, scene_beside, sphere_view
+from sphereorient.pose.pixels import Pixels
+from sphereorient.so3 import solve_damped
+
+TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
+KNOWN = 0.3  # least share of a disk that shows known paint
+NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Residuals:
+    """The linear problem at one pose, of L disks; made by `residuals`."""
+
+    view: SphereView
+    design: Tensor  # (L, 6 + K, P), derivatives by pose and by the light's coefficients
+    residual: Tensor  # (L, P), grey levels
+    model: Tensor  # (L, P), grey levels
+    variance: Tensor  # (L, P), expected
+    weight: Tensor  # (L, P), robust and inside, 0 .. 1
+    inside: Tensor  # (L, P) bool, the pixels that count: of known paint
+    deviation: Tensor  # (L,), robust standard deviation of the residuals over the noise expected
+    lit: Tensor  # (L, P), grey levels from black to white paint, the frame's own light included, coverage too
+    over: Tensor  # (L, P), grey levels of the sphere above the background
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DiskSums:
+    """What one step of the fit needs of L disks at one pose each; made by `torch_sums`, or by compiled code."""
+
+    state: tuple[Tensor, Tensor]  # expected grey levels and weights, (L, P) each
+    information: Tensor  # (L, 6, 6) float64, of delta (rad) and position (mm), the light's coefficients eliminated
+    pull: Tensor  # (L, 6)
+    told: "Told | None"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Told:
+    """How well L disks are explained."""
+
+    scores: Tensor  # (L, 6, T) float64, of the tiles of the disk, summed
+    share: Tensor  # (L,), of the picture's variance that is explained; 0 of hardly any known paint
+    loss: Tensor  # (L,), nats
+    step: Tensor  # (L,), grey levels from black to white paint, median
+
+
+def torch_sums(
+    pixels: Pixels,
+    X: Tensor,
+    R: Tensor,
+    state: tuple[Tensor, Tensor] | None,
+    model: SphereModel,
+    cameras: int,
+    tell: bool,
+) -> DiskSums:
+    """Sum the linear problem of B * C disks at poses X (B, 3), mm, R_lab_body R (B, 3, 3); `state` as in `residuals`.
+    `tell`: with what is told of how well they are explained.
+    """
+    at = residuals(pixels, X, R, state, model, cameras)
+    precision = at.weight / at.variance
+    weighted = at.design * precision[:, None]
+    normal = (weighted @ at.design.mT).double()
+    gradient = (weighted @ at.residual[..., None])[..., 0].double()
+    information, pull, mixed = without_light(normal, gradient)
+    told = None
+    if tell:
+        told = Told(
+            scores=_tile_scores(at, precision, mixed, pixels.tile),
+            share=_score(at).double(),
+            loss=_loss(at, pixels.inside),
+            step=at.lit[:, : pixels.inner].double().median(-1).values,
+        )
+    return DiskSums(state=(at.model, at.weight), information=information, pull=pull, told=told)
+
+
+def residuals(
+    pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel, cameras: int
+) -> Residuals:
+    """Linearise the pictures of B * C disks about poses X (B, 3), mm, R_lab_body R (B, 3, 3), the light at its best.
+    `state`: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
+    """
+    view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
+    difference, black = model.light.at(view, pixels)  # as learnt
+    tints = polynomials(view.across, max(model.shading.difference, model.shading.black))
+    n, n_black = ((order + 1) * (order + 2) // 2 for order in (model.shading.difference, model.shading.black))
+    learnt = (view.coverage * (view.paint * difference + black))[:, None]
+    columns = torch.cat([learnt * tints[:, :n], view.coverage[:, None] * tints[:, :n_black]], dim=1)
+    beside = scene_beside(view, pixels, model.light.stray)
+    beyond = (1.0 - view.coverage) * beside
+    noise = model.light.noise.repeat(len(X), 1)
+    inside = pixels.inside if view.known is None else pixels.inside & view.known
+    target = pixels.grey - beyond
+    # The first weights come from the picture itself, bubbles included; a second round does without it.
+    rounds = (pixels.grey, (inside & ~pixels.clipped).to(columns.dtype)) if state is None else state
+    for _ in range(1 if state is not None else 2):
+        expected, weight = rounds
+        weighted = columns * (weight / _variance(expected, noise))[:, None]
+        coefficients = solve_damped(
+            (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double(), ridge=1e-7
+        ).to(columns.dtype)
+        painted = (coefficients[:, None] @ columns)[:, 0]
+        grey, residual = painted + beyond, target - painted
+        # A saturated pixel tells only that its grey level is at least this one.
+        silent = pixels.clipped & (residual <= 0)
+        residual = residual.masked_fill(silent, 0.0)
+        variance = _variance(grey, noise)
+        deviation = _deviation(residual, variance, inside)
+        variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
+        weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * (inside & ~silent)
+        rounds = grey, weight
+    gain = (coefficients[:, None, :n] @ tints[:, :n])[:, 0]
+    offset = (coefficients[:, None, n:] @ tints[:, :n_black])[:, 0]
+    step, ground = difference * gain, black * gain + offset
+    lit = view.coverage * step
+    over = view.paint * step + ground - beside
+    return Residuals(
+        view=view,
+        design=torch.cat([grey_by_pose(view, lit, over), columns], dim=1),
+        residual=residual,
+        model=grey,
+        variance=variance,
+        weight=weight,
+        inside=inside,
+        deviation=deviation,
+        lit=lit,
+        over=over,
+    )
+
+
+def grey_by_pose(view: SphereView, lit: Tensor, over: Tensor) -> Tensor:
+    """Return the derivatives (L, 6, P) of grey by delta (rad) and position (mm); `lit`, `over` as in `Residuals`."""
+    paint, limb = lit[:, None], over[:, None]
+    return torch.cat(
+        [paint * view.paint_by_rotation, paint * view.paint_by_position + limb * view.coverage_by_position], dim=1
+    )
+
+
+def without_light(normal: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Eliminate the light's coefficients: information (L, 6, 6), gradient (L, 6), coupling to the pose."""
+    light = normal[:, 6:, 6:]
+    light = light + 1e-7 * torch.diag_embed(light.diagonal(dim1=-2, dim2=-1) + 1e-12)
+    mixed = torch.linalg.solve(light, normal[:, 6:, :6])
+    information = normal[:, :6, :6] - normal[:, :6, 6:] @ mixed
+    return information, gradient[:, :6] - (mixed.mT @ gradient[:, 6:, None])[..., 0], mixed
+
+
+def _tile_scores(at: Residuals, precision: Tensor, mixed: Tensor, tile: Tensor) -> Tensor:
+    """Sum the scores of the pose, the light eliminated, over tiles, (L, 6, T)."""
+    by_pose = at.design[:, :6] - mixed.mT.to(at.design.dtype) @ at.design[:, 6:]
+    score = by_pose * (precision * at.residual)[:, None]
+    tiles = score.new_zeros(*score.shape[:2], int(tile.max()) + 1 if len(tile) else 1)
+    return tiles.index_add(2, tile, score).double()
+
+
+def by_pose(disks: Tensor, cameras: int) -> Tensor:
+    """Return (B * C, ...) as (B, C, ...)."""
+    return disks.reshape(-1, cameras, *disks.shape[1:])
+
+
+def _variance(grey: Tensor, noise: Tensor) -> Tensor:
+    """Return the noise variance expected at grey levels (L, P) by the curves (L, 4)."""
+    grey = grey.clamp_min(0.0)
+    a, b, c, d = noise[..., None].unbind(1)
+    variance: Tensor = a + grey * (b + grey * (c + grey * d))
+    return variance.clamp_min(NOISE_MIN)
+
+
+def _deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
+    """Return the robust standard deviation of residuals over the noise expected, (L,), at least 1."""
+    # A quarter of the places suffices: they are in order of distance from the middle.
+    residual, variance, inside = residual[:, ::4], variance[:, ::4], inside[:, ::4]
+    scaled = torch.where(inside, residual.abs() * variance.rsqrt(), torch.nan)
+    return 1.4826 * torch.nan_to_num(scaled.nanmedian(-1).values)
+
+
+def _loss(at: Residuals, inside: Tensor) -> Tensor:
+    """Return Tukey's loss (L,) with the normalisation of its scale, nats; unknown paint may have any grey level."""
+    share = (at.residual.square() / (TUKEY**2 * at.variance)).clamp_max(1.0)
+    loss = (TUKEY**2 / 6.0) * (1.0 - (1.0 - share) ** 3) + at.deviation.clamp_min(1.0).log()[:, None]
+    if at.view.known is not None:
+        loss = torch.where(at.view.known, loss, (at.lit / (2 * math.pi * at.variance).sqrt()).clamp_min(1.0).log())
+    return (loss * inside).sum(-1).double()
+
+
+def _score(at: Residuals) -> Tensor:
+    """Return the share of the disk's variance that the model explains, (L,); outliers count up to a limit.
+    0 for a disk that shows hardly any known paint.
+    """
+    share = at.view.coverage * at.inside
+    known = share.sum(-1) > KNOWN * at.view.coverage.sum(-1)
+    share = share / share.sum(-1, keepdim=True).clamp_min(1e-6)
+    grey = at.model + at.residual
+    spread = (share * (grey - (share * grey).sum(-1, keepdim=True)).square()).sum(-1)
+    left = (share * torch.minimum(at.residual.square(), 4.0 * spread[:, None])).sum(-1)
+    explained = 1.0 - left / spread.clamp_min(1e-9)
+    return torch.where((spread > 1e-6) & known, explained, torch.zeros_like(explained))
