@@ -1,4 +1,4 @@
-"""Build hook of the package: compile sphereorient/pose/disk_sums.c where there is a compiler; torch does it elsewhere."""
+"""Build hook of the package: compile sphereorient/pose/disk_sums.c where there is a compiler."""
 
 from __future__ import annotations
 

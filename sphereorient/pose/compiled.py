@@ -112,9 +112,7 @@ def disk_sums(
         return torch_sums(pixels, X, R, state, model, cameras, tell)
     L, P = pixels.grey.shape
     light = model.light.tables
-    n_difference, n_black = (
-        (order + 1) * (order + 2) // 2 for order in (model.shading.difference, model.shading.black)
-    )
+    n_difference, n_black = model.shading.counts
     size, tiles = 6 + n_difference + n_black, int(pixels.tile.max()) + 1 if P else 1
     instants, shares = exposure(pixels.instants)
     X, R = X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0)

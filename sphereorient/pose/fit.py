@@ -202,11 +202,8 @@ def _limb_moved_px(step: Tensor, model: SphereModel) -> Tensor:
 
 
 def _shared_scores(tiles: Tensor, shading: Shading) -> Tensor:
-    """Sum over tiles the outer products of their scores (L, 6, T), (L, 6, 6): errors of neighbours are not independent."""
-    count, fitted = (
-        tiles.shape[2],
-        6 + sum((order + 1) * (order + 2) // 2 for order in (shading.difference, shading.black)),
-    )
+    """Sum over tiles the outer products of their scores (L, 6, T), (L, 6, 6): errors of neighbours are dependent."""
+    count, fitted = tiles.shape[2], 6 + sum(shading.counts)
     # Residuals of a fit are smaller than errors: the correction for few clusters (Cameron and Miller 2015, CR1).
     few = count / max(count - fitted, 1)
     return few * (tiles @ tiles.mT)

@@ -37,6 +37,12 @@ class Shading:
     difference: int
     black: int
 
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Numbers of coefficients of difference and black."""
+        difference, black = ((order + 1) * (order + 2) // 2 for order in (self.difference, self.black))
+        return difference, black
+
 
 FIRST = Shading(difference=4, black=2)  # before the light is estimated
 LATER = Shading(difference=2, black=1)

@@ -1,4 +1,4 @@
-"""The linear problem of the fit: residuals of L disks at given poses, and what a step of the fit needs of them, `DiskSums`."""
+"""The linear problem of the fit: residuals of L disks at given poses, and what a step needs of them, `DiskSums`."""
 
 import math
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ def residuals(
     view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
     difference, black = model.light.at(view, pixels)  # as learnt
     tints = polynomials(view.across, max(model.shading.difference, model.shading.black))
-    n, n_black = ((order + 1) * (order + 2) // 2 for order in (model.shading.difference, model.shading.black))
+    n, n_black = model.shading.counts
     learnt = (view.coverage * (view.paint * difference + black))[:, None]
     columns = torch.cat([learnt * tints[:, :n], view.coverage[:, None] * tints[:, :n_black]], dim=1)
     beside = scene_beside(view, pixels, model.light.stray)
