@@ -59,7 +59,7 @@ def begin() -> PoseStart:
 
 
 def unseen_model(pixels) -> SphereModel:
-    unseen = map_directions(len(paint_of("blobs")))[..., 2] > 0.4
+    unseen = map_directions(len(paint_of("blobs")))[..., 2] > 0.7
     # A frame's light of high order would be extrapolated to the unknown paint.
     paint = texture_table(paint_of("blobs"), 2 * BLUR_PX / RIG.diameter_px, unseen=unseen)
     return model_of(paint=paint, shading=LATER)
