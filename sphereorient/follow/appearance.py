@@ -56,6 +56,7 @@ FITS = 3.0  # excess of a fit whose map is right once worn paint is not used: 1.
 # By which the logarithm of the variance left must fall where worn paint is not used: 1.3 to 2.8 in balls that have lost
 # 2 to 45 % of their paint, up to 1.1 where the map is warped, and with highlights or a rod.
 WORN_GAIN = 1.2
+WORN_SEEN = 0.005  # share of the ball that differs at first sight, below which it is not looked for
 WORN_LEAST = 0.01  # share of the ball; less paint than this moves no pose by as much as its noise
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
 CLEAR = 3.0  # times the variance that the typical right pose leaves
@@ -158,7 +159,7 @@ def estimate_appearance(
             return estimate_appearance(matched, frames, base, settings, following)
     worn, paint = None, base
     if settings.learn_paint:
-        fitter, fit, worn = _without_worn(fitter, base, pixels, fit, use)
+        fitter, fit, worn = _without_worn(fitter, pixels, fit, use)
         if worn is not None:  # the blur, too, was found with it
             given, paint = settings.blur_px is not None, without(base, worn)
             fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=given)
@@ -437,12 +438,14 @@ def _with_light(fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor) -
 
 
 def _without_worn(
-    fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor
+    fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor
 ) -> tuple[Fitter, FittedPoses, Tensor | None]:
     """Return a fitter that does not use paint that differs from the map, its fit, and where that is; None: nowhere.
     Found in one half of the movie, it must leave less in the other half: what differs there, too, turns with the ball.
     """
     if len(use) < FEWEST_LIT:  # too few views of each patch to tell paint from light
+        return fitter, fit, None
+    if worn_share(worn_cells(pixels, fit, use, fitter.model(fitter.optics.fine))) < WORN_SEEN:
         return fitter, fit, None
 
     def found(
@@ -452,7 +455,8 @@ def _without_worn(
         for _ in range(WORN_ROUNDS):  # worn paint bends the light and the poses that it is found with
             if not whole:
                 worn = worn_cells(pixels, fit, use, now.model(now.optics.fine))
-                optics = Optics(without(base, worn), fitter.optics.blur_px, widest_px(fitter.views))
+                paint = without(fitter.optics.fine.paint, worn)  # blurred already
+                optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views))
                 now = replace(now, optics=optics)
             now = now.with_light_of(pixels, fit, use)
             fit = now.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, now.optics.fine, 3)

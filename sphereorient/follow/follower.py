@@ -129,13 +129,13 @@ def sample_frames(
             screened_frames(stream, view.background, first, max(last, first + 1))
             for stream, view in zip(recording.streams, views, strict=True)
         ]
-        frames = zip(*movies, strict=True)
-        best, place = next(frames), first
-        for k, shots in enumerate(frames, first + 1):
+        best: tuple[Frame, ...] = ()
+        place = first
+        for k, shots in enumerate(zip(*movies, strict=True), first):
+            if not best or sum(shot.usable for shot in shots) > sum(shot.usable for shot in best):
+                best, place = shots, k
             if all(shot.usable for shot in best):
                 break
-            if sum(shot.usable for shot in shots) > sum(shot.usable for shot in best):
-                best, place = shots, k
         taken.append(best)
         places.append(place)
     return taken, places

@@ -16,7 +16,7 @@ from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, sphere_radiu
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene
 from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
-from sphereorient.pose.lab_light import learn_lab_light
+from sphereorient.pose.lab_light import ROUNDS, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
 from sphereorient.pose.residuals import KNOWN
@@ -37,6 +37,7 @@ FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a
 
 FEWEST_LIT = 8  # rows of poses from which the light in the lab is learnt
 MORE_EXPLAINED = 0.05  # share of the variance by which it must leave less
+HALF_WAY = 0.4  # share of that by which it must leave less after half of them: others need not be finished
 LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
 DISK_PX = 32  # of the disk on which the share of known paint is counted
 NOISE = 1.0  # grey levels, of a background of one grey
@@ -181,13 +182,15 @@ class Fitter:
         if len(use) < FEWEST_LIT:
             return self, fit
 
-        def in_the_lab(pixels: Pixels, fit: FittedPoses, use: Tensor) -> "Fitter":
-            return replace(self, light=learn_lab_light(pixels, fit, use, self.model(fine)))
+        def in_the_lab(pixels: Pixels, fit: FittedPoses, use: Tensor, rounds: int = ROUNDS) -> "Fitter":
+            return replace(self, light=learn_lab_light(pixels, fit, use, self.model(fine), rounds))
 
         every = torch.arange(len(use))
         learning, held = (some_of(rows, pixels, fit, use) for rows in (every[::2], every[1::2]))
-        if in_the_lab(*learning).left(*held) > self.with_light_of(*learning).left(*held) - MORE_EXPLAINED:
-            return self, fit
+        maps_leave = self.with_light_of(*learning).left(*held)
+        for rounds, more in ((ROUNDS // 2, HALF_WAY * MORE_EXPLAINED), (ROUNDS, MORE_EXPLAINED)):
+            if in_the_lab(*learning, rounds).left(*held) > maps_leave - more:
+                return self, fit
         lit = self
         for _ in range(4):  # the poses, too, were found with the maps
             lit = in_the_lab(pixels, fit, use)

@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
-from scipy.special import sph_harm_y_all
+from scipy.special import sph_legendre_p_all
 from torch import Tensor
 
 from sphereorient.pose.fit import FittedPoses, learn_stray, noise_curves
@@ -143,12 +143,14 @@ def harmonics(direction: Tensor, degree: int) -> Tensor:
     Their mean square over the sphere is 1; degree l has the places l^2 .. (l + 1)^2, order -l first.
     """
     x, y, z = direction.double().cpu().numpy().reshape(-1, 3).T
-    values = sph_harm_y_all(degree, degree, np.arccos(np.clip(z, -1.0, 1.0)), np.arctan2(y, x))
+    polar, place = np.unique(np.arccos(np.clip(z, -1.0, 1.0)).round(14), return_inverse=True)  # maps repeat them
+    along = math.sqrt(8.0 * math.pi) * sph_legendre_p_all(degree, degree, polar)[0][..., place]
+    turn = np.arange(degree + 1)[:, None] * np.arctan2(y, x)
+    cos, sin = np.cos(turn), np.sin(turn)
     columns = []
     for n in range(degree + 1):
-        whole = math.sqrt(8.0 * math.pi) * values[n]
-        columns += [whole[m].imag for m in range(n, 0, -1)]
-        columns += [whole[0].real / math.sqrt(2.0), *(whole[m].real for m in range(1, n + 1))]
+        columns += [along[n, m] * sin[m] for m in range(n, 0, -1)]
+        columns += [along[n, 0] / math.sqrt(2.0), *(along[n, m] * cos[m] for m in range(1, n + 1))]
     return torch.from_numpy(np.stack(columns, axis=-1)).reshape(*direction.shape[:-1], len(columns))
 
 
@@ -178,7 +180,9 @@ def _cells(coefficients: Tensor, degree: int) -> Tensor:
     return sample_texture(grid, octahedral_directions(SIDE)).float()
 
 
-def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> LabLight:
+def learn_lab_light(
+    pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, rounds: int = ROUNDS
+) -> LabLight:
     """Estimate light and noise from the fits of B * C disks, those of `use` (B, C) bool, the model's light known.
     Gauss-Newton at the fits' poses; the light of each frame may differ a little, as its tints do in the fit.
     Source: irradiance as harmonics of the normal, Ramamoorthi and Hanrahan 2001.
@@ -188,7 +192,7 @@ def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: Sphere
     bases = _bases(at.view, pixels)
     light = _flat(model.light, at.view, pixels, use)
     light = replace(light, stray=learn_stray(at, pixels, use, model.light.stray))
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         light = _better(light, at.view, pixels, (at.weight / at.variance).where(used, 0.0), bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
         at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model, cameras)
