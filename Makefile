@@ -12,7 +12,7 @@ INDEX := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
 
 setup: $(VENV)/.ready
 
-$(VENV)/.ready: pyproject.toml sphereorient/pose/disk_sums.c
+$(VENV)/.ready: pyproject.toml $(wildcard sphereorient/*/*.c)
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed, this is " + sys.version.split()[0])'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -q $(INDEX) torch==2.13.0

@@ -1,9 +1,16 @@
-"""Kalman filter and modified Bryson-Frazier smoother: linear in time, no inverse of a covariance of states."""
+"""Kalman filter and modified Bryson-Frazier smoother: linear in time, no inverse of a covariance of states.
 
+`kalman.c` does the same, where it was built, ten times faster.
+"""
+
+import ctypes
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sphereorient.files.compiled import compiled
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -49,6 +56,8 @@ class Filtered:
 
 def run_filter(chain: StateSpace) -> Filtered:
     """Run Kalman's filter (Kalman 1960)."""
+    if library() is not None:
+        return _filtered_compiled(chain)
     count, size = len(chain.measured), chain.start.shape[0]
     x, P, F = np.zeros(size), chain.start, np.zeros((size, size))
     states, covariances = np.empty((count, size)), np.empty((-(-count // EVERY), size, size))
@@ -122,6 +131,8 @@ def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedSta
     """Run backwards over a filtered chain; `wanted` (K, D) holds the rows whose covariance is returned.
     Source: Bierman 1973 (modified Bryson-Frazier); the distance from the others: de Jong 1988.
     """
+    if library() is not None:
+        return _smoothed_compiled(chain, filtered, wanted)
     count, size = filtered.state.shape
     F = np.zeros((size, size))
     pull, hold = np.zeros(size), np.zeros((size, size))  # gradient and curvature that the future exerts
@@ -150,3 +161,66 @@ def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedSta
             pull, hold = F.T @ pull, F.T @ hold @ F
             hold = 0.5 * (hold + hold.T)  # asymmetry from rounding would grow
     return SmoothedStates(state=state, covariance=covariance, mahalanobis=mahalanobis)
+
+
+class _Chain(ctypes.Structure):
+    """The record `Chain` of kalman.c, field by field."""
+
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in ("count", "size", "every", "wanted_rows")),
+        *((name, ctypes.c_void_p) for name in ("carried", "drift", "kind", "grown", "noise", "start", "measured")),
+        *((name, ctypes.c_void_p) for name in ("covariance", "used", "state", "stored", "gain", "innovation")),
+        *((name, ctypes.c_void_p) for name in ("inverse", "sums", "wanted", "smoothed", "spread", "mahalanobis")),
+    ]
+
+
+def library() -> ctypes.CDLL | None:
+    """Return the compiled recursions; None where there are none."""
+    return compiled(Path(__file__).with_name("kalman"), _Chain)
+
+
+def _run(name: str, chain: StateSpace, **arrays: Floats) -> None:
+    """Call a function of the compiled code on a chain, and on arrays in and out, contiguous ones."""
+    given = {key: np.ascontiguousarray(getattr(chain, key)) for key in StateSpace.__dataclass_fields__} | arrays
+    numbers = {"count": len(chain.measured), "size": len(chain.start), "every": EVERY}
+    numbers["wanted_rows"] = len(arrays.get("wanted", ()))
+    record = _Chain(**numbers, **{key: array.ctypes.data for key, array in given.items()})
+    code = library()
+    assert code is not None
+    if code[name](ctypes.byref(record)):
+        raise MemoryError
+
+
+def _filtered_compiled(chain: StateSpace) -> Filtered:
+    count, size = len(chain.measured), len(chain.start)
+    found = {
+        "state": np.empty((count, size)),
+        "stored": np.empty((-(-count // EVERY), size, size)),
+        "gain": np.zeros((count, size, 3)),
+        "innovation": np.zeros((count, 3)),
+        "inverse": np.zeros((count, 3, 3)),
+        "sums": np.zeros(2),
+    }
+    _run("kalman_filter", chain, **found)
+    misfit, log_determinant = found.pop("sums").tolist()
+    return Filtered(covariance=found.pop("stored"), misfit=misfit, log_determinant=log_determinant, **found)
+
+
+def _smoothed_compiled(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedStates:
+    count, size = filtered.state.shape
+    state, mahalanobis = np.empty((count, size)), np.empty(count)
+    spread = np.empty((count, len(wanted), len(wanted)))
+    _run(
+        "kalman_smooth",
+        chain,
+        state=filtered.state,
+        stored=filtered.covariance,
+        gain=filtered.gain,
+        innovation=filtered.innovation,
+        inverse=filtered.inverse,
+        wanted=np.ascontiguousarray(wanted),
+        smoothed=state,
+        spread=spread,
+        mahalanobis=mahalanobis,
+    )
+    return SmoothedStates(state=state, covariance=spread, mahalanobis=mahalanobis)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.files.compiled import compiled
 from sphereorient.pose.model import (
     COVER_MIN,
     DEPTH_MIN,
@@ -33,7 +34,7 @@ from sphereorient.pose.residuals import (
 )
 
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
-WITHOUT = "SPHEREORIENT_TORCH"  # an environment variable: set, and torch does all
+SOURCE = Path(__file__).with_name("disk_sums")
 
 
 class _Table(ctypes.Structure):
@@ -67,29 +68,9 @@ class _Task(ctypes.Structure):
     ]
 
 
-@cache
 def library() -> ctypes.CDLL | None:
-    """Return the compiled code for this processor; None where there is none, or the variable `WITHOUT` is set."""
-    if os.environ.get(WITHOUT):
-        return None
-    for kind in dict.fromkeys((torch.backends.cpu.get_cpu_capability().lower(), "default")):
-        found = load(kind)
-        if found is not None:
-            return found
-    return None
-
-
-def load(kind: str) -> ctypes.CDLL | None:
-    """Return the code compiled for a set of instructions (avx512, avx2, default); None: not built, or not for this."""
-    try:
-        code = ctypes.CDLL(str(Path(__file__).with_name(f"disk_sums_{kind}.so")))
-        code.disk_sums_record.restype = ctypes.c_int64
-        if code.disk_sums_record() != ctypes.sizeof(_Task):
-            return None  # of another version
-    except (OSError, AttributeError):
-        return None
-    code.disk_sums.argtypes = [ctypes.POINTER(_Task), ctypes.c_int64, ctypes.c_int64]
-    return code
+    """Return the compiled code for this processor; None where there is none."""
+    return compiled(SOURCE, _Task)
 
 
 @cache
@@ -188,7 +169,8 @@ def disk_sums(
     )
     ends = [L * part // threads for part in range(threads + 1)]
     work = [
-        lambda begin=begin, end=end: code.disk_sums(ctypes.byref(task), begin, end) for begin, end in pairwise(ends)
+        lambda begin=begin, end=end: code.disk_sums(ctypes.byref(task), ctypes.c_int64(begin), ctypes.c_int64(end))
+        for begin, end in pairwise(ends)
     ]
     others = [_threads().submit(part) for part in work[1:]]
     if any([work[0](), *(other.result() for other in others)]):

@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
+from sphereorient.motion import kalman
 from sphereorient.motion.kalman import StateSpace, run_filter, smooth
 from sphereorient.motion.matern import _M, ORDER, STATIONARY, Prior, grown, grown_rate, integral, nodes, prior_of_band
 from sphereorient.motion.path import RotationTrack, propagated, rotation_of, rotvec_between
@@ -46,8 +47,18 @@ def test_a_band_is_where_signal_and_noise_are_equally_strong() -> None:
     assert density == pytest.approx(0.5**2 * rate**2, rel=2e-2)
 
 
+@pytest.fixture(params=["numpy", "compiled"])
+def body(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Both forms of the recursions."""
+    if request.param == "numpy":
+        monkeypatch.setattr(kalman, "library", lambda: None)
+    elif kalman.library() is None:
+        pytest.skip("needs compiled code: `make setup` with a compiler")
+    return str(request.param)
+
+
 @pytest.mark.parametrize("hidden", [(), (0,), (3, 4), (9,)], ids=str)
-def test_filter_and_smoother_agree_with_dense_least_squares(hidden: tuple[int, ...]) -> None:
+def test_filter_and_smoother_agree_with_dense_least_squares(hidden: tuple[int, ...], body: str) -> None:
     rng = np.random.default_rng(5)
     count, size = 10, 7
     spread = lambda n: (lambda A: A @ A.swapaxes(-1, -2) + 0.1 * np.eye(n))(rng.standard_normal((n, n)))  # noqa: E731
@@ -124,3 +135,32 @@ def test_the_linear_problem_of_turns_has_the_derivatives_of_the_true_one() -> No
     still = propagated(path.mean, path.scaled(prior)[:1], prior.pole, np.ones(1))[0] @ R[0]
     moved = propagated(mean, rate, prior.pole, np.ones(1))[0] @ rotation_of(delta[None])[0] @ R[0]
     np.testing.assert_allclose(rotvec_between(still[None], moved[None])[0], F[:3] @ small, atol=1e-9)
+
+
+@pytest.mark.skipif(kalman.library() is None, reason="needs compiled code: `make setup` with a compiler")
+def test_compiled_recursions_are_those_of_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(2)
+    count = 3 * kalman.EVERY + 7
+    time = np.cumsum(rng.choice([1.0, 1.0, 2.5], count))
+    turns = np.cumsum(0.1 * rng.standard_normal((count, 3)), axis=0)
+    spread = 1e-4 * np.eye(3) + 1e-4 * np.outer([1.0, -1.0, 0.5], [1.0, -1.0, 0.5])
+    seen = rng.random(count) > 0.2
+    value = np.stack([rotation_of(turn[None])[0] for turn in turns])
+    value[~seen] = np.nan
+    covariance = np.broadcast_to(spread, (count, 3, 3))
+    chain = RotationTrack.of(time, value, covariance, seen).chain(Prior(pole=0.3, deviation=0.05))
+    wanted = np.eye(len(chain.start))[:9] + np.eye(len(chain.start))[5]
+    compiled = run_filter(chain)
+    behind = smooth(chain, compiled, wanted)
+    with monkeypatch.context() as patch:
+        patch.setattr(kalman, "library", lambda: None)
+        plain = run_filter(chain)
+        expected = smooth(chain, plain, wanted)
+    assert compiled.misfit == pytest.approx(plain.misfit, rel=1e-9)
+    assert compiled.log_determinant == pytest.approx(plain.log_determinant, rel=1e-9)
+    for name in ("state", "covariance", "gain", "innovation", "inverse"):
+        one, other = getattr(compiled, name), getattr(plain, name)
+        np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(other).max(), err_msg=name)
+    for name in ("state", "covariance", "mahalanobis"):
+        one, other = getattr(behind, name), getattr(expected, name)
+        np.testing.assert_allclose(one, other, atol=1e-7 * np.abs(other).max(), err_msg=name)

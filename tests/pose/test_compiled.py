@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 
 import pytest
@@ -22,6 +21,7 @@ from refine_examples import (
 )
 
 from sphereorient import so3
+from sphereorient.files.compiled import built_for
 from sphereorient.pose import compiled
 from sphereorient.pose.fit import POSE_PARTS, PoseStart, learn_light, refine
 from sphereorient.pose.lab_light import learn_lab_light
@@ -136,7 +136,7 @@ def test_a_disk_does_not_depend_on_batch_threads_or_the_width_of_vectors(pixels,
     torch.set_num_threads(3)
     threaded = refine(pixels, start, model)
     torch.set_num_threads(threads)
-    plain = compiled.load("default")
+    plain = built_for(compiled.SOURCE, compiled._Task, "default")
     assert plain is not None
     monkeypatch.setattr(compiled, "library", lambda: plain)
     narrow = refine(pixels, start, model)
@@ -153,17 +153,3 @@ def test_a_disk_without_a_number_gives_none_and_spoils_no_other(pixels):
     others = torch.arange(10) != 2
     assert bool(found.position_lab_mm[2].isnan().all())
     assert torch.equal(found.R_lab_body[others], whole.R_lab_body[others])
-
-
-def test_code_of_another_version_is_not_called(monkeypatch):
-    fields = [*compiled._Task._fields_, ("more", ctypes.c_int64)]
-    longer = type("Longer", (ctypes.Structure,), {"_fields_": fields})
-    monkeypatch.setattr(compiled, "_Task", longer)
-    assert compiled.load("default") is None
-
-
-def test_where_nothing_is_built_torch_fits(pixels, monkeypatch, tmp_path):
-    monkeypatch.setattr(compiled, "__file__", str(tmp_path / "compiled.py"))
-    assert compiled.load("default") is None
-    (tmp_path / "disk_sums_default.so").write_bytes(b"no library")
-    assert compiled.load("default") is None

@@ -1,4 +1,4 @@
-"""Build hook of the package: compile sphereorient/pose/disk_sums.c where there is a compiler."""
+"""Build hook of the package: compile its C sources where there is a compiler."""
 
 from __future__ import annotations
 
@@ -7,28 +7,29 @@ import platform
 import subprocess
 import sys
 import sysconfig
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-SOURCE = Path("sphereorient/pose/disk_sums.c")
+SOURCES = [Path("sphereorient/pose/disk_sums.c"), Path("sphereorient/motion/kalman.c")]
 # Fused multiplication and addition would give other bits on other processors.
 FLAGS = ["-std=c11", "-O3", "-fPIC", "-shared", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off"]
 X86 = {"avx2": ["-march=x86-64-v3"], "avx512": ["-march=x86-64-v4"]}
 
 
-class CompiledSums(BuildHookInterface):
+class Compiled(BuildHookInterface):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         compiler = os.environ.get("CC", "cc")
         kinds = {"default": [], **(X86 if platform.machine().lower() in ("x86_64", "amd64") else {})}
-        for kind, flags in kinds.items():
-            target = SOURCE.with_name(f"disk_sums_{kind}.so")
-            command = [compiler, *FLAGS, *flags, str(SOURCE), "-o", str(target), "-lm"]
+        for source, (kind, flags) in product(SOURCES, kinds.items()):
+            target = source.with_name(f"{source.stem}_{kind}.so")
+            command = [compiler, *FLAGS, *flags, str(source), "-o", str(target), "-lm"]
             try:
                 subprocess.run(command, cwd=self.root, check=True, capture_output=True)
             except (OSError, subprocess.CalledProcessError) as error:
-                print(f"disk_sums.c is not compiled for {kind} ({error}); the fit uses torch", file=sys.stderr)
+                print(f"{source} is not compiled for {kind} ({error}); slower code does its work", file=sys.stderr)
                 continue
             build_data["artifacts"].append(str(target))
             build_data["pure_python"] = False
