@@ -131,7 +131,7 @@ def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stenci
 
 
 def cut_pixels(
-    frame: NDArray[np.generic],
+    frame: NDArray[Any],
     background: Background,
     sight: LinesOfSight,
     middle_px: tuple[float, float],
@@ -144,28 +144,35 @@ def cut_pixels(
     width, height = sight.size
     u, v = round(middle_px[0]), round(middle_px[1])
     columns, rows = u + stencil.right, v + stencil.down
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    columns, rows = columns.clip(0, width - 1), rows.clip(0, height - 1)
+    if stencil.reach <= u < width - stencil.reach and stencil.reach <= v < height - stencil.reach:
+        inside = np.ones(len(columns), bool)
+    else:
+        inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+        columns, rows = columns.clip(0, width - 1), rows.clip(0, height - 1)
+    place = rows * width + columns
     if background.shown is not None:
-        inside &= background.shown[rows, columns]
-    reach = stencil.reach + math.ceil(3 * blur_px)
-    left, top = min(max(u - reach, 0), width - 1), min(max(v - reach, 0), height - 1)
-    window = np.s_[top : max(v + reach + 1, top + 1), left : max(u + reach + 1, left + 1)]
-    grey, behind = frame[window].astype(np.float32), background.mean[window]
+        inside &= background.shown.take(place)
+    grey, behind = frame.take(place), background.mean.take(place)
     clipped = grey >= background.full_scale
     if blur_px > 0:
-        grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), blur_px), np.float32)
-        behind = np.asarray(cv2.GaussianBlur(behind, (0, 0), blur_px), np.float32)
-    place = (rows - top).clip(0, grey.shape[0] - 1) * grey.shape[1] + (columns - left).clip(0, grey.shape[1] - 1)
-    at = torch.from_numpy(rows * width + columns)
+        reach = stencil.reach + math.ceil(3 * blur_px)
+        left, top = min(max(u - reach, 0), width - 1), min(max(v - reach, 0), height - 1)
+        window = np.s_[top : max(v + reach + 1, top + 1), left : max(u + reach + 1, left + 1)]
+        pictures = frame[window].astype(np.float32), background.mean[window]
+        soft = [np.asarray(cv2.GaussianBlur(picture, (0, 0), blur_px), np.float32) for picture in pictures]
+        down, right = (
+            at.clip(0, size - 1) for at, size in zip((rows - top, columns - left), soft[0].shape, strict=True)
+        )
+        grey, behind = (picture[down, right] for picture in soft)
+    at = torch.from_numpy(place)
     flat = sight.direction.reshape(3, -1)
     pitch_rad, pitch_mm = sight.pitch(min(max(u, 0), width - 2), min(max(v, 0), height - 2))
     return Pixels(
-        grey=torch.from_numpy(grey.reshape(-1)[place])[None],
-        behind=torch.from_numpy(np.ascontiguousarray(behind).reshape(-1)[place])[None],
+        grey=torch.from_numpy(grey.astype(np.float32))[None],
+        behind=torch.from_numpy(behind)[None],
         inside=torch.from_numpy(inside)[None],
-        clipped=torch.from_numpy(clipped.reshape(-1)[place])[None],
-        direction=flat[:, at][None],
+        clipped=torch.from_numpy(clipped)[None],
+        direction=flat.index_select(1, at)[None],
         origin=(sight.origin.reshape(3, 1) if sight.one_origin else sight.origin.reshape(3, -1)[:, at])[None],
         axes=sight.axes[None],
         pitch_rad=pitch_rad[None],
