@@ -57,6 +57,7 @@ FITS = 3.0  # excess of a fit whose map is right once worn paint is not used: 1.
 # 2 to 45 % of their paint, up to 1.1 where the map is warped, and with highlights or a rod.
 WORN_GAIN = 1.2
 WORN_SEEN = 0.005  # share of the ball that differs at first sight, below which it is not looked for
+MUCH_WORN = 0.2  # share of the ball: errors of what is left were 0.9 times those stated at 0.11, 3 times at 0.29
 WORN_LEAST = 0.01  # share of the ball; less paint than this moves no pose by as much as its noise
 BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
 CLEAR = 3.0  # times the variance that the typical right pose leaves
@@ -98,6 +99,11 @@ class Appearance:
     def soft(self) -> bool:
         """Whether the pictures are out of focus; the model of blur then errs by more than noise, and is not stated."""
         return defocus_radii(self.fitter.optics.blur_px, widest_px(self.fitter.views)) > 0
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether the model errs by more than its stated errors hold: soft pictures, or paint of which much is worn."""
+        return self.soft or (self.worn is not None and worn_share(self.worn) > MUCH_WORN)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

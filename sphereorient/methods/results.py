@@ -260,7 +260,7 @@ def _fit_flags(
     best = torch.where(table.use, picked["score"], -torch.inf).amax(-1)
     # Errors that scatter by this much more than noise lets them come from a model that is wrong, the map for example.
     excess = torch.where(table.use, picked["excess"], torch.inf).amin(-1)
-    doubtful = found & ((best < poor) | (excess > EXCESS) | learnt.soft | torch.from_numpy(missed))
+    doubtful = found & ((best < poor) | (excess > EXCESS) | learnt.in_doubt | torch.from_numpy(missed))
     bits = {Flag.ONE_CAMERA: one, Flag.DOUBTFUL_FIT: doubtful, Flag.AMBIGUOUS: found & learnt.second_ball}
     return torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0)
 

@@ -17,7 +17,7 @@ from sphereorient.methods.method import Learnt
 from sphereorient.pose.worn import UNUSED_PAINT, worn_of_text, worn_share
 from sphereorient.run.stages import run
 from sphereorient.run.store import MemoryStore, Request
-from sphereorient.trajectory import Trajectory
+from sphereorient.trajectory import Flag, Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +52,15 @@ def test_worn_paint_is_not_used_told_and_kept(worn, tmp_path, monkeypatch):
     assert 0.04 < worn_share(cells) < 0.2  # not all of it was in sight
     assert torch.equal(worn_of_text(track.provenance[UNUSED_PAINT]), cells)
     assert UNUSED_PAINT not in asis.provenance
+    assert not (track.flags & int(Flag.DOUBTFUL_FIT)).any()
     again = run(Request(experiment=worn, learnt=known), MemoryStore())
     assert again.orientation.tobytes() == track.orientation.tobytes()
     assert again.orientation_cov.tobytes() == track.orientation_cov.tobytes()
+
+
+@pytest.mark.slow
+def test_a_ball_that_has_lost_half_of_its_paint_is_in_doubt(tmp_path):
+    scene = BenchmarkScene(kind="wear", level=5, seed=0, number=0, degradations={"paint_wear": 5}, frames=24)
+    track = run(Request(experiment=write_scene(tmp_path, scene)), MemoryStore())
+    assert track.valid.all()
+    assert (track.flags[track.valid] & int(Flag.DOUBTFUL_FIT)).all()
