@@ -3,7 +3,8 @@
     scripts/bench_speed.py EXPERIMENT_FOLDER [--frames 240]
 
 CPU seconds of one thread for the stages, best of the repetitions, and wall seconds of the whole command in a fresh
-process. Other programs on the machine only ever make them longer: compare within one run. Prints Markdown.
+process. Other programs on the machine only ever make them longer: compare within one run. What is compiled is measured
+without it as well, five times in turn: median, and the least and largest. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -18,6 +21,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -26,6 +31,7 @@ import yaml
 from sphereorient import locate, so3
 from sphereorient.experiment import Experiment, load_experiment, open_movies
 from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.files.compiled import WITHOUT
 from sphereorient.follow import Appearance, ChunkTracker
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.follower import sample_frames
@@ -33,11 +39,15 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
-from sphereorient.pose import CameraView, base_table
+from sphereorient.motion import kalman
+from sphereorient.motion.matern import Prior
+from sphereorient.motion.path import RotationTrack, rotation_of
+from sphereorient.pose import CameraView, base_table, compiled
 from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
 from sphereorient.search import GreySearch, crop_disk, extract_paint
 from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
 
+TURNS, SMOOTHED = 5, 3000  # measurements in turn; frames of the smoother's
 FOLLOWED = 48  # frames over which one prediction after the other is timed
 TOLD = """
 import json, sys, time
@@ -71,6 +81,7 @@ def main() -> None:
     bench = prepared(arguments.folder)
     mean_s = stages(bench)
     literal(bench, mean_s)
+    smoother()
     with tempfile.TemporaryDirectory() as folder:
         whole("FFV1", arguments.folder / "experiment.yaml", len(bench.eyes))
         whole(".npy", as_npy(arguments.folder, Path(folder), arguments.frames), len(bench.eyes))
@@ -88,6 +99,45 @@ def cpu_s(work: Callable[[], object], repetitions: int = 5) -> float:
         work()
         spent.append(time.process_time() - begin)
     return min(spent)
+
+
+def told(values: list[float], scale: float = 1.0, digits: int = 2) -> str:
+    """Median, least and largest in words."""
+    median, low, high = (
+        f"{scale * value:.{digits}f}" for value in (statistics.median(values), min(values), max(values))
+    )
+    return f"{median} ({low} to {high})"
+
+
+def in_turn(work: Callable[[], float]) -> tuple[list[float], list[float]]:
+    """Measure five times in turn: with compiled code, and without."""
+    pairs = []
+    for _ in range(TURNS):
+        fast = work()
+        with (
+            mock.patch.object(compiled, "library", return_value=None),
+            mock.patch.object(kalman, "library", return_value=None),
+        ):
+            pairs.append((fast, work()))
+    return [fast for fast, _ in pairs], [slow for _, slow in pairs]
+
+
+def smoother() -> None:
+    """Time the smoother's two passes over a smooth random rotation."""
+    turns = np.cumsum(np.cumsum(1e-4 * np.random.default_rng(0).standard_normal((SMOOTHED, 3)), axis=0), axis=0)
+    time_, noise = np.arange(SMOOTHED, dtype=np.float64), np.broadcast_to(1e-6 * np.eye(3), (SMOOTHED, 3, 3))
+    track = RotationTrack.of(time_, rotation_of(turns), noise, np.ones(SMOOTHED, bool))
+    chain = track.chain(Prior(pole=0.3, deviation=0.01))
+    wanted = np.eye(len(chain.start))[:9]
+
+    def passes() -> float:
+        begin = time.process_time()
+        kalman.smooth(chain, kalman.run_filter(chain), wanted)
+        return (time.process_time() - begin) / SMOOTHED
+
+    fast, slow = in_turn(passes)
+    say("smoother, there and back, compiled, CPU us a frame", told(fast, 1e6, 1))
+    say("the same in numpy", told(slow, 1e6, 1))
 
 
 def prepared(folder: Path) -> Bench:
@@ -157,11 +207,16 @@ def stages(bench: Bench) -> float:
     # As many blocks side by side as the tracker follows: first frames are searched for, second ones approached.
     lanes = settings.refine.chunks
     begun, whole = [2] * lanes, [FOLLOWED // lanes] * lanes
-    short = cpu_s(lambda: list(tracker.track([movie[: sum(begun)] for movie in bench.shots], begun, bench.times)), 3)
-    long = cpu_s(lambda: list(tracker.track([movie[: sum(whole)] for movie in bench.shots], whole, bench.times)), 3)
-    each = (long - short) / (sum(whole) - sum(begun)) / cameras
-    say("predicted frame, decoded already, with covariance, CPU ms a camera; bar 3.7", f"{1e3 * each:.2f}")
-    say("refinement, camera-frames per CPU second (two cores: twice); bar 300", f"{1 / each:.0f}")
+
+    def tracked(batch: list[int]) -> float:
+        shots = [movie[: sum(batch)] for movie in bench.shots]
+        return cpu_s(lambda: list(tracker.track(shots, batch, bench.times)), 1)
+
+    fast, slow = in_turn(lambda: (tracked(whole) - tracked(begun)) / (sum(whole) - sum(begun)) / cameras)
+    each, short = statistics.median(fast), tracked(begun)
+    say("predicted frame, decoded already, with covariance, compiled, CPU ms a camera; bar 0.8", told(fast, 1e3))
+    say("the same in torch; bar: no slower than before, 4.3 to 5.0", told(slow, 1e3))
+    say("torch over compiled", told([b / a for a, b in zip(fast, slow, strict=True)]))
     block = settings.refine.chunk_frames
     return (short / lanes / cameras + (block - 2) * each) / block
 
@@ -221,15 +276,22 @@ def as_npy(folder: Path, out: Path, count: int) -> Path:
 
 
 def whole(kind: str, experiment: Path, cameras: int) -> None:
-    """Time the whole command in a fresh process."""
-    run = subprocess.run([sys.executable, "-c", TOLD, str(experiment)], stdout=subprocess.PIPE, text=True, check=True)
-    result = json.loads(run.stdout)
+    """Time the whole command in a fresh process, and once more without compiled code."""
+    result, plain = (in_process(experiment, without) for without in ({}, {WITHOUT: "1"}))
+    seconds = [f"{each['end']:.1f}, {each['cpu']:.1f}" for each in (result, plain)]
+    say(f"{kind}: the whole run, wall and CPU s; without compiled code", "; ".join(seconds))
     tracked = [(done, total, at) for stage, done, total, at in result["told"] if stage == "track"]
     begin, (_, total, _) = tracked[0][2], tracked[0]
-    say(f"{kind}: start-up to tracking, wall s; bar 5", f"{begin:.1f}")
+    say(f"{kind}: start-up to tracking, wall s; bar 3.5 cold", f"{begin:.1f}")
     rate = cameras * total / (result["end"] - begin)
-    say(f"{kind}: camera-frames per wall second, start-up apart; bars 120 (FFV1), 250 (.npy)", f"{rate:.0f}")
-    say(f"{kind}: CPU s in all, {total} frames of {cameras} cameras", f"{result['cpu']:.1f}")
+    say(f"{kind}: camera-frames per wall second, start-up apart; bars 180 (FFV1), 600 (.npy)", f"{rate:.0f}")
+
+
+def in_process(experiment: Path, environment: dict[str, str]) -> dict[str, Any]:
+    """Track in a fresh process; return when each stage was told."""
+    command = [sys.executable, "-c", TOLD, str(experiment)]
+    run = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=os.environ | environment)
+    return dict(json.loads(run.stdout))
 
 
 if __name__ == "__main__":

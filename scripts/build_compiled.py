@@ -24,7 +24,7 @@ class Compiled(BuildHookInterface):
         compiler = os.environ.get("CC", "cc")
         kinds = {"default": [], **(X86 if platform.machine().lower() in ("x86_64", "amd64") else {})}
         for source, (kind, flags) in product(SOURCES, kinds.items()):
-            target = source.with_name(f"{source.stem}_{kind}.so")
+            target = source.with_name(f"{source.stem}.{kind}.compiled")
             command = [compiler, *FLAGS, *flags, str(source), "-o", str(target), "-lm"]
             try:
                 subprocess.run(command, cwd=self.root, check=True, capture_output=True)

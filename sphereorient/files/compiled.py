@@ -24,7 +24,7 @@ def compiled(source: Path, record: type[ctypes.Structure]) -> ctypes.CDLL | None
 def built_for(source: Path, record: type[ctypes.Structure], kind: str) -> ctypes.CDLL | None:
     """Return the code built for a set of instructions (avx512, avx2, default), as `compiled`."""
     try:
-        code = ctypes.CDLL(str(source.with_name(f"{source.name}_{kind}.so")))
+        code = ctypes.CDLL(str(source.with_name(f"{source.name}.{kind}.compiled")))
         size = code[f"{source.name}_record"]
     except (OSError, AttributeError):  # not there, or for another machine
         return None

@@ -174,7 +174,7 @@ def test_after_a_gap_of_12_frames_and_44_degrees_the_track_goes_on(brisk, tmp_pa
     assert set(track.segment) == {0}
     assert angle_deg(track.orientation_smooth, brisk.R_lab_body)[gap].max() < 1.0
     sigma = np.sqrt(np.trace(track.orientation_smooth_cov, axis1=1, axis2=2))
-    assert sigma[gap[5]] > 1.2 * np.median(sigma[rest(brisk, gap)])
+    assert sigma[gap[5]] > 1.1 * np.median(sigma[rest(brisk, gap)])  # errors that last are in both
     turn = torch.from_numpy(brisk.R_lab_body @ track.orientation_smooth.swapaxes(1, 2))
     z = in_sigmas(so3.log(turn).numpy(), track.orientation_smooth_cov)[gap]
     assert 0.3 < np.sqrt((z**2).mean()) < 2.0

@@ -144,7 +144,7 @@ def followed_poses(
         times = recording.timeline.time_s.tolist()
         found = []
         for where in (None, place):
-            tracker = ChunkTracker(known, search, settings.refine, where)
+            tracker = ChunkTracker(known, search, settings.refine, centre=where)
             poses: list[Poses] = []
             for window in tracker.batches(recording.frames):
                 n = len(poses)
