@@ -54,6 +54,7 @@ class _Chunk:
     last: int  # + 1
     time_s: Sequence[float]  # of the batch's frames
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
+    turns: deque[Tensor] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
 
     def expected(self, frame: int, radius_mm: float, exposure_s: float = 0.0) -> _Expected | None:
         """Extrapolate position and rotation, to second order where three frames are known."""
@@ -72,20 +73,19 @@ class _Chunk:
         if not rough:
             *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
             *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
-            *_, R0, R1 = (poses.R_lab_body[0] for poses in rows)
-            turn, move, spread = on * so3.log(R1 @ R0.mT), on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
+            turn, move, spread = on * self.turns[-1], on * (X1 - X0), (1 + on) ** 2 * C1 + on**2 * C0
             astray_mm = ASTRAY_SHARE * radius_mm
             if len(rows) == 3:
                 before = (t1 - t0) / (t0 - self.time_s[frame - 3])
                 # The rate changes from the middle of one step to that of the next as it did between the two before.
                 more = (t2 - t0) / (t1 - self.time_s[frame - 3])
-                turn = (1 + more) * turn - on * before * more * so3.log(R0 @ rows[0].R_lab_body[0].mT)
+                turn = (1 + more) * turn - on * before * more * self.turns[0]
                 a, b = on * (1 + more), on * before * more
                 further = (1 + a) ** 2 * C1 + (a + b) ** 2 * C0 + b**2 * rows[0].covariance[0, 3:, 3:]
                 # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
                 if float(further.diagonal().sum()) < astray_mm**2:
                     move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
-            X, R = X1 + move, so3.exp(turn) @ R1
+            X, R = X1 + move, so3.exp(turn) @ R
             moved = open_share * torch.cat([turn, move])
         return _Expected(
             position_lab_mm=X,
@@ -101,6 +101,8 @@ class _Chunk:
     def saw(self, frame: int, poses: Poses) -> None:
         """Remember the best pose of a frame, if a picture supports it."""
         if len(poses) and bool(poses.use.any()):
+            if self.past:
+                self.turns.append(so3.log(poses.R_lab_body[0] @ self.past[-1][1].R_lab_body[0].mT))
             self.past.append((frame, poses))
 
 
