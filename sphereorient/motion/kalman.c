@@ -86,6 +86,12 @@ static void transpose(const double *X, double *Y, int64_t n) {
         for (int64_t j = 0; j < n; j++) Y[j * n + i] = X[i * n + j];
 }
 
+/* Asymmetry from rounding would grow. */
+static void make_symmetric(double *P, int64_t n) {
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t j = 0; j < i; j++) P[i * n + j] = P[j * n + i] = 0.5 * (P[i * n + j] + P[j * n + i]);
+}
+
 /* Take a symmetric P through F on both sides; the result is symmetric to the last bit. */
 static void both_sides(void (*one)(const Step *, const double *, double *, int64_t), const Step *step, double *P) {
     double half[MOST * MOST], other[MOST * MOST];
@@ -93,8 +99,7 @@ static void both_sides(void (*one)(const Step *, const double *, double *, int64
     one(step, P, half, n);
     transpose(half, other, n);
     one(step, other, P, n);
-    for (int64_t i = 0; i < n; i++)
-        for (int64_t j = 0; j < i; j++) P[i * n + j] = P[j * n + i] = 0.5 * (P[i * n + j] + P[j * n + i]);
+    make_symmetric(P, n);
 }
 
 /* Invert a positive definite (MEASURED, MEASURED); return the logarithm of its determinant. */
@@ -127,8 +132,7 @@ static void updated(double *P, const double *gain, int64_t n) {
     memcpy(seen[2], P + 2 * n, sizeof(double) * (size_t)n);
     for (int64_t i = 0; i < n; i++)
         for (int m = 0; m < MEASURED; m++) add_row(P + i * n, seen[m], -gain[i * MEASURED + m], n);
-    for (int64_t i = 0; i < n; i++)
-        for (int64_t j = 0; j < i; j++) P[i * n + j] = P[j * n + i] = 0.5 * (P[i * n + j] + P[j * n + i]);
+    make_symmetric(P, n);
 }
 
 /* P of state k - 1 becomes that of state k before its measurement. */

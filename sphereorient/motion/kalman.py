@@ -1,6 +1,6 @@
 """Kalman filter and modified Bryson-Frazier smoother: linear in time, no inverse of a covariance of states.
 
-`kalman.c` does the same, where it was built, ten times faster.
+`kalman.c` does the same, where it was built, three times faster.
 """
 
 import ctypes
@@ -56,8 +56,9 @@ class Filtered:
 
 def run_filter(chain: StateSpace) -> Filtered:
     """Run Kalman's filter (Kalman 1960)."""
-    if library() is not None:
-        return _filtered_compiled(chain)
+    code = library()
+    if code is not None:
+        return _filtered_compiled(code, chain)
     count, size = len(chain.measured), chain.start.shape[0]
     x, P, F = np.zeros(size), chain.start, np.zeros((size, size))
     states, covariances = np.empty((count, size)), np.empty((-(-count // EVERY), size, size))
@@ -131,8 +132,9 @@ def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedSta
     """Run backwards over a filtered chain; `wanted` (K, D) holds the rows whose covariance is returned.
     Source: Bierman 1973 (modified Bryson-Frazier); the distance from the others: de Jong 1988.
     """
-    if library() is not None:
-        return _smoothed_compiled(chain, filtered, wanted)
+    code = library()
+    if code is not None:
+        return _smoothed_compiled(code, chain, filtered, wanted)
     count, size = filtered.state.shape
     F = np.zeros((size, size))
     pull, hold = np.zeros(size), np.zeros((size, size))  # gradient and curvature that the future exerts
@@ -179,19 +181,17 @@ def library() -> ctypes.CDLL | None:
     return compiled(Path(__file__).with_name("kalman"), _Chain)
 
 
-def _run(name: str, chain: StateSpace, **arrays: Floats) -> None:
+def _run(code: ctypes.CDLL, name: str, chain: StateSpace, **arrays: Floats) -> None:
     """Call a function of the compiled code on a chain, and on arrays in and out, contiguous ones."""
     given = {key: np.ascontiguousarray(getattr(chain, key)) for key in StateSpace.__dataclass_fields__} | arrays
     numbers = {"count": len(chain.measured), "size": len(chain.start), "every": EVERY}
     numbers["wanted_rows"] = len(arrays.get("wanted", ()))
     record = _Chain(**numbers, **{key: array.ctypes.data for key, array in given.items()})
-    code = library()
-    assert code is not None
     if code[name](ctypes.byref(record)):
         raise MemoryError
 
 
-def _filtered_compiled(chain: StateSpace) -> Filtered:
+def _filtered_compiled(code: ctypes.CDLL, chain: StateSpace) -> Filtered:
     count, size = len(chain.measured), len(chain.start)
     found = {
         "state": np.empty((count, size)),
@@ -201,16 +201,17 @@ def _filtered_compiled(chain: StateSpace) -> Filtered:
         "inverse": np.zeros((count, 3, 3)),
         "sums": np.zeros(2),
     }
-    _run("kalman_filter", chain, **found)
+    _run(code, "kalman_filter", chain, **found)
     misfit, log_determinant = found.pop("sums").tolist()
     return Filtered(covariance=found.pop("stored"), misfit=misfit, log_determinant=log_determinant, **found)
 
 
-def _smoothed_compiled(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedStates:
+def _smoothed_compiled(code: ctypes.CDLL, chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedStates:
     count, size = filtered.state.shape
     state, mahalanobis = np.empty((count, size)), np.empty(count)
     spread = np.empty((count, len(wanted), len(wanted)))
     _run(
+        code,
         "kalman_smooth",
         chain,
         state=filtered.state,

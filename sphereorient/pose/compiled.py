@@ -11,14 +11,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sphereorient import so3
 from sphereorient.files.compiled import compiled
 from sphereorient.pose.model import (
     COVER_MIN,
     DEPTH_MIN,
     UNSEEN,
     SphereModel,
-    exposure,
+    during_exposure,
     limb_shape,
     rim_shape,
 )
@@ -95,12 +94,8 @@ def disk_sums(
     light = model.light.tables
     n_difference, n_black = model.shading.counts
     size, tiles = 6 + n_difference + n_black, int(pixels.tile.max()) + 1 if P else 1
-    instants, shares = exposure(pixels.instants)
-    X, R = X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0)
-    if pixels.instants > 1:
-        turn, move = pixels.moved[:, :3], pixels.moved[:, 3:]
-        X = torch.stack([X + at * move for at in instants])
-        R = torch.stack([so3.exp(at * turn) @ R for at in instants])
+    poses, shares = during_exposure(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0))
+    X, R = (torch.stack(parts) for parts in zip(*poses, strict=True))
     expected, weight = torch.empty(2, L, P) if state is None else state
     normal, gradient = torch.empty(L, size, size, dtype=torch.float64), torch.empty(L, size, dtype=torch.float64)
     scores, told = torch.empty(L, tiles if tell else 0, size, dtype=torch.float64), torch.empty(L, 3).double()

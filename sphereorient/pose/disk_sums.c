@@ -353,7 +353,7 @@ static inline float noise_variance(const float *noise, float grey, float floor_)
     return most(noise[0] + grey * (noise[1] + grey * (noise[2] + grey * noise[3])), floor_);
 }
 
-/* Return the number of monomials written for a block: 1, x, y, x^2, xy, y^2 .. */
+/* Write the first `count` monomials of a block, and those of the same order: 1, x, y, x^2, xy, y^2 .. */
 static void monomials(const float *x, const float *y, int n, int64_t count, float to[TINTS][BLOCK]) {
     for (int i = 0; i < n; i++) to[0][i] = 1.0f;
     for (int order = 1, last = 0, next = 1; next < count; order++) {
@@ -367,7 +367,7 @@ static void monomials(const float *x, const float *y, int n, int64_t count, floa
 }
 
 /* Write what each coefficient of the frame's own light adds in a block; places beyond n become 0. */
-static int lit_columns(const Task *t, const Disk *at, int64_t from, int n, float tints[TINTS][BLOCK],
+static void lit_columns(const Task *t, const Disk *at, int64_t from, int n, float tints[TINTS][BLOCK],
                        float to[][BLOCK]) {
     const int64_t more = t->n_difference > t->n_black ? t->n_difference : t->n_black;
     monomials(at->x + from, at->y + from, n, more, tints);
@@ -382,7 +382,6 @@ static int lit_columns(const Task *t, const Disk *at, int64_t from, int n, float
     const int count = (int)(t->n_difference + t->n_black);
     for (int c = 0; c < count; c++)
         for (int i = n; i < BLOCK; i++) to[c][i] = 0.0f;
-    return count;
 }
 
 /* Find the frame's own light, residuals, and weights by an expected picture and weights, as `residuals`. */
