@@ -152,8 +152,9 @@ def estimate_appearance(
     else:
         X, R, use = best_poses([found[k] for k in _clear(found)])
         shown = [pictures[k] for k in _clear(found)]
-    pixels = fitter.pixels(shown, X, fitter.optics.fine)
-    pixels = pixels.thinned(max(1, round(pixels.grey.shape[1] / ENOUGH)))
+    whole = fitter.pixels(shown, X, fitter.optics.fine)
+    thin = max(1, round(whole.grey.shape[1] / ENOUGH))
+    pixels = whole.thinned(thin)
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 4)
     fitter, fit = _light_and_blur(fitter, base, pixels, fit, use, given=settings.blur_px is not None)
     blur_px = fitter.optics.blur_px
@@ -176,6 +177,12 @@ def estimate_appearance(
         pixels, use = fitter.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
         fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=False)
     fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
+    whole = fitter.exposed(whole, None if moved is None else moved.nan_to_num())
+    free = fitter.unoccluded(whole, fit.position_lab_mm, fit.R_lab_body).thinned(thin)
+    if not torch.equal(free.inside, pixels.inside):  # what covers the ball bends light and poses
+        pixels = free
+        fitter = fitter.lit_again(pixels, fit, use)
+        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
     still = fitter if moved is None else replace(fitter, optics=blurred, instants=1)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())

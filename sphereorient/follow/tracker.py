@@ -247,6 +247,7 @@ class ChunkTracker:
         if bool(far.any()):
             begin = torch.where(far[:, None], self._from(fit.position_lab_mm), X)
             pixels = self.fitter.pixels(frames, begin, fine, widest, moved)
+        pixels = self.fitter.unoccluded(pixels, fit.position_lab_mm, fit.R_lab_body)
         return self._settled(pixels, self._from(fit.position_lab_mm), fit.R_lab_body, use, precision, 3)[0]
 
     def _settled(

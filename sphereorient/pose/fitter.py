@@ -15,11 +15,13 @@ from torch import Tensor, nn
 from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, sphere_radius_px
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene
+from sphereorient.pose.compiled import disk_sums
 from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
 from sphereorient.pose.lab_light import ROUNDS, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
+from sphereorient.pose.occluders import occluded
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
-from sphereorient.pose.residuals import KNOWN
+from sphereorient.pose.residuals import KNOWN, residuals
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 
@@ -197,6 +199,12 @@ class Fitter:
             fit = lit.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
         return lit, fit
 
+    def lit_again(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> "Fitter":
+        """Return a fitter whose light, of the same kind, and noise are learnt anew from fitted pictures."""
+        if isinstance(self.light, Light):
+            return self.with_light_of(pixels, fit, use)
+        return replace(self, light=learn_lab_light(pixels, fit, use, self.model(self.optics.fine)))
+
     def left(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, level: PyramidLevel | None = None, iterations: int = 3
     ) -> float:
@@ -258,6 +266,21 @@ class Fitter:
         if moved is None or self.instants == 1:
             return pixels
         return replace(pixels, moved=moved.repeat_interleave(len(self.views), 0), instants=self.instants)
+
+    def unoccluded(self, pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor) -> Pixels:
+        """Return the pixels of B * C disks without those that something before the sphere shows; see `occluded`.
+        Positions (B, 3), mm, and rotations (B, 3, 3) are right to a fraction of a pixel.
+        """
+        there, model, cameras = moved_to(self.device, pixels), self.model(self.optics.fine), len(self.views)
+        X, R = (part.to(self.device).double() for part in (position_lab_mm, R_lab_body))
+        noise, counted = model.light.noise.repeat(len(X), 1), there.inside & ~there.clipped
+        if model.paint.unseen is None:
+            expected, _ = disk_sums(there, X, R, None, model, cameras, tell=False).state
+        else:
+            at = residuals(there, X, R, None, model, cameras)
+            expected, counted = at.model, counted & at.inside
+        hidden = occluded(there, expected, noise, counted)
+        return replace(pixels, inside=pixels.inside & ~hidden.to(CPU))
 
     def fit(
         self,

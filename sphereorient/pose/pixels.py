@@ -39,6 +39,7 @@ class Pixels:
     pitch_mm: Tensor  # (L,), how far apart they start; 0 but behind a wall and in parallel light
     moved: Tensor  # (L, 6) float64, turn (rad) and move (mm, lab) of the sphere while the shutter is open
     tile: Tensor  # (P,) int64, square tile of the disk that a place belongs to, for errors that neighbours share
+    place: Tensor  # (2, P) int64, px to the right of and below the middle pixel
     inner: int = 0  # number of first places well within the limb
     instants: int = 1  # of the exposure that are rendered; 1: the sphere as if at rest
 
@@ -57,7 +58,7 @@ class Pixels:
         places = torch.arange(0, self.grey.shape[1], step)
         places = places[: whole_vectors(len(places))]
         own = ("origin",) if self.origin.shape[-1] > 1 else ()
-        some = self._with((*ALONG_PLACES, *own, "tile"), lambda part: part[..., places])
+        some = self._with((*ALONG_PLACES, *own, "tile", "place"), lambda part: part[..., places])
         return replace(some, inner=int((places < self.inner).sum()))
 
     def _with(self, names: Iterable[str], change: Callable[[Tensor], Tensor]) -> "Pixels":
@@ -106,6 +107,7 @@ class Stencil:
     right: NDArray[np.int64]  # (P,), px
     down: NDArray[np.int64]
     tile: Tensor  # (P,) int64
+    place: Tensor  # (2, P) int64, right and down
     reach: int  # px
     inner: int  # number of first places well within the limb
 
@@ -127,7 +129,8 @@ def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stenci
     tile = (down + reach) // tile_px * across + (right + reach) // tile_px
     _, tile = np.unique(tile, return_inverse=True)
     inner = int((right**2 + down**2 < (INNER * radius_px) ** 2).sum())
-    return Stencil(right=right, down=down, tile=torch.from_numpy(tile), reach=reach, inner=inner)
+    place = torch.from_numpy(np.stack([right, down]))
+    return Stencil(right=right, down=down, tile=torch.from_numpy(tile), place=place, reach=reach, inner=inner)
 
 
 def cut_pixels(
@@ -179,6 +182,7 @@ def cut_pixels(
         pitch_mm=pitch_mm[None],
         moved=torch.zeros(1, 6, dtype=torch.float64),
         tile=stencil.tile,
+        place=stencil.place,
         inner=stencil.inner,
     )
 

@@ -101,7 +101,7 @@ def residuals(
     rounds = (pixels.grey, (inside & ~pixels.clipped).to(columns.dtype)) if state is None else state
     for _ in range(1 if state is not None else 2):
         expected, weight = rounds
-        weighted = columns * (weight / _variance(expected, noise))[:, None]
+        weighted = columns * (weight / noise_variance(expected, noise))[:, None]
         coefficients = solve_damped(
             (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double(), ridge=1e-7
         ).to(columns.dtype)
@@ -110,8 +110,8 @@ def residuals(
         # A saturated pixel tells only that its grey level is at least this one.
         silent = pixels.clipped & (residual <= 0)
         residual = residual.masked_fill(silent, 0.0)
-        variance = _variance(grey, noise)
-        deviation = _deviation(residual, variance, inside)
+        variance = noise_variance(grey, noise)
+        deviation = robust_deviation(residual, variance, inside)
         variance = variance * deviation.clamp_min(1.0)[:, None] ** 2
         weight = (1.0 - residual.square() / (TUKEY**2 * variance)).clamp_min(0.0).square() * (inside & ~silent)
         rounds = grey, weight
@@ -164,7 +164,7 @@ def by_pose(disks: Tensor, cameras: int) -> Tensor:
     return disks.reshape(-1, cameras, *disks.shape[1:])
 
 
-def _variance(grey: Tensor, noise: Tensor) -> Tensor:
+def noise_variance(grey: Tensor, noise: Tensor) -> Tensor:
     """Return the noise variance expected at grey levels (L, P) by the curves (L, 4)."""
     grey = grey.clamp_min(0.0)
     a, b, c, d = noise[..., None].unbind(1)
@@ -172,7 +172,7 @@ def _variance(grey: Tensor, noise: Tensor) -> Tensor:
     return variance.clamp_min(NOISE_MIN)
 
 
-def _deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
+def robust_deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
     """Return the robust standard deviation of residuals over the noise expected, (L,), at least 1."""
     # A quarter of the places suffices: they are in order of distance from the middle.
     residual, variance, inside = residual[:, ::4], variance[:, ::4], inside[:, ::4]
