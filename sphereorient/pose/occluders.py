@@ -41,7 +41,8 @@ def occluded(pixels: Pixels, expected: Tensor, noise: Tensor, counted: Tensor) -
         return grid.reshape(-1, 1, height, width)
 
     mean = [avg_pool2d(on_grid(part), WINDOW_PX, 1, WINDOW_PX // 2) for part in (differs, counted.to(differs.dtype))]
-    seeds = (mean[0] > COVERED * mean[1]).to(differs.dtype)
+    # At the border of the stencil a few pixels are no window.
+    seeds = (mean[0] > COVERED * mean[1].clamp_min(0.5)).to(differs.dtype)
     hidden = max_pool2d(seeds, 2 * MARGIN_PX + 1, 1, MARGIN_PX).flatten(1)[:, cell] > 0
     share = (hidden & counted).sum(-1) / counted.sum(-1).clamp_min(1)
     return hidden & (share <= MOST_HIDDEN)[:, None]

@@ -39,7 +39,7 @@ def test_where_most_of_a_disk_differs_the_model_is_wrong():
     pictures[:, :, :, ::12] += 60.0
     pictures[:, :, :, 1::12] += 60.0
     pictures[:, :, :, 2::12] += 60.0
-    hidden, pixels = found(pictures)
+    hidden, _ = found(pictures)
     assert MOST_HIDDEN < 0.5
     assert not hidden.any()
 
