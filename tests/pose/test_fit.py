@@ -266,7 +266,7 @@ def test_the_deviation_of_normal_residuals_is_one_whatever_a_few_of_them_are():
     residual[:, ::9] = 500.0
     inside = torch.ones_like(residual, dtype=torch.bool)
     inside[1, ::9] = False
-    found = residuals_module._deviation(residual, torch.full_like(residual, 9.0), inside)
+    found = residuals_module.robust_deviation(residual, torch.full_like(residual, 9.0), inside)
     assert_close(found, torch.tensor([1.15, 1.0]), atol=0.03)  # among a ninth of outliers: the 56 % quantile
 
 
