@@ -31,6 +31,7 @@ from sphereorient.pose.fitter import (
     widest_px,
 )
 from sphereorient.pose.lasting import Lasting, lasting_errors
+from sphereorient.pose.occluders import USUALLY_HIDDEN
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.worn import without, worn_cells, worn_share
 from sphereorient.sphere.texture_table import TextureTable
@@ -179,7 +180,10 @@ def estimate_appearance(
     fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
     whole = fitter.exposed(whole, None if moved is None else moved.nan_to_num())
     free = fitter.unoccluded(whole, fit.position_lab_mm, fit.R_lab_body).thinned(thin)
-    if not torch.equal(free.inside, pixels.inside):  # what covers the ball bends light and poses
+    hidden = 1.0 - free.inside.sum(-1) / pixels.inside.sum(-1).clamp_min(1)
+    if float(hidden[use.flatten()].median()) > USUALLY_HIDDEN:
+        fitter = replace(fitter, most_hidden=0.0)
+    elif bool(hidden.any()):  # what covers the ball bends light and poses
         pixels = free
         fitter = fitter.lit_again(pixels, fit, use)
         fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)

@@ -181,7 +181,7 @@ class Initialiser:
             held = None if level is optics.fine else precision.expand(len(R), 3, 3)
             # All starts of a level use the same pixels: those about the position of the outlines.
             one = fitter.pixels([pictures], place, level).thinned(every)
-            if level is optics.fine and every == 1:
+            if level is optics.fine and every == 1 and fitter.light.known:
                 one = fitter.unoccluded(one, X[:1], R[:1])  # by the likeliest pose; the same pixels for all
             pixels = one.where(torch.arange(len(one)).repeat(len(R)))
             fit = fitter.fit(pixels, X, R, use.expand(len(R), -1), level, iterations, held)

@@ -47,6 +47,7 @@ class Learnt:
     blur_px: float
     still_blur_px: float  # of frames whose motion is not known
     instants: int  # of the exposure that fits render
+    most_hidden: float  # share of a disk that occluders may cover
     widest_px: float
     score_min: float
     right_score: float
@@ -75,6 +76,7 @@ class Learnt:
             blur_px=fitter.optics.blur_px,
             still_blur_px=study.still.optics.blur_px,
             instants=fitter.instants,
+            most_hidden=fitter.most_hidden,
             widest_px=fitter.widest_px,
             **{name: getattr(study, name) for name in (*OF_SCORES, *WHETHER)},
             worn=study.worn,
@@ -102,6 +104,7 @@ class Learnt:
             light=self.light,
             widest_px=self.widest_px,
             limb_px=self.limb_px,
+            most_hidden=self.most_hidden,
         )
         if self.instants > 1:
             fitter = replace(still, optics=Optics(paint, self.blur_px, widest), instants=self.instants)
@@ -167,6 +170,7 @@ def _write(learnt: Learnt, file: h5py.File) -> None:
     file.attrs["schema"] = SCHEMA
     for name in NUMBERS:
         file.attrs[name] = getattr(learnt, name)
+    file.attrs["most_hidden"] = learnt.most_hidden
     for name in WHETHER:
         file.attrs[name] = getattr(learnt, name)
     if learnt.instants > 1:
@@ -220,6 +224,7 @@ def _read(file: h5py.File) -> Learnt:
         scenes=scenes,
         still_blur_px=float(file.attrs.get("still_blur_px", file.attrs["blur_px"])),
         instants=int(file.attrs.get("instants", 1)),
+        most_hidden=float(file.attrs.get("most_hidden", 0.0)),  # an older version sought none
         light=light_of(parts, bool(light.attrs["known"])),
         limb_px=torch.from_numpy(file["limb_px"][()]) if "limb_px" in file else None,
         lasting=lasting,

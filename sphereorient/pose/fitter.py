@@ -19,7 +19,7 @@ from sphereorient.pose.compiled import disk_sums
 from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
 from sphereorient.pose.lab_light import ROUNDS, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
-from sphereorient.pose.occluders import occluded
+from sphereorient.pose.occluders import MOST_HIDDEN, occluded
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
 from sphereorient.pose.residuals import KNOWN, residuals
 from sphereorient.sphere import orthographic_view
@@ -158,6 +158,7 @@ class Fitter:
     device: torch.device = CPU  # of the fits; inputs and results are on the CPU
     widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
     limb_px: Tensor | None = None  # (C,), see `SphereModel`; None: 0
+    most_hidden: float = MOST_HIDDEN  # share of a disk that occluders may cover; 0: the model is wrong, none are sought
     instants: int = 1  # of the exposure that fits render; 1: the sphere as if at rest, the blur holds its motion
 
     def model(self, level: PyramidLevel) -> SphereModel:
@@ -271,6 +272,8 @@ class Fitter:
         """Return the pixels of B * C disks without those that something before the sphere shows; see `occluded`.
         Positions (B, 3), mm, and rotations (B, 3, 3) are right to a fraction of a pixel.
         """
+        if self.most_hidden == 0.0:
+            return pixels
         there, model, cameras = moved_to(self.device, pixels), self.model(self.optics.fine), len(self.views)
         X, R = (part.to(self.device).double() for part in (position_lab_mm, R_lab_body))
         noise, counted = model.light.noise.repeat(len(X), 1), there.inside & ~there.clipped
@@ -279,7 +282,7 @@ class Fitter:
         else:
             at = residuals(there, X, R, None, model, cameras)
             expected, counted = at.model, counted & at.inside
-        hidden = occluded(there, expected, noise, counted)
+        hidden = occluded(there, expected, noise, counted, self.most_hidden)
         return replace(pixels, inside=pixels.inside & ~hidden.to(CPU))
 
     def fit(
