@@ -179,6 +179,8 @@ def estimate_appearance(
         fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=False)
     fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
     whole = fitter.exposed(whole, None if moved is None else moved.nan_to_num())
+    # What lasts is sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
+    lasting_pixels = pixels
     free = fitter.unoccluded(whole, fit.position_lab_mm, fit.R_lab_body).thinned(thin)
     hidden = 1.0 - free.inside.sum(-1) / pixels.inside.sum(-1).clamp_min(1)
     if float(hidden[use.flatten()].median()) > USUALLY_HIDDEN:
@@ -208,7 +210,7 @@ def estimate_appearance(
     return Appearance(
         fitter=fitter,
         still=still,
-        lasting=lasting_errors(pixels, fit, use, fitter.model(fitter.optics.fine)),
+        lasting=lasting_errors(lasting_pixels, fit, use, fitter.model(fitter.optics.fine)),
         score_min=score_min,
         right_score=right,
         usual_apart_rad=_usual_apart(fit, use),
