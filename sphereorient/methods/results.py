@@ -149,11 +149,6 @@ def precise_track(
         "orientation_cov": smoothed.cov_given_path_rad2.numpy(),
         **datasets_of(smoothed, experiment.length_unit),
     }
-    # What lasts over all frames, no path averages away.
-    place, turn = learnt.lasting.covariance[3:, 3:].numpy(), _lasting_turns(table.use, learnt.lasting).numpy()
-    for kind in ("_cov", "_smooth_cov"):
-        known["position" + kind] = known["position" + kind] + place
-        known["orientation" + kind] = known["orientation" + kind] + turn
     return replace(
         empty,
         valid=(chosen.choice >= 0).numpy(),
@@ -168,13 +163,6 @@ def precise_track(
         margin_angle=angle.numpy(),
         cameras=cameras,
     )
-
-
-def _lasting_turns(use: Tensor, lasting: Lasting) -> Tensor:
-    """Return the covariances (N, 3, 3), rad^2, of what lasts, of frames that the cameras of `use` (N, C) measured."""
-    together = lasting.covariance[:3, :3].expand(len(use), 3, 3)
-    alone = use.to(torch.float64) @ lasting.own_rad2.flatten(1)
-    return torch.where((use.sum(1) == 1)[:, None, None], alone.reshape(-1, 3, 3), together)
 
 
 def map_track(
@@ -282,6 +270,22 @@ def with_systematic_errors(
     return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())
 
 
+def with_lasting_errors(track: Trajectory, lasting: Lasting) -> Trajectory:
+    """Add the errors that all frames share, which no path averages away, to the covariances of the poses."""
+    use = torch.from_numpy(np.stack([np.array(one.reason) == str(Reason.OK) for one in track.cameras.values()], 1))
+    together = lasting.covariance[:3, :3].expand(len(use), 3, 3)
+    alone = (use.to(torch.float64) @ lasting.own_rad2.flatten(1)).reshape(-1, 3, 3)
+    turn = torch.where((use.sum(1) == 1)[:, None, None], alone, together).numpy()
+    place = lasting.covariance[3:, 3:].numpy()
+    return replace(
+        track,
+        position_cov=track.position_cov + place,
+        position_smooth_cov=track.position_smooth_cov + place,
+        orientation_cov=track.orientation_cov + turn,
+        orientation_smooth_cov=track.orientation_smooth_cov + turn,
+    )
+
+
 def with_contradictions(
     track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool
 ) -> tuple[Trajectory, Consistency]:
@@ -312,7 +316,8 @@ def with_contradictions(
         gap_mm = 0.5 * (pair.apart > CONTRADICTS_SIGMAS * place_scale) * pair.gaps.signed_mm.nan_to_num()
         shift_mm = (pair.gaps.position_lab_mm - torch.from_numpy(track.position)).nan_to_num()
         shift_mm = torch.where(pair.both[:, None], 0.0, shift_mm)
-        rolled = gap_mm[:, None] / (diameter_mm / 2)
+        # A pose between two pictures turns the sphere to match their paint; one camera's own pose does not.
+        rolled = torch.where(pair.both, gap_mm, 0.0)[:, None] / (diameter_mm / 2)
         for whole, off in ((turn_cov, turn), (turn_cov, rolled), (place_cov, gap_mm[:, None]), (place_cov, shift_mm)):
             # In all directions: that of the error is not known as well as its size.
             whole += off.square().sum(-1)[:, None, None] * unit

@@ -21,6 +21,7 @@ from sphereorient.methods.paper import PAPER
 from sphereorient.methods.precise import PRECISE
 from sphereorient.methods.proposers import checkpoint_path
 from sphereorient.methods.settings import DEFAULT_METHOD, Settings, check_settings, settings_yaml
+from sphereorient.pose.lasting import Lasting
 from sphereorient.run.store import MemoryStore, Request, Store, writing_of
 from sphereorient.trajectory import Trajectory
 
@@ -122,7 +123,7 @@ class Work:
         measured = (self.store.read(batch) for batch in self.batches)
         self.progress("join", 0, 1)
         track, learnt = self.method.join(self.job, self.follower, measured, self.progress)
-        track = finished(track, self.job, self.request)
+        track = finished(track, self.job, self.request, None if learnt is None else learnt.lasting)
         with writing_of(self.request):
             if learnt is not None and self.request.save_learnt is not None:
                 learnt.save(self.request.save_learnt)
@@ -184,8 +185,8 @@ def track_movies(
     return run(request, MemoryStore(), progress=progress)
 
 
-def finished(track: Trajectory, job: Job, request: Request) -> Trajectory:
-    """Add the systematic errors of the calibration, and the provenance, to a track."""
+def finished(track: Trajectory, job: Job, request: Request, lasting: Lasting | None) -> Trajectory:
+    """Add the errors of calibration, of cameras that contradict each other, and of what lasts, and the provenance."""
     recording, settings = job.recording, job.settings
     track = results.with_systematic_errors(
         track, recording.cameras, recording.covariance, recording.experiment.radius_mm
@@ -196,6 +197,8 @@ def finished(track: Trajectory, job: Job, request: Request) -> Trajectory:
         track, found = results.with_contradictions(track, recording.cameras, diameter_mm, even)
         if found.contradicts:
             remarks.append(f"the cameras contradict each other ({found}): {found.advice}")
+    if lasting is not None:  # after the others: only noise is scaled
+        track = results.with_lasting_errors(track, lasting)
     inputs = input_files(recording.experiment, list(recording.cameras))
     origin = dict(track.provenance) | provenance(inputs, recording.experiment.folder, request.command)
     origin["remarks"] = remarks

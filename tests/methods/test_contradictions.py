@@ -12,8 +12,9 @@ import torch
 
 from sphereorient import so3
 from sphereorient.cameras import sphere_radius_px
-from sphereorient.methods.results import _missed, with_contradictions
+from sphereorient.methods.results import _missed, with_contradictions, with_lasting_errors
 from sphereorient.pose.fitter import CameraView
+from sphereorient.pose.lasting import Lasting
 from sphereorient.synth import SynthSettings
 from sphereorient.synth.write import default_cameras, frame_times_s, motion_of
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
@@ -84,6 +85,32 @@ def test_a_gap_between_the_lines_of_sight_is_stated_and_marked_from_a_pixel_on()
         assert (marked.flags == flag).all()
         half_mm = shift_px / 2 * MM / (2 * track.cameras["cam1"].radius_px)
         np.testing.assert_allclose(np.sqrt(marked.position_cov[:, 0, 0]), half_mm, rtol=0.02)
+
+
+def test_a_gap_turns_a_pose_between_two_pictures_but_not_that_of_one_camera():
+    for why, rolls in ((Reason.OK, True), (Reason.CONTRADICTS, False)):
+        track = track_of({}, {"cam1": 3.0}, why)
+        marked, _ = with_contradictions(track, CAMERAS, MM, True)
+        half_mm = 3.0 / 2 * MM / (2 * track.cameras["cam1"].radius_px)
+        added = np.sqrt(marked.orientation_cov[:, 0, 0] - track.orientation_cov[:, 0, 0])
+        np.testing.assert_allclose(added, half_mm / (MM / 2) * rolls, rtol=0.02)
+
+
+def test_what_lasts_is_added_by_the_cameras_that_measured_a_frame():
+    rng = np.random.default_rng(5)
+    whole, cam1, cam2 = (torch.from_numpy(a @ np.swapaxes(a, -1, -2)) for a in (rng.normal(size=(3, 6, 6))))
+    lasting = Lasting(covariance=whole, own_rad2=torch.stack([cam1, cam2])[:, :3, :3])
+    track = track_of({}, {})
+    track = replace(track, orientation_smooth_cov=2 * track.orientation_cov, position_smooth_cov=2 * track.position_cov)
+    reason = (Reason.OK, Reason.CONTRADICTS, Reason.NOT_FOUND, *[Reason.OK] * (FRAMES - 3))
+    reasons = {"cam1": reason[::-1], "cam2": reason}
+    one = {name: replace(camera, reason=reasons[name]) for name, camera in track.cameras.items()}
+    added = with_lasting_errors(replace(track, cameras=one), lasting)
+    turn = np.stack([whole.numpy()[:3, :3]] * FRAMES)
+    turn[1:3], turn[-3:-1] = cam1.numpy()[:3, :3], cam2.numpy()[:3, :3]
+    for kind in ("_cov", "_smooth_cov"):
+        for name, what in (("orientation", turn), ("position", whole.numpy()[3:, 3:])):
+            np.testing.assert_allclose(getattr(added, name + kind), getattr(track, name + kind) + what, rtol=1e-12)
 
 
 def test_frames_that_are_not_valid_get_no_flag():
