@@ -13,7 +13,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-SOURCES = [Path("sphereorient/pose/disk_sums.c"), Path("sphereorient/motion/kalman.c")]
+SOURCES = [Path("sphereorient/pose/refine.c"), Path("sphereorient/motion/kalman.c")]
 # Fused multiplication and addition would give other bits on other processors.
 FLAGS = ["-std=c11", "-O3", "-fPIC", "-shared", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off"]
 X86 = {"avx2": ["-march=x86-64-v3"], "avx512": ["-march=x86-64-v4"]}

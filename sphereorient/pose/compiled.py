@@ -1,4 +1,4 @@
-"""The sums of the fit from compiled code, disk_sums.c; where that was not built, on a GPU and in double: from torch."""
+"""The fit of poses by compiled code, refine.c; none where that was not built, on a GPU and in double."""
 
 import ctypes
 import math
@@ -7,33 +7,32 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.files.compiled import compiled
-from sphereorient.pose.model import (
-    COVER_MIN,
-    DEPTH_MIN,
-    UNSEEN,
-    SphereModel,
-    during_exposure,
-    limb_shape,
-    rim_shape,
-)
+from sphereorient.pose.model import COVER_MIN, DEPTH_MIN, UNSEEN, SphereModel, exposure, limb_shape, rim_shape
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.residuals import (
-    KNOWN,
-    NOISE_MIN,
-    TUKEY,
-    DiskSums,
-    Told,
-    torch_sums,
-    without_light,
-)
+from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, TUKEY
 
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
-SOURCE = Path(__file__).with_name("disk_sums")
+RESULTS = {
+    "position_lab_mm": (3,),
+    "R_lab_body": (3, 3),
+    "covariance": (6, 6),
+    "own_turn": (-1, 3),  # -1: of each camera
+    "own_covariance": (-1, 3, 3),
+    "own_move": (-1, 3),
+    "own_sigma_mm": (-1,),
+    "excess": (-1,),
+    "score": (-1,),
+    "nll": (),
+    "step": (6,),
+}  # parts of `FittedPoses`, in the order of the record
+SOURCE = Path(__file__).with_name("refine")
 
 
 class _Table(ctypes.Structure):
@@ -41,12 +40,12 @@ class _Table(ctypes.Structure):
 
 
 class _Task(ctypes.Structure):
-    """The record `Task` of disk_sums.c, field by field."""
+    """The record `Task` of refine.c, field by field."""
 
     _fields_ = [
         *((name, ctypes.c_int64) for name in ("disks", "places", "inner", "cameras", "tiles", "instants", "origins")),
         *((name, ctypes.c_void_p) for name in ("grey", "behind", "inside", "clipped", "direction", "origin", "axes")),
-        *((name, ctypes.c_void_p) for name in ("pitch_rad", "pitch_mm", "moved", "rotation", "shares", "tile")),
+        *((name, ctypes.c_void_p) for name in ("pitch_rad", "pitch_mm", "move", "turn", "shares", "tile")),
         *((name, ctypes.c_float) for name in ("radius_mm", "blur_px")),
         *((name, _Table) for name in ("paint", "unseen")),
         *(
@@ -62,8 +61,13 @@ class _Task(ctypes.Structure):
         ("cover", ctypes.c_void_p),
         ("depths", ctypes.c_int64),
         *((name, ctypes.c_void_p) for name in ("gain", "noise", "stray")),
-        *((name, ctypes.c_int64) for name in ("n_difference", "n_black", "first", "last")),
-        *((name, ctypes.c_void_p) for name in ("expected", "weight", "normal", "gradient", "scores", "told")),
+        *((name, ctypes.c_int64) for name in ("n_difference", "n_black")),
+        *((name, ctypes.c_void_p) for name in ("start", "start_rotation", "use", "place_precision")),
+        ("iterations", ctypes.c_int64),
+        ("limb_px", ctypes.c_void_p),
+        ("edge_px", ctypes.c_float),
+        ("expected", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in RESULTS),
     ]
 
 
@@ -74,47 +78,54 @@ def library() -> ctypes.CDLL | None:
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="disk-sums")
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="refine")
 
 
-def disk_sums(
+def refined(
     pixels: Pixels,
     X: Tensor,
     R: Tensor,
-    state: tuple[Tensor, Tensor] | None,
     model: SphereModel,
-    cameras: int,
-    tell: bool,
-) -> DiskSums:
-    """Sum the linear problem of B * C disks, as `torch_sums`, with compiled code where that can."""
+    use: Tensor,
+    place_precision: Tensor | None = None,
+    iterations: int = 0,
+) -> tuple[Tensor, dict[str, Tensor]] | None:
+    """Fit B poses, X (B, 3), mm, and R_lab_body R (B, 3, 3), to B * C disks, those of `use` (B, C) bool.
+    Return expected grey levels (B * C, P) before the last step, and the parts of `FittedPoses`, without meaning where
+    there are no iterations; None where compiled code cannot do it. `place_precision` as in `PoseStart`.
+    """
     code = library()
     if code is None or pixels.grey.device.type != "cpu" or pixels.grey.dtype != torch.float32 or X.requires_grad:
-        return torch_sums(pixels, X, R, state, model, cameras, tell)
+        return None
     L, P = pixels.grey.shape
-    light = model.light.tables
+    poses, cameras = use.shape
+    light, paint, unseen = model.light.tables, model.paint, model.paint.unseen
     n_difference, n_black = model.shading.counts
-    size, tiles = 6 + n_difference + n_black, int(pixels.tile.max()) + 1 if P else 1
-    poses, shares = during_exposure(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0))
-    X, R = (torch.stack(parts) for parts in zip(*poses, strict=True))
-    expected, weight = torch.empty(2, L, P) if state is None else state
-    normal, gradient = torch.empty(L, size, size, dtype=torch.float64), torch.empty(L, size, dtype=torch.float64)
-    scores, told = torch.empty(L, tiles if tell else 0, size, dtype=torch.float64), torch.empty(L, 3).double()
-    threads = max(1, min(L, torch.get_num_threads()))
+    instants, shares = exposure(pixels.instants)
+    move = turn = None
+    if pixels.instants > 1:
+        along = torch.tensor(instants, dtype=torch.float64)[:, None, None] * pixels.moved.double()
+        move, turn = along[..., 3:], so3.exp(along[..., :3])
+    expected = torch.empty(L, P)
+    parts = {
+        name: torch.empty(poses, *(cameras if n < 0 else n for n in tail), dtype=torch.float64)
+        for name, tail in RESULTS.items()
+    }
     kept: list[Tensor] = []
 
-    def at(part: Tensor | None) -> int | None:
+    def at(part: Tensor | None, dtype: torch.dtype | None = None) -> int | None:
         if part is None:
             return None
-        kept.append(part.contiguous())
+        kept.append(part.to(dtype or part.dtype).contiguous())
         return kept[-1].data_ptr()
 
-    paint, unseen = model.paint, model.paint.unseen
+    results: dict[str, Any] = {name: part.data_ptr() for name, part in parts.items()}
     task = _Task(
         disks=L,
         places=P,
         inner=pixels.inner,
         cameras=cameras,
-        tiles=tiles,
+        tiles=int(pixels.tile.max()) + 1 if P else 1,
         instants=pixels.instants,
         origins=pixels.origin.shape[-1],
         grey=at(pixels.grey),
@@ -126,8 +137,8 @@ def disk_sums(
         axes=at(pixels.axes),
         pitch_rad=at(pixels.pitch_rad),
         pitch_mm=at(pixels.pitch_mm),
-        moved=at(X.double()),
-        rotation=at(R.double()),
+        move=at(move),
+        turn=at(turn),
         shares=at(torch.tensor(shares, dtype=torch.float32)),
         tile=at(pixels.tile),
         radius_mm=model.radius_mm,
@@ -153,29 +164,26 @@ def disk_sums(
         stray=at(model.light.stray),
         n_difference=n_difference,
         n_black=n_black,
-        first=int(state is None),
-        last=int(tell),
+        start=at(X, torch.float64),
+        start_rotation=at(R, torch.float64),
+        use=at(use),
+        place_precision=at(place_precision, torch.float64),
+        iterations=iterations,
+        limb_px=at(model.limb_px, torch.float32),
+        edge_px=EDGE_PX,
         expected=at(expected),
-        weight=at(weight),
-        normal=at(normal),
-        gradient=at(gradient),
-        scores=at(scores),
-        told=at(told),
+        **results,
     )
-    ends = [L * part // threads for part in range(threads + 1)]
+    threads = max(1, min(poses, torch.get_num_threads()))
+    ends = [poses * part // threads for part in range(threads + 1)]
     work = [
-        lambda begin=begin, end=end: code.disk_sums(ctypes.byref(task), ctypes.c_int64(begin), ctypes.c_int64(end))
+        lambda begin=begin, end=end: code.refine(ctypes.byref(task), ctypes.c_int64(begin), ctypes.c_int64(end))
         for begin, end in pairwise(ends)
     ]
     others = [_threads().submit(part) for part in work[1:]]
     if any([work[0](), *(other.result() for other in others)]):
         raise MemoryError
-    information, pull, mixed = without_light(normal, gradient)
-    said = None
-    if tell:
-        share, loss, step = told.unbind(1)
-        said = Told(scores=(scores[..., :6] - scores[..., 6:] @ mixed).mT, share=share, loss=loss, step=step)
-    return DiskSums(state=(expected, weight), information=information, pull=pull, told=said)
+    return expected, parts
 
 
 @cache

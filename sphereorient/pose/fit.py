@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.compiled import disk_sums
+from sphereorient.pose.compiled import refined
 from sphereorient.pose.model import (
     Light,
     Shading,
@@ -24,10 +24,9 @@ from sphereorient.pose.model import (
     stray_basis,
 )
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.residuals import NOISE_MIN, Residuals, by_pose, residuals
+from sphereorient.pose.residuals import EDGE_PX, NOISE_MIN, Residuals, by_pose, residuals, torch_sums
 from sphereorient.so3 import inverse_damped, solve_damped
 
-EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
 NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it
 STRAY_ROUNDS, STRAY_TUKEY, FEWEST_BESIDE = 5, 6.0, 200  # rounds, standard deviations, pixels
 STRAY_LEAST = 0.05  # coefficients, summed, of the step from black to white paint: clean pictures 0.01, glare 0.13
@@ -100,9 +99,13 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
     """Fit poses to pictures: robust Gauss-Newton, the light's coefficients eliminated in every step.
     `pixels` holds B * C disks, the cameras of a pose next to each other; `iterations` is at least 1. The covariance is
     robust, with errors shared within tiles. All results but the pose belong to the pose before the last step.
+    Where compiled code can do it, it does, to less than 0.001 degrees.
     Source: variable projection, Golub and Pereyra 1973; covariance from clustered scores, Liang and Zeger 1986.
     """
     use, place_precision, radius_mm = begin.use, begin.place_precision, model.radius_mm
+    done = refined(pixels, begin.position_lab_mm, begin.R_lab_body, model, use, place_precision, iterations)
+    if done is not None:
+        return FittedPoses(**done[1])
     cameras = use.shape[1]
     start = begin.position_lab_mm.double()
     X, R = start, begin.R_lab_body.double()
@@ -110,7 +113,7 @@ def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int
     seen = use.to(X.dtype)
     state: tuple[Tensor, Tensor] | None = None
     for k in range(iterations):
-        sums = disk_sums(pixels, X, R, state, model, cameras, tell=k == iterations - 1)
+        sums = torch_sums(pixels, X, R, state, model, cameras, tell=k == iterations - 1)
         state = sums.state
         information, pull = by_pose(sums.information, cameras), by_pose(sums.pull, cameras)
         whole = (information * seen[..., None, None]).sum(1)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, sphere_radius_px
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene
-from sphereorient.pose.compiled import disk_sums
+from sphereorient.pose.compiled import refined
 from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
 from sphereorient.pose.lab_light import ROUNDS, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
@@ -277,11 +277,13 @@ class Fitter:
         there, model, cameras = moved_to(self.device, pixels), self.model(self.optics.fine), len(self.views)
         X, R = (part.to(self.device).double() for part in (position_lab_mm, R_lab_body))
         noise, counted = model.light.noise.repeat(len(X), 1), there.inside & ~there.clipped
-        if model.paint.unseen is None:
-            expected, _ = disk_sums(there, X, R, None, model, cameras, tell=False).state
-        else:
+        every = torch.ones(len(X), cameras, dtype=torch.bool)
+        done = refined(there, X, R, model, every) if model.paint.unseen is None else None
+        if done is None:
             at = residuals(there, X, R, None, model, cameras)
             expected, counted = at.model, counted & at.inside
+        else:
+            expected = done[0]
         hidden = occluded(there, expected, noise, counted, self.most_hidden)
         return replace(pixels, inside=pixels.inside & ~hidden.to(CPU))
 

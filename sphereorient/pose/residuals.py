@@ -12,6 +12,7 @@ from sphereorient.so3 import solve_damped
 
 TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
 KNOWN = 0.3  # least share of a disk that shows known paint
+EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
 NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
 
 
@@ -33,7 +34,7 @@ class Residuals:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DiskSums:
-    """What one step of the fit needs of L disks at one pose each; made by `torch_sums`, or by compiled code."""
+    """What one step of the fit needs of L disks at one pose each; made by `torch_sums`."""
 
     state: tuple[Tensor, Tensor]  # expected grey levels and weights, (L, P) each
     information: Tensor  # (L, 6, 6) float64, of delta (rad) and position (mm), the light's coefficients eliminated

@@ -21,8 +21,8 @@ def test_code_of_another_version_is_not_called():
 
 
 def test_there_is_none_where_nothing_was_built_or_the_file_is_no_library(tmp_path, monkeypatch):
-    assert built_for(tmp_path / "disk_sums", _Task, "default") is None
-    (tmp_path / "disk_sums.default.compiled").write_bytes(b"no library")
-    assert built_for(tmp_path / "disk_sums", _Task, "default") is None
+    assert built_for(tmp_path / "refine", _Task, "default") is None
+    (tmp_path / "refine.default.compiled").write_bytes(b"no library")
+    assert built_for(tmp_path / "refine", _Task, "default") is None
     monkeypatch.setenv(WITHOUT, "1")
     assert compiled(tmp_path / "other", _Task) is None

@@ -1,4 +1,4 @@
-"""The compiled sums of the fit against torch's, which define them: same poses, covariances and scores, everywhere."""
+"""The compiled fit against torch's, which defines it: same poses, covariances and scores, everywhere."""
 
 from __future__ import annotations
 

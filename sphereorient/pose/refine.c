@@ -1,4 +1,4 @@
-/* The sums of one step of the fit, disk by disk: what `torch_sums` of residuals.py computes, which defines it.
+/* The fit of poses, pose by pose: what `refine` of fit.py computes with `torch_sums` of residuals.py, which define it.
 
    Built for several instruction sets without fused or reordered arithmetic: all of them give the same bits. Stages over
    blocks of pixels keep their data in the first cache. Pictures in single precision, sums in double. */
@@ -29,9 +29,8 @@ typedef struct {
     const uint8_t *inside, *clipped;
     /* geometry: (disks, 3, places), (disks, 3, origins), (disks, 2, 3), (disks), (disks) */
     const float *direction, *origin, *axes, *pitch_rad, *pitch_mm;
-    const double *moved;    /* (instants, disks, 3) positions, mm */
-    const double *rotation; /* (instants, disks, 3, 3) */
-    const float *shares;    /* (instants) */
+    const double *move, *turn; /* (instants, disks, 3), mm, (instants, disks, 3, 3): from the middle of the exposure */
+    const float *shares;       /* (instants) */
     const int64_t *tile;    /* (places) */
     /* the model */
     float radius_mm, blur_px;
@@ -47,13 +46,30 @@ typedef struct {
     int64_t depths;
     const float *gain, *noise, *stray; /* (cameras), (cameras, 4), (cameras, HARMONICS) */
     int64_t n_difference, n_black;     /* columns of a frame's own light */
-    int64_t first, last;               /* whether the state is unknown; whether `told` and `scores` are asked for */
-    /* results; `expected` and `weight` (disks, places) are the state */
-    float *expected, *weight;
-    double *normal, *gradient; /* (disks, n, n), (disks, n), n = 6 + n_difference + n_black */
-    double *scores;            /* (disks, tiles, n) */
-    double *told;              /* (disks, 3): share of variance explained, loss, median step from black to white */
+    /* where the fits begin: (poses, 3), (poses, 3, 3), (poses, cameras), (poses, 3, 3) or none */
+    const double *start, *start_rotation;
+    const uint8_t *use;
+    const double *place_precision;
+    int64_t iterations; /* 0: only `expected` is asked for */
+    const float *limb_px; /* (cameras), or none */
+    float edge_px;
+    /* results: (disks, places), and the parts of `FittedPoses` */
+    float *expected;
+    double *position, *rotation, *covariance, *own_turn, *own_covariance, *own_move, *own_sigma, *excess, *score, *nll;
+    double *step;
 } Task;
+
+/* Where one disk stands in the fit, and what a step needs of it. */
+typedef struct {
+    const double *position, *rotation; /* of the pose */
+    float *expected, *weight;          /* (places) */
+    int first, last;                   /* whether these are unknown; whether scores and `told` are asked for */
+    double *scores;                    /* (tiles, n), n = 6 + n_difference + n_black */
+    double normal[COLUMNS * COLUMNS], gradient[COLUMNS];
+    double information[36], pull[6];
+    double told[3];      /* share of variance explained, loss, median step from black to white */
+    double to_centre[3]; /* from the camera, mm */
+} Sums;
 
 /* What is known of the places of one disk. */
 typedef struct {
@@ -123,25 +139,47 @@ static float ranked(const float *at, int64_t count, int64_t rank) {
     return value;
 }
 
-/* Solve the damped symmetric system (n, n) in place by elimination; `right` becomes the solution. */
-static void solve(double *matrix, double *right, int n, double ridge) {
-    for (int i = 0; i < n; i++) matrix[i * n + i] += ridge * (matrix[i * n + i] > 0 ? matrix[i * n + i] : 0) + 1e-12;
+/* Solve the symmetric system (n, n) in place by elimination; `right` (n, m) becomes the solution. */
+static void eliminate(double *matrix, double *right, int n, int m) {
     for (int k = 0; k < n; k++)
         for (int i = k + 1; i < n; i++) {
             const double factor = matrix[i * n + k] / matrix[k * n + k];
             for (int j = k; j < n; j++) matrix[i * n + j] -= factor * matrix[k * n + j];
-            right[i] -= factor * right[k];
+            for (int j = 0; j < m; j++) right[i * m + j] -= factor * right[k * m + j];
         }
-    for (int i = n - 1; i >= 0; i--) {
-        for (int j = i + 1; j < n; j++) right[i] -= matrix[i * n + j] * right[j];
-        right[i] /= matrix[i * n + i];
-    }
+    for (int i = n - 1; i >= 0; i--)
+        for (int c = 0; c < m; c++) {
+            for (int j = i + 1; j < n; j++) right[i * m + c] -= matrix[i * n + j] * right[j * m + c];
+            right[i * m + c] /= matrix[i * n + i];
+        }
+}
+
+/* The same, damped by a share of each diagonal element. */
+static void solve(double *matrix, double *right, int n, int m, double ridge) {
+    for (int i = 0; i < n; i++) matrix[i * n + i] += ridge * (matrix[i * n + i] > 0 ? matrix[i * n + i] : 0) + 1e-12;
+    eliminate(matrix, right, n, m);
+}
+
+/* Write the product of a (n, k) and b (k, m). */
+static void multiply(const double *a, const double *b, double *to, int n, int k, int m) {
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < m; j++) {
+            double sum = 0;
+            for (int l = 0; l < k; l++) sum += a[i * k + l] * b[l * m + j];
+            to[i * m + j] = sum;
+        }
 }
 
 /* Render a block of places at one instant, added to the disk with the instant's share; as `sphere_view`. */
-static void render(const Task *t, const Disk *to, int64_t k, int64_t instant, int64_t from, int n, float share) {
-    const double *position = t->moved + (instant * t->disks + k) * 3;
-    const double *turned = t->rotation + (instant * t->disks + k) * 9;
+static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int64_t instant, int64_t from, int n) {
+    const double *move = t->move + (instant * t->disks + k) * 3, *turn_by = t->turn + (instant * t->disks + k) * 9;
+    const float share = t->shares[instant];
+    double position[3], turned[9];
+    for (int c = 0; c < 3; c++) position[c] = of->position[c] + (t->instants > 1 ? move[c] : 0.0);
+    if (t->instants > 1)
+        multiply(turn_by, of->rotation, turned, 3, 3, 3);
+    else
+        memcpy(turned, of->rotation, sizeof turned);
     const float *d[3], *origin = t->origin + k * 3 * t->origins, *axes = t->axes + k * 6;
     float R[3][3], centre[3], radius = t->radius_mm;
     double distance2 = 0;
@@ -385,12 +423,12 @@ static void lit_columns(const Task *t, const Disk *at, int64_t from, int n, floa
 }
 
 /* Find the frame's own light, residuals, and weights by an expected picture and weights, as `residuals`. */
-static float light_up(const Task *t, const Disk *at, int64_t k, double *coefficients) {
+static float light_up(const Task *t, const Disk *at, const Sums *of, int64_t k, double *coefficients) {
     const int64_t P = t->places;
     const float *grey = t->grey + k * P, *noise = t->noise + (k % t->cameras) * 4, floor_ = t->noise_least;
     const float own[4] = {noise[0], noise[1], noise[2], noise[3]};
     const uint8_t *inside = at->counts, *clipped = t->clipped + k * P;
-    float *expected = t->expected + k * P, *weight = t->weight + k * P;
+    float *expected = of->expected, *weight = of->weight;
     float tints[TINTS][BLOCK], column[COLUMNS][BLOCK], weighted[BLOCK], target[BLOCK];
     double matrix[COLUMNS * COLUMNS] = {0};
     const int count = (int)(t->n_difference + t->n_black);
@@ -411,7 +449,7 @@ static float light_up(const Task *t, const Disk *at, int64_t k, double *coeffici
     }
     for (int a = 0; a < count; a++)
         for (int b = 0; b < a; b++) matrix[a * count + b] = matrix[b * count + a];
-    solve(matrix, coefficients, count, 1e-7);
+    solve(matrix, coefficients, count, 1, 1e-7);
     float by[COLUMNS];
     for (int c = 0; c < count; c++) by[c] = (float)coefficients[c];
     int64_t told = 0;
@@ -456,17 +494,16 @@ static float light_up(const Task *t, const Disk *at, int64_t k, double *coeffici
 }
 
 /* Sum the normal equations of pose and light, and where asked for the scores of tiles. */
-static void gather(const Task *t, const Disk *at, int64_t k, const double *coefficients) {
+static void gather(const Task *t, const Disk *at, Sums *of, const double *coefficients) {
     const int64_t P = t->places, nd = t->n_difference;
     const int n_all = 6 + (int)(nd + t->n_black);
-    const float *weight = t->weight + k * P;
-    double *normal = t->normal + k * n_all * n_all, *gradient = t->gradient + k * n_all;
-    double *scores = t->scores + k * n_all * t->tiles;
+    const float *weight = of->weight;
+    double *normal = of->normal, *gradient = of->gradient, *scores = of->scores;
     float tints[TINTS][BLOCK], column[COLUMNS][BLOCK], weighted[BLOCK], precision[BLOCK], left[BLOCK];
     float score[BLOCK][COLUMNS];
     memset(normal, 0, sizeof(double) * (size_t)(n_all * n_all));
     memset(gradient, 0, sizeof(double) * (size_t)n_all);
-    if (t->last) memset(scores, 0, sizeof(double) * (size_t)(n_all * t->tiles));
+    if (of->last) memset(scores, 0, sizeof(double) * (size_t)(n_all * t->tiles));
     for (int64_t from = 0; from < P; from += BLOCK) {
         const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
         lit_columns(t, at, from, n, tints, column + 6);
@@ -503,10 +540,10 @@ static void gather(const Task *t, const Disk *at, int64_t k, const double *coeff
             for (int i = 0; i < n; i++) weighted[i] = precision[i] * column[a][i];
             for (int b = a; b < n_all; b++) normal[a * n_all + b] += product(weighted, column[b]);
             gradient[a] += product(weighted, left);
-            if (t->last)
+            if (of->last)
                 for (int i = 0; i < n; i++) score[i][a] = weighted[i] * left[i];
         }
-        if (t->last)
+        if (of->last)
             for (int i = 0; i < n; i++) {
                 double *tile = scores + t->tile[from + i] * n_all;
                 for (int a = 0; a < n_all; a++) tile[a] += score[i][a];
@@ -517,9 +554,9 @@ static void gather(const Task *t, const Disk *at, int64_t k, const double *coeff
 }
 
 /* Tell how well the disk is explained: share of its variance, loss, median step from black to white paint. */
-static void tell(const Task *t, const Disk *at, int64_t k, float deviation) {
+static void tell(const Task *t, const Disk *at, Sums *of, int64_t k, float deviation) {
     const int64_t P = t->places;
-    const float *expected = t->expected + k * P;
+    const float *expected = of->expected;
     const uint8_t *inside = t->inside + k * P;
     double share = 0, cover = 0, mean = 0, spread = 0, left = 0, loss = 0;
     float one[BLOCK], counted[BLOCK] = {0}, all[BLOCK] = {0}, part[BLOCK] = {0};
@@ -558,57 +595,272 @@ static void tell(const Task *t, const Disk *at, int64_t k, float deviation) {
         if (pass == 1) spread /= share > 1e-6 ? share : 1e-6;
     }
     left /= share > 1e-6 ? share : 1e-6;
-    double *told = t->told + k * 3;
+    double *told = of->told;
     told[0] = spread > 1e-6 && share > t->known_least * cover ? 1.0 - left / (spread > 1e-9 ? spread : 1e-9) : 0.0;
     told[1] = loss;
     for (int64_t p = 0; p < t->inner; p++) at->sorted[p] = most(at->lit[p], 0.0f); /* below 1 all count alike */
     told[2] = t->inner ? ranked(at->sorted, t->inner, (t->inner - 1) / 2) : 0.0;
 }
 
-/* The size of the record that this code reads: a caller with another one must not call it. */
-int64_t disk_sums_record(void) { return (int64_t)sizeof(Task); }
-
-/* Sum the disks from `begin` to before `end`, each by itself; return 0, or 1 without memory. */
-int disk_sums(const Task *t, int64_t begin, int64_t end) {
-    const int64_t P = (t->places + BLOCK - 1) / BLOCK * BLOCK;
-    float *floats = malloc(sizeof(float) * (size_t)(P * FLOATS)), *next = floats;
-    uint8_t *bytes = malloc((size_t)(2 * P));
-    if (!floats || !bytes) {
-        free(floats), free(bytes);
-        return 1;
+/* Eliminate the light's coefficients, from the scores as well. */
+static void without_light(const Task *t, Sums *of) {
+    const int light = (int)(t->n_difference + t->n_black), n = 6 + light;
+    double own[COLUMNS * COLUMNS], mixed[COLUMNS * 6];
+    for (int a = 0; a < light; a++) {
+        for (int b = 0; b < light; b++) own[a * light + b] = of->normal[(6 + a) * n + 6 + b];
+        own[a * light + a] += 1e-7 * (own[a * light + a] + 1e-12);
+        for (int c = 0; c < 6; c++) mixed[a * 6 + c] = of->normal[(6 + a) * n + c];
     }
-    Disk at;
-    float **parts[] = {&at.paint,   &at.cover,   &at.x,       &at.y,       &at.aside,      &at.out[0],  &at.out[1],
-                       &at.out[2],  &at.turn[0], &at.turn[1], &at.turn[2], &at.move[0],    &at.move[1], &at.move[2],
-                       &at.limb[0], &at.limb[1], &at.limb[2], &at.count,   &at.difference, &at.black,   &at.beside,
-                       &at.residual, &at.variance, &at.lit};
-    for (int c = 0; c < FLOATS; c++, next += P) *parts[c] = next;
-    at.sorted = at.count; /* not needed at the same time */
-    at.known = bytes, at.counts = bytes + P;
-    for (int64_t k = begin; k < end; k++) {
-        memset(floats, 0, sizeof(float) * (size_t)(P * 18));
-        memset(at.known, 1, (size_t)P);
-        for (int64_t instant = 0; instant < t->instants; instant++)
-            for (int64_t from = 0, n; from < t->places; from += n) {
-                const int64_t end = from < t->inner ? t->inner : t->places; /* a block lies on one side of `inner` */
-                n = end - from < BLOCK ? end - from : BLOCK;
-                render(t, &at, k, instant, from, (int)n, t->shares[instant]);
-            }
-        if (t->instants > 1) mean_of_instants(t, &at);
-        shine(t, &at, k);
-        const uint8_t *inside = t->inside + k * t->places, *clipped = t->clipped + k * t->places;
-        float *expected = t->expected + k * t->places, *weight = t->weight + k * t->places;
-        for (int64_t p = 0; p < t->places; p++) at.counts[p] = inside[p] && at.known[p];
-        if (t->first) { /* the first weights come from the picture itself, bubbles included; a second round does without */
-            memcpy(expected, t->grey + k * t->places, sizeof(float) * (size_t)t->places);
-            for (int64_t p = 0; p < t->places; p++) weight[p] = (float)(at.counts[p] && !clipped[p]);
+    eliminate(own, mixed, light, 6);
+    for (int a = 0; a < 6; a++) {
+        of->pull[a] = of->gradient[a];
+        for (int l = 0; l < light; l++) of->pull[a] -= mixed[l * 6 + a] * of->gradient[6 + l];
+        for (int b = 0; b < 6; b++) {
+            double sum = of->normal[a * n + b];
+            for (int l = 0; l < light; l++) sum -= of->normal[a * n + 6 + l] * mixed[l * 6 + b];
+            of->information[a * 6 + b] = sum;
         }
-        double coefficients[COLUMNS];
-        float deviation = 0;
-        for (int round = 0; round < (t->first ? 2 : 1); round++) deviation = light_up(t, &at, k, coefficients);
-        gather(t, &at, k, coefficients);
-        if (t->last) tell(t, &at, k, deviation);
     }
-    free(floats), free(bytes);
-    return 0;
+    for (int64_t tile = 0; of->last && tile < t->tiles; tile++)
+        for (int a = 0; a < 6; a++)
+            for (int l = 0; l < light; l++)
+                of->scores[tile * n + a] -= of->scores[tile * n + 6 + l] * mixed[l * 6 + a];
+}
+
+/* Sum the linear problem of one disk. */
+static void sum_disk(const Task *t, const Disk *at, Sums *of, int64_t k) {
+    const int64_t padded = (t->places + BLOCK - 1) / BLOCK * BLOCK;
+    memset(at->paint, 0, sizeof(float) * (size_t)(padded * 18)); /* the first of its arrays, up to `count` */
+    memset(at->known, 1, (size_t)padded);
+    for (int64_t instant = 0; instant < t->instants; instant++)
+        for (int64_t from = 0, n; from < t->places; from += n) {
+            const int64_t end = from < t->inner ? t->inner : t->places; /* a block lies on one side of `inner` */
+            n = end - from < BLOCK ? end - from : BLOCK;
+            render(t, at, of, k, instant, from, (int)n);
+        }
+    if (t->instants > 1) mean_of_instants(t, at);
+    shine(t, at, k);
+    const uint8_t *inside = t->inside + k * t->places, *clipped = t->clipped + k * t->places;
+    for (int64_t p = 0; p < t->places; p++) at->counts[p] = inside[p] && at->known[p];
+    if (of->first) { /* the first weights come from the picture itself, bubbles included; a second round does without */
+        memcpy(of->expected, t->grey + k * t->places, sizeof(float) * (size_t)t->places);
+        for (int64_t p = 0; p < t->places; p++) of->weight[p] = (float)(at->counts[p] && !clipped[p]);
+    }
+    double coefficients[COLUMNS];
+    float deviation = 0;
+    for (int round = 0; round < (of->first ? 2 : 1); round++) deviation = light_up(t, at, of, k, coefficients);
+    if (!t->iterations) return;
+    gather(t, at, of, coefficients);
+    if (of->last) tell(t, at, of, k, deviation);
+    without_light(t, of);
+}
+
+static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+static double length(const double *a) { return sqrt(dot(a, a)); }
+
+/* Shorten a step by the largest change that a camera of `seen` sees, as `_bounded`. */
+static void bound(double *step, const Sums *sums, const uint8_t *seen, int64_t cameras, double radius) {
+    double size = length(step);
+    for (int64_t c = 0; c < cameras; c++) {
+        const double *to_centre = sums[c].to_centre, norm = length(to_centre), distance = norm > radius ? norm : radius;
+        double along = 0, aside[3];
+        for (int i = 0; i < 3; i++) along += step[3 + i] * to_centre[i] / distance;
+        for (int i = 0; i < 3; i++) aside[i] = step[3 + i] - along * to_centre[i] / distance;
+        const double change = (!seen || seen[c]) * hypot(length(aside) / radius, along / distance);
+        size = change > size || change != change ? change : size;
+    }
+    const double shorter = 0.1 / (size < 0.1 ? 0.1 : size);
+    for (int i = 0; i < 6; i++) step[i] *= shorter;
+}
+
+/* Write the rotation by a vector, rad. */
+static void rotation_by(const double *turn, double *to) {
+    const double angle2 = dot(turn, turn), angle = sqrt(angle2);
+    const double a = angle > 1e-4 ? sin(angle) / angle : 1 - angle2 / 6;
+    const double half = angle > 1e-4 ? sin(angle / 2) / angle : 0.5 - angle2 / 48, b = 2 * half * half;
+    const double x = turn[0], y = turn[1], z = turn[2];
+    const double cross[9] = {0, -z, y, z, 0, -x, -y, x, 0};
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            to[i * 3 + j] = (i == j) + a * cross[i * 3 + j] + b * (turn[i] * turn[j] - (i == j ? angle2 : 0));
+}
+
+static void invert(const double *matrix, int stride, double *inverse, int n) {
+    double work[36];
+    for (int i = 0; i < n; i++)
+        for (int j = 0; j < n; j++) work[i * n + j] = matrix[i * stride + j], inverse[i * n + j] = i == j;
+    solve(work, inverse, n, n, 1e-9);
+}
+
+/* Write a b a' of symmetric a and b, (n, n). */
+static void sandwich(const double *a, const double *b, double *to, int n) {
+    double half[36];
+    multiply(a, b, half, n, n, n);
+    multiply(half, a, to, n, n, n);
+}
+
+static double trace(const double *matrix, int n) {
+    double sum = 0;
+    for (int i = 0; i < n; i++) sum += matrix[i * n + i];
+    return sum;
+}
+
+/* Tell the covariance of a pose, and what each camera alone says. `whole` is the information of all, `step` the last. */
+static void conclude(const Task *t, const Sums *sums, int64_t pose, const double *whole, const double *step) {
+    const int64_t cameras = t->cameras, n_all = 6 + t->n_difference + t->n_black;
+    const uint8_t *use = t->use + pose * cameras;
+    const double radius = t->radius_mm, count = (double)t->tiles, fitted = (double)n_all;
+    const double few = count / (count - fitted > 1 ? count - fitted : 1);
+    double meat[36] = {0}, bread[36], lured[36] = {0}, found[6] = {0}, aside_px = 0, finest_mm = INFINITY, nll = 0;
+    invert(whole, 6, bread, 6);
+    for (int64_t c = 0; c < cameras; c++) {
+        const Sums *of = sums + c;
+        const int64_t k = pose * cameras + c;
+        const double *information = of->information, *to_centre = of->to_centre, distance = length(to_centre);
+        double shared[36] = {0}, corner[9], own_bread[9], own[36], freely[36], right[6];
+        for (int64_t tile = 0; tile < t->tiles; tile++)
+            for (int a = 0; a < 6; a++)
+                for (int b = 0; b < 6; b++)
+                    shared[a * 6 + b] += of->scores[tile * n_all + a] * of->scores[tile * n_all + b];
+        for (int i = 0; i < 36; i++) shared[i] *= few;
+        for (int a = 0; a < 3; a++)
+            for (int b = 0; b < 3; b++) corner[a * 3 + b] = information[a * 6 + b];
+        for (int a = 0; a < 3; a++) {
+            right[a] = of->pull[a];
+            for (int b = 0; b < 3; b++) right[a] -= information[a * 6 + 3 + b] * step[3 + b];
+        }
+        invert(corner, 3, own_bread, 3);
+        memcpy(own, corner, sizeof corner);
+        solve(own, right, 3, 1, 1e-9);
+        for (int a = 0; a < 3; a++) t->own_turn[k * 3 + a] = right[a] - step[a];
+        for (int a = 0; a < 3; a++)
+            for (int b = 0; b < 3; b++) corner[a * 3 + b] = shared[a * 6 + b];
+        double *own_covariance = t->own_covariance + k * 9;
+        sandwich(own_bread, corner, own_covariance, 3);
+        const double noise = trace(own_bread, 3);
+        t->excess[k] = sqrt(trace(own_covariance, 3) / (noise > 1e-30 ? noise : 1e-30));
+        invert(information, 6, freely, 6);
+        multiply(freely, of->pull, right, 6, 6, 1);
+        for (int i = 0; i < 6; i++) right[i] -= step[i];
+        bound(right, of, 0, 1, radius);
+        memcpy(t->own_move + k * 3, right + 3, sizeof(double) * 3);
+        sandwich(freely, shared, own, 6);
+        double across = own[21] + own[28] + own[35];
+        for (int a = 0; a < 3; a++)
+            for (int b = 0; b < 3; b++)
+                across -= to_centre[a] * own[(3 + a) * 6 + 3 + b] * to_centre[b] / (distance * distance);
+        t->own_sigma[k] = sqrt((across > 0 ? across : 0) / 2);
+        t->score[k] = of->told[0];
+        if (!use[c]) continue;
+        nll += of->told[1];
+        /* An edge that is a pixel off moves the sphere along each line of sight. */
+        const double px_mm = (double)t->pitch_mm[k] + (double)t->pitch_rad[k] * distance;
+        double edge[6], moved[6];
+        for (int a = 0; a < 6; a++) {
+            edge[a] = 0;
+            for (int b = 0; b < 3; b++) edge[a] += information[a * 6 + 3 + b] * to_centre[b] * (px_mm / radius);
+        }
+        multiply(bread, edge, moved, 6, 6, 1);
+        for (int a = 0; a < 6; a++) {
+            found[a] += t->limb_px ? (double)t->limb_px[c] * moved[a] : 0;
+            for (int b = 0; b < 6; b++) lured[a * 6 + b] += moved[a] * moved[b];
+        }
+        for (int i = 0; i < 36; i++) meat[i] += shared[i];
+        const float *stray = t->stray + c * HARMONICS;
+        double square = (double)stray[0] * stray[0];
+        for (int h = 1; h < HARMONICS; h++) square += 0.5 * stray[h] * stray[h];
+        const double limb = t->blur_px * sqrt(square) / (of->told[2] > 1 ? of->told[2] : 1);
+        aside_px = limb > aside_px ? limb : aside_px;
+        finest_mm = px_mm < finest_mm ? px_mm : finest_mm;
+    }
+    t->nll[pose] = nll;
+    int any_seen = 1;
+    for (int i = 0; i < 6; i++) any_seen &= whole[i * 7] > 0;
+    double *covariance = t->covariance + pose * 36, sum[36];
+    memcpy(covariance, bread, sizeof bread); /* without a picture */
+    if (!any_seen) return;
+    if (t->place_precision) /* the prior position has an error of its own */
+        for (int a = 0; a < 3; a++)
+            for (int b = 0; b < 3; b++) meat[(3 + a) * 6 + 3 + b] += t->place_precision[pose * 9 + a * 3 + b];
+    sandwich(bread, meat, sum, 6);
+    const double edge2 = (double)t->edge_px * (double)t->edge_px, aside_mm = finest_mm < INFINITY ? aside_px * finest_mm : 0;
+    for (int a = 0; a < 6; a++)
+        for (int b = 0; b < 6; b++) sum[a * 6 + b] += edge2 * lured[a * 6 + b] + found[a] * found[b];
+    for (int a = 0; a < 6; a++) sum[a * 7] += (a < 3 ? aside_mm / radius : aside_mm) * (a < 3 ? aside_mm / radius : aside_mm);
+    for (int a = 0; a < 6; a++)
+        for (int b = 0; b < 6; b++) covariance[a * 6 + b] = 0.5 * (sum[a * 6 + b] + sum[b * 6 + a]);
+}
+
+/* Fit one pose to the pictures of all cameras. */
+static void fit(const Task *t, const Disk *at, Sums *sums, int64_t pose) {
+    const int64_t cameras = t->cameras;
+    const uint8_t *use = t->use + pose * cameras;
+    const double *start = t->start + pose * 3, *prior = t->place_precision ? t->place_precision + pose * 9 : 0;
+    double X[3], R[9], whole[36], step[6];
+    memcpy(X, start, sizeof X), memcpy(R, t->start_rotation + pose * 9, sizeof R);
+    for (int64_t round = 0; round < (t->iterations ? t->iterations : 1); round++) {
+        memset(whole, 0, sizeof whole), memset(step, 0, sizeof step);
+        for (int64_t c = 0; c < cameras; c++) {
+            const int64_t k = pose * cameras + c;
+            Sums *of = sums + c;
+            of->position = X, of->rotation = R;
+            of->expected = t->expected + k * t->places;
+            of->first = round == 0, of->last = round == t->iterations - 1;
+            sum_disk(t, at, of, k);
+            for (int i = 0; i < 3; i++) of->to_centre[i] = X[i] - (double)t->origin[(k * 3 + i) * t->origins];
+            if (!use[c]) continue;
+            for (int i = 0; i < 36; i++) whole[i] += of->information[i];
+            for (int i = 0; i < 6; i++) step[i] += of->pull[i];
+        }
+        if (!t->iterations) break;
+        for (int a = 0; a < 3 && prior; a++)
+            for (int b = 0; b < 3; b++) {
+                whole[(3 + a) * 6 + 3 + b] += prior[a * 3 + b];
+                step[3 + a] -= prior[a * 3 + b] * (X[b] - start[b]);
+            }
+        double work[36], by[9], turned[9];
+        memcpy(work, whole, sizeof work);
+        solve(work, step, 6, 1, 1e-9);
+        bound(step, sums, use, cameras, t->radius_mm);
+        rotation_by(step, by);
+        multiply(by, R, turned, 3, 3, 3);
+        memcpy(R, turned, sizeof R);
+        for (int i = 0; i < 3; i++) X[i] += step[3 + i];
+    }
+    if (!t->iterations) return;
+    for (int64_t c = 0; c < cameras; c++)
+        for (int i = 0; i < 3; i++)
+            sums[c].to_centre[i] = X[i] - (double)t->origin[((pose * cameras + c) * 3 + i) * t->origins];
+    memcpy(t->position + pose * 3, X, sizeof X), memcpy(t->rotation + pose * 9, R, sizeof R);
+    memcpy(t->step + pose * 6, step, sizeof step);
+    conclude(t, sums, pose, whole, step);
+}
+
+/* The size of the record that this code reads: a caller with another one must not call it. */
+int64_t refine_record(void) { return (int64_t)sizeof(Task); }
+
+/* Fit the poses from `begin` to before `end`, each by itself; return 0, or 1 without memory. */
+int refine(const Task *t, int64_t begin, int64_t end) {
+    const int64_t P = (t->places + BLOCK - 1) / BLOCK * BLOCK, n = 6 + t->n_difference + t->n_black;
+    float *floats = malloc(sizeof(float) * (size_t)(P * (FLOATS + t->cameras))), *next = floats;
+    uint8_t *bytes = malloc((size_t)(2 * P));
+    Sums *sums = malloc(sizeof(Sums) * (size_t)t->cameras);
+    double *scores = malloc(sizeof(double) * (size_t)(t->cameras * t->tiles * n));
+    const int without = !floats || !bytes || !sums || !scores;
+    if (!without) {
+        Disk at;
+        float **parts[] = {&at.paint,   &at.cover,   &at.x,       &at.y,       &at.aside,      &at.out[0],  &at.out[1],
+                           &at.out[2],  &at.turn[0], &at.turn[1], &at.turn[2], &at.move[0],    &at.move[1], &at.move[2],
+                           &at.limb[0], &at.limb[1], &at.limb[2], &at.count,   &at.difference, &at.black,   &at.beside,
+                           &at.residual, &at.variance, &at.lit};
+        for (int c = 0; c < FLOATS; c++, next += P) *parts[c] = next;
+        at.sorted = at.count; /* not needed at the same time */
+        at.known = bytes, at.counts = bytes + P;
+        for (int64_t c = 0; c < t->cameras; c++, next += P)
+            sums[c].weight = next, sums[c].scores = scores + c * t->tiles * n;
+        for (int64_t pose = begin; pose < end; pose++) fit(t, &at, sums, pose);
+    }
+    free(floats), free(bytes), free(sums), free(scores);
+    return without;
 }
