@@ -39,9 +39,8 @@ def occluded(pixels: Pixels, expected: Tensor, noise: Tensor, counted: Tensor, m
     own = variance * robust_deviation(residual, variance, counted).clamp_min(1.0)[:, None].square()
     differs = (residual.square() / own).clamp_max(MOST_EACH) * counted
     right, down = (pixels.place - pixels.place.amin(1, keepdim=True)).cpu().numpy()
-    hidden = torch.from_numpy(
-        np.stack([_covered(*disk, down, right) for disk in zip(*_arrays(differs, counted), strict=True)])
-    ).to(counted.device)
+    disks = zip(_array(differs), _array(counted), strict=True)
+    hidden = torch.from_numpy(np.stack([_covered(*disk, down, right) for disk in disks])).to(counted.device)
     share = (hidden & counted).sum(-1) / counted.sum(-1).clamp_min(1)
     return hidden & (share <= most)[:, None]
 
@@ -59,5 +58,6 @@ def _covered(differs: Floats, counted: Floats, down: Indices, right: Indices) ->
     return covered
 
 
-def _arrays(*parts: Tensor) -> list[Floats]:
-    return [part.to(torch.float32).cpu().numpy() for part in parts]
+def _array(part: Tensor) -> Floats:
+    array: Floats = part.to(torch.float32).cpu().numpy()
+    return array
