@@ -193,7 +193,8 @@ def estimate_appearance(
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
     best, highest = _scores(looked)
-    if max(best, right) < highest + NO_BETTER and _times_better(looked) < TELLING:
+    # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
+    if best < highest + NO_BETTER and _times_better(looked) < TELLING:
         do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
         got = f"poses that explain {100 * best:.0f} % of the pictures, as wrong ones do"
         raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
