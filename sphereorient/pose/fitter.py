@@ -17,7 +17,7 @@ from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene
 from sphereorient.pose.compiled import refined
 from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
-from sphereorient.pose.lab_light import ROUNDS, learn_lab_light
+from sphereorient.pose.lab_light import lab_lights, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
 from sphereorient.pose.occluders import MOST_HIDDEN, occluded
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
@@ -184,19 +184,16 @@ class Fitter:
         if len(use) < FEWEST_LIT:
             return self, fit
 
-        def in_the_lab(pixels: Pixels, fit: FittedPoses, use: Tensor, rounds: int = ROUNDS) -> "Fitter":
-            return replace(self, light=learn_lab_light(pixels, fit, use, self.model(fine), rounds))
-
         every = torch.arange(len(use))
         learning, held = (some_of(rows, pixels, fit, use) for rows in (every[::2], every[1::2]))
         maps_leave = self.with_light_of(*learning).left(*held)
         # What leaves more half-way does not get there; of a glossy ball before one camera it leaves 1 % less, then 7 %.
-        for rounds, more in ((ROUNDS // 2, 0.0), (ROUNDS, MORE_EXPLAINED)):
-            if in_the_lab(*learning, rounds).left(*held) > maps_leave - more:
+        for light, more in zip(lab_lights(*learning, self.model(fine)), (0.0, MORE_EXPLAINED), strict=True):
+            if replace(self, light=light).left(*held) > maps_leave - more:
                 return self, fit
         lit = self
         for _ in range(4):  # the poses, too, were found with the maps
-            lit = in_the_lab(pixels, fit, use)
+            lit = replace(self, light=learn_lab_light(pixels, fit, use, self.model(fine)))
             fit = lit.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
         return lit, fit
 

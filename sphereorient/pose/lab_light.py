@@ -4,7 +4,7 @@
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 
@@ -180,10 +180,14 @@ def _cells(coefficients: Tensor, degree: int) -> Tensor:
     return sample_texture(grid, octahedral_directions(SIDE)).float()
 
 
-def learn_lab_light(
-    pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, rounds: int = ROUNDS
-) -> LabLight:
-    """Estimate light and noise from the fits of B * C disks, those of `use` (B, C) bool, the model's light known.
+def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> LabLight:
+    """Estimate light and noise from the fits of B * C disks, those of `use` (B, C) bool, the model's light known."""
+    *_, light = lab_lights(pixels, fit, use, model)
+    return light
+
+
+def lab_lights(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Iterator[LabLight]:
+    """Yield the estimates of `learn_lab_light` half-way and at the end.
     Gauss-Newton at the fits' poses; the light of each frame may differ a little, as its tints do in the fit.
     Source: irradiance as harmonics of the normal, Ramamoorthi and Hanrahan 2001.
     """
@@ -192,12 +196,13 @@ def learn_lab_light(
     bases = _bases(at.view, pixels)
     light = _flat(model.light, at.view, pixels, use)
     light = replace(light, stray=learn_stray(at, pixels, use, model.light.stray))
-    for _ in range(rounds):
+    for done in range(1, ROUNDS + 1):
         light = _better(light, at.view, pixels, (at.weight / at.variance).where(used, 0.0), bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
         at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model, cameras)
-    counted = at.inside & ~pixels.clipped & used
-    return replace(light, noise=noise_curves(at.model, at.residual, counted, cameras))
+        if done in (ROUNDS // 2, ROUNDS):
+            counted = at.inside & ~pixels.clipped & used
+            yield replace(light, noise=noise_curves(at.model, at.residual, counted, cameras))
 
 
 def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
