@@ -165,6 +165,12 @@ def estimate_appearance(
         with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
             settings = settings.model_copy(update={"blur_px": blur_px})
             return estimate_appearance(matched, frames, base, settings, following)
+    # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
+    best, highest = _scores(looked)
+    if best < highest + NO_BETTER and _times_better(looked) < TELLING:
+        do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
+        got = f"poses that explain {100 * best:.0f} % of the pictures, as wrong ones do"
+        raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
     worn, paint = None, base
     if settings.learn_paint:
         fitter, fit, worn = _without_worn(fitter, pixels, fit, use)
@@ -179,25 +185,16 @@ def estimate_appearance(
         fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=False)
     fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
     whole = fitter.exposed(whole, None if moved is None else moved.nan_to_num())
-    # What lasts is sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
-    lasting_pixels = pixels
     free = fitter.unoccluded(whole, fit.position_lab_mm, fit.R_lab_body).thinned(thin)
     hidden = 1.0 - free.inside.sum(-1) / pixels.inside.sum(-1).clamp_min(1)
     if float(hidden[use.flatten()].median()) > USUALLY_HIDDEN:
         fitter = replace(fitter, most_hidden=0.0)
     elif bool(hidden.any()):  # what covers the ball bends light and poses
-        pixels = free
-        fitter = fitter.lit_again(pixels, fit, use)
-        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
+        fitter = fitter.lit_again(free, fit, use)
+        fit = fitter.fit(free, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
     still = fitter if moved is None else replace(fitter, optics=blurred, instants=1)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
-    best, highest = _scores(looked)
-    # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
-    if best < highest + NO_BETTER and _times_better(looked) < TELLING:
-        do = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
-        got = f"poses that explain {100 * best:.0f} % of the pictures, as wrong ones do"
-        raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=do))
     if right < highest + NO_BETTER:
         # Dirt or a hidden rim spoils the estimated light: all poses are explained worse than before.
         highest = right - (best - highest)
@@ -211,7 +208,8 @@ def estimate_appearance(
     return Appearance(
         fitter=fitter,
         still=still,
-        lasting=lasting_errors(lasting_pixels, fit, use, fitter.model(fitter.optics.fine)),
+        # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
+        lasting=lasting_errors(pixels, fit, use, fitter.model(fitter.optics.fine)),
         score_min=score_min,
         right_score=right,
         usual_apart_rad=_usual_apart(fit, use),

@@ -261,7 +261,7 @@ def with_systematic_errors(
         return track
     position = torch.from_numpy(track.position)
     place, turn = torch.from_numpy(track.position_cov * np.nan), torch.from_numpy(track.orientation_cov * np.nan)
-    saw = {name: np.array([why == Reason.OK for why in track.cameras[name].reason]) for name in cameras}
+    saw = dict(zip(track.cameras, _believed(track).T, strict=True))
     for some in chain.from_iterable(combinations(cameras, count) for count in range(1, len(cameras) + 1)):
         rows = torch.from_numpy(np.all([saw[name] == (name in some) for name in cameras], axis=0))
         if bool(rows.any()):
@@ -272,7 +272,7 @@ def with_systematic_errors(
 
 def with_lasting_errors(track: Trajectory, lasting: Lasting) -> Trajectory:
     """Add the errors that all frames share, which no path averages away, to the covariances of the poses."""
-    use = torch.from_numpy(np.stack([np.array(one.reason) == str(Reason.OK) for one in track.cameras.values()], 1))
+    use = torch.from_numpy(_believed(track))
     together = lasting.covariance[:3, :3].expand(len(use), 3, 3)
     alone = (use.to(torch.float64) @ lasting.own_rad2.flatten(1)).reshape(-1, 3, 3)
     turn = torch.where((use.sum(1) == 1)[:, None, None], alone, together).numpy()
@@ -344,8 +344,7 @@ class _Compared:
 def _compared(track: Trajectory, seen: Seen, k: int, m: int) -> _Compared:
     """Compare the cameras k and m of a track."""
     radius_mm = seen.diameter_mm / 2
-    own, spread = list(track.cameras.values()), _of_cameras(track, "orientation_cov")[:, [k, m]].sum(1)
-    believed = [np.array([why == Reason.OK for why in own[c].reason]) for c in (k, m)]
+    spread = _of_cameras(track, "orientation_cov")[:, [k, m]].sum(1)
     turn = log(seen.R_lab_body[:, k] @ seen.R_lab_body[:, m].mT)
     gaps = gaps_between([list(seen.cameras.values())[c] for c in (k, m)], [seen.centre_px[:, c] for c in (k, m)])
     across, known = gaps.across_lab[..., None], torch.from_numpy(np.nan_to_num(track.position_systematic_cov))
@@ -354,7 +353,7 @@ def _compared(track: Trajectory, seen: Seen, k: int, m: int) -> _Compared:
     for c in (k, m):
         variance = variance + (_of_cameras(track, "centre_sigma_px") / seen.radius_px)[:, c].square() * radius_mm**2
     return _Compared(
-        both=torch.from_numpy(believed[0] & believed[1]),
+        both=torch.from_numpy(_believed(track)[:, [k, m]].all(1)),
         turn=turn,
         away=(turn * solve_damped(spread, turn)).sum(-1).sqrt(),
         gaps=gaps,
@@ -381,6 +380,11 @@ def said_alone(
         frame=torch.arange(len(track)) if consecutive else None,
     )
     return seen, limits_of(seen, _of_cameras(track, "orientation_cov"))
+
+
+def _believed(track: Trajectory) -> NDArray[np.bool_]:
+    """Return in which frames which cameras measured the pose, (N, C) bool."""
+    return np.stack([np.array([why == Reason.OK for why in one.reason], bool) for one in track.cameras.values()], 1)
 
 
 def _of_cameras(track: Trajectory, name: str) -> Tensor:

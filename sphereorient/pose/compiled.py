@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.files.compiled import compiled
-from sphereorient.pose.model import COVER_MIN, DEPTH_MIN, UNSEEN, SphereModel, exposure, limb_shape, rim_shape
+from sphereorient.pose.model import COVER_MIN, DEPTH_MIN, UNSEEN, SphereModel, exposure_instants, limb_shape, rim_shape
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, TUKEY
 
@@ -71,6 +71,14 @@ class _Task(ctypes.Structure):
     ]
 
 
+def pose_arrays(cameras: int, *shape: int) -> dict[str, Tensor]:
+    """Return the arrays of `FittedPoses` of a leading shape, zeros."""
+    return {
+        name: torch.zeros(*shape, *(cameras if n < 0 else n for n in tail), dtype=torch.float64)
+        for name, tail in RESULTS.items()
+    }
+
+
 def library() -> ctypes.CDLL | None:
     """Return the compiled code for this processor; None where there is none."""
     return compiled(SOURCE, _Task)
@@ -101,16 +109,13 @@ def refined(
     poses, cameras = use.shape
     light, paint, unseen = model.light.tables, model.paint, model.paint.unseen
     n_difference, n_black = model.shading.counts
-    instants, shares = exposure(pixels.instants)
+    instants, shares = exposure_instants(pixels.instants)
     move = turn = None
     if pixels.instants > 1:
         along = torch.tensor(instants, dtype=torch.float64)[:, None, None] * pixels.moved.double()
         move, turn = along[..., 3:], so3.exp(along[..., :3])
     expected = torch.empty(L, P)
-    parts = {
-        name: torch.empty(poses, *(cameras if n < 0 else n for n in tail), dtype=torch.float64)
-        for name, tail in RESULTS.items()
-    }
+    parts = pose_arrays(cameras, poses)
     kept: list[Tensor] = []
 
     def at(part: Tensor | None, dtype: torch.dtype | None = None) -> int | None:

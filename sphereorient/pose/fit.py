@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.compiled import refined
+from sphereorient.pose.compiled import pose_arrays, refined
 from sphereorient.pose.model import (
     Light,
     Shading,
@@ -73,15 +73,7 @@ POSE_PARTS = tuple(field.name for field in fields(FittedPoses))
 
 def blank_parts(cameras: int, *shape: int) -> dict[str, Tensor]:
     """Return arrays of `FittedPoses` of a leading shape: zeros, and the unit rotation."""
-    tails = {"position_lab_mm": (3,), "R_lab_body": (3, 3), "covariance": (6, 6), "own_turn": (cameras, 3)}
-    tails |= {
-        "own_covariance": (cameras, 3, 3),
-        "own_move": (cameras, 3),
-        "own_sigma_mm": (cameras,),
-        "excess": (cameras,),
-    }
-    tails |= {"score": (cameras,), "nll": (), "step": (6,)}
-    parts = {name: torch.zeros(*shape, *tails[name], dtype=torch.float64) for name in POSE_PARTS}
+    parts = pose_arrays(cameras, *shape)
     return parts | {"R_lab_body": parts["R_lab_body"] + torch.eye(3, dtype=torch.float64)}
 
 

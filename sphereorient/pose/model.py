@@ -232,13 +232,13 @@ def during_exposure(pixels: Pixels, X: Tensor, R: Tensor) -> tuple[list[tuple[Te
     """
     if pixels.instants == 1:
         return [(X, R)], [1.0]
-    instants, shares = exposure(pixels.instants)
+    instants, shares = exposure_instants(pixels.instants)
     turn, move = pixels.moved[:, :3], pixels.moved[:, 3:]
     return [(X + at * move, so3.exp(at * turn) @ R) for at in instants], shares
 
 
 @cache
-def exposure(instants: int) -> tuple[list[float], list[float]]:
+def exposure_instants(instants: int) -> tuple[list[float], list[float]]:
     """Return instants from -1/2 to 1/2 of the exposure, and their shares of its light: Gauss-Legendre quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(instants)
     return (nodes / 2).tolist(), (weights / 2).tolist()

@@ -40,7 +40,8 @@ def occluded(pixels: Pixels, expected: Tensor, noise: Tensor, counted: Tensor, m
     differs = (residual.square() / own).clamp_max(MOST_EACH) * counted
     right, down = (pixels.place - pixels.place.amin(1, keepdim=True)).cpu().numpy()
     disks = zip(_array(differs), _array(counted), strict=True)
-    hidden = torch.from_numpy(np.stack([_covered(*disk, down, right) for disk in disks])).to(counted.device)
+    covered = np.array([_covered(*disk, down, right) for disk in disks], bool).reshape(differs.shape)
+    hidden = torch.from_numpy(covered).to(counted.device)
     share = (hidden & counted).sum(-1) / counted.sum(-1).clamp_min(1)
     return hidden & (share <= most)[:, None]
 

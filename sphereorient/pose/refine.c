@@ -686,10 +686,10 @@ static void rotation_by(const double *turn, double *to) {
             to[i * 3 + j] = (i == j) + a * cross[i * 3 + j] + b * (turn[i] * turn[j] - (i == j ? angle2 : 0));
 }
 
-static void invert(const double *matrix, int stride, double *inverse, int n) {
+static void invert(const double *matrix, double *inverse, int n) {
     double work[36];
     for (int i = 0; i < n; i++)
-        for (int j = 0; j < n; j++) work[i * n + j] = matrix[i * stride + j], inverse[i * n + j] = i == j;
+        for (int j = 0; j < n; j++) work[i * n + j] = matrix[i * n + j], inverse[i * n + j] = i == j;
     solve(work, inverse, n, n, 1e-9);
 }
 
@@ -713,7 +713,7 @@ static void conclude(const Task *t, const Sums *sums, int64_t pose, const double
     const double radius = t->radius_mm, count = (double)t->tiles, fitted = (double)n_all;
     const double few = count / (count - fitted > 1 ? count - fitted : 1);
     double meat[36] = {0}, bread[36], lured[36] = {0}, found[6] = {0}, aside_px = 0, finest_mm = INFINITY, nll = 0;
-    invert(whole, 6, bread, 6);
+    invert(whole, bread, 6);
     for (int64_t c = 0; c < cameras; c++) {
         const Sums *of = sums + c;
         const int64_t k = pose * cameras + c;
@@ -730,7 +730,7 @@ static void conclude(const Task *t, const Sums *sums, int64_t pose, const double
             right[a] = of->pull[a];
             for (int b = 0; b < 3; b++) right[a] -= information[a * 6 + 3 + b] * step[3 + b];
         }
-        invert(corner, 3, own_bread, 3);
+        invert(corner, own_bread, 3);
         memcpy(own, corner, sizeof corner);
         solve(own, right, 3, 1, 1e-9);
         for (int a = 0; a < 3; a++) t->own_turn[k * 3 + a] = right[a] - step[a];
@@ -740,7 +740,7 @@ static void conclude(const Task *t, const Sums *sums, int64_t pose, const double
         sandwich(own_bread, corner, own_covariance, 3);
         const double noise = trace(own_bread, 3);
         t->excess[k] = sqrt(trace(own_covariance, 3) / (noise > 1e-30 ? noise : 1e-30));
-        invert(information, 6, freely, 6);
+        invert(information, freely, 6);
         multiply(freely, of->pull, right, 6, 6, 1);
         for (int i = 0; i < 6; i++) right[i] -= step[i];
         bound(right, of, 0, 1, radius);
@@ -809,11 +809,11 @@ static void fit(const Task *t, const Disk *at, Sums *sums, int64_t pose) {
             of->first = round == 0, of->last = round == t->iterations - 1;
             sum_disk(t, at, of, k);
             for (int i = 0; i < 3; i++) of->to_centre[i] = X[i] - (double)t->origin[(k * 3 + i) * t->origins];
-            if (!use[c]) continue;
+            if (!use[c] || !t->iterations) continue;
             for (int i = 0; i < 36; i++) whole[i] += of->information[i];
             for (int i = 0; i < 6; i++) step[i] += of->pull[i];
         }
-        if (!t->iterations) break;
+        if (!t->iterations) return;
         for (int a = 0; a < 3 && prior; a++)
             for (int b = 0; b < 3; b++) {
                 whole[(3 + a) * 6 + 3 + b] += prior[a * 3 + b];
@@ -828,7 +828,6 @@ static void fit(const Task *t, const Disk *at, Sums *sums, int64_t pose) {
         memcpy(R, turned, sizeof R);
         for (int i = 0; i < 3; i++) X[i] += step[3 + i];
     }
-    if (!t->iterations) return;
     for (int64_t c = 0; c < cameras; c++)
         for (int i = 0; i < 3; i++)
             sums[c].to_centre[i] = X[i] - (double)t->origin[((pose * cameras + c) * 3 + i) * t->origins];
