@@ -67,7 +67,7 @@ def errors_deg(
     search = {view.name: GreySearch(texture, settings.search)}
     spread = spread_frames(range(len(frames)), settings.refine.appearance_frames)
     base = base_table(texture, view.diameter_px)
-    shots = [[Frame(picture=frames[k])] for k in spread]
+    shots = [[Frame(shown=frames[k])] for k in spread]
     first = Initialiser(
         fitter=first_fitter([view], radius_mm, base, FIRST_BLUR_PX),
         proposers=search,
@@ -77,7 +77,7 @@ def errors_deg(
     learnt = estimate_appearance(first, shots, base, settings.refine)
     errors = []
     for frame, R in zip(frames, R_lab_body, strict=True):
-        poses = replace(first, fitter=learnt.fitter, score_min=learnt.clear_score).poses([Frame(picture=frame)])
+        poses = replace(first, fitter=learnt.fitter, score_min=learnt.clear_score).poses([Frame(shown=frame)])
         error = float(so3.geodesic_distance(poses.R_lab_body[0], R)) if len(poses) else math.inf
         errors.append(math.degrees(error))
     return errors

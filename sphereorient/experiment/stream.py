@@ -1,9 +1,11 @@
 """A camera's pictures: those of its movie, frame by frame, and the given ones of its scene and of what hides it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +16,10 @@ from sphereorient.experiment.experiment import Experiment
 from sphereorient.experiment.timeline import NONE
 from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
-from sphereorient.movies import Grey, Movie, flipped_picture
+from sphereorient.movies import Grey, Movie, OnDemand, flipped_picture
 from sphereorient.trajectory import Reason
+
+Shown = TypeVar("Shown", bound=Grey | OnDemand)
 
 BYTES_A_PIXEL, HEADER_BYTES = 8, 1_000_000  # of a given picture, uncompressed, and of its header
 EVERY = 4  # pixels: faults of whole pictures show in every fourth row and column
@@ -37,8 +41,19 @@ class CameraStream:
 
     def pictures(self, first: int = 0, last: int | None = None) -> Iterator[tuple[Grey | None, Reason]]:
         """Yield the pictures of frames first .. last - 1, from the first frame in use, or None, with the reason."""
+        return self._with_reasons(self.movie.readable, first, last)
+
+    def on_demand(
+        self, pool: Executor, first: int = 0, last: int | None = None
+    ) -> Iterator[tuple[Grey | OnDemand | None, Reason]]:
+        """Yield the same, of movies that allow it as pictures that are decoded in `pool` part by part."""
+        return self._with_reasons(partial(self.movie.on_demand, pool), first, last)
+
+    def _with_reasons(
+        self, read: Callable[[int, int], Iterator[Shown | None]], first: int, last: int | None
+    ) -> Iterator[tuple[Shown | None, Reason]]:
         rows = self.rows[first:last]
-        for row, picture in zip(rows.tolist(), pictures_of(self.movie, rows), strict=True):
+        for row, picture in zip(rows.tolist(), _of_rows(read, rows), strict=True):
             why = Reason.MISSING if row == NONE else Reason.UNDECODABLE
             yield picture, why if picture is None else Reason.OK
 
@@ -49,7 +64,7 @@ class CameraStream:
         try:
             pictures = list(self.movie.sample(wanted))
         except MovieError:
-            pictures = [picture for picture in _read(self.movie, wanted) if picture is not None]
+            pictures = [picture for picture in _read(self.movie.readable, wanted) if picture is not None]
         good = [picture for picture in pictures if not (uniform(picture) or _glares(picture))]
         if not good:
             got, do = "none (black, white or damaged ones)", "check the movie with `sphereorient movie`"
@@ -72,16 +87,20 @@ def uniform(picture: Grey) -> bool:
 
 def pictures_of(movie: Movie, rows: NDArray[np.int64]) -> Iterator[Grey | None]:
     """Yield a movie's pictures by number (N,); None for NONE and undecodable pictures."""
-    found = _read(movie, rows[rows != NONE].tolist())
+    return _of_rows(movie.readable, rows)
+
+
+def _of_rows(read: Callable[[int, int], Iterator[Shown | None]], rows: NDArray[np.int64]) -> Iterator[Shown | None]:
+    found = _read(read, rows[rows != NONE].tolist())
     for row in rows.tolist():
         yield None if row == NONE else next(found)
 
 
-def _read(movie: Movie, numbers: Sequence[int]) -> Iterator[Grey | None]:
+def _read(read: Callable[[int, int], Iterator[Shown | None]], numbers: Sequence[int]) -> Iterator[Shown | None]:
     """Yield pictures by number, consecutive ones in one pass."""
     for run in np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1):
         if len(run):
-            yield from movie.readable(int(run[0]), int(run[-1]) + 1)
+            yield from read(int(run[0]), int(run[-1]) + 1)
 
 
 def _glares(picture: Grey) -> bool:

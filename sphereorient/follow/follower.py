@@ -19,6 +19,8 @@ from sphereorient.locate import Frame, screened_frames
 from sphereorient.pose import CameraView
 from sphereorient.trajectory import Reason
 
+DECODING = 2  # threads in which parts of pictures are decoded
+
 
 class PerCameraTracker:
     """Tracks the sphere in each camera alone; the first that sees it gives the pose, the others contradict."""
@@ -98,14 +100,20 @@ class Follower:
     def _follow(self, batches: Sequence[Batch]) -> Iterator[tuple[Batch, list[Poses]]]:
         streams, time_s = self.recording.streams, self.recording.timeline.time_s
         first, last = batches[0].first, batches[-1].last
-        with ThreadPoolExecutor(len(streams)) as pool:
+        with ThreadPoolExecutor(DECODING) as parts, ThreadPoolExecutor(len(streams)) as pool:
             movies = [
-                screened_frames(stream, view.background, first, last)
+                screened_frames(stream, view.background, first, last, parts)
                 for stream, view in zip(streams, self.appearance.fitter.views, strict=True)
             ]
 
+            def read_on(movie: Iterator[Frame], batch: Batch) -> list[Frame]:
+                frames = list(islice(movie, len(batch)))
+                for begin in accumulate([0, *batch.lengths[:-1]]):
+                    _ = frames[begin].reason  # what a chunk begins with is decoded whole
+                return frames
+
             def ahead(batch: Batch) -> list[Future[list[Frame]]]:
-                return [pool.submit(list, islice(movie, len(batch))) for movie in movies]
+                return [pool.submit(read_on, movie, batch) for movie in movies]
 
             coming = ahead(batches[0])
             for k, batch in enumerate(batches):

@@ -17,7 +17,7 @@ from sphereorient.follow.poses import Poses, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
 from sphereorient.pose.fit import FittedPoses
-from sphereorient.pose.fitter import Fitter, Picture, Steps
+from sphereorient.pose.fitter import Fitter, Picture, Shown, Steps
 from sphereorient.pose.pixels import Pixels
 from sphereorient.trajectory import Reason
 
@@ -169,20 +169,28 @@ class ChunkTracker:
             return []
         asked, missing = len(expected), self.settings.chunks - len(expected)
         expected, shots = [*expected, *[expected[-1]] * missing], [*shots, *[shots[-1]] * missing]
-        frames = [[shot.picture for shot in row] for row in shots]
-        usable = torch.tensor([[shot.usable for shot in row] for row in shots])
+        frames = [[shot.shown for shot in row] for row in shots]
+        usable = torch.tensor([[shot.readable for shot in row] for row in shots])
         X, R, use, precision, moved = (
             torch.stack([getattr(one, name) for one in expected])
             for name in ("position_lab_mm", "R_lab_body", "use", "place_precision", "moved")
         )
-        use = use & usable
+        known, use = use, use & usable
         if any(one.rough for one in expected):
             was = X, R
             X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
             share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
             moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
         fit = self._fitted(frames, X, R, use, precision, moved)
-        good = first = self._supported(fit, use)
+        good = self._supported(fit, use)
+        # Whether a picture is dark or white takes all of it: only where it is not as expected.
+        usable = torch.stack([all_ if ok else _usable(row) for all_, ok, row in zip(usable, good, shots, strict=True)])
+        changed = (use != (known & usable)).any(1)
+        if bool(changed.any()):
+            use = known & usable
+            fit = self._fitted(frames, X, R, use, precision, moved).where(changed, fit)
+            good = torch.where(changed, self._supported(fit, use), good)
+        first = good
         within = self.fitter.largest_px(X) <= self.fitter.widest_px  # others are searched for, frame by frame
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
         alone: list[FittedPoses] = []
@@ -224,7 +232,7 @@ class ChunkTracker:
         return [poses_of(fit, torch.tensor([n]), use[n], reasons[n]) if good[n] else None for n in range(asked)]
 
     def _approached(
-        self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, rough: Tensor
+        self, frames: Sequence[Sequence[Shown]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, rough: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Bring rough poses (B,) bool into the basin of the finest level, through coarser ones."""
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
@@ -235,7 +243,7 @@ class ChunkTracker:
         return X, R
 
     def _fitted(
-        self, frames: Sequence[Sequence[Picture]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, moved: Tensor
+        self, frames: Sequence[Sequence[Shown]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, moved: Tensor
     ) -> FittedPoses:
         """Fit poses that are nearly right: to some pixels, repeated where that moves them, then to all."""
         if self.centre is None:
@@ -291,7 +299,7 @@ class ChunkTracker:
         poses = self.search.poses(shots)
         if not len(poses):
             return poses
-        frames, usable = [shot.picture for shot in shots], torch.tensor([shot.usable for shot in shots])
+        frames, usable = [shot.picture for shot in shots], _usable(shots)
         if self.centre is not None:
             optics = self.search.fitter.optics
             fit = self._looked_at(frames, poses, poses.use, ((optics.middle, 1, 3), (optics.fine, 1, 4)))
@@ -345,6 +353,10 @@ class ChunkTracker:
             return poses
         reason = [Reason.OK if ok else why for ok, why in zip(usable, poses.reason, strict=True)]
         return poses_of(fit, order, usable, reason)
+
+
+def _usable(shots: Sequence[Frame]) -> Tensor:
+    return torch.tensor([shot.usable for shot in shots])
 
 
 def _only(usable: Tensor, camera: int) -> Tensor:

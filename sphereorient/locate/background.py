@@ -1,6 +1,7 @@
 """The background of a movie, and the frames that show nothing against it: unreadable, dark, saturated or repeated."""
 
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.experiment.stream import EVERY, CameraStream, uniform
+from sphereorient.movies import OnDemand
 from sphereorient.trajectory import Reason
 
 Picture = NDArray[Any]
@@ -119,40 +121,80 @@ def _nan_quantile(values: NDArray[np.float32], share: float) -> NDArray[np.float
 class Frame:
     """Picture of one camera at one instant; made by `screened_frames`."""
 
-    picture: Picture  # (H, W); zeros if missing
-    reason: Reason = Reason.OK  # OK, or why it cannot be used
+    shown: Picture | OnDemand  # (H, W); zeros if missing
+    read: Reason = Reason.OK  # OK, MISSING, UNDECODABLE, or REPEATED: equal to the frame before
+    background: Background | None = None  # of the empty scene, by which it is dark or white; None: it is not
+
+    @cached_property
+    def picture(self) -> Picture:
+        """The whole picture."""
+        if not isinstance(self.shown, OnDemand):
+            return self.shown
+        height, width = self.shown.shape
+        return self.shown.part(0, 0, width - 1, height - 1)
+
+    @cached_property
+    def reason(self) -> Reason:
+        """OK, or why it cannot be used: as `read`, or `DARK` (no light) or `SATURATED` (white) by the whole picture."""
+        if self.background is None or self.read in (Reason.MISSING, Reason.UNDECODABLE):
+            return self.read
+        return dark_or_white(self.picture, self.background) or self.read
 
     @property
     def usable(self) -> bool:
         """Whether the picture may show the sphere."""
         return self.reason is Reason.OK
 
+    @property
+    def readable(self) -> bool:
+        """Whether there is a new picture, by which `usable` is not told yet."""
+        return self.read is Reason.OK
 
-def screened(picture: Picture, before: Picture | None, background: Background) -> Frame:
-    """Return the picture (H, W) with `OK`, `DARK` (no light), `SATURATED` (white) or `REPEATED` (equal to `before`)."""
+
+def dark_or_white(picture: Picture, background: Background) -> Reason | None:
+    """Return `DARK` (no light) or `SATURATED` (white) of a picture (H, W) that shows nothing; None of others."""
     some = picture[::EVERY, ::EVERY]
     empty = background.mean[::EVERY, ::EVERY]
     if uniform(picture):
-        white = float(some[0, 0]) > 0.5 * background.full_scale
-        return Frame(picture=picture, reason=Reason.SATURATED if white else Reason.DARK)
+        return Reason.SATURATED if float(some[0, 0]) > 0.5 * background.full_scale else Reason.DARK
     if np.mean(some >= background.full_scale) > max(WHITE_SHARE, 2 * float(np.mean(empty >= background.full_scale))):
-        return Frame(picture=picture, reason=Reason.SATURATED)
+        return Reason.SATURATED
     lit = empty > LIT_NOISES * background.typical_noise
     if lit.mean() > LIT_SHARE and np.mean(some[lit] < DARK_LEVEL * empty[lit]) > DARK_SHARE:
-        return Frame(picture=picture, reason=Reason.DARK)
-    if before is not None and np.array_equal(some, before[::EVERY, ::EVERY]) and np.array_equal(picture, before):
-        return Frame(picture=picture, reason=Reason.REPEATED)
-    return Frame(picture=picture)
+        return Reason.DARK
+    return None
+
+
+def screened(picture: Picture | OnDemand, before: Picture | OnDemand | None, background: Background) -> Frame:
+    """Return the frame of a picture (H, W) that was read after another one."""
+    read = Reason.REPEATED if _equal(picture, before) else Reason.OK
+    return Frame(shown=picture, read=read, background=background)
 
 
 def screened_frames(
-    stream: CameraStream, background: Background, first: int = 0, last: int | None = None
+    stream: CameraStream,
+    background: Background,
+    first: int = 0,
+    last: int | None = None,
+    pool: Executor | None = None,
 ) -> Iterator[Frame]:
-    """Yield frames first .. last - 1 from the first in use; reasons depend on this and the previous frame only."""
+    """Yield frames first .. last - 1 from the first in use; reasons depend on this and the previous frame only.
+    With a `pool` movies that allow it are decoded there, part by part, as fits ask for it.
+    """
     lead = min(first, 1)
     blank = np.zeros(stream.movie.frame_shape, stream.movie.dtype)
-    before: Picture | None = None
-    for k, (picture, reason) in enumerate(stream.pictures(first - lead, last)):
-        if k >= lead:
-            yield Frame(picture=blank, reason=reason) if picture is None else screened(picture, before, background)
+    before: Picture | OnDemand | None = None
+    pictures = stream.pictures(first - lead, last) if pool is None else stream.on_demand(pool, first - lead, last)
+    for k, (picture, reason) in enumerate(pictures):
+        if k >= lead and picture is None:
+            yield Frame(shown=blank, read=reason)
+        elif k >= lead and picture is not None:
+            yield screened(picture, before, background)
         before = picture
+
+
+def _equal(picture: Picture | OnDemand, before: Picture | OnDemand | None) -> bool:
+    if isinstance(picture, OnDemand) or isinstance(before, OnDemand) or before is None:
+        return isinstance(picture, OnDemand) and picture.equals(before)
+    some = np.s_[::EVERY, ::EVERY]
+    return np.array_equal(picture[some], before[some]) and np.array_equal(picture, before)

@@ -1,5 +1,7 @@
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,6 +20,24 @@ LARGEST_RATIO = 1200  # largest compression ratio of a picture of one grey value
 RED, GREEN, BLUE = 299, 587, 114
 COLOUR_REMARK = "colour, made grey (0.299 R + 0.587 G + 0.114 B)"
 FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1)}  # steps of rows and columns
+
+
+class OnDemand(ABC):
+    """Picture of which the parts that are asked for are decoded; made by `Movie.on_demand`."""
+
+    shape: tuple[int, int]  # (H, W)
+
+    @abstractmethod
+    def equals(self, other: object) -> bool:
+        """Return whether another picture on demand is the same."""
+
+    @abstractmethod
+    def ask(self, left: int, top: int, right: int, bottom: int) -> None:
+        """Begin to decode a part, right and bottom included, of this picture, and of the next one."""
+
+    @abstractmethod
+    def part(self, left: int, top: int, right: int, bottom: int) -> Grey:
+        """Return the picture (H, W), decoded at least where asked for, right and bottom included."""
 
 
 class Movie:
@@ -62,6 +82,10 @@ class Movie:
     def readable(self, first: int = 0, last: int | None = None) -> Iterator[Grey | None]:
         """Yield frames first .. last - 1, None for damaged ones and those predicted from them (MovieError outside)."""
         return self._read_on(self._range(first, last))
+
+    def on_demand(self, pool: Executor, first: int = 0, last: int | None = None) -> Iterator[Grey | OnDemand | None]:
+        """Yield frames as `readable` does; of movies that allow it, pictures decoded in `pool` part by part."""
+        return self.readable(first, last)
 
     def sample(self, indices: Sequence[int]) -> Grey:
         """Return frames in the given order, (n, H, W); MovieError outside the movie or at damage."""

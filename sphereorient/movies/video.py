@@ -1,9 +1,10 @@
 """Videos that FFmpeg decodes: exact seeks, exact grey values, nothing decoded from damaged data."""
 
 import ctypes
-import zlib
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import av
 import numpy as np
 
 from sphereorient.errors import MovieError, error_words
-from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, luma, refused
+from sphereorient.movies.ffv1 import SliceDecoder, SlicedPicture, split_slices
+from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, OnDemand, luma, refused
 from sphereorient.movies.packets import Packet, PacketIndex, index_packets
 
 LOSSLESS = "lossless"
@@ -21,10 +23,6 @@ PACKETS_TRIED = 8  # of FFV1: if the check sums of one are right, all packets ha
 SHOWN = 8  # missing frames named in a remark
 SLACK = 1.5  # frames by which a rounded duration may be too long
 THREADS = 2  # slices of one frame in parallel: 1.8 times faster for FFV1 on 2 cores, and errors keep their frame
-TRAILER = 8  # bytes after each slice of FFV1: 3 its size, 1 a status, 4 the check sum
-# FFV1 computes its CRC from the most significant bit on, zlib from the least: they agree on bit-reversed bytes.
-REVERSED_BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-INVERTED = 0xFFFFFFFF  # zlib inverts check sums before and after
 
 
 class VideoMovie(Movie):
@@ -56,7 +54,7 @@ class VideoMovie(Movie):
         try:
             for number, packet in enumerate(container.demux(stream)):
                 if number < PACKETS_TRIED and stream.codec_context.name == "ffv1":
-                    self._checked |= _check_sums_right(bytes(packet))
+                    self._checked |= split_slices(bytes(packet)) is not None
                 if packet.size and not packet.is_discard:
                     packets.append(Packet(packet.pts, packet.dts, packet.is_keyframe, packet.pos))
         except av.FFmpegError as error:
@@ -76,6 +74,62 @@ class VideoMovie(Movie):
 
     def _read_on(self, numbers: Sequence[int]) -> Iterator[Grey | None]:
         return (None if isinstance(got, MovieError) else got for got in self._decode(numbers))
+
+    def on_demand(self, pool: Executor, first: int = 0, last: int | None = None) -> Iterator[Grey | OnDemand | None]:
+        """Yield frames as `readable` does; of FFV1 whose slices stand alone, these are decoded when asked for."""
+        if self._slice_decoder is None:
+            yield from self.readable(first, last)
+            return
+        before: SlicedPicture | None = None
+        for _, packet in self._packets(self._range(first, last)):
+            slices = None if packet is None else split_slices(packet)
+            picture = None
+            if packet is not None and slices is not None:
+                picture = SlicedPicture(self._slice_decoder, packet, slices, pool)
+            if before is not None:
+                before.following = picture
+            before = picture
+            yield picture
+
+    @cached_property
+    def _slice_decoder(self) -> SliceDecoder | None:
+        """What decodes slices alone; None for other videos, and where that gives other pictures than whole frames."""
+        alone = self._index.number_of is not None and self._index.each_alone
+        if not (self._checked and alone and self._pixels.startswith("gray")):
+            return None
+        packets = (packet for _, packet in self._packets(range(self._count)) if packet is not None)
+        packet = next((packet for packet in packets if split_slices(packet) is not None), None)
+        if packet is None:
+            return None
+        with _opened(self.path) as container:
+            context: Any = container.streams.video[0].codec_context
+            decoder = SliceDecoder(context, _plane_0)
+            frames = context.decode(av.Packet(packet))
+            whole = _plane_0(frames[0]) if frames else None
+        alike = whole is not None and whole.shape == self.frame_shape and decoder.matches(packet, whole)
+        return decoder if alike else None
+
+    def _packets(self, numbers: range) -> Iterator[tuple[int, bytes | None]]:
+        """Yield increasing frame numbers with their packets, None where the file holds none."""
+        waiting = iter(numbers)
+        wanted = next(waiting, None)
+        if wanted is None:
+            return
+        with _opened(self.path) as container:
+            self._seek(container, wanted)
+            for packet in _demuxed(container):
+                number = self._index.number(packet.pts, packet.pos)
+                while wanted is not None and number is not None and wanted < number:
+                    yield wanted, None
+                    wanted = next(waiting, None)
+                if wanted is not None and wanted == number:
+                    yield wanted, bytes(packet)
+                    wanted = next(waiting, None)
+                if wanted is None:
+                    return
+        while wanted is not None:
+            yield wanted, None
+            wanted = next(waiting, None)
 
     def _decode(self, numbers: Sequence[int]) -> Iterator[Grey | MovieError]:
         with _opened(self.path) as container:
@@ -133,7 +187,7 @@ class VideoMovie(Movie):
             number = self._index.number(packet.pts, packet.pos)
             if number is not None:
                 packet.pts = number  # the decoder passes it on to the frame, in any order
-            if packet.size and self._checked and not _check_sums_right(bytes(packet)):
+            if packet.size and self._checked and split_slices(bytes(packet)) is None:
                 yield (following if number is None else number), "one whose check sum is wrong"
                 continue
             try:
@@ -191,20 +245,6 @@ def _first_frame(container: av.container.InputContainer) -> av.VideoFrame | None
         if frames:
             return frames[0]
     return None
-
-
-def _check_sums_right(packet: bytes) -> bool:
-    """Verify the check sums of all slices of an FFV1 packet, which the decoder only logs (RFC 9043, 4.9 and 4.9.3)."""
-    end = len(packet)
-    while end > 0:
-        first = end - TRAILER - int.from_bytes(packet[end - TRAILER : end - TRAILER + 3], "big")
-        if end < TRAILER or first < 0:
-            return False
-        reversed_slice = packet[first:end].translate(REVERSED_BITS)
-        if zlib.crc32(reversed_slice, INVERTED) ^ INVERTED != 0:  # 0 for a slice followed by its own sum
-            return False
-        end = first
-    return bool(packet)
 
 
 def _remarks(container: av.container.InputContainer, pixels: str, index: PacketIndex) -> Iterator[str]:

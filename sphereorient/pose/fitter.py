@@ -15,17 +15,19 @@ from torch import Tensor, nn
 from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, sphere_radius_px
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene
+from sphereorient.movies import OnDemand
 from sphereorient.pose.compiled import refined
 from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
 from sphereorient.pose.lab_light import lab_lights, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
 from sphereorient.pose.occluders import MOST_HIDDEN, occluded
-from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked
+from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.pose.residuals import KNOWN, residuals
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 
 Picture = NDArray[np.generic]
+Shown = Picture | OnDemand  # of which fits cut out disks
 Record = TypeVar("Record", Pixels, PoseStart, FittedPoses)
 
 RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
@@ -238,7 +240,7 @@ class Fitter:
 
     def pixels(
         self,
-        pictures: Sequence[Sequence[Picture]],
+        pictures: Sequence[Sequence[Shown]],
         position_lab_mm: Tensor,
         level: PyramidLevel,
         radius_px: float | None = None,
@@ -253,6 +255,10 @@ class Fitter:
             radius_px = max(1.0, float(self.largest_px(position_lab_mm).max()))
             radius_px = SIZES ** math.ceil(math.log(radius_px) / math.log(SIZES))
         stencil = level.stencil(min(radius_px, 0.5 * max(self.views[0].camera.image_size)))
+        for b, frames in enumerate(pictures):
+            for c, (view, frame) in enumerate(zip(self.views, frames, strict=True)):
+                if isinstance(frame, OnDemand):  # all of them, before the first is waited for
+                    frame.ask(*window_of(middles[c][b], stencil, level.extra_px, view.sight.size))
         disks = []
         for b, frames in enumerate(pictures):
             for c, (view, frame) in enumerate(zip(self.views, frames, strict=True)):
@@ -304,7 +310,7 @@ class Fitter:
     def fit_through(
         self,
         steps: Steps,
-        pictures: Sequence[Sequence[Picture]],
+        pictures: Sequence[Sequence[Shown]],
         position_lab_mm: Tensor,
         R_lab_body: Tensor,
         use: Tensor,

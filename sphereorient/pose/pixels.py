@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sphereorient.cameras import Camera
 from sphereorient.locate import Background
+from sphereorient.movies import OnDemand
 
 VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
 # Parts of `Pixels`, the places along their last axis.
@@ -133,8 +134,20 @@ def disk_stencil(radius_px: float, step_px: int = 1, tile_px: int = 6) -> Stenci
     return Stencil(right=right, down=down, tile=torch.from_numpy(tile), place=place, reach=reach, inner=inner)
 
 
+def window_of(
+    middle_px: tuple[float, float], stencil: Stencil, blur_px: float, size: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Return left, top, right and bottom, included, px, of what `cut_pixels` reads of a frame of `size` (W, H)."""
+    reach = stencil.reach + math.ceil(3 * blur_px)
+    (left, right), (top, bottom) = (
+        [min(max(round(middle) + side, 0), count - 1) for side in (-reach, reach)]
+        for middle, count in zip(middle_px, size, strict=True)
+    )
+    return left, top, right, bottom
+
+
 def cut_pixels(
-    frame: NDArray[Any],
+    frame: NDArray[Any] | OnDemand,
     background: Background,
     sight: LinesOfSight,
     middle_px: tuple[float, float],
@@ -155,13 +168,14 @@ def cut_pixels(
     place = rows * width + columns
     if background.shown is not None:
         inside &= background.shown.take(place)
-    grey, behind = frame.take(place), background.mean.take(place)
+    window = window_of(middle_px, stencil, blur_px, sight.size)
+    picture = frame.part(*window) if isinstance(frame, OnDemand) else frame
+    grey, behind = picture.take(place), background.mean.take(place)
     clipped = grey >= background.full_scale
     if blur_px > 0:
-        reach = stencil.reach + math.ceil(3 * blur_px)
-        left, top = min(max(u - reach, 0), width - 1), min(max(v - reach, 0), height - 1)
-        window = np.s_[top : max(v + reach + 1, top + 1), left : max(u + reach + 1, left + 1)]
-        pictures = frame[window].astype(np.float32), background.mean[window]
+        left, top, last_right, last_down = window
+        around = np.s_[top : last_down + 1, left : last_right + 1]
+        pictures = picture[around].astype(np.float32), background.mean[around]
         soft = [np.asarray(cv2.GaussianBlur(picture, (0, 0), blur_px), np.float32) for picture in pictures]
         down, right = (
             at.clip(0, size - 1) for at, size in zip((rows - top, columns - left), soft[0].shape, strict=True)

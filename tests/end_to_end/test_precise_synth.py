@@ -470,7 +470,7 @@ def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tm
     def poses_of(*blocks: int) -> list[str]:
         """Follow blocks, by number, in one window."""
         rows = np.concatenate([np.arange(16 * block, 16 * block + 16) for block in blocks])
-        shots = [[Frame(picture=picture) for picture in movie[rows]] for movie in pictures]
+        shots = [[Frame(shown=picture) for picture in movie[rows]] for movie in pictures]
         return [_digest(poses) for poses in tracker.track(shots, [16] * len(blocks), (rows / 600.0).tolist())]
 
     each = [poses_of(block) for block in range(3)]
