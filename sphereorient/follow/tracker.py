@@ -255,21 +255,29 @@ class ChunkTracker:
         if bool(far.any()):
             begin = torch.where(far[:, None], self._from(fit.position_lab_mm), X)
             pixels = self.fitter.pixels(frames, begin, fine, widest, moved)
-        pixels = self.fitter.unoccluded(pixels, fit.position_lab_mm, fit.R_lab_body)
-        return self._settled(pixels, self._from(fit.position_lab_mm), fit.R_lab_body, use, precision, 3)[0]
+        begin, most_hidden = self._from(fit.position_lab_mm), self.fitter.most_hidden
+        return self._settled(pixels, begin, fit.R_lab_body, use, precision, 3, most_hidden)[0]
 
     def _settled(
-        self, pixels: Pixels, X: Tensor, R: Tensor, use: Tensor, precision: Tensor, more: int
+        self,
+        pixels: Pixels,
+        X: Tensor,
+        R: Tensor,
+        use: Tensor,
+        precision: Tensor,
+        more: int,
+        most_hidden: float = 0.0,
     ) -> tuple[FittedPoses, Tensor]:
         """Take one step, and `more` from where that one was long; return also where it was, (B,) bool."""
         fine = self.fitter.optics.fine
-        fit = self.fitter.fit(pixels, X, R, use, fine, 1, precision)
+        fit = self.fitter.fit(pixels, X, R, use, fine, 1, precision, most_hidden)
         turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
         # One camera's distances scatter; a change of its picture shows in the rotation as well.
         far = (turn > NEAR_RAD) | ((use.sum(1) > 1) & (move > NEAR_RAD * self.fitter.radius_mm))
         if bool(far.any()):
             begin = self._from(fit.position_lab_mm)
-            fit = self.fitter.fit(pixels, begin, fit.R_lab_body, use, fine, more, precision).where(far, fit)
+            again = self.fitter.fit(pixels, begin, fit.R_lab_body, use, fine, more, precision, most_hidden)
+            fit = again.where(far, fit)
         return fit, far
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:

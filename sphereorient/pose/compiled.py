@@ -15,6 +15,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.files.compiled import compiled
 from sphereorient.pose.model import COVER_MIN, DEPTH_MIN, UNSEEN, SphereModel, exposure_instants, limb_shape, rim_shape
+from sphereorient.pose.occluders import COVERED, LEAST_OF_WINDOW, MARGIN_PX, MOST_EACH, WINDOW_PX
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, TUKEY
 
@@ -65,8 +66,11 @@ class _Task(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("start", "start_rotation", "use", "place_precision")),
         ("iterations", ctypes.c_int64),
         ("limb_px", ctypes.c_void_p),
-        ("edge_px", ctypes.c_float),
-        ("expected", ctypes.c_void_p),
+        *((name, ctypes.c_float) for name in ("edge_px", "most_hidden", "covered", "most_each", "least_of_window")),
+        *((name, ctypes.c_int64) for name in ("window", "margin")),
+        ("place", ctypes.c_void_p),
+        *((name, 2 * ctypes.c_int64) for name in ("first", "last")),
+        ("kept", ctypes.c_void_p),
         *((name, ctypes.c_void_p) for name in RESULTS),
     ]
 
@@ -97,10 +101,12 @@ def refined(
     use: Tensor,
     place_precision: Tensor | None = None,
     iterations: int = 0,
+    most_hidden: float = 0.0,
 ) -> tuple[Tensor, dict[str, Tensor]] | None:
     """Fit B poses, X (B, 3), mm, and R_lab_body R (B, 3, 3), to B * C disks, those of `use` (B, C) bool.
-    Return expected grey levels (B * C, P) before the last step, and the parts of `FittedPoses`, without meaning where
-    there are no iterations; None where compiled code cannot do it. `place_precision` as in `PoseStart`.
+    Return which places are inside and not hidden by an occluder, (B * C, P) bool, and the parts of `FittedPoses`,
+    without meaning where there are no iterations; None where compiled code cannot do it. `place_precision` as in
+    `PoseStart`, `most_hidden` as in `occluded`.
     """
     code = library()
     if code is None or pixels.grey.device.type != "cpu" or pixels.grey.dtype != torch.float32 or X.requires_grad:
@@ -114,15 +120,16 @@ def refined(
     if pixels.instants > 1:
         along = torch.tensor(instants, dtype=torch.float64)[:, None, None] * pixels.moved.double()
         move, turn = along[..., 3:], so3.exp(along[..., :3])
-    expected = torch.empty(L, P)
+    kept = torch.empty(L, P, dtype=torch.bool)
+    first, last = (tuple(side.tolist()) for side in pixels.place.aminmax(dim=1)) if P else ((0, 0), (0, 0))
     parts = pose_arrays(cameras, poses)
-    kept: list[Tensor] = []
+    alive: list[Tensor] = []
 
     def at(part: Tensor | None, dtype: torch.dtype | None = None) -> int | None:
         if part is None:
             return None
-        kept.append(part.to(dtype or part.dtype).contiguous())
-        return kept[-1].data_ptr()
+        alive.append(part.to(dtype or part.dtype).contiguous())
+        return alive[-1].data_ptr()
 
     results: dict[str, Any] = {name: part.data_ptr() for name, part in parts.items()}
     task = _Task(
@@ -176,7 +183,16 @@ def refined(
         iterations=iterations,
         limb_px=at(model.limb_px, torch.float32),
         edge_px=EDGE_PX,
-        expected=at(expected),
+        most_hidden=most_hidden,
+        covered=COVERED,
+        most_each=MOST_EACH,
+        least_of_window=LEAST_OF_WINDOW,
+        window=WINDOW_PX // 2,
+        margin=MARGIN_PX,
+        place=at(pixels.place),
+        first=first,
+        last=last,
+        kept=at(kept),
         **results,
     )
     threads = max(1, min(poses, torch.get_num_threads()))
@@ -188,7 +204,7 @@ def refined(
     others = [_threads().submit(part) for part in work[1:]]
     if any([work[0](), *(other.result() for other in others)]):
         raise MemoryError
-    return expected, parts
+    return kept, parts
 
 
 @cache

@@ -23,6 +23,7 @@ from sphereorient.pose.model import (
     scene_beside,
     stray_basis,
 )
+from sphereorient.pose.occluders import unoccluded
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import EDGE_PX, NOISE_MIN, Residuals, by_pose, residuals, torch_sums
 from sphereorient.so3 import inverse_damped, solve_damped
@@ -87,20 +88,26 @@ class PoseStart:
     place_precision: Tensor | None = None  # (B, 3, 3), 1/mm^2, of `position_lab_mm` as known beforehand
 
 
-def refine(pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4) -> FittedPoses:
+def refine(
+    pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4, most_hidden: float = 0.0
+) -> FittedPoses:
     """Fit poses to pictures: robust Gauss-Newton, the light's coefficients eliminated in every step.
-    `pixels` holds B * C disks, the cameras of a pose next to each other; `iterations` is at least 1. The covariance is
+    `pixels` holds B * C disks, the cameras of a pose next to each other; `iterations` is at least 1. Pixels that an
+    occluder shows by the first pose are not used; `most_hidden`: share of a disk, see `occluded`. The covariance is
     robust, with errors shared within tiles. All results but the pose belong to the pose before the last step.
     Where compiled code can do it, it does, to less than 0.001 degrees.
     Source: variable projection, Golub and Pereyra 1973; covariance from clustered scores, Liang and Zeger 1986.
     """
     use, place_precision, radius_mm = begin.use, begin.place_precision, model.radius_mm
-    done = refined(pixels, begin.position_lab_mm, begin.R_lab_body, model, use, place_precision, iterations)
+    at = begin.position_lab_mm, begin.R_lab_body
+    done = refined(pixels, *at, model, use, place_precision, iterations, most_hidden)
     if done is not None:
         return FittedPoses(**done[1])
     cameras = use.shape[1]
-    start = begin.position_lab_mm.double()
-    X, R = start, begin.R_lab_body.double()
+    start, R = (part.double() for part in at)
+    X = start
+    if most_hidden > 0:
+        pixels = unoccluded(pixels, start, R, model, cameras, most_hidden)
     origin = by_pose(pixels.origin[..., 0].double(), cameras)
     seen = use.to(X.dtype)
     state: tuple[Tensor, Tensor] | None = None

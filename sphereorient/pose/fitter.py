@@ -20,9 +20,9 @@ from sphereorient.pose.compiled import refined
 from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
 from sphereorient.pose.lab_light import lab_lights, learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, UNSEEN, Light, Lighting, SphereModel
-from sphereorient.pose.occluders import MOST_HIDDEN, occluded
+from sphereorient.pose.occluders import MOST_HIDDEN, unoccluded
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
-from sphereorient.pose.residuals import KNOWN, residuals
+from sphereorient.pose.residuals import KNOWN
 from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 
@@ -279,16 +279,10 @@ class Fitter:
             return pixels
         there, model, cameras = moved_to(self.device, pixels), self.model(self.optics.fine), len(self.views)
         X, R = (part.to(self.device).double() for part in (position_lab_mm, R_lab_body))
-        noise, counted = model.light.noise.repeat(len(X), 1), there.inside & ~there.clipped
         every = torch.ones(len(X), cameras, dtype=torch.bool)
-        done = refined(there, X, R, model, every) if model.paint.unseen is None else None
-        if done is None:
-            at = residuals(there, X, R, None, model, cameras)
-            expected, counted = at.model, counted & at.inside
-        else:
-            expected = done[0]
-        hidden = occluded(there, expected, noise, counted, self.most_hidden)
-        return replace(pixels, inside=pixels.inside & ~hidden.to(CPU))
+        done = refined(there, X, R, model, every, most_hidden=self.most_hidden)
+        kept = unoccluded(there, X, R, model, cameras, self.most_hidden).inside if done is None else done[0]
+        return replace(pixels, inside=kept.to(CPU))
 
     def fit(
         self,
@@ -299,13 +293,14 @@ class Fitter:
         level: PyramidLevel,
         iterations: int,
         place_precision: Tensor | None = None,
+        most_hidden: float = 0.0,
     ) -> FittedPoses:
         """Refine B poses at one level; see `refine`."""
         begin = PoseStart(
             position_lab_mm=position_lab_mm, R_lab_body=R_lab_body, use=use, place_precision=place_precision
         )
-        fit = refine(moved_to(self.device, pixels), moved_to(self.device, begin), self.model(level), iterations)
-        return moved_to(CPU, fit)
+        there, begin = moved_to(self.device, pixels), moved_to(self.device, begin)
+        return moved_to(CPU, refine(there, begin, self.model(level), iterations, most_hidden))
 
     def fit_through(
         self,

@@ -1,13 +1,16 @@
 """What covers the sphere (bubbles, specks, a rod, an unknown glint): connected residuals, whose pixels are not used."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.residuals import noise_variance, robust_deviation
+from sphereorient.pose.residuals import noise_variance, residuals, robust_deviation
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -44,6 +47,14 @@ def occluded(pixels: Pixels, expected: Tensor, noise: Tensor, counted: Tensor, m
     hidden = torch.from_numpy(covered).to(counted.device)
     share = (hidden & counted).sum(-1) / counted.sum(-1).clamp_min(1)
     return hidden & (share <= most)[:, None]
+
+
+def unoccluded(pixels: Pixels, X: Tensor, R: Tensor, model: SphereModel, cameras: int, most: float) -> Pixels:
+    """Return the pixels of B * C disks without those of occluders, by poses X (B, 3), mm, R_lab_body R (B, 3, 3)."""
+    at = residuals(pixels, X, R, None, model, cameras)
+    counted = at.inside & ~pixels.clipped
+    hidden = occluded(pixels, at.model, model.light.noise.repeat(len(X), 1), counted, most)
+    return replace(pixels, inside=pixels.inside & ~hidden)
 
 
 def _covered(differs: Floats, counted: Floats, down: Indices, right: Indices) -> NDArray[np.bool_]:

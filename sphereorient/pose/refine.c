@@ -50,11 +50,16 @@ typedef struct {
     const double *start, *start_rotation;
     const uint8_t *use;
     const double *place_precision;
-    int64_t iterations; /* 0: only `expected` is asked for */
+    int64_t iterations; /* 0: only `kept` is asked for */
     const float *limb_px; /* (cameras), or none */
     float edge_px;
-    /* results: (disks, places), and the parts of `FittedPoses` */
-    float *expected;
+    /* occluders: share of a disk that they may cover, 0: none are sought; see occluders.py */
+    float most_hidden, covered, most_each, least_of_window;
+    int64_t window, margin;        /* half widths, px */
+    const int64_t *place;          /* (2, places), px to the right and below, and their least and largest */
+    int64_t first[2], last[2];
+    /* results: places that count, (disks, places), and the parts of `FittedPoses` */
+    uint8_t *kept;
     double *position, *rotation, *covariance, *own_turn, *own_covariance, *own_move, *own_sigma, *excess, *score, *nll;
     double *step;
 } Task;
@@ -62,6 +67,7 @@ typedef struct {
 /* Where one disk stands in the fit, and what a step needs of it. */
 typedef struct {
     const double *position, *rotation; /* of the pose */
+    uint8_t *kept;                     /* (places), inside and not hidden by an occluder */
     float *expected, *weight;          /* (places) */
     int first, last;                   /* whether these are unknown; whether scores and `told` are asked for */
     double *scores;                    /* (tiles, n), n = 6 + n_difference + n_black */
@@ -76,6 +82,7 @@ typedef struct {
     float *paint, *cover, *x, *y, *aside, *out[3], *turn[3], *move[3], *limb[3], *count;
     float *difference, *black, *beside, *residual, *variance, *lit, *sorted;
     uint8_t *known, *counts;
+    float *grid[4]; /* of the square about the disk, wider by the margin on each side */
 } Disk;
 
 enum { FLOATS = 24 };
@@ -554,10 +561,10 @@ static void gather(const Task *t, const Disk *at, Sums *of, const double *coeffi
 }
 
 /* Tell how well the disk is explained: share of its variance, loss, median step from black to white paint. */
-static void tell(const Task *t, const Disk *at, Sums *of, int64_t k, float deviation) {
+static void tell(const Task *t, const Disk *at, Sums *of, float deviation) {
     const int64_t P = t->places;
     const float *expected = of->expected;
-    const uint8_t *inside = t->inside + k * P;
+    const uint8_t *inside = of->kept;
     double share = 0, cover = 0, mean = 0, spread = 0, left = 0, loss = 0;
     float one[BLOCK], counted[BLOCK] = {0}, all[BLOCK] = {0}, part[BLOCK] = {0};
     for (int i = 0; i < BLOCK; i++) one[i] = 1.0f;
@@ -627,6 +634,61 @@ static void without_light(const Task *t, Sums *of) {
                 of->scores[tile * n + a] -= of->scores[tile * n + 6 + l] * mixed[l * 6 + a];
 }
 
+/* Add the neighbours within `reach` along one axis of a grid, `stride` apart; or find the largest of them. */
+static void along(const float *from, float *to, int64_t cells, int64_t stride, int64_t reach, int sum) {
+    const int64_t edge = stride * reach;
+    for (int64_t i = 0; i < cells; i++) to[i] = 0.0f;
+    for (int64_t step = -edge; step <= edge; step += stride)
+        if (sum)
+            for (int64_t i = edge; i < cells - edge; i++) to[i] += from[i + step];
+        else
+            for (int64_t i = edge; i < cells - edge; i++) to[i] = most(to[i], from[i + step]);
+}
+
+/* Leave out the places that something before the sphere shows, as `occluded`: windows that differ, and their margin. */
+static void uncover(const Task *t, const Disk *at, Sums *of, int64_t k) {
+    const int64_t P = t->places, margin = t->margin;
+    const float *grey = t->grey + k * P, *noise = t->noise + (k % t->cameras) * 4;
+    const uint8_t *clipped = t->clipped + k * P;
+    const int64_t width = t->last[0] - t->first[0] + 1 + 2 * margin, height = t->last[1] - t->first[1] + 1 + 2 * margin;
+    const int64_t cells = width * height, origin = (margin - t->first[1]) * width + margin - t->first[0];
+    const int64_t *right = t->place, *down = t->place + P;
+    float *squares = at->residual, *differs = at->grid[0], *counted = at->grid[1], *work = at->grid[2];
+    int64_t told = 0, all = 0, hidden = 0;
+    for (int64_t p = 0; p < P; p++) {
+        const float residual = grey[p] - of->expected[p];
+        squares[p] = residual * residual / noise_variance(noise, of->expected[p], t->noise_least);
+        const int counts = at->counts[p] & !clipped[p];
+        all += counts;
+        if (counts && p % 4 == 0 && squares[p] == squares[p]) at->sorted[told++] = sqrtf(squares[p]);
+    }
+    const float deviation = told ? 1.4826f * ranked(at->sorted, told, (told - 1) / 2) : 0.0f;
+    const float scale = most(deviation, 1.0f) * most(deviation, 1.0f);
+    memset(differs, 0, sizeof(float) * (size_t)cells), memset(counted, 0, sizeof(float) * (size_t)cells);
+    for (int64_t p = 0; p < P; p++)
+        if (at->counts[p] && !clipped[p]) {
+            const int64_t cell = origin + down[p] * width + right[p];
+            differs[cell] = least(squares[p] / scale, t->most_each);
+            counted[cell] = 1.0f;
+        }
+    for (int g = 0; g < 2; g++) {
+        along(at->grid[g], work, cells, 1, t->window, 1);
+        along(work, at->grid[g], cells, width, t->window, 1);
+    }
+    float *seeds = at->grid[3];
+    memset(seeds, 0, sizeof(float) * (size_t)cells);
+    for (int64_t row = margin; row < height - margin; row++)
+        for (int64_t i = row * width + margin; i < (row + 1) * width - margin; i++)
+            seeds[i] = (float)(differs[i] > t->covered * most(counted[i], t->least_of_window));
+    along(seeds, work, cells, 1, margin, 0);
+    along(work, seeds, cells, width, margin, 0);
+    for (int64_t p = 0; p < P; p++)
+        hidden += at->counts[p] && !clipped[p] && seeds[origin + down[p] * width + right[p]] > 0.0f;
+    if ((float)hidden > t->most_hidden * (float)(all ? all : 1)) return;
+    for (int64_t p = 0; p < P; p++)
+        if (seeds[origin + down[p] * width + right[p]] > 0.0f) of->kept[p] = 0;
+}
+
 /* Sum the linear problem of one disk. */
 static void sum_disk(const Task *t, const Disk *at, Sums *of, int64_t k) {
     const int64_t padded = (t->places + BLOCK - 1) / BLOCK * BLOCK;
@@ -640,18 +702,21 @@ static void sum_disk(const Task *t, const Disk *at, Sums *of, int64_t k) {
         }
     if (t->instants > 1) mean_of_instants(t, at);
     shine(t, at, k);
-    const uint8_t *inside = t->inside + k * t->places, *clipped = t->clipped + k * t->places;
-    for (int64_t p = 0; p < t->places; p++) at->counts[p] = inside[p] && at->known[p];
-    if (of->first) { /* the first weights come from the picture itself, bubbles included; a second round does without */
-        memcpy(of->expected, t->grey + k * t->places, sizeof(float) * (size_t)t->places);
-        for (int64_t p = 0; p < t->places; p++) of->weight[p] = (float)(at->counts[p] && !clipped[p]);
-    }
+    const uint8_t *clipped = t->clipped + k * t->places;
     double coefficients[COLUMNS];
     float deviation = 0;
-    for (int round = 0; round < (of->first ? 2 : 1); round++) deviation = light_up(t, at, of, k, coefficients);
-    if (!t->iterations) return;
+    for (int seek = of->first && t->most_hidden > 0; seek >= 0; seek--) { /* without occluders, anew */
+        for (int64_t p = 0; p < t->places; p++) at->counts[p] = of->kept[p] && at->known[p];
+        if (of->first) { /* the first weights come from the picture itself, bubbles included; a second round does without */
+            memcpy(of->expected, t->grey + k * t->places, sizeof(float) * (size_t)t->places);
+            for (int64_t p = 0; p < t->places; p++) of->weight[p] = (float)(at->counts[p] && !clipped[p]);
+        }
+        for (int round = 0; round < (of->first ? 2 : 1); round++) deviation = light_up(t, at, of, k, coefficients);
+        if (seek) uncover(t, at, of, k);
+        if (!t->iterations) return;
+    }
     gather(t, at, of, coefficients);
-    if (of->last) tell(t, at, of, k, deviation);
+    if (of->last) tell(t, at, of, deviation);
     without_light(t, of);
 }
 
@@ -799,13 +864,17 @@ static void fit(const Task *t, const Disk *at, Sums *sums, int64_t pose) {
     const double *start = t->start + pose * 3, *prior = t->place_precision ? t->place_precision + pose * 9 : 0;
     double X[3], R[9], whole[36], step[6];
     memcpy(X, start, sizeof X), memcpy(R, t->start_rotation + pose * 9, sizeof R);
+    for (int64_t c = 0; c < cameras; c++) {
+        const int64_t k = (pose * cameras + c) * t->places;
+        sums[c].kept = t->kept + k;
+        memcpy(t->kept + k, t->inside + k, (size_t)t->places);
+    }
     for (int64_t round = 0; round < (t->iterations ? t->iterations : 1); round++) {
         memset(whole, 0, sizeof whole), memset(step, 0, sizeof step);
         for (int64_t c = 0; c < cameras; c++) {
             const int64_t k = pose * cameras + c;
             Sums *of = sums + c;
             of->position = X, of->rotation = R;
-            of->expected = t->expected + k * t->places;
             of->first = round == 0, of->last = round == t->iterations - 1;
             sum_disk(t, at, of, k);
             for (int i = 0; i < 3; i++) of->to_centre[i] = X[i] - (double)t->origin[(k * 3 + i) * t->origins];
@@ -842,7 +911,9 @@ int64_t refine_record(void) { return (int64_t)sizeof(Task); }
 /* Fit the poses from `begin` to before `end`, each by itself; return 0, or 1 without memory. */
 int refine(const Task *t, int64_t begin, int64_t end) {
     const int64_t P = (t->places + BLOCK - 1) / BLOCK * BLOCK, n = 6 + t->n_difference + t->n_black;
-    float *floats = malloc(sizeof(float) * (size_t)(P * (FLOATS + t->cameras))), *next = floats;
+    const int64_t cells = (t->last[0] - t->first[0] + 1 + 2 * t->margin) * (t->last[1] - t->first[1] + 1 + 2 * t->margin);
+    const int64_t grids = t->most_hidden > 0 ? 4 : 0;
+    float *floats = malloc(sizeof(float) * (size_t)(P * (FLOATS + 2 * t->cameras) + grids * cells)), *next = floats;
     uint8_t *bytes = malloc((size_t)(2 * P));
     Sums *sums = malloc(sizeof(Sums) * (size_t)t->cameras);
     double *scores = malloc(sizeof(double) * (size_t)(t->cameras * t->tiles * n));
@@ -856,8 +927,9 @@ int refine(const Task *t, int64_t begin, int64_t end) {
         for (int c = 0; c < FLOATS; c++, next += P) *parts[c] = next;
         at.sorted = at.count; /* not needed at the same time */
         at.known = bytes, at.counts = bytes + P;
-        for (int64_t c = 0; c < t->cameras; c++, next += P)
-            sums[c].weight = next, sums[c].scores = scores + c * t->tiles * n;
+        for (int64_t c = 0; c < t->cameras; c++, next += 2 * P)
+            sums[c].expected = next, sums[c].weight = next + P, sums[c].scores = scores + c * t->tiles * n;
+        for (int64_t g = 0; g < grids; g++, next += cells) at.grid[g] = next;
         for (int64_t pose = begin; pose < end; pose++) fit(t, &at, sums, pose);
     }
     free(floats), free(bytes), free(sums), free(scores);

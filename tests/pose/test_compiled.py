@@ -26,6 +26,7 @@ from sphereorient.pose import compiled
 from sphereorient.pose.fit import POSE_PARTS, PoseStart, learn_light, refine
 from sphereorient.pose.lab_light import learn_lab_light
 from sphereorient.pose.model import FIRST, LATER, SphereModel
+from sphereorient.pose.occluders import unoccluded
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import texture_table
 
@@ -123,23 +124,47 @@ def test_of_lines_of_sight_that_start_at_different_places(pixels, monkeypatch):
     assert_same(refine(ported, begin(), model_of()), by_torch(monkeypatch, ported, model_of(), 4))
 
 
+@pytest.mark.parametrize("kind", ["light in the lab", "unseen paint"])
+def test_occluders_are_those_of_torch(pixels, kind, monkeypatch):
+    covered = pixels.grey.clone()
+    near = ((pixels.place - torch.tensor([[4], [-6]])).abs() <= 4).all(0)
+    covered[::3, near] += 90.0
+    covered[1, :] = covered[1].flip(0)  # so much differs that nothing is taken for an occluder
+    hidden, model = replace(pixels, grey=covered), MODELS[kind](pixels)
+    every, start = torch.ones(10, 2, dtype=torch.bool), begin()
+    for most in (0.4, 1e-4):
+        done = compiled.refined(hidden, start.position_lab_mm, start.R_lab_body, model, every, most_hidden=most)
+        expected = unoccluded(hidden, start.position_lab_mm, start.R_lab_body, model, 2, most)
+        assert done is not None
+        assert torch.equal(done[0], expected.inside)
+        assert bool((pixels.inside & ~expected.inside)[0, near].any()) == (most == 0.4)
+        assert torch.equal(expected.inside[1], pixels.inside[1])
+        fit = refine(hidden, start, model, 2, most)
+        with monkeypatch.context() as patch:
+            patch.setattr(compiled, "library", lambda: None)
+            assert_same(fit, refine(hidden, start, model, 2, most), nll=5e-3)
+        without = refine(expected, start, model, 2)
+        for name in POSE_PARTS:
+            assert torch.equal(getattr(fit, name), getattr(without, name)), name
+
+
 def test_a_disk_does_not_depend_on_batch_threads_or_the_width_of_vectors(pixels, monkeypatch):
     model = learnt(pixels, learn_light)
-    whole = refine(pixels, begin(), model)
+    whole = refine(pixels, begin(), model, most_hidden=0.4)
     start = begin()
     few = replace(
         start,
         **{name: getattr(start, name)[3:5] for name in ("position_lab_mm", "R_lab_body", "use", "place_precision")},
     )
-    some = refine(pixels.where(torch.arange(6, 10)), few, model)
+    some = refine(pixels.where(torch.arange(6, 10)), few, model, most_hidden=0.4)
     threads = torch.get_num_threads()
     torch.set_num_threads(3)
-    threaded = refine(pixels, start, model)
+    threaded = refine(pixels, start, model, most_hidden=0.4)
     torch.set_num_threads(threads)
     plain = built_for(compiled.SOURCE, compiled._Task, "default")
     assert plain is not None
     monkeypatch.setattr(compiled, "library", lambda: plain)
-    narrow = refine(pixels, start, model)
+    narrow = refine(pixels, start, model, most_hidden=0.4)
     for name in POSE_PARTS:
         assert torch.equal(getattr(whole, name), getattr(threaded, name)), name
         assert torch.equal(getattr(whole, name), getattr(narrow, name)), name
