@@ -82,6 +82,7 @@ typedef struct {
     float *paint, *cover, *x, *y, *aside, *out[3], *turn[3], *move[3], *limb[3], *count;
     float *difference, *black, *beside, *residual, *variance, *lit, *sorted;
     uint8_t *known, *counts;
+    double (*sums)[LANES]; /* of pairs of columns, and of each with what is left */
     float *grid[4]; /* of the square about the disk, wider by the margin on each side */
 } Disk;
 
@@ -114,14 +115,25 @@ static inline int32_t octahedral_cell(float x, float y, float z, float side) {
     return placed(v + half, side) * (int32_t)side + placed(u + half, side);
 }
 
-/* Sum of products of two blocks of places, the same for every width of the processor's vectors. */
-static inline double product(const float *restrict a, const float *restrict b) {
+/* Add products of two blocks of places to sums in lanes, the same for every width of the processor's vectors. */
+static inline void add_products(const float *restrict a, const float *restrict b, double *restrict sums) {
     float lanes[LANES] = {0};
     for (int i = 0; i < BLOCK; i += LANES)
         for (int l = 0; l < LANES; l++) lanes[l] += a[i + l] * b[i + l];
+    for (int l = 0; l < LANES; l++) sums[l] += (double)lanes[l];
+}
+
+static double total(const double *lanes) {
     double sum = 0;
     for (int l = 0; l < LANES; l++) sum += lanes[l];
     return sum;
+}
+
+/* Sum of products of two blocks of places. */
+static double product(const float *restrict a, const float *restrict b) {
+    double lanes[LANES] = {0};
+    add_products(a, b, lanes);
+    return total(lanes);
 }
 
 /* Return the element of rank `rank` of some numbers that are not negative, by their bits, the highest first. */
@@ -437,9 +449,9 @@ static float light_up(const Task *t, const Disk *at, const Sums *of, int64_t k, 
     const uint8_t *inside = at->counts, *clipped = t->clipped + k * P;
     float *expected = of->expected, *weight = of->weight;
     float tints[TINTS][BLOCK], column[COLUMNS][BLOCK], weighted[BLOCK], target[BLOCK];
-    double matrix[COLUMNS * COLUMNS] = {0};
+    double matrix[COLUMNS * COLUMNS], (*sums)[LANES] = at->sums;
     const int count = (int)(t->n_difference + t->n_black);
-    for (int c = 0; c < count; c++) coefficients[c] = 0;
+    memset(sums, 0, sizeof(double) * LANES * (size_t)(count * (count + 3) / 2));
     for (int64_t from = 0; from < P; from += BLOCK) {
         const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
         lit_columns(t, at, from, n, tints, column);
@@ -448,14 +460,16 @@ static float light_up(const Task *t, const Disk *at, const Sums *of, int64_t k, 
         float factor[BLOCK];
         for (int i = 0; i < n; i++)
             factor[i] = weight[from + i] / noise_variance(own, expected[from + i], floor_);
-        for (int a = 0; a < count; a++) {
+        for (int a = 0, next = 0; a < count; a++) {
             for (int i = 0; i < n; i++) weighted[i] = factor[i] * column[a][i];
-            for (int b = a; b < count; b++) matrix[a * count + b] += product(weighted, column[b]);
-            coefficients[a] += product(weighted, target);
+            for (int b = a; b < count; b++) add_products(weighted, column[b], sums[next++]);
+            add_products(weighted, target, sums[next++]);
         }
     }
-    for (int a = 0; a < count; a++)
-        for (int b = 0; b < a; b++) matrix[a * count + b] = matrix[b * count + a];
+    for (int a = 0, next = 0; a < count; a++) {
+        for (int b = a; b < count; b++) matrix[a * count + b] = matrix[b * count + a] = total(sums[next++]);
+        coefficients[a] = total(sums[next++]);
+    }
     solve(matrix, coefficients, count, 1, 1e-7);
     float by[COLUMNS];
     for (int c = 0; c < count; c++) by[c] = (float)coefficients[c];
@@ -484,10 +498,10 @@ static float light_up(const Task *t, const Disk *at, const Sums *of, int64_t k, 
     }
     for (int64_t p = 0; p < P; p += 4) /* a quarter of the places suffices: they are in order of distance */
         if (inside[p]) {
-            const float size = fabsf(at->residual[p]) / sqrtf(at->variance[p]);
-            if (size == size) at->sorted[told++] = size;
+            const float square = at->residual[p] * at->residual[p] / at->variance[p];
+            if (square == square) at->sorted[told++] = square;
         }
-    const float deviation = told ? 1.4826f * ranked(at->sorted, told, (told - 1) / 2) : 0.0f;
+    const float deviation = told ? 1.4826f * sqrtf(ranked(at->sorted, told, (told - 1) / 2)) : 0.0f;
     const float scale = most(deviation, 1.0f) * most(deviation, 1.0f);
     float *variance = at->variance;
     const float *residual = at->residual, limit = t->tukey2;
@@ -508,8 +522,8 @@ static void gather(const Task *t, const Disk *at, Sums *of, const double *coeffi
     double *normal = of->normal, *gradient = of->gradient, *scores = of->scores;
     float tints[TINTS][BLOCK], column[COLUMNS][BLOCK], weighted[BLOCK], precision[BLOCK], left[BLOCK];
     float score[BLOCK][COLUMNS];
-    memset(normal, 0, sizeof(double) * (size_t)(n_all * n_all));
-    memset(gradient, 0, sizeof(double) * (size_t)n_all);
+    double(*sums)[LANES] = at->sums;
+    memset(sums, 0, sizeof(double) * LANES * (size_t)(n_all * (n_all + 3) / 2));
     if (of->last) memset(scores, 0, sizeof(double) * (size_t)(n_all * t->tiles));
     for (int64_t from = 0; from < P; from += BLOCK) {
         const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
@@ -543,10 +557,10 @@ static void gather(const Task *t, const Disk *at, Sums *of, const double *coeffi
             left[i] = weighted[i] = 0.0f;
             for (int c = 0; c < 6; c++) column[c][i] = 0.0f;
         }
-        for (int a = 0; a < n_all; a++) {
+        for (int a = 0, next = 0; a < n_all; a++) {
             for (int i = 0; i < n; i++) weighted[i] = precision[i] * column[a][i];
-            for (int b = a; b < n_all; b++) normal[a * n_all + b] += product(weighted, column[b]);
-            gradient[a] += product(weighted, left);
+            for (int b = a; b < n_all; b++) add_products(weighted, column[b], sums[next++]);
+            add_products(weighted, left, sums[next++]);
             if (of->last)
                 for (int i = 0; i < n; i++) score[i][a] = weighted[i] * left[i];
         }
@@ -556,8 +570,10 @@ static void gather(const Task *t, const Disk *at, Sums *of, const double *coeffi
                 for (int a = 0; a < n_all; a++) tile[a] += score[i][a];
             }
     }
-    for (int a = 0; a < n_all; a++)
-        for (int b = 0; b < a; b++) normal[a * n_all + b] = normal[b * n_all + a];
+    for (int a = 0, next = 0; a < n_all; a++) {
+        for (int b = a; b < n_all; b++) normal[a * n_all + b] = normal[b * n_all + a] = total(sums[next++]);
+        gradient[a] = total(sums[next++]);
+    }
 }
 
 /* Tell how well the disk is explained: share of its variance, loss, median step from black to white paint. */
@@ -645,24 +661,26 @@ static void along(const float *from, float *to, int64_t cells, int64_t stride, i
             for (int64_t i = edge; i < cells - edge; i++) to[i] = most(to[i], from[i + step]);
 }
 
-/* Leave out the places that something before the sphere shows, as `occluded`: windows that differ, and their margin. */
-static void uncover(const Task *t, const Disk *at, Sums *of, int64_t k) {
+/* Leave out the places that something before the sphere shows, as `occluded`: windows that differ, and their margin.
+   Return whether there are any. */
+static int uncover(const Task *t, const Disk *at, Sums *of, int64_t k) {
     const int64_t P = t->places, margin = t->margin;
     const float *grey = t->grey + k * P, *noise = t->noise + (k % t->cameras) * 4;
     const uint8_t *clipped = t->clipped + k * P;
     const int64_t width = t->last[0] - t->first[0] + 1 + 2 * margin, height = t->last[1] - t->first[1] + 1 + 2 * margin;
     const int64_t cells = width * height, origin = (margin - t->first[1]) * width + margin - t->first[0];
     const int64_t *right = t->place, *down = t->place + P;
-    float *squares = at->residual, *differs = at->grid[0], *counted = at->grid[1], *work = at->grid[2];
+    float *squares = at->lit, *differs = at->grid[0], *counted = at->grid[1], *work = at->grid[2];
     int64_t told = 0, all = 0, hidden = 0;
+    const float own[4] = {noise[0], noise[1], noise[2], noise[3]}, floor_ = t->noise_least, *expected = of->expected;
+    INDEPENDENT
     for (int64_t p = 0; p < P; p++) {
-        const float residual = grey[p] - of->expected[p];
-        squares[p] = residual * residual / noise_variance(noise, of->expected[p], t->noise_least);
-        const int counts = at->counts[p] & !clipped[p];
-        all += counts;
-        if (counts && p % 4 == 0 && squares[p] == squares[p]) at->sorted[told++] = sqrtf(squares[p]);
+        const float residual = grey[p] - expected[p];
+        squares[p] = residual * residual / noise_variance(own, expected[p], floor_);
     }
-    const float deviation = told ? 1.4826f * ranked(at->sorted, told, (told - 1) / 2) : 0.0f;
+    for (int64_t p = 0; p < P; p += 4)
+        if (at->counts[p] && !clipped[p] && squares[p] == squares[p]) at->sorted[told++] = squares[p];
+    const float deviation = told ? 1.4826f * sqrtf(ranked(at->sorted, told, (told - 1) / 2)) : 0.0f;
     const float scale = most(deviation, 1.0f) * most(deviation, 1.0f);
     memset(differs, 0, sizeof(float) * (size_t)cells), memset(counted, 0, sizeof(float) * (size_t)cells);
     for (int64_t p = 0; p < P; p++)
@@ -677,16 +695,25 @@ static void uncover(const Task *t, const Disk *at, Sums *of, int64_t k) {
     }
     float *seeds = at->grid[3];
     memset(seeds, 0, sizeof(float) * (size_t)cells);
+    int any = 0;
     for (int64_t row = margin; row < height - margin; row++)
-        for (int64_t i = row * width + margin; i < (row + 1) * width - margin; i++)
-            seeds[i] = (float)(differs[i] > t->covered * most(counted[i], t->least_of_window));
+        for (int64_t i = row * width + margin; i < (row + 1) * width - margin; i++) {
+            const int seed = differs[i] > t->covered * most(counted[i], t->least_of_window);
+            seeds[i] = (float)seed;
+            any |= seed;
+        }
+    if (!any) return 0;
     along(seeds, work, cells, 1, margin, 0);
     along(work, seeds, cells, width, margin, 0);
-    for (int64_t p = 0; p < P; p++)
-        hidden += at->counts[p] && !clipped[p] && seeds[origin + down[p] * width + right[p]] > 0.0f;
-    if ((float)hidden > t->most_hidden * (float)(all ? all : 1)) return;
+    for (int64_t p = 0; p < P; p++) {
+        const int counts = at->counts[p] && !clipped[p];
+        all += counts;
+        hidden += counts && seeds[origin + down[p] * width + right[p]] > 0.0f;
+    }
+    if ((float)hidden > t->most_hidden * (float)(all ? all : 1)) return 0;
     for (int64_t p = 0; p < P; p++)
         if (seeds[origin + down[p] * width + right[p]] > 0.0f) of->kept[p] = 0;
+    return 1;
 }
 
 /* Sum the linear problem of one disk. */
@@ -712,7 +739,7 @@ static void sum_disk(const Task *t, const Disk *at, Sums *of, int64_t k) {
             for (int64_t p = 0; p < t->places; p++) of->weight[p] = (float)(at->counts[p] && !clipped[p]);
         }
         for (int round = 0; round < (of->first ? 2 : 1); round++) deviation = light_up(t, at, of, k, coefficients);
-        if (seek) uncover(t, at, of, k);
+        if (seek && !uncover(t, at, of, k)) seek = 0; /* all is as before: once is enough */
         if (!t->iterations) return;
     }
     gather(t, at, of, coefficients);
@@ -917,7 +944,8 @@ int refine(const Task *t, int64_t begin, int64_t end) {
     uint8_t *bytes = malloc((size_t)(2 * P));
     Sums *sums = malloc(sizeof(Sums) * (size_t)t->cameras);
     double *scores = malloc(sizeof(double) * (size_t)(t->cameras * t->tiles * n));
-    const int without = !floats || !bytes || !sums || !scores;
+    double *pairs = malloc(sizeof(double) * LANES * (size_t)(n * (n + 3) / 2));
+    const int without = !floats || !bytes || !sums || !scores || !pairs;
     if (!without) {
         Disk at;
         float **parts[] = {&at.paint,   &at.cover,   &at.x,       &at.y,       &at.aside,      &at.out[0],  &at.out[1],
@@ -927,11 +955,12 @@ int refine(const Task *t, int64_t begin, int64_t end) {
         for (int c = 0; c < FLOATS; c++, next += P) *parts[c] = next;
         at.sorted = at.count; /* not needed at the same time */
         at.known = bytes, at.counts = bytes + P;
+        at.sums = (double(*)[LANES])pairs;
         for (int64_t c = 0; c < t->cameras; c++, next += 2 * P)
             sums[c].expected = next, sums[c].weight = next + P, sums[c].scores = scores + c * t->tiles * n;
         for (int64_t g = 0; g < grids; g++, next += cells) at.grid[g] = next;
         for (int64_t pose = begin; pose < end; pose++) fit(t, &at, sums, pose);
     }
-    free(floats), free(bytes), free(sums), free(scores);
+    free(floats), free(bytes), free(sums), free(scores), free(pairs);
     return without;
 }
