@@ -11,6 +11,7 @@ from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.files.threads import side_by_side
 from sphereorient.mapping.compare import fit_levels
 from sphereorient.mapping.disks import Crops, Disks, evenly_spread, pixels_of
 from sphereorient.mapping.grid import (
@@ -28,7 +29,6 @@ from sphereorient.mapping.grid import (
 from sphereorient.mapping.joint import Linearisation, LinearSystem, joint_step, linear_system, linearise
 from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.mapping.threads import side_by_side
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curves
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
 from sphereorient.pose.lab_light import LabLight, learn_lab_light

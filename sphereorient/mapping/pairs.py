@@ -10,8 +10,8 @@ from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.files.threads import side_by_side
 from sphereorient.mapping.disks import Disks, disk_places
-from sphereorient.mapping.threads import side_by_side
 from sphereorient.so3 import cross_first_axis
 
 STEP_RAD = 0.15  # longest step of a refinement

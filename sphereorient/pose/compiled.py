@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.files.compiled import compiled
+from sphereorient.files.threads import cores
 from sphereorient.pose.model import COVER_MIN, DEPTH_MIN, UNSEEN, SphereModel, exposure_instants, limb_shape, rim_shape
 from sphereorient.pose.occluders import COVERED, LEAST_OF_WINDOW, MARGIN_PX, MOST_EACH, WINDOW_PX
 from sphereorient.pose.pixels import Pixels
@@ -195,7 +196,7 @@ def refined(
         kept=at(kept),
         **results,
     )
-    threads = max(1, min(poses, torch.get_num_threads()))
+    threads = max(1, min(poses, cores()))
     ends = [poses * part // threads for part in range(threads + 1)]
     work = [
         lambda begin=begin, end=end: code.refine(ctypes.byref(task), ctypes.c_int64(begin), ctypes.c_int64(end))

@@ -13,6 +13,7 @@ import torch
 from scipy.special import sph_legendre_p_all
 from torch import Tensor
 
+from sphereorient.files.threads import side_by_side
 from sphereorient.pose.fit import FittedPoses, learn_stray, noise_curves
 from sphereorient.pose.model import (
     LATER,
@@ -254,7 +255,8 @@ def _better(
     own = torch.cat([learnt[:, None] * tints, view.coverage[:, None] * tints[:, :3]], dim=1)
     counts = (precision > 0).any(1)
     factor = torch.zeros(len(left), len(now) + 1, dtype=torch.float64)
-    for k in counts.nonzero()[:, 0].tolist():  # one disk at a time: the columns of all would fill the memory
+
+    def of_disk(k: int) -> tuple[int, Tensor, Tensor]:
         over_normal, over_mirror, over_depth = (basis[k] for basis in bases)
         scattered = (cover[k] * through[k]) * over_normal
         columns = [view.paint[k] * scattered, scattered, (cover[k] * mirrored[k]) * over_mirror]
@@ -263,8 +265,11 @@ def _better(
         weighted, own_weighted = whole * precision[k], own[k] * precision[k]
         sums, mixed = (weighted @ whole.T).double(), (own_weighted @ whole.T).double()
         taken = torch.linalg.solve((own_weighted @ own[k].T).double() + tied.double().pow(-2).diag(), mixed)
-        factor[k] = taken[0]
-        sums -= mixed.T @ taken
+        return k, sums - mixed.T @ taken, taken[0]
+
+    # A few disks at a time: the columns of all would fill the memory.
+    for k, sums, own_part in side_by_side(of_disk, counts.nonzero()[:, 0].tolist()):
+        factor[k] = own_part
         normal += sums[:-1, :-1]
         right += sums[:-1, -1]
     expected, deviation = _beforehand(unit)

@@ -19,6 +19,7 @@ import numpy as np
 
 from sphereorient.errors import SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.experiment.recording import Progress, silent
+from sphereorient.files.threads import limit_cores
 from sphereorient.follow.follower import Batch
 from sphereorient.methods.method import one_thread
 from sphereorient.run.stages import Task, Work, check_method, check_out, opened, stages
@@ -198,6 +199,7 @@ def _work(request: Request, run_id: str) -> tuple[Work, ExitStack]:
 
 def do_task(request: Request, run_id: str, task: Task) -> Any:
     """Do one task in a worker; a track is returned as its numbers of frames and of valid frames."""
+    limit_cores(1)
     with one_thread():
         result = _work(request, run_id)[0].do(task)
     return (len(result), int(np.sum(result.valid))) if isinstance(result, Trajectory) else result

@@ -1,12 +1,13 @@
 """Tables of the texture map over directions: paint for banks, value and slope for fits."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from sphereorient.cameras import Rays
+from sphereorient.files.threads import side_by_side
 from sphereorient.sphere.renderer import see_sphere
 from sphereorient.sphere.texture import reduced_texture, sample_texture
 
@@ -22,7 +23,7 @@ THREE = ((-math.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (math.sqrt(3.0), 1 / 6))
 # The same in the plane: right, up and weight of each node.
 SQUARE_25, SQUARE_9 = ([(a, b, p * q) for a, p in rule for b, q in rule] for rule in (FIVE, THREE))
 BASE_RAD = 0.008  # blur of the finest table: below half a pixel for disks up to 160 px
-CHUNK = 1 << 16  # directions per batch while a table is built
+CHUNK = 1 << 14  # directions per batch while a table is built
 STEPS = 127.0  # of a direction table: white paint; black is its negative
 AT_ONCE = 16  # orientations looked up at once: temporaries stay in the cache
 SIDE = 512  # cells per axis of the finest table: 0.4 degrees, 4 MB
@@ -123,15 +124,16 @@ class TextureTable:
         added = math.sqrt(target**2 - self.blur_rad**2)
         # A cell is 2.2 / side wide: a wider blur needs fewer cells.
         side = min(self.side, 1 << math.ceil(math.log2(2.2 * CELLS_A_BLUR / target)))
-        parts = [torch.zeros(0, 4)]
-        for centre in torch.split(octahedral_directions(side), CHUNK):
+
+        def rows(centre: Tensor) -> Tensor:
             value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
             for share, _, at in _disk_nodes(centre, added, SQUARE_9):
                 v, g = self.sample(at.T[None])
                 value, slope = value + share * v[0], slope + share * g[0].T
-            parts.append(_rows(value, slope, centre.float()))
+            return _rows(value, slope, centre.float())
+
         unseen = self.unseen and self.unseen.blurred(target)
-        return TextureTable(torch.cat(parts), target, unseen).blurred(blur_rad)
+        return TextureTable(_in_chunks(rows, side), target, unseen).blurred(blur_rad)
 
 
 def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Tensor | None = None) -> TextureTable:
@@ -141,15 +143,21 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Te
     finest = min(blur_rad, BASE_RAD)
     hidden = None if unseen is None else texture_table(unseen.float(), finest, side)
     reduced = reduced_texture(texture.float(), 2.0 / finest)  # pixels as wide as the blur: no steps
-    parts = [torch.zeros(0, 4)]
-    for centre in torch.split(octahedral_directions(side), CHUNK):
+
+    def rows(centre: Tensor) -> Tensor:
         value, slope = torch.zeros(len(centre)), torch.zeros(len(centre), 3)
         for share, offset, at in _disk_nodes(centre, finest, SQUARE_25):
             v = sample_texture(reduced, at)
             value = value + share * v
             slope = slope + share * v[:, None] * offset / finest**2
-        parts.append(_rows(value, slope, centre.float()))
-    return TextureTable(torch.cat(parts), finest, hidden).blurred(blur_rad)
+        return _rows(value, slope, centre.float())
+
+    return TextureTable(_in_chunks(rows, side), finest, hidden).blurred(blur_rad)
+
+
+def _in_chunks(rows: Callable[[Tensor], Tensor], side: int) -> Tensor:
+    """Return the rows (side^2, 4) of all cells of directions."""
+    return torch.cat([torch.zeros(0, 4), *side_by_side(rows, torch.split(octahedral_directions(side), CHUNK))])
 
 
 def _disk_nodes(

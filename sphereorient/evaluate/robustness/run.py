@@ -21,6 +21,7 @@ from sphereorient.evaluate.robustness.results import FIRST, SCHEMA, WRONG_DEG, R
 from sphereorient.evaluate.robustness.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
 from sphereorient.evaluate.score import distance_deg, score_track, true_orientations
 from sphereorient.files.provenance import versions
+from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
 from sphereorient.methods.settings import Settings
 from sphereorient.run.stages import track_movies
@@ -86,6 +87,7 @@ def run_benchmark(
 def limit_threads() -> None:
     """Limit a worker to one thread."""
     torch.set_num_threads(1)
+    limit_cores(1)
 
 
 def _prepare(folder: Path, settings: BenchSettings) -> None:

@@ -1,4 +1,4 @@
-"""Batches on all cores: torch computes without Python's lock."""
+"""Independent pieces on all cores: torch, numpy and compiled code compute without Python's lock."""
 
 import os
 from collections import deque
@@ -9,12 +9,23 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-MOST = 8  # batches in memory
+MOST = 8  # pieces in memory
+_limit: list[int] = []  # of this process: that of a worker, which shares the machine with others
+
+
+def cores() -> int:
+    """Return how many threads compute: one a core, or those that `limit_cores` set."""
+    return _limit[-1] if _limit else os.cpu_count() or 1
+
+
+def limit_cores(count: int) -> None:
+    """Limit the threads of this process from now on."""
+    _limit[:] = [count]
 
 
 def side_by_side(task: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     """Yield the results of all items in their order, computed on as many threads as there are cores."""
-    rest, threads = iter(items), min(os.cpu_count() or 1, MOST)
+    rest, threads = iter(items), min(cores(), MOST)
     with ThreadPoolExecutor(threads) as pool:
         waiting = deque(pool.submit(task, item) for item in islice(rest, threads))
         while waiting:
