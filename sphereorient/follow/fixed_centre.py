@@ -32,9 +32,14 @@ class FixedCentre:
     follows_rad_mm: Tensor  # (3, 3), error of the orientation, delta lab, per error of the centre: mean over frames
 
     @property
+    def spread_mm2(self) -> Tensor:
+        """Covariance (3, 3) that holds fits at the centre to FIRM of its error."""
+        return FIRM**2 * self.covariance_mm2
+
+    @property
     def precision(self) -> Tensor:
-        """Precision (3, 3), 1/mm^2, that holds fits at the centre to FIRM of its error."""
-        inverse: Tensor = torch.linalg.inv(FIRM**2 * self.covariance_mm2)
+        """Its inverse, 1/mm^2."""
+        inverse: Tensor = torch.linalg.inv(self.spread_mm2)
         return inverse
 
     def with_error(self, covariance: Tensor) -> Tensor:

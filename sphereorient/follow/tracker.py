@@ -37,10 +37,11 @@ OWN = ("own_covariance", "own_sigma_mm", "excess", "score")
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Expected:
     position_lab_mm: Tensor  # (3,)
-    R_lab_body: Tensor  # (3, 3)
+    R_before: Tensor  # (3, 3), rotation from lab to body in the frame before
+    turn: Tensor  # (3,), rad, lab, since then
     use: Tensor  # (C,) bool, cameras that saw the sphere
     reason: tuple[Reason, ...]  # C, why the others did not
-    place_precision: Tensor  # (3, 3), 1/mm^2
+    place_spread: Tensor  # (3, 3), mm^2
     rough: bool  # from one predecessor alone: the motion is unknown
     moved: Tensor  # (6,), turn (rad) and move (mm) while the shutter is open; 0 where rough
     open_share: float  # of the time from the frame before to this one, in which the shutter is open
@@ -66,10 +67,10 @@ class _Chunk:
         if len(rows) > 1 and numbers[-2] == frame - 2:
             t0, t1, t2 = (self.time_s[k] for k in range(frame - 2, frame + 1))
             on = (t2 - t1) / (t1 - t0)  # 1 for even frames
-        X, R, spread = last.position_lab_mm[0], last.R_lab_body[0], last.covariance[0, 3:, 3:]
+        X, spread = last.position_lab_mm[0], last.covariance[0, 3:, 3:]
         rough, astray_mm = on > LONG_STEP, MOVE_SHARE * radius_mm
         open_share = exposure_s / (self.time_s[frame] - self.time_s[frame - 1])
-        moved = torch.zeros(6, dtype=torch.float64)
+        turn, moved = torch.zeros(3, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)
         if not rough:
             *_, X0, X1 = (poses.position_lab_mm[0] for poses in rows)
             *_, C0, C1 = (poses.covariance[0, 3:, 3:] for poses in rows)
@@ -85,25 +86,31 @@ class _Chunk:
                 # Not for the distances of one camera: they scatter by more than the acceleration of the sphere.
                 if float(further.diagonal().sum()) < astray_mm**2:
                     move, spread = (1 + more) * move - b * (X0 - rows[0].position_lab_mm[0]), further
-            X, R = X1 + move, so3.exp(turn) @ R
+            X = X1 + move
             moved = open_share * torch.cat([turn, move])
         return _Expected(
             position_lab_mm=X,
-            R_lab_body=R,
+            R_before=last.R_lab_body[0],
+            turn=turn,
             use=last.use,
             reason=last.reason,
-            place_precision=torch.linalg.inv(spread + astray_mm**2 * torch.eye(3, dtype=torch.float64)),
+            place_spread=spread + astray_mm**2 * torch.eye(3, dtype=torch.float64),
             rough=rough,
             moved=moved,
             open_share=open_share,
         )
 
-    def saw(self, frame: int, poses: Poses) -> None:
-        """Remember the best pose of a frame, if a picture supports it."""
-        if len(poses) and bool(poses.use.any()):
+    def saw(self, frame: int, poses: Poses, turn: Tensor) -> None:
+        """Remember the best pose of a frame, if a picture supports it, and the turn (3,), rad, since the one before."""
+        if supported(poses):
             if self.past:
-                self.turns.append(so3.log(poses.R_lab_body[0] @ self.past[-1][1].R_lab_body[0].mT))
+                self.turns.append(turn)
             self.past.append((frame, poses))
+
+
+def supported(poses: Poses) -> bool:
+    """Return whether a picture supports the best pose of a frame."""
+    return len(poses) > 0 and bool(poses.use.any())
 
 
 class ChunkTracker:
@@ -143,10 +150,23 @@ class ChunkTracker:
         for k in range(max(batch)):
             now = [chunk for chunk in chunks if chunk.first + k < chunk.last]
             frames = {chunk.first: [movie[chunk.first + k] for movie in shots] for chunk in now}
-            for chunk, poses in zip(now, self._step(now, k, frames), strict=True):
-                chunk.saw(chunk.first + k, poses)
+            here = list(self._step(now, k, frames))
+            for chunk, poses, turn in zip(now, here, self._turns(now, here), strict=True):
+                chunk.saw(chunk.first + k, poses, turn)
                 found[chunk.first + k] = poses
         yield from (found[k] for k in range(sum(batch)))
+
+    def _turns(self, chunks: Sequence[_Chunk], found: Sequence[Poses]) -> Tensor:
+        """Return the turn of each chunk since the pose that it saw last, (n, 3), rad, lab; 0 without one."""
+        turns = torch.eye(3, dtype=torch.float64).repeat(self._lanes(len(chunks)), 1, 1)
+        for row, (chunk, poses) in enumerate(zip(chunks, found, strict=True)):
+            if chunk.past and supported(poses):
+                turns[row] = poses.R_lab_body[0] @ chunk.past[-1][1].R_lab_body[0].mT
+        return so3.log(turns)[: len(chunks)]
+
+    def _lanes(self, count: int) -> int:
+        """Return the size of batches: always the same, since the last bits depend on it."""
+        return max(count, self.settings.chunks)
 
     def _step(self, chunks: Sequence[_Chunk], k: int, frames: Mapping[int, Sequence[Frame]]) -> Iterator[Poses]:
         """Measure one frame of each chunk: from the prediction where that holds, else by a search."""
@@ -155,8 +175,8 @@ class ChunkTracker:
         }
         ahead = {first: pose for first, pose in expected.items() if pose is not None}
         if self.centre is not None:
-            X, precision = self.centre.position_lab_mm, self.centre.precision
-            ahead = {n: replace(pose, position_lab_mm=X, place_precision=precision) for n, pose in ahead.items()}
+            X, spread = self.centre.position_lab_mm, self.centre.spread_mm2
+            ahead = {n: replace(pose, position_lab_mm=X, place_spread=spread) for n, pose in ahead.items()}
         followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
         for chunk in chunks:
             poses = followed.get(chunk.first)
@@ -167,14 +187,15 @@ class ChunkTracker:
         """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
         if not expected:
             return []
-        asked, missing = len(expected), self.settings.chunks - len(expected)
+        asked, missing = len(expected), self._lanes(len(expected)) - len(expected)
         expected, shots = [*expected, *[expected[-1]] * missing], [*shots, *[shots[-1]] * missing]
         frames = [[shot.shown for shot in row] for row in shots]
         usable = torch.tensor([[shot.readable for shot in row] for row in shots])
-        X, R, use, precision, moved = (
+        X, R_before, turn, use, spread, moved = (
             torch.stack([getattr(one, name) for one in expected])
-            for name in ("position_lab_mm", "R_lab_body", "use", "place_precision", "moved")
+            for name in ("position_lab_mm", "R_before", "turn", "use", "place_spread", "moved")
         )
+        R, precision = so3.exp(turn) @ R_before, torch.linalg.inv(spread)
         known, use = use, use & usable
         if any(one.rough for one in expected):
             was = X, R

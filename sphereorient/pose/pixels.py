@@ -56,11 +56,10 @@ class Pixels:
         """Return every `step`-th place of all disks."""
         if step == 1:
             return self
-        places = torch.arange(0, self.grey.shape[1], step)
-        places = places[: whole_vectors(len(places))]
+        count = whole_vectors(len(range(0, self.grey.shape[1], step)))
         own = ("origin",) if self.origin.shape[-1] > 1 else ()
-        some = self._with((*ALONG_PLACES, *own, "tile", "place"), lambda part: part[..., places])
-        return replace(some, inner=int((places < self.inner).sum()))
+        some = self._with((*ALONG_PLACES, *own, "tile", "place"), lambda part: part[..., : step * count : step])
+        return replace(some, inner=min(len(range(0, self.inner, step)), count))
 
     def _with(self, names: Iterable[str], change: Callable[[Tensor], Tensor]) -> "Pixels":
         parts: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
@@ -93,12 +92,13 @@ class LinesOfSight:
     def pitch(self, u: int, v: int) -> tuple[Tensor, Tensor]:
         """Return the change of the line of sight to the next pixel: angle, rad, and start, mm."""
         d = self.direction
-        turned = 0.5 * ((d[:, v, u + 1] - d[:, v, u]).norm() + (d[:, v + 1, u] - d[:, v, u]).norm())
+        here, right, down = (d[:, row, column].tolist() for row, column in ((v, u), (v, u + 1), (v + 1, u)))
+        turned = torch.tensor(0.5 * (math.dist(here, right) + math.dist(here, down)))
         if self.one_origin:
             return turned, torch.zeros(())
-        o, here = self.origin, d[:, v, u]
+        o, sight = self.origin, d[:, v, u]
         moved = [o[:, v, u + 1] - o[:, v, u], o[:, v + 1, u] - o[:, v, u]]
-        return turned, torch.stack([(step - (step @ here) * here).norm() for step in moved]).mean()
+        return turned, torch.stack([(step - (step @ sight) * sight).norm() for step in moved]).mean()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -50,7 +50,9 @@ def seen(time: float, change: float) -> Poses:
 def lane(frames: list[int], change: float, times: list[float] = TIMES) -> _Chunk:
     found = _Chunk(0, len(times), times)
     for frame in frames:
-        found.saw(frame, seen(times[frame], change))
+        now = seen(times[frame], change)
+        before = found.past[-1][1].R_lab_body[0] if found.past else now.R_lab_body[0]
+        found.saw(frame, now, so3.log(now.R_lab_body[0] @ before.mT))
     return found
 
 
@@ -59,7 +61,7 @@ def test_the_next_pose_continues_the_motion_whatever_the_times(frames, change):
     expected = lane(frames, change).expected(3, RADIUS_MM)
     assert not expected.rough
     assert_close(expected.position_lab_mm, place(3.2, change), 1e-9)
-    assert_close(expected.R_lab_body, so3.exp(angle(3.2, change) * AXIS), 1e-9)
+    assert_close(so3.exp(expected.turn) @ expected.R_before, so3.exp(angle(3.2, change) * AXIS), 1e-9)
 
 
 def test_the_shutter_sees_its_share_of_the_motion():
@@ -77,8 +79,9 @@ def test_without_a_known_motion_the_ball_is_near_where_it_was():
     for one in (lane([2], 0.0), lane([0, 2], 0.0), lane([0, 1, 2], 0.0, after_a_pause)):
         expected = one.expected(3, RADIUS_MM)
         assert expected.rough
-        assert_close(expected.R_lab_body, one.past[-1][1].R_lab_body[0])
-        assert_close(torch.linalg.inv(expected.place_precision).diagonal().sqrt(), f64([2.7] * 3), 1e-6)
+        assert_close(expected.R_before, one.past[-1][1].R_lab_body[0])
+        assert not expected.turn.any()
+        assert_close(expected.place_spread.diagonal().sqrt(), f64([2.7] * 3), 1e-6)
 
 
 def test_after_a_frame_without_the_ball_nothing_is_expected():
