@@ -10,6 +10,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # Two workers with two threads each wait for each other's cores; the commands that tests start inherit this.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+# No test may read what another run kept, or fill the folder of the user.
+os.environ["SPHEREORIENT_NO_CACHE"] = "1"
+
 import pytest
 import torch
 from torch import Tensor

@@ -7,6 +7,7 @@ import re
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import wraps
@@ -218,6 +219,7 @@ def info() -> None:
     """Print versions, threads and device."""
     import torch
 
+    from sphereorient.files.cache import cache_folder
     from sphereorient.files.provenance import versions
     from sphereorient.pose.compiled import library
 
@@ -227,6 +229,7 @@ def info() -> None:
     typer.echo(f"{'fit':24} {'compiled' if library() else 'torch (no compiled code for this machine: slower)'}")
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu (no GPU found)"
     typer.echo(f"{'device':24} {device}")
+    typer.echo(f"{'cache':24} {cache_folder() or 'none'}")
 
 
 def main() -> None:
@@ -234,6 +237,7 @@ def main() -> None:
     # Without it torch's threads spin while another program has their core: 136 s instead of 9 s for the excerpt beside
     # two busy processes. OpenMP reads it when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    warnings.formatwarning = lambda message, *_: f"sphereorient: {message}\n"
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(EXIT_INTERRUPTED))
     try:
         # Without its standalone mode the parser returns exit codes, also that of Ctrl-C.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sphereorient.cli.app import Advance, app, check_writable, echo_lines, progress_bar
-from sphereorient.cli.options import ExperimentPath, Overrides, Quiet, SettingsPath, frames_of
+from sphereorient.cli.options import ExperimentPath, NoCache, Overrides, Quiet, SettingsPath, frames_of
 from sphereorient.errors import MovieError, refusal
 from sphereorient.files.whole_file import check_ending, writing
 
@@ -43,6 +43,7 @@ def check(
     ] = None,
     settings: SettingsPath = None,
     set_: Overrides = None,
+    no_cache: NoCache = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and only warnings and faults.")] = False,
 ) -> None:
     """Check an experiment in seconds before tracking: findings, and what to do. Exit code 1: there is a fault."""

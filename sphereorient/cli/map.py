@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
-from sphereorient.cli.options import Cameras, ExperimentPath, Overrides, Quiet, SettingsPath, cameras_of, settings_of
+from sphereorient.cli.options import (
+    Cameras,
+    ExperimentPath,
+    NoCache,
+    Overrides,
+    Quiet,
+    SettingsPath,
+    cameras_of,
+    settings_of,
+)
 from sphereorient.errors import PaintError, refusal
 from sphereorient.files.whole_file import check_ending
 
@@ -42,6 +51,7 @@ def map_(
     ] = False,
     settings: SettingsPath = None,
     set_: Overrides = None,
+    no_cache: NoCache = False,
     quiet: Quiet = False,
 ) -> None:
     """Learn the texture map of a ball, and all attitudes, from movies in which it turns: no map needed."""

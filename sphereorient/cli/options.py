@@ -1,5 +1,6 @@
 """Options that several commands have, and what their texts mean."""
 
+import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +16,24 @@ Cameras = Annotated[str | None, typer.Option(help="Use these cameras only, e.g. 
 SettingsPath = Annotated[Path | None, typer.Option(help="YAML as `sphereorient settings` writes it.")]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", help="Override one setting, e.g. --set locate.diameter_px=90.")
+]
+
+
+def _without_cache(chosen: bool) -> bool:
+    if chosen:
+        from sphereorient.files.cache import WITHOUT
+
+        os.environ[WITHOUT] = "1"  # workers inherit it
+    return chosen
+
+
+NoCache = Annotated[
+    bool,
+    typer.Option(
+        "--no-cache",
+        callback=_without_cache,
+        help="Compute what earlier runs kept in the user's cache folder, and keep nothing.",
+    ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
-from sphereorient.cli.options import Cameras, Overrides, Quiet, SettingsPath, cameras_of, settings_of
+from sphereorient.cli.options import Cameras, NoCache, Overrides, Quiet, SettingsPath, cameras_of, settings_of
 from sphereorient.errors import OutputError, SettingsError, refusal
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ def track(
     no_learn_paint: Annotated[
         bool, typer.Option("--no-learn-paint", help="Use the whole map, even where the ball wears other paint.")
     ] = False,
+    no_cache: NoCache = False,
     quiet: Quiet = False,
 ) -> None:
     """Track the sphere of an experiment, or of many: position and orientation of every frame."""

@@ -20,9 +20,10 @@ from sphereorient.follow import Appearance
 from sphereorient.follow.follower import Follower
 from sphereorient.follow.poses import Poses
 from sphereorient.locate import Background, CameraScene
+from sphereorient.methods.proposers import finest_table
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import Prior, ProcessNoise, ProcessPrior
-from sphereorient.pose import CameraView, Fitter, Optics, base_table
+from sphereorient.pose import CameraView, Fitter, Optics
 from sphereorient.pose.lab_light import light_of, light_parts
 from sphereorient.pose.lasting import Lasting
 from sphereorient.pose.model import Lighting
@@ -95,7 +96,7 @@ class Learnt:
             raise TrackError(refusal("learnt", expected=f"what was learnt of {expected}", got=got, do=do))
         views = [CameraView.of(stream.name, stream.camera, self.scenes[stream.name]) for stream in recording.streams]
         widest = max(scene.diameter_px for scene in self.scenes.values())
-        base = base_table(recording.texture, widest, recording.unseen)
+        base = finest_table(recording.texture, widest, recording.unseen)
         paint = base if self.worn is None else without(base, self.worn)
         fitter = still = Fitter(
             views=views,

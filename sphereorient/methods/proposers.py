@@ -3,11 +3,15 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient.experiment.recording import Progress, Recording
 from sphereorient.experiment.stream import CameraStream
+from sphereorient.files.cache import cached
 from sphereorient.locate import find_scene, known_diameter_px
 from sphereorient.methods.settings import Settings
 from sphereorient.pose import CameraView, base_table
@@ -24,7 +28,24 @@ def precise_proposer(texture: Tensor, settings: Settings, blur: float = 0.0) -> 
 
     Raise CheckpointError if the checkpoint cannot be used with this map.
     """
-    return _proposer(texture, settings.propose, lambda: GreySearch(texture, settings.search, blur))
+    return _proposer(texture, settings.propose, lambda: _grey_search(texture, settings, blur))
+
+
+def _grey_search(texture: Tensor, settings: Settings, blur: float) -> GreySearch:
+    made: list[GreySearch] = []
+
+    def make() -> dict[str, NDArray[Any]]:
+        made.append(GreySearch(texture, settings.search, blur))
+        return {"bank": made[0].bank.numpy()}
+
+    kept = cached("bank", (texture, settings.search.model_dump_json(), blur), make)
+    return made[0] if made else GreySearch(texture, settings.search, blur, bank=torch.from_numpy(kept["bank"]))
+
+
+def finest_table(texture: Tensor, diameter_px: float, unseen: Tensor | None) -> TextureTable:
+    """Return `base_table`, kept between runs."""
+    inputs = texture, diameter_px, unseen
+    return TextureTable.of(cached("table", inputs, lambda: base_table(texture, diameter_px, unseen).arrays()))
 
 
 class BlurMatchedSearch:
@@ -56,7 +77,7 @@ def open_views(
         known = [known_diameter_px(recording, stream.name, settings.locate) for stream in recording.streams]
         widest = max(px or view.result().diameter_px for px, view in zip(known, opening, strict=True))
         search = BlurMatchedSearch(recording.texture, settings, widest)
-        base = pool.submit(base_table, recording.texture, widest, recording.unseen)
+        base = pool.submit(finest_table, recording.texture, widest, recording.unseen)
         sharp = pool.submit(search.of, settings.refine.blur_px or 0.0)
         views = [view.result() for view in opening]
         sharp.result()

@@ -33,12 +33,17 @@ class GreySearch(DiskSearch):
         texture: (H, 2 H), the texture map, 0 black .. 1 white.
         settings: of the search; None: the defaults.
         blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
+        bank: (K, P) int8, that of another search with the same arguments; None: made here.
 
-    `size_px` is the side of the disks, `templates` (K, 3, 3) float32 are the rotations of the bank.
+    `size_px` is the side of the disks, `templates` (K, 3, 3) float32 are the rotations of the `bank`.
     """
 
     def __init__(
-        self, texture: Tensor | NDArray[np.generic], settings: GreySearchSettings | None = None, blur: float = 0.0
+        self,
+        texture: Tensor | NDArray[np.generic],
+        settings: GreySearchSettings | None = None,
+        blur: float = 0.0,
+        bank: Tensor | None = None,
     ) -> None:
         super().__init__()
         settings = settings or GreySearchSettings()
@@ -57,14 +62,14 @@ class GreySearch(DiskSearch):
         self._grid = grid[compact_groups(grid, GROUP).T]
         self.templates = self._grid.flatten(0, 1)
         self._pixels = int(self._view.inside.sum())
-        self._bank = self._templates(paint)
+        self.bank = self._templates(paint) if bank is None else bank
 
     def score(self, disks: Tensor | NDArray[np.generic]) -> Tensor:
         """Return the correlation of disks (..., S, S) with all `templates`, (..., K) float32, -1 .. 1."""
         grey = torch.as_tensor(disks).float()
         steps = self._normalised(grey.reshape(-1, *grey.shape[-2:]))
         scale = 127.0 / DEVIATIONS * math.sqrt(self._pixels)
-        return (torch._int_mm(steps, self._bank.T) / scale**2).reshape(*grey.shape[:-2], -1)
+        return (torch._int_mm(steps, self.bank.T) / scale**2).reshape(*grey.shape[:-2], -1)
 
     def propose(self, disks: Tensor) -> Candidates:
         """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
@@ -85,7 +90,7 @@ class GreySearch(DiskSearch):
         """Return the best templates of the best groups, (F, M) int64, best first, and which are peaks, (F, M) bool.
         All scores of the disks (F, S, S) float32 are held at once, 36 kB each.
         """
-        scores = torch._int_mm(self._normalised(disks), self._bank.T)
+        scores = torch._int_mm(self._normalised(disks), self.bank.T)
         place = best_of_groups(scores.reshape(-1, *self._grid.shape[:2]), LOOKED_AT)
         apart = math.radians(self._settings.peak_deg)
         looked_at = self.templates[F.pad(place, (0, 0, 0, -len(disks) % BATCH))]

@@ -1,9 +1,12 @@
 """Tables of the texture map over directions: paint for banks, value and slope for fits."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sphereorient.cameras import Rays
@@ -114,6 +117,19 @@ class TextureTable:
     def to(self, device: torch.device) -> "TextureTable":
         """Return the table on another device for `sample`; `blurred` needs the CPU."""
         return TextureTable(self.rows.to(device), self.blur_rad, self.unseen and self.unseen.to(device))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what `of` makes the same table from."""
+        own: dict[str, NDArray[Any]] = {"rows": self.rows.cpu().numpy(), "blur_rad": np.array(self.blur_rad)}
+        unseen = {} if self.unseen is None else self.unseen.arrays()
+        return own | {f"unseen_{name}": array for name, array in unseen.items()}
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> "TextureTable":
+        """Return the table of `arrays`."""
+        hidden = {name.removeprefix("unseen_"): part for name, part in arrays.items() if name.startswith("unseen_")}
+        rows, blur_rad = torch.from_numpy(arrays["rows"]), float(arrays["blur_rad"])
+        return cls(rows, blur_rad, cls.of(hidden) if hidden else None)
 
     def blurred(self, blur_rad: float) -> "TextureTable":
         """Return a table whose total blur is `blur_rad`, or itself if that is not wider."""

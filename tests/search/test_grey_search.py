@@ -250,11 +250,11 @@ def test_whole_numbers_keep_the_correlation_to_a_few_thousandths():
     per_unit = (127 / DEVIATIONS) ** 2 * even.shape[1]
     steps = _steps(even)
     assert (steps.abs() < 127).float().mean() > 0.999  # hardly anything is cut off
-    assert search._bank.shape[1] == steps.shape[1]
-    bank = search._bank[:500].float()
+    assert search.bank.shape[1] == steps.shape[1]
+    bank = search.bank[:500].float()
     assert_close(bank.square().sum(1) / per_unit, torch.ones(500), atol=5e-3)
     correlation = even @ bank[:, : even.shape[1]].T / per_unit**0.5
-    error = torch._int_mm(steps, search._bank[:500].T) / per_unit - correlation
+    error = torch._int_mm(steps, search.bank[:500].T) / per_unit - correlation
     assert error.square().mean().sqrt() < 1e-3
     assert error.abs().max() < 5e-3
 

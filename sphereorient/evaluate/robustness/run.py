@@ -20,6 +20,7 @@ from sphereorient.errors import BenchError, OutputError, SphereOrientError, erro
 from sphereorient.evaluate.robustness.results import FIRST, SCHEMA, WRONG_DEG, Results, SceneResult, save_results
 from sphereorient.evaluate.robustness.scenes import BenchmarkScene, BenchSettings, scenes_of, write_scene
 from sphereorient.evaluate.score import distance_deg, score_track, true_orientations
+from sphereorient.files.cache import WITHOUT
 from sphereorient.files.provenance import versions
 from sphereorient.files.threads import limit_cores
 from sphereorient.files.whole_file import make_folder, write_text
@@ -85,7 +86,8 @@ def run_benchmark(
 
 
 def limit_threads() -> None:
-    """Limit a worker to one thread."""
+    """Limit a worker to one thread; its scenes have a map of their own, which no other run uses."""
+    os.environ[WITHOUT] = "1"
     torch.set_num_threads(1)
     limit_cores(1)
 

@@ -1,0 +1,121 @@
+"""Arrays that depend on their inputs alone and take long to compute, kept in the user's cache folder between runs."""
+
+import hashlib
+import os
+import secrets
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import platformdirs
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient.errors import error_words
+
+WITHOUT = "SPHEREORIENT_NO_CACHE"  # an environment variable: where it is set, nothing is kept or read
+LARGEST_BYTES = 500_000_000  # of all files; the least recently used go first
+PACKAGE = Path(__file__).parents[1]
+MAKERS = ("so3.py", "sphere", "search", "pose")  # whose code what is kept depends on
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def cache_folder() -> Path | None:
+    """Return the folder of kept arrays, there or not; None where `WITHOUT` is set."""
+    return None if os.environ.get(WITHOUT) else platformdirs.user_cache_path("sphereorient", appauthor=False)
+
+
+def cached(kind: str, inputs: Iterable[Tensor | str | float | None], make: Callable[[], Arrays]) -> Arrays:
+    """Return what `make` does, from an earlier run with the same inputs, code, versions and processor if there is one.
+    A file that is damaged is made again, with a warning; a folder that cannot be written is warned of once.
+    """
+    folder = cache_folder()
+    if folder is None:
+        return make()
+    path = folder / f"{kind}-{_key(inputs)}.npz"
+    kept = _read(path)
+    if kept is None:
+        kept = make()
+        _write(path, kept)
+    return kept
+
+
+def _key(inputs: Iterable[Tensor | str | float | None]) -> str:
+    told = hashlib.sha256(_code())
+    for one in inputs:
+        if isinstance(one, Tensor):
+            told.update(f"{tuple(one.shape)} {one.dtype}".encode() + one.contiguous().numpy().tobytes())
+        else:
+            told.update(repr(one).encode())
+        told.update(b"|")
+    return told.hexdigest()[:32]
+
+
+@lru_cache(maxsize=1)
+def _code() -> bytes:
+    """Return a word for all that decides on the last bits beside the inputs."""
+    told = hashlib.sha256(f"{torch.__version__} {np.__version__} {torch.backends.cpu.get_cpu_capability()}".encode())
+    for name in MAKERS:
+        files = sorted((PACKAGE / name).rglob("*.py")) if (PACKAGE / name).is_dir() else [PACKAGE / name]
+        for file in files:
+            told.update(file.read_bytes())
+    return told.digest()
+
+
+def _read(path: Path) -> Arrays | None:
+    """Return kept arrays, whose check sums are verified; None where there are none."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        with suppress(OSError):
+            os.utime(path)  # used now
+        return arrays
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        warnings.warn(f"{path} in the cache is damaged ({error_words(error)}) and is made again", stacklevel=2)
+        return None
+
+
+def _write(path: Path, arrays: Arrays) -> None:
+    """Keep arrays under their final name at once, whoever else writes; delete the oldest files over the limit."""
+    aside = path.with_name(f".{path.stem}.{secrets.token_hex(8)}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with aside.open("xb") as file:
+            save: Any = np.savez  # whose types take no names
+            save(file, **arrays)
+        aside.replace(path)
+        _trim(path.parent)
+    except OSError as error:
+        _warn_once(f"nothing is kept in {path.parent} ({error_words(error)}): each run computes it again (--no-cache)")
+    finally:
+        with suppress(OSError):
+            aside.unlink(missing_ok=True)
+
+
+@lru_cache(maxsize=8)
+def _warn_once(words: str) -> None:
+    warnings.warn(words, stacklevel=3)
+
+
+def _trim(folder: Path) -> None:
+    """Delete the least recently used files until the rest is below the limit; another run may delete them too."""
+    files = []
+    for path in folder.glob("*.npz"):
+        with suppress(OSError):
+            files.append((path.stat().st_mtime_ns, path.stat().st_size, path))
+    total = sum(size for _, size, _ in files)
+    for _, size, path in sorted(files):
+        if total <= LARGEST_BYTES:
+            return
+        with suppress(OSError):
+            path.unlink()
+        total -= size
