@@ -13,6 +13,7 @@ from sphereorient import so3
 from sphereorient.calibration.consistency import Limits, Seen, compare_cameras
 from sphereorient.cameras import centre_lab_mm, triangulate
 from sphereorient.errors import ExperimentError, refusal
+from sphereorient.files.threads import side_by_side
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, best_poses, pose_table, poses_of
 from sphereorient.follow.settings import RefineSettings
@@ -204,7 +205,7 @@ def estimate_appearance(
     score_min = 0.5 * (right + min(highest, right))
     if defocus_radii(fitter.optics.blur_px, diameter_px):  # wrong poses explain nearly as much, and right ones scatter
         score_min = min(score_min, _clear_of(right))
-    rivals = sum(first.claimants(shots) > 1 for shots in frames)
+    rivals = sum(count > 1 for count in side_by_side(first.claimants, frames))
     return Appearance(
         fitter=fitter,
         still=still,

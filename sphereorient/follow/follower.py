@@ -10,6 +10,7 @@ import torch
 from sphereorient import so3
 from sphereorient.experiment.recording import Recording
 from sphereorient.experiment.stream import spread_frames
+from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, no_pose
@@ -131,10 +132,11 @@ def sample_frames(
     """
     total = len(recording.timeline)
     spread = spread_frames(range(total), count)
-    taken, places = [], []
-    for first, last in zip(spread, [*spread[1:], total], strict=True):
+
+    def of_stretch(ends: tuple[int, int]) -> tuple[tuple[Frame, ...], int]:
+        first, last = ends
         movies = [
-            screened_frames(stream, view.background, first, max(last, first + 1))
+            screened_frames(stream, view.background, first, max(last, first + 1), parts)
             for stream, view in zip(recording.streams, views, strict=True)
         ]
         best: tuple[Frame, ...] = ()
@@ -144,15 +146,21 @@ def sample_frames(
                 best, place = shots, k
             if all(shot.usable for shot in best):
                 break
-        taken.append(best)
-        places.append(place)
-    return taken, places
+        return best, place
+
+    with ThreadPoolExecutor(DECODING) as parts:  # `usable` decodes all of a picture
+        found = list(side_by_side(of_stretch, zip(spread, [*spread[1:], total], strict=True)))
+    return [shots for shots, _ in found], [place for _, place in found]
 
 
 def frames_at(recording: Recording, views: Sequence[CameraView], places: Sequence[int]) -> list[tuple[Frame, ...]]:
     """Return the frames of all cameras at some places among the frames in use."""
-    found = []
-    for k in places:
+
+    def at(k: int) -> tuple[Frame, ...]:
         pairs = zip(recording.streams, views, strict=True)
-        found.append(tuple(next(screened_frames(stream, view.background, k, k + 1)) for stream, view in pairs))
-    return found
+        shots = tuple(next(screened_frames(stream, view.background, k, k + 1, parts)) for stream, view in pairs)
+        _ = [shot.reason for shot in shots]  # decodes all of a picture
+        return shots
+
+    with ThreadPoolExecutor(DECODING) as parts:
+        return list(side_by_side(at, places))
