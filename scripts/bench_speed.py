@@ -1,7 +1,8 @@
 """Where the time goes: each stage of the precise method, against the paper's literal method and against its floor.
 
-    scripts/bench_speed.py EXPERIMENT_FOLDER [--frames 240]
+    scripts/bench_speed.py EXPERIMENT_FOLDER [--frames 1200] [--fixed EXPERIMENT] [--long EXPERIMENT ...]
 
+`--fixed`: one camera before a ball in its place, frame by frame; `--long`: whole runs of these as well.
 CPU seconds of one thread for the stages, best of the repetitions, and wall seconds of the whole command in a fresh
 process. Other programs on the machine only ever make them longer: compare within one run. What is compiled is measured
 without it as well, five times in turn: median, and the least and largest. Prints Markdown.
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import av
 import numpy as np
 import torch
 import yaml
@@ -31,21 +33,26 @@ import yaml
 from sphereorient import locate, so3
 from sphereorient.experiment import Experiment, load_experiment, open_movies
 from sphereorient.experiment.recording import open_recording, silent
+from sphereorient.files.cache import WITHOUT as WITHOUT_CACHE
 from sphereorient.files.compiled import WITHOUT
 from sphereorient.follow import Appearance, ChunkTracker
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.locate import Frame, screened_frames
+from sphereorient.methods import precise
+from sphereorient.methods.method import Job
 from sphereorient.methods.proposers import open_view
 from sphereorient.methods.settings import Settings
 from sphereorient.motion import kalman
 from sphereorient.motion.matern import Prior
 from sphereorient.motion.path import RotationTrack, rotation_of
+from sphereorient.movies import write_ffv1
 from sphereorient.pose import CameraView, base_table, compiled
 from sphereorient.pose.fitter import FIRST_BLUR_PX, first_fitter, widest_px
 from sphereorient.search import GreySearch, crop_disk, extract_paint
 from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 TURNS, SMOOTHED = 5, 3000  # measurements in turn; frames of the smoother's
 FOLLOWED = 48  # frames over which one prediction after the other is timed
@@ -55,7 +62,9 @@ begun = time.perf_counter()
 from sphereorient import track_movies
 told = []
 track = track_movies(sys.argv[1], progress=lambda *what: told.append((*what, time.perf_counter() - begun)))
-print(json.dumps({"told": told, "end": time.perf_counter() - begun, "cpu": time.process_time()}))
+pictures = len(track) * len(track.cameras)
+end = time.perf_counter() - begun
+print(json.dumps({"told": told, "end": end, "cpu": time.process_time(), "pictures": pictures}))
 """
 
 
@@ -74,7 +83,9 @@ class Bench:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--frames", type=int, default=240)
+    parser.add_argument("--frames", type=int, default=1200, help="of the runs of the repeated movies")
+    parser.add_argument("--fixed", type=Path)
+    parser.add_argument("--long", type=Path, nargs="*", default=[])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print("| what | figure |\n|---|---|")
@@ -82,9 +93,16 @@ def main() -> None:
     mean_s = stages(bench)
     literal(bench, mean_s)
     smoother()
+    sizes()
+    if arguments.fixed:
+        live(arguments.fixed)
     with tempfile.TemporaryDirectory() as folder:
-        whole("FFV1", arguments.folder / "experiment.yaml", len(bench.eyes))
-        whole(".npy", as_npy(arguments.folder, Path(folder), arguments.frames), len(bench.eyes))
+        whole("as it is", arguments.folder / "experiment.yaml")
+        for kind in ("as it is, repeated", "24 slices", ".npy"):
+            out = Path(folder) / kind.replace(" ", "")
+            whole(kind, repeated(arguments.folder, out, arguments.frames, kind))
+    for path in arguments.long:
+        whole(str(path), path)
 
 
 def say(what: str, figure: str) -> None:
@@ -140,10 +158,10 @@ def smoother() -> None:
     say("the same in numpy", told(slow, 1e6, 1))
 
 
-def prepared(folder: Path) -> Bench:
+def prepared(folder: Path, cameras: list[str] | None = None, say: Callable[[str, str], None] = say) -> Bench:
     """Learn what the stages need, as the pipeline does."""
     settings = Settings()
-    with open_recording(folder / "experiment.yaml") as recording:
+    with open_recording(folder / "experiment.yaml", cameras) as recording:
         eyes = [open_view(recording, reel, settings, silent) for reel in recording.streams]
         shots = [
             list(screened_frames(reel, eye.background, 0, FOLLOWED))
@@ -203,22 +221,69 @@ def stages(bench: Bench) -> float:
     search = initialiser(bench)
     found = cpu_s(lambda: replace(search, score_min=0.0).poses(first))
     say("frame without history, outlines to covariances, CPU ms a camera", f"{1e3 * found / cameras:.1f}")
-    tracker = ChunkTracker(bench.learnt, search, settings.refine)
-    # As many blocks side by side as the tracker follows: first frames are searched for, second ones approached.
-    lanes = settings.refine.chunks
-    begun, whole = [2] * lanes, [FOLLOWED // lanes] * lanes
-
-    def tracked(batch: list[int]) -> float:
-        shots = [movie[: sum(batch)] for movie in bench.shots]
-        return cpu_s(lambda: list(tracker.track(shots, batch, bench.times)), 1)
-
-    fast, slow = in_turn(lambda: (tracked(whole) - tracked(begun)) / (sum(whole) - sum(begun)) / cameras)
-    each, short = statistics.median(fast), tracked(begun)
+    fast, slow = in_turn(lambda: predicted(bench, settings.refine.chunks))
+    each, lanes = statistics.median(fast), settings.refine.chunks
+    short = following(bench, lanes)([2] * lanes)
     say("predicted frame, decoded already, with covariance, compiled, CPU ms a camera; bar 0.8", told(fast, 1e3))
     say("the same in torch; bar: no slower than before, 4.3 to 5.0", told(slow, 1e3))
     say("torch over compiled", told([b / a for a, b in zip(fast, slow, strict=True)]))
     block = settings.refine.chunk_frames
     return (short / lanes / cameras + (block - 2) * each) / block
+
+
+def following(bench: Bench, lanes: int) -> Callable[[list[int]], float]:
+    """Return what tells the CPU seconds in which blocks of some lengths are followed."""
+    tracker = ChunkTracker(bench.learnt, initialiser(bench), Settings().refine.model_copy(update={"chunks": lanes}))
+
+    def tracked(batch: list[int]) -> float:
+        shots = [movie[: sum(batch)] for movie in bench.shots]
+        return cpu_s(lambda: list(tracker.track(shots, batch, bench.times)), 1)
+
+    return tracked
+
+
+def predicted(bench: Bench, lanes: int) -> float:
+    """CPU seconds a predicted frame, a camera, of as many blocks side by side."""
+    tracked = following(bench, lanes)
+    # First frames are searched for, second ones approached.
+    begun, whole = [2] * lanes, [FOLLOWED // lanes] * lanes
+    return (tracked(whole) - tracked(begun)) / (sum(whole) - sum(begun)) / len(bench.eyes)
+
+
+def sizes() -> None:
+    """Time predicted frames of rendered balls of several sizes, by one camera and by two."""
+    for diameter_px in (20, 80, 160, 400):
+        side = max(400, 5 * diameter_px // 2)
+        settings = SynthSettings(frames=FOLLOWED, diameter_px=diameter_px, image_size=(side, side))
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name) / "movie"
+            write_synthetic_experiment(folder, settings)
+            for cameras in (["cam1"], None):
+                bench = prepared(folder, cameras, say=lambda *_: None)
+                spent = [predicted(bench, Settings().refine.chunks) for _ in range(TURNS)]
+                what = f"predicted frame of {diameter_px} px, {len(bench.eyes)} camera(s), CPU ms a camera"
+                say(what, told(spent, 1e3))
+
+
+def live(experiment: Path) -> None:
+    """Time one camera before a ball in its place, frame by frame, nothing ahead."""
+    settings = Settings()
+    settings = settings.model_copy(update={"refine": settings.refine.model_copy(update={"chunks": 1})})
+    with open_recording(experiment) as recording:
+        job = Job(recording=recording, settings=settings, device=torch.device("cpu"))
+        follower = precise.learn(job, silent)
+        view, stream = follower.appearance.fitter.views[0], recording.streams[0]
+        shots = list(screened_frames(stream, view.background, 0, FOLLOWED))
+        times = recording.timeline.time_s[:FOLLOWED].tolist()
+    spent = []
+    for _ in range(TURNS):
+        ends = []
+        for count in (2, FOLLOWED):
+            begin = time.perf_counter()
+            list(follower.tracker.track([shots[:count]], [count], times[:count]))
+            ends.append(time.perf_counter() - begin)
+        spent.append((ends[1] - ends[0]) / (FOLLOWED - 2))
+    say("one camera, ball fixed, frame by frame, decoded, wall ms; bar 1.5", told(spent, 1e3))
 
 
 def literal(bench: Bench, mean_s: float) -> None:
@@ -259,32 +324,66 @@ def literal(bench: Bench, mean_s: float) -> None:
     say(f"ratio to the mean frame of a block of {block}, refinement included; bar 100", f"{paper / mean_s:.0f}")
 
 
-def as_npy(folder: Path, out: Path, count: int) -> Path:
-    """Write an experiment's movies as .npy, forwards and backwards until there are `count` frames."""
+def repeated(folder: Path, out: Path, count: int, kind: str) -> Path:
+    """Write an experiment's movies forwards and backwards until there are `count` frames: .npy, FFV1 with 24 slices, or
+    the packets of the movie as it is.
+    """
+    out.mkdir()
     entry = yaml.safe_load((folder / "experiment.yaml").read_text())
     experiment = load_experiment(folder / "experiment.yaml")
     movies = open_movies(experiment, list(experiment.cameras))
+    ending = "npy" if kind == ".npy" else "mkv"
     for name, movie in movies.items():
+        order = [*range(len(movie)), *reversed(range(len(movie)))]
+        some = [order[k % len(order)] for k in range(count)]
+        target = out / f"{name}.{ending}"
+        if kind == "as it is, repeated":
+            repeat_packets(movie.path, target, some)
+            continue
         frames = np.stack(list(movie.frames(0, len(movie))))
-        there_and_back = np.concatenate([frames, frames[::-1]])
-        np.save(out / f"{name}.npy", there_and_back[np.arange(count) % len(there_and_back)])
-    entry["movies"] = {name: str(out / f"{name}.npy") for name in movies}
+        if kind == ".npy":
+            np.save(target, frames[some])
+        else:
+            write_ffv1(target, (frames[k] for k in some), 25.0)
+    entry["movies"] = {name: str(out / f"{name}.{ending}") for name in movies}
     entry["cameras"] = str((folder / "cameras.yaml").resolve())
     entry["sphere"]["texture"] = str(experiment.texture_path.resolve())
     (out / "experiment.yaml").write_text(yaml.safe_dump(entry))
     return out / "experiment.yaml"
 
 
-def whole(kind: str, experiment: Path, cameras: int) -> None:
-    """Time the whole command in a fresh process, and once more without compiled code."""
-    result, plain = (in_process(experiment, without) for without in ({}, {WITHOUT: "1"}))
-    seconds = [f"{each['end']:.1f}, {each['cpu']:.1f}" for each in (result, plain)]
-    say(f"{kind}: the whole run, wall and CPU s; without compiled code", "; ".join(seconds))
-    tracked = [(done, total, at) for stage, done, total, at in result["told"] if stage == "track"]
-    begin, (_, total, _) = tracked[0][2], tracked[0]
-    say(f"{kind}: start-up to tracking, wall s; bar 3.5 cold", f"{begin:.1f}")
-    rate = cameras * total / (result["end"] - begin)
-    say(f"{kind}: camera-frames per wall second, start-up apart; bars 180 (FFV1), 600 (.npy)", f"{rate:.0f}")
+def repeat_packets(movie: Path, target: Path, order: list[int]) -> None:
+    """Write a movie's packets, all of them key frames, in another order."""
+    with av.open(str(movie)) as source, av.open(str(target), "w") as container:
+        stream = container.add_stream_from_template(source.streams.video[0])
+        packets = [bytes(packet) for packet in source.demux(video=0) if packet.size]
+        step = 1 / (source.streams.video[0].average_rate * source.streams.video[0].time_base)
+        for number, place in enumerate(order):
+            packet = av.Packet(packets[place])
+            packet.stream, packet.time_base = stream, source.streams.video[0].time_base
+            packet.pts = packet.dts = round(number * step)
+            packet.is_keyframe = True
+            container.mux(packet)
+
+
+def whole(kind: str, experiment: Path) -> None:
+    """Time the whole command in fresh processes: with nothing in the cache, again, and without compiled code."""
+    with tempfile.TemporaryDirectory() as cache:
+        kept = {"XDG_CACHE_HOME": cache}
+        cold, warm = (in_process(experiment, kept) for _ in range(2))
+    plain = in_process(experiment, {WITHOUT: "1", WITHOUT_CACHE: "1"})
+    seconds = [f"{each['end']:.1f}, {each['cpu']:.1f}" for each in (cold, warm, plain)]
+    say(f"{kind}: whole run, wall and CPU s, cold cache; warm; without compiled code", "; ".join(seconds))
+    begins, rates, joins = [], [], []
+    for each in (cold, warm):
+        stages = {stage: at for stage, _, _, at in each["told"]}
+        tracked = [(done, at) for stage, done, _, at in each["told"] if stage == "track"]
+        begins.append(f"{next(at for done, at in tracked if done):.1f}")
+        rates.append(f"{each['pictures'] / (stages['track'] - tracked[0][1]):.0f}")
+        joins.append(f"{each['end'] - stages['track']:.1f}")
+    say(f"{kind}: start-up to the first batch tracked, wall s, cold; warm; bars 3.5, 2", "; ".join(begins))
+    say(f"{kind}: camera-frames per wall second of following; bars 180 (FFV1), 300 (24 slices), 600 (.npy)", rates[1])
+    say(f"{kind}: path, smoother and writing, wall s", joins[1])
 
 
 def in_process(experiment: Path, environment: dict[str, str]) -> dict[str, Any]:
