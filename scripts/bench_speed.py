@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from sphereorient.follow import Appearance, ChunkTracker
 from sphereorient.follow.appearance import estimate_appearance
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
+from sphereorient.follow.poses import Poses
 from sphereorient.locate import Frame, screened_frames
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job
@@ -221,46 +222,50 @@ def stages(bench: Bench) -> float:
     search = initialiser(bench)
     found = cpu_s(lambda: replace(search, score_min=0.0).poses(first))
     say("frame without history, outlines to covariances, CPU ms a camera", f"{1e3 * found / cameras:.1f}")
-    fast, slow = in_turn(lambda: predicted(bench, settings.refine.chunks))
-    each, lanes = statistics.median(fast), settings.refine.chunks
-    short = following(bench, lanes)([2] * lanes)
+    fast, slow = in_turn(lambda: predicted(bench))
+    each, (short, _) = statistics.median(fast), steps(bench, settings.refine.chunks)
     say("predicted frame, decoded already, with covariance, compiled, CPU ms a camera; bar 0.8", told(fast, 1e3))
     say("the same in torch; bar: no slower than before, 4.3 to 5.0", told(slow, 1e3))
     say("torch over compiled", told([b / a for a, b in zip(fast, slow, strict=True)]))
     block = settings.refine.chunk_frames
-    return (short / lanes / cameras + (block - 2) * each) / block
+    return (short + (block - 2) * each) / block
 
 
-def following(bench: Bench, lanes: int) -> Callable[[list[int]], float]:
-    """Return what tells the CPU seconds in which blocks of some lengths are followed."""
+def steps(bench: Bench, lanes: int) -> tuple[float, float]:
+    """CPU seconds a camera of a block's first two frames, and of a predicted one, as many blocks side by side."""
     tracker = ChunkTracker(bench.learnt, initialiser(bench), Settings().refine.model_copy(update={"chunks": lanes}))
+    at: list[float] = []
+    real = tracker._step
 
-    def tracked(batch: list[int]) -> float:
-        shots = [movie[: sum(batch)] for movie in bench.shots]
-        return cpu_s(lambda: list(tracker.track(shots, batch, bench.times)), 1)
+    def step(*given: Any) -> Iterator[Poses]:
+        at.append(time.process_time())
+        return real(*given)
 
-    return tracked
-
-
-def predicted(bench: Bench, lanes: int) -> float:
-    """CPU seconds a predicted frame, a camera, of as many blocks side by side."""
-    tracked = following(bench, lanes)
+    length = FOLLOWED // lanes
+    with mock.patch.object(tracker, "_step", step):
+        list(tracker.track([movie[: lanes * length] for movie in bench.shots], [length] * lanes, bench.times))
+    at.append(time.process_time())
+    pictures = lanes * len(bench.eyes)
     # First frames are searched for, second ones approached.
-    begun, whole = [2] * lanes, [FOLLOWED // lanes] * lanes
-    return (tracked(whole) - tracked(begun)) / (sum(whole) - sum(begun)) / len(bench.eyes)
+    return (at[2] - at[0]) / pictures, (at[-1] - at[2]) / pictures / (length - 2)
+
+
+def predicted(bench: Bench) -> float:
+    """CPU seconds a predicted frame, a camera."""
+    return steps(bench, Settings().refine.chunks)[1]
 
 
 def sizes() -> None:
     """Time predicted frames of rendered balls of several sizes, by one camera and by two."""
     for diameter_px in (20, 80, 160, 400):
-        side = max(400, 5 * diameter_px // 2)
-        settings = SynthSettings(frames=FOLLOWED, diameter_px=diameter_px, image_size=(side, side))
+        side = max(400, 3 * diameter_px)
+        settings = SynthSettings(frames=FOLLOWED, diameter_px=diameter_px, image_size=(side, side), volume_mm=9.0)
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name) / "movie"
             write_synthetic_experiment(folder, settings)
             for cameras in (["cam1"], None):
                 bench = prepared(folder, cameras, say=lambda *_: None)
-                spent = [predicted(bench, Settings().refine.chunks) for _ in range(TURNS)]
+                spent = [predicted(bench) for _ in range(TURNS)]
                 what = f"predicted frame of {diameter_px} px, {len(bench.eyes)} camera(s), CPU ms a camera"
                 say(what, told(spent, 1e3))
 
