@@ -287,14 +287,15 @@ def with_lasting_errors(track: Trajectory, lasting: Lasting) -> Trajectory:
 
 
 def with_contradictions(
-    track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool
+    track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool, lasting: Lasting
 ) -> tuple[Trajectory, Consistency]:
     """Mark frames in which two cameras contradict each other, and make the covariances hold what they disagree by.
+    Errors that last, see `with_lasting_errors`, let them disagree without a contradiction.
     A contradiction is added to those of its frame; all are scaled where cameras disagree more than they state in most
     frames. Return also how well the cameras agree in the whole movie.
     """
     seen, limits = said_alone(track, cameras, diameter_mm, consecutive)
-    pairs = [_compared(track, seen, *two) for two in combinations(range(len(cameras)), 2)]
+    pairs = [_compared(track, seen, lasting, *two) for two in combinations(range(len(cameras)), 2)]
     wrong = torch.from_numpy(np.any([np.isin(one.reason, ELSEWHERE) for one in track.cameras.values()], axis=0))
     for pair in pairs:
         wrong |= pair.turned | (pair.gaps.signed_px.abs() > limits.gap_px)
@@ -341,10 +342,10 @@ class _Compared:
         return self.away > CONTRADICTS_SIGMAS
 
 
-def _compared(track: Trajectory, seen: Seen, k: int, m: int) -> _Compared:
+def _compared(track: Trajectory, seen: Seen, lasting: Lasting, k: int, m: int) -> _Compared:
     """Compare the cameras k and m of a track."""
     radius_mm = seen.diameter_mm / 2
-    spread = _of_cameras(track, "orientation_cov")[:, [k, m]].sum(1)
+    spread = (_of_cameras(track, "orientation_cov") + lasting.own_rad2)[:, [k, m]].sum(1)
     turn = log(seen.R_lab_body[:, k] @ seen.R_lab_body[:, m].mT)
     gaps = gaps_between([list(seen.cameras.values())[c] for c in (k, m)], [seen.centre_px[:, c] for c in (k, m)])
     across, known = gaps.across_lab[..., None], torch.from_numpy(np.nan_to_num(track.position_systematic_cov))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.pose.fit import FittedPoses, trace
-from sphereorient.pose.lasting import ASIDE_PX, FEWEST_FRAMES, Lasting, lasting_errors
+from sphereorient.pose.lasting import ASIDE_PX, FEWEST_FRAMES, Lasting, _of_left_out, lasting_errors
 
 COUNT, SIGMA = 24, 4.0
 LOBE, LOBE_AT, LOBE_WIDTH = 60.0, (0.45, -0.3), 0.2  # grey levels; radii along the camera's x and y
@@ -60,3 +60,18 @@ def test_of_few_frames_only_the_limb_is_known_to_be_uncertain():
     alone = found.of(1)
     assert alone.own_rad2.shape == (1, 3, 3)
     assert torch.equal(alone.covariance[:3, :3], found.own_rad2[1])
+
+
+def test_leaving_out_is_fitting_again():
+    rng = torch.Generator().manual_seed(11)
+    columns = torch.randn(5, 40, 4, generator=rng, dtype=torch.float64)
+    grey = torch.randn(5, 40, generator=rng, dtype=torch.float64)
+    columns[3] = 0.0  # a part that shows nothing is none
+    found = _of_left_out(columns.mT @ columns, (columns.mT @ grey[..., None])[..., 0], torch.zeros(4, 4).double())
+
+    def fitted_without(k: int) -> Tensor:
+        rest = [part for part in range(5) if part != k]
+        return torch.linalg.lstsq(columns[rest].reshape(-1, 4), grey[rest].reshape(-1)).solution
+
+    moved = torch.stack([fitted_without(k) - fitted_without(5) for k in (0, 1, 2, 4)])
+    torch.testing.assert_close(found, 0.75 * moved.mT @ moved, rtol=1e-6, atol=0.0)
