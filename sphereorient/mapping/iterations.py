@@ -29,7 +29,7 @@ from sphereorient.mapping.grid import (
 from sphereorient.mapping.joint import Linearisation, LinearSystem, joint_step, linear_system, linearise
 from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
-from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_maps, light_sums, noise_curves
+from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_columns, light_sums, noise_curves, solved_light
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
 from sphereorient.pose.lab_light import LabLight, learn_lab_light
 from sphereorient.pose.model import Light, Lighting, light_basis, no_stray
@@ -224,12 +224,12 @@ def _with_light(state: State) -> State:
     greys: list[tuple[Tensor, Tensor, Tensor]] = []
     some = slice(None, None, NOISE_EVERY)
     for (rows, pixels), at in zip(state.batches(), state.linearised(), strict=True):
-        more_normal, more_right = light_sums(at.view, pixels, at.precision)
+        more_normal, more_right = light_sums(light_columns(at.view), at.view, pixels, at.precision)
         normal += more_normal.reshape(-1, cameras, *normal.shape[1:]).sum(0)
         right += more_right.reshape(-1, cameras, 2 * basis).sum(0)
         inside = pixels.inside & ~pixels.clipped & state.use[rows].reshape(-1, 1)
         greys.append(((pixels.grey - at.residual)[:, some], at.residual[:, some], inside[:, some]))
-    difference, black = light_maps(normal, right)
+    difference, black = solved_light(normal, right).chunk(2, dim=-1)
     model, residual, inside = (torch.cat(part) for part in zip(*greys, strict=True))
     noise = noise_curves(model, residual, inside, cameras)
     light = Light(difference=difference, black=black, noise=noise, stray=no_stray(cameras), known=True)

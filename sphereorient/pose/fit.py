@@ -212,13 +212,22 @@ def _shared_scores(tiles: Tensor, shading: Shading) -> Tensor:
 
 
 def learn_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Light:
-    """Estimate the light and the noise of a movie from the fits of B * C disks, those of `use` (B, C) bool."""
+    """Estimate the light and the noise of a movie from the fits of B * C disks, those of `use` (B, C) bool.
+    Each pose may change with the light: a light at given poses favours them, however wrong they are.
+    """
     cameras = use.shape[1]
     at = settled(pixels, fit, model, cameras)
     stray = learn_stray(at, pixels, use, model.light.stray)
     lit = replace(pixels, behind=scene_beside(at.view, pixels, stray))
-    normal, right = light_sums(at.view, lit, at.weight / at.variance * use.reshape(-1, 1))
-    difference, black = light_maps(by_pose(normal, cameras).sum(0), by_pose(right, cameras).sum(0))
+    columns = torch.cat([at.design[:, :6], light_columns(at.view)], dim=1)
+    normal, right = light_sums(columns, at.view, lit, at.weight / at.variance * use.reshape(-1, 1))
+    normal, right = by_pose(normal, cameras), by_pose(right, cameras)
+    by_light = normal[..., 6:, :6].flatten(1, 2)  # (B, C 2K, 6): the cameras share the pose
+    mixed = by_light @ inverse_damped(normal[..., :6, :6].sum(1))
+    each = torch.einsum("cd,cij->cidj", torch.eye(cameras, dtype=torch.float64), normal[..., 6:, 6:].sum(0))
+    whole = each.flatten(2, 3).flatten(0, 1) - (mixed @ by_light.mT).sum(0)
+    force = right[..., 6:].sum(0).flatten() - (mixed @ right[..., :6].sum(1)[..., None])[..., 0].sum(0)
+    difference, black = solved_light(whole, force).reshape(cameras, -1).chunk(2, dim=-1)
     counted = at.inside & ~pixels.clipped & use.reshape(-1, 1)
     noise = noise_curves(at.model, at.residual, counted, cameras)
     return Light(difference=difference, black=black, noise=noise, stray=stray, known=True)
@@ -258,21 +267,19 @@ def light_columns(view: SphereView) -> Tensor:
     return torch.cat([(view.coverage * view.paint)[:, None] * basis, view.coverage[:, None] * basis], dim=1)
 
 
-def light_sums(view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the normal equations of light maps of L disks, (L, 2 K, 2 K) and (L, 2 K); precision (L, P)."""
-    columns = light_columns(view)
+def light_sums(columns: Tensor, view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normal equations of what columns (L, n, P) add to L disks, (L, n, n) and (L, n); precision (L, P)."""
     weighted = columns * precision[:, None]
     target = pixels.grey - (1.0 - view.coverage) * pixels.behind
     return (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double()
 
 
-def light_maps(normal: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve the summed normal equations (C, 2 K, 2 K), (C, 2 K) for the maps of difference and black, (C, K) each."""
+def solved_light(normal: Tensor, right: Tensor) -> Tensor:
+    """Solve summed normal equations (..., n, n), (..., n) for coefficients of light maps, (..., n)."""
     # The basis is nearly dependent (x^2 + y^2 + depth^2 = 1): a ridge picks the smallest coefficients.
     ridge = RIDGE * normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9)
-    solution = torch.linalg.solve(normal + torch.diag_embed(ridge), right).float()
-    difference, black = solution.chunk(2, dim=-1)
-    return difference, black
+    solution: Tensor = torch.linalg.solve(normal + torch.diag_embed(ridge), right)
+    return solution.float()
 
 
 def noise_curves(model: Tensor, residual: Tensor, inside: Tensor, cameras: int) -> Tensor:

@@ -15,9 +15,9 @@ from sphereorient.pose.residuals import Residuals, by_pose
 from sphereorient.so3 import solve_damped
 
 FEWEST_FRAMES = 8  # from which it is seen what stays
-TILES = 3  # along each axis of the disk: errors of light are wide
+TILES = 4  # along each axis of the disk: errors of light are wide
 WHOLE = 0.98  # coverage of a pixel that the limb does not cut: the limb has tiles of its own
-ASIDE_PX = 0.004  # by how much the model's limb and paint may lie aside: large balls would state less
+ASIDE_PX = 0.004  # by how much the model's limb and paint may lie aside, where no more is known
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,41 +44,43 @@ class Lasting:
 
 def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Lasting:
     """Estimate the errors that B poses share from the fits of B * C disks, those of `use` (B, C) bool.
-    One turn and move of all poses, and the light of each camera with them, are fitted to all frames but for one tile of
-    one camera's disk: by how much that changes them from tile to tile. What is wrong in a place of every picture shows
-    in it, as far as the light can follow it, too. With fewer than `FEWEST_FRAMES` frames only `ASIDE_PX` is known.
+    One turn and move of all poses, with the light of each camera and the place and width of its limb, are fitted to all
+    frames but for one tile of one camera's disk: by how much that changes them from tile to tile. What is wrong in a
+    place of every picture shows, and what light or limb could take of it. With fewer than `FEWEST_FRAMES` frames only
+    `ASIDE_PX` is known.
     Source: the jackknife over clusters, CR3 of Bell and McCaffrey 2002.
     """
     cameras = use.shape[1]
-    distance_mm = (fit.position_lab_mm.repeat_interleave(cameras, 0) - pixels.origin[..., 0]).norm(dim=-1)
-    px_mm = float((pixels.pitch_mm + pixels.pitch_rad * distance_mm).min())
-    aside = torch.tensor([1 / model.radius_mm] * 3 + [1.0] * 3, dtype=torch.float64) * ASIDE_PX * px_mm
-    found = Lasting(covariance=aside.square().diag(), own_rad2=aside[:3].square().diag().expand(cameras, 3, 3))
     if len(use) < FEWEST_FRAMES:
-        return found
+        distance_mm = (fit.position_lab_mm.repeat_interleave(cameras, 0) - pixels.origin[..., 0]).norm(dim=-1)
+        aside_mm = ASIDE_PX * float((pixels.pitch_mm + pixels.pitch_rad * distance_mm).min())
+        aside = torch.tensor([1 / model.radius_mm] * 3 + [1.0] * 3, dtype=torch.float64) * aside_mm
+        return Lasting(covariance=aside.square().diag(), own_rad2=aside[:3].square().diag().expand(cameras, 3, 3))
     at = settled(pixels, fit, model, cameras)
     normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), cameras)
-    lights = normal.shape[-1] - 6
-    turn = [0, 1, 2, *range(6, 6 + lights)]
+    others = normal.shape[-1] - 6
+    turn = [0, 1, 2, *range(6, 6 + others)]
     alone = [part[..., turn] for part in (normal[..., turn, :], right, ridge[..., turn, :])]
     own = torch.stack([_of_left_out(*of_camera)[:3, :3] for of_camera in zip(*alone, strict=True)])
-    # The cameras share the pose; each has a light of its own.
-    place = torch.zeros(cameras, 6 + cameras * lights, 6 + lights, dtype=torch.float64)
+    # The cameras share the pose; each has a light and a limb of its own.
+    place = torch.zeros(cameras, 6 + cameras * others, 6 + others, dtype=torch.float64)
     for camera in range(cameras):
         place[camera, :6, :6] = torch.eye(6)
-        place[camera, 6 + camera * lights :][:lights, 6:] = torch.eye(lights)
+        place[camera, 6 + camera * others :][:others, 6:] = torch.eye(others)
     joined = (place[:, None] @ normal @ place[:, None].mT).flatten(0, 1)
     pulled = (place[:, None] @ right[..., None])[..., 0].flatten(0, 1)
     together = _of_left_out(joined, pulled, (place @ ridge @ place.mT).sum(0))[:6, :6]
-    return Lasting(covariance=found.covariance + together, own_rad2=found.own_rad2 + own)
+    return Lasting(covariance=together, own_rad2=own)
 
 
 def _by_tile(at: Residuals, precision: Tensor, cameras: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return normal equations of pose and light of each tile, (C, T, n, n) and (C, T, n), and the light's ridge,
-    (C, n, n), float64: summed over frames, each with its own coefficients of light eliminated. The limb has tiles of
-    its own.
+    """Return normal equations of pose, light and limb of each tile, (C, T, n, n) and (C, T, n), and a ridge of all but
+    the pose, (C, n, n), float64: summed over frames, each with its own coefficients of light eliminated. The limb has
+    tiles of its own.
     """
-    columns = torch.cat([at.design[:, :6], light_columns(at.view)], dim=1)
+    limb = at.over * at.view.coverage_by_position.norm(dim=1)
+    wider = limb * torch.special.ndtri(at.view.coverage.clamp(1e-6, 1 - 1e-6))
+    columns = torch.cat([at.design[:, :6], light_columns(at.view), torch.stack([limb, wider], dim=1)], dim=1)
     weighted = at.design[:, 6:] * precision[:, None]
     mixed = solve_damped(
         (weighted @ at.design[:, 6:].mT).double()[:, None], (columns @ weighted.mT).double(), ridge=1e-7
