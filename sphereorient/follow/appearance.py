@@ -53,7 +53,7 @@ ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the t
 
 GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may differ, in any light
 TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
-LIGHT_ROUNDS, BLUR_ROUNDS, WORN_ROUNDS = 2, 4, 4
+BLUR_ROUNDS, WORN_ROUNDS = 4, 4
 FITS = 3.0  # excess of a fit whose map is right once worn paint is not used: 1.1 to 2.7; of a warped map 4.2
 # By which the logarithm of the variance left must fall where worn paint is not used: 1.3 to 2.8 in balls that have lost
 # 2 to 45 % of their paint, up to 1.1 where the map is warped, and with highlights or a rod.
@@ -450,10 +450,8 @@ def _light_and_blur(
 
 
 def _with_light(fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses]:
-    for _ in range(LIGHT_ROUNDS):
-        fitter = fitter.with_light_of(pixels, fit, use)
-        fit = fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
-    return fitter, fit
+    fitter = fitter.with_light_of(pixels, fit, use)
+    return fitter, fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
 
 
 def _without_worn(
@@ -477,8 +475,7 @@ def _without_worn(
                 paint = without(fitter.optics.fine.paint, worn)  # blurred already
                 optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views))
                 now = replace(now, optics=optics)
-            now = now.with_light_of(pixels, fit, use)
-            fit = now.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, now.optics.fine, 3)
+            now, fit = _with_light(now, pixels, fit, use)
         return now, fit, worn
 
     every, middle = torch.arange(len(use)), len(use) // 2
