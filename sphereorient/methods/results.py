@@ -20,7 +20,7 @@ from sphereorient.follow.appearance import limits_of
 from sphereorient.follow.poses import PoseTable
 from sphereorient.locate import Positions, Sightings
 from sphereorient.mapping import LearntMap
-from sphereorient.motion import Motion, Smoothed, datasets_of
+from sphereorient.motion import Motion, Smoothed, datasets_of, off_middle
 from sphereorient.pose.fit import trace
 from sphereorient.pose.fitter import CameraView
 from sphereorient.pose.lasting import Lasting
@@ -130,7 +130,15 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
 def precise_track(
     experiment: Experiment, clock: Tensor, table: PoseTable, chosen: Chosen, smoothed: Smoothed, learnt: Appearance
 ) -> Trajectory:
-    """Collect all results of the precise method in a trajectory."""
+    """Collect all results of the precise method in a trajectory, poses in the middle of the exposure."""
+    move_mm, turn = off_middle(smoothed, experiment.exposure_s or 0.0)
+    back = exp(-turn)
+    smoothed = replace(
+        smoothed,
+        position_lab_mm=smoothed.position_lab_mm - move_mm,
+        R_lab_body=back @ smoothed.R_lab_body,
+        R_given_path=back @ smoothed.R_given_path,
+    )
     names = [view.name for view in learnt.fitter.views]
     empty = _empty(experiment, clock, names)
     picked = table.rows(chosen.choice)
@@ -152,7 +160,7 @@ def precise_track(
     return replace(
         empty,
         valid=(chosen.choice >= 0).numpy(),
-        position=picked["position_lab_mm"].numpy(),
+        position=(picked["position_lab_mm"] - move_mm).numpy(),
         orientation=smoothed.R_given_path.numpy(),
         **known,
         segment=chosen.segment.numpy(),

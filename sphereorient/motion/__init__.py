@@ -12,6 +12,7 @@ from sphereorient.motion.smooth import (
     Smoothed,
     datasets_of,
     lasting_share,
+    off_middle,
     smooth_motion,
 )
 from sphereorient.motion.stencil import gaussian_derivative, gaussian_kernel

@@ -66,6 +66,15 @@ class MeasuredPoses:
             raise ShapeError(refusal("smooth_motion", expected="N frames in each", got=got, do=do))
 
 
+def off_middle(motion: Motion, exposure_s: float) -> tuple[Tensor, Tensor]:
+    """Return by how much poses in pictures lie off the middle of the exposure: moves (..., N, 3), mm, and turns
+    (..., N, 3), rad, lab; 0 where the accelerations are not known. A picture shows the mean over the exposure, which
+    steady accelerations shift by a twenty-fourth of their product with its square.
+    """
+    share = exposure_s**2 / 24
+    return 1e3 * share * motion.acceleration_m_s2.nan_to_num(), share * motion.alpha_lab_rad_s2.nan_to_num()
+
+
 def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: ProcessNoise | None = None) -> Smoothed:
     """Smooth a track, segment by segment, and take its derivatives; the result is on the CPU.
     Velocity and omega_lab are a constant plus a stationary random process, estimated from the whole track unless

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import ShapeError
-from sphereorient.motion import MeasuredPoses, Smoothed, SmoothSettings, lasting_share, smooth_motion
+from sphereorient.motion import MeasuredPoses, Smoothed, SmoothSettings, lasting_share, off_middle, smooth_motion
 from sphereorient.synth.motion import Motion6D, random_motion
 
 RATE = 600.0
@@ -484,3 +484,25 @@ def test_the_share_of_errors_that_last_is_found_in_the_disagreement_of_cameras(r
     gaps[::7] = torch.nan
     assert lasting_share(gaps, cov, segment, 0.0) == pytest.approx(0.85, abs=0.12)
     assert lasting_share(slow, cov, torch.arange(frames), 0.25) == 0.25  # no two frames of one segment
+
+
+def test_pictures_show_the_mean_over_the_exposure():
+    """Against the mean of many instants of a motion whose rates change evenly."""
+    omega, alpha = torch.tensor([0.1, -0.15, 0.05]).double(), torch.tensor([0.01, 0.02, -0.015]).double()
+    velocity, acceleration = torch.tensor([2.0, 1.0, -1.0]).double(), torch.tensor([0.3, -0.2, 0.1]).double()
+    at = (torch.arange(400, dtype=torch.float64)[:, None] + 0.5) / 400 - 0.5  # of the exposure
+    shown = so3.exp(at * omega + at**2 / 2 * alpha)
+    turned = so3.log(so3.nearest_rotation(shown.mean(0)))
+    moved = (at * velocity + at**2 / 2 * acceleration).mean(0)
+    exposure_s = 0.02
+    truth = planted()
+    one = smoothed(truth, truth.position_lab_mm, truth.R_lab_body)
+    rates = {"acceleration_m_s2": acceleration / exposure_s**2 / 1e3, "alpha_lab_rad_s2": alpha / exposure_s**2}
+    known = {name: rate.repeat(len(truth.time_s), 1) for name, rate in rates.items()}
+    for rate in known.values():
+        rate[3] = torch.nan
+    move_mm, turn = off_middle(replace(one, **known), exposure_s)
+    assert_close(turn[0], turned, atol=0.02 * float(turned.norm()))
+    assert_close(move_mm[0], moved, atol=1e-4 * float(moved.norm()))
+    assert not turn[3].any()
+    assert not move_mm[3].any()
