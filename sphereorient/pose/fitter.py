@@ -194,7 +194,7 @@ class Fitter:
             if replace(self, light=light).left(*held) > maps_leave - more:
                 return self, fit
         lit = self
-        for _ in range(2):  # the poses, too, were found with the maps
+        for _ in range(4):  # the poses, too, were found with the maps
             lit = replace(self, light=learn_lab_light(pixels, fit, use, self.model(fine)))
             fit = lit.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
         return lit, fit

@@ -29,8 +29,7 @@ from sphereorient.pose.model import (
     surface_normals,
 )
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.residuals import Residuals, by_pose, residuals
-from sphereorient.so3 import inverse_damped
+from sphereorient.pose.residuals import by_pose, residuals
 from sphereorient.sphere.texture import sample_texture
 from sphereorient.sphere.texture_table import octahedral_cells, octahedral_directions
 
@@ -190,8 +189,7 @@ def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: Sphere
 
 def lab_lights(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Iterator[LabLight]:
     """Yield the estimates of `learn_lab_light` half-way and at the end.
-    Gauss-Newton, all poses free as in `learn_light`; the light of each frame may differ a little, as its tints do in
-    the fit.
+    Gauss-Newton at the fits' poses; the light of each frame may differ a little, as its tints do in the fit.
     Source: irradiance as harmonics of the normal, Ramamoorthi and Hanrahan 2001.
     """
     cameras, used = use.shape[1], use.reshape(-1, 1)
@@ -200,7 +198,7 @@ def lab_lights(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel
     light = _flat(model.light, at.view, pixels, use)
     light = replace(light, stray=learn_stray(at, pixels, use, model.light.stray))
     for done in range(1, ROUNDS + 1):
-        light = _better(light, at, pixels, (at.weight / at.variance).where(used, 0.0), bases)
+        light = _better(light, at.view, pixels, (at.weight / at.variance).where(used, 0.0), bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
         at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model, cameras)
         if done in (ROUNDS // 2, ROUNDS):
@@ -240,34 +238,30 @@ def _flat(known: Lighting, view: SphereView, pixels: Pixels, use: Tensor) -> Lab
 
 
 def _better(
-    light: LabLight, at: Residuals, pixels: Pixels, precision: Tensor, bases: tuple[Tensor, Tensor, Tensor]
+    light: LabLight, view: SphereView, pixels: Pixels, precision: Tensor, bases: tuple[Tensor, Tensor, Tensor]
 ) -> LabLight:
     """Return the light after one step of Gauss-Newton; precision (L, P)."""
-    view, cameras = at.view, len(light.gain)
     unit = float(light.difference[0])
     tied = torch.tensor([TINT[0]] + [TINT[1]] * 2 + [TINT[2]] * 3 + [unit * SHADE[0]] + [unit * SHADE[1]] * 2)
     unknown = [getattr(light, name) for name in UNKNOWN]
     now, sizes = torch.cat(unknown).double(), [len(part) for part in unknown]
-    count = len(now)
-    # Of the light, of what is left, and of each frame's pose, which its cameras share.
-    normal = torch.zeros(count + 1, count + 1, dtype=torch.float64)
-    by_turn = torch.zeros(len(at.design) // cameras, count + 7, 6, dtype=torch.float64)
+    normal, right = torch.zeros(len(now), len(now), dtype=torch.float64), torch.zeros(len(now), dtype=torch.float64)
     difference, black, gloss, through, mirrored = light.parts(view, pixels)
     shown, ground = light.at(view, pixels)
-    cover = view.coverage * light.gain.repeat(len(gloss) // cameras)[:, None]
+    cover = view.coverage * light.gain.repeat(len(gloss) // len(light.gain))[:, None]
     learnt = view.coverage * (view.paint * shown + ground)
     left = pixels.grey - (1.0 - view.coverage) * scene_beside(view, pixels, light.stray) - learnt
     tints = polynomials(view.across, 2)
     own = torch.cat([learnt[:, None] * tints, view.coverage[:, None] * tints[:, :3]], dim=1)
     counts = (precision > 0).any(1)
-    factor = torch.zeros(len(left), count + 7, dtype=torch.float64)
+    factor = torch.zeros(len(left), len(now) + 1, dtype=torch.float64)
 
     def of_disk(k: int) -> tuple[int, Tensor, Tensor]:
         over_normal, over_mirror, over_depth = (basis[k] for basis in bases)
         scattered = (cover[k] * through[k]) * over_normal
         columns = [view.paint[k] * scattered, scattered, (cover[k] * mirrored[k]) * over_mirror]
         columns += [(cover[k] * part) * over_depth for part in (view.paint[k] * difference[k] + black[k], gloss[k])]
-        whole = torch.cat([*columns, left[k : k + 1], at.design[k, :6]])
+        whole = torch.cat([*columns, left[k : k + 1]])
         weighted, own_weighted = whole * precision[k], own[k] * precision[k]
         sums, mixed = (weighted @ whole.T).double(), (own_weighted @ whole.T).double()
         taken = torch.linalg.solve((own_weighted @ own[k].T).double() + tied.double().pow(-2).diag(), mixed)
@@ -276,18 +270,14 @@ def _better(
     # A few disks at a time: the columns of all would fill the memory.
     for k, sums, own_part in side_by_side(of_disk, counts.nonzero()[:, 0].tolist()):
         factor[k] = own_part
-        normal += sums[:-6, :-6]
-        by_turn[k // cameras] += sums[:, -6:]
-    mixed = by_turn[:, :-6] @ inverse_damped(by_turn[:, -6:])
-    normal -= (mixed @ by_turn[:, :-6].mT).sum(0)
+        normal += sums[:-1, :-1]
+        right += sums[:-1, -1]
     expected, deviation = _beforehand(unit)
     known = deviation.double() ** -2
-    step = torch.linalg.solve(normal[:-1, :-1] + known.diag(), normal[:-1, -1] + known * (expected - now))
+    step = torch.linalg.solve(normal + known.diag(), right + known * (expected - now))
     # What all frames of a camera share of their own factor is the camera's gain.
-    moved = mixed[:, -1] - (mixed[:, :-1].mT @ step)
-    taken = torch.cat([step.expand(len(moved), -1), moved.new_full((len(moved), 1), -1.0), moved], dim=1)
-    own_factor = -(by_pose(factor, cameras) @ taken[..., None])[..., 0].where(by_pose(counts, cameras), 0.0)
-    shared = own_factor.sum(0) / by_pose(counts, cameras).sum(0).clamp_min(1)
+    own_factor, cameras = factor[:, -1] - factor[:, :-1] @ step, len(light.gain)
+    shared = by_pose(own_factor, cameras).sum(0) / by_pose(counts, cameras).sum(0).clamp_min(1)
     gain = light.gain * (1.0 + shared).float()
     return replace(light, gain=gain, **dict(zip(UNKNOWN, (now + step).float().split(sizes), strict=True)))
 

@@ -14,7 +14,7 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import Residuals, by_pose
 from sphereorient.so3 import solve_damped
 
-FEWEST_FRAMES = 8  # from which it is seen what stays
+FEWEST_FRAMES = 3  # from which it is seen what stays
 TILES = 4  # along each axis of the disk: errors of light are wide
 WHOLE = 0.98  # coverage of a pixel that the limb does not cut: the limb has tiles of its own
 ASIDE_PX = 0.004  # by how much the model's limb and paint may lie aside, where no more is known

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from refine_examples import RADIUS_MM, balls, cut, fitted, model_of, noisy, pictures_of, rig_of
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.pose.fit import FittedPoses, trace
+from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine, trace
 from sphereorient.pose.lasting import ASIDE_PX, FEWEST_FRAMES, Lasting, _of_left_out, lasting_errors
 
 COUNT, SIGMA = 24, 4.0
@@ -28,8 +30,12 @@ def measured(count: int, lobe: float) -> tuple[Tensor, FittedPoses, Lasting]:
         pictures[:, c] += lobe * torch.exp(-0.5 * away2 / LOBE_WIDTH**2) * (right.hypot(down) < 0.97)
     pixels = cut(RIG, noisy(pictures, SIGMA, 7), X)
     fit = fitted(RIG, "patches", pixels, X, R, SIGMA)
-    model = model_of(RIG.table("patches"), SIGMA)
-    found = lasting_errors(pixels, fit, torch.ones(count, 2, dtype=torch.bool), model)
+    model, use = model_of(RIG.table("patches"), SIGMA), torch.ones(count, 2, dtype=torch.bool)
+    for _ in range(2):
+        model = replace(model, light=learn_light(pixels, fit, use, model))
+        begin = PoseStart(position_lab_mm=fit.position_lab_mm, R_lab_body=fit.R_lab_body, use=use)
+        fit = refine(pixels, begin, model, 3)
+    found = lasting_errors(pixels, fit, use, model)
     off = torch.cat([so3.log(fit.R_lab_body @ R.mT), fit.position_lab_mm - X], dim=-1)
     return off, fit, found
 
