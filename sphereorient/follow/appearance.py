@@ -34,7 +34,7 @@ from sphereorient.pose.fitter import (
 from sphereorient.pose.lasting import Lasting, lasting_errors
 from sphereorient.pose.occluders import USUALLY_HIDDEN
 from sphereorient.pose.pixels import Pixels
-from sphereorient.pose.worn import without, worn_cells, worn_share
+from sphereorient.pose.worn import CHANGED, without, worn_cells, worn_share
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.trajectory import Reason
 
@@ -53,7 +53,9 @@ ALWAYS = 1.0  # score from which outlines of blurred pictures are trusted: the t
 
 GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may differ, in any light
 TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
-BLUR_ROUNDS, WORN_ROUNDS = 4, 4
+BLUR_ROUNDS = 4
+# By how much paint differs that is not used, round by round: while poses are wrong, so do the borders of right paint.
+WORN_ROUNDS = (0.5, 0.5, 0.35, 0.35, 0.25, 0.25, 0.2, 0.2, CHANGED, CHANGED)
 FITS = 3.0  # excess of a fit whose map is right once worn paint is not used: 1.1 to 2.7; of a warped map 4.2
 # By which the logarithm of the variance left must fall where worn paint is not used: 1.3 to 2.8 in balls that have lost
 # 2 to 45 % of their paint, up to 1.1 where the map is warped, and with highlights or a rod.
@@ -469,9 +471,9 @@ def _without_worn(
         pixels: Pixels, fit: FittedPoses, use: Tensor, whole: bool = False
     ) -> tuple[Fitter, FittedPoses, Tensor | None]:
         now, worn = fitter, None
-        for _ in range(WORN_ROUNDS):  # worn paint bends the light and the poses that it is found with
+        for changed in WORN_ROUNDS:  # worn paint bends the light and the poses that it is found with
             if not whole:
-                worn = worn_cells(pixels, fit, use, now.model(now.optics.fine))
+                worn = worn_cells(pixels, fit, use, now.model(now.optics.fine), changed)
                 paint = without(fitter.optics.fine.paint, worn)  # blurred already
                 optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views))
                 now = replace(now, optics=optics)

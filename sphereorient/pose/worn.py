@@ -21,9 +21,10 @@ ROWS = 180  # of latitude, of the map of what is not used
 SIDE = 256  # cells per axis of its table
 
 
-def worn_cells(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Tensor:
+def worn_cells(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, changed: float = CHANGED) -> Tensor:
     """Return where the paint differs from the map, (CELLS^2,) bool, octahedral cells of the body's directions.
     From the fits of B * C disks, those of `use` (B, C) bool: what turns with the ball is paint, what stays is light.
+    `changed`: share of the step from black to white by which it differs at least.
     """
     cameras = use.shape[1]
     at = settled(pixels, fit, model, cameras)
@@ -34,7 +35,7 @@ def worn_cells(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel
     counted = pixels.inside & ~pixels.clipped & use.reshape(-1, 1) & (at.view.aside < LIMB)
     slope = at.lit / at.variance * counted
     sums = [torch.zeros(CELLS**2).index_add(0, cells, (slope * part).reshape(-1)) for part in (at.residual, at.lit)]
-    return (sums[0] / (sums[1] + SLACK**-2)).abs() > CHANGED
+    return (sums[0] / (sums[1] + SLACK**-2)).abs() > changed
 
 
 def without(paint: TextureTable, worn: Tensor) -> TextureTable:
