@@ -30,6 +30,7 @@ BEAM_NATS = 30.0  # more than a break and a new beginning cost
 STATES_MAX = 256
 STUCK_FRAMES = 3  # a stuck candidate may be absent for this many frames, less one
 PIN_NATS = 6.0  # least gain of following the motion in every frame of a run without search
+PIN_ALONE_NATS = 12.0  # by which every other candidate of such a frame costs more
 PIN_MARGIN = 3  # frames at either end of such a run that are searched nevertheless
 NEAR_WHOLE_TURN = 1.0  # rad; nearer, two orientations do not determine the axis of the rotation between them
 REST_SHARE = 0.5  # prior share of new spheres with an omega as small as its changes
@@ -57,6 +58,7 @@ class BeamSearch:
         self.hole_s = (gap_frames_max + 1.5) * rows.frame_s  # half a frame for uneven times
         self.hit, self.miss = (np.array(each) for each in cost.presence())  # index: the last frame was a hit
         self.breaks, self.goes_on = -math.log(cost.break_probability), -math.log1p(-cost.break_probability)
+        self.main = np.lexsort((-rows.log_weight, rows.frame))[rows.offset[:-1]]  # (F,), likeliest row by the pictures
         self.chain_cost, self.chain_turn, self.last_pin = self._pins(gap_frames_max + 2)
 
     def run(self) -> Histories:
@@ -212,38 +214,55 @@ class BeamSearch:
         return pruned, new_least[near], new_total[near]
 
     def _pins(self, length: int) -> tuple[Floats, Floats, Ints]:
-        """Find runs of frames with one candidate each that follow the motion: all good histories contain them.
-        Return, per frame, the cost and rotation from the two frames before, and, with one more frame at the end, the
-        last frame of a run inside its margins at the second of these frames, -1 elsewhere.
+        """Find runs of frames whose likeliest candidates follow the motion, and no others: all good histories contain
+        them. Return, per frame, cost and rotation from the two frames before, and, with one more frame at the end, the
+        last frame of a run inside its margins at the second of two frames with one candidate each, -1 elsewhere.
         """
-        frames = len(self.time)
+        frames, main = len(self.time), self.main
         cost, turn, last = np.zeros(frames), np.zeros((frames, 3)), np.full(frames + 1, -1)
         single, dt = np.diff(self.offset) == 1, np.diff(self.time)
         close = (dt <= self.hole_s) & (self.rows.zones(dt) == 1)
-        R, variance = self.rows.R_lab_body[self.offset[:-1]], self.rows.variance[self.offset[:-1]]
+        R, variance = self.rows.R_lab_body[main], self.rows.variance[main]
         angle, axis = rotation_between(R[:-1], R[1:])
         turn[1:] = angle[:, None] * axis
-        off, _ = rotation_between(rotated(R[1:-1], turn[1:-1] * (dt[1:] / dt[:-1])[:, None]), R[2:])
-        expected = self.cost.predicted_variance(dt[1:], dt[:-1], variance[:-2], variance[1:-1], variance[2:])
-        row = self.offset[2:-1]
-        ratio = self.cost.log_ratio(off**2, expected)
-        cost[2:] = self.hit[1] + self.goes_on + self._candidate_cost(row, ratio)
-        follows = single[2:] & single[1:-1] & single[:-2] & close[1:] & close[:-1]
-        follows &= ratio - np.maximum(self.still[row] + self.log_stuck, 0.0) >= PIN_NATS
+        alone = single.copy()
+        follows = np.zeros(max(frames - 2, 0), dtype=np.bool_)
+        if frames > 2:
+            predicted = rotated(R[1:-1], turn[1:-1] * (dt[1:] / dt[:-1])[:, None])
+            row = np.arange(self.offset[2], self.offset[-1])
+            k = self.rows.frame[row] - 2
+            off, _ = rotation_between(predicted[k], self.rows.R_lab_body[row])
+            spread = self.cost.predicted_variance(
+                dt[1:][k], dt[:-1][k], variance[:-2][k], variance[1:-1][k], self.rows.variance[row]
+            )
+            ratio = self.cost.log_ratio(off**2, spread)
+            each = self._candidate_cost(row, ratio)
+            here = main[2:] - self.offset[2]
+            others = each.copy()
+            others[here] = np.inf
+            cost[2:] = self.hit[1] + self.goes_on + each[here]
+            alone[2:] |= np.minimum.reduceat(others, self.offset[2:-1] - self.offset[2]) - each[here] >= PIN_ALONE_NATS
+            follows = alone[2:] & alone[1:-1] & alone[:-2] & close[1:] & close[:-1]
+            follows &= ratio[here] - np.maximum(self.still[main[2:]] + self.log_stuck, 0.0) >= PIN_NATS
         edge = np.diff(np.concatenate([[0], follows.astype(np.int64), [0]]))
         for begin, end in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) + 1, strict=True):
-            if end - begin + 1 >= max(length, 2 * PIN_MARGIN + 4):
-                last[begin + PIN_MARGIN + 1] = end - PIN_MARGIN
+            if end - begin + 1 < max(length, 2 * PIN_MARGIN + 4):
+                continue
+            first, stop = begin + PIN_MARGIN + 1, end - PIN_MARGIN
+            # There one state is left.
+            starts = first + np.flatnonzero(single[first:stop] & single[first - 1 : stop - 1])
+            if len(starts):
+                last[starts[0]] = stop
         return cost, turn, last
 
     def _jump(self, step: BeamStep, last: int) -> BeamStep:
         """Return the step to the last frame of a run, whose only state follows from the run's second frame."""
         states = PathStates(
             frame=np.array([last]),
-            row=self.offset[[last]],
+            row=self.main[[last]],
             turn=self.chain_turn[[last]],
             span=self.time[[last]] - self.time[[last - 1]],
-            before=self.rows.variance[self.offset[[last - 1]]],
+            before=self.rows.variance[self.main[[last - 1]]],
         )
         cost, none = self.chain_cost[step.frame + 1 : last + 1].sum(keepdims=True), np.zeros(1, dtype=np.int64)
         return BeamStep(frame=last, states=states, source=none, target=none, cost=cost, best=none)
@@ -263,8 +282,8 @@ class BeamSearch:
                 row[f], begins[f] = states.row[end], states.span[end] == 0
                 turn[f] = states.turn[end] if states.span[end] > 0 else np.nan
             inside = np.arange(previous + 1, f)  # of a pinned run
-            row[inside], turn[inside] = self.offset[inside], self.chain_turn[inside]
-            posterior[self.offset[inside]] = 1.0
+            row[inside], turn[inside] = self.main[inside], self.chain_turn[inside]
+            posterior[self.main[inside]] = 1.0
             end = int(step.source[step.best[end]])
             if begins[f] and place:
                 breaks[f] = self._alive(steps[place - 1].states, f)[1][end]

@@ -25,6 +25,11 @@ class CandidateRows:
     time_s: Floats  # (F,)
     frame_s: float  # usual time between frames of the movie
 
+    @property
+    def frame(self) -> Ints:
+        """Frame of each row, (M,)."""
+        return np.repeat(np.arange(len(self.time_s)), np.diff(self.offset))
+
     def part(self, first: int, last: int) -> "CandidateRows":
         """Return the frames first .. last - 1."""
         rows = slice(self.offset[first], self.offset[last])

@@ -350,6 +350,28 @@ def test_runs_that_need_no_search_give_what_the_search_gives(rng, monkeypatch):
     assert_close(skipping.turn_rad, searching.turn_rad)
 
 
+@pytest.mark.parametrize("gap_nats", [0.5, 30.0])
+def test_runs_go_on_over_frames_whose_other_candidates_do_not_follow(rng, monkeypatch, gap_nats):
+    """Every sixteenth frame has several, as after a search without history."""
+    R = turning(200, 6.0)
+    places = [seen(R, rng), *(so3.random_rotations(200, generator=rng) for _ in range(3))]
+    mask = torch.ones(200, 4, dtype=torch.bool)
+    mask[:, 1:] = (torch.arange(200) % 16 == 0)[:, None]
+    nll = torch.tensor([0.0, gap_nats, gap_nats, gap_nats], dtype=torch.float64).expand(200, 4)
+    hypotheses = replace(pooled(*places, mask=mask), nll=nll)
+    steps = []
+    one_step = beam.BeamSearch._step
+    monkeypatch.setattr(beam.BeamSearch, "_step", lambda self, *given: steps.append(0) or one_step(self, *given))
+    settings = SETTINGS.model_copy(update={"acceleration_rad_s2": 5000.0})
+    skipping = physical_path(hypotheses, times(200), settings)
+    assert len(steps) < 20
+    monkeypatch.setattr(beam, "PIN_NATS", math.inf)
+    searching = physical_path(hypotheses, times(200), settings)
+    assert torch.equal(skipping.choice, searching.choice)
+    assert_close(skipping.posterior, searching.posterior, 1e-4)
+    assert_close(skipping.turn_rad, searching.turn_rad)
+
+
 @pytest.mark.parametrize(("frames", "places"), [(0, 1), (1, 1), (4, 2), (3, 0), (0, 0)])
 def test_a_movie_without_candidates_has_an_empty_path(frames, places):
     R = torch.eye(3, dtype=torch.float64).expand(frames, places, 3, 3)
