@@ -154,7 +154,12 @@ class SlicedPicture(OnDemand):
     def _ask(self, wanted: Rectangle) -> None:
         missing = [k for k, place in enumerate(self._decoder.places) if k not in self._asked and place.meets(wanted)]
         if missing:
-            work = self._pool.submit(self._decoder.decode, self._slices, missing, self._pixels)
+            try:
+                work = self._pool.submit(self._decoder.decode, self._slices, missing, self._pixels)
+            except RuntimeError:  # the pool is closed, the picture is not
+                self._decoder.decode(self._slices, missing, self._pixels)
+                work = Future()
+                work.set_result(None)
             self._asked |= dict.fromkeys(missing, work)
 
     def part(self, left: int, top: int, right: int, bottom: int) -> Grey:

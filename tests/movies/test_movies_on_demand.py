@@ -90,6 +90,16 @@ def test_only_slices_that_hold_the_part_are_decoded_here_and_ahead_in_the_next_f
         assert decoded[2:] == [[1]]
 
 
+def test_a_part_may_be_asked_for_after_the_pool_has_closed(tmp_path: Path) -> None:
+    expected = pictures(count=2)
+    path = written(tmp_path / "m.mkv", expected, slices="9")
+    with ThreadPoolExecutor(2) as pool:
+        found = list(open_movie(path).on_demand(pool))
+    for picture, whole in zip(found, expected, strict=True):
+        picture.ask(0, 0, 3, 3)
+        np.testing.assert_array_equal(picture.part(0, 0, SHAPE[1] - 1, SHAPE[0] - 1), whole)
+
+
 def test_a_range_of_frames_begins_where_it_is_asked_to(tmp_path: Path) -> None:
     expected = pictures()
     path = written(tmp_path / "m.mkv", expected, slices="4")
