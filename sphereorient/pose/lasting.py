@@ -14,10 +14,8 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import Residuals, by_pose
 from sphereorient.so3 import solve_damped
 
-FEWEST_FRAMES = 3  # from which it is seen what stays
 TILES = 4  # along each axis of the disk: errors of light are wide
 WHOLE = 0.98  # coverage of a pixel that the limb does not cut: the limb has tiles of its own
-ASIDE_PX = 0.004  # by how much the model's limb and paint may lie aside, where no more is known
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,16 +44,10 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     """Estimate the errors that B poses share from the fits of B * C disks, those of `use` (B, C) bool.
     One turn and move of all poses, with the light of each camera and the place and width of its limb, are fitted to all
     frames but for one tile of one camera's disk: by how much that changes them from tile to tile. What is wrong in a
-    place of every picture shows, and what light or limb could take of it. With fewer than `FEWEST_FRAMES` frames only
-    `ASIDE_PX` is known.
+    place of every picture shows, and what light or limb could take of it; of few frames their noise as well.
     Source: the jackknife over clusters, CR3 of Bell and McCaffrey 2002.
     """
     cameras = use.shape[1]
-    if len(use) < FEWEST_FRAMES:
-        distance_mm = (fit.position_lab_mm.repeat_interleave(cameras, 0) - pixels.origin[..., 0]).norm(dim=-1)
-        aside_mm = ASIDE_PX * float((pixels.pitch_mm + pixels.pitch_rad * distance_mm).min())
-        aside = torch.tensor([1 / model.radius_mm] * 3 + [1.0] * 3, dtype=torch.float64) * aside_mm
-        return Lasting(covariance=aside.square().diag(), own_rad2=aside[:3].square().diag().expand(cameras, 3, 3))
     at = settled(pixels, fit, model, cameras)
     normal, right, ridge = _by_tile(at, at.weight / at.variance * use.reshape(-1, 1), cameras)
     others = normal.shape[-1] - 6

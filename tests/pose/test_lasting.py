@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 import torch
-from refine_examples import RADIUS_MM, balls, cut, fitted, model_of, noisy, pictures_of, rig_of
+from refine_examples import balls, cut, fitted, model_of, noisy, pictures_of, rig_of
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine, trace
-from sphereorient.pose.lasting import ASIDE_PX, FEWEST_FRAMES, Lasting, _of_left_out, lasting_errors
+from sphereorient.pose.lasting import Lasting, _of_left_out, lasting_errors
 
 COUNT, SIGMA = 24, 4.0
 LOBE, LOBE_AT, LOBE_WIDTH = 60.0, (0.45, -0.3), 0.2  # grey levels; radii along the camera's x and y
@@ -43,8 +42,7 @@ def measured(count: int, lobe: float) -> tuple[Tensor, FittedPoses, Lasting]:
 def test_of_noise_alone_little_lasts():
     _, fit, found = measured(COUNT, 0.0)
     frame = trace(fit.covariance[:, :3, :3]).mean()
-    aside = 3 * (ASIDE_PX * RIG.px_mm / RADIUS_MM) ** 2
-    assert trace(found.covariance[:3, :3]) - aside < 0.1 * frame
+    assert trace(found.covariance[:3, :3]) < 0.2 * frame
     assert bool((torch.linalg.eigvalsh(found.covariance) > 0).all())
     assert found.own_rad2.shape == (2, 3, 3)
 
@@ -58,14 +56,12 @@ def test_what_a_reflection_does_to_all_poses_is_stated():
     assert 0.3 < float((distance2 / 6).sqrt()) < 3.0
 
 
-def test_of_few_frames_only_the_limb_is_known_to_be_uncertain():
-    found = measured(FEWEST_FRAMES - 1, LOBE)[2]
-    sigma_mm = found.covariance.diagonal()[3:].sqrt()
-    assert float(sigma_mm.max()) == pytest.approx(ASIDE_PX * RIG.px_mm, rel=0.05)
-    assert float(found.covariance[0, 0].sqrt()) == pytest.approx(float(sigma_mm[0]) / RADIUS_MM, rel=1e-6)
-    alone = found.of(1)
+def test_of_one_frame_more_may_last_than_of_many():
+    one, many = (measured(count, LOBE)[2] for count in (1, COUNT))
+    assert trace(one.covariance[:3, :3]) > trace(many.covariance[:3, :3])
+    alone = many.of(1)
     assert alone.own_rad2.shape == (1, 3, 3)
-    assert torch.equal(alone.covariance[:3, :3], found.own_rad2[1])
+    assert torch.equal(alone.covariance[:3, :3], many.own_rad2[1])
 
 
 def test_leaving_out_is_fitting_again():
