@@ -42,7 +42,7 @@ def measured(count: int, lobe: float) -> tuple[Tensor, FittedPoses, Lasting]:
 def test_of_noise_alone_little_lasts():
     _, fit, found = measured(COUNT, 0.0)
     frame = trace(fit.covariance[:, :3, :3]).mean()
-    assert trace(found.covariance[:3, :3]) < 0.2 * frame
+    assert trace(found.covariance[:3, :3]) < 0.1 * frame
     assert bool((torch.linalg.eigvalsh(found.covariance) > 0).all())
     assert found.own_rad2.shape == (2, 3, 3)
 
