@@ -162,6 +162,24 @@ def test_gloss_is_found_where_it_is_planted():
     assert float(brightest @ (WINDOW / WINDOW.norm())) > 0.97  # 14 degrees
 
 
+def test_flicker_of_each_frame_bends_no_light():
+    rig, pixels, X, R, model = pictures()
+    view = sphere_view(pixels, X.repeat_interleave(2, 0), R.repeat_interleave(2, 0), model)
+    beside = (1 - view.coverage) * pixels.behind
+    own = torch.tensor([0.1, 0.06, 0.06]) * torch.randn(24, 3, generator=torch.Generator().manual_seed(1))
+    even, across, down = own.unbind(1)
+    flicker = even[:, None] + across[:, None] * view.across[:, 0] + down[:, None] * view.across[:, 1]
+    pixels = replace(pixels, grey=(pixels.grey - beside) * (1 + flicker) + beside)
+    use = torch.ones(12, 2, dtype=torch.bool)
+    fit = fitted(rig, "patches", pixels, X, R, SIGMA, shading=FIRST)
+    light = learn_lab_light(pixels, fit, use, replace(model, light=learn_light(pixels, fit, use, model), shading=LATER))
+    _, pixels, X, R, model = pictures(6, 2, 9)
+    view = sphere_view(pixels, X.repeat_interleave(2, 0), R.repeat_interleave(2, 0), model)
+    within = view.aside < 0.95
+    for got, expected in zip(light.at(view, pixels), planted(2).at(view, pixels), strict=True):
+        assert (got - expected)[within].square().mean().sqrt() < 0.04 * expected[within].mean()
+
+
 def test_it_explains_other_frames_better_than_maps_of_each_disk():
     light, fit = learnt()
     _, pixels, X, R, model = pictures(6, 2, 9)
