@@ -467,23 +467,19 @@ def _without_worn(
     if worn_share(worn_cells(pixels, fit, use, fitter.model(fitter.optics.fine))) < WORN_SEEN:
         return fitter, fit, None
 
-    def found(
-        pixels: Pixels, fit: FittedPoses, use: Tensor, whole: bool = False
-    ) -> tuple[Fitter, FittedPoses, Tensor | None]:
+    def found(pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses, Tensor | None]:
         now, worn = fitter, None
         for changed in WORN_ROUNDS:  # worn paint bends the light and the poses that it is found with
-            if not whole:
-                worn = worn_cells(pixels, fit, use, now.model(now.optics.fine), changed)
-                paint = without(fitter.optics.fine.paint, worn)  # blurred already
-                optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views))
-                now = replace(now, optics=optics)
-            now, fit = _with_light(now, pixels, fit, use)
+            worn = worn_cells(pixels, fit, use, now.model(now.optics.fine), changed)
+            paint = without(fitter.optics.fine.paint, worn)  # blurred already
+            optics = Optics(paint, fitter.optics.blur_px, widest_px(fitter.views))
+            now, fit = _with_light(replace(now, optics=optics), pixels, fit, use)
         return now, fit, worn
 
     every, middle = torch.arange(len(use)), len(use) // 2
     halves = [some_of(rows, pixels, fit, use) for rows in (every[:middle], every[middle:])]
     gain = [
-        found(*half, whole=True)[0].left(*held) - found(*half)[0].left(*held) for half, held in permutations(halves, 2)
+        _with_light(fitter, *half)[0].left(*held) - found(*half)[0].left(*held) for half, held in permutations(halves, 2)
     ]
     if sum(gain) / 2 < WORN_GAIN:
         return fitter, fit, None

@@ -191,11 +191,11 @@ class Fitter:
         maps_leave = self.with_light_of(*learning).left(*held)
         # What leaves more half-way does not get there; of a glossy ball before one camera it leaves 2 % less, then 5 %.
         for light, more in zip(lab_lights(*learning, self.model(fine)), (0.0, MORE_EXPLAINED), strict=True):
-            if replace(self, light=light).left(*held) > maps_leave - more:
+            lit = replace(self, light=light)
+            if lit.left(*held) > maps_leave - more:
                 return self, fit
-        lit = self
         for _ in range(4):  # the poses, too, were found with the maps
-            lit = replace(self, light=learn_lab_light(pixels, fit, use, self.model(fine)))
+            lit = replace(lit, light=learn_lab_light(pixels, fit, use, lit.model(fine)))
             fit = lit.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
         return lit, fit
 

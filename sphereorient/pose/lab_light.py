@@ -40,7 +40,7 @@ SIDE = 256  # cells per axis of a look-up map
 BASIS_SIDE = 128  # the same of the harmonics that light is learnt with: 20 MB
 DEPTHS = 1024  # entries of the look-up of the cover's functions
 GRID = 360  # rows of latitude from which the look-up maps are interpolated: half a degree
-ROUNDS = 10  # of Gauss-Newton, from an even light
+ROUNDS, AGAIN = 10, 3  # of Gauss-Newton from an even light, from one of the lab
 # Standard deviations known beforehand. Of harmonics of degree l, over 1 + l, in units of white less black paint:
 LEVEL, SLOPES, GLOSS = 3.0, 0.2, 0.03  # the mean, all others, those of the mirrored light
 THROUGH, FACE = 0.2, 0.1  # of the cover's two functions at a knot
@@ -145,13 +145,14 @@ def harmonics(direction: Tensor, degree: int) -> Tensor:
     """
     x, y, z = direction.double().cpu().numpy().reshape(-1, 3).T
     polar, place = np.unique(np.arccos(np.clip(z, -1.0, 1.0)).round(14), return_inverse=True)  # maps repeat them
-    along = math.sqrt(8.0 * math.pi) * sph_legendre_p_all(degree, degree, polar)[0][..., place]
+    along = math.sqrt(8.0 * math.pi) * sph_legendre_p_all(degree, degree, polar)[0]
     turn = np.arange(degree + 1)[:, None] * np.arctan2(y, x)
     cos, sin = np.cos(turn), np.sin(turn)
     columns = []
     for n in range(degree + 1):
-        columns += [along[n, m] * sin[m] for m in range(n, 0, -1)]
-        columns += [along[n, 0] / math.sqrt(2.0), *(along[n, m] * cos[m] for m in range(1, n + 1))]
+        here = along[n, : n + 1][:, place]
+        columns += [here[m] * sin[m] for m in range(n, 0, -1)]
+        columns += [here[0] / math.sqrt(2.0), *(here[m] * cos[m] for m in range(1, n + 1))]
     return torch.from_numpy(np.stack(columns, axis=-1)).reshape(*direction.shape[:-1], len(columns))
 
 
@@ -182,7 +183,9 @@ def _cells(coefficients: Tensor, degree: int) -> Tensor:
 
 
 def learn_lab_light(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> LabLight:
-    """Estimate light and noise from the fits of B * C disks, those of `use` (B, C) bool, the model's light known."""
+    """Estimate light and noise from the fits of B * C disks, those of `use` (B, C) bool, the model's light known: from
+    there where it is a light of the lab, else from an even one.
+    """
     *_, light = lab_lights(pixels, fit, use, model)
     return light
 
@@ -195,13 +198,15 @@ def lab_lights(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel
     cameras, used = use.shape[1], use.reshape(-1, 1)
     at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
     bases = _bases(at.view, pixels)
-    light = _flat(model.light, at.view, pixels, use)
-    light = replace(light, stray=learn_stray(at, pixels, use, model.light.stray))
-    for done in range(1, ROUNDS + 1):
+    start = model.light
+    rounds = AGAIN if isinstance(start, LabLight) else ROUNDS
+    light = start if isinstance(start, LabLight) else _flat(start, at.view, pixels, use)
+    light = replace(light, stray=learn_stray(at, pixels, use, start.stray))
+    for done in range(1, rounds + 1):
         light = _better(light, at.view, pixels, (at.weight / at.variance).where(used, 0.0), bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
         at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, state, model, cameras)
-        if done in (ROUNDS // 2, ROUNDS):
+        if done in (rounds // 2, rounds):
             counted = at.inside & ~pixels.clipped & used
             yield replace(light, noise=noise_curves(at.model, at.residual, counted, cameras))
 
