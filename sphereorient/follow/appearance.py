@@ -186,7 +186,7 @@ def estimate_appearance(
     if moved is not None:
         pixels, use = fitter.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
         fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=False)
-    fitter, fit = fitter.lit_in_the_lab(pixels, fit, use)
+    fitter, fit, rivals = fitter.lit_in_the_lab(pixels, fit, use)
     whole = fitter.exposed(whole, None if moved is None else moved.nan_to_num())
     free = fitter.unoccluded(whole, fit.position_lab_mm, fit.R_lab_body).thinned(thin)
     hidden = 1.0 - free.inside.sum(-1) / pixels.inside.sum(-1).clamp_min(1)
@@ -194,7 +194,7 @@ def estimate_appearance(
         fitter = replace(fitter, most_hidden=0.0)
     elif bool(hidden.any()):  # what covers the ball bends light and poses
         fitter = fitter.lit_again(free, fit, use)
-        fit = fitter.fit(free, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
+        fit = fitter.again(free, fit, use)
     still = fitter if moved is None else replace(fitter, optics=blurred, instants=1)
     widest = WIDER * float(fitter.largest_px(fit.position_lab_mm).max())
     right = float(fit.score[use].median())
@@ -207,17 +207,18 @@ def estimate_appearance(
     score_min = 0.5 * (right + min(highest, right))
     if defocus_radii(fitter.optics.blur_px, diameter_px):  # wrong poses explain nearly as much, and right ones scatter
         score_min = min(score_min, _clear_of(right))
-    rivals = sum(count > 1 for count in side_by_side(first.claimants, frames))
+    # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
+    lasting = lasting_errors(pixels, fit, use, fitter.model(fitter.optics.fine))
+    claimed = sum(count > 1 for count in side_by_side(first.claimants, frames))
     return Appearance(
         fitter=fitter,
         still=still,
-        # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
-        lasting=lasting_errors(pixels, fit, use, fitter.model(fitter.optics.fine)),
+        lasting=lasting if rivals is None else lasting.widened(*rivals),
         score_min=score_min,
         right_score=right,
         usual_apart_rad=_usual_apart(fit, use),
         together=together,
-        second_ball=rivals >= max(2, RIVALS * len(frames)),
+        second_ball=claimed >= max(2, RIVALS * len(frames)),
         worn=worn,
     )
 
@@ -453,7 +454,7 @@ def _light_and_blur(
 
 def _with_light(fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses]:
     fitter = fitter.with_light_of(pixels, fit, use)
-    return fitter, fitter.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fitter.optics.fine, 3)
+    return fitter, fitter.again(pixels, fit, use)
 
 
 def _without_worn(
@@ -479,7 +480,8 @@ def _without_worn(
     every, middle = torch.arange(len(use)), len(use) // 2
     halves = [some_of(rows, pixels, fit, use) for rows in (every[:middle], every[middle:])]
     gain = [
-        _with_light(fitter, *half)[0].left(*held) - found(*half)[0].left(*held) for half, held in permutations(halves, 2)
+        _with_light(fitter, *half)[0].left(*held) - found(*half)[0].left(*held)
+        for half, held in permutations(halves, 2)
     ]
     if sum(gain) / 2 < WORN_GAIN:
         return fitter, fit, None

@@ -107,6 +107,7 @@ class PyramidLevel:
 
 
 Steps = Sequence[tuple[PyramidLevel, int, int]]  # of a fit: level, every n-th pixel, iterations
+Rivals = tuple[FittedPoses, FittedPoses, Tensor] | None  # fits of the same pictures by two models, and `use` (B, C)
 
 
 class Optics:
@@ -178,26 +179,28 @@ class Fitter:
         """Return a fitter with the light and the noise of fitted pictures; see `learn_light`."""
         return replace(self, light=learn_light(pixels, fit, use, self.model(self.optics.fine)))
 
-    def lit_in_the_lab(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple["Fitter", FittedPoses]:
+    def lit_in_the_lab(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple["Fitter", FittedPoses, Rivals]:
         """Return a fitter with one light in the lab for all cameras, and its fit, if maps of the disks explain less.
         Both are learnt from every other row of `use` (B, C); what counts is what they leave in the rows between.
+        Return the fits of these rows by both where neither explains clearly more.
         """
         fine = self.optics.fine
         if len(use) < FEWEST_LIT:
-            return self, fit
+            return self, fit, None
 
         every = torch.arange(len(use))
         learning, held = (some_of(rows, pixels, fit, use) for rows in (every[::2], every[1::2]))
-        maps_leave = self.with_light_of(*learning).left(*held)
+        maps, lit = self.with_light_of(*learning), self
         # What leaves more half-way does not get there; of a glossy ball before one camera it leaves 2 % less, then 5 %.
         for light, more in zip(lab_lights(*learning, self.model(fine)), (0.0, MORE_EXPLAINED), strict=True):
             lit = replace(self, light=light)
-            if lit.left(*held) > maps_leave - more:
-                return self, fit
+            gain = maps.left(*held) - lit.left(*held)
+            if gain < more:
+                return self, fit, (maps.again(*held), lit.again(*held), held[2]) if gain > -MORE_EXPLAINED else None
         for _ in range(4):  # the poses, too, were found with the maps
             lit = replace(lit, light=learn_lab_light(pixels, fit, use, lit.model(fine)))
-            fit = lit.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, fine, 3)
-        return lit, fit
+            fit = lit.again(pixels, fit, use)
+        return lit, fit, None
 
     def lit_again(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> "Fitter":
         """Return a fitter whose light, of the same kind, and noise are learnt anew from fitted pictures."""
@@ -301,6 +304,10 @@ class Fitter:
         )
         there, begin = moved_to(self.device, pixels), moved_to(self.device, begin)
         return moved_to(CPU, refine(there, begin, self.model(level), iterations, most_hidden))
+
+    def again(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> FittedPoses:
+        """Refine fitted poses in all detail, once the model is another."""
+        return self.fit(pixels, fit.position_lab_mm, fit.R_lab_body, use, self.optics.fine, 3)
 
     def fit_through(
         self,

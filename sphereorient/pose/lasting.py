@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.pose.fit import RIDGE, FittedPoses, light_columns, settled
 from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
@@ -39,6 +40,14 @@ class Lasting:
         covariance[:3, :3] = own
         return Lasting(covariance=covariance, own_rad2=own[None])
 
+    def widened(self, one: FittedPoses, other: FittedPoses, use: Tensor) -> "Lasting":
+        """Return errors that hold the mean difference of B poses by two models, `use` (B, C), that explain as much."""
+        turn = so3.log(other.R_lab_body @ one.R_lab_body.mT)
+        way = torch.cat([turn, other.position_lab_mm - one.position_lab_mm], dim=1)
+        seen = use.to(turn.dtype)[..., None]
+        alone = (seen * (turn[:, None] + other.own_turn - one.own_turn)).sum(0) / seen.sum(0).clamp_min(1)
+        return Lasting(covariance=_holding(self.covariance, way.mean(0)), own_rad2=_holding(self.own_rad2, alone))
+
 
 def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> Lasting:
     """Estimate the errors that B poses share from the fits of B * C disks, those of `use` (B, C) bool.
@@ -63,6 +72,12 @@ def lasting_errors(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereM
     pulled = (place[:, None] @ right[..., None])[..., 0].flatten(0, 1)
     together = _of_left_out(joined, pulled, (place @ ridge @ place.mT).sum(0))[:6, :6]
     return Lasting(covariance=together, own_rad2=own)
+
+
+def _holding(covariance: Tensor, difference: Tensor) -> Tensor:
+    """Widen covariances (..., n, n) until differences (..., n) are one standard deviation; those that are less stay."""
+    size = (difference * solve_damped(covariance, difference)).sum(-1)[..., None, None]
+    return covariance + (1 - 1 / size.clamp_min(1)) * difference[..., :, None] * difference[..., None, :]
 
 
 def _by_tile(at: Residuals, precision: Tensor, cameras: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -25,7 +26,9 @@ from refine_examples import (
 )
 from torch import Tensor
 
+from sphereorient import so3
 from sphereorient.locate import CameraScene
+from sphereorient.pose import fitter
 from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
 from sphereorient.pose.fitter import CameraView, Fitter, first_fitter
 from sphereorient.pose.lab_light import (
@@ -318,7 +321,8 @@ def test_a_light_that_both_cameras_see_is_learnt_in_the_lab():
     first = fitter_of(rig)
     fit = first.fit(pixels, X, R, use, first.optics.fine, 4)
     maps = first.with_light_of(pixels, fit, use)
-    lit, again = maps.lit_in_the_lab(pixels, fit, use)
+    lit, again, rivals = maps.lit_in_the_lab(pixels, fit, use)
+    assert rivals is None
     assert isinstance(lit.light, LabLight)
     assert again.score.mean() > maps.fit(pixels, X, R, use, first.optics.fine, 3).score.mean()
 
@@ -334,7 +338,24 @@ def test_lamps_that_only_one_camera_sees_stay_maps_of_the_disk():
     first = fitter_of(rig)
     fit = first.fit(pixels, X, R, use, first.optics.fine, 4)
     maps = first.with_light_of(pixels, fit, use)
-    assert maps.lit_in_the_lab(pixels, fit, use) == (maps, fit)
+    assert maps.lit_in_the_lab(pixels, fit, use)[:2] == (maps, fit)
+
+
+def test_two_lights_that_explain_as_much_are_both_told(monkeypatch):
+    rig, pixels, X, R, _ = pictures()
+    use = torch.ones(12, 2, dtype=torch.bool)
+    first = fitter_of(rig)
+    fit = first.fit(pixels, X, R, use, first.optics.fine, 4)
+    maps = first.with_light_of(pixels, fit, use)
+    monkeypatch.setattr(fitter, "MORE_EXPLAINED", math.inf)  # neither explains clearly more
+    lit, kept, rivals = maps.lit_in_the_lab(pixels, fit, use)
+    assert lit is maps
+    assert kept is fit
+    one, other, held = rivals
+    assert held.shape == (6, 2)
+    assert not one.R_lab_body.equal(other.R_lab_body)
+    off = [so3.geodesic_distance(part.R_lab_body, R[1::2]).max() for part in (one, other)]
+    assert max(off) < 0.01
 
 
 def test_few_poses_stay_with_maps():

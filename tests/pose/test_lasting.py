@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import torch
+from conftest import assert_close
 from refine_examples import balls, cut, fitted, model_of, noisy, pictures_of, rig_of
 from torch import Tensor
 
@@ -17,6 +19,7 @@ LOBE, LOBE_AT, LOBE_WIDTH = 60.0, (0.45, -0.3), 0.2  # grey levels; radii along 
 RIG = rig_of()
 
 
+@cache
 def measured(count: int, lobe: float) -> tuple[Tensor, FittedPoses, Lasting]:
     """Errors (B, 6), rad and mm, of fits to pictures with a reflection that no model knows, and what lasts of them."""
     X, R = balls(count, 4)
@@ -77,3 +80,29 @@ def test_leaving_out_is_fitting_again():
 
     moved = torch.stack([fitted_without(k) - fitted_without(5) for k in (0, 1, 2, 4)])
     torch.testing.assert_close(found, 0.75 * moved.mT @ moved, rtol=1e-6, atol=0.0)
+
+
+def test_what_two_models_differ_in_is_within_one_sigma():
+    _, fit, found = measured(COUNT, 0.0)
+    use = torch.ones(COUNT, 2, dtype=torch.bool)
+    use[::2, 1] = False  # whatever a camera that is not in use says counts for nothing
+    more = torch.tensor([[3e-3, 0.0, 0.0], [0.0, -2e-3, 0.0]], dtype=torch.float64)
+    own = torch.where(use[..., None], fit.own_turn + more, torch.nan_to_num(torch.full((), torch.inf)))
+    for turn_rad, moved_mm in ((1e-3, 0.02), (1e-7, 1e-6)):
+        turn = torch.tensor([turn_rad, -turn_rad, 0.0], dtype=torch.float64)
+        move = torch.tensor([0.0, moved_mm, 0.0], dtype=torch.float64)
+        other = replace(
+            fit,
+            R_lab_body=so3.exp(turn) @ fit.R_lab_body,
+            position_lab_mm=fit.position_lab_mm + move,
+            own_turn=own - turn,
+        )
+        wide = found.widened(fit, other, use)
+        way = torch.cat([turn, move])
+        if turn_rad < 1e-6:  # less than what lasts anyway
+            assert wide.covariance.equal(found.covariance)
+            continue
+        assert_close(way @ torch.linalg.solve(wide.covariance, way), torch.ones((), dtype=torch.float64), atol=1e-4)
+        for camera in range(2):
+            distance2 = more[camera] @ torch.linalg.solve(wide.own_rad2[camera], more[camera])
+            assert_close(distance2, torch.ones((), dtype=torch.float64), atol=1e-4)
