@@ -18,7 +18,7 @@ class RefineSettings(BaseModel, frozen=True, extra="forbid"):
     )
     candidates: int = Field(4, ge=1, description="proposals of each camera that are fitted where nothing is known")
     chunk_frames: int = Field(
-        32, ge=2, description="frames between full searches; chunks begin at its multiples, each independent"
+        64, ge=2, description="frames between full searches; chunks begin at its multiples, each independent"
     )
     chunks: int = Field(
         4, ge=1, description="chunks followed side by side, one batch; more suit a GPU; memory holds all frames"

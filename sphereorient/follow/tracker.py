@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.files.threads import side_by_side
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.fixed_centre import FixedCentre
 from sphereorient.follow.initialise import Initialiser, explaining_first
@@ -178,9 +179,11 @@ class ChunkTracker:
             X, spread = self.centre.position_lab_mm, self.centre.spread_mm2
             ahead = {n: replace(pose, position_lab_mm=X, place_spread=spread) for n, pose in ahead.items()}
         followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
+        lost = [chunk.first for chunk in chunks if followed.get(chunk.first) is None]
+        followed |= zip(lost, side_by_side(self._search, [frames[n] for n in lost]), strict=True)
         for chunk in chunks:
-            poses = followed.get(chunk.first)
-            poses = self._search(frames[chunk.first]) if poses is None else poses
+            poses = followed[chunk.first]
+            assert poses is not None  # a search returns one that may be empty
             yield poses if self.centre is None else replace(poses, covariance=self.centre.with_error(poses.covariance))
 
     def _follow(self, expected: Sequence[_Expected], shots: Sequence[Sequence[Frame]]) -> list[Poses | None]:

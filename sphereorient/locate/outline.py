@@ -156,17 +156,20 @@ def _circles_through(p: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _support(circles: NDArray[np.float64], edges: _Edges, tolerance: float) -> NDArray[np.float64]:
     """Count directions with an edge on the circle, less half of those with one just outside: the rim is outermost."""
-    away = edges.point[None] - circles[:, None, :2]
-    distance = np.linalg.norm(away, axis=2)
-    radial = -(away * edges.inward[None]).sum(2) / np.maximum(distance, 1e-9) > 0.8
+    across, down = (edges.point[:, k] - circles[:, k : k + 1] for k in (0, 1))
+    distance = np.sqrt(across**2 + down**2)
     offset = distance - circles[:, 2:3]
-    direction = ((np.arctan2(away[..., 1], away[..., 0]) + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
-    on = radial & (np.abs(offset) < tolerance)
-    beyond = radial & (offset >= tolerance) & (offset < 0.25 * circles[:, 2:3])
-    row = np.arange(len(circles))[:, None] * DIRECTIONS + direction
+    # Most edges lie far from most circles.
+    near = (offset > -tolerance) & (offset < np.maximum(0.25 * circles[:, 2:3], tolerance))
+    circle, edge = np.nonzero(near)
+    across, down, distance, offset = (part[near] for part in (across, down, distance, offset))
+    inward = edges.inward[edge]
+    radial = -(across * inward[:, 0] + down * inward[:, 1]) / np.maximum(distance, 1e-9) > 0.8
+    direction = ((np.arctan2(down, across) + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
+    row = circle * DIRECTIONS + direction
     counted = [
-        np.bincount(row[which], minlength=len(circles) * DIRECTIONS).reshape(-1, DIRECTIONS) > 0
-        for which in (on, beyond)
+        np.bincount(row[radial & which], minlength=len(circles) * DIRECTIONS).reshape(-1, DIRECTIONS) > 0
+        for which in (offset < tolerance, (offset >= tolerance) & (offset < 0.25 * circles[circle, 2]))
     ]
     return np.asarray(counted[0].sum(1) - 0.5 * counted[1].sum(1), np.float64)
 
