@@ -34,6 +34,7 @@ def _stationary() -> Floats:
 
 STATIONARY = _stationary()  # (ORDER, ORDER), per pole
 _DENSITY = 2 * np.pi / np.exp(betaln(0.5, ORDER - 0.5))  # of the white noise that sustains w of unit variance
+_AT, _WEIGHT = leggauss(NODES)
 _FACTORIAL = np.array([math.factorial(k) for k in range(ORDER)], dtype=np.float64)
 
 
@@ -57,8 +58,7 @@ def integral(tau: Floats) -> Floats:
 
 def nodes(step: Floats) -> tuple[Floats, Floats]:
     """Return Gauss's instants within steps and their weights, (M, NODES) each, in the unit of `step` (M,)."""
-    at, weight = leggauss(NODES)
-    return 0.5 * step[:, None] * (1 + at), 0.5 * step[:, None] * weight
+    return 0.5 * step[:, None] * (1 + _AT), 0.5 * step[:, None] * _WEIGHT
 
 
 @dataclass(frozen=True, kw_only=True)
