@@ -18,7 +18,7 @@ from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.poses import Poses, best_poses, pose_table, poses_of
 from sphereorient.follow.settings import RefineSettings
 from sphereorient.locate import Frame
-from sphereorient.pose.blur import best_blur_px
+from sphereorient.pose.blur import FINER, FINEST, best_blur_px
 from sphereorient.pose.fit import FittedPoses, trace
 from sphereorient.pose.fitter import (
     FEWEST_LIT,
@@ -441,10 +441,10 @@ def _light_and_blur(
     diameter_px = widest_px(fitter.views)
     fitter, fit = _with_light(fitter, pixels, fit, use)
     soft = defocus_radii(fitter.optics.blur_px, diameter_px) > 0  # there each round moves it by little
-    for _ in range(1 if given else BLUR_ROUNDS):
+    for done in range(1 if given else BLUR_ROUNDS):
         before_px = fitter.optics.blur_px
         if not given:
-            blur_px = best_blur_px(fitter, base, pixels, fit, use)
+            blur_px = best_blur_px(fitter, base, pixels, fit, use, FINEST if done else FINER)
             fitter = replace(fitter, optics=Optics(base, blur_px, diameter_px))
         fitter, fit = _with_light(fitter, pixels, fit, use)
         if not soft and abs(fitter.optics.blur_px / before_px - 1) < BLUR_STAYS:

@@ -20,7 +20,7 @@ CALM_PX = 1.0  # blur that is laid over pictures first, against noise
 AROUND = 1.2  # of the radius: the sphere and its rim
 CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and scene lie
 STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
-FINER = 1.25  # ratio of the blurs that are tried, from FINEST_PX on
+FINER, FINEST = 1.25, 1.07  # ratio of the blurs that are tried, at first and once it is nearly known
 WIDEST = 0.3  # of the radius: wider ones remove all paint
 
 
@@ -60,24 +60,27 @@ def steepest_blur_px(picture: NDArray[np.float32]) -> float:
     return float(np.sqrt(max(blur**2 - CALM_PX**2, 0.0)))
 
 
-def best_blur_px(fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor) -> float:
-    """Return the blur that leaves the least variance unexplained, interpolated between the tried ones."""
-    radius_px = widest_px(fitter.views) / 2
-    steps = math.log(max(WIDEST * radius_px / FINEST_PX, FINER**7)) / math.log(FINER)
-    blurs = [FINEST_PX * FINER**k for k in range(math.ceil(steps) + 1)]
+def best_blur_px(
+    fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor, ratio: float = FINER
+) -> float:
+    """Return the blur that leaves the least variance unexplained, interpolated between tried ones, `ratio` apart."""
+    radius_px, now_px = widest_px(fitter.views) / 2, fitter.optics.blur_px
+    most_px = max(WIDEST * radius_px, FINEST_PX * FINER**7)
+    fewest, most = (math.log(end / now_px) / math.log(ratio) for end in (FINEST_PX, most_px))
+    fewest, most = math.ceil(fewest), math.floor(most)
 
     @cache
     def unexplained(k: int) -> float:
-        return fitter.left(pixels, fit, use, level_of(base, blurs[k], 0.0, radius_px), 2)
+        return fitter.left(pixels, fit, use, level_of(base, now_px * ratio**k, 0.0, radius_px), 2)
 
-    # Downhill from the first guess: each table of the paint costs a tenth of a second.
-    best, k = min(range(len(blurs)), key=lambda k: abs(blurs[k] - fitter.optics.blur_px)), -1
+    # Downhill from the blur that is known: each table of the paint costs a tenth of a second.
+    best, k = min(max(0, fewest), most), None
     while best != k:
         k = best
-        best = min((n for n in (k - 1, k, k + 1) if 0 <= n < len(blurs)), key=unexplained)
-    if k in (0, len(blurs) - 1):
-        return blurs[k]
+        best = min((n for n in (k - 1, k, k + 1) if fewest <= n <= most), key=unexplained)
+    if k in (fewest, most):
+        return now_px * ratio**k
     below, here, above = (unexplained(n) for n in (k - 1, k, k + 1))
     bend = below - 2 * here + above
     shift = 0.5 * (below - above) / bend if bend > 0 else 0.0
-    return float(blurs[k] * FINER**shift)
+    return float(now_px * ratio ** (k + shift))
