@@ -13,8 +13,9 @@ from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.cameras import Camera, PinholeCamera, TsaiCamera
-from sphereorient.locate import Background
+from sphereorient.locate import Background, CameraScene
 from sphereorient.pose.fit import FittedPoses, PoseStart, refine
+from sphereorient.pose.fitter import CameraView, Fitter, first_fitter
 from sphereorient.pose.model import LATER, Light, Shading, SphereModel
 from sphereorient.pose.pixels import LinesOfSight, Pixels, cut_pixels, disk_stencil, stacked
 from sphereorient.sphere import Sampling, SphereRenderer
@@ -170,3 +171,12 @@ def moved(X: Tensor, distance_mm: float, seed: int) -> Tensor:
 def turn_errors(fit: FittedPoses, R: Tensor) -> Tensor:
     """delta of R = exp(delta) R_fitted, (B, 3), rad, lab."""
     return so3.log(R @ fit.R_lab_body.mT)
+
+
+def fitter_of(rig: Rig, blur_px: float = BLUR_PX) -> Fitter:
+    """A fitter of the rig's cameras that knows no light, and guesses the blur."""
+    views = []
+    for k, camera in enumerate(rig.cameras):
+        scene = CameraScene(background=scene_of(np.full((120, 120), BEHIND, np.float32)), diameter_px=rig.diameter_px)
+        views.append(CameraView.of(f"cam{k + 1}", camera, scene))
+    return first_fitter(views, RADIUS_MM, base_of("patches"), blur_px)

@@ -8,9 +8,10 @@ import pytest
 import torch
 from grey_examples import camera_disks, grey_search_of
 from orient_examples import attitudes, texture_of
+from refine_examples import BLUR_PX, balls, base_of, cut, fitter_of, noisy, pictures_of, rig_of
 
 from sphereorient import so3
-from sphereorient.pose.blur import steepest_blur_px
+from sphereorient.pose.blur import FINER, FINEST, best_blur_px, steepest_blur_px
 from sphereorient.pose.fitter import defocus_radii
 from sphereorient.search import GreySearch, GreySearchSettings
 
@@ -34,6 +35,17 @@ def test_the_blur_of_an_edge_is_read_off_its_slope(blur_px, noise):
 
 def test_a_picture_of_one_grey_is_not_divided_by_nothing():
     assert np.isfinite(steepest_blur_px(np.full((40, 40), 7.0, np.float32)))
+
+
+def test_the_blur_of_the_pictures_is_found_to_a_percent():
+    rig, (X, R) = rig_of(), balls(4, 3)
+    pixels, use = cut(rig, noisy(pictures_of(rig, "patches", X, R), 2.0, 5), X), torch.ones(4, 2, dtype=torch.bool)
+    fitter = fitter_of(rig, 1.6 * BLUR_PX)
+    for ratio in (FINER, FINEST):
+        fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 3)
+        found = best_blur_px(fitter, base_of("patches"), pixels, fit, use, ratio)
+        fitter = fitter_of(rig, found)
+    assert found == pytest.approx(BLUR_PX, rel=0.015)
 
 
 def test_only_pictures_that_are_blurred_by_much_are_soft():

@@ -6,31 +6,24 @@ import math
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
 import pytest
 import torch
 from conftest import assert_close
 from refine_examples import (
-    BEHIND,
-    BLUR_PX,
-    RADIUS_MM,
     Rig,
     balls,
-    base_of,
     cut,
     fitted,
+    fitter_of,
     flat_light,
     model_of,
     rig_of,
-    scene_of,
 )
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.locate import CameraScene
 from sphereorient.pose import fitter
 from sphereorient.pose.fit import FittedPoses, PoseStart, learn_light, refine
-from sphereorient.pose.fitter import CameraView, Fitter, first_fitter
 from sphereorient.pose.lab_light import (
     KNOTS,
     LAB_PARTS,
@@ -305,14 +298,6 @@ def test_normals_look_at_the_camera_and_mirrored_rays_leave_the_sphere():
 
 
 # --- which light
-
-
-def fitter_of(rig: Rig) -> Fitter:
-    views = []
-    for k, camera in enumerate(rig.cameras):
-        scene = CameraScene(background=scene_of(np.full((120, 120), BEHIND, np.float32)), diameter_px=rig.diameter_px)
-        views.append(CameraView.of(f"cam{k + 1}", camera, scene))
-    return first_fitter(views, RADIUS_MM, base_of("patches"), BLUR_PX)
 
 
 def test_a_light_that_both_cameras_see_is_learnt_in_the_lab():
