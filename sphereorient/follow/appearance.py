@@ -182,7 +182,7 @@ def estimate_appearance(
             fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=given)
     blurred, moved = fitter.optics, None
     if following is not None and looked is found:
-        fitter, moved = _exposed(fitter, fit, use, _clear(found), following)
+        fitter, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, _clear(found), following)
     if moved is not None:
         pixels, use = fitter.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
         fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=False)
@@ -351,22 +351,38 @@ def _in_view(fitter: Fitter, position_lab_mm: Tensor) -> bool:
 
 
 def _exposed(
-    fitter: Fitter, fit: FittedPoses, use: Tensor, rows: Sequence[int], following: Following
+    search: Initialiser, paint: TextureTable, fit: FittedPoses, use: Tensor, rows: Sequence[int], following: Following
 ) -> tuple[Fitter, Tensor | None]:
-    """Return a fitter that renders as many instants of the exposure as B poses need, and their turn and move (B, 6)
-    while the shutter is open, NaN where it is not known; None, and the same fitter, where it hardly blurs the pictures.
+    """Return a fitter that renders as many instants of the exposure as B poses need, with the blur that is left of the
+    `paint`, and their turn and move (B, 6) while the shutter is open, NaN where it is not known; None, and the same
+    fitter, where it hardly blurs the pictures.
     """
+    fitter = search.fitter
 
     def measured(some: Tensor) -> Tensor:
         shots = following.shots([rows[k] for k in some.tolist()])
         usable = torch.tensor([[shot.usable for shot in frame] for frame in shots])
-        pictures = [[shot.picture for shot in frame] for frame in shots]
-        X, R, seen = fit.position_lab_mm[some], fit.R_lab_body[some], use[some]
-        there = fitter.fit_through(fitter.optics.steps, pictures, X, R, seen & usable)
-        right = ((1 - there.score <= CLEAR * (1 - fit.score[some])) | ~seen).all(1) & (usable | ~seen).all(1)
-        way = torch.cat([so3.log(there.R_lab_body @ R.mT), there.position_lab_mm - X], dim=-1)
+        before, seen = fit.of(some), use[some]
         share = following.open_share[[rows[k] for k in some.tolist()]]
-        return torch.where(right[:, None], share[:, None] * way, torch.nan)
+
+        def from_poses(these: Tensor, X: Tensor, R: Tensor) -> Tensor:
+            pictures = [[shot.picture for shot in shots[k]] for k in these.tolist()]
+            known, shown, was = seen[these], usable[these], before.of(these)
+            there = fitter.fit_through(fitter.optics.steps, pictures, X, R, known & shown)
+            right = ((1 - there.score <= CLEAR * (1 - was.score)) | ~known).all(1) & (shown | ~known).all(1)
+            turn = so3.log(there.R_lab_body @ was.R_lab_body.mT)
+            way = torch.cat([turn, there.position_lab_mm - was.position_lab_mm], dim=-1)
+            return torch.where(right[:, None], share[these, None] * way, torch.nan)
+
+        way = from_poses(torch.arange(len(some)), before.position_lab_mm, before.R_lab_body)
+        # Of a ball that turns far between frames the next pose has to be searched for.
+        lost = [k for k in torch.nonzero(way.isnan().any(1))[:, 0].tolist() if bool(usable[k].all())]
+        found = dict(zip(lost, search.all_poses([shots[k] for k in lost]), strict=True))
+        again = torch.tensor([k for k in lost if len(found[k])], dtype=torch.int64)
+        if len(again):
+            X, R, _ = best_poses([found[k] for k in again.tolist()])
+            way[again] = from_poses(again, X, R)
+        return way
 
     def smear_px(some: Tensor, moved: Tensor) -> Tensor:
         return (
@@ -389,7 +405,8 @@ def _exposed(
     # What is left of the blur once the motion is taken out sets how far apart instants may be.
     left_px = math.sqrt(max(blur_px**2 - float(width_px.square().nanmean()) / 12, FINEST_PX**2))
     instants = 1 + math.ceil(float(width_px.nanquantile(0.9)) / (APART_BLURS * left_px))
-    return replace(fitter, instants=min(max(2, instants), MOST_INSTANTS)), moved
+    optics = Optics(paint, left_px, widest_px(fitter.views))
+    return replace(fitter, optics=optics, instants=min(max(2, instants), MOST_INSTANTS)), moved
 
 
 def _scores(found: Sequence[Poses]) -> tuple[float, float]:
