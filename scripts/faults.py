@@ -38,8 +38,8 @@ BLOCK = 16  # frames; short, so that a short movie has blocks without the fault
 RATE = 600.0
 CAMERAS = ("cam1", "cam2")
 Pictures = dict[str, NDArray[np.uint8]]
+SAME_MM = 1e-6  # of positions: where they are in the exposure follows the smoothed path
 # Orientations follow the path of all positions, and stated errors the disagreement of the cameras in the whole movie.
-SAME_MM = 1e-6
 SEEN = ("score", "centre_px", "orientation", "orientation_cov")
 
 

@@ -497,8 +497,7 @@ def _without_worn(
     every, middle = torch.arange(len(use)), len(use) // 2
     halves = [some_of(rows, pixels, fit, use) for rows in (every[:middle], every[middle:])]
     gain = [
-        _with_light(fitter, *half)[0].left(*held) - found(*half)[0].left(*held)
-        for half, held in permutations(halves, 2)
+        fitter.with_light_of(*half).left(*held) - found(*half)[0].left(*held) for half, held in permutations(halves, 2)
     ]
     if sum(gain) / 2 < WORN_GAIN:
         return fitter, fit, None

@@ -31,8 +31,8 @@ from sphereorient.mapping.pairs import attitude_change_rad
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.fit import POSE_PARTS, FittedPoses, light_columns, light_sums, noise_curves, solved_light
 from sphereorient.pose.fitter import FIRST_BLUR_PX, CameraView, Fitter, Optics, unknown_light, widest_px
-from sphereorient.pose.lab_light import LabLight, learn_lab_light
-from sphereorient.pose.model import Light, Lighting, light_basis, no_stray
+from sphereorient.pose.lab_light import LabLight
+from sphereorient.pose.model import Light, light_basis, no_stray
 from sphereorient.pose.pixels import Pixels
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import texture_table
@@ -244,10 +244,10 @@ def _lit_in_the_lab(state: State) -> State:
     pixels = state.disks(rows)
     fit = fitter.fit(pixels, X, R, use, fitter.optics.fine, 1)
     if isinstance(fitter.light, LabLight):  # known to be better
-        light: Lighting = learn_lab_light(pixels, fit, use, fitter.model(fitter.optics.fine))
+        lit = fitter.lit_again(pixels, fit, use)
     else:
-        light = fitter.lit_in_the_lab(pixels, fit, use)[0].light
-    return replace(state, fitter=replace(state.fitter, light=light))
+        lit = fitter.lit_in_the_lab(pixels, fit, use)[0]
+    return replace(state, fitter=replace(state.fitter, light=lit.light))
 
 
 def _rescaled(state: State) -> State:

@@ -61,7 +61,7 @@ def steepest_blur_px(picture: NDArray[np.float32]) -> float:
 
 
 def best_blur_px(
-    fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor, ratio: float = FINER
+    fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor, ratio: float
 ) -> float:
     """Return the blur that leaves the least variance unexplained, interpolated between tried ones, `ratio` apart."""
     radius_px, now_px = widest_px(fitter.views) / 2, fitter.optics.blur_px

@@ -198,10 +198,11 @@ def lab_lights(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel
     cameras, used = use.shape[1], use.reshape(-1, 1)
     at = residuals(pixels, fit.position_lab_mm, fit.R_lab_body, None, model, cameras)
     bases = _bases(at.view, pixels)
-    start = model.light
-    rounds = AGAIN if isinstance(start, LabLight) else ROUNDS
-    light = start if isinstance(start, LabLight) else _flat(start, at.view, pixels, use)
-    light = replace(light, stray=learn_stray(at, pixels, use, start.stray))
+    if isinstance(model.light, LabLight):
+        light, rounds = model.light, AGAIN
+    else:
+        light, rounds = _flat(model.light, at.view, pixels, use), ROUNDS
+    light = replace(light, stray=learn_stray(at, pixels, use, light.stray))
     for done in range(1, rounds + 1):
         light = _better(light, at.view, pixels, (at.weight / at.variance).where(used, 0.0), bases)
         state, model = (at.model, at.weight), replace(model, light=light, shading=LATER)
