@@ -271,7 +271,7 @@ def test_every_command_of_a_page_exists_with_its_options_and_settings(page):
             command = command.commands[words.pop(0)]
         options = {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
         assert {word for word in words if word.startswith("-")} <= options, line
-        changed = [value for option, value in pairwise(words) if option == "--set"]
+        changed = [value for option, value in pairwise(words) if option == "--set" and command.name != "init"]
         load = {"synth": load_synth_settings, "train": load_proposer_settings}.get(command.name, load_settings)
         load(None, changed)
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, FiniteFloat, PositiveInt, StrictInt
 from torch import Tensor
 
 from sphereorient import so3
-from sphereorient.calibration.targets import CalibrationTarget, plate_from_entry
+from sphereorient.calibration.targets import CalibrationTarget, missing_keys, plate_from_entry
 from sphereorient.cameras import Port
 from sphereorient.cameras.checks import camera_error, check_known, named
 from sphereorient.cameras.io.cameras_yaml import Entry, PortEntry
@@ -88,7 +88,10 @@ class CalibrationDocument:
 def load_calibration(path: Path | str) -> CalibrationDocument:
     """Read calibration.yaml, without its pictures and tables; CameraError if missing, malformed or incomplete."""
     path = Path(path)
-    keys = validated(CalibrationKeys, read_document(path, SCHEMA, CameraError), str(path), CameraError)
+    do = "write one with `sphereorient init --plate FOLDER`, or correct the path"
+    document = read_document(path, SCHEMA, CameraError, do)
+    missing = [f"plate.{key}" for key in missing_keys(document.get("plate"))]
+    keys = validated(CalibrationKeys, document, str(path), CameraError, missing)
     if bool(keys.pictures) == bool(keys.points):
         got, do = ("both" if keys.points else "neither"), "name pictures of a plate, or tables of points"
         raise camera_error(f"{path}, pictures, points", "one of them", got, do)

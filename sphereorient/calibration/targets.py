@@ -195,6 +195,14 @@ def target_keys(kind: Kind) -> dict[str, tuple[str, bool]]:
     return {_key(one.name): (one.name, one.default is MISSING) for one in fields(kind)}
 
 
+def missing_keys(entry: Any) -> list[str]:
+    """Return the keys that the parsed `plate` of calibration.yaml needs and has not; none for an unknown type."""
+    kind = entry.get("type") if isinstance(entry, Mapping) else None
+    if not isinstance(kind, str) or kind not in KINDS:
+        return []
+    return [key for key, (_, needed) in target_keys(KINDS[kind]).items() if needed and key not in entry]
+
+
 def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> CalibrationTarget:
     """Build the target from the parsed `plate` of calibration.yaml; CameraError, naming the key, if impossible."""
     kind = entry.get("type") if isinstance(entry, Mapping) else None
@@ -202,7 +210,7 @@ def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> Calib
         expected, got = f"a mapping with `type` one of {', '.join(KINDS)}", entry if kind is None else kind
         raise _refused(name, expected, got, "write the type of the plate")
     keys = target_keys(KINDS[kind])
-    missing = [key for key, (_, needed) in keys.items() if needed and key not in entry]
+    missing = missing_keys(entry)
     unknown = [str(key)[:40] for key in entry if key != "type" and key not in keys][:5]
     if missing or unknown:
         faults = {"no": missing, "unknown": unknown}

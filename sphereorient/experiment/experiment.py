@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field, FiniteFloat, StrictBool
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
 from sphereorient.errors import ExperimentError, MovieError, refusal
 from sphereorient.files.yaml_file import read_document, refuse_unknown, validated, write_document
-from sphereorient.movies import Movie, flipped, movie_files, open_movie
+from sphereorient.movies import Movie, flipped, is_movie, movie_files, open_movie
 from sphereorient.sphere import seen_path
 
 SCHEMA = "sphereorient-experiment/1"
@@ -103,8 +103,13 @@ def load_experiment(path: Path | str) -> Experiment:
         CameraError: missing or malformed cameras file.
     """
     path = Path(path)
-    document = read_document(path, SCHEMA, ExperimentError)
-    keys = validated(ExperimentKeys, document, str(path), ExperimentError)
+    if is_movie(path):
+        do = f"write its experiment.yaml first: `sphereorient init {path}`"
+        raise ExperimentError(refusal(str(path), expected="an experiment.yaml", got="a movie", do=do))
+    do = "write one with `sphereorient init MOVIE`, or correct the path"
+    document = read_document(path, SCHEMA, ExperimentError, do)
+    untimed = () if {"frame_rate", "times"} & document.keys() else ("frame_rate or times",)
+    keys = validated(ExperimentKeys, document, str(path), ExperimentError, untimed)
     for key in ("masks", "backgrounds", "start", "flip"):
         for name in getattr(keys, key):
             if name not in keys.movies:

@@ -2,7 +2,7 @@
 
 import difflib
 import unicodedata
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -26,9 +26,13 @@ UNSEEN = frozenset({"Cc", "Cs", "Zl", "Zp"})
 FAULTS = (yaml.YAMLError, ValueError, OverflowError)  # a date that does not exist is a ValueError, 1:1:...:1.5 the last
 
 
-def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> dict[str, Any]:
-    """Read a YAML mapping whose key `schema` must be `schema`, without this key; raise `error` for anything else."""
-    document = read_yaml(path, error)
+def read_document(
+    path: Path, schema: str, error: type[SphereOrientError], do: str = "correct the path"
+) -> dict[str, Any]:
+    """Read a YAML mapping whose key `schema` must be `schema`, without this key; raise `error` for anything else.
+    `do`: what to do where there is no such file.
+    """
+    document = read_yaml(path, error, do)
     if not isinstance(document, dict):
         got = "an empty file" if document is None else short(document)
         raise error(refusal(str(path), expected="keys and values", got=got, do=f"begin with 'schema: {schema}'"))
@@ -39,21 +43,25 @@ def read_document(path: Path, schema: str, error: type[SphereOrientError]) -> di
     return document
 
 
-def read_yaml(path: Path, error: type[SphereOrientError]) -> Any:
+def read_yaml(path: Path, error: type[SphereOrientError], do: str = "correct the path") -> Any:
     """Read a YAML file of plain values, UTF-8, at most TEXT_BYTES; None if empty; raise `error` for anything else."""
-    text = read_text(path, TEXT_BYTES, "a YAML file", error, "correct the path")
+    text = read_text(path, TEXT_BYTES, "a YAML file", error, do)
     try:
         return parse_yaml(text)
     except FAULTS as fault:
         raise error(refusal(str(path), expected="YAML", got=yaml_words(fault), do="correct the file there")) from fault
 
 
-def validated(model: type[Model], data: Any, where: str, error: type[SphereOrientError]) -> Model:
-    """Validate YAML data against a model that forbids extra keys; raise `error` with the first fault and `where`."""
+def validated(
+    model: type[Model], data: Any, where: str, error: type[SphereOrientError], also: Sequence[str] = ()
+) -> Model:
+    """Validate YAML data against a model that forbids extra keys; raise `error` with the first fault and `where`.
+    All missing keys are told at once; `also`: those that the caller misses.
+    """
     try:
         return model.model_validate(data)
     except ValidationError as fault:
-        raise error(_worded(fault, model, where)) from None
+        raise error(_worded(fault, model, where, also)) from None
 
 
 def refuse_unknown(key: object, known: Iterable[str], where: str) -> str:
@@ -153,7 +161,7 @@ class _BoundedLoader(yaml.SafeLoader):
             raise ComposerError(None, None, problem, at.start_mark)
 
 
-def _worded(fault: ValidationError, model: type[BaseModel], where: str) -> str:
+def _worded(fault: ValidationError, model: type[BaseModel], where: str, also: Sequence[str]) -> str:
     # An unknown key first: it is often a missing one, mistyped.
     first = min(fault.errors(include_url=False), key=lambda error: error["type"] != "extra_forbidden")
     place, kind, message = first["loc"], first["type"], first["msg"]
@@ -161,6 +169,10 @@ def _worded(fault: ValidationError, model: type[BaseModel], where: str) -> str:
     if kind == "extra_forbidden":
         return refuse_unknown(place[-1], known_keys(model, place[:-1]), ", ".join([where, *map(str, place[:-1])]))
     if kind == "missing":
+        missing = [".".join(map(str, one["loc"])) for one in fault.errors() if one["type"] == "missing"]
+        missing = [*also, *missing]
+        if len(missing) > 1:
+            return refusal(where, expected="all needed keys", got=f"no {', '.join(missing)}", do="add them")
         return refusal(name, expected="a value", got="none", do="add the key")
     expected = message.removeprefix("Value error, ").removeprefix("Input should be ")
     expected = expected[:1].lower() + expected[1:]

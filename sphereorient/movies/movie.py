@@ -48,6 +48,7 @@ class Movie:
     frame_shape: tuple[int, int]  # (H, W)
     dtype: np.dtype[Any]  # uint8, or uint16 where the file holds more than 8 bits; values are not rescaled
     times_s: NDArray[np.float64] | None = None  # (N,), s, exact time stamps of the file; None: none, or rounded (MKV)
+    played_hz: float | None = None  # rate at which players show it; that of the recording only of an ordinary camera
     remarks: tuple[str, ...] = ()  # warnings for the user: truncated, colour converted to grey, lossy codec
 
     def __init__(self, path: Path, form: str, count: int, frame_shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
@@ -126,7 +127,7 @@ class FlippedMovie(Movie):
 
     def __init__(self, movie: Movie, how: str) -> None:
         super().__init__(movie.path, movie.format, len(movie), movie.frame_shape, movie.dtype)
-        self.times_s = movie.times_s
+        self.times_s, self.played_hz = movie.times_s, movie.played_hz
         self.remarks = (*movie.remarks, f"flipped on reading: {how}")
         self._movie, self._how = movie, how
 

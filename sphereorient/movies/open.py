@@ -44,6 +44,11 @@ def open_movie(path: Path | str) -> Movie:
     return reader(path)
 
 
+def is_movie(path: Path) -> bool:
+    """Return whether a file is a movie by the suffix of its name."""
+    return path.suffix.lower() in READERS and _is(path, Path.is_file)
+
+
 def movie_files(path: Path | str) -> list[Path]:
     """Return the files of a movie: one, or the pictures of a sequence (MovieError without any)."""
     path = Path(path)

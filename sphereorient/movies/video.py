@@ -37,6 +37,8 @@ class VideoMovie(Movie):
             self._pixels = frame.format.name
             codec = container.streams.video[0].codec_context
             form = f"{path.suffix[1:].lower()}, codec {codec.name} ({_loss(codec)}), pixels {self._pixels}"
+            rate = container.streams.video[0].average_rate
+            self.played_hz = float(rate) if rate else None
         self._checked = False  # whether the packets carry check sums that can be verified
         with _opened(path) as container:
             self._index, broken = self._read_index(container)

@@ -59,7 +59,7 @@ def preflight(
         # Threads: decoding, outlines and products release the interpreter.
         experiment = recording.experiment
         image, unseen = None, None
-        if experiment.texture_path is not None:
+        if experiment.texture_path is not None and experiment.texture_path.exists():
             image, unseen = load_texture(experiment.texture_path), load_unseen(experiment.texture_path)
         sizes, wrong_sizes = _expected_sizes(experiment, settings)
         progress("frames", 0, len(recording.streams))
@@ -134,7 +134,10 @@ def _outline_findings(seen: Preflight) -> Iterator[Finding]:
 
 def _texture_findings(seen: Preflight) -> Iterator[Finding]:
     if seen.measures is None or seen.similar is None:
-        yield warning("paint", "no map is given", "give sphere.texture, the map of the paint, to measure orientations")
+        path = seen.experiment.texture_path
+        measured = "no texture map is given" if path is None else f"no texture map yet: {path.name} is not there"
+        do = f"learn it: sphereorient map {seen.experiment.path} --out {path or seen.experiment.folder / 'texture.png'}"
+        yield warning("paint", measured, do if path else f"{do}; then write it under sphere: as texture:")
         return
     radii = [float(sample.sightings.radius_px.nanmedian()) for sample in seen.samples]
     default = seen.samples[0].diameter_px / 2

@@ -2,6 +2,7 @@
 
 import math
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from sphereorient.movies import Movie
 from sphereorient.movies.survey import Survey, SurveyedFrame
 from sphereorient.preflight import Finding, Preflight, Severity
 from sphereorient.preflight.cameras import REACH, expected_outline_px, sample_gaps
+from sphereorient.preflight.first_look import FirstLook
 from sphereorient.preflight.sample import MovieSample
 from sphereorient.report.plots.style import AXIS_COLOURS, in_style, new_figure, write_figure
 
@@ -28,6 +30,7 @@ COLUMNS, TITLE, HEAD = 6, 0.27, 0.8  # of a contact sheet: frames in a row; the 
 PICTURE, LINE = 3.3, 0.165  # of a check: a row of pictures, a line of text
 BRIGHT_QUANTILE = 0.999  # of the pixels: shown white, so that a few glints do not darken the rest
 SHOWN = 3  # pictures of each camera
+NEAR = 1.4  # of the radius: half the side of a picture of the ball alone
 CHARACTERS = 145  # in a line of the list
 
 
@@ -135,6 +138,31 @@ def _draw_histogram(ax: Any, missed: NDArray[np.float64], rms_px: float) -> None
     ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.set_title(f"all pictures: rms {rms_px:.3f} px", fontsize=9)
     ax.legend()
+
+
+@in_style
+def first_look_figure(looks: Sequence[FirstLook], path: Path) -> None:
+    """Draw a frame of each movie with the ball that was found, whole and near; into a PNG or PDF."""
+    figure = new_figure(2.6 * PICTURE, PICTURE * len(looks) + 0.3)
+    for look, (whole, near) in zip(looks, figure.subplots(len(looks), 2, squeeze=False), strict=True):
+        for ax in (whole, near):
+            ax.set(xticks=[], yticks=[])
+            ax.imshow(look.picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(look.picture, 99.8))))
+        if look.outline is None:
+            near.set_axis_off()
+            whole.set_title(f"{look.name}: no ball was found", fontsize=9)
+            continue
+        outline = look.outline
+        angle = np.linspace(0, 2 * np.pi, 181)
+        u, v = outline.u_px + outline.radius_px * np.cos(angle), outline.v_px + outline.radius_px * np.sin(angle)
+        for ax in (whole, near):
+            ax.plot(u, v, lw=1.4, color=FOUND)
+        reach = NEAR * outline.radius_px
+        near.set(xlim=(outline.u_px - reach, outline.u_px + reach), ylim=(outline.v_px + reach, outline.v_px - reach))
+        where = "stays in its place" if look.stays else f"moves; found in {look.found} of {look.looked} frames"
+        whole.set_title(f"{look.name}, {Path(look.movie.path).name}: the ball {where}", fontsize=9)
+        near.set_title(f"outline found, {2 * outline.radius_px:.1f} px across", fontsize=9)
+    write_figure(figure, path, dpi=110)
 
 
 def preflight_figure(result: Preflight, path: Path) -> None:

@@ -19,13 +19,14 @@ SPLINE_TEXELS = 2  # reach of a cubic spline beyond the map's edges
 WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}  # grey level of white paint
 
 
-def load_texture(path: Path) -> Tensor:
+def load_texture(path: Path | str) -> Tensor:
     """Read an 8 or 16 bit equirectangular map (docs/conventions.md), (H, 2 H) float32, 0 black .. 1 white.
 
     Raises:
         TextureError: missing, not a picture, not 2:1, smaller than 16 x 8, or of one grey.
     """
-    name, do = f"texture {path}", "correct sphere.texture in the experiment"
+    path = Path(path)
+    name, do = f"texture {path}", "learn it with `sphereorient map`, or correct the path"
     content = read_whole(path, PICTURE_BYTES, "a picture file", TextureError, do)
 
     def refused(expected: str, got: str, do: str) -> TextureError:

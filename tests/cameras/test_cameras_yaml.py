@@ -112,7 +112,10 @@ FAULTS = {
     "model of another": (TSAI.replace("tsai", "fisheye"), "expected one of tsai, pinhole, .*, got 'fisheye'"),
     "model as a list": (TSAI.replace("tsai", "[tsai]"), "model: expected one of tsai, pinhole"),
     "no model": (TSAI.replace("    model: tsai\n", ""), "cam1, model: expected one of tsai, pinhole, .* got none"),
-    "half a port": (TSAI + "    port: {normal: [0, 0, -1], offset: 120.0}\n", "cam1, port.thickness: expected a value"),
+    "half a port": (
+        TSAI + "    port: {normal: [0, 0, -1], offset: 120.0}\n",
+        "cam1: expected all needed keys, got no port.thickness, port.n_glass, port.n_fluid",
+    ),
     "unknown key of a port": (TSAI + PORT.replace("n_fluid", "n_liquid"), "cam1, port: .* write 'n_fluid' instead"),
     "wall the wrong way round": (TSAI + PORT.replace("-1]", "1]"), "cam1, port: expected a camera before the wall, .*"),
     "long normal": (TSAI + PORT.replace("-1]", "-2]"), "cam1, port, normal: expected a vector of length 1, got 2"),

@@ -22,6 +22,7 @@ SCHEMA = "sphereorient-cameras/1"
 KEYS = ("cameras", "covariance")
 MOST = 100  # cameras of a file
 Triple = tuple[float, float, float]
+IN_ITS_OWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0)  # frame: R and T
 HOLDS: dict[int, Any] = {0: float, 2: tuple[float, float], 3: Triple}  # by the number of a key's parts
 
 # To add a model: one file with the camera, one name here.
@@ -68,8 +69,8 @@ class CameraEntry(Entry):
 
     model: str
     image_size: tuple[int, int]
-    R: tuple[Triple, Triple, Triple]
-    T: Triple
+    R: tuple[Triple, Triple, Triple] | None = None  # None, with T: the only camera, whose frame is the lab
+    T: Triple | None = None
     port: PortEntry | None = None
     covariance: CovarianceEntry | None = None
 
@@ -97,7 +98,7 @@ def load_cameras(path: Path | str) -> dict[str, Camera]:
         CameraError: missing, not YAML, another schema, an unknown key or model, or an impossible parameter.
     """
     path = Path(path)
-    document = read_document(path, SCHEMA, CameraError)
+    document = read_document(path, SCHEMA, CameraError, "write it with `sphereorient calibrate`, or correct the path")
     check_known(document, KEYS, str(path))
     entries = document.get("cameras")
     if not isinstance(entries, dict) or not entries:
@@ -106,7 +107,8 @@ def load_cameras(path: Path | str) -> dict[str, Camera]:
     if len(entries) > MOST:
         do = "write those of one experiment"
         raise camera_error(f"{path}, cameras", f"at most {MOST} cameras", f"{len(entries)}", do)
-    return {str(name): _build(entry, f"{path}, {name}") for name, entry in entries.items()}
+    alone = len(entries) == 1
+    return {str(name): _build(entry, f"{path}, {name}", alone) for name, entry in entries.items()}
 
 
 def load_covariance(path: Path | str, cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
@@ -142,7 +144,7 @@ def save_cameras(
     write_document(Path(path), SCHEMA, document | _covariance_keys(covariance), comment)
 
 
-def _build(entry: object, where: str) -> Camera:
+def _build(entry: object, where: str, alone: bool) -> Camera:
     if not isinstance(entry, Mapping):
         raise camera_error(where, "the keys of a camera", short(entry), "indent them below it")
     if "model" not in entry:
@@ -150,13 +152,18 @@ def _build(entry: object, where: str) -> Camera:
     if not isinstance(entry["model"], str) or entry["model"] not in MODELS:
         raise CameraError(refuse_unknown(entry["model"], MODELS, f"{where}, model"))
     checked = validated(ENTRIES[entry["model"]], entry, where, CameraError)
+    missing = [name for name in ("R", "T") if getattr(checked, name) is None]
+    if missing and not (alone and len(missing) == 2):
+        do = "write both, X_cam = R X_lab + T; a single camera whose frame is the lab's has neither"
+        raise camera_error(f"{where}, {' and '.join(missing)}", "the camera's pose in the lab", "none", do)
     with named(where):
         return _with_port_and_covariance(_in_air(MODELS[checked.model], checked), checked)
 
 
 def _in_air(kind: type[CameraModel], entry: CameraEntry) -> CameraModel:
     values = kind.completed(dict(entry))
-    fields: dict[str, Any] = {"image_size": entry.image_size, "R_cam_lab": entry.R, "T_cam_lab_mm": entry.T}
+    R, T = entry.R or IN_ITS_OWN[0], entry.T or IN_ITS_OWN[1]
+    fields: dict[str, Any] = {"image_size": entry.image_size, "R_cam_lab": R, "T_cam_lab_mm": T}
     for key in kind.KEYS:
         if key.place is None:
             fields[key.field] = values[key.name]

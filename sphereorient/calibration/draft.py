@@ -1,0 +1,208 @@
+"""The first calibration.yaml of a folder of plate pictures: dots counted, larger ones found, poses by their numbers."""
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sphereorient.calibration.dots import find_dots
+from sphereorient.calibration.lattice import LEAST_DOTS, find_lattice
+from sphereorient.calibration.targets import Ints
+from sphereorient.cameras.checks import camera_error
+from sphereorient.files.draft import DraftKey
+from sphereorient.files.picture import decoded_grey
+from sphereorient.files.threads import side_by_side
+
+Progress = Callable[[str, int, int], None]
+
+ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+NUMBERED = re.compile(r"^(?P<camera>.*?)[-_ ]*(?P<pose>\d+)$")
+LARGER = 1.25  # of the usual width: a larger dot
+CERTAIN = 30  # dots in a lattice: those of the other polarity need not be sought
+DIAMETERS = "plate.dot_diameter", "plate.fiducial_diameter"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlateSeen:
+    """The plate of dots in one picture."""
+
+    size: tuple[int, int]  # W, H px
+    columns: int  # dots along x, or the longer side where x is not known; 0: no lattice of dots
+    rows: int
+    dark: bool
+    width: float  # of a usual dot, in pitches; NaN: none
+    larger: float  # of a larger dot; NaN: none
+    marks: (
+        tuple[int, int] | None
+    )  # dots from the origin's to the larger ones on x and on y; None: not three larger ones
+
+
+def numbered_pictures(folder: Path) -> dict[int, dict[str, str]]:
+    """Return the pictures of a folder by pose, then camera: cam1_07.png is pose 7 of cam1; 07.png of the only one.
+    CameraError for a folder without such names.
+    """
+    poses: dict[int, dict[str, str]] = defaultdict(dict)
+    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in ENDINGS) if folder.is_dir() else []
+    for path in files:
+        found = NUMBERED.match(path.stem)
+        if found is not None:
+            poses[int(found["pose"])][found["camera"] or "cam1"] = path.name
+    if not poses:
+        got = f"{len(files)} pictures, none with a number" if files else "no pictures"
+        do = "name pictures by camera and pose: cam1_00.png, cam2_00.png, cam1_01.png"
+        raise camera_error(str(folder), "numbered pictures of the plate", got, do)
+    return {pose: dict(sorted(poses[pose].items())) for pose in sorted(poses)}
+
+
+def look_at_plate(path: Path) -> PlateSeen:
+    """Find the dots of a picture, dark or bright ones; CameraError where it cannot be decoded."""
+    picture = decoded_grey(path.read_bytes())
+    if picture is None:
+        raise camera_error(str(path), "a picture", "a file that cannot be decoded", "save it as PNG")
+    size = picture.shape[1], picture.shape[0]
+    best, dark = None, True
+    for polarity in (True, False):
+        lattice = find_lattice(find_dots(picture, dark=polarity))
+        if lattice is not None and len(lattice.index) > (LEAST_DOTS if best is None else len(best.index)):
+            best, dark = lattice, polarity
+        if best is not None and len(best.index) > CERTAIN:
+            break
+    if best is None:
+        nan = float("nan")
+        return PlateSeen(size=size, columns=0, rows=0, dark=dark, width=nan, larger=nan, marks=None)
+    usual = float(np.median(best.width))
+    large = best.width > LARGER * usual
+    extent = (np.ptp(best.index, axis=0) + 1).tolist()
+    axis, marks = _marks(best.index, best.index[large])
+    columns, rows = sorted(extent, reverse=True) if axis is None else (extent[axis], extent[1 - axis])
+    larger = float(np.median(best.width[large])) if large.any() else float("nan")
+    return PlateSeen(size=size, columns=columns, rows=rows, dark=dark, width=usual, larger=larger, marks=marks)
+
+
+def _marks(index: Ints, large: Ints) -> tuple[int | None, tuple[int, int] | None]:
+    """Return the axis of the lattice that is the plate's x, and the dots from the origin's to those on x and y.
+    The origin is the larger dot at which the other two make a right angle; from the front, y is left of x.
+    """
+    if len(large) != 3:
+        return None, None
+    for k in range(3):
+        first, second = np.delete(large, k, axis=0) - large[k]
+        if (first != 0).sum() != 1 or (second != 0).sum() != 1 or first @ second:
+            continue
+        x, y = (first, second) if first[0] * second[1] > first[1] * second[0] else (second, first)
+        return int(np.flatnonzero(x)[0]), (int(np.abs(x).max()), int(np.abs(y).max()))
+    return None, None
+
+
+def calibration_keys(
+    folder: Path, pictures: Mapping[int, Mapping[str, str]], where: str, progress: Progress
+) -> list[DraftKey]:
+    """Return the keys of calibration.yaml, measured in the pictures of `folder`; `where`: folder as the file names it.
+
+    Raises:
+        CameraError: a picture that cannot be read, pictures of several sizes, or no plate of dots in any.
+    """
+    paths = [folder / name for of_pose in pictures.values() for name in of_pose.values()]
+    seen: list[PlateSeen] = []
+    progress("plate", 0, len(paths))
+    for one in side_by_side(look_at_plate, paths):
+        seen.append(one)
+        progress("plate", len(seen), len(paths))
+    sizes = Counter(one.size for one in seen)
+    if len(sizes) > 1:
+        got = ", ".join(f"{count} of {w} x {h}" for (w, h), count in sizes.most_common())
+        do = "calibrate cameras of different sizes one by one, or leave foreign pictures out"
+        raise camera_error(str(folder), "pictures of one size, px", got, do)
+    with_dots = [one for one in seen if one.columns]
+    cameras = sorted({name for of_pose in pictures.values() for name in of_pose})
+    return [
+        DraftKey(name="image_size", value=list(seen[0].size), comment="W, H px, measured"),
+        DraftKey(name="pixel_pitch", comment="mm, of the sensor, across and down", example=[0.02, 0.02], asked=True),
+        DraftKey(name="model", value="tsai", comment="or pinhole, brown"),
+        *_plate_keys(with_dots, len(seen)),
+        DraftKey(name="surveyed.pose", value=min(pictures), comment="its plate defines the lab; any that was surveyed"),
+        DraftKey(
+            name="surveyed.R_lab_plate",
+            comment="the plate's x, y, z axes in the lab, as columns",
+            example=[[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+            asked=True,
+        ),
+        DraftKey(name="surveyed.T_lab_plate", comment="its origin in the lab, mm", example=[0, 0, 0], asked=True),
+        *(
+            DraftKey(
+                name=f"ports.{name}",
+                comment="behind a flat wall: see docs/calibration.md; leave it out in air",
+                example={"normal": [0, -1, 0], "offset": 120.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36},
+            )
+            for name in cameras
+        ),
+        DraftKey(
+            name="pictures",
+            value=[
+                {"pose": pose} | {name: f"{where}{file}" for name, file in of.items()} for pose, of in pictures.items()
+            ],
+            comment=f"{len(seen)} of {len(pictures)} poses, paired by number",
+        ),
+    ]
+
+
+def _plate_keys(seen: Sequence[PlateSeen], count: int) -> list[DraftKey]:
+    """Return the keys of a plate of dots, where any picture shows one; the pitch is what pictures cannot tell."""
+    if not seen:
+        example = {"type": "chessboard", "columns": 9, "rows": 6, "pitch": 10.0}
+        comment = f"no dots in any of {count} pictures: type, columns, rows, pitch (docs/calibration.md)"
+        return [DraftKey(name="plate", comment=comment, example=example, asked=True)]
+    columns, rows = max(one.columns for one in seen), max(one.rows for one in seen)
+    whole = sum((one.columns, one.rows) == (columns, rows) for one in seen)
+    marks = Counter(one.marks for one in seen if one.marks).most_common(1)
+    on_x, on_y = marks[0][0] if marks else (3, 2)
+    fiducials = [[0, 0], [on_x, 0], [0, on_y]]
+    told = f"of the largest grid seen, in {whole} of {len(seen)} pictures"
+    return [
+        DraftKey(name="plate.type", value="dots", comment="or chessboard, charuco, circles"),
+        DraftKey(name="plate.columns", value=columns, comment=told),
+        DraftKey(name="plate.rows", value=rows, comment=told),
+        DraftKey(name="plate.pitch", comment="mm, between the middles of dots", example=8.0, asked=True),
+        *(
+            DraftKey(name=name, comment=f"{share:.3f} of the pitch, measured; mm", example=round(8.0 * share, 2))
+            for name, share in zip(DIAMETERS, _widths(seen), strict=True)
+        ),
+        DraftKey(
+            name="plate.fiducials",
+            value=fiducials if marks else ...,
+            comment="larger dots at the middle of the grid, on +x, on +y: columns and rows from the first",
+            example=fiducials,
+            asked=True,
+        ),
+        DraftKey(
+            name="plate.dots",
+            value="dark" if 2 * sum(one.dark for one in seen) >= len(seen) else "bright",
+            comment="or bright, on a dark plate",
+        ),
+    ]
+
+
+def _widths(seen: Sequence[PlateSeen]) -> tuple[float, float]:
+    """Return the widths of a usual and of a larger dot, in pitches; NaN where none was seen."""
+    usual, larger = ([getattr(one, part) for one in seen] for part in ("width", "larger"))
+    return float(np.median(usual)), float(np.nanmedian(larger)) if np.isfinite(larger).any() else float("nan")
+
+
+def with_diameters(keys: Sequence[DraftKey]) -> list[DraftKey]:
+    """Return keys with the measured diameters of the dots in mm, once the pitch is known."""
+    known = {key.name: key.value for key in keys}
+    pitch, shares = (
+        known.get("plate.pitch"),
+        {key.name: float(key.comment.split()[0]) for key in keys if key.name in DIAMETERS},
+    )
+    if not isinstance(pitch, int | float):
+        return list(keys)
+    return [
+        replace(key, value=round(shares[key.name] * pitch, 4))
+        if key.name in shares and key.value is ... and np.isfinite(shares[key.name])
+        else key
+        for key in keys
+    ]

@@ -1,0 +1,242 @@
+"""`sphereorient init`: the first files of an experiment, from movies, plate pictures, or what FicTrac used."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sphereorient.cli.app import app, check_writable, echo_lines, progress_bar
+from sphereorient.cli.options import Quiet
+from sphereorient.errors import SettingsError, SphereOrientError, refusal
+from sphereorient.files.draft import DraftKey, draft_yaml, given, open_keys
+from sphereorient.files.whole_file import check_ending, write_text
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from sphereorient.experiment.draft import MovieFacts
+    from sphereorient.preflight.first_look import FirstLook
+
+YAML = (".yaml", ".yml")
+HEAD = "Made by `sphereorient init`. Remove # before the keys to use; paths are relative to this file."
+VFOV_DEG = 30.0  # of a camera of which nothing is known: its ball is far, and nearly the same for any field of view
+
+
+@app.command()
+def init(
+    movies: Annotated[
+        list[Path] | None, typer.Argument(metavar="[MOVIE] [MOVIE]", help="One or two movies of the ball.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="experiment.yaml here without it; calibration.yaml with --plate.")
+    ] = None,
+    plate: Annotated[Path | None, typer.Option(help="Folder of plate pictures: write calibration.yaml.")] = None,
+    from_fictrac: Annotated[
+        Path | None, typer.Option(help="config.txt of FicTrac: take over movie, field of view, masks, animal frame.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="A key's value, e.g. --set sphere.diameter=18; asked for at a terminal without it."),
+    ] = None,
+    vfov: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=179.0, help="Field of view of a single camera, top to bottom, degrees."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Look at movies or plate pictures, and write the first file: all keys explained, what can be measured measured."""
+    chosen = [source for source in (movies, plate, from_fictrac) if source]
+    if len(chosen) != 1:
+        got, do = f"{len(chosen)} of them", "name movies, or --plate FOLDER, or --from-fictrac config.txt"
+        raise SettingsError(refusal("init", expected="one source", got=got, do=do))
+    target = out or Path("calibration.yaml" if plate else "experiment.yaml")
+    check_ending(target, "--out", YAML)
+    check_writable(target)
+    if plate:
+        _calibration(plate, target, set_ or [], quiet)
+    elif from_fictrac:
+        _fictrac(from_fictrac, target, set_ or [], quiet)
+    else:
+        _experiment(movies or [], target, set_ or [], vfov, quiet)
+
+
+def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: float | None, quiet: bool) -> None:
+    from sphereorient.experiment.draft import MovieFacts, camera_keys, relative
+
+    if len(movies) > 2:
+        do = "name those of one ball; track other pairs as experiments of their own"
+        raise SettingsError(refusal("MOVIE", expected="one or two movies", got=f"{len(movies)}", do=do))
+    cameras = target.parent / "cameras.yaml"
+    alone = len(movies) == 1 and not cameras.exists()
+    looks = _looked(movies, target, quiet)
+    facts = [
+        MovieFacts(
+            camera=look.name,
+            movie=relative(Path(look.movie.path), target.parent),
+            frames=len(look.movie),
+            image_size=(look.movie.frame_shape[1], look.movie.frame_shape[0]),
+            rate_hz=look.rate_hz,
+            played_hz=look.movie.played_hz,
+            diameter_px=look.diameter_px,
+            stays=look.stays,
+        )
+        for look in looks
+    ]
+    missing = _write_experiment(facts, target, changes)
+    if alone:
+        known = vfov is not None
+        _write_cameras(cameras, camera_keys(facts[0], vfov or VFOV_DEG, known=known))
+    if quiet:
+        return
+    echo_lines(_found(look) for look in looks)
+    counts = {len(look.movie) for look in looks}
+    if len(counts) > 1:
+        typer.echo("The movies differ in length: whether they began together, `sphereorient check` measures.")
+    _end(target, missing, _next(target, cameras), [cameras] if alone else [])
+
+
+def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> None:
+    import cv2
+    import numpy as np
+
+    from sphereorient.experiment.draft import MovieFacts, camera_keys, relative
+    from sphereorient.experiment.fictrac import read_fictrac
+    from sphereorient.files.picture import write_picture
+    from sphereorient.movies import open_movie
+
+    said = read_fictrac(config)
+    mask, cameras = target.parent / "cam1_mask.png", target.parent / "cameras.yaml"
+    check_writable(cameras)
+    check_writable(mask)
+    height, width = open_movie(said.movie).frame_shape
+    shown = np.full((height, width), 255, np.uint8)
+    for polygon in said.ignored:
+        cv2.fillPoly(shown, [polygon], 0)
+    look = _looked([said.movie], target, quiet, shown > 0)[0]
+    if said.ignored:
+        write_picture(mask, shown)
+    facts = MovieFacts(
+        camera=look.name,
+        movie=relative(Path(look.movie.path), target.parent),
+        frames=len(look.movie),
+        image_size=(width, height),
+        rate_hz=look.rate_hz,
+        played_hz=look.movie.played_hz,
+        diameter_px=2 * said.circle_px[2] if said.circle_px else look.diameter_px,
+        stays=True,  # FicTrac follows no other balls
+        mask=mask.name if said.ignored else None,
+    )
+    rate_hz = said.rate_hz or (None if look.rate_hz else look.movie.played_hz)  # its cameras are ordinary ones
+    known = ["sphere.diameter=null", *([f"frame_rate={rate_hz}"] if rate_hz else [])]
+    missing = _write_experiment([facts], target, [*known, *changes])
+    R_cam_lab = said.R_animal_cam.mT.tolist()  # the lab is the animal's frame
+    _write_cameras(cameras, camera_keys(facts, said.vfov_deg, R_cam_lab, known=True))
+    if not quiet:
+        typer.echo(_found(look))
+        made = [cameras, mask] if said.ignored else [cameras]
+        _end(target, missing, _next(target, cameras), made)
+
+
+def _calibration(folder: Path, target: Path, changes: list[str], quiet: bool) -> None:
+    from sphereorient.calibration.document import SCHEMA
+    from sphereorient.calibration.draft import calibration_keys, numbered_pictures, with_diameters
+    from sphereorient.experiment.draft import relative
+
+    pictures = numbered_pictures(folder)
+    where = relative(folder, target.parent)
+    with progress_bar(quiet, unit="pictures") as advance:
+        keys = calibration_keys(folder, pictures, "" if where == "." else f"{where}/", advance)
+    keys = with_diameters(_asked(given(keys, changes)))
+    write_text(target, draft_yaml(SCHEMA, keys, HEAD))
+    if not quiet:
+        echo_lines(
+            f"{key.name}: {key.value} ({key.comment})" for key in keys if key.name in ("plate.columns", "plate.rows")
+        )
+        _end(target, open_keys(keys), [f"sphereorient calibrate {target} --out cameras.yaml"], [])
+
+
+def _looked(
+    movies: Sequence[Path], target: Path, quiet: bool, shown: "NDArray[np.bool_] | None" = None
+) -> "list[FirstLook]":
+    """Look at movies, and draw what was found beside the file to write; `shown` as in `look_at`."""
+    picture = target.with_suffix(".png")
+    check_writable(picture)
+    from sphereorient.preflight.first_look import look_at
+    from sphereorient.report.inputs import first_look_figure
+
+    with progress_bar(quiet, unit="movies") as advance:
+        looks = look_at(movies, advance, shown)
+    first_look_figure(looks, picture)
+    return looks
+
+
+def _write_experiment(facts: "Sequence[MovieFacts]", target: Path, changes: list[str]) -> list[DraftKey]:
+    """Write experiment.yaml; return the keys that are left to the user."""
+    from sphereorient.experiment.draft import experiment_keys
+    from sphereorient.experiment.experiment import SCHEMA
+
+    name = Path(target).resolve().parent.name
+    keys = _asked(given(experiment_keys(facts, name), changes))
+    write_text(target, draft_yaml(SCHEMA, keys, HEAD))
+    return open_keys(keys)
+
+
+def _write_cameras(path: Path, keys: list[DraftKey]) -> None:
+    from sphereorient.cameras.io.cameras_yaml import SCHEMA
+
+    check_writable(path)
+    write_text(path, draft_yaml(SCHEMA, keys, HEAD))
+
+
+def _asked(keys: list[DraftKey]) -> list[DraftKey]:
+    """Ask for the open keys at a terminal, each once; Enter leaves one open."""
+    if not sys.stdin.isatty():
+        return keys
+    for key in open_keys(keys):
+        while True:
+            answer = typer.prompt(f"{key.name}, {key.comment} (Enter: later)", default="", show_default=False)
+            try:
+                keys = given(keys, [f"{key.name}={answer}"] if answer.strip() else [])
+            except SphereOrientError as error:
+                typer.echo(str(error))
+                continue
+            break
+    return keys
+
+
+def _found(look: "FirstLook") -> str:
+    """Return what a movie shows, in a line."""
+    height, width = look.movie.frame_shape
+    told = f"{look.name}: {look.movie.path}, {len(look.movie)} frames of {width} x {height} px"
+    if look.rate_hz:
+        told += f", {look.rate_hz:.6g} Hz"
+    if look.diameter_px is None:
+        return f"{told}; no ball was found: light, or more than one thing that moves?"
+    where = "stays in its place" if look.stays else f"moves, found in {look.found} of {look.looked} frames"
+    return f"{told}; ball of {look.diameter_px:.0f} px, {where}"
+
+
+def _next(target: Path, cameras: Path) -> list[str]:
+    """Return the commands that come next."""
+    calibrate = [
+        "sphereorient init --plate FOLDER  # pictures of a calibration plate",
+        f"sphereorient calibrate calibration.yaml --out {cameras}",
+    ]
+    return [
+        *([] if cameras.exists() else calibrate),
+        f"sphereorient map {target} --out {target.parent / 'texture.png'}",
+        f"sphereorient check {target}",
+        f"sphereorient track {target} --out {target.parent / 'track.h5'}",
+        f"sphereorient report {target.parent / 'track.h5'} --experiment {target} --out {target.parent / 'report'}",
+    ]
+
+
+def _end(target: Path, missing: Sequence[DraftKey], after: Sequence[str], made: Sequence[Path]) -> None:
+    picture = target.with_suffix(".png")
+    typer.echo(f"Wrote {', '.join(map(str, [target, *made, *([picture] if picture.exists() else [])]))}")
+    for key in missing:
+        typer.echo(f"write in {target.name}: {key.name}, {key.comment}")
+    echo_lines(["next:", *(f"  {line}" for line in after)])

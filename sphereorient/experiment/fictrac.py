@@ -1,0 +1,78 @@
+"""config.txt of FicTrac, whose users film an animal on a ball."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sphereorient import so3
+from sphereorient.errors import ExperimentError, refusal
+from sphereorient.files.whole_file import TEXT_BYTES, read_text
+
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+DO = "name the config.txt with which FicTrac ran"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FicTracConfig:
+    """What a config.txt says of camera, ball and animal."""
+
+    movie: Path
+    rate_hz: float | None  # None: that of the file
+    vfov_deg: float  # field of view, from the top of the picture to its bottom
+    ignored: tuple[NDArray[np.int32], ...]  # polygons (n, 2), px, where something hides the ball
+    circle_px: tuple[float, float, float] | None  # u, v, radius of the circle through points of the limb
+    R_animal_cam: Tensor  # (3, 3): x ahead, y to the right, z down, of the animal
+
+
+def read_fictrac(path: Path) -> FicTracConfig:
+    """Read config.txt; ExperimentError for another file, or one without movie or field of view."""
+    lines = read_text(path, TEXT_BYTES, "a config.txt", ExperimentError, DO).splitlines()
+    pairs = (line.partition(":") for line in lines if ":" in line and not line.lstrip().startswith("#"))
+    values = {key.strip(): value.strip() for key, _, value in pairs}
+    for name, what in (("src_fn", "the movie"), ("vfov", "the camera's field of view, degrees")):
+        if not values.get(name):
+            raise ExperimentError(refusal(f"{path}, {name}", expected=what, got="none", do=DO))
+    vfov = _numbers(values["vfov"])
+    if len(vfov) != 1 or not 0 < vfov[0] < 180:
+        raise ExperimentError(
+            refusal(f"{path}, vfov", expected="degrees, 0 to 180", got=f"'{values['vfov'][:40]}'", do="correct it")
+        )
+    rate = _numbers(values.get("src_fps", ""))
+    turn = _numbers(values.get("c2a_r", "")) or [0.0, 0.0, 0.0]
+    if len(turn) != 3:
+        got = f"{len(turn)}"
+        raise ExperimentError(refusal(f"{path}, c2a_r", expected="three numbers, rad", got=got, do="correct it"))
+    limb = np.array(_numbers(values.get("roi_circ", "")))
+    return FicTracConfig(
+        movie=path.parent / values["src_fn"],
+        rate_hz=rate[0] if len(rate) == 1 and rate[0] > 0 else None,
+        vfov_deg=vfov[0],
+        ignored=tuple(_polygons(path, values.get("roi_ignr", ""))),
+        circle_px=_circle(limb.reshape(-1, 2)) if len(limb) >= 6 and len(limb) % 2 == 0 else None,
+        R_animal_cam=so3.exp(torch.tensor(turn, dtype=torch.float64)),
+    )
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(number) for number in re.findall(NUMBER, text)]
+
+
+def _polygons(path: Path, text: str) -> list[NDArray[np.int32]]:
+    """Return the innermost { ... } of a text as polygons (n, 2)."""
+    polygons = [np.array(_numbers(group)) for group in re.findall(r"\{([^{}]+)\}", text)]
+    if any(len(one) < 6 or len(one) % 2 for one in polygons):
+        got, do = "another count of numbers", "correct it"
+        raise ExperimentError(refusal(f"{path}, roi_ignr", expected="u, v of three points or more", got=got, do=do))
+    return [np.rint(one).astype(np.int32).reshape(-1, 2) for one in polygons]
+
+
+def _circle(limb: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return the circle that fits points (n, 2) best, by Kasa's linear least squares."""
+    design = np.column_stack([2 * limb, np.ones(len(limb))])
+    u, v, rest = np.linalg.lstsq(design, (limb**2).sum(1), rcond=None)[0]
+    return float(u), float(v), float(np.sqrt(max(rest + u**2 + v**2, 0.0)))

@@ -1,0 +1,78 @@
+"""YAML files for people to go on with: each key explained, those that nobody could measure left open."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import yaml
+
+from sphereorient.errors import SettingsError, refusal
+from sphereorient.files.yaml_file import FAULTS, parse_yaml, refuse_unknown, short
+
+WIDTH = 120  # characters of a line
+
+
+@dataclass(frozen=True, kw_only=True)
+class DraftKey:
+    """A key of a draft."""
+
+    name: str  # with its parent: sphere.diameter
+    value: Any = ...  # ...: not known
+    comment: str  # unit, meaning, what was measured
+    example: Any = None  # of a key that is not known
+    asked: bool = False  # whether the file is of no use without it
+
+
+def given(keys: Sequence[DraftKey], changes: Iterable[str]) -> list[DraftKey]:
+    """Return keys with values `name=value`, YAML, put in; SettingsError for an unknown name or no YAML."""
+    known = {key.name: key for key in keys}
+    for text in changes:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise SettingsError(refusal(f"--set {text}", expected="key=value", got=short(text), do="give both"))
+        if name.strip() not in known:
+            raise SettingsError(refuse_unknown(name.strip(), known, "--set"))
+        try:
+            known[name.strip()] = replace(known[name.strip()], value=parse_yaml(value))
+        except FAULTS:
+            do = "quote it for the shell"
+            raise SettingsError(refusal(f"--set {name}", expected="a YAML value", got=short(value), do=do)) from None
+    return list(known.values())
+
+
+def open_keys(keys: Iterable[DraftKey]) -> list[DraftKey]:
+    """Return the keys that are asked for and not known."""
+    return [key for key in keys if key.asked and key.value is ...]
+
+
+def draft_yaml(schema: str, keys: Sequence[DraftKey], head: str = "") -> str:
+    """Return the text of a file: keys not known are comments, with an example; those asked for say so."""
+    lines = [f"# {line}" for line in head.splitlines()] + [f"schema: {schema}"]
+    for parent in dict.fromkeys(key.name.partition(".")[0] for key in keys):
+        children = [key for key in keys if key.name.partition(".")[0] == parent]
+        if children[0].name == parent:
+            lines += _line(children[0], parent, "")
+            continue
+        known = any(key.value is not ... for key in children)
+        lines.append(f"{'' if known else '# '}{parent}:")
+        for key in children:
+            lines += _line(key, key.name.partition(".")[2], "  ")
+    return "\n".join([*lines, ""])
+
+
+def _line(key: DraftKey, name: str, indent: str) -> list[str]:
+    known = key.value is not ...
+    values = key.value if known else key.example
+    comment = f"# {'' if known or not key.asked else 'WRITE THIS: '}{key.comment}"
+    mark = indent if known else f"# {indent}"
+    if isinstance(values, list) and values and isinstance(values[0], Mapping):
+        return [f"{mark}{name}:  {comment}", *(f"{mark}  - {_flow(value)}" for value in values)]
+    text = f"{mark}{name}: {_flow(values)}"
+    if len(text) + len(comment) + 2 > WIDTH:
+        return [f"{indent}{comment}", text]
+    return [f"{text:34}  {comment}"]
+
+
+def _flow(value: Any) -> str:
+    text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000, allow_unicode=True)
+    return text.strip().removesuffix("...").strip()

@@ -1,0 +1,121 @@
+"""A first look at movies of which nothing is known: how large the ball is, and whether it stays in its place."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sphereorient.cameras import PinholeCamera
+from sphereorient.errors import ExperimentError, MovieError
+from sphereorient.experiment import Experiment
+from sphereorient.experiment.recording import Progress, silent
+from sphereorient.experiment.stream import CameraStream
+from sphereorient.files.threads import side_by_side
+from sphereorient.locate import LocateSettings
+from sphereorient.locate.outline import Outline
+from sphereorient.locate.scene import fixed_ball
+from sphereorient.movies import Movie, open_movie
+from sphereorient.preflight.sample import MovieSample, sample_movie
+
+STAYS = 0.15  # of the radius: a ball whose outlines scatter by less stays in its place
+SEEN = 0.4  # share of the frames in which a ball that moves is found at least
+PICTURES = 40  # all over the movie, for a ball that stays
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FirstLook:
+    """What a movie shows; made by `look_at`."""
+
+    name: str  # of its camera
+    movie: Movie
+    rate_hz: float | None  # by exact time stamps; None: the file has none
+    diameter_px: float | None  # None: no ball was found
+    stays: bool | None  # whether the ball stays in its place; None: not known
+    found: int  # frames with a ball, of `looked`
+    looked: int
+    picture: NDArray[Any]  # (H, W), a frame in which the ball was found, where there is one
+    outline: Outline | None  # of the ball in it
+
+
+def look_at(
+    paths: Sequence[Path | str], progress: Progress = silent, shown: NDArray[np.bool_] | None = None
+) -> list[FirstLook]:
+    """Look at the movies of one ball; raise MovieError for a movie that cannot be read.
+    `shown` (H, W) is False where something hides the ball of the only movie.
+    """
+    movies = [open_movie(path) for path in paths]
+    looks = []
+    progress("look", 0, len(movies))
+    for look in side_by_side(lambda k: _look(f"cam{k + 1}", movies[k], shown), range(len(movies))):
+        looks.append(look)
+        progress("look", len(looks), len(movies))
+    return looks
+
+
+def _look(name: str, movie: Movie, shown: NDArray[np.bool_] | None) -> FirstLook:
+    settings, stream = LocateSettings(), _stream(name, movie, shown)
+    sample = sample_movie(stream, _unknown(movie), None, settings)
+    outlines = [outline for _, outline in sample.balls]
+    picture, outline = sample.balls[len(outlines) // 2] if outlines else (_first_picture(sample), None)
+    looked = sum(one is not None for one in sample.picture)
+    seen, stays = len(outlines) >= SEEN * looked, None
+    if seen:
+        places = np.array([(one.u_px, one.v_px) for one in outlines])
+        radius_px = float(np.median([one.radius_px for one in outlines]))
+        stays = bool(np.median(np.hypot(*(places - np.median(places, axis=0)).T)) < STAYS * radius_px)
+    if stays or not seen:
+        try:
+            outline, _ = fixed_ball(stream.spread(PICTURES), settings, shown=shown)
+            seen, stays = True, True
+            radius_px = outline.radius_px
+        except (ExperimentError, MovieError):
+            stays = None
+    rate_hz = None if movie.times_s is None or len(movie) < 2 else 1 / float(np.median(np.diff(movie.times_s)))
+    return FirstLook(
+        name=name,
+        movie=movie,
+        rate_hz=rate_hz,
+        diameter_px=2 * radius_px if seen else None,
+        stays=stays,
+        found=looked if stays else len(outlines),
+        looked=looked,
+        picture=picture,
+        outline=outline if seen else None,
+    )
+
+
+def _first_picture(sample: MovieSample) -> NDArray[Any]:
+    return next(picture for picture in sample.picture if picture is not None)
+
+
+def _stream(name: str, movie: Movie, shown: NDArray[np.bool_] | None) -> CameraStream:
+    return CameraStream(name=name, camera=_camera(movie), movie=movie, rows=np.arange(len(movie)), shown=shown)
+
+
+def _camera(movie: Movie) -> PinholeCamera:
+    """Return a camera that stands for one not known: where a ball is sought in pictures alone, none is used."""
+    height, width = movie.frame_shape
+    f64 = torch.float64
+    return PinholeCamera(
+        image_size=(width, height),
+        f_px=torch.tensor(2.0 * height, dtype=f64),
+        centre_px=torch.tensor(((width - 1) / 2, (height - 1) / 2), dtype=f64),
+        R_cam_lab=torch.eye(3, dtype=f64),
+        T_cam_lab_mm=torch.zeros(3, dtype=f64),
+    )
+
+
+def _unknown(movie: Movie) -> Experiment:
+    path = Path(movie.path)
+    return Experiment(
+        name=path.stem,
+        path=path.parent / "experiment.yaml",
+        frame_rate_hz=float("nan"),
+        cameras_path=path.parent / "cameras.yaml",
+        cameras={},
+        movie_paths={},
+    )

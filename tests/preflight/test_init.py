@@ -1,0 +1,289 @@
+"""`sphereorient init`: what it measures, what it writes, and that the files it writes are read."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import UnionType
+from typing import get_args
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+from plate_drawing import Scene
+from preflight_examples import Example, clean_example
+from pydantic import BaseModel
+from typer.testing import CliRunner
+
+from sphereorient import so3
+from sphereorient.calibration.document import CalibrationKeys, load_calibration
+from sphereorient.calibration.draft import numbered_pictures
+from sphereorient.cameras import load_cameras
+from sphereorient.cli import app
+from sphereorient.errors import CameraError, ExperimentError, SettingsError, SphereOrientError
+from sphereorient.experiment import load_experiment
+from sphereorient.experiment.draft import MovieFacts, experiment_keys
+from sphereorient.experiment.experiment import ExperimentKeys
+from sphereorient.experiment.fictrac import read_fictrac
+from sphereorient.files.draft import DraftKey, draft_yaml, given
+from sphereorient.preflight.first_look import look_at
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
+
+ROUND = ["--set", "frame_rate=600", "--set", "sphere.diameter=18"]
+CONFIG = """## FicTrac v2.1.2 config file
+c2a_r            : { 0.72, -0.13, -0.46 }
+roi_circ         : { 10, 0, 0, 10, -10, 0 }
+roi_ignr         : { { 96, 156, 113, 147, 106, 128 }, { 71, 113, 90, 119, 114, 118, 135, 111 } }
+src_fn           : cam1.mkv
+src_fps          : -1
+vfov             : 45
+"""
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
+    return clean_example(tmp_path_factory)
+
+
+def init(*arguments: object) -> str:
+    """Run the command as a user does, without a terminal; return what it prints."""
+    run = CliRunner().invoke(app, ["init", *map(str, arguments)])
+    if isinstance(run.exception, SphereOrientError):
+        raise run.exception
+    assert run.exit_code == 0, run.output
+    return run.output
+
+
+def two_movies(clean: Example, folder: Path) -> list[Path]:
+    """Link two movies into an empty folder."""
+    for name in ("cam1", "cam2"):
+        (folder / f"{name}.mkv").symlink_to(clean.folder / f"{name}.mkv")
+    return [folder / "cam1.mkv", folder / "cam2.mkv"]
+
+
+@pytest.mark.slow
+def test_two_movies_become_an_experiment(clean, tmp_path):
+    said = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml", *ROUND, "-q")
+    assert said == ""
+    with pytest.raises(CameraError, match=r"cameras.yaml.*`sphereorient calibrate`"):
+        load_experiment(tmp_path / "experiment.yaml")
+    (tmp_path / "cameras.yaml").symlink_to(clean.folder / "cameras.yaml")
+    experiment = load_experiment(tmp_path / "experiment.yaml")
+    assert (experiment.frame_rate_hz, experiment.diameter_mm, experiment.fixed) == (600.0, 18.0, False)
+    assert list(experiment.movie_paths.values()) == [tmp_path / "cam1.mkv", tmp_path / "cam2.mkv"]
+    assert cv2.imread(str(tmp_path / "experiment.png")) is not None
+
+
+def test_what_nobody_knows_is_asked_for_by_name_and_refused_at_once(clean, tmp_path):
+    said = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml")
+    assert re.findall(r"write in experiment.yaml: ([\w.]+),", said) == ["frame_rate", "sphere.diameter"]
+    assert "moves, found in" in said
+    with pytest.raises(ExperimentError, match=r"got no frame_rate or times, sphere\.diameter; add them"):
+        load_experiment(tmp_path / "experiment.yaml")
+
+
+def test_a_file_of_the_user_is_not_replaced(clean, tmp_path):
+    own = tmp_path / "experiment.yaml"
+    own.write_text("mine")
+    with pytest.raises(SphereOrientError, match="--force"):
+        init(*two_movies(clean, tmp_path), "--out", own)
+    assert own.read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_the_look_measures_the_ball(clean, tmp_path):
+    for look in look_at(two_movies(clean, tmp_path)):
+        assert look.diameter_px == pytest.approx(56.0, rel=0.12)  # nearer and farther
+        assert look.stays is False
+        assert look.found > 0.9 * look.looked
+
+
+@pytest.mark.slow
+def test_the_look_knows_a_ball_that_stays(tmp_path):
+    settings = SynthSettings(frames=40, image_size=(200, 200), diameter_px=60.0, velocity_rms=0.0, volume_mm=1e-3)
+    write_synthetic_experiment(tmp_path, settings)
+    (look,) = look_at([tmp_path / "cam1.mkv"])
+    assert look.stays is True
+    assert look.diameter_px == pytest.approx(60.0, rel=0.05)
+    said = init(tmp_path / "cam1.mkv", "--out", tmp_path / "new.yaml")
+    assert "stays in its place" in said
+
+
+def test_a_movie_without_a_ball_says_so(tmp_path):
+    noise = np.random.default_rng(0).integers(20, 24, (40, 120, 160)).astype(np.uint8)
+    np.save(tmp_path / "empty.npy", noise)
+    (look,) = look_at([tmp_path / "empty.npy"])
+    assert look.diameter_px is None
+    assert "no ball was found" in init(tmp_path / "empty.npy", "--out", tmp_path / "experiment.yaml")
+
+
+def leaves(model: type[BaseModel], before: str = "") -> Iterator[str]:
+    for name, field in model.model_fields.items():
+        kinds = get_args(field.annotation) if isinstance(field.annotation, UnionType) else (field.annotation,)
+        inner = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)]
+        yield from leaves(inner[0], f"{before}{name}.") if inner else [before + name]
+
+
+FACTS = MovieFacts(
+    camera="cam1",
+    movie="cam1.mkv",
+    frames=240,
+    image_size=(640, 480),
+    rate_hz=None,
+    played_hz=25.0,
+    diameter_px=80.0,
+    stays=False,
+)
+
+
+def uncommented(text: str) -> str:
+    """Return a draft with its examples put to use."""
+    return "\n".join(re.sub(r"^# (\s*[\w]+:( |$))", r"\1", line) for line in text.splitlines())
+
+
+def test_a_draft_has_every_key_and_valid_examples():
+    text = uncommented(draft_yaml("sphereorient-experiment/1", experiment_keys([FACTS], "free")))
+    document = yaml.safe_load(text)
+    assert document.pop("schema") == "sphereorient-experiment/1"
+    ExperimentKeys.model_validate(document)
+    names = {key for key in leaves(ExperimentKeys) if not key.startswith("flow.")} | {"flow"}
+    written = {key.name for key in experiment_keys([FACTS], "free")}
+    assert names - written == {"times"}  # instead of frame_rate
+
+
+def test_a_key_that_is_not_one_is_refused_with_its_neighbour():
+    keys = [DraftKey(name="sphere.diameter", comment="mm")]
+    assert given(keys, ["sphere.diameter=null"])[0].value is None
+    for text in ("sphere.diametre=18", "sphere.diameter", "sphere.diameter=[1"):
+        with pytest.raises(SettingsError):
+            given(keys, [text])
+
+
+def plates(folder: Path, scenes: Sequence[Scene]) -> Path:
+    folder.mkdir()
+    for pose, scene in enumerate(scenes):
+        cv2.imwrite(str(folder / f"left-{pose:02d}.png"), scene.picture())
+    return folder
+
+
+def test_a_folder_of_plates_becomes_a_calibration(tmp_path):
+    scenes = [Scene(tilt_deg=20.0, about_deg=about, spin_deg=spin) for about, spin in ((0, 10), (90, 100), (45, 200))]
+    folder, plate = plates(tmp_path / "plates", scenes), Scene().plate
+    out = tmp_path / "calibration.yaml"
+    known = [f"plate.pitch={plate.pitch_mm}", "pixel_pitch=[0.02, 0.02]", "surveyed.T_lab_plate=[0, 0, 0]"]
+    said = init("--plate", folder, "--out", out, *(word for text in known for word in ("--set", text)))
+    assert re.findall(r"write in calibration.yaml: ([\w.]+),", said) == ["surveyed.R_lab_plate"]
+    with pytest.raises(CameraError, match=r"surveyed.R_lab_plate: expected a value, got none"):
+        load_calibration(out)
+    init(
+        "--plate",
+        folder,
+        "--out",
+        out,
+        "--force",
+        *(word for text in [*known, "surveyed.R_lab_plate=[[1,0,0],[0,1,0],[0,0,1]]"] for word in ("--set", text)),
+    )
+    found = load_calibration(out).plate
+    assert (found.columns, found.rows, found.fiducials, found.dark) == (
+        *(plate.columns, plate.rows, plate.fiducials, plate.dark),
+    )
+    assert found.dot_diameter_mm == pytest.approx(plate.dot_diameter_mm, rel=0.03)
+    assert found.fiducial_diameter_mm == pytest.approx(plate.fiducial_diameter_mm, rel=0.03)
+    assert set(leaves(CalibrationKeys)) - set(yaml.safe_load(out.read_text())) <= {
+        *("ports", "points", "fit_ports", "surveyed.pose", "surveyed.R_lab_plate", "surveyed.T_lab_plate")
+    }
+
+
+def test_all_missing_keys_of_a_calibration_are_told_at_once(tmp_path):
+    out = tmp_path / "calibration.yaml"
+    init("--plate", plates(tmp_path / "plates", [Scene()]), "--out", out, "-q")
+    with pytest.raises(CameraError) as refused:
+        load_calibration(out)
+    for key in ("plate.pitch", "plate.dot_diameter", "pixel_pitch", "surveyed.R_lab_plate", "surveyed.T_lab_plate"):
+        assert key in str(refused.value)
+
+
+def test_plate_pictures_are_paired_by_number(tmp_path):
+    for name in ("cam1_00.png", "cam2_00.png", "cam1_10.tif", "3.jpg", "notes.txt", "unnumbered.png"):
+        (tmp_path / name).touch()
+    assert numbered_pictures(tmp_path) == {
+        0: {"cam1": "cam1_00.png", "cam2": "cam2_00.png"},
+        3: {"cam1": "3.jpg"},
+        10: {"cam1": "cam1_10.tif"},
+    }
+    with pytest.raises(CameraError, match="no pictures"):
+        numbered_pictures(tmp_path / "nowhere")
+
+
+def test_a_folder_without_plates_is_told(tmp_path):
+    cv2.imwrite(str(tmp_path / "a1.png"), np.full((100, 120), 90, np.uint8))
+    said = init("--plate", tmp_path, "--out", tmp_path / "calibration.yaml")
+    assert "no dots in any of 1 pictures" in said
+
+
+def test_fictrac_is_taken_over(clean, tmp_path):
+    two_movies(clean, tmp_path)
+    (tmp_path / "config.txt").write_text(CONFIG)
+    said = read_fictrac(tmp_path / "config.txt")
+    assert said.circle_px == pytest.approx((0.0, 0.0, 10.0), abs=1e-9)
+    assert [len(one) for one in said.ignored] == [3, 4]
+    init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml")
+    experiment = load_experiment(tmp_path / "experiment.yaml")
+    camera = experiment.cameras["cam1"]
+    assert experiment.fixed
+    assert experiment.diameter_mm is None
+    assert experiment.frame_rate_hz == 600.0  # of the file: FicTrac's own is -1
+    assert float(camera.f_px) == pytest.approx(120.0 / math.tan(math.radians(22.5)))
+    C = so3.exp(torch.tensor([0.72, -0.13, -0.46], dtype=torch.float64))
+    torch.testing.assert_close(camera.R_cam_lab, C.mT)  # x_animal = C x_cam
+    mask = cv2.imread(str(experiment.mask_paths["cam1"]), cv2.IMREAD_GRAYSCALE)
+    assert mask[140, 105] == 0
+    assert mask[10, 10] == 255
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("src_fn           :", "src_fn: expected the movie"),
+        ("vfov             : 190", "vfov: expected degrees"),
+        ("c2a_r            : { 1, 2 }", "c2a_r: expected three numbers"),
+        ("roi_ignr         : { { 1, 2, 3 } }", "roi_ignr: expected u, v"),
+    ],
+)
+def test_a_wrong_config_is_refused_by_its_key(tmp_path, line, message):
+    key = line.partition(":")[0]
+    lines = [line if each.startswith(key) else each for each in CONFIG.splitlines()]
+    (tmp_path / "config.txt").write_text("\n".join(lines))
+    with pytest.raises(ExperimentError, match=message):
+        read_fictrac(tmp_path / "config.txt")
+
+
+def test_one_camera_needs_no_pose_and_two_do(tmp_path):
+    entry = "{model: pinhole, image_size: [64, 48], vfov_deg: 30}"
+    path = tmp_path / "cameras.yaml"
+    path.write_text(f"schema: sphereorient-cameras/1\ncameras:\n  cam1: {entry}\n")
+    camera = load_cameras(path)["cam1"]
+    assert torch.equal(camera.R_cam_lab, torch.eye(3, dtype=torch.float64))
+    assert not camera.T_cam_lab_mm.any()
+    path.write_text(f"schema: sphereorient-cameras/1\ncameras:\n  cam1: {entry}\n  cam2: {entry}\n")
+    with pytest.raises(CameraError, match="cam1, R and T: expected the camera's pose"):
+        load_cameras(path)
+    half = entry.replace("}", ", T: [0, 0, 0]}")
+    path.write_text(f"schema: sphereorient-cameras/1\ncameras:\n  cam1: {half}\n")
+    with pytest.raises(CameraError, match="cam1, R: expected the camera's pose"):
+        load_cameras(path)
+
+
+def test_a_movie_in_place_of_an_experiment_is_told(clean):
+    with pytest.raises(ExperimentError, match=r"got a movie; .*`sphereorient init"):
+        load_experiment(clean.folder / "cam1.mkv")
+
+
+@pytest.mark.parametrize("arguments", [[], ["a.mkv", "--plate", "b"], ["a.mkv", "b.mkv", "c.mkv"]])
+def test_one_source_is_named(tmp_path, arguments):
+    with pytest.raises(SettingsError):
+        init(*arguments, "--out", tmp_path / "experiment.yaml")
