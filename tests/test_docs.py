@@ -241,7 +241,7 @@ def test_the_commands_and_the_python_of_the_walkthrough_print_what_it_says(tmp_p
     (tmp_path / "out").mkdir()
     monkeypatch.chdir(tmp_path)
     commands = [line for block in blocks("walkthrough.md", "") for line in block.splitlines()]
-    assert len(commands) == 6
+    assert len(commands) == 7
     printed = ""
     for command in commands:
         run = subprocess.run(command.split(), check=True, capture_output=True, text=True)

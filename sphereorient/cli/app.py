@@ -18,8 +18,8 @@ import typer
 from typer.core import TyperGroup
 
 from sphereorient import __version__
-from sphereorient.errors import OutputError, SettingsError, SphereOrientError, error_words, refusal
-from sphereorient.files.whole_file import check_target, write_text, writing
+from sphereorient.errors import SettingsError, SphereOrientError, error_words, refusal
+from sphereorient.files.whole_file import check_folder, check_target, write_text, writing
 
 
 class InOrder(TyperGroup):
@@ -101,6 +101,7 @@ app = Commands(
 )
 
 LINE_S = 60.0  # from one line of a stage to its next, without a terminal
+SLOWEST = 0.05  # units per second: slower rates are told by the time left
 EXIT_REFUSED = 2  # an error that the user can correct
 NO_MEMORY = re.compile("(not enough|out of|insufficient|n't allocate|not allocate|to allocate) memory|bad_alloc", re.I)
 EXIT_INTERRUPTED = 130  # Ctrl-C, as in shells
@@ -118,12 +119,7 @@ def common(
 
 def check_writable(out: Path, *, folder_made: bool = False) -> None:
     """Check before hours of work that a file can be written and replaces none of the user's; or a folder be made."""
-    folder, name = out.parent, f"--out {out}"
-    if not folder.is_dir():
-        raise OutputError(refusal(name, expected=f"an existing folder {folder}", got="none", do="make it first"))
-    if not os.access(folder, os.W_OK):
-        do = "choose another --out"
-        raise OutputError(refusal(name, expected="a writable folder", got=f"{folder}, which is not", do=do))
+    check_folder(out, f"--out {out}")
     if not folder_made:
         check_target(out)
 
@@ -143,10 +139,9 @@ Advance = Callable[[str, int, int], None]
 
 
 @contextmanager
-def progress_bar(quiet: bool = False, unit: str = "frames", *, lines: bool = False) -> Iterator[Advance]:
-    """Show a line of progress for each stage, with units per second and remaining time; nothing if `quiet`.
-
-    With `lines`, where there is no terminal: print a line as a stage begins, and each minute.
+def progress_bar(quiet: bool = False, unit: str = "frames") -> Iterator[Advance]:
+    """Show a line of progress for each stage, with units per second and the time left; nothing if `quiet`.
+    Where there is no terminal: print a line as a stage begins, each minute, and at the end of one of over a second.
     """
     if quiet:
         yield lambda stage, done, total: None
@@ -155,17 +150,16 @@ def progress_bar(quiet: bool = False, unit: str = "frames", *, lines: bool = Fal
     from rich.console import Console
 
     console = Console(stderr=True)
-    if lines and not console.is_terminal:
-        yield _lines()
+    if not console.is_terminal:
+        yield _lines(unit)
         return
     bar = progress.Progress(
-        "{task.description:13}",
+        "{task.description:16}",
         progress.BarColumn(),
-        progress.MofNCompleteColumn(),
+        "{task.fields[count]:>11}",
         "{task.fields[rate]:>14}",
         progress.TimeElapsedColumn(),
-        "left",
-        progress.TimeRemainingColumn(),
+        "{task.fields[left]:12}",
         console=console,
     )
     tasks: dict[str, Any] = {}
@@ -175,23 +169,47 @@ def progress_bar(quiet: bool = False, unit: str = "frames", *, lines: bool = Fal
             if not tasks:
                 shown.enter_context(bar)  # not earlier: a refusal prints one line only
             if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total, rate="")
-            elapsed = bar.tasks[bar.task_ids.index(tasks[stage])].elapsed
-            rate = f"{done / elapsed:.1f} {unit}/s" if unit and done and elapsed else ""
-            bar.update(tasks[stage], completed=done, total=total, rate=rate)
+                tasks[stage] = bar.add_task(stage, total=total or None, count="", rate="", left="")
+            elapsed = bar.tasks[bar.task_ids.index(tasks[stage])].elapsed or 0.0
+            count, rate, left = _told(done, total, elapsed, unit)
+            bar.update(tasks[stage], completed=done, total=total or None, count=count, rate=rate, left=left)
 
         yield advance
 
 
-def _lines() -> Advance:
+def _told(done: int, total: int, elapsed_s: float, unit: str) -> tuple[str, str, str]:
+    """Return how much is done, how fast, and the time left, in words; a stage of one step has nothing to count."""
+    if total == 1 or (not done and not total):
+        return "", "", ""
+    count = f"{done} of {total}" if total else f"{done}"
+    if not done or elapsed_s <= 0:
+        return count, "", ""
+    per_s = done / elapsed_s
+    rate = f"{per_s:.1f} {unit}/s" if unit and per_s >= SLOWEST else ""
+    left_s = (total - done) / per_s
+    return count, rate, f"{_duration(left_s)} left" if left_s > 0 else ""
+
+
+def _duration(seconds: float) -> str:
+    """Return a duration as people say it: 40 s, 3 min, 2.5 h."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def _lines(unit: str) -> Advance:
     begun = time.monotonic()
-    told: dict[str, float] = {}  # by stage, when its last line was printed
+    first: dict[str, float] = {}  # by stage, when it began
+    last: dict[str, float] = {}  # when its last line was printed
 
     def advance(stage: str, done: int, total: int) -> None:
         now = time.monotonic()
-        if now - told.get(stage, -math.inf) >= LINE_S:
-            told[stage] = now
-            typer.echo(f"{now - begun:6.0f} s  {stage}: {done}" + (f" of {total}" if total else ""), err=True)
+        since = first.setdefault(stage, now)
+        ended = done == total and now - since > 1.0
+        if ended or now - last.get(stage, -math.inf) >= LINE_S:
+            last[stage] = now
+            words = ", ".join(word for word in _told(done, total, now - since, unit) if word)
+            typer.echo(f"{now - begun:6.0f} s  {stage}{': ' if words else ''}{words}", err=True)
 
     return advance
 

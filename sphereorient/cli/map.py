@@ -69,7 +69,7 @@ def map_(
     names = None if named is None else tuple(named)
     request = Request(experiment=experiment, out=out, method="map", settings=chosen, cameras=names)
     store = FolderStore(request.parts)
-    with store.held(request, resume=resume), progress_bar(quiet, lines=True) as advance:
+    with store.held(request, resume=resume), progress_bar(quiet, unit="iterations") as advance:
         kept = store.folder / "map.h5"
         result = learn_map(experiment, chosen, init=old, cameras=names, progress=advance, kept=kept, command=command)
         advance("figure", 0, 1)

@@ -156,6 +156,7 @@ def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()
     failures: tuple[type[Exception], ...] = (OSError, *also)
     check_target(path)
     aside = unfinished(path)
+    make_folder(path.parent, str(path))
     try:
         aside.touch(exist_ok=False)  # exclusively: a link planted here is not followed
         _made[aside.absolute()] = _state(aside.stat())
@@ -188,6 +189,17 @@ def make_folder(path: Path, name: str) -> None:
     except OSError as error:
         expected, do = "a folder that can be made", "choose another --out"
         raise OutputError(refusal(name, expected=expected, got=error_words(error), do=do)) from error
+
+
+def check_folder(path: Path, name: str) -> None:
+    """Raise OutputError, with `name`, if the folder of a file to write cannot be made or may not be written in."""
+    folder = next((one for one in path.absolute().parents if one.exists()), Path("/"))
+    if not folder.is_dir():
+        do = "choose another --out"
+        raise OutputError(refusal(name, expected="a folder to write in", got=f"{folder}, a file", do=do))
+    if not os.access(folder, os.W_OK):
+        do = "choose another --out"
+        raise OutputError(refusal(name, expected="a writable folder", got=f"{folder}, which is not", do=do))
 
 
 def check_ending(path: Path, option: str, endings: Collection[str]) -> None:

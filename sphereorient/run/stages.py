@@ -9,11 +9,11 @@ from typing import Any
 
 import torch
 
-from sphereorient.errors import OutputError, SettingsError, error_words, refusal
+from sphereorient.errors import SettingsError, error_words, refusal
 from sphereorient.experiment import Experiment, input_files
 from sphereorient.experiment.recording import Progress, open_recording, silent
 from sphereorient.files.provenance import provenance, sha256
-from sphereorient.files.whole_file import check_target
+from sphereorient.files.whole_file import check_folder, check_target
 from sphereorient.follow.follower import Batch, Follower
 from sphereorient.methods import results
 from sphereorient.methods.method import Job, Learnt, Method, one_thread
@@ -228,9 +228,8 @@ def check_method(request: Request) -> Method:
 
 def check_out(request: Request) -> None:
     """Check before starting that the outputs can be written and replace nothing of the user's; else OutputError."""
-    if request.out is not None and not request.out.parent.is_dir():
-        expected, do = f"an existing folder {request.out.parent}", "make it first"
-        raise OutputError(refusal(str(request.out), expected=expected, got="none", do=do))
+    if request.out is not None:
+        check_folder(request.out, str(request.out))
     with writing_of(request):
         for path in filter(None, (request.out, request.save_learnt)):
             check_target(path)

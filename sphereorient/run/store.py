@@ -182,7 +182,7 @@ class FolderStore:
         """Make the folder where there is none, refuse one that is not of a run, and lock it."""
         name, lock = str(self.folder), FileLock(self.folder / LOCK, blocking=False)
         try:
-            self.folder.mkdir(exist_ok=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
             if self._fingerprint() is None and not all(TRACES.fullmatch(path.name) for path in self.folder.iterdir()):
                 expected, do = "the parts of a run, or no such folder", "move it away, or choose another --out"
                 raise OutputError(refusal(name, expected=expected, got="a folder of something else", do=do))

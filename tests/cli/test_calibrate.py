@@ -137,7 +137,11 @@ def test_a_fault_while_writing_leaves_the_old_files(tmp_path, monkeypatch, capsy
 
 @pytest.mark.parametrize(
     ("out", "words"),
-    [("cameras.png", "expected .yaml"), ("calibration.yaml", "an input"), ("nowhere/cameras.yaml", "folder")],
+    [
+        ("cameras.png", "expected .yaml"),
+        ("calibration.yaml", "an input"),
+        ("calibration.yaml/cameras.yaml", "a folder to write in"),
+    ],
 )
 def test_an_output_that_would_harm_is_refused_before_any_work(tmp_path, monkeypatch, capsys, out, words):
     source = tables(tmp_path)

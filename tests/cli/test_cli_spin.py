@@ -93,7 +93,7 @@ def test_inputs_that_are_damaged_are_refused_in_one_line(flight, monkeypatch, ca
         (("--times", "nan"), "a rate above 0"),
         (("--times", "missing.csv"), "no such file"),
         (("--dot-radius", "90"), "0.5 .. 45 degrees"),
-        (("--out", "nowhere/spin.json"), "existing folder"),
+        (("--out", "/dev/null/spin.json"), "a folder to write in"),
         (("--out", "spin.txt"), "expected .json"),
         (("--texture", "missing.png"), "no such file"),
     ],

@@ -164,3 +164,8 @@ def test_other_errors_keep_their_traceback(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["sphereorient", "info"])
     with pytest.raises(KeyError, match="a key"):
         main()
+
+
+def test_folders_of_an_output_are_made(command, tmp_path):
+    assert command("settings", "--out", tmp_path / "new" / "one" / "settings.yaml") == (0, [])
+    assert (tmp_path / "new" / "one" / "settings.yaml").is_file()

@@ -72,5 +72,7 @@ def test_a_document_can_be_read_by_others(tmp_path: Path) -> None:
     umask = os.umask(0)
     os.umask(umask)
     assert path.stat().st_mode & 0o777 == 0o666 & ~umask
-    with pytest.raises(OutputError, match="expected a file that can be written"):
-        write_document(tmp_path / "none" / "a.yaml", "sphereorient-test/1", {})
+    write_document(tmp_path / "new" / "a.yaml", "sphereorient-test/1", {})
+    assert (tmp_path / "new" / "a.yaml").is_file()
+    with pytest.raises(OutputError, match="Not a directory"):
+        write_document(path / "a.yaml", "sphereorient-test/1", {})

@@ -126,8 +126,8 @@ def test_a_config_that_is_none_is_one_line(tmp_path):
 
 def test_resuming_nothing_and_an_impossible_folder_are_one_line(config, tmp_path):
     assert "last.ckpt" in refused("train", config, "--out", tmp_path / "out", "--resume")
-    assert "existing folder" in refused("train", config, "--out", tmp_path / "none" / "out")
     (tmp_path / "file").write_text("")
+    assert "a folder to write in" in refused("train", config, "--out", tmp_path / "file" / "out")
     assert "file" in refused("train", config, "--out", tmp_path / "file", *LENGTH)
 
 

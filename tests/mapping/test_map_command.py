@@ -127,11 +127,11 @@ def test_without_a_terminal_each_stage_prints_a_line(monkeypatch, capsys):
     """Before: 16 minutes of silence."""
     clock = iter((100.0, 100.0, 112.0, 150.0, 175.0))
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
-    with progress_bar(lines=True) as advance:
-        for stage, done, total in (("chain", 0, 1), ("map", 0, 9), ("map", 1, 9), ("map", 2, 9)):
+    with progress_bar(unit="iterations") as advance:
+        for stage, done, total in (("chain", 0, 1), ("map", 0, 9), ("map", 1, 9), ("map", 3, 9)):
             advance(stage, done, total)
     lines = capsys.readouterr().err.splitlines()
-    assert [line.strip() for line in lines] == ["0 s  chain: 0 of 1", "12 s  map: 0 of 9", "75 s  map: 2 of 9"]
+    assert [line.strip() for line in lines] == ["0 s  chain", "12 s  map: 0 of 9", "75 s  map: 3 of 9, 2 min left"]
 
 
 def test_a_movie_of_one_frame_is_refused(copy, tmp_path, monkeypatch, capsys):
@@ -154,8 +154,8 @@ def test_a_ball_that_does_not_turn_is_refused(copy, tmp_path, monkeypatch, capsy
 
 
 def test_places_that_cannot_be_written_are_refused_before_any_work(copy, tmp_path, monkeypatch, capsys):
-    line = refused(monkeypatch, capsys, "map", copy, "--out", tmp_path / "nowhere" / "map.png")
-    assert "existing folder" in line
+    line = refused(monkeypatch, capsys, "map", copy, "--out", copy / "map.png")
+    assert "a folder to write in" in line
     line = refused(monkeypatch, capsys, "map", copy, "--out", tmp_path / "map.jpg")
     assert ".png" in line
 

@@ -369,7 +369,7 @@ def test_the_command_writes_movie_and_sheet(tmp_path, monkeypatch, capsys):
     [
         ([], "expected something to write, got neither --out nor --worst"),
         (["--out", "o.mp4", "--frames", "9:3"], "--frames 9:3: expected A:B, A below B"),
-        (["--out", "nowhere/o.mp4"], "expected an existing folder nowhere"),
+        (["--out", "track.h5/o.mp4"], "expected a folder to write in"),
         (["--out", "o.avi"], "expected .mp4 .m4v .mov .mkv, got '.avi'"),
     ],
 )

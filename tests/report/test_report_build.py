@@ -89,10 +89,10 @@ def test_a_folder_with_other_things_in_it_is_left_alone(place, report, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_a_missing_parent_folder_is_said_before_any_work(place, report, tmp_path):
-    code, _, said = report(place / "precise.h5", "--out", tmp_path / "no" / "page")
+def test_a_file_in_place_of_a_folder_is_said_before_any_work(place, report, tmp_path):
+    code, _, said = report(place / "precise.h5", "--out", place / "precise.h5" / "page")
     assert code == 2
-    assert "an existing folder" in said
+    assert "a folder to write in" in said
 
 
 @pytest.mark.slow

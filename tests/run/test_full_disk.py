@@ -62,9 +62,10 @@ def test_when_there_is_room_again_the_run_goes_on(tmp_path):
 
 @pytest.mark.slow
 def test_a_place_that_may_not_be_written_is_one_line(tmp_path):
+    (tmp_path / "none").touch()
     told = run(EXCERPT, "--out", tmp_path / "none" / "track.h5")
     assert told.returncode == 2
-    assert "expected an existing folder" in told.stderr
+    assert "expected a folder to write in" in told.stderr
     told = run(EXCERPT, "--out", "/proc/track.h5")
     assert told.returncode == 2
     assert len(told.stderr.strip().splitlines()) == 1, told.stderr
