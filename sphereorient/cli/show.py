@@ -113,19 +113,31 @@ def export(
     track: TrackPath,
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")],
     to: Annotated[
-        str | None, typer.Option(help="csv, parquet or mat; default: by the suffix of the name.", metavar="FORMAT")
+        str | None,
+        typer.Option(
+            help="csv, parquet, mat, fictrac, tum, vtk, nwb or netcdf; default: by the suffix of the name.",
+            metavar="FORMAT",
+        ),
+    ] = None,
+    experiment: Annotated[
+        Path | None, typer.Option(help="experiment.yaml of the track: FicTrac's table needs the camera.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write a track for other programs: a table, or arrays for MATLAB, with units in the names."""
+    """Write a track for other programs: tables, MATLAB, FicTrac's table, poses (TUM), ParaView, NWB, netCDF."""
     from sphereorient.report.export import export_track, format_of
     from sphereorient.trajectory import Trajectory
 
     to = format_of(out, to)
     check_writable(out)
     loaded = Trajectory.load(track)
+    camera = None
+    if experiment is not None:
+        from sphereorient.experiment import load_experiment
+
+        camera = next(iter(load_experiment(experiment).cameras.values()))
     with progress_bar(quiet) as advance:
-        export_track(loaded, out, to, lambda *at: advance("export", *at))
+        export_track(loaded, out, to, lambda *at: advance("export", *at), camera)
     if not quiet:
         typer.echo(f"Wrote {out}: {len(loaded)} frames")
 

@@ -1,58 +1,71 @@
-"""A track for other programs: CSV, Parquet, MATLAB, xarray; columns with the unit in the name (docs/export.md)."""
+"""A track for other programs: tables, MATLAB, and what programs of poses read (docs/export.md)."""
 
-import json
-import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from importlib import import_module
-from itertools import combinations_with_replacement
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, refusal
 from sphereorient.files.whole_file import put_aside
-from sphereorient.trajectory import CameraTrack, Flag, Trajectory, quaternions_wxyz
-from sphereorient.trajectory.datasets import stored_fields
+from sphereorient.report import export_poses
+from sphereorient.report.columns import (
+    FORMULA,
+    as_text,
+    columns,
+    frame_wise,
+    metadata,
+    reasons,
+    safe_names,
+    to_arrow,
+    with_unit,
+)
+from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-    import xarray as xr
-
-REASON = "why this camera has no orientation in the frame; ok where it has one"
-AXES: dict[tuple[int, ...], str] = {(3,): "xyz", (2,): "uv"}  # names of the components, by the shape of a frame's value
-PAIRS = tuple(combinations_with_replacement(range(3), 2))  # of a symmetric matrix: xx xy xz yy yz zz
-SUFFIXES = {".csv": "csv", ".parquet": "parquet", ".pq": "parquet", ".mat": "mat"}
+SUFFIXES = {
+    ".csv": "csv",
+    ".parquet": "parquet",
+    ".pq": "parquet",
+    ".mat": "mat",
+    ".dat": "fictrac",
+    ".tum": "tum",
+    ".vtkhdf": "vtk",
+    ".nwb": "nwb",
+    ".nc": "netcdf",
+}
 ROWS = 50_000  # written at once
-FORMULA = re.compile(r"(^|[,;\t])([=+\-@\t\r])")  # begins a cell that spreadsheet programs compute
 Advance = Callable[[int, int], None]
 
 
 def export_track(
-    track: Trajectory, path: Path, to: str | None = None, progress: Advance = lambda done, total: None
+    track: Trajectory,
+    path: Path,
+    to: str | None = None,
+    progress: Advance = lambda done, total: None,
+    camera: Camera | None = None,
 ) -> None:
-    """Write all frame-wise datasets of a track, with units in their names, and its metadata; NaN stays NaN.
+    """Write a track for other programs, whole or not at all; NaN stays NaN.
 
-    `to` is csv, parquet or mat; None: by the suffix. The file is written whole or not at all.
+    `to` is a key of `WRITERS`; None: by the suffix. `camera`: of the picture, for FicTrac's table.
 
     Raises:
         OutputError: an unknown format, a package that is not installed, or a file that cannot be written.
     """
     write = WRITERS[format_of(path, to)]
     with put_aside(path) as aside:
-        write(track, aside, progress)
+        write(Export(track=track, path=aside, progress=progress, camera=camera))
 
 
 def format_of(path: Path, to: str | None) -> str:
-    """Return csv, parquet or mat, from `to`, or from the suffix if None; OutputError if unknown or contradictory."""
-    by_name = SUFFIXES.get(path.suffix.lower())
+    """Return the format, from `to`, or from the suffix if None; OutputError if unknown or contradictory."""
+    by_name, known = SUFFIXES.get(path.suffix.lower()), ", ".join(WRITERS)
     if to is not None and to not in WRITERS:
-        do = "write --to csv, parquet or mat"
-        raise OutputError(refusal("--to", expected=f"one of {', '.join(WRITERS)}", got=repr(to)[:60], do=do))
+        do = "write --to with one of these"
+        raise OutputError(refusal("--to", expected=f"one of {known}", got=repr(to)[:60], do=do))
     if to is None and by_name is None:
-        do = "add --to csv, parquet or mat, or end the name in one of these"
+        do = f"add --to with one of {known}, or end the name in one of these"
         got = f"'{path.suffix}'"
         raise OutputError(refusal(f"--out {path}", expected=" ".join(SUFFIXES), got=got, do=do))
     if to is not None and by_name not in (None, to):
@@ -61,62 +74,52 @@ def format_of(path: Path, to: str | None) -> str:
     return to or str(by_name)
 
 
-def to_arrow(track: Trajectory) -> "pa.Table":
-    """Return a track as an Arrow table, a row for each frame, each field with `units` and `description`.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Export:
+    """A track on its way into a file."""
 
-    Raises:
-        OutputError: pyarrow is not installed.
-    """
-    arrow = package("pyarrow", "table")
-    parts = list(columns(track))
-    text = arrow.string()
-    arrays = [arrow.array(c.values, type=text if c.values.dtype == object else None, from_pandas=False) for c in parts]
-    schema = arrow.schema(
-        [arrow.field(c.name, array.type, metadata=c.about) for c, array in zip(parts, arrays, strict=True)],
-        metadata={key: as_text(value) for key, value in metadata(track).items()},
-    )
-    return arrow.table(arrays, schema=schema)
+    track: Trajectory
+    path: Path
+    progress: Advance
+    camera: Camera | None
 
 
-def _write_csv(track: Trajectory, path: Path, progress: Advance) -> None:
-    package("pyarrow", "table")
-    import pyarrow.csv as arrow_csv
-
-    table = to_arrow(track)
-    valid = table.schema.get_field_index("valid")
-    table = table.set_column(valid, "valid", table["valid"].cast("int8"))  # every program reads 1 and 0
-    about = metadata(track)
+def _write_csv(job: Export) -> None:
+    parts = list(columns(job.track))
+    about = metadata(job.track)
     settings = about.pop("settings")
     lines = [f"{key}: {' '.join(as_text(value).split())}" for key, value in about.items()]
     lines += ["quaternions: of R_lab_body, w first; units stand at the end of the names", "settings:"]
     lines = ["made by sphereorient", *lines, *(f"  {line}" for line in settings.splitlines())]
-    plain = arrow_csv.WriteOptions(include_header=False, quoting_style="none")
-    with path.open("wb") as file:
+    # Every program reads 1 and 0.
+    values = [part.values.astype(np.int8) if part.values.dtype == bool else part.values for part in parts]
+    with job.path.open("w", encoding="utf-8", newline="\n") as file:
         for line in lines:
-            file.write(FORMULA.sub(r"\1'\2", f"# {line}".rstrip()).encode() + b"\n")
-        file.write(",".join(table.column_names).encode() + b"\n")
-        for first in range(0, len(table), ROWS):
-            part = table.slice(first, ROWS)
-            arrow_csv.write_csv(part, file, plain)
-            progress(first + len(part), len(table))
+            file.write(FORMULA.sub(r"\1'\2", f"# {line}".rstrip()) + "\n")
+        file.write(",".join(part.name for part in parts) + "\n")
+        for first in range(0, len(job.track), ROWS):
+            rows = zip(*(column[first : first + ROWS].tolist() for column in values), strict=True)
+            file.writelines(",".join(map(str, row)) + "\n" for row in rows)
+            job.progress(min(first + ROWS, len(job.track)), len(job.track))
 
 
-def _write_parquet(track: Trajectory, path: Path, progress: Advance) -> None:
-    table = to_arrow(track)
+def _write_parquet(job: Export) -> None:
+    table = to_arrow(job.track)
     import pyarrow.parquet as arrow_parquet
 
-    with arrow_parquet.ParquetWriter(path, table.schema, compression="zstd") as writer:
+    with arrow_parquet.ParquetWriter(job.path, table.schema, compression="zstd") as writer:
         for first in range(0, max(len(table), 1), ROWS):
             part = table.slice(first, ROWS)
             writer.write_table(part)
-            progress(first + len(part), len(table))
+            job.progress(first + len(part), len(table))
 
 
-def _write_mat(track: Trajectory, path: Path, progress: Advance) -> None:
+def _write_mat(job: Export) -> None:
     """Write MATLAB 5: arrays with the frames along their first axis, structs for cameras and metadata."""
     from scipy.io import savemat
 
-    progress(0, len(track))  # SciPy writes in one step
+    track = job.track
+    job.progress(0, len(track))  # SciPy writes in one step
     content = _mat_arrays(track)
     content["cameras"] = {name: _mat_arrays(camera) for name, camera in safe_names(track).items()}
     about = metadata(track)
@@ -126,8 +129,8 @@ def _write_mat(track: Trajectory, path: Path, progress: Advance) -> None:
         "provenance": as_text(about["provenance"]),
         "units": {with_unit(each.name, each.units): each.units for each in frame_wise(track)},
     }
-    savemat(path, content, long_field_names=True, do_compression=True, oned_as="column")
-    progress(len(track), len(track))
+    savemat(job.path, content, long_field_names=True, do_compression=True, oned_as="column")
+    job.progress(len(track), len(track))
 
 
 def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
@@ -142,163 +145,17 @@ def _mat_arrays(record: Trajectory | CameraTrack) -> dict[str, Any]:
     return arrays
 
 
-WRITERS: dict[str, Callable[[Trajectory, Path, Advance], None]] = {
+def _poses(write: Callable[[Trajectory, Path, Camera | None], None]) -> Callable[[Export], None]:
+    return lambda job: write(job.track, job.path, job.camera)
+
+
+WRITERS: dict[str, Callable[[Export], None]] = {
     "csv": _write_csv,
     "parquet": _write_parquet,
     "mat": _write_mat,
+    "fictrac": _poses(export_poses.write_fictrac),
+    "tum": _poses(export_poses.write_tum),
+    "vtk": _poses(export_poses.write_vtk),
+    "nwb": _poses(export_poses.write_nwb),
+    "netcdf": _poses(export_poses.write_netcdf),
 }
-
-
-def to_xarray(track: Trajectory) -> "xr.Dataset":
-    """Return a track as an xarray dataset, with units and descriptions as attributes; candidates are left out.
-
-    Dimensions: time (s), axis (x, y, z of lab or body), axis_2 (covariances), body_axis (columns of orientations),
-    camera, image_axis (u, v). Variables of the cameras are camera_*; provenance is JSON; NaN stays NaN.
-
-    Raises:
-        OutputError: xarray is not installed.
-    """
-    xarray = package("xarray", "table")
-    own = {dataset.name: dataset for dataset in frame_wise(track)}
-    time = own.pop("time")
-    made = {name: (_dims(dataset), dataset.values, dataset.about) for name, dataset in own.items()}
-    for same in zip(*(frame_wise(camera) for camera in track.cameras.values()), strict=True):
-        values = np.stack([each.values for each in same])
-        made[f"camera_{same[0].name}"] = (("camera", *_dims(same[0])), values, same[0].about)
-    if track.cameras:
-        reason = np.array([[str(why) for why in camera.reason] for camera in track.cameras.values()])
-        made["camera_reason"] = (("camera", "time"), reason, {"units": "1", "description": REASON})
-    coordinates = {
-        "time": (("time",), track.time, time.about),
-        "axis": list("xyz"),
-        "axis_2": list("xyz"),
-        "body_axis": list("xyz"),
-        **({"camera": list(track.cameras), "image_axis": list("uv")} if track.cameras else {}),
-    }
-    about = {key: value if isinstance(value, str | float) else as_text(value) for key, value in metadata(track).items()}
-    named: xr.Dataset = xarray.Dataset(made, coords=coordinates, attrs=about)
-    return named
-
-
-def _dims(dataset: "Dataset") -> tuple[str, ...]:
-    second = "body_axis" if dataset.rotation else "axis_2"
-    named = {(): (), (2,): ("image_axis",), (3,): ("axis",), (3, 3): ("axis", second)}
-    return ("time", *named[dataset.tail])
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Dataset:
-    """A dataset of the file with a row for each frame, or one column of it; made by `frame_wise` and `columns`."""
-
-    name: str
-    units: str
-    description: str
-    values: NDArray[Any]  # (N, ...); of a column (N,)
-
-    @property
-    def tail(self) -> tuple[int, ...]:
-        """Axes after the frames."""
-        return self.values.shape[1:]
-
-    @property
-    def rotation(self) -> bool:
-        """Whether the values are rotations, which tables hold as quaternions."""
-        return self.tail == (3, 3) and self.units == "1"
-
-    @property
-    def about(self) -> dict[str, str]:
-        """Units and description, for the attributes of other formats."""
-        return {"units": self.units, "description": self.description}
-
-
-def frame_wise(record: Trajectory | CameraTrack) -> Iterator[Dataset]:
-    """Yield the datasets of a track or camera that have a row for each frame, in the order of the file."""
-    for name, column in stored_fields(record):
-        if column.rows == "frames":
-            values = np.asarray(getattr(record, name))
-            yield Dataset(name=name, units=column.units, description=column.description, values=values)
-
-
-def columns(track: Trajectory) -> Iterator[Dataset]:
-    """Yield every frame-wise dataset of a track as columns, then of each camera, names as in `Trajectory.to_pandas`.
-
-    Columns are components (position_x_mm), pairs (position_cov_xy_mm2), and quaternions with w >= 0 (quat_w ..).
-    """
-    for dataset in frame_wise(track):
-        yield from _split(dataset, "")
-    for prefix, camera in safe_names(track).items():
-        for dataset in frame_wise(camera):
-            yield from _split(dataset, f"{prefix}_")
-        yield Dataset(name=f"{prefix}_reason", units="1", description=REASON, values=reasons(camera))
-
-
-def _split(dataset: Dataset, prefix: str) -> Iterator[Dataset]:
-    name, values = f"{prefix}{dataset.name}", dataset.values
-    parts = {name: values}
-    if dataset.rotation:
-        stem = prefix + dataset.name.replace("orientation", "quat", 1)
-        parts = {f"{stem}_{axis}": column for axis, column in zip("wxyz", quaternions_wxyz(values).T, strict=True)}
-    elif dataset.tail == (3, 3):
-        parts = {f"{name}_{'xyz'[i]}{'xyz'[j]}": values[:, i, j] for i, j in PAIRS}
-    elif dataset.tail in AXES:
-        parts = {f"{name.removesuffix('_px')}_{axis}": values[:, k] for k, axis in enumerate(AXES[dataset.tail])}
-    for stem, column in parts.items():
-        yield replace(dataset, name=with_unit(stem, dataset.units), values=column)
-
-
-def reasons(camera: CameraTrack) -> NDArray[Any]:
-    """Return a camera's reasons as text, (N,)."""
-    return np.array([str(reason) for reason in camera.reason], dtype=object)
-
-
-def safe_names(track: Trajectory) -> dict[str, CameraTrack]:
-    """Return the cameras by unique names of letters, digits and _, which all programs accept."""
-    safe: dict[str, CameraTrack] = {}
-    for name, camera in track.cameras.items():
-        plain = re.sub(r"\W", "_", name, flags=re.ASCII)
-        plain = plain if plain[:1].isalpha() else f"camera_{plain}"
-        base, count = plain, 1
-        while plain in safe:
-            count += 1
-            plain = f"{base}_{count}"
-        safe[plain] = camera
-    return safe
-
-
-def metadata(track: Trajectory) -> dict[str, Any]:
-    """Return the root attributes of a track's file, with the names of the flags."""
-    return {
-        "experiment": track.experiment,
-        "method": track.method,
-        "frame_rate_hz": track.frame_rate,
-        "length_unit": track.length_unit,
-        "cameras": list(track.cameras),
-        "flags": {flag.name: flag.value for flag in Flag},
-        "provenance": dict(track.provenance),
-        "settings": track.settings,
-    }
-
-
-def as_text(value: Any) -> str:
-    """Return text unchanged and anything else as JSON."""
-    return value if isinstance(value, str) else json.dumps(value)
-
-
-def plain_cell(value: Any) -> Any:
-    """Return a cell of a table for CSV: a text that a spreadsheet program would compute gets an apostrophe."""
-    return f"'{value}" if isinstance(value, str) and FORMULA.match(value) else value
-
-
-def with_unit(name: str, units: str) -> str:
-    """Return a name with its unit at the end, once: alpha_lab_rad_s2, score, centre_px."""
-    unit = "" if units == "1" else "_" + units.replace("^", "").replace("/", "_")
-    return name if name.endswith(unit) else f"{name}{unit}"
-
-
-def package(name: str, extra: str) -> Any:
-    """Import a package of an extra; an OutputError names the command that installs it."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        label, do = f"sphereorient[{extra}]", f"install it with `pip install sphereorient[{extra}]`"
-        raise OutputError(refusal(label, expected=f"the package {name}", got="none", do=do)) from error

@@ -18,7 +18,7 @@ from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, error_words, refusal
 from sphereorient.experiment import Experiment
 from sphereorient.files.whole_file import check_ending, put_aside
-from sphereorient.report.export import package
+from sphereorient.report.columns import package
 from sphereorient.report.frame_warnings import frame_warnings
 from sphereorient.report.overlay import pictures_by_row, streams_of
 from sphereorient.report.overlay_model import Path3D, finite_rows, path_of

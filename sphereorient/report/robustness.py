@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from sphereorient.evaluate.robustness.results import Results, ResultSummary, summaries
 from sphereorient.evaluate.robustness.scenes import CLEAN, TOGETHER
 from sphereorient.files.whole_file import put_aside
-from sphereorient.report.export import plain_cell
+from sphereorient.report.columns import plain_cell
 from sphereorient.report.plots.style import new_figure
 from sphereorient.synth.severities import DEGRADATIONS
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sphereorient.errors import OutputError
-from sphereorient.report.export import package, plain_cell
+from sphereorient.report.columns import package, plain_cell
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.statistics.density import Density, stretched_exponential

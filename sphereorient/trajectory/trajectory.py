@@ -21,6 +21,9 @@ from sphereorient.trajectory.reasons import Flag, Reason
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+    from scipy.spatial.transform import Rotation
+
+    from sphereorient.trajectory.walk import Walk
 
 SCHEMA = "sphereorient-track/1"
 TEXTS = ("method", "settings", "experiment")
@@ -275,6 +278,24 @@ class Trajectory:
         for name, R in (("quat", self.orientation), ("quat_smooth", self.orientation_smooth)):
             table |= {f"{name}_{axis}": part for axis, part in zip("wxyz", quaternions_wxyz(R).T, strict=True)}
         return pd.DataFrame(table)
+
+    @property
+    def posed(self) -> Floats:
+        """R_lab_body (N, 3, 3): measured, else the smoother's, else NaN."""
+        known = np.isfinite(self.orientation).all(axis=(1, 2), keepdims=True)
+        return np.where(known, self.orientation, self.orientation_smooth)
+
+    def to_scipy(self) -> "Rotation":
+        """Return the orientations of the valid frames as rotations of SciPy; their times are `time[valid]`."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_matrix(self.orientation[self.valid])
+
+    def walk(self) -> "Walk":
+        """Return how an animal walks on the ball, by `posed`, the lab being its frame; see `walk_of`."""
+        from sphereorient.trajectory.walk import walk_of  # it computes with torch
+
+        return walk_of(self.time, self.posed)
 
     def plot(self) -> "Figure":
         """Draw position, quaternion (continuous sign), velocity and omega over time: measured dots, smoothed lines."""

@@ -17,7 +17,8 @@ from sphereorient.errors import TrackError
 from sphereorient.motion import MotionSettings, datasets_of, measure_motion
 from sphereorient.report import plots
 from sphereorient.report.build import write_report
-from sphereorient.report.export import columns, export_track, to_xarray
+from sphereorient.report.columns import columns, to_xarray
+from sphereorient.report.export import export_track
 from sphereorient.report.recording import series_of
 from sphereorient.report.verdicts import verdicts
 from sphereorient.statistics import StatisticsSettings, summarise

@@ -1,0 +1,69 @@
+"""How an animal walks on a ball that turns under it: heading, path, and speeds ahead, to the side and of turns."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sphereorient import so3
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Walk:
+    """Motion of an animal that stands still on a ball, lab axes x ahead, y to the right, z down; made by `walk_of`.
+    Lengths are in radii of the ball. A segment begins at 0: what happened in a gap is not known.
+    """
+
+    turn_rad: Floats  # (N, 3), of the ball since the frame before, lab; NaN in the first frame of a segment
+    heading_rad: Floats  # (N,), direction that the animal faces, 0 .. 2 pi, from x towards y
+    path: Floats  # (N, 2), place on the plane on which it walks
+    forward_rad_s: Floats  # (N,), radii a second ahead
+    side_rad_s: Floats  # (N,), to the right
+    turn_rad_s: Floats  # (N,), change of the heading, to the right positive
+    start: NDArray[np.bool_]  # (N,), first frame of a segment
+
+
+def walk_of(time_s: Floats, R_lab_body: Floats) -> Walk:
+    """Integrate the motion of a ball (N, 3, 3), NaN where it was not measured, over times (N,), s.
+    Between two frames the ball turns at a constant rate: the path is an arc.
+    Source: FicTrac, Moore et al. 2014, columns 15 to 21 of its table.
+    """
+    known = np.asarray(np.isfinite(R_lab_body).all(axis=(1, 2)))
+    linked = known & np.concatenate([[False], known[:-1]])
+    R = torch.from_numpy(np.where(known[:, None, None], R_lab_body, np.eye(3)))
+    turn = np.full((len(R), 3), np.nan)
+    turn[1:] = so3.log(R[1:] @ R[:-1].mT).numpy()
+    turn[~linked] = np.nan
+    ahead, right, about = turn[:, 1], -turn[:, 0], -turn[:, 2]
+    # A step along an arc: chord and its direction relative to the heading before the step.
+    half = np.nan_to_num(about) / 2
+    chord = np.sinc(half / np.pi)
+    heading, path = np.full(len(R), np.nan), np.full((len(R), 2), np.nan)
+    for first, last in _stretches(known):
+        some = slice(first + 1, last)
+        heading[first:last] = np.concatenate([[0.0], np.cumsum(about[some])])
+        direction = heading[first : last - 1] + half[some]
+        cosine, sine = np.cos(direction), np.sin(direction)
+        steps = chord[some, None] * np.stack(
+            [cosine * ahead[some] - sine * right[some], sine * ahead[some] + cosine * right[some]], axis=1
+        )
+        path[first:last] = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    step_s = np.concatenate([[np.nan], np.diff(time_s)])
+    return Walk(
+        turn_rad=turn,
+        heading_rad=np.mod(heading, 2 * np.pi),
+        path=path,
+        forward_rad_s=ahead / step_s,
+        side_rad_s=right / step_s,
+        turn_rad_s=about / step_s,
+        start=known & ~linked,
+    )
+
+
+def _stretches(known: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last + 1 of the stretches of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
