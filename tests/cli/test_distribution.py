@@ -1,0 +1,86 @@
+"""What is uploaded: the wheel and the source distribution, used in an environment of their own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+from conftest import REPO
+
+EXCERPT = REPO / "synthetic_data" / "excerpt"
+EXTRAS = ("pandas", "pyarrow", "xarray", "rerun", "distributed", "pynwb")
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a wheel that was built from the source distribution, and of that."""
+    folder = tmp_path_factory.mktemp("dist")
+    pip = [sys.executable, "-m", "pip"]
+    build = "import sys; from hatchling.build import build_sdist; build_sdist(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", build, str(folder)], check=True, cwd=REPO)
+    (source,) = folder.glob("*.tar.gz")
+    subprocess.run(
+        [*pip, "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(folder), str(source)], check=True
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def python(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of an environment with the wheel, what it requires, and no extra."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=False, symlinks=True)
+    own = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
+    (wheel,) = built.glob("*.whl")
+    pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python")]
+    subprocess.run([*pip, "install", "-q", "--no-deps", "--no-index", str(wheel)], check=True)
+    # What the wheel requires is here already; the project's folder is not on this path.
+    (own / "required.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    hidden = "".join(f"sys.modules[{name!r}] = None\n" for name in EXTRAS)
+    (own / "sitecustomize.py").write_text(f"import sys\n{hidden}")
+    return folder / "bin" / "python"
+
+
+def run(python: Path, folder: Path, *words: object) -> str:
+    command = [str(python), "-m", "sphereorient.cli", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=500)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow  # builds and installs
+def test_the_wheel_tracks_reports_and_exports_without_an_extra(python, tmp_path):
+    where = subprocess.run(
+        [str(python), "-c", "import sphereorient; print(sphereorient.__file__)"],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=tmp_path,
+    ).stdout
+    assert str(python.parents[1]) in where
+    assert "Commands:" in run(python, tmp_path, "--help")
+    run(python, tmp_path, "track", EXCERPT / "experiment.yaml", "--out", "track.h5", "-q")
+    run(python, tmp_path, "report", "track.h5", "--experiment", EXCERPT / "experiment.yaml", "--out", "report", "-q")
+    run(python, tmp_path, "export", "track.h5", "--to", "csv", "--out", "track.csv", "-q")
+    assert (tmp_path / "report" / "index.html").is_file()
+    assert (tmp_path / "track.csv").read_text().count("\n") > 40
+
+
+@pytest.mark.slow
+def test_wheel_and_source_hold_what_they_should(built):
+    (wheel,), (source,) = built.glob("*.whl"), built.glob("*.tar.gz")
+    names = zipfile.ZipFile(wheel).namelist()
+    assert all(name.startswith("sphereorient") for name in names)  # no tests, no data
+    for needed in ("sphereorient/pose/refine.c", "sphereorient/py.typed"):
+        assert needed in names
+    assert any(name.endswith("LICENSE") for name in names)
+    inside = tarfile.open(source).getnames()
+    for needed in ("scripts/build_compiled.py", "README.md", "LICENSE", "CITATION.cff"):
+        assert any(name.endswith(needed) for name in inside), needed
+    assert not any("/.venv/" in name or "/out/" in name for name in inside)
