@@ -1,15 +1,16 @@
-"""`sphereorient init`: the first files of an experiment, from movies, plate pictures, or what FicTrac used."""
+"""`sphereorient init` and `mark`: the first files of an experiment, and the masks that people draw."""
 
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sphereorient.cli.app import app, check_writable, echo_lines, progress_bar
-from sphereorient.cli.options import Quiet
-from sphereorient.errors import SettingsError, SphereOrientError, refusal
+from sphereorient.cli.options import ExperimentPath, Quiet
+from sphereorient.errors import SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.files.draft import DraftKey, draft_yaml, given, open_keys
 from sphereorient.files.whole_file import check_ending, write_text
 
@@ -61,6 +62,34 @@ def init(
         _fictrac(from_fictrac, target, set_ or [], quiet)
     else:
         _experiment(movies or [], target, set_ or [], vfov, quiet)
+
+
+@app.command()
+def mark(
+    experiment: ExperimentPath,
+    port: Annotated[
+        int,
+        typer.Option(min=0, max=65535, help="Of this machine; 0: any free one. Over SSH: ssh -L PORT:127.0.0.1:PORT."),
+    ] = 0,
+    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+) -> None:
+    """Draw masks, what hides the ball, on the movies in the browser; they are saved beside the experiment."""
+    from sphereorient.preflight.mark import HOST, Marking, serve
+
+    marking = Marking(experiment)
+    try:
+        server = serve(marking, port)
+    except OSError as error:
+        do = "choose another --port"
+        raise SettingsError(refusal(f"--port {port}", expected="a free port", got=error_words(error), do=do)) from None
+    address = f"http://{HOST}:{server.server_address[1]}/{marking.token}/"
+    typer.echo(f"{address}\nCtrl-C ends it.")
+    if browser:
+        import webbrowser
+
+        webbrowser.open(address)
+    with server, suppress(KeyboardInterrupt):
+        server.serve_forever()
 
 
 def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: float | None, quiet: bool) -> None:

@@ -74,7 +74,7 @@ def experiment_keys(facts: Sequence[MovieFacts], name: str) -> list[DraftKey]:
         DraftKey(
             name="masks",
             value=masks or ...,
-            comment="black where something that does not move hides the ball",
+            comment="black where something that does not move hides the ball: `sphereorient mark` draws them",
             example=each("mask_{}.png"),
         ),
         DraftKey(

@@ -19,7 +19,7 @@ from sphereorient.locate import LocateSettings
 from sphereorient.locate.outline import Outline
 from sphereorient.locate.scene import fixed_ball
 from sphereorient.movies import Movie, open_movie
-from sphereorient.preflight.sample import MovieSample, sample_movie
+from sphereorient.preflight.sample import sample_movie
 
 STAYS = 0.15  # of the radius: a ball whose outlines scatter by less stays in its place
 SEEN = 0.4  # share of the frames in which a ball that moves is found at least
@@ -37,7 +37,8 @@ class FirstLook:
     stays: bool | None  # whether the ball stays in its place; None: not known
     found: int  # frames with a ball, of `looked`
     looked: int
-    picture: NDArray[Any]  # (H, W), a frame in which the ball was found, where there is one
+    frame: int  # one in which the ball was found, where there is one
+    picture: NDArray[Any]  # (H, W), of it
     outline: Outline | None  # of the ball in it
 
 
@@ -50,17 +51,22 @@ def look_at(
     movies = [open_movie(path) for path in paths]
     looks = []
     progress("look", 0, len(movies))
-    for look in side_by_side(lambda k: _look(f"cam{k + 1}", movies[k], shown), range(len(movies))):
+    for look in side_by_side(lambda k: look_at_movie(f"cam{k + 1}", movies[k], shown), range(len(movies))):
         looks.append(look)
         progress("look", len(looks), len(movies))
     return looks
 
 
-def _look(name: str, movie: Movie, shown: NDArray[np.bool_] | None) -> FirstLook:
+def look_at_movie(name: str, movie: Movie, shown: NDArray[np.bool_] | None = None) -> FirstLook:
+    """Look at the movie of a camera; `shown` (H, W) is False where something hides the ball."""
     settings, stream = LocateSettings(), _stream(name, movie, shown)
     sample = sample_movie(stream, _unknown(movie), None, settings)
     outlines = [outline for _, outline in sample.balls]
-    picture, outline = sample.balls[len(outlines) // 2] if outlines else (_first_picture(sample), None)
+    with_ball = [k for k, (outline, _) in enumerate(sample.found) if outline is not None]
+    readable = [k for k, picture in enumerate(sample.picture) if picture is not None]
+    k = with_ball[len(with_ball) // 2] if with_ball else readable[0]
+    picture, outline = sample.picture[k], sample.found[k][0]
+    assert picture is not None
     looked = sum(one is not None for one in sample.picture)
     seen, stays = len(outlines) >= SEEN * looked, None
     if seen:
@@ -83,13 +89,10 @@ def _look(name: str, movie: Movie, shown: NDArray[np.bool_] | None) -> FirstLook
         stays=stays,
         found=looked if stays else len(outlines),
         looked=looked,
+        frame=int(sample.row[k]),
         picture=picture,
         outline=outline if seen else None,
     )
-
-
-def _first_picture(sample: MovieSample) -> NDArray[Any]:
-    return next(picture for picture in sample.picture if picture is not None)
 
 
 def _stream(name: str, movie: Movie, shown: NDArray[np.bool_] | None) -> CameraStream:

@@ -80,7 +80,8 @@ def test_wheel_and_source_hold_what_they_should(built):
     for needed in ("sphereorient/pose/refine.c", "sphereorient/py.typed"):
         assert needed in names
     assert any(name.endswith("LICENSE") for name in names)
-    inside = tarfile.open(source).getnames()
+    with tarfile.open(source) as packed:
+        inside = packed.getnames()
     for needed in ("scripts/build_compiled.py", "README.md", "LICENSE", "CITATION.cff"):
         assert any(name.endswith(needed) for name in inside), needed
     assert not any("/.venv/" in name or "/out/" in name for name in inside)

@@ -1,0 +1,211 @@
+"""`sphereorient mark`: what is drawn becomes the mask, in a browser as well; and who may ask."""
+
+from __future__ import annotations
+
+import json
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from preflight_examples import Example, clean_example, write
+
+from sphereorient.errors import ExperimentError
+from sphereorient.experiment import load_experiment
+from sphereorient.experiment.stream import given_mask
+from sphereorient.preflight.mark import HOST, Marking, drawn_mask, serve, with_key
+
+pytest_plugins = ["browser_examples"]
+TRIANGLE = {"kind": "hide", "points": [[10, 10], [60, 10], [10, 60]]}
+DISK = {"kind": "show", "u": 100.0, "v": 70.0, "radius": 40.0}
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
+    return clean_example(tmp_path_factory)
+
+
+@pytest.fixture
+def marking(clean: Example, tmp_path: Path) -> Marking:
+    return Marking(write(clean, tmp_path / "experiment"))
+
+
+@pytest.fixture
+def address(marking: Marking) -> Iterator[str]:
+    server = serve(marking)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://{HOST}:{server.server_address[1]}"
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def ask(url: str, content: object = None, **headers: str) -> tuple[int, bytes]:
+    data = None if content is None else json.dumps(content).encode()
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, data, headers), timeout=60) as answer:
+            return answer.status, answer.read()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read()
+
+
+def test_a_shape_hides_or_is_all_that_is_shown():
+    hidden = drawn_mask((120, 160), [TRIANGLE], None)
+    assert not hidden[20, 20]
+    assert hidden[50, 50]
+    region = drawn_mask((120, 160), [DISK, TRIANGLE], None)
+    assert region[70, 100]
+    assert region.mean() == pytest.approx(np.pi * 40**2 / (120 * 160), rel=0.03)
+    old = np.ones((120, 160), bool)
+    old[70, 100] = False
+    assert not drawn_mask((120, 160), [DISK], old)[70, 100]
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"kind": "paint", "points": TRIANGLE["points"]},
+        {"kind": "hide", "points": [[1, 2], [3, 4]]},
+        {"kind": "hide", "points": [[1, 2], [3, float("nan")], [4, 5]]},
+        {"kind": "hide", "points": [[1, 2], [3, 1e9], [4, 5]]},
+        {"kind": "hide", "u": 1.0, "v": "x", "radius": 3.0},
+        {"kind": "hide", "u": 1.0, "v": 3.0},
+        {"kind": "hide", "u": 80.0, "v": 60.0, "radius": 500.0},
+        "circle",
+    ],
+)
+def test_impossible_shapes_are_refused(shape):
+    with pytest.raises(ExperimentError):
+        drawn_mask((120, 160), [shape], None)
+
+
+def test_the_mask_is_saved_and_named(marking):
+    marking.save("cam1", [TRIANGLE], keep=True)
+    experiment = load_experiment(marking.path)
+    assert list(experiment.mask_paths) == ["cam1"]
+    shown = given_mask(experiment, "cam1", (240, 240))
+    np.testing.assert_array_equal(shown, drawn_mask((240, 240), [TRIANGLE], None))
+    marking.save("cam2", [DISK], keep=True)
+    marking.save("cam1", [{"kind": "hide", "u": 200.0, "v": 200.0, "radius": 9.0}], keep=True)
+    experiment = load_experiment(marking.path)
+    assert list(experiment.mask_paths) == ["cam1", "cam2"]
+    again = given_mask(experiment, "cam1", (240, 240))
+    assert not again[20, 20]  # kept
+    assert not again[200, 200]
+
+
+def test_a_mirrored_movie_keeps_its_mask_where_it_was_drawn(clean, tmp_path):
+    marking = Marking(write(clean, tmp_path / "experiment", flip={"cam1": "vertical"}))
+    marking.save("cam1", [TRIANGLE], keep=True)
+    experiment = load_experiment(marking.path)
+    file = cv2.imread(str(experiment.mask_paths["cam1"]), cv2.IMREAD_GRAYSCALE)
+    assert file[-21, 20] == 0  # as the file of the movie lies
+    assert not given_mask(experiment, "cam1", (240, 240))[20, 20]
+
+
+def test_comments_and_other_keys_of_the_file_stay(marking):
+    text = "# mine\n" + marking.path.read_text() + "# masks: {cam1: mask_cam1.png}  # an example\n# the end\n"
+    marking.path.write_text(text)
+    before = yaml.safe_load(text)
+    marking.save("cam1", [TRIANGLE], keep=True)
+    after = marking.path.read_text()
+    assert after.startswith("# mine\n")
+    assert after.endswith("# the end\n")
+    assert yaml.safe_load(after) == before | {"masks": {"cam1": "cam1_mask.png"}}
+
+
+def test_a_key_of_several_lines_is_left_alone(marking):
+    text = marking.path.read_text() + "masks:\n  cam2: other.png\n"
+    cv2.imwrite(str(marking.path.parent / "other.png"), np.full((240, 240), 255, np.uint8))
+    marking.path.write_text(text)
+    with pytest.raises(ExperimentError, match=r"write masks: \{cam1: cam1_mask.png\} there"):
+        marking.save("cam1", [TRIANGLE], keep=True)
+    assert marking.path.read_text() == text
+
+
+def test_a_key_is_put_in_once():
+    assert with_key("a: 1\n", "masks", {"cam1": "m.png"}) == "a: 1\nmasks: {cam1: m.png}\n"
+    assert with_key("masks: {}\nb: 2\n", "masks", {"c": "d"}) == "masks: {c: d}\nb: 2\n"
+
+
+def test_the_server_answers_who_knows_the_token(marking, address):
+    mine = f"{address}/{marking.token}"
+    assert ask(f"{mine}/")[0] == 200
+    assert json.loads(ask(f"{mine}/state")[1])["cameras"][0]["frames"] == 64
+    picture = cv2.imdecode(np.frombuffer(ask(f"{mine}/frame/cam1/5")[1], np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture.shape == (240, 240)
+    status, content = ask(f"{mine}/save/cam1", {"shapes": [TRIANGLE], "keep": True})
+    assert (status, json.loads(content)["hidden"]) == (200, pytest.approx(100 * 1250 / 240**2, rel=0.1))
+
+
+@pytest.mark.parametrize("path", ["/", "/state", "/wrong/state", "/{token}", "/{token}/nothing", "/{token}/../state"])
+def test_others_get_nothing(marking, address, path):
+    assert ask(address + path.format(token=marking.token))[0] == 404
+
+
+def test_a_page_of_another_host_gets_nothing(marking, address):
+    assert ask(f"{address}/{marking.token}/state", Host="evil.example:80")[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("path", "content", "words"),
+    [
+        ("frame/cam1/99999", None, "0 .. 63"),
+        ("frame/cam9/1", None, "cam1, cam2"),
+        ("save/cam1", {"shapes": [{"kind": "hide"}], "keep": True}, "circle"),
+        ("save/cam1", {"keep": True}, "shapes and keep"),
+        ("save/cam1", [1], "shapes and keep"),
+    ],
+)
+def test_a_wrong_request_is_told_and_changes_nothing(marking, address, path, content, words):
+    before = sorted(marking.path.parent.iterdir())
+    status, said = ask(f"{address}/{marking.token}/{path}", content)
+    assert status == 400
+    assert words in json.loads(said)["error"]
+    assert sorted(marking.path.parent.iterdir()) == before
+
+
+@pytest.mark.slow  # a browser
+def test_a_person_draws_a_mask(marking, address, browser: Any, tmp_path: Path, request):
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    wrong: list[str] = []
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    page.goto(f"{address}/{marking.token}/")
+    page.wait_for_function("picture !== null")
+    page.get_by_label("frame number").fill("7")
+    page.get_by_label("frame number").press("Tab")
+
+    def place(u: float, v: float) -> tuple[float, float]:
+        code = """([u, v]) => { const box = canvas.getBoundingClientRect(), [x, y] = toPage(u, v);
+            const scale = canvas.width / box.width; return [box.left + x / scale, box.top + y / scale]; }"""
+        x, y = page.evaluate(code, [u, v])
+        return x, y
+
+    for corner in TRIANGLE["points"]:
+        page.mouse.click(*place(*corner))
+    page.get_by_role("button", name="close polygon").click()
+    page.get_by_role("button", name="show only").click()
+    page.get_by_role("button", name="circle", exact=True).click()
+    page.mouse.move(*place(120, 120))
+    page.mouse.down()
+    page.mouse.move(*place(220, 120))
+    page.mouse.up()
+    page.get_by_text("show only circle, 200 px across").wait_for()
+    page.get_by_role("button", name="find the ball").click()
+    page.get_by_text("which moves").wait_for()
+    page.screenshot(path=str(tmp_path / "mark.png"))
+    page.get_by_role("button", name="save mask").click()
+    page.get_by_text("of the picture is hidden").wait_for()
+    page.close()
+    assert wrong == []
+    drawn = given_mask(load_experiment(marking.path), "cam1", (240, 240))
+    expected = drawn_mask((240, 240), [TRIANGLE, {"kind": "show", "u": 120, "v": 120, "radius": 100}], None)
+    assert np.mean(drawn != expected) < 0.01  # the mouse stands on whole pixels of the screen
