@@ -1,4 +1,4 @@
-# make setup | demo | test | test-all | test-portable | mutants | lint | types
+# make setup | demo | test | test-all | test-portable | mutants | lint | types | docs
 # TORCH_INDEX: on a machine without a GPU, give pip the address of torch's CPU builds here to avoid the CUDA packages.
 PYTHON ?= python3
 TORCH_INDEX ?=
@@ -8,7 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INDEX := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
 
-.PHONY: setup demo test test-all test-portable mutants lint types clean
+.PHONY: setup demo test test-all test-portable mutants lint types docs clean
 
 setup: $(VENV)/.ready
 
@@ -42,6 +42,11 @@ lint: setup
 
 types: setup
 	$(BIN)/mypy
+
+# The site, out/site/index.html: every tutorial runs, every link is followed, any warning fails.
+docs: setup
+	$(BIN)/python -m pip install -q $(INDEX) -e '.[docs]'
+	$(BIN)/mkdocs build
 
 clean:
 	rm -rf out .pytest_cache .mypy_cache .ruff_cache

@@ -205,7 +205,7 @@ def _lines(unit: str) -> Advance:
     def advance(stage: str, done: int, total: int) -> None:
         now = time.monotonic()
         since = first.setdefault(stage, now)
-        ended = done == total and now - since > 1.0
+        ended = done == total > 1 and now - since > 1.0
         if ended or now - last.get(stage, -math.inf) >= LINE_S:
             last[stage] = now
             words = ", ".join(word for word in _told(done, total, now - since, unit) if word)

@@ -1,0 +1,43 @@
+"""Each tutorial runs from its first line to its last; what it states is asserted in it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import REPO
+
+TUTORIALS = sorted((REPO / "docs" / "tutorials").glob("*.py"))
+
+
+@pytest.mark.slow  # two of them learn a map
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+def test_a_tutorial_runs(path: Path, tmp_path: Path):
+    told = subprocess.run(
+        [sys.executable, str(path)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=900,
+        env=os.environ | {"MPLBACKEND": "agg"},
+    )
+    assert told.returncode == 0, told.stderr
+    assert not list(tmp_path.iterdir())  # it leaves nothing behind
+
+
+def test_every_page_of_the_site_exists_and_every_page_is_in_it():
+    text = (REPO / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    named = {
+        line.split(": ")[-1].removeprefix("- ").strip()
+        for line in text.splitlines()
+        if line.strip().endswith((".md", ".py"))
+    }
+    pages = {
+        path.relative_to(REPO / "docs").as_posix()
+        for path in (REPO / "docs").rglob("*")
+        if path.suffix in (".md", ".py")
+    }
+    assert named == pages
