@@ -13,8 +13,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from sphereorient.cameras import load_cameras, save_cameras
-from sphereorient.cameras.io import cameras_yaml
+from sphereorient.cameras import add_model, load_cameras, save_cameras
 from sphereorient.cameras.model import CentralCamera, Key
 from sphereorient.cameras.parameters import parameter_names
 
@@ -74,12 +73,11 @@ assert miss < 1e-9
 # %% [markdown]
 # ## Into files, calibration and tracking
 #
-# One name in `MODELS`, and `cameras.yaml` may say `model: division`. Calibration, walls (`port`), triangulation and fits use
-# `project` and `rays`, and know the parameters by their names.
+# `add_model`, and `cameras.yaml` may say `model: division`. Calibration, walls (`port`), triangulation and
+# fits use `project` and `rays`, and know the parameters by their names.
 
 # %%
-cameras_yaml.MODELS["division"] = DivisionCamera
-cameras_yaml.ENTRIES["division"] = cameras_yaml._entry(DivisionCamera)
+add_model(DivisionCamera)
 with TemporaryDirectory() as folder:
     path = Path(folder) / "cameras.yaml"
     save_cameras(path, {"cam1": camera})

@@ -2,8 +2,8 @@
 # # A fly on a ball, coming from FicTrac
 #
 # One camera, of which the field of view is known; a ball that turns in its place, of unknown texture. FicTrac's
-# `config.txt` is taken over, the texture map is learnt from the movie, and the walk is read off. The ball is rendered, so
-# that the truth is known.
+# `config.txt` is taken over, the texture map is learnt from the movie, and the walk is read off. The ball is
+# rendered, so that the truth is known.
 
 # %%
 import subprocess
@@ -41,7 +41,8 @@ write_synthetic_experiment(folder, settings)
 # %% [markdown]
 # ## What FicTrac was told
 #
-# `vfov` is the field of view from top to bottom. `c2a_r` turns the camera's axes into the animal's: here they are the same.
+# `vfov` is the field of view from top to bottom. `c2a_r` turns the camera's axes into the animal's: here they are the
+# same.
 
 # %%
 vfov = 2 * np.degrees(np.arctan(height / 2 / focal_px))
@@ -86,8 +87,7 @@ with h5py.File(folder / "truth.h5") as truth:
     R_cam_lab = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # cam1 of `synth` looks along lab +y
     true_walk = walk_of(truth["time"][:], R_cam_lab @ truth["orientation"][:])
 error = np.nanstd(walk.forward_rad_s - true_walk.forward_rad_s) / np.nanstd(true_walk.forward_rad_s)
-print(
-    f"speed ahead: error {100 * error:.1f} % of its scatter; path off by {np.abs(walk.path - true_walk.path).max():.3f} radii"
-)
+off = np.abs(walk.path - true_walk.path).max()
+print(f"speed ahead: error {100 * error:.1f} % of its scatter; path off by {off:.3f} radii")
 assert error < 0.05
 place.cleanup()

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # The toolkit from Python
 #
-# The parts are `torch.nn.Module`s that work without a movie: a differentiable renderer, a template search over SO(3), a
-# fit with covariance, and a path layer.
+# The parts are `torch.nn.Module`s that work without a movie: a differentiable renderer, a template search over SO(3),
+# a fit with covariance, and a path layer.
 
 # %%
 import math
@@ -35,7 +35,8 @@ figure
 # %% [markdown]
 # ## Search
 #
-# Templates of all SO(3), compared in batches; then finer about the best. float32, float64 and NumPy arrays are accepted.
+# Templates of all SO(3), compared in batches; then finer about the best. float32, float64 and NumPy arrays are
+# accepted.
 
 # %%
 bank = TemplateBank(texture, size_px=80)

@@ -23,15 +23,16 @@ experiment = write_synthetic_experiment(folder, settings)
 # %% [markdown]
 # ## Calibrate
 #
-# `sphereorient init --plate FOLDER` writes `calibration.yaml` from pictures of a plate. Here each camera gets a table of
-# points instead, as another program could have measured them: lab coordinates (mm) and pixels, with noise of 0.03 px.
+# `sphereorient init --plate FOLDER` writes `calibration.yaml` from pictures of a plate. Here each camera gets a table
+# of points instead, as another program could have measured them: lab coordinates (mm) and pixels, with noise of 0.03
+# px.
 
 # %%
 exact = load_cameras(folder / "cameras.yaml")
 rng = np.random.default_rng(1)
-points = 40.0 * (rng.random((200, 3)) - 0.5)
+points = 80.0 * (rng.random((400, 3)) - 0.5)
 for name, camera in exact.items():
-    uv = camera.project(torch.from_numpy(points)).numpy() + 0.03 * rng.standard_normal((200, 2))
+    uv = camera.project(torch.from_numpy(points)).numpy() + 0.03 * rng.standard_normal((400, 2))
     np.savetxt(folder / f"{name}.csv", np.hstack([points, uv]), delimiter=",", header="x,y,z,u,v", comments="")
 (folder / "calibration.yaml").write_text(
     "schema: sphereorient-calibration/1\n"
@@ -73,7 +74,7 @@ figure
 # The truth is known here: errors in degrees and mm, and how large the track says they are.
 
 # %%
-from sphereorient.evaluate import score_track  # noqa: E402
+from sphereorient.evaluate import score_track
 
 score = score_track(track, folder / "truth.h5")
 p50, p95, *_ = score.percentiles_deg()

@@ -11,6 +11,6 @@ from sphereorient.cameras.camera import (
     triangulate,
 )
 from sphereorient.cameras.ideal import PinholeCamera
-from sphereorient.cameras.io.cameras_yaml import load_cameras, load_covariance, save_cameras
+from sphereorient.cameras.io.cameras_yaml import add_model, load_cameras, load_covariance, save_cameras
 from sphereorient.cameras.port import Port, PortCamera
 from sphereorient.cameras.tsai import TsaiCamera

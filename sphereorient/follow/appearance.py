@@ -182,10 +182,14 @@ def estimate_appearance(
             fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=given)
     blurred, moved = fitter.optics, None
     if following is not None and looked is found:
-        fitter, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, _clear(found), following)
+        open_, moved = _exposed(replace(first, fitter=fitter), paint, fit, use, _clear(found), following)
     if moved is not None:
-        pixels, use = fitter.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
-        fitter, fit = _light_and_blur(fitter, paint, pixels, fit, use, given=False)
+        smeared, known = open_.exposed(pixels, moved.nan_to_num()), use & moved.isfinite().all(1)[:, None]
+        open_, there = _light_and_blur(open_, paint, smeared, fit, known, given=False)
+        if open_.left(smeared, there, known) < fitter.left(pixels, fit, known):
+            fitter, fit, pixels, use = open_, there, smeared, known
+        else:  # sharper than the exposure allows: it is not that of these pictures
+            moved = None
     fitter, fit, rivals = fitter.lit_in_the_lab(pixels, fit, use)
     whole = fitter.exposed(whole, None if moved is None else moved.nan_to_num())
     free = fitter.unoccluded(whole, fit.position_lab_mm, fit.R_lab_body).thinned(thin)

@@ -13,6 +13,7 @@ from sphereorient.evaluate.robustness.scenes import BenchmarkScene, write_scene
 from sphereorient.methods.method import Learnt
 from sphereorient.run.stages import run
 from sphereorient.run.store import MemoryStore, Request
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 
 def off_deg(track, experiment) -> np.ndarray:
@@ -47,3 +48,16 @@ def test_motion_while_the_shutter_is_open_is_no_blur(tmp_path):
     asis = run(Request(experiment=experiment, save_learnt=tmp_path / "asis.h5"), MemoryStore())
     assert Learnt.load(tmp_path / "asis.h5").instants == 1
     assert np.median(off_deg(asis, experiment)) > 1.5 * np.median(off)
+
+
+@pytest.mark.slow
+def test_an_exposure_that_is_not_that_of_the_pictures_smears_nothing(tmp_path):
+    """Sharp pictures of a ball that would turn by 20 degrees in the exposure of the file."""
+    settings = SynthSettings(frames=24, omega_rms=480.0, omega_time=1.0, exposure=0.0004, exposure_samples=1)
+    experiment, known = write_synthetic_experiment(tmp_path, settings), tmp_path / "learnt.h5"
+    track = run(Request(experiment=experiment, save_learnt=known), MemoryStore())
+    assert Learnt.load(known).instants == 1
+    off = off_deg(track, experiment)
+    assert np.median(off) < 0.03
+    sigma = np.degrees(np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)))
+    assert np.sqrt(np.mean((off / sigma) ** 2)) < 1.5

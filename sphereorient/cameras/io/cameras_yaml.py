@@ -91,6 +91,11 @@ def _entry(kind: type[CameraModel]) -> type[CameraEntry]:
 ENTRIES = {name: _entry(kind) for name, kind in MODELS.items()}
 
 
+def add_model(kind: type[CameraModel]) -> None:
+    """Let cameras.yaml name another model, a dataclass with `MODEL` and `KEYS`, in this process."""
+    MODELS[kind.MODEL], ENTRIES[kind.MODEL] = kind, _entry(kind)
+
+
 def load_cameras(path: Path | str) -> dict[str, Camera]:
     """Read all cameras of a cameras.yaml (docs/cameras.md), in its order; a camera with a `port` becomes a PortCamera.
 
