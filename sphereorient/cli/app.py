@@ -101,6 +101,7 @@ app = Commands(
 )
 
 LINE_S = 60.0  # from one line of a stage to its next, without a terminal
+TABLE = 140  # characters, of a table without a terminal
 SLOWEST = 0.05  # units per second: slower rates are told by the time left
 EXIT_REFUSED = 2  # an error that the user can correct
 NO_MEMORY = re.compile("(not enough|out of|insufficient|n't allocate|not allocate|to allocate) memory|bad_alloc", re.I)
@@ -133,6 +134,15 @@ def echo_lines(lines: Iterable[str]) -> None:
     """Print lines."""
     for line in lines:
         typer.echo(line)
+
+
+def print_table(table: Any) -> None:
+    """Print a table of rich; where there is no terminal, wide enough for whole words."""
+    from rich.console import Console
+
+    console = Console()
+    console.width = console.width if console.is_terminal else max(console.width, TABLE)
+    console.print(table)
 
 
 Advance = Callable[[str, int, int], None]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sphereorient.cli.app import Commands, app, check_writable, progress_bar
+from sphereorient.cli.app import Commands, app, check_writable, print_table, progress_bar
 from sphereorient.cli.options import Quiet, TrackPath, names_in
 from sphereorient.errors import SettingsError, refusal
 from sphereorient.files.whole_file import write_text, writing
@@ -56,12 +56,10 @@ def score(
     truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="truth.h5 of the synthetic experiment.")],
 ) -> None:
     """Print the errors of a track against the exact truth of a synthetic experiment."""
-    from rich.console import Console
-
     from sphereorient.evaluate import score_track
     from sphereorient.trajectory import Trajectory
 
-    Console().print(error_table(score_track(Trajectory.load(track), truth)))
+    print_table(error_table(score_track(Trajectory.load(track), truth)))
 
 
 def error_table(found: "Score") -> "Table":
@@ -234,7 +232,6 @@ def score_result(
 
 def _print(found: "Results") -> None:
     """Print one line for each degradation, level and method."""
-    from rich.console import Console
     from rich.table import Table
 
     from sphereorient.evaluate.robustness.results import summaries
@@ -254,7 +251,7 @@ def _print(found: "Results") -> None:
             f"{line.over_stated:.2f}",
             f"{line.frames_per_s:.1f}",
         )
-    Console().print(table)
+    print_table(table)
 
 
 def _print_changes(now: "Results", baseline: "Results", quiet: bool) -> None:

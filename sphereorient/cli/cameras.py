@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
+from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
 from sphereorient.cli.options import ExperimentPath, cameras_of
 from sphereorient.errors import CameraError, ExperimentError, refusal
 from sphereorient.files.whole_file import check_ending, put_aside
@@ -52,13 +52,10 @@ def calibrate(
         for line in result.verdict:
             typer.echo(f"doubtful: {line}", err=True)
         return
-    from rich.console import Console
-
     from sphereorient.calibration.table import parameters_table, pictures_table, summary
 
-    console = Console()
-    console.print(pictures_table(result))
-    console.print(parameters_table(result))
+    print_table(pictures_table(result))
+    print_table(parameters_table(result))
     echo_lines([*summary(result), f"Wrote {out} and {picture}"])
 
 

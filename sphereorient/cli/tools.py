@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sphereorient.cli.app import Commands, app, check_writable, command_line, echo_lines, progress_bar
+from sphereorient.cli.app import Commands, app, check_writable, command_line, echo_lines, print_table, progress_bar
 from sphereorient.cli.options import Quiet, names_in
 from sphereorient.errors import TextureError, refusal
 from sphereorient.files.whole_file import check_ending, make_folder, write_text
@@ -223,7 +223,6 @@ def _written(out: Path, drawn: "Tensor", judgement: "Judgement", title: str, *, 
 
 def _print_judgement(judgement: "Judgement", title: str) -> None:
     """Print the judgement as a table."""
-    from rich.console import Console
     from rich.table import Table
 
     told = judgement.as_dict()
@@ -231,7 +230,7 @@ def _print_judgement(judgement: "Judgement", title: str) -> None:
     white, bound = told["white_share"], told["bound_deg"]
     table.add_row("white in a view, %", *(_number(white[name], 100, 0) for name in SPREAD))
     table.add_row("best possible error of a view, degrees", *(_number(bound[name], 1, 3) for name in SPREAD))
-    Console().print(table)
+    print_table(table)
     settings = judgement.settings
     lines = [
         f"(ball of {settings.diameter_px:g} px, noise {100 * settings.noise_share:g} % of black to white, "

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, command_line, echo_lines, progress_bar
+from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
 from sphereorient.cli.options import Cameras, NoCache, Overrides, Quiet, SettingsPath, cameras_of, settings_of
 from sphereorient.errors import OutputError, SettingsError, refusal
 
@@ -132,7 +132,6 @@ def _track_side_by_side(
 
 def _print_table(outcomes: "Sequence[Outcome]") -> None:
     """Print frames, valid frames and time of each experiment."""
-    from rich.console import Console
     from rich.table import Column, Table
 
     table = Table("track", *(Column(heading, justify="right") for heading in ("frames", "valid", "s", "frames/s")), "")
@@ -141,7 +140,7 @@ def _print_table(outcomes: "Sequence[Outcome]") -> None:
         counts = (str(outcome.frames), str(outcome.valid)) if outcome.error is None else ("", "")
         told = str(outcome.request.out) if outcome.error is None else "failed, see below"
         table.add_row(outcome.name, *counts, f"{outcome.seconds:.0f}", rate, told)
-    Console().print(table)
+    print_table(table)
 
 
 def _print_summary(result: "Trajectory", out: Path) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sphereorient.cli.app import app, check_writable, progress_bar
+from sphereorient.cli.app import app, check_writable, print_table, progress_bar
 from sphereorient.cli.options import Quiet
 
 if TYPE_CHECKING:
@@ -85,7 +85,6 @@ def evaluate(
 
 def _print(found: "ProposerBenchmark") -> None:
     """Print a line for each degradation, then the metrics of the mixed pictures."""
-    from rich.console import Console
     from rich.table import Table
 
     levels = sorted({one.level for one in found.families})
@@ -94,7 +93,7 @@ def _print(found: "ProposerBenchmark") -> None:
         row = {one.level: one for one in found.families if one.family == family}
         cells = [f"{100 * row[level].recall_1:.1f} / {100 * row[level].recall_5:.1f} %" for level in levels]
         table.add_row(family, *cells)
-    Console().print(table)
+    print_table(table)
     mixed = found.mixed
     typer.echo(
         f"{mixed.pictures} mixed pictures: right first {100 * mixed.recall_1:.1f} %, among five "
