@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from sphereorient.experiment.draft import MovieFacts
     from sphereorient.preflight.first_look import FirstLook
 
 YAML = (".yaml", ".yml")
@@ -93,7 +93,7 @@ def mark(
 
 
 def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: float | None, quiet: bool) -> None:
-    from sphereorient.experiment.draft import MovieFacts, camera_keys, relative
+    from sphereorient.preflight.draft import camera_keys
 
     if len(movies) > 2:
         do = "name those of one ball; track other pairs as experiments of their own"
@@ -101,78 +101,51 @@ def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: 
     cameras = target.parent / "cameras.yaml"
     alone = len(movies) == 1 and not cameras.exists()
     looks = _looked(movies, target, quiet)
-    facts = [
-        MovieFacts(
-            camera=look.name,
-            movie=relative(Path(look.movie.path), target.parent),
-            frames=len(look.movie),
-            image_size=(look.movie.frame_shape[1], look.movie.frame_shape[0]),
-            rate_hz=look.rate_hz,
-            played_hz=look.movie.played_hz,
-            diameter_px=look.diameter_px,
-            stays=look.stays,
-        )
-        for look in looks
-    ]
-    missing = _write_experiment(facts, target, changes)
+    missing = _write_experiment(looks, target, changes)
     if alone:
-        known = vfov is not None
-        _write_cameras(cameras, camera_keys(facts[0], vfov or VFOV_DEG, known=known))
+        _write_cameras(cameras, camera_keys(looks[0], vfov or VFOV_DEG, known=vfov is not None))
     if quiet:
         return
     echo_lines(_found(look) for look in looks)
-    counts = {len(look.movie) for look in looks}
-    if len(counts) > 1:
+    if len({len(look.movie) for look in looks}) > 1:
         typer.echo("The movies differ in length: whether they began together, `sphereorient check` measures.")
     _end(target, missing, _next(target, cameras), [cameras] if alone else [])
 
 
 def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> None:
-    import cv2
-    import numpy as np
-
-    from sphereorient.experiment.draft import MovieFacts, camera_keys, relative
     from sphereorient.experiment.fictrac import read_fictrac
     from sphereorient.files.picture import write_picture
     from sphereorient.movies import open_movie
+    from sphereorient.preflight.draft import camera_keys
+    from sphereorient.preflight.mark import drawn_mask
 
     said = read_fictrac(config)
     mask, cameras = target.parent / "cam1_mask.png", target.parent / "cameras.yaml"
     check_writable(cameras)
     check_writable(mask)
-    height, width = open_movie(said.movie).frame_shape
-    shown = np.full((height, width), 255, np.uint8)
-    for polygon in said.ignored:
-        cv2.fillPoly(shown, [polygon], 0)
-    look = _looked([said.movie], target, quiet, shown > 0)[0]
-    if said.ignored:
-        write_picture(mask, shown)
-    facts = MovieFacts(
-        camera=look.name,
-        movie=relative(Path(look.movie.path), target.parent),
-        frames=len(look.movie),
-        image_size=(width, height),
-        rate_hz=look.rate_hz,
-        played_hz=look.movie.played_hz,
-        diameter_px=2 * said.circle_px[2] if said.circle_px else look.diameter_px,
-        stays=True,  # FicTrac follows no other balls
-        mask=mask.name if said.ignored else None,
-    )
+    hidden = [{"kind": "hide", "points": polygon} for polygon in said.ignored]
+    shown = drawn_mask(open_movie(said.movie).frame_shape, hidden, None)
+    look = _looked([said.movie], target, quiet, shown)[0]
+    diameter_px = 2 * said.circle_px[2] if said.circle_px else look.diameter_px
+    look = replace(look, stays=True, diameter_px=diameter_px)  # FicTrac follows no other balls
+    made = [cameras]
+    if hidden:
+        write_picture(mask, shown.astype("uint8") * 255)
+        made.append(mask)
     rate_hz = said.rate_hz or (None if look.rate_hz else look.movie.played_hz)  # its cameras are ordinary ones
     known = ["sphere.diameter=null", *([f"frame_rate={rate_hz}"] if rate_hz else [])]
-    missing = _write_experiment([facts], target, [*known, *changes])
+    missing = _write_experiment([look], target, [*known, *changes], {look.name: mask.name} if hidden else None)
     R_cam_lab = said.R_animal_cam.mT.tolist()  # the lab is the animal's frame
-    _write_cameras(cameras, camera_keys(facts, said.vfov_deg, R_cam_lab, known=True))
+    _write_cameras(cameras, camera_keys(look, said.vfov_deg, R_cam_lab, known=True))
     if not quiet:
         typer.echo(_found(look))
-        made = [cameras, mask] if said.ignored else [cameras]
         _end(target, missing, _next(target, cameras), made)
 
 
 def _calibration(folder: Path, target: Path, changes: list[str], quiet: bool) -> None:
     from sphereorient.calibration.document import SCHEMA
     from sphereorient.calibration.draft import calibration_keys, numbered_pictures, with_diameters
-    from sphereorient.experiment.draft import relative
+    from sphereorient.preflight.draft import relative
 
     pictures = numbered_pictures(folder)
     where = relative(folder, target.parent)
@@ -202,13 +175,14 @@ def _looked(
     return looks
 
 
-def _write_experiment(facts: "Sequence[MovieFacts]", target: Path, changes: list[str]) -> list[DraftKey]:
+def _write_experiment(
+    looks: "Sequence[FirstLook]", target: Path, changes: list[str], masks: dict[str, str] | None = None
+) -> list[DraftKey]:
     """Write experiment.yaml; return the keys that are left to the user."""
-    from sphereorient.experiment.draft import experiment_keys
     from sphereorient.experiment.experiment import SCHEMA
+    from sphereorient.preflight.draft import experiment_keys
 
-    name = Path(target).resolve().parent.name
-    keys = _asked(given(experiment_keys(facts, name), changes))
+    keys = _asked(given(experiment_keys(looks, target.parent, masks), changes))
     write_text(target, draft_yaml(SCHEMA, keys, HEAD))
     return open_keys(keys)
 

@@ -26,11 +26,12 @@ from sphereorient.cameras import load_cameras
 from sphereorient.cli import app
 from sphereorient.errors import CameraError, ExperimentError, SettingsError, SphereOrientError
 from sphereorient.experiment import load_experiment
-from sphereorient.experiment.draft import MovieFacts, experiment_keys
 from sphereorient.experiment.experiment import ExperimentKeys
 from sphereorient.experiment.fictrac import read_fictrac
 from sphereorient.files.draft import DraftKey, draft_yaml, given
-from sphereorient.preflight.first_look import look_at
+from sphereorient.movies import open_movie
+from sphereorient.preflight.draft import experiment_keys
+from sphereorient.preflight.first_look import FirstLook, look_at
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 ROUND = ["--set", "frame_rate=600", "--set", "sphere.diameter=18"]
@@ -128,16 +129,12 @@ def leaves(model: type[BaseModel], before: str = "") -> Iterator[str]:
         yield from leaves(inner[0], f"{before}{name}.") if inner else [before + name]
 
 
-FACTS = MovieFacts(
-    camera="cam1",
-    movie="cam1.mkv",
-    frames=240,
-    image_size=(640, 480),
-    rate_hz=None,
-    played_hz=25.0,
-    diameter_px=80.0,
-    stays=False,
-)
+def look(folder: Path) -> FirstLook:
+    """What a movie of noise shows, as if a ball of 80 px moved in it."""
+    np.save(folder / "a.npy", np.zeros((40, 48, 64), np.uint8))
+    movie = open_movie(folder / "a.npy")
+    frame = {"found": 40, "looked": 40, "frame": 0, "picture": np.zeros((48, 64)), "outline": None}
+    return FirstLook(name="cam1", movie=movie, rate_hz=None, diameter_px=80.0, stays=False, **frame)
 
 
 def uncommented(text: str) -> str:
@@ -145,13 +142,14 @@ def uncommented(text: str) -> str:
     return "\n".join(re.sub(r"^# (\s*[\w]+:( |$))", r"\1", line) for line in text.splitlines())
 
 
-def test_a_draft_has_every_key_and_valid_examples():
-    text = uncommented(draft_yaml("sphereorient-experiment/1", experiment_keys([FACTS], "free")))
+def test_a_draft_has_every_key_and_valid_examples(tmp_path):
+    keys = experiment_keys([look(tmp_path)], tmp_path)
+    text = uncommented(draft_yaml("sphereorient-experiment/1", keys))
     document = yaml.safe_load(text)
     assert document.pop("schema") == "sphereorient-experiment/1"
     ExperimentKeys.model_validate(document)
     names = {key for key in leaves(ExperimentKeys) if not key.startswith("flow.")} | {"flow"}
-    written = {key.name for key in experiment_keys([FACTS], "free")}
+    written = {key.name for key in keys}
     assert names - written == {"times"}  # instead of frame_rate
 
 

@@ -1,51 +1,35 @@
 """The first experiment.yaml of new movies: what was measured is in it, what nobody measured is asked for."""
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sphereorient.files.draft import DraftKey
+from sphereorient.preflight.first_look import FirstLook
 
 EXPOSURE = "s, how long the shutter is open; the ball's motion in this time is told from the blur of the optics"
 RATE = "Hz, of the recording"
 
 
-@dataclass(frozen=True, kw_only=True)
-class MovieFacts:
-    """What is known of one movie before anything is written down."""
-
-    camera: str
-    movie: str  # path as the file names it
-    frames: int
-    image_size: tuple[int, int]  # W, H px
-    rate_hz: float | None  # by exact time stamps of the file
-    played_hz: float | None  # at which players show it
-    diameter_px: float | None
-    stays: bool | None  # whether the ball stays in its place
-    mask: str | None = None
-
-
-def experiment_keys(facts: Sequence[MovieFacts], name: str) -> list[DraftKey]:
-    """Return the keys of experiment.yaml in their order."""
-    sizes = ", ".join(f"{one.diameter_px:.0f} px in {one.camera}" for one in facts if one.diameter_px)
-    stamped = all(one.rate_hz for one in facts)
-    one_camera, stays = len(facts) == 1, all(one.stays for one in facts)
+def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str, str] | None = None) -> list[DraftKey]:
+    """Return the keys of an experiment.yaml in a folder, in their order; `masks`: files by camera."""
+    sizes = ", ".join(f"{one.diameter_px:.0f} px in {one.name}" for one in looks if one.diameter_px)
+    stamped = all(one.rate_hz for one in looks)
+    one_camera, stays = len(looks) == 1, all(one.stays for one in looks)
     diameter = "mm" + ("; null where it is not known: lengths are then in radii" if one_camera and stays else "")
-    cameras = {one.camera: one for one in facts}
+    cameras = [one.name for one in looks]
 
     def each(what: str) -> dict[str, Any]:
         return {camera: what.format(camera) for camera in cameras}
 
-    counts = ", ".join(f"{one.camera} {one.frames}" for one in facts)
-    masks = {one.camera: one.mask for one in facts if one.mask}
-    keys = [DraftKey(name="name", value=name, comment="free")]
+    counts = ", ".join(f"{one.name} {len(one.movie)}" for one in looks)
+    keys = [DraftKey(name="name", value=folder.resolve().name, comment="free")]
     if stamped:
-        rate = facts[0].rate_hz
+        rate = looks[0].rate_hz
         keys.append(DraftKey(name="times", value="movies", comment=f"time stamps of the files: usually {rate:.6g} Hz"))
     else:
-        played = next((one.played_hz for one in facts if one.played_hz), None)
+        played = next((one.movie.played_hz for one in looks if one.movie.played_hz), None)
         told = f"{RATE}; players show it at {played:g}" if played else RATE
         keys.append(DraftKey(name="frame_rate", comment=told, example=600.0, asked=True))
     return [
@@ -65,7 +49,11 @@ def experiment_keys(facts: Sequence[MovieFacts], name: str) -> list[DraftKey]:
             value="cameras.yaml",
             comment="`sphereorient calibrate` writes it" if not one_camera else "written beside this file",
         ),
-        DraftKey(name="movies", value={one.camera: one.movie for one in facts}, comment=f"frames: {counts}"),
+        DraftKey(
+            name="movies",
+            value={one.name: relative(Path(one.movie.path), folder) for one in looks},
+            comment=f"frames: {counts}",
+        ),
         DraftKey(
             name="backgrounds",
             comment="the scene without the ball, of the movie's size: better for short movies",
@@ -83,7 +71,7 @@ def experiment_keys(facts: Sequence[MovieFacts], name: str) -> list[DraftKey]:
             example=dict.fromkeys(cameras, 0),
         ),
         DraftKey(
-            name="frames", comment="first, last + 1; all without it", example=[0, min(one.frames for one in facts)]
+            name="frames", comment="first, last + 1; all without it", example=[0, min(len(one.movie) for one in looks)]
         ),
         DraftKey(name="flip", comment="mirrored movies: vertical, horizontal, both", example=each("vertical")),
         DraftKey(
@@ -101,18 +89,19 @@ def experiment_keys(facts: Sequence[MovieFacts], name: str) -> list[DraftKey]:
 
 
 def camera_keys(
-    facts: MovieFacts, vfov_deg: float, R: Sequence[Sequence[float]] | None = None, *, known: bool
+    look: FirstLook, vfov_deg: float, R: Sequence[Sequence[float]] | None = None, *, known: bool
 ) -> list[DraftKey]:
     """Return the keys of cameras.yaml for one camera of which at most the field of view is known.
     R: R_cam_lab, where the lab is not the camera's own frame.
     """
-    entry: dict[str, Any] = {"model": "pinhole", "image_size": list(facts.image_size), "vfov_deg": vfov_deg}
+    height, width = look.movie.frame_shape
+    entry: dict[str, Any] = {"model": "pinhole", "image_size": [width, height], "vfov_deg": vfov_deg}
     if R is not None:
         entry |= {"R": [list(row) for row in R], "T": [0.0, 0.0, 0.0]}
     told = "known" if known else "assumed: it hardly matters for a ball in its place"
     where = "the lab is the animal's frame: x ahead, y right, z down" if R else "the lab is the camera's frame"
     comment = f"field of view {told}; {where}"
-    return [DraftKey(name=f"cameras.{facts.camera}", value=entry, comment=comment)]
+    return [DraftKey(name=f"cameras.{look.name}", value=entry, comment=comment)]
 
 
 def relative(path: Path, folder: Path) -> str:
