@@ -135,7 +135,8 @@ def _figures(summary: Summary, tracks: Mapping[str, Trajectory], distances: Sequ
     name, track = max(tracks.items(), key=lambda item: int(item[1].valid.sum()))
     of = "" if len(tracks) == 1 else f" of {name}"
     yield "track", f"Track{of}, with bands of two standard errors.", lambda: plots.track_figure(track)
-    yield "path", f"Path{of} with the sphere's axes.", lambda: plots.path_figure(track)
+    if not track.held:
+        yield "path", f"Path{of} with the sphere's axes.", lambda: plots.path_figure(track)
     if any(len(one.distance_rad) for one in distances):
         caption = "Distance of the cameras' own orientations."
         yield "camera_distance", caption, lambda: plots.camera_distance_figure(distances)

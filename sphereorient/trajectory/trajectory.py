@@ -200,13 +200,9 @@ class Trajectory:
         """Write HDF5 of schema sphereorient-track/1, replacing an old file at the end; equal arrays give equal bytes.
 
         Raises:
-            OutputError: folder missing or not writable.
+            OutputError: the file cannot be written.
         """
-        path = Path(path)
-        if not path.parent.is_dir():
-            do = "create it first or choose another place"
-            raise OutputError(refusal(str(path), expected=f"a folder {path.parent}", got="none", do=do))
-        with whole_hdf5(path) as file:
+        with whole_hdf5(Path(path)) as file:
             file.attrs["schema"] = SCHEMA
             file.attrs["provenance"] = json.dumps(self.provenance, sort_keys=True)
             for name in (*TEXTS, "frame_rate", "length_unit"):

@@ -13,7 +13,7 @@ from conftest import SHARED, assert_close
 
 from sphereorient.cameras import PinholeCamera, TsaiCamera, load_cameras, save_cameras
 from sphereorient.cameras.camera import ParameterCovariance
-from sphereorient.errors import CameraError, OutputError
+from sphereorient.errors import CameraError
 
 TSAI = """
 schema: sphereorient-cameras/1
@@ -180,9 +180,9 @@ def test_a_missing_file_a_folder_and_bytes_are_refused(tmp_path):
         load_cameras(tmp_path / "cameras.yaml")
 
 
-def test_a_folder_that_is_not_there_is_refused_on_writing(tmp_path):
-    with pytest.raises(OutputError, match="expected a file that can be written"):
-        save_cameras(tmp_path / "none" / "cameras.yaml", {"cam1": tsai()})
+def test_a_folder_that_is_not_there_is_made_on_writing(tmp_path):
+    save_cameras(tmp_path / "new" / "cameras.yaml", {"cam1": tsai()})
+    assert list(load_cameras(tmp_path / "new" / "cameras.yaml")) == ["cam1"]
 
 
 def test_an_old_file_survives_a_camera_that_cannot_be_written(tmp_path):

@@ -241,8 +241,9 @@ def test_what_openptv_cannot_hold_is_refused(tmp_path):
         CameraError, match=r"expected a wall with the lab's origin on its liquid side .*, got offset -3"
     ):
         save_openptv(*paths, behind)
-    with pytest.raises(OutputError, match="expected a file that can be written"):
-        save_openptv(tmp_path / "none" / "cam.ori", paths[1], openptv())
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="Not a directory"):
+        save_openptv(tmp_path / "file" / "cam.ori", paths[1], openptv())
 
 
 def test_media_that_are_all_alike_make_no_wall():

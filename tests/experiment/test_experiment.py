@@ -71,10 +71,10 @@ def test_an_experiment_in_another_folder_finds_its_files(folder, tmp_path_factor
         assert len(movie) == 12
 
 
-def test_a_folder_that_is_not_there_cannot_be_written_to(folder):
+def test_a_folder_that_cannot_be_made_cannot_be_written_to(folder):
     experiment = load_experiment(written(folder, SHORT))
-    with pytest.raises(OutputError, match="can be written"):
-        write_experiment(dataclasses.replace(experiment, path=folder / "none" / "experiment.yaml"))
+    with pytest.raises(OutputError, match="Not a directory"):
+        write_experiment(dataclasses.replace(experiment, path=experiment.path / "experiment.yaml"))
 
 
 FAULTS = {

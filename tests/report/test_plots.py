@@ -307,7 +307,8 @@ def test_the_same_input_gives_the_same_bytes_whatever_the_users_own_style(name, 
     assert b"CreationDate" not in pdf
 
 
-def test_a_folder_that_is_not_there_is_refused(tmp_path):
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "none").touch()
     with pytest.raises(OutputError, match=r"figure\.png"):
         plots.write_figure(FIGURES["noise"](), tmp_path / "none" / "figure")
 

@@ -195,9 +195,9 @@ def test_a_failure_while_writing_leaves_the_old_file_and_no_other(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_saving_into_a_missing_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"nowhere.*create it"):
-        full_trajectory().save(tmp_path / "nowhere" / "track.h5")
+def test_saving_makes_a_missing_folder(tmp_path: Path) -> None:
+    full_trajectory().save(tmp_path / "new" / "track.h5")
+    assert len(Trajectory.load(tmp_path / "new" / "track.h5")) == len(full_trajectory())
 
 
 def test_saving_where_nothing_can_be_written_is_refused(tmp_path: Path) -> None:

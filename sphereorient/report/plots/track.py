@@ -52,6 +52,7 @@ class TrackPart:
 @look.in_style
 def track_figure(track: Trajectory) -> Figure:
     """Draw position, Tait-Bryan angles, velocities and accelerations against time: smooth with 2 sigma, and measured.
+    Of a ball in its place, the rotation alone.
 
     Frames that are not valid are shaded. Of a long track, the part of `shown_part` is drawn, with a note.
     Source: the paper, figure of a sample track; the angles by docs/errata.md E1.
@@ -61,15 +62,16 @@ def track_figure(track: Trajectory) -> Figure:
     late = len(track) > 0 and (float(np.ptp(track.time)) > LONG_S or float(track.time.max()) > LATE_S)
     unit, time = ("s", track.time) if late else ("ms", 1e3 * track.time)
     figure = look.new_figure(look.WIDTH_IN, 7.6)
-    panels = figure.subplots(3, 2, sharex=True)
-    _dots(panels[0, 0], time, track.position)
-    _curves(panels[0, 0], time, track.position_smooth, _sigma(track.position_smooth_cov), part.broken)
-    panels[0, 0].set_ylabel(in_length("position, lab (mm)", track.length_unit))
-    _angles(panels[0, 1], time, part)
-    for axes, (name, label) in zip(panels[1:].ravel(), RATES.items(), strict=True):
-        if name in ("omega_lab", "alpha_lab") or not track.held:
-            _curves(axes, time, getattr(track, name), getattr(track, f"{name}_sigma"), part.broken)
-        axes.set_ylabel(in_length(label, track.length_unit))
+    panels = figure.subplots(3, 1 if track.held else 2, sharex=True, squeeze=False)
+    if not track.held:
+        _dots(panels[0, 0], time, track.position)
+        _curves(panels[0, 0], time, track.position_smooth, _sigma(track.position_smooth_cov), part.broken)
+        panels[0, 0].set_ylabel(in_length("position, lab (mm)", track.length_unit))
+    _angles(panels[0, -1], time, part)
+    shown = ("omega_lab", "alpha_lab") if track.held else tuple(RATES)
+    for axes, name in zip(panels[1:].ravel(), shown, strict=True):
+        _curves(axes, time, getattr(track, name), getattr(track, f"{name}_sigma"), part.broken)
+        axes.set_ylabel(in_length(RATES[name], track.length_unit))
     edges = np.flatnonzero(np.diff(np.concatenate([[True], track.valid, [True]]).astype(np.int8)))
     half = float(np.median(np.diff(time))) / 2 if len(time) > 1 else 0.5
     runs = [(time[a] - half, time[b - 1] - time[a] + 2 * half) for a, b in edges.reshape(-1, 2)]
