@@ -49,4 +49,4 @@ docs: setup
 	$(BIN)/mkdocs build
 
 clean:
-	rm -rf out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf out .cache .pytest_cache .mypy_cache .ruff_cache
