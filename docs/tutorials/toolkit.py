@@ -30,7 +30,6 @@ figure, axes = plt.subplots(1, 4, figsize=(9, 2.4))
 for ax, view in zip(axes, views, strict=True):
     ax.imshow(view, cmap="gray")
     ax.set_axis_off()
-figure
 
 # %% [markdown]
 # ## Search
