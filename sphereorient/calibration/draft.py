@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,19 +10,17 @@ import numpy as np
 
 from sphereorient.calibration.dots import find_dots
 from sphereorient.calibration.lattice import LEAST_DOTS, find_lattice
+from sphereorient.calibration.plates import Progress, read_plate_picture
 from sphereorient.calibration.targets import Ints
 from sphereorient.cameras.checks import camera_error
 from sphereorient.files.draft import DraftKey
-from sphereorient.files.picture import decoded_grey
 from sphereorient.files.threads import side_by_side
-
-Progress = Callable[[str, int, int], None]
 
 ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 NUMBERED = re.compile(r"^(?P<camera>.*?)[-_ ]*(?P<pose>\d+)$")
 LARGER = 1.25  # of the usual width: a larger dot
 CERTAIN = 30  # dots in a lattice: those of the other polarity need not be sought
-DIAMETERS = "plate.dot_diameter", "plate.fiducial_diameter"
+DIAMETERS = {"plate.dot_diameter": "width", "plate.fiducial_diameter": "larger"}  # keys, and parts of `PlateSeen`
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,9 +33,7 @@ class PlateSeen:
     dark: bool
     width: float  # of a usual dot, in pitches; NaN: none
     larger: float  # of a larger dot; NaN: none
-    marks: (
-        tuple[int, int] | None
-    )  # dots from the origin's to the larger ones on x and on y; None: not three larger ones
+    marks: tuple[int, int] | None  # dots from the origin's to the larger ones on x and y; None: not three of these
 
 
 def numbered_pictures(folder: Path) -> dict[int, dict[str, str]]:
@@ -59,9 +55,7 @@ def numbered_pictures(folder: Path) -> dict[int, dict[str, str]]:
 
 def look_at_plate(path: Path) -> PlateSeen:
     """Find the dots of a picture, dark or bright ones; CameraError where it cannot be decoded."""
-    picture = decoded_grey(path.read_bytes())
-    if picture is None:
-        raise camera_error(str(path), "a picture", "a file that cannot be decoded", "save it as PNG")
+    picture = read_plate_picture(path)
     size = picture.shape[1], picture.shape[0]
     best, dark = None, True
     for polarity in (True, False):
@@ -99,8 +93,9 @@ def _marks(index: Ints, large: Ints) -> tuple[int | None, tuple[int, int] | None
 
 def calibration_keys(
     folder: Path, pictures: Mapping[int, Mapping[str, str]], where: str, progress: Progress
-) -> list[DraftKey]:
-    """Return the keys of calibration.yaml, measured in the pictures of `folder`; `where`: folder as the file names it.
+) -> tuple[list[DraftKey], dict[str, float]]:
+    """Return the keys of calibration.yaml, measured in the pictures of `folder`, and the widths of dots, in pitches,
+    by key. `where`: folder as the file names it.
 
     Raises:
         CameraError: a picture that cannot be read, pictures of several sizes, or no plate of dots in any.
@@ -118,11 +113,12 @@ def calibration_keys(
         raise camera_error(str(folder), "pictures of one size, px", got, do)
     with_dots = [one for one in seen if one.columns]
     cameras = sorted({name for of_pose in pictures.values() for name in of_pose})
-    return [
+    widths = _widths(with_dots)
+    keys = [
         DraftKey(name="image_size", value=list(seen[0].size), comment="W, H px, measured"),
         DraftKey(name="pixel_pitch", comment="mm, of the sensor, across and down", example=[0.02, 0.02], asked=True),
         DraftKey(name="model", value="tsai", comment="or pinhole, brown"),
-        *_plate_keys(with_dots, len(seen)),
+        *_plate_keys(with_dots, widths, len(seen)),
         DraftKey(name="surveyed.pose", value=min(pictures), comment="its plate defines the lab; any that was surveyed"),
         DraftKey(
             name="surveyed.R_lab_plate",
@@ -147,9 +143,10 @@ def calibration_keys(
             comment=f"{len(seen)} of {len(pictures)} poses, paired by number",
         ),
     ]
+    return keys, widths
 
 
-def _plate_keys(seen: Sequence[PlateSeen], count: int) -> list[DraftKey]:
+def _plate_keys(seen: Sequence[PlateSeen], widths: Mapping[str, float], count: int) -> list[DraftKey]:
     """Return the keys of a plate of dots, where any picture shows one; the pitch is what pictures cannot tell."""
     if not seen:
         example = {"type": "chessboard", "columns": 9, "rows": 6, "pitch": 10.0}
@@ -167,8 +164,12 @@ def _plate_keys(seen: Sequence[PlateSeen], count: int) -> list[DraftKey]:
         DraftKey(name="plate.rows", value=rows, comment=told),
         DraftKey(name="plate.pitch", comment="mm, between the middles of dots", example=8.0, asked=True),
         *(
-            DraftKey(name=name, comment=f"{share:.3f} of the pitch, measured; mm", example=round(8.0 * share, 2))
-            for name, share in zip(DIAMETERS, _widths(seen), strict=True)
+            DraftKey(
+                name=name,
+                comment=f"{widths[name]:.3f} of the pitch, measured; mm" if name in widths else "mm; none was seen",
+                example=round(8.0 * widths.get(name, 0.6), 2),
+            )
+            for name in DIAMETERS
         ),
         DraftKey(
             name="plate.fiducials",
@@ -185,24 +186,18 @@ def _plate_keys(seen: Sequence[PlateSeen], count: int) -> list[DraftKey]:
     ]
 
 
-def _widths(seen: Sequence[PlateSeen]) -> tuple[float, float]:
-    """Return the widths of a usual and of a larger dot, in pitches; NaN where none was seen."""
-    usual, larger = ([getattr(one, part) for one in seen] for part in ("width", "larger"))
-    return float(np.median(usual)), float(np.nanmedian(larger)) if np.isfinite(larger).any() else float("nan")
+def _widths(seen: Sequence[PlateSeen]) -> dict[str, float]:
+    """Return the median widths of usual and larger dots, in pitches, by key, of those that were seen."""
+    widths = {name: [getattr(one, part) for one in seen] for name, part in DIAMETERS.items()}
+    return {name: float(np.nanmedian(some)) for name, some in widths.items() if np.isfinite(some).any()}
 
 
-def with_diameters(keys: Sequence[DraftKey]) -> list[DraftKey]:
-    """Return keys with the measured diameters of the dots in mm, once the pitch is known."""
-    known = {key.name: key.value for key in keys}
-    pitch, shares = (
-        known.get("plate.pitch"),
-        {key.name: float(key.comment.split()[0]) for key in keys if key.name in DIAMETERS},
-    )
+def with_diameters(keys: Sequence[DraftKey], widths: Mapping[str, float]) -> list[DraftKey]:
+    """Return keys with the diameters of the dots in mm, from `widths` in pitches, once the pitch is known."""
+    pitch = next((key.value for key in keys if key.name == "plate.pitch"), None)
     if not isinstance(pitch, int | float):
         return list(keys)
     return [
-        replace(key, value=round(shares[key.name] * pitch, 4))
-        if key.name in shares and key.value is ... and np.isfinite(shares[key.name])
-        else key
+        replace(key, value=round(widths[key.name] * pitch, 4)) if key.value is ... and key.name in widths else key
         for key in keys
     ]

@@ -88,17 +88,23 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Pict
     return views
 
 
-def _read_grey(path: Path, image_size: tuple[int, int]) -> NDArray[Any]:
+def read_plate_picture(path: Path) -> NDArray[Any]:
+    """Return the grey levels (H, W) of a picture of a plate; CameraError for a file that is no picture or too large."""
     content = read_whole(path, LARGEST_BYTES, "a picture", CameraError, "correct the path")
     pixels = claimed_pixels(content)
     # Do not decode a file that claims more pixels than any camera has.
     picture = decoded_grey(content) if pixels is not None and pixels <= LARGEST_PIXELS else None
     if picture is None:
         raise camera_error(str(path), "a picture", "a file that is no picture or too large", "save it as PNG")
+    return np.asarray(picture)
+
+
+def _read_grey(path: Path, image_size: tuple[int, int]) -> NDArray[Any]:
+    picture = read_plate_picture(path)
     if picture.shape != image_size[::-1]:
         expected, got = (f"{w} x {h} px" for w, h in (image_size, picture.shape[::-1]))
         raise camera_error(str(path), expected, got, "correct image_size, or leave the picture out")
-    return np.asarray(picture)
+    return picture
 
 
 def _check_seen(

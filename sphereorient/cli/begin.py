@@ -13,7 +13,7 @@ from sphereorient.cli.app import app, check_writable, echo_lines, progress_bar
 from sphereorient.cli.options import ExperimentPath, Quiet
 from sphereorient.errors import SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.files.draft import DraftKey, draft_yaml, given, open_keys
-from sphereorient.files.whole_file import check_ending, write_text
+from sphereorient.files.whole_file import check_ending, relative_path, write_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -113,13 +113,13 @@ def _experiment(movies: Sequence[Path], target: Path, changes: list[str], vfov: 
 
 
 def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> None:
-    from sphereorient.experiment.fictrac import read_fictrac
+    from sphereorient.experiment.fictrac import read_fictrac_config
     from sphereorient.files.picture import write_picture
     from sphereorient.movies import open_movie
     from sphereorient.preflight.draft import camera_keys
     from sphereorient.preflight.mark import drawn_mask
 
-    said = read_fictrac(config)
+    said = read_fictrac_config(config)
     mask, cameras = target.parent / "cam1_mask.png", target.parent / "cameras.yaml"
     check_writable(cameras)
     check_writable(mask)
@@ -145,13 +145,12 @@ def _fictrac(config: Path, target: Path, changes: list[str], quiet: bool) -> Non
 def _calibration(folder: Path, target: Path, changes: list[str], quiet: bool) -> None:
     from sphereorient.calibration.document import SCHEMA
     from sphereorient.calibration.draft import calibration_keys, numbered_pictures, with_diameters
-    from sphereorient.preflight.draft import relative
 
     pictures = numbered_pictures(folder)
-    where = relative(folder, target.parent)
+    where = relative_path(folder, target.parent)
     with progress_bar(quiet, unit="pictures") as advance:
-        keys = calibration_keys(folder, pictures, "" if where == "." else f"{where}/", advance)
-    keys = with_diameters(_asked(given(keys, changes)))
+        keys, widths = calibration_keys(folder, pictures, "" if where == "." else f"{where}/", advance)
+    keys = with_diameters(_asked(given(keys, changes)), widths)
     write_text(target, draft_yaml(SCHEMA, keys, HEAD))
     if not quiet:
         echo_lines(

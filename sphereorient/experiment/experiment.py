@@ -8,6 +8,7 @@ from pydantic import BaseModel, Field, FiniteFloat, StrictBool
 
 from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load_covariance
 from sphereorient.errors import ExperimentError, MovieError, refusal
+from sphereorient.files.whole_file import relative_path
 from sphereorient.files.yaml_file import read_document, refuse_unknown, validated, write_document
 from sphereorient.movies import Movie, flipped, is_movie, movie_files, open_movie
 from sphereorient.sphere import seen_path
@@ -152,7 +153,7 @@ def write_experiment(experiment: Experiment, comment: str = "") -> Path:
     """
 
     def relative(path: Path | str) -> str:
-        return Path(os.path.relpath(path, experiment.folder)).as_posix()
+        return relative_path(path, experiment.folder)
 
     times, texture = experiment.times, experiment.texture_path
     sphere: dict[str, Any] = {"diameter": experiment.diameter_mm}

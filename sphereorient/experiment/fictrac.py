@@ -29,7 +29,7 @@ class FicTracConfig:
     R_animal_cam: Tensor  # (3, 3): x ahead, y to the right, z down, of the animal
 
 
-def read_fictrac(path: Path) -> FicTracConfig:
+def read_fictrac_config(path: Path) -> FicTracConfig:
     """Read config.txt; ExperimentError for another file, or one without movie or field of view."""
     lines = read_text(path, TEXT_BYTES, "a config.txt", ExperimentError, DO).splitlines()
     pairs = (line.partition(":") for line in lines if ":" in line and not line.lstrip().startswith("#"))

@@ -1,5 +1,4 @@
 import hashlib
-import os
 import platform
 import sys
 from collections.abc import Mapping, Sequence
@@ -7,6 +6,8 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+from sphereorient.files.whole_file import relative_path
 
 PACKAGES = ("sphereorient", "torch", "kornia", "numpy", "scipy", "opencv-python-headless", "h5py", "av")
 
@@ -43,5 +44,5 @@ def provenance(inputs: Mapping[Path, Sequence[Path]], folder: Path, command: str
         "platform": f"{platform.system()} {platform.machine()}, {sys.implementation.name}",
         "versions": versions(),
         # By path relative to experiment.yaml: two cameras' movies in two folders often share a name.
-        "sha256": {Path(os.path.relpath(path, folder)).as_posix(): _digest(files) for path, files in inputs.items()},
+        "sha256": {relative_path(path, folder): _digest(files) for path, files in inputs.items()},
     }

@@ -191,6 +191,11 @@ def make_folder(path: Path, name: str) -> None:
         raise OutputError(refusal(name, expected=expected, got=error_words(error), do=do)) from error
 
 
+def relative_path(path: Path | str, folder: Path) -> str:
+    """Return a path as a file in `folder` names it, with / on every system."""
+    return Path(os.path.relpath(path, folder)).as_posix()
+
+
 def check_folder(path: Path, name: str) -> None:
     """Raise OutputError, with `name`, if the folder of a file to write cannot be made or may not be written in."""
     folder = next((one for one in path.absolute().parents if one.exists()), Path("/"))

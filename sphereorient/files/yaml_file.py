@@ -169,8 +169,7 @@ def _worded(fault: ValidationError, model: type[BaseModel], where: str, also: Se
     if kind == "extra_forbidden":
         return refuse_unknown(place[-1], known_keys(model, place[:-1]), ", ".join([where, *map(str, place[:-1])]))
     if kind == "missing":
-        missing = [".".join(map(str, one["loc"])) for one in fault.errors() if one["type"] == "missing"]
-        missing = [*also, *missing]
+        missing = [*also, *(".".join(map(str, one["loc"])) for one in fault.errors() if one["type"] == "missing")]
         if len(missing) > 1:
             return refusal(where, expected="all needed keys", got=f"no {', '.join(missing)}", do="add them")
         return refusal(name, expected="a value", got="none", do="add the key")

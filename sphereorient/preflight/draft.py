@@ -1,11 +1,11 @@
 """The first experiment.yaml of new movies: what was measured is in it, what nobody measured is asked for."""
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sphereorient.files.draft import DraftKey
+from sphereorient.files.whole_file import relative_path
 from sphereorient.preflight.first_look import FirstLook
 
 EXPOSURE = "s, how long the shutter is open; the ball's motion in this time is told from the blur of the optics"
@@ -51,7 +51,7 @@ def experiment_keys(looks: Sequence[FirstLook], folder: Path, masks: Mapping[str
         ),
         DraftKey(
             name="movies",
-            value={one.name: relative(Path(one.movie.path), folder) for one in looks},
+            value={one.name: relative_path(one.movie.path, folder) for one in looks},
             comment=f"frames: {counts}",
         ),
         DraftKey(
@@ -102,8 +102,3 @@ def camera_keys(
     where = "the lab is the animal's frame: x ahead, y right, z down" if R else "the lab is the camera's frame"
     comment = f"field of view {told}; {where}"
     return [DraftKey(name=f"cameras.{look.name}", value=entry, comment=comment)]
-
-
-def relative(path: Path, folder: Path) -> str:
-    """Return a path as a file in `folder` names it."""
-    return Path(os.path.relpath(path, folder)).as_posix()

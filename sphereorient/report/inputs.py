@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sphereorient.calibration import Calibrated, PictureReport
 from sphereorient.files.picture import decoded_grey
+from sphereorient.locate.outline import Outline
 from sphereorient.movies import Movie
 from sphereorient.movies.survey import Survey, SurveyedFrame
 from sphereorient.preflight import Finding, Preflight, Severity
@@ -153,16 +154,20 @@ def first_look_figure(looks: Sequence[FirstLook], path: Path) -> None:
             whole.set_title(f"{look.name}: no ball was found", fontsize=9)
             continue
         outline = look.outline
-        angle = np.linspace(0, 2 * np.pi, 181)
-        u, v = outline.u_px + outline.radius_px * np.cos(angle), outline.v_px + outline.radius_px * np.sin(angle)
         for ax in (whole, near):
-            ax.plot(u, v, lw=1.4, color=FOUND)
+            ax.plot(*_circle(outline), lw=1.4, color=FOUND)
         reach = NEAR * outline.radius_px
         near.set(xlim=(outline.u_px - reach, outline.u_px + reach), ylim=(outline.v_px + reach, outline.v_px - reach))
         where = "stays in its place" if look.stays else f"moves; found in {look.found} of {look.looked} frames"
         whole.set_title(f"{look.name}, {Path(look.movie.path).name}: the ball {where}", fontsize=9)
         near.set_title(f"outline found, {2 * outline.radius_px:.1f} px across", fontsize=9)
     write_figure(figure, path, dpi=110)
+
+
+def _circle(outline: Outline) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return u and v, px, of points on an outline."""
+    angle = np.linspace(0, 2 * np.pi, 181)
+    return outline.u_px + outline.radius_px * np.cos(angle), outline.v_px + outline.radius_px * np.sin(angle)
 
 
 def preflight_figure(result: Preflight, path: Path) -> None:
@@ -214,9 +219,7 @@ def _draw_ball(ax: Any, sample: MovieSample, k: int, expected: NDArray[np.float6
         picture = np.zeros(sample.stream.movie.frame_shape)
     ax.imshow(picture, cmap="gray", vmin=0, vmax=max(1.0, float(np.percentile(picture, 99.8))))
     if outline is not None:
-        angle = np.linspace(0, 2 * np.pi, 181)
-        u, v = outline.u_px + outline.radius_px * np.cos(angle), outline.v_px + outline.radius_px * np.sin(angle)
-        ax.plot(u, v, lw=1.4, color=FOUND, label="outline found")
+        ax.plot(*_circle(outline), lw=1.4, color=FOUND, label="outline found")
     if expected is not None:
         closed = np.concatenate([expected, expected[:1]])
         ax.plot(*closed.T, "--", lw=1.4, color=EXPECTED, label="expected from both cameras and the diameter")

@@ -27,7 +27,7 @@ from sphereorient.cli import app
 from sphereorient.errors import CameraError, ExperimentError, SettingsError, SphereOrientError
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.experiment import ExperimentKeys
-from sphereorient.experiment.fictrac import read_fictrac
+from sphereorient.experiment.fictrac import read_fictrac_config
 from sphereorient.files.draft import DraftKey, draft_yaml, given
 from sphereorient.movies import open_movie
 from sphereorient.preflight.draft import experiment_keys
@@ -226,7 +226,7 @@ def test_a_folder_without_plates_is_told(tmp_path):
 def test_fictrac_is_taken_over(clean, tmp_path):
     two_movies(clean, tmp_path)
     (tmp_path / "config.txt").write_text(CONFIG)
-    said = read_fictrac(tmp_path / "config.txt")
+    said = read_fictrac_config(tmp_path / "config.txt")
     assert said.circle_px == pytest.approx((0.0, 0.0, 10.0), abs=1e-9)
     assert [len(one) for one in said.ignored] == [3, 4]
     init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml")
@@ -257,7 +257,7 @@ def test_a_wrong_config_is_refused_by_its_key(tmp_path, line, message):
     lines = [line if each.startswith(key) else each for each in CONFIG.splitlines()]
     (tmp_path / "config.txt").write_text("\n".join(lines))
     with pytest.raises(ExperimentError, match=message):
-        read_fictrac(tmp_path / "config.txt")
+        read_fictrac_config(tmp_path / "config.txt")
 
 
 def test_one_camera_needs_no_pose_and_two_do(tmp_path):
