@@ -147,12 +147,18 @@ def centre_lab_mm(camera: Camera) -> Tensor:
     return -(camera.R_cam_lab.mT @ camera.T_cam_lab_mm)
 
 
-def sphere_radius_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
-    """Return the radius (...), px, of a sphere's picture at positions (..., 3), mm, lab, along the camera's x."""
+def sphere_disk_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
+    """Return middle (..., 2) and radius (...), px, of a sphere's picture at positions (..., 3), mm, lab.
+    The radius is that along the camera's x.
+    """
     right = camera.R_cam_lab[0] * radius_mm
     centre, rim = camera.project(torch.stack([position_lab_mm, position_lab_mm + right]))
-    radius_px: Tensor = (rim - centre).norm(dim=-1)
-    return radius_px
+    return centre, (rim - centre).norm(dim=-1)
+
+
+def sphere_radius_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -> Tensor:
+    """Return the radius (...), px, of `sphere_disk_px`."""
+    return sphere_disk_px(camera, position_lab_mm, radius_mm)[1]
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

@@ -205,23 +205,26 @@ class ChunkTracker:
             X, R = self._approached(frames, X, R, use, precision, torch.tensor([one.rough for one in expected]))
             share = torch.tensor([[one.rough * one.open_share] for one in expected], dtype=X.dtype)
             moved = moved + share * torch.cat([so3.log(R @ was[1].mT), X - was[0]], dim=-1)
-        fit = self._fitted(frames, X, R, use, precision, moved)
+        disks_px = self.fitter.disks_px(X)
+        fit = self._fitted(frames, X, R, use, precision, moved, disks_px)
         good = self._supported(fit, use)
         # Whether a picture is dark or white takes all of it: only where it is not as expected.
         usable = torch.stack([all_ if ok else _usable(row) for all_, ok, row in zip(usable, good, shots, strict=True)])
         changed = (use != (known & usable)).any(1)
         if bool(changed.any()):
             use = known & usable
-            fit = self._fitted(frames, X, R, use, precision, moved).where(changed, fit)
+            fit = self._fitted(frames, X, R, use, precision, moved, disks_px).where(changed, fit)
             good = torch.where(changed, self._supported(fit, use), good)
         first = good
-        within = self.fitter.largest_px(X) <= self.fitter.widest_px  # others are searched for, frame by frame
+        within = disks_px[1] <= self.fitter.widest_px  # others are searched for, frame by frame
         before = torch.tensor([[why is Reason.CONTRADICTS for why in one.reason] for one in expected])
         alone: list[FittedPoses] = []
         if not bool((good | ~within).all()):
             # One picture without the sphere spoils the joint fit: try each camera; of two that disagree the nearer one
             # counts.
-            alone = [self._fitted(frames, X, R, _only(usable, k), precision, moved) for k in range(use.shape[1])]
+            alone = [
+                self._fitted(frames, X, R, _only(usable, k), precision, moved, disks_px) for k in range(use.shape[1])
+            ]
             supported = [self._supported(one, _only(usable, k)) for k, one in enumerate(alone)]
             astray = [
                 torch.where(right, so3.geodesic_distance(one.R_lab_body, R), torch.inf)
@@ -267,14 +270,21 @@ class ChunkTracker:
         return X, R
 
     def _fitted(
-        self, frames: Sequence[Sequence[Shown]], X: Tensor, R: Tensor, use: Tensor, precision: Tensor, moved: Tensor
+        self,
+        frames: Sequence[Sequence[Shown]],
+        X: Tensor,
+        R: Tensor,
+        use: Tensor,
+        precision: Tensor,
+        moved: Tensor,
+        disks_px: tuple[Tensor, Tensor] | None = None,
     ) -> FittedPoses:
         """Fit poses that are nearly right: to some pixels, repeated where that moves them, then to all."""
         if self.centre is None:
             # All cameras together determine the position; for one of two the distance is better known from before.
             precision = torch.where(use.all(1)[:, None, None], 0.0, precision)
         fine, widest = self.fitter.optics.fine, self.fitter.widest_px
-        pixels = self.fitter.pixels(frames, X, fine, widest, moved)
+        pixels = self.fitter.pixels(frames, X, fine, widest, moved, disks_px)
         fit, far = self._settled(pixels.thinned(FIRST_EVERY), X, R, use, precision, 2)
         if bool(far.any()):
             begin = torch.where(far[:, None], self._from(fit.position_lab_mm), X)

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sphereorient import so3
 from sphereorient.files.compiled import compiled
 from sphereorient.files.threads import cores
 from sphereorient.pose.model import COVER_MIN, DEPTH_MIN, UNSEEN, SphereModel, exposure_instants, limb_shape, rim_shape
@@ -47,7 +46,7 @@ class _Task(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_int64) for name in ("disks", "places", "inner", "cameras", "tiles", "instants", "origins")),
         *((name, ctypes.c_void_p) for name in ("grey", "behind", "inside", "clipped", "direction", "origin", "axes")),
-        *((name, ctypes.c_void_p) for name in ("pitch_rad", "pitch_mm", "move", "turn", "shares", "tile")),
+        *((name, ctypes.c_void_p) for name in ("pitch_rad", "pitch_mm", "moved", "instant", "shares", "tile")),
         *((name, ctypes.c_float) for name in ("radius_mm", "blur_px")),
         *((name, _Table) for name in ("paint", "unseen")),
         *(
@@ -70,7 +69,6 @@ class _Task(ctypes.Structure):
         *((name, ctypes.c_float) for name in ("edge_px", "most_hidden", "covered", "most_each", "least_of_window")),
         *((name, ctypes.c_int64) for name in ("window", "margin")),
         ("place", ctypes.c_void_p),
-        *((name, 2 * ctypes.c_int64) for name in ("first", "last")),
         ("kept", ctypes.c_void_p),
         *((name, ctypes.c_void_p) for name in RESULTS),
     ]
@@ -117,12 +115,7 @@ def refined(
     light, paint, unseen = model.light.tables, model.paint, model.paint.unseen
     n_difference, n_black = model.shading.counts
     instants, shares = exposure_instants(pixels.instants)
-    move = turn = None
-    if pixels.instants > 1:
-        along = torch.tensor(instants, dtype=torch.float64)[:, None, None] * pixels.moved.double()
-        move, turn = along[..., 3:], so3.exp(along[..., :3])
     kept = torch.empty(L, P, dtype=torch.bool)
-    first, last = (tuple(side.tolist()) for side in pixels.place.aminmax(dim=1)) if P else ((0, 0), (0, 0))
     parts = pose_arrays(cameras, poses)
     alive: list[Tensor] = []
 
@@ -150,8 +143,8 @@ def refined(
         axes=at(pixels.axes),
         pitch_rad=at(pixels.pitch_rad),
         pitch_mm=at(pixels.pitch_mm),
-        move=at(move),
-        turn=at(turn),
+        moved=at(pixels.moved, torch.float64) if pixels.instants > 1 else None,
+        instant=at(torch.tensor(instants, dtype=torch.float64)),
         shares=at(torch.tensor(shares, dtype=torch.float32)),
         tile=at(pixels.tile),
         radius_mm=model.radius_mm,
@@ -191,8 +184,6 @@ def refined(
         window=WINDOW_PX // 2,
         margin=MARGIN_PX,
         place=at(pixels.place),
-        first=first,
-        last=last,
         kept=at(kept),
         **results,
     )

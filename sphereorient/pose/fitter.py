@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, sphere_radius_px
+from sphereorient.cameras import Camera, R_lab_view, centre_lab_mm, sphere_disk_px, sphere_radius_px
 from sphereorient.errors import ShapeError, check_tail, refusal
 from sphereorient.locate import Background, CameraScene
 from sphereorient.movies import OnDemand
@@ -228,10 +228,15 @@ class Fitter:
         limb_px = self.limb_px if self.limb_px is None else self.limb_px[camera : camera + 1]
         return replace(self, views=[self.views[camera]], light=self.light.of(camera), limb_px=limb_px)
 
+    def disks_px(self, position_lab_mm: Tensor) -> tuple[Tensor, Tensor]:
+        """Return middles (C, B, 2) of the disks that a sphere at (B, 3), mm, shows, and the largest radius (B,), px."""
+        disks = [sphere_disk_px(view.camera, position_lab_mm, self.radius_mm) for view in self.views]
+        middles, radii = (torch.stack(parts) for parts in zip(*disks, strict=True))
+        return middles, radii.nan_to_num().amax(0)
+
     def largest_px(self, position_lab_mm: Tensor) -> Tensor:
         """Return the radius (B,), px, of the largest disk that a sphere at positions (B, 3) shows in any picture."""
-        radii = torch.stack([view.radius_px(position_lab_mm, self.radius_mm) for view in self.views])
-        return radii.nan_to_num().amax(0)
+        return self.disks_px(position_lab_mm)[1]
 
     def shows_unknown(self, camera: int, position_lab_mm: Tensor, R_lab_body: Tensor) -> Tensor:
         """Return which poses (B, 3), mm, (B, 3, 3) turn hardly any known paint to a camera, (B,) bool."""
@@ -249,14 +254,17 @@ class Fitter:
         level: PyramidLevel,
         radius_px: float | None = None,
         moved: Tensor | None = None,
+        disks_px: tuple[Tensor, Tensor] | None = None,
     ) -> Pixels:
         """Cut the disks of B poses out of the pictures of C views; position_lab_mm (B, 3) is right to a few pixels.
         Without `radius_px` the largest disk sets it, so that the last bits depend on the batch. `moved` (B, 6): the
-        sphere's turn (rad) and move (mm) while the shutter is open; None: unknown, as if at rest.
+        sphere's turn (rad) and move (mm) while the shutter is open; None: unknown, as if at rest. `disks_px`: what
+        the method of this name tells of these positions, where that is known.
         """
-        middles = [torch.nan_to_num(view.camera.project(position_lab_mm)).tolist() for view in self.views]
+        middle_px, largest_px = disks_px or self.disks_px(position_lab_mm)
+        middles = middle_px.nan_to_num().tolist()
         if radius_px is None:
-            radius_px = max(1.0, float(self.largest_px(position_lab_mm).max()))
+            radius_px = max(1.0, float(largest_px.max()))
             radius_px = SIZES ** math.ceil(math.log(radius_px) / math.log(SIZES))
         stencil = level.stencil(min(radius_px, 0.5 * max(self.views[0].camera.image_size)))
         for b, frames in enumerate(pictures):
@@ -330,7 +338,9 @@ class Fitter:
 
 
 def moved_to(device: torch.device, record: Record) -> Record:
-    """Return a record with its tensors on another device."""
+    """Return a record with its tensors on a device; all of them are on one."""
+    if next(part for part in vars(record).values() if isinstance(part, Tensor)).device == device:
+        return record
     parts = {field.name: getattr(record, field.name) for field in fields(record)}
     moved: dict[str, Any] = {name: part.to(device) for name, part in parts.items() if isinstance(part, Tensor)}
     return replace(record, **moved)

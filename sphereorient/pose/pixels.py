@@ -88,17 +88,28 @@ class LinesOfSight:
         self.origin = origin.float().movedim(-1, 0)[:, :1, :1] if self.one_origin else origin.float().movedim(-1, 0)
         self.axes = camera.R_cam_lab[:2].float()
         self.size = width, height
+        self.pitch_rad = _to_next_pixel(self.direction)
+        apart = not self.one_origin
+        self.pitch_mm = _to_next_pixel(self.origin, self.direction) if apart else torch.zeros(1, 1)
 
     def pitch(self, u: int, v: int) -> tuple[Tensor, Tensor]:
-        """Return the change of the line of sight to the next pixel: angle, rad, and start, mm."""
-        d = self.direction
-        here, right, down = (d[:, row, column].tolist() for row, column in ((v, u), (v, u + 1), (v + 1, u)))
-        turned = torch.tensor(0.5 * (math.dist(here, right) + math.dist(here, down)))
-        if self.one_origin:
-            return turned, torch.zeros(())
-        o, sight = self.origin, d[:, v, u]
-        moved = [o[:, v, u + 1] - o[:, v, u], o[:, v + 1, u] - o[:, v, u]]
-        return turned, torch.stack([(step - (step @ sight) * sight).norm() for step in moved]).mean()
+        """Return the change of the line of sight to the next pixel: angle, rad, and start, mm; each (1,)."""
+        there = self.pitch_mm.shape[0] > 1
+        return self.pitch_rad[v, u : u + 1], self.pitch_mm[v * there, u * there : u * there + 1]
+
+
+def _to_next_pixel(field: Tensor, sight: Tensor | None = None) -> Tensor:
+    """Return the mean length of a field's (3, H, W) change to the right and below, (H - 1, W - 1).
+    Of changes across lines of sight (3, H, W) where these are given.
+    """
+    here = (slice(None), slice(None, -1), slice(None, -1))
+    lengths = []
+    for axis in (1, 2):
+        change = field.diff(dim=axis)[:, : field.shape[1] - 1, : field.shape[2] - 1]
+        if sight is not None:
+            change = change - (change * sight[here]).sum(0) * sight[here]
+        lengths.append(change.square().sum(0).sqrt())
+    return (lengths[0] + lengths[1]) / 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -159,15 +170,16 @@ def cut_pixels(
     """
     width, height = sight.size
     u, v = round(middle_px[0]), round(middle_px[1])
-    columns, rows = u + stencil.right, v + stencil.down
     if stencil.reach <= u < width - stencil.reach and stencil.reach <= v < height - stencil.reach:
-        inside = np.ones(len(columns), bool)
+        inside = None
+        place = (v * width + u) + (stencil.down * width + stencil.right)
     else:
+        columns, rows = u + stencil.right, v + stencil.down
         inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-        columns, rows = columns.clip(0, width - 1), rows.clip(0, height - 1)
-    place = rows * width + columns
+        place = rows.clip(0, height - 1) * width + columns.clip(0, width - 1)
     if background.shown is not None:
-        inside &= background.shown.take(place)
+        shown = background.shown.take(place)
+        inside = shown if inside is None else inside & shown
     window = window_of(middle_px, stencil, blur_px, sight.size)
     picture = frame.part(*window) if isinstance(frame, OnDemand) else frame
     grey, behind = picture.take(place), background.mean.take(place)
@@ -178,22 +190,24 @@ def cut_pixels(
         pictures = picture[around].astype(np.float32), background.mean[around]
         soft = [np.asarray(cv2.GaussianBlur(picture, (0, 0), blur_px), np.float32) for picture in pictures]
         down, right = (
-            at.clip(0, size - 1) for at, size in zip((rows - top, columns - left), soft[0].shape, strict=True)
+            at.clip(0, size - 1)
+            for at, size in zip((place // width - top, place % width - left), soft[0].shape, strict=True)
         )
         grey, behind = (picture[down, right] for picture in soft)
     at = torch.from_numpy(place)
     flat = sight.direction.reshape(3, -1)
     pitch_rad, pitch_mm = sight.pitch(min(max(u, 0), width - 2), min(max(v, 0), height - 2))
+    count = len(place)
     return Pixels(
         grey=torch.from_numpy(grey.astype(np.float32))[None],
         behind=torch.from_numpy(behind)[None],
-        inside=torch.from_numpy(inside)[None],
+        inside=torch.ones(1, count, dtype=torch.bool) if inside is None else torch.from_numpy(inside)[None],
         clipped=torch.from_numpy(clipped)[None],
         direction=flat.index_select(1, at)[None],
         origin=(sight.origin.reshape(3, 1) if sight.one_origin else sight.origin.reshape(3, -1)[:, at])[None],
         axes=sight.axes[None],
-        pitch_rad=pitch_rad[None],
-        pitch_mm=pitch_mm[None],
+        pitch_rad=pitch_rad,
+        pitch_mm=pitch_mm,
         moved=torch.zeros(1, 6, dtype=torch.float64),
         tile=stencil.tile,
         place=stencil.place,
@@ -204,6 +218,7 @@ def cut_pixels(
 def stacked(parts: list[Pixels]) -> Pixels:
     """Return the disks of all parts, which share one stencil, in one record."""
     widest = max(part.origin.shape[-1] for part in parts)
-    full = [replace(part, origin=part.origin.expand(-1, -1, widest)) for part in parts]
-    whole: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in full]) for name in OF_DISKS}
-    return replace(full[0], **whole)
+    if any(part.origin.shape[-1] < widest for part in parts):
+        parts = [replace(part, origin=part.origin.expand(-1, -1, widest)) for part in parts]
+    whole: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in OF_DISKS}
+    return replace(parts[0], **whole)

@@ -29,9 +29,10 @@ typedef struct {
     const uint8_t *inside, *clipped;
     /* geometry: (disks, 3, places), (disks, 3, origins), (disks, 2, 3), (disks), (disks) */
     const float *direction, *origin, *axes, *pitch_rad, *pitch_mm;
-    const double *move, *turn; /* (instants, disks, 3), mm, (instants, disks, 3, 3): from the middle of the exposure */
-    const float *shares;       /* (instants) */
-    const int64_t *tile;    /* (places) */
+    const double *moved; /* (disks, 6), rad and mm while the shutter is open, or none */
+    const double *instant; /* (instants), of the exposure, from its middle */
+    const float *shares;   /* (instants) */
+    const int64_t *tile;   /* (places) */
     /* the model */
     float radius_mm, blur_px;
     Table paint, unseen;
@@ -56,8 +57,7 @@ typedef struct {
     /* occluders: share of a disk that they may cover, 0: none are sought; see occluders.py */
     float most_hidden, covered, most_each, least_of_window;
     int64_t window, margin;        /* half widths, px */
-    const int64_t *place;          /* (2, places), px to the right and below, and their least and largest */
-    int64_t first[2], last[2];
+    const int64_t *place;          /* (2, places), px to the right and below */
     /* results: places that count, (disks, places), and the parts of `FittedPoses` */
     uint8_t *kept;
     double *position, *rotation, *covariance, *own_turn, *own_covariance, *own_move, *own_sigma, *excess, *score, *nll;
@@ -84,6 +84,7 @@ typedef struct {
     uint8_t *known, *counts;
     double (*sums)[LANES]; /* of pairs of columns, and of each with what is left */
     float *grid[4]; /* of the square about the disk, wider by the margin on each side */
+    int64_t first[2], width, height; /* of that square: least of `place`, and sizes with margins */
 } Disk;
 
 enum { FLOATS = 24 };
@@ -189,16 +190,29 @@ static void multiply(const double *a, const double *b, double *to, int n, int k,
         }
 }
 
+/* Write the rotation by a vector, rad. */
+static void rotation_by(const double *turn, double *to) {
+    const double angle2 = turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2], angle = sqrt(angle2);
+    const double a = angle > 1e-4 ? sin(angle) / angle : 1 - angle2 / 6;
+    const double half = angle > 1e-4 ? sin(angle / 2) / angle : 0.5 - angle2 / 48, b = 2 * half * half;
+    const double x = turn[0], y = turn[1], z = turn[2];
+    const double cross[9] = {0, -z, y, z, 0, -x, -y, x, 0};
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            to[i * 3 + j] = (i == j) + a * cross[i * 3 + j] + b * (turn[i] * turn[j] - (i == j ? angle2 : 0));
+}
+
 /* Render a block of places at one instant, added to the disk with the instant's share; as `sphere_view`. */
 static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int64_t instant, int64_t from, int n) {
-    const double *move = t->move + (instant * t->disks + k) * 3, *turn_by = t->turn + (instant * t->disks + k) * 9;
     const float share = t->shares[instant];
-    double position[3], turned[9];
-    for (int c = 0; c < 3; c++) position[c] = of->position[c] + (t->instants > 1 ? move[c] : 0.0);
-    if (t->instants > 1)
+    double position[3], turned[9], turn_by[9], by[3];
+    memcpy(position, of->position, sizeof position), memcpy(turned, of->rotation, sizeof turned);
+    if (t->moved) {
+        const double *moved = t->moved + k * 6, open = t->instant[instant];
+        for (int c = 0; c < 3; c++) by[c] = open * moved[c], position[c] += open * moved[3 + c];
+        rotation_by(by, turn_by);
         multiply(turn_by, of->rotation, turned, 3, 3, 3);
-    else
-        memcpy(turned, of->rotation, sizeof turned);
+    }
     const float *d[3], *origin = t->origin + k * 3 * t->origins, *axes = t->axes + k * 6;
     float R[3][3], centre[3], radius = t->radius_mm;
     double distance2 = 0;
@@ -661,14 +675,26 @@ static void along(const float *from, float *to, int64_t cells, int64_t stride, i
             for (int64_t i = edge; i < cells - edge; i++) to[i] = most(to[i], from[i + step]);
 }
 
+/* Write the least and the size of the square about all places, with a margin on each side. */
+static void square_about(const Task *t, Disk *at) {
+    int64_t size[2];
+    for (int c = 0; c < 2; c++) {
+        const int64_t *place = t->place + c * t->places;
+        int64_t low = t->places ? place[0] : 0, high = low;
+        for (int64_t p = 0; p < t->places; p++) low = place[p] < low ? place[p] : low, high = place[p] > high ? place[p] : high;
+        at->first[c] = low, size[c] = high - low + 1 + 2 * t->margin;
+    }
+    at->width = size[0], at->height = size[1];
+}
+
 /* Leave out the places that something before the sphere shows, as `occluded`: windows that differ, and their margin.
    Return whether there are any. */
 static int uncover(const Task *t, const Disk *at, Sums *of, int64_t k) {
     const int64_t P = t->places, margin = t->margin;
     const float *grey = t->grey + k * P, *noise = t->noise + (k % t->cameras) * 4;
     const uint8_t *clipped = t->clipped + k * P;
-    const int64_t width = t->last[0] - t->first[0] + 1 + 2 * margin, height = t->last[1] - t->first[1] + 1 + 2 * margin;
-    const int64_t cells = width * height, origin = (margin - t->first[1]) * width + margin - t->first[0];
+    const int64_t width = at->width, height = at->height;
+    const int64_t cells = width * height, origin = (margin - at->first[1]) * width + margin - at->first[0];
     const int64_t *right = t->place, *down = t->place + P;
     float *squares = at->lit, *differs = at->grid[0], *counted = at->grid[1], *work = at->grid[2];
     int64_t told = 0, all = 0, hidden = 0;
@@ -764,18 +790,6 @@ static void bound(double *step, const Sums *sums, const uint8_t *seen, int64_t c
     }
     const double shorter = 0.1 / (size < 0.1 ? 0.1 : size);
     for (int i = 0; i < 6; i++) step[i] *= shorter;
-}
-
-/* Write the rotation by a vector, rad. */
-static void rotation_by(const double *turn, double *to) {
-    const double angle2 = dot(turn, turn), angle = sqrt(angle2);
-    const double a = angle > 1e-4 ? sin(angle) / angle : 1 - angle2 / 6;
-    const double half = angle > 1e-4 ? sin(angle / 2) / angle : 0.5 - angle2 / 48, b = 2 * half * half;
-    const double x = turn[0], y = turn[1], z = turn[2];
-    const double cross[9] = {0, -z, y, z, 0, -x, -y, x, 0};
-    for (int i = 0; i < 3; i++)
-        for (int j = 0; j < 3; j++)
-            to[i * 3 + j] = (i == j) + a * cross[i * 3 + j] + b * (turn[i] * turn[j] - (i == j ? angle2 : 0));
 }
 
 static void invert(const double *matrix, double *inverse, int n) {
@@ -938,8 +952,10 @@ int64_t refine_record(void) { return (int64_t)sizeof(Task); }
 /* Fit the poses from `begin` to before `end`, each by itself; return 0, or 1 without memory. */
 int refine(const Task *t, int64_t begin, int64_t end) {
     const int64_t P = (t->places + BLOCK - 1) / BLOCK * BLOCK, n = 6 + t->n_difference + t->n_black;
-    const int64_t cells = (t->last[0] - t->first[0] + 1 + 2 * t->margin) * (t->last[1] - t->first[1] + 1 + 2 * t->margin);
     const int64_t grids = t->most_hidden > 0 ? 4 : 0;
+    Disk at = {0};
+    if (grids) square_about(t, &at);
+    const int64_t cells = at.width * at.height;
     float *floats = malloc(sizeof(float) * (size_t)(P * (FLOATS + 2 * t->cameras) + grids * cells)), *next = floats;
     uint8_t *bytes = malloc((size_t)(2 * P));
     Sums *sums = malloc(sizeof(Sums) * (size_t)t->cameras);
@@ -947,7 +963,6 @@ int refine(const Task *t, int64_t begin, int64_t end) {
     double *pairs = malloc(sizeof(double) * LANES * (size_t)(n * (n + 3) / 2));
     const int without = !floats || !bytes || !sums || !scores || !pairs;
     if (!without) {
-        Disk at;
         float **parts[] = {&at.paint,   &at.cover,   &at.x,       &at.y,       &at.aside,      &at.out[0],  &at.out[1],
                            &at.out[2],  &at.turn[0], &at.turn[1], &at.turn[2], &at.move[0],    &at.move[1], &at.move[2],
                            &at.limb[0], &at.limb[1], &at.limb[2], &at.count,   &at.difference, &at.black,   &at.beside,
