@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 
 import torch
-from kornia.geometry import conversions
 from torch import Tensor
 
 from sphereorient.errors import SettingsError, check_tail, refusal
@@ -17,16 +16,36 @@ HALF_EDGE = 2 ** (1 / 3) / 2  # half the cube's edge of the body-centred cubic l
 def exp(rotvec: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) of rotation vectors (..., 3), rad, of any length, by Rodrigues' formula."""
     check_tail("rotvec", rotvec, 3)
-    return conversions.axis_angle_to_rotation_matrix(rotvec)
+    turn = torch.linalg.vector_norm(rotvec, dim=-1)[..., None, None]
+    # sin(t) / t and (1 - cos(t)) / t^2; a branch that is not taken needs a finite argument for its gradient.
+    some = turn > torch.finfo(turn.dtype).tiny ** 0.25
+    t = torch.where(some, turn, torch.ones_like(turn))
+    along = torch.where(some, t.sin() / t, torch.ones_like(t))
+    across = torch.where(some, 2 * ((t / 2).sin() / t).square(), torch.full_like(t, 0.5))
+    K = hat(rotvec)
+    return torch.eye(3, dtype=K.dtype, device=K.device) + along * K + across * (K @ K)
 
 
 def log(R: Tensor) -> Tensor:
     """Return the shortest rotation vectors (..., 3), rad, of rotations (..., 3, 3), not checked.
     At exactly pi the choice between the two vectors is always the same, and the gradient is finite.
-    Source: textbook; through the quaternion's largest component, so it keeps all digits at 0 and at pi.
+    Source: Shepperd 1978, through the quaternion's largest component, so it keeps all digits at 0 and at pi.
     """
     check_tail("R", R, 3, 3)
-    return conversions.rotation_matrix_to_axis_angle(R)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = R.flatten(-2).unbind(-1)
+    x, y, z, xy, xz, yz = zy - yz, xz - zx, yx - xy, xy + yx, xz + zx, yz + zy
+    squares = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
+    # Four times the products of the quaternion's components (w, x, y, z), row by row.
+    products = torch.stack(
+        [squares[0], x, y, z, x, squares[1], xy, xz, y, xy, squares[2], yz, z, xz, yz, squares[3]], dim=-1
+    ).unflatten(-1, (4, 4))
+    largest = torch.stack(squares, dim=-1).argmax(-1)[..., None, None]
+    w, axis = products.gather(-2, largest.expand(*R.shape[:-2], 1, 4))[..., 0, :].split([1, 3], dim=-1)
+    axis = torch.where(w < 0, -axis, axis)
+    length = torch.linalg.vector_norm(axis, dim=-1, keepdim=True)
+    turned = ~(length <= torch.finfo(R.dtype).tiny ** 0.5)  # NaN stays NaN
+    length = torch.where(turned, length, torch.ones_like(length))
+    return axis * torch.where(turned, 2 * torch.atan2(length, w.abs()) / length, 0.5)
 
 
 def hat(v: Tensor) -> Tensor:
@@ -124,7 +143,13 @@ def random_rotations(
     leading = (shape,) if isinstance(shape, int) else tuple(shape)
     origin = generator.device if generator is not None else None
     quat_wxyz = torch.randn(*leading, 4, generator=generator, dtype=torch.float64, device=origin)
-    return conversions.quaternion_to_rotation_matrix(quat_wxyz).to(dtype=dtype, device=device)
+    w, x, y, z = torch.nn.functional.normalize(quat_wxyz, dim=-1).unbind(-1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3)).to(dtype=dtype, device=device)
 
 
 def from_tait_bryan(theta: Tensor) -> Tensor:

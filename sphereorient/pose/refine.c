@@ -190,6 +190,14 @@ static void multiply(const double *a, const double *b, double *to, int n, int k,
         }
 }
 
+/* Write the rows of some cells of a table. */
+static void look_up(const float *rows, const int32_t *cell, int n, float to[4][BLOCK]) {
+    for (int i = 0; i < n; i++) {
+        const float *row = rows + 4 * (int64_t)cell[i];
+        for (int c = 0; c < 4; c++) to[c][i] = row[c];
+    }
+}
+
 /* Write the rotation by a vector, rad. */
 static void rotation_by(const double *turn, double *to) {
     const double angle2 = turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2], angle = sqrt(angle2);
@@ -286,11 +294,7 @@ static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int
             cell[i] = octahedral_cell(normal[0][i], normal[1][i], normal[2][i], side);
         }
         float plane[4][BLOCK];
-        const float *rows = t->paint.rows;
-        for (int i = 0; i < n; i++) {
-            const float *row = rows + 4 * (int64_t)cell[i];
-            for (int c = 0; c < 4; c++) plane[c][i] = row[c];
-        }
+        look_up(t->paint.rows, cell, n, plane);
         INDEPENDENT
         for (int i = 0; i < n; i++) {
             const float x = normal[0][i], y = normal[1][i], z = normal[2][i];
@@ -306,12 +310,20 @@ static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int
             turn[1][i] += each * (gz * x - gx * z);
             turn[2][i] += each * (gx * y - gy * x);
         }
-        if (t->unseen.rows)
-            for (int i = 0; i < n; i++) {
-                const float *row = t->unseen.rows + 4 * (int64_t)octahedral_cell(normal[0][i], normal[1][i],
-                                                                                 normal[2][i], (float)t->unseen.side);
-                hidden[i] = most(hidden[i], row[0] + row[1] * normal[0][i] + row[2] * normal[1][i] + row[3] * normal[2][i]);
+        if (t->unseen.rows) {
+            const float unseen_side = (float)t->unseen.side;
+            if (t->unseen.side != t->paint.side) {
+                INDEPENDENT
+                for (int i = 0; i < n; i++)
+                    cell[i] = octahedral_cell(normal[0][i], normal[1][i], normal[2][i], unseen_side);
             }
+            look_up(t->unseen.rows, cell, n, plane);
+            INDEPENDENT
+            for (int i = 0; i < n; i++) {
+                const float x = normal[0][i], y = normal[1][i], z = normal[2][i];
+                hidden[i] = most(hidden[i], plane[0][i] + plane[1][i] * x + plane[2][i] * y + plane[3][i] * z);
+            }
+        }
     }
     const float limb = share / (blur * radius), least_cover = t->cover_least;
     const int whole = t->instants == 1;

@@ -1,7 +1,6 @@
 import math
 from pathlib import Path
 
-import kornia.geometry.transform as kornia_transform
 import numpy as np
 import torch
 from PIL import Image
@@ -130,9 +129,11 @@ def sample_texture(texture: Tensor, direction_body: Tensor) -> Tensor:
 
     Source: docs/conventions.md (texture map); kornia's remap needs align_corners=True for pixel coordinates.
     """
+    from kornia.geometry.transform import remap  # late: half a second, and tables do without it
+
     check_texture_shape(texture)
     column, row = texel_coordinates(direction_body, len(texture))
-    grey = kornia_transform.remap(
+    grey = remap(
         _continued(texture, 1)[None, None],
         (column + 1).reshape(1, 1, -1),
         (row + 1).reshape(1, 1, -1),
