@@ -179,8 +179,8 @@ class ChunkTracker:
             X, spread = self.centre.position_lab_mm, self.centre.spread_mm2
             ahead = {n: replace(pose, position_lab_mm=X, place_spread=spread) for n, pose in ahead.items()}
         followed = dict(zip(ahead, self._follow(list(ahead.values()), [frames[n] for n in ahead]), strict=True))
-        lost = [chunk.first for chunk in chunks if followed.get(chunk.first) is None]
-        followed |= zip(lost, side_by_side(self._search, [frames[n] for n in lost]), strict=True)
+        if lost := [chunk.first for chunk in chunks if followed.get(chunk.first) is None]:
+            followed |= zip(lost, side_by_side(self._search, [frames[n] for n in lost]), strict=True)
         for chunk in chunks:
             poses = followed[chunk.first]
             assert poses is not None  # a search returns one that may be empty

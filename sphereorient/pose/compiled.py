@@ -4,10 +4,9 @@ import ctypes
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -112,41 +111,57 @@ def refined(
         return None
     L, P = pixels.grey.shape
     poses, cameras = use.shape
-    light, paint, unseen = model.light.tables, model.paint, model.paint.unseen
-    n_difference, n_black = model.shading.counts
-    instants, shares = exposure_instants(pixels.instants)
     kept = torch.empty(L, P, dtype=torch.bool)
     parts = pose_arrays(cameras, poses)
-    alive: list[Tensor] = []
+    at = _Addresses()
+    instant, share = _quadrature(pixels.instants)
+    task = _Task.from_buffer_copy(_of_model(model)[0])
+    task.disks, task.places, task.inner, task.cameras = L, P, pixels.inner, cameras
+    task.tiles = int(pixels.tile.max()) + 1 if P else 1
+    task.instants, task.origins = pixels.instants, pixels.origin.shape[-1]
+    for name in ("grey", "behind", "inside", "clipped", "direction", "origin", "axes", "pitch_rad", "pitch_mm"):
+        setattr(task, name, at(getattr(pixels, name)))
+    task.tile, task.place = at(pixels.tile), at(pixels.place)
+    task.moved = at(pixels.moved, torch.float64) if pixels.instants > 1 else None
+    task.instant, task.shares = at(instant), at(share)
+    task.start, task.start_rotation = at(X, torch.float64), at(R, torch.float64)
+    task.use, task.place_precision = at(use), at(place_precision, torch.float64)
+    task.iterations, task.most_hidden = iterations, most_hidden
+    for name, part in (("kept", kept), *parts.items()):
+        setattr(task, name, part.data_ptr())
+    threads = max(1, min(poses, cores()))
+    ends = [poses * part // threads for part in range(threads + 1)]
+    work = [
+        lambda begin=begin, end=end: code.refine(ctypes.byref(task), ctypes.c_int64(begin), ctypes.c_int64(end))
+        for begin, end in pairwise(ends)
+    ]
+    others = [_threads().submit(part) for part in work[1:]]
+    if any([work[0](), *(other.result() for other in others)]):
+        raise MemoryError
+    return kept, parts
 
-    def at(part: Tensor | None, dtype: torch.dtype | None = None) -> int | None:
+
+class _Addresses:
+    """Addresses of tensors as C reads them; each lives as long as this."""
+
+    def __init__(self) -> None:
+        self._alive: list[Tensor] = []
+
+    def __call__(self, part: Tensor | None, dtype: torch.dtype | None = None) -> int | None:
+        """Return where the numbers of a tensor lie, in their order; None of None."""
         if part is None:
             return None
-        alive.append(part.to(dtype or part.dtype).contiguous())
-        return alive[-1].data_ptr()
+        self._alive.append(part.to(dtype or part.dtype).contiguous())
+        return self._alive[-1].data_ptr()
 
-    results: dict[str, Any] = {name: part.data_ptr() for name, part in parts.items()}
+
+@lru_cache(maxsize=4)
+def _of_model(model: SphereModel) -> tuple[_Task, _Addresses]:
+    """Return a record with all that depends on the model alone, and what it points to."""
+    at = _Addresses()
+    light, paint, unseen = model.light.tables, model.paint, model.paint.unseen
+    n_difference, n_black = model.shading.counts
     task = _Task(
-        disks=L,
-        places=P,
-        inner=pixels.inner,
-        cameras=cameras,
-        tiles=int(pixels.tile.max()) + 1 if P else 1,
-        instants=pixels.instants,
-        origins=pixels.origin.shape[-1],
-        grey=at(pixels.grey),
-        behind=at(pixels.behind),
-        inside=at(pixels.inside),
-        clipped=at(pixels.clipped),
-        direction=at(pixels.direction),
-        origin=at(pixels.origin),
-        axes=at(pixels.axes),
-        pitch_rad=at(pixels.pitch_rad),
-        pitch_mm=at(pixels.pitch_mm),
-        moved=at(pixels.moved, torch.float64) if pixels.instants > 1 else None,
-        instant=at(torch.tensor(instants, dtype=torch.float64)),
-        shares=at(torch.tensor(shares, dtype=torch.float32)),
-        tile=at(pixels.tile),
         radius_mm=model.radius_mm,
         blur_px=model.blur_px,
         paint=_Table(at(paint.rows), paint.side),
@@ -170,33 +185,22 @@ def refined(
         stray=at(model.light.stray),
         n_difference=n_difference,
         n_black=n_black,
-        start=at(X, torch.float64),
-        start_rotation=at(R, torch.float64),
-        use=at(use),
-        place_precision=at(place_precision, torch.float64),
-        iterations=iterations,
         limb_px=at(model.limb_px, torch.float32),
         edge_px=EDGE_PX,
-        most_hidden=most_hidden,
         covered=COVERED,
         most_each=MOST_EACH,
         least_of_window=LEAST_OF_WINDOW,
         window=WINDOW_PX // 2,
         margin=MARGIN_PX,
-        place=at(pixels.place),
-        kept=at(kept),
-        **results,
     )
-    threads = max(1, min(poses, cores()))
-    ends = [poses * part // threads for part in range(threads + 1)]
-    work = [
-        lambda begin=begin, end=end: code.refine(ctypes.byref(task), ctypes.c_int64(begin), ctypes.c_int64(end))
-        for begin, end in pairwise(ends)
-    ]
-    others = [_threads().submit(part) for part in work[1:]]
-    if any([work[0](), *(other.result() for other in others)]):
-        raise MemoryError
-    return kept, parts
+    return task, at
+
+
+@cache
+def _quadrature(instants: int) -> tuple[Tensor, Tensor]:
+    """Return the instants of an exposure, float64, and their shares, float32."""
+    at, shares = exposure_instants(instants)
+    return torch.tensor(at, dtype=torch.float64), torch.tensor(shares, dtype=torch.float32)
 
 
 @cache

@@ -163,8 +163,16 @@ class Fitter:
     most_hidden: float = MOST_HIDDEN  # share of a disk that occluders may cover; 0: the model is wrong, none are sought
     instants: int = 1  # of the exposure that fits render; 1: the sphere as if at rest, the blur holds its motion
 
+    @cached_property
+    def fine_model(self) -> SphereModel:
+        """What the pictures of the finest level depend on."""
+        return self._model(self.optics.fine)
+
     def model(self, level: PyramidLevel) -> SphereModel:
         """Return what the pictures of a level depend on."""
+        return self.fine_model if level is self.optics.fine else self._model(level)
+
+    def _model(self, level: PyramidLevel) -> SphereModel:
         shading = LATER if self.light.known or level.extra_px > 0 else FIRST  # high orders while nothing is learnt
         return SphereModel(
             radius_mm=self.radius_mm,
