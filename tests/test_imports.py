@@ -35,6 +35,12 @@ def test_the_front_door_does_not_wait_for_torch(code):
     subprocess.run([sys.executable, "-c", check], check=True)
 
 
+def test_tracking_does_not_wait_for_what_it_does_not_use():
+    unused = "{'kornia', 'pytorch_lightning', 'matplotlib', 'pandas'}"
+    code = f"import sphereorient.methods.precise, sys; late = {unused} & set(sys.modules); assert not late, late"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_help_comes_without_torch():
     code = "import sys; sys.argv = ['sphereorient', '--help']\nfrom sphereorient import cli\ntry:\n    cli.main()\n"
     code += "except SystemExit as stop:\n    assert not stop.code\nassert 'torch' not in sys.modules"

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import torch
-from kornia.filters import filter2d, gaussian_blur2d
-from scipy.optimize import bisect
 from torch import Tensor
 
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
@@ -119,6 +117,8 @@ def occlusion(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) 
         return pictures
     angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]
     radius = disk.radius(pictures)
+    from scipy.optimize import bisect  # late, as kornia below: settings name these functions, tracking calls none
+
     away = bisect(lambda apart: _overlap(apart) - share, 0.0, 2.0, xtol=1e-15) * radius
     right, down = disk.offset(pictures)
     hidden = _round(right - away * angle.cos(), down - away * angle.sin(), radius)
@@ -156,6 +156,8 @@ def dirt(pictures: Tensor, radius_px: float, disk: Disk, rng: torch.Generator) -
     speck = _round(at, at[:, None], pictures.new_tensor(radius_px))
     if pictures.numel() == 0:
         return pictures
+    from kornia.filters import filter2d
+
     flat = middles.reshape(-1, 1, *wider.shape[-2:])
     hidden = filter2d(flat, speck[None], border_type="constant", padding="valid").clamp_max(1)
     return pictures + hidden.reshape(pictures.shape) * (SPECK - pictures)
@@ -247,6 +249,8 @@ def blurred(pictures: Tensor, sigma_px: float) -> Tensor:
     """Blur pictures (..., H, W) with a Gaussian, px; the border is replicated."""
     if sigma_px == 0 or pictures.numel() == 0:
         return pictures
+    from kornia.filters import gaussian_blur2d
+
     size = 2 * math.ceil(4 * sigma_px) + 1
     flat = pictures.reshape(-1, 1, *pictures.shape[-2:])
     smooth: Tensor = gaussian_blur2d(flat, (size, size), (sigma_px, sigma_px), border_type="replicate")
