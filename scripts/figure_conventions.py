@@ -1,8 +1,9 @@
-"""Draw docs/conventions.png: the frames, the map and how a camera sees it, and where pixels lie.
+"""Draw docs/conventions.png: the frames, the map and how a camera sees it, and where pixels lie; and docs/animal.png.
 
-    scripts/figure_conventions.py [--out docs/conventions.png]
+    scripts/figure_conventions.py [--out docs]
 
-The map is read and the sphere drawn by the package's own functions, so that the picture shows what the code does.
+The second one shows how an animal's walk follows from the turns of the ball under it. Maps,
+spheres and walks are those of the package's own functions, so that the pictures show what the code does.
 """
 
 from __future__ import annotations
@@ -25,11 +26,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.report.plots.style import AXIS_COLOURS
 from sphereorient.sphere import orthographic_view
+from sphereorient.trajectory.walk import walk_of
 
 REPO = Path(__file__).resolve().parents[1]
 HEIGHT = 180  # rows of the map, one a degree
-COLOURS = ("#c0392b", "#2e8b57", "#2c5aa0")  # x, y, z of every frame
 R_CAM_LAB = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # looks along lab +y, lab z up
 R_LAB_BODY = so3.exp(torch.tensor([0.0, 0.0, -math.pi / 2]))  # body +x towards that camera
 
@@ -47,7 +49,7 @@ def letter_map() -> Tensor:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=REPO / "docs" / "conventions.png")
+    parser.add_argument("--out", type=Path, default=REPO / "docs", help="folder")
     out = parser.parse_args().out
     figure = plt.figure(figsize=(9.6, 6.6), dpi=110, layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
@@ -55,7 +57,12 @@ def main() -> None:
     draw_map(figure.add_subplot(grid[0, 1]))
     draw_picture(figure.add_subplot(grid[1, 0]))
     draw_pixels(figure.add_subplot(grid[1, 1]))
-    figure.savefig(out, metadata={"Software": None})
+    figure.savefig(out / "conventions.png", metadata={"Software": None})
+    figure = plt.figure(figsize=(9.6, 4.2), dpi=110, layout="constrained")
+    grid = figure.add_gridspec(1, 2)
+    draw_turns(figure.add_subplot(grid[0], projection="3d"))
+    draw_walk(figure.add_subplot(grid[1]))
+    figure.savefig(out / "animal.png", metadata={"Software": None})
 
 
 def draw_frames(axes: Any) -> None:
@@ -73,13 +80,13 @@ def draw_frames(axes: Any) -> None:
     axes.view_init(elev=24, azim=-28)
     axes.set_axis_off()
     axes.set_title("frames: the camera looks along lab +y,\nR_lab_body = Rz(-90 degrees)", fontsize=10)
-    handles = [Line2D([], [], color=colour, lw=2, label=name) for colour, name in zip(COLOURS, "xyz", strict=True)]
+    handles = [Line2D([], [], color=colour, lw=2, label=name) for colour, name in zip(AXIS_COLOURS, "xyz", strict=True)]
     axes.legend(handles=handles, loc="lower right", fontsize=8, frameon=False, ncols=3)
 
 
 def triad(axes: Any, origin: NDArray[Any], columns: NDArray[Any], name: str, length: float) -> None:
     """Three arrows; `columns` are their directions in the lab."""
-    for axis, direction, colour in zip("xyz", columns.T, COLOURS, strict=True):
+    for axis, direction, colour in zip("xyz", columns.T, AXIS_COLOURS, strict=True):
         axes.quiver(*origin, *(length * direction), color=colour, lw=2, arrow_length_ratio=0.18)
         axes.text(*(origin + 1.25 * length * direction), f"{name} {axis}", color=colour, fontsize=8, ha="center")
 
@@ -129,6 +136,68 @@ def draw_pixels(axes: Any) -> None:
     axes.set_aspect("equal")
     axes.set_ylabel("v, row", fontsize=9)
     axes.set_xlabel("pixels (u, v) of a 4 x 3 picture: it spans -0.5 .. 3.5 and -0.5 .. 2.5", fontsize=9)
+
+
+def draw_turns(axes: Any) -> None:
+    """The ball under the animal, and how each part of a walk turns it."""
+    upright = np.diag([1.0, -1.0, -1.0])  # the lab's z points down, that of the drawing up
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
+    ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
+    axes.plot_surface(*ball, color="0.8", alpha=0.35, linewidth=0)
+    axes.plot([0.3, -0.3], [0, 0], [1.09, 1.09], color="0.25", lw=7, solid_capstyle="round")
+    axes.plot([0.34], [0], [1.12], "o", color="0.25", ms=10)
+    triad(axes, np.zeros(3), upright, "lab", 1.5)
+    parts = (
+        (np.array([0.0, 1.0, 0.0]), 1.15, "ahead", (-0.35, 1.15, 0.05)),
+        (np.array([-1.0, 0.0, 0.0]), 1.15, "to the right", (1.3, -0.1, -0.5)),
+        (np.array([0.0, 0.0, -1.0]), 1.15, "turn to the right", (0.95, 0.35, 1.28)),
+    )
+    for turn, along, name, at in parts:
+        axis = int(np.abs(turn).argmax())
+        first = np.roll(np.eye(3)[axis], 1)
+        around = np.linspace(0.0, 1.6 * np.pi, 60)[:, None]
+        arc = 0.32 * (np.cos(around) * first + np.sin(around) * np.cross(turn, first))
+        arc[:, axis] = along
+        arc = arc @ upright
+        colour = AXIS_COLOURS[axis]
+        axes.plot(*arc.T, color=colour, lw=1.6)
+        axes.quiver(*arc[-2], *(10 * (arc[-1] - arc[-2])), color=colour, lw=1.6, arrow_length_ratio=0.9)
+        axes.text(*(upright @ np.array(at)), name, color=colour, fontsize=9, ha="center")
+    axes.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), zlim=(-1.3, 1.3))
+    axes.set_box_aspect((1, 1, 1), zoom=1.3)
+    axes.view_init(elev=20, azim=-118)
+    axes.set_axis_off()
+    axes.set_title(
+        "the animal on the ball; x ahead, y to the right, z down;\nthe ball's turns by which the animal goes",
+        fontsize=10,
+    )
+
+
+def draw_walk(axes: Any) -> None:
+    """A walk: ahead, a turn to the right, ahead, a step to the right."""
+    ahead, right, about = np.array([0.0, 0.1, 0.0]), np.array([-0.1, 0.0, 0.0]), np.array([0.0, 0.0, -np.pi / 60])
+    steps = [ahead] * 12 + [ahead + about] * 30 + [ahead] * 8 + [right] * 8
+    R = [torch.eye(3, dtype=torch.float64)]
+    for step in steps:
+        R.append(so3.exp(torch.from_numpy(step)) @ R[-1])
+    walk = walk_of(np.arange(len(R)) / 100, torch.stack(R).numpy())
+    axes.plot(walk.path[:, 1], walk.path[:, 0], ".-", color="0.3", ms=4, lw=1)
+    some = slice(0, None, 6)
+    axes.quiver(
+        *walk.path[some, ::-1].T,
+        np.sin(walk.heading_rad[some]),
+        np.cos(walk.heading_rad[some]),
+        color=AXIS_COLOURS[0],
+        scale=14,
+        width=0.008,
+        zorder=3,
+    )
+    for k, text, off in ((6, "ahead", -6), (24, "ahead, and a turn\nto the right", -8), (53, "to the right", 26)):
+        side = "right" if off < 0 else "left"
+        axes.annotate(text, walk.path[k, ::-1], (off, 0), textcoords="offset points", fontsize=9, ha=side)
+    axes.set(xlabel="path y (radii)", ylabel="path x (radii)", xlim=(-1.8, 4.4), aspect="equal")
+    axes.tick_params(labelsize=8)
+    axes.set_title("path and heading (arrows) of a walk", fontsize=10)
 
 
 if __name__ == "__main__":

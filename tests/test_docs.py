@@ -93,13 +93,13 @@ def test_parameters_and_configs_are_those_of_the_code(monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_the_figure_of_the_conventions_is_drawn_by_its_script(tmp_path):
-    out = tmp_path / "conventions.png"
-    subprocess.run([sys.executable, REPO / "scripts" / "figure_conventions.py", "--out", out], check=True)
-    drawn, committed = (cv2.imread(str(path)) for path in (out, REPO / "docs" / "conventions.png"))
-    assert drawn.shape == committed.shape
-    # Fonts and line ends differ between versions of matplotlib, the panels do not.
-    assert abs(drawn.astype(float) - committed).mean() < 10
+def test_the_figures_of_the_conventions_are_drawn_by_their_script(tmp_path):
+    subprocess.run([sys.executable, REPO / "scripts" / "figure_conventions.py", "--out", tmp_path], check=True)
+    for name in ("conventions.png", "animal.png"):
+        drawn, committed = (cv2.imread(str(folder / name)) for folder in (tmp_path, REPO / "docs"))
+        assert drawn.shape == committed.shape
+        # Fonts and line ends differ between versions of matplotlib, the panels do not.
+        assert abs(drawn.astype(float) - committed).mean() < 10
 
 
 @cache

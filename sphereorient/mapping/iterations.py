@@ -54,6 +54,7 @@ BLUR_RATIO = 1.25  # between neighbouring blurs that are tried
 BLUR_PX = (0.25, 3.0)  # narrowest and widest
 BATCH = 24  # instants at once
 LONGEST_RAD = 0.05  # joint step
+MAP_STEPS = 10  # of conjugate gradients: what they leave, the next iteration finds
 BLACK, WHITE = 0.03, 0.97  # shares of the sphere that count as black and white
 BEYOND = 0.2  # by how much the map may leave 0 .. 1 on the way
 NOISE_EVERY = 4  # pixels from which the noise is estimated
@@ -307,7 +308,7 @@ def with_map(state: State, smoothest: float = 0.0) -> tuple[State, float]:
     tie = max(smoothest * _typical(normal.diagonal()), state.tie)
     # Penalise the whole map, not the correction alone: else noise would grow with the iterations.
     right -= tie * (stiffness(height) @ _unexpected(state).double().numpy().ravel())
-    texture = state.texture + solve_map(normal, right, height, tie).float()
+    texture = state.texture + solve_map(normal, right, height, tie, MAP_STEPS).float()
     return replace(state, texture=texture.clamp(-BEYOND, 1 + BEYOND)), chi2
 
 

@@ -9,7 +9,7 @@ import torch
 from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
-from sphereorient.mapping.grid import READS, Array, SplineTable, conjugate_gradients, stiffness
+from sphereorient.mapping.grid import READS, Array, SplineTable, conjugate_gradients, stiffness, texel_sums
 from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.residuals import Residuals, grey_by_pose, residuals
@@ -19,7 +19,7 @@ POSE = 6  # unknowns of a pose
 DAMPING = 1e-5  # of the diagonal: the body frame is free, the step along it zero
 RIDGE = 1e-7
 LONGEST_SHARE = 0.1  # typical length of a turn, rad, and of a move, radii
-STEPS = 60  # of conjugate gradients
+STEPS = 12  # of conjugate gradients: each iteration linearises anew, and more of them fit the noise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,7 +57,9 @@ class Linearisation(Residuals):
         columns = torch.cat([part.flatten(1) for part in places], dim=1).reshape(-1).to(torch.int32)
         entries = torch.cat([part.flatten(1) for part in values], dim=1).reshape(-1).float()
         shape = (count.numel(), 2 * height * height)
-        return csr_matrix((entries.numpy(), columns.numpy(), start), shape=shape)
+        found = csr_matrix((entries.numpy(), columns.numpy(), start), shape=shape)
+        found.sum_duplicates()  # look-ups of a pixel lie close together: a third of the texels are read twice
+        return found
 
 
 def linearise(
@@ -157,7 +159,7 @@ def joint_step(
     damp = DAMPING * blocks.diagonal(dim1=1, dim2=2) + 1.0 / size.square()
     damp_map = np.full(ties.shape[0], 1e-3 * smooth, np.float32)
     damping = unknowns(_shared(damp, fixed), damp_map)
-    precondition_map = 1.0 / (np.asarray(by_texel.power(2).sum(0)).ravel() + ties.diagonal() + damp_map)
+    precondition_map = 1.0 / (texel_sums(by_texel) + ties.diagonal() + damp_map)
     solve_pose = _inverse_blocks(blocks, damp, fixed)
     right = pulled(without_light(residual))
     right[poses:] -= ties @ texture.reshape(-1).float().numpy()

@@ -38,7 +38,7 @@ PLOTTED = (
     ("velocity (m/s)", "", "velocity"),
     ("angular velocity, lab (rad/s)", "", "omega_lab"),
 )
-COLOURS = {"w": "0.4", "x": "#0072b2", "y": "#d55e00", "z": "#009e73"}
+COLOURS = {"w": "#666666", "x": "#D55E00", "y": "#009E73", "z": "#0072B2"}  # of the axes, in every figure
 Floats = NDArray[np.float64]
 
 

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from sphereorient.files.whole_file import put_aside
 from sphereorient.statistics import Interval
+from sphereorient.trajectory.trajectory import COLOURS
 
 Floats = NDArray[np.float64]
 
 WIDTH_IN = 7.0  # of a page with margins: 178 mm
 DPI = 150  # of the PNG
 # Okabe and Ito's colours: distinct for colour-blind readers, and in grey print.
-AXIS_COLOURS = ("#D55E00", "#009E73", "#0072B2")
+AXIS_COLOURS = COLOURS["x"], COLOURS["y"], COLOURS["z"]
 BLACK = "#000000"
 GREY = "#666666"
 SHADE = "#BBBBBB"  # of what does not count
