@@ -159,7 +159,7 @@ def joint_step(
     damp = DAMPING * blocks.diagonal(dim1=1, dim2=2) + 1.0 / size.square()
     damp_map = np.full(ties.shape[0], 1e-3 * smooth, np.float32)
     damping = unknowns(_shared(damp, fixed), damp_map)
-    precondition_map = 1.0 / (texel_sums(by_texel) + ties.diagonal() + damp_map)
+    precondition_map = (1.0 / (texel_sums(by_texel) + ties.diagonal() + damp_map)).astype(np.float32)
     solve_pose = _inverse_blocks(blocks, damp, fixed)
     right = pulled(without_light(residual))
     right[poses:] -= ties @ texture.reshape(-1).float().numpy()
