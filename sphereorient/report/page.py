@@ -15,6 +15,7 @@ from sphereorient.files.provenance import versions
 from sphereorient.report.frame_warnings import STATUS_WORDS, BadStretch, bad_stretches, stated_error, strip_of
 from sphereorient.report.gallery import Gallery, GalleryFrame
 from sphereorient.report.plots.style import SYMBOLS, decimals
+from sphereorient.report.tables import Table
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.moments import COMPONENTS
 from sphereorient.trajectory import Trajectory
@@ -46,6 +47,7 @@ def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, 
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
         "contents": CONTENTS,
         "tiles": _tiles(summary, tracks),
+        "each": _each(parts["tables"]) if len(tracks) > 1 else None,
         "grids": [grid for grid in (*_moments(summary), _flow(summary)) if grid["rows"]],
         "settings": _settings(summary),
         "provenance": [_provenance(name, track) for name, track in tracks.items()],
@@ -127,6 +129,30 @@ def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str
         known = f"{rms:.3g} {_unit(part.units)}" if math.isfinite(rms) else "unknown"
         found.append((known, f"rms of {SYMBOLS[quantity]}, all components"))
     return found
+
+
+def _each(tables: Sequence[Table]) -> Grid:
+    """Return the tracks side by side, in the order of their names on the command line."""
+    shown = {
+        "frames": "frames",
+        "valid": "valid",
+        "doubtful": "in doubt",
+        "stated_error_deg": "stated error, \u00b0",
+        "stated_error_mm": "stated error, mm",
+        "rms_v_m_s": "rms of v, m/s",
+        "rms_omega_rad_s": "rms of \u03c9, rad/s",
+        "duration_s": "duration, s",
+    }
+    (rows,) = (table.rows for table in tables if table.name == "tracks")
+    cells = [[(row["file"], ""), *((_plain(row[name]), "") for name in shown)] for row in rows]
+    about = "Numbers below are of all of them together."
+    return {"title": "Tracks side by side", "about": about, "head": ["", *shown.values()], "rows": cells}
+
+
+def _plain(value: object) -> str:
+    if not isinstance(value, float):
+        return f"{value:,}" if isinstance(value, int) else str(value)
+    return f"{value:.3g}" if math.isfinite(value) else "\u2013"
 
 
 def _unit(units: str) -> str:

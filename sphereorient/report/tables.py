@@ -7,20 +7,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sphereorient.errors import OutputError
 from sphereorient.report.columns import package, plain_cell
+from sphereorient.report.frame_warnings import stated_error
 from sphereorient.statistics import Interval, Summary
 from sphereorient.statistics.cameras import CameraDistance
 from sphereorient.statistics.density import Density, stretched_exponential
 from sphereorient.statistics.moments import COMPONENTS, STATISTICS
 from sphereorient.statistics.summary import Distributions
-from sphereorient.trajectory import Reason, Trajectory
+from sphereorient.trajectory import Flag, Reason, Trajectory
 
 POOLED = ("x", "y", "z", "all")
 VECTOR = ("x", "y", "z", "vector")
 WIDTH_COLUMNS = ("rms", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
 Row = dict[str, Any]
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,6 +97,17 @@ def _rows(**columns: Any) -> Iterator[Row]:
     yield from (dict(zip(parts, row, strict=True)) for row in entries)
 
 
+def _median(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _rms(vectors: Floats) -> float:
+    """Return the root of the mean squared length of vectors (N, 3); NaN where none is known."""
+    known = vectors[np.isfinite(vectors).all(axis=1)]
+    return float(np.sqrt((known**2).sum(axis=1).mean())) if len(known) else float("nan")
+
+
 def _tracks(tracks: Mapping[str, Trajectory]) -> Iterator[Row]:
     for name, track in tracks.items():
         lost = {camera: sum(why != Reason.OK for why in seen.reason) for camera, seen in track.cameras.items()}
@@ -104,6 +118,11 @@ def _tracks(tracks: Mapping[str, Trajectory]) -> Iterator[Row]:
             "method": track.method,
             "frames": len(track),
             "valid": int(track.valid.sum()),
+            "doubtful": int((track.valid & (track.flags & Flag.DOUBTFUL_FIT > 0)).sum()),
+            "stated_error_deg": _median(np.rad2deg(stated_error(track.orientation_cov))),
+            "stated_error_mm": _median(stated_error(track.position_cov)),
+            "rms_v_m_s": _rms(track.velocity),
+            "rms_omega_rad_s": _rms(track.omega_lab),
             "duration_s": float(time[-1] - time[0]) if len(time) else float("nan"),
             "lost": "; ".join(f"{camera}: {count}" for camera, count in lost.items()),
         }

@@ -94,6 +94,8 @@ def test_angles_and_distances_are_in_the_units_of_their_names(written):
 def test_what_was_lost_and_what_the_flow_is(written):
     (row,) = rows_of(written[0], "tracks")
     assert (row["file"], row["lost"]) == ("a/track.h5", "left: 7; right: 7")
+    assert 0 < float(row["stated_error_deg"]) < 5
+    assert int(row["doubtful"]) <= int(row["valid"]) <= int(row["frames"])
     flow = {row["formula"]: float(row["value"]) for row in rows_of(written[0], "comparisons")}
     assert flow["(nu^3 / epsilon)^(1/4)"] == pytest.approx(1e-6**0.75)
 
