@@ -1,0 +1,156 @@
+"""The first hour of a new user as a protocol: the commands of a journey, their times, and what is said of wrong inputs.
+
+    scripts/first_hour.py tank|fictrac|wrong [--shared ../shared] [--work FOLDER]
+
+`tank`: two movies and plate pictures in a folder, nothing else. `fictrac`: the folder of FicTrac's sample movie.
+`wrong`: the first journey with a wrong input at each step. What only the user knows is given by `--set`, once. Prints
+Markdown; errors against the truth where there is one, by the shared score_track.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+PROGRAM = [sys.executable, "-m", "sphereorient.cli"]
+KNOWN = ["frame_rate=600", "sphere.diameter=18", "exposure=0.0004"]  # of the tank: what nobody can measure
+PLATE = ("pixel_pitch", "surveyed", "ports")  # and of its plates; the plate's own key beside them is `pitch`
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("journey", choices=("tank", "fictrac", "wrong"))
+    parser.add_argument("--shared", type=Path, default=Path(__file__).resolve().parents[1].parent / "shared")
+    parser.add_argument("--work", type=Path)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = arguments.work or Path(name)
+        folder.mkdir(parents=True, exist_ok=True)
+        {"tank": tank, "fictrac": fictrac, "wrong": wrong}[arguments.journey](arguments.shared, folder)
+
+
+def run(folder: Path, *words: str, status: int = 0) -> str:
+    """Run a command of the program, print its row, and return what it said; refuse another status."""
+    before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    done = subprocess.run([*PROGRAM, *words], cwd=folder, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+    after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - begun
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    said = done.stderr.strip().splitlines()
+    last = said[-1] if said and status else ""
+    print(f"| `{shlex.join(words)}` | {wall:.1f} | {cpu:.1f} | {last.replace('|', ' ')} |", flush=True)
+    if done.returncode != status:
+        raise SystemExit(f"{shlex.join(words)}: expected status {status}, got {done.returncode}\n{done.stderr}")
+    return done.stdout
+
+
+def head(what: str) -> None:
+    print(f"\n| {what} | wall s | CPU s | said |\n|---|---|---|---|")
+
+
+def sets(values: Sequence[str]) -> list[str]:
+    return [word for value in values for word in ("--set", value)]
+
+
+def tank_inputs(shared: Path, folder: Path) -> list[str]:
+    """Copy movies and plate pictures; return what the user knows of the plates, as `--set` takes it."""
+    for movie in ("cam1.mkv", "cam2.mkv"):
+        shutil.copy(shared / "tank" / movie, folder)
+    shutil.copytree(shared / "tank" / "calibration", folder / "plates", ignore=shutil.ignore_patterns("*.yaml", "*.h5"))
+    known = yaml.safe_load((shared / "tank" / "calibration" / "calibration.yaml").read_text())
+    values = {name: known[name] for name in PLATE if name != "surveyed"} | {"plate.pitch": known["plate"]["pitch"]}
+    values |= {f"surveyed.{name}": known["surveyed"][name] for name in ("R_lab_plate", "T_lab_plate")}
+    return [f"{name}={json.dumps(value)}" for name, value in values.items()]
+
+
+def tank(shared: Path, folder: Path) -> None:
+    """From movies and plate pictures to a report."""
+    plates = tank_inputs(shared, folder)
+    head("command")
+    run(folder, "init", "cam1.mkv", "cam2.mkv", *sets(KNOWN))
+    run(folder, "init", "--plate", "plates", *sets(plates))
+    run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml")
+    run(folder, "map", "experiment.yaml", "--out", "texture.png")
+    run(folder, "check", "experiment.yaml")
+    run(folder, "track", "experiment.yaml", "--out", "track.h5")
+    run(folder, "report", "track.h5", "--experiment", "experiment.yaml", "--out", "report")
+    score(shared, folder / "track.h5", shared / "tank" / "truth.h5", "body")
+
+
+def fictrac(shared: Path, folder: Path) -> None:
+    """From FicTrac's folder to a walk."""
+    for name in ("config.txt", "sample.mp4"):
+        shutil.copy(shared / "real" / "fictrac" / name, folder)
+    head("command")
+    run(folder, "init", "--from-fictrac", "config.txt", "--set", "frame_rate=30")
+    run(folder, "map", "experiment.yaml", "--out", "texture.png")
+    run(folder, "check", "experiment.yaml")
+    run(folder, "track", "experiment.yaml", "--out", "track.h5")
+    run(folder, "report", "track.h5", "--experiment", "experiment.yaml", "--out", "report")
+    run(folder, "export", "track.h5", "--experiment", "experiment.yaml", "--to", "fictrac", "--out", "walk.dat")
+    table = np.loadtxt(folder / "walk.dat", delimiter=",")
+    print(f"\n{len(table)} rows of {table.shape[1]} columns; {int(np.isfinite(table[:, 1]).sum())} with a rotation")
+
+
+def wrong(shared: Path, folder: Path) -> None:
+    """Make a mistake at each step of the first journey, then put it right."""
+    plates = tank_inputs(shared, folder)
+    head("command, with a wrong input")
+    run(folder, "init", "cam1.mkv", "cam3.mkv", *sets(KNOWN), status=2)
+    run(folder, "init", "cam1.mkv", "plates/cam1_00.png", *sets(KNOWN), status=2)
+    run(folder, "init", "cam1.mkv", "cam2.mkv", *sets(["sphere.diameter=eighteen"]), status=2)
+    run(folder, "init", "--plate", "plate", status=2)
+    run(folder, "track", "cam1.mkv", "--out", "track.h5", status=2)
+    run(folder, "init", "cam1.mkv", "cam2.mkv", "-q")
+    run(folder, "check", "experiment.yaml", status=2)
+    run(folder, "init", "cam1.mkv", "cam2.mkv", *sets(KNOWN), "--force", "-q")
+    run(folder, "track", "experiment.yaml", "--out", "track.h5", status=2)
+    pitch = [part for part in plates if not part.startswith("plate.pitch")]
+    run(folder, "init", "--plate", "plates", *sets([*pitch, "plate.pitch=6"]), "-q")
+    run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml", status=2)
+    walls = [part for part in plates if not part.startswith("ports")]
+    run(folder, "init", "--plate", "plates", *sets(walls), "--force", "-q")
+    run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml", status=2)
+    run(folder, "init", "--plate", "plates", *sets(plates), "--force", "-q")
+    run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml", "-q")
+    run(folder, "track", "experiment.yaml", "--out", "track.h5", status=2)
+    picture = cv2.imread(str(folder / "plates" / "cam1_00.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(folder / "texture.png"), cv2.resize(picture, (512, 256)))
+    run(folder, "track", "experiment.yaml", "--out", "track.h5", status=2)
+    shutil.copy(shared / "experiment" / "texture.png", folder)
+    run(folder, "track", "experiment.yaml", "--out", "track.h5", status=2)
+    shutil.copy(shared / "tank" / "texture.png", folder)
+    swapped = (
+        (folder / "experiment.yaml")
+        .read_text()
+        .replace("{cam1: cam1.mkv, cam2: cam2.mkv}", "{cam1: cam2.mkv, cam2: cam1.mkv}")
+    )
+    (folder / "swapped.yaml").write_text(swapped)
+    run(folder, "check", "swapped.yaml", status=1)
+    run(folder, "track", "swapped.yaml", "--out", "track.h5", status=2)
+    run(folder, "track", "experiment.yaml", "--out", "plates", status=2)
+    run(folder, "report", "experiment.yaml", "--out", "report", status=2)
+
+
+def score(shared: Path, track: Path, truth: Path, align: str) -> None:
+    command = [sys.executable, str(shared / "score_track.py"), str(track), str(truth), "--align", align]
+    found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ).stdout)
+    names = ("orientation_p50_deg", "orientation_p95_deg", "position_p50_mm", "position_p95_mm")
+    print("\n" + "; ".join(f"{name} {found[name]:.4g}" for name in names if found.get(name) is not None))
+
+
+if __name__ == "__main__":
+    main()
