@@ -32,12 +32,29 @@ def given(keys: Sequence[DraftKey], changes: Iterable[str]) -> list[DraftKey]:
             raise SettingsError(refusal(f"--set {text}", expected="key=value", got=short(text), do="give both"))
         if name.strip() not in known:
             raise SettingsError(refuse_unknown(name.strip(), known, "--set"))
+        key, do = known[name.strip()], "quote it for the shell"
         try:
-            known[name.strip()] = replace(known[name.strip()], value=parse_yaml(value))
+            found = parse_yaml(value)
         except FAULTS:
-            do = "quote it for the shell"
             raise SettingsError(refusal(f"--set {name}", expected="a YAML value", got=short(value), do=do)) from None
+        example = key.example if key.value in (..., None) else key.value
+        if found is not None and not _alike(found, example):
+            expected = f"a value like {_flow(example)[:60]}"
+            raise SettingsError(refusal(f"--set {name}", expected=expected, got=short(value), do="write such a one"))
+        known[key.name] = replace(key, value=found)
     return list(known.values())
+
+
+def _alike(value: Any, example: Any) -> bool:
+    """Return whether a value is of an example's kind: a number, words, yes or no, a list or a mapping of such."""
+    if isinstance(example, Mapping):
+        some = next(iter(example.values()), None)
+        return isinstance(value, Mapping) and all(_alike(part, example.get(name, some)) for name, part in value.items())
+    if isinstance(example, list | tuple):
+        return isinstance(value, list) and all(_alike(part, example[0]) for part in value)
+    if isinstance(example, bool) or not isinstance(example, int | float):
+        return example is None or isinstance(value, type(example))
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def open_keys(keys: Iterable[DraftKey]) -> list[DraftKey]:

@@ -168,6 +168,31 @@ def plates(folder: Path, scenes: Sequence[Scene]) -> Path:
     return folder
 
 
+KINDS = [
+    DraftKey(name="rate", comment="Hz", example=600.0),
+    DraftKey(name="fixed", value=False, comment="whether it stays"),
+    DraftKey(name="pitch", comment="mm", example=[0.02, 0.02]),
+    DraftKey(name="walls", comment="of cameras", example={"cam1": {"offset": 120.0}}),
+]
+
+
+@pytest.mark.parametrize(
+    "change", ["rate=fast", "rate=true", "rate=[1]", "fixed=1", "pitch=0.02", "pitch=[a, b]", "walls={cam1: 3}"]
+)
+def test_a_value_of_another_kind_is_refused(change):
+    name = change.partition("=")[0]
+    with pytest.raises(SettingsError, match=f"--set {name}: expected a value like "):
+        given(KINDS, [change])
+
+
+@pytest.mark.parametrize(
+    "change", ["rate=25", "rate=null", "fixed=true", "pitch=[1, 2]", "walls={cam1: {offset: 90}, cam2: {offset: 1.5}}"]
+)
+def test_a_value_of_its_kind_is_taken(change):
+    name, _, text = change.partition("=")
+    assert {key.name: key.value for key in given(KINDS, [change])}[name] == yaml.safe_load(text)
+
+
 def test_a_folder_of_plates_becomes_a_calibration(tmp_path):
     scenes = [Scene(tilt_deg=20.0, about_deg=about, spin_deg=spin) for about, spin in ((0, 10), (90, 100), (45, 200))]
     folder, plate = plates(tmp_path / "plates", scenes), Scene().plate
