@@ -28,7 +28,7 @@ import yaml
 
 PROGRAM = [sys.executable, "-m", "sphereorient.cli"]
 KNOWN = ["frame_rate=600", "sphere.diameter=18", "exposure=0.0004"]  # of the tank: what nobody can measure
-PLATE = ("pixel_pitch", "surveyed", "ports")  # and of its plates; the plate's own key beside them is `pitch`
+SHOWN = 60  # letters of a word in the protocol
 
 
 def main() -> None:
@@ -43,18 +43,20 @@ def main() -> None:
         {"tank": tank, "fictrac": fictrac, "wrong": wrong}[arguments.journey](arguments.shared, folder)
 
 
-def run(folder: Path, *words: str, status: int = 0) -> str:
-    """Run a command of the program, print its row, and return what it said; refuse another status."""
+def run(folder: Path, *words: str, status: int = 0, doubt: bool = False) -> None:
+    """Run a command of the program and print its row, with its refusal or its doubts; stop at another status."""
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run([*PROGRAM, *words], cwd=folder, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - begun
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    said = done.stderr.strip().splitlines()
-    last = said[-1] if said and status else ""
-    print(f"| `{shlex.join(words)}` | {wall:.1f} | {cpu:.1f} | {last.replace('|', ' ')} |", flush=True)
+    lines = done.stderr.strip().splitlines()[-1:] if status else []
+    if doubt:
+        lines = [line for line in done.stdout.splitlines() if line.startswith("doubtful") or "fault" in line]
+    last = " / ".join(lines)
+    shown = shlex.join(word if len(word) <= SHOWN else f"{word[:SHOWN]} .." for word in words)
+    print(f"| `{shown}` | {wall:.1f} | {cpu:.1f} | {last.replace('|', ' ')} |", flush=True)
     if done.returncode != status:
         raise SystemExit(f"{shlex.join(words)}: expected status {status}, got {done.returncode}\n{done.stderr}")
-    return done.stdout
 
 
 def head(what: str) -> None:
@@ -71,8 +73,9 @@ def tank_inputs(shared: Path, folder: Path) -> list[str]:
         shutil.copy(shared / "tank" / movie, folder)
     shutil.copytree(shared / "tank" / "calibration", folder / "plates", ignore=shutil.ignore_patterns("*.yaml", "*.h5"))
     known = yaml.safe_load((shared / "tank" / "calibration" / "calibration.yaml").read_text())
-    values = {name: known[name] for name in PLATE if name != "surveyed"} | {"plate.pitch": known["plate"]["pitch"]}
+    values = {"pixel_pitch": known["pixel_pitch"], "plate.pitch": known["plate"]["pitch"]}
     values |= {f"surveyed.{name}": known["surveyed"][name] for name in ("R_lab_plate", "T_lab_plate")}
+    values |= {f"ports.{name}": wall for name, wall in known["ports"].items()}
     return [f"{name}={json.dumps(value)}" for name, value in values.items()]
 
 
@@ -120,10 +123,10 @@ def wrong(shared: Path, folder: Path) -> None:
     run(folder, "track", "experiment.yaml", "--out", "track.h5", status=2)
     pitch = [part for part in plates if not part.startswith("plate.pitch")]
     run(folder, "init", "--plate", "plates", *sets([*pitch, "plate.pitch=6"]), "-q")
-    run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml", status=2)
+    run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml", doubt=True)
     walls = [part for part in plates if not part.startswith("ports")]
     run(folder, "init", "--plate", "plates", *sets(walls), "--force", "-q")
-    run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml", status=2)
+    run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml", doubt=True)
     run(folder, "init", "--plate", "plates", *sets(plates), "--force", "-q")
     run(folder, "calibrate", "calibration.yaml", "--out", "cameras.yaml", "-q")
     run(folder, "track", "experiment.yaml", "--out", "track.h5", status=2)
@@ -139,7 +142,7 @@ def wrong(shared: Path, folder: Path) -> None:
         .replace("{cam1: cam1.mkv, cam2: cam2.mkv}", "{cam1: cam2.mkv, cam2: cam1.mkv}")
     )
     (folder / "swapped.yaml").write_text(swapped)
-    run(folder, "check", "swapped.yaml", status=1)
+    run(folder, "check", "swapped.yaml", status=1, doubt=True)
     run(folder, "track", "swapped.yaml", "--out", "track.h5", status=2)
     run(folder, "track", "experiment.yaml", "--out", "plates", status=2)
     run(folder, "report", "experiment.yaml", "--out", "report", status=2)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from tifffile import TiffFile
+from tifffile import TiffFile, TiffFileError
 
 from sphereorient.files.whole_file import put_aside
 
@@ -20,7 +20,7 @@ GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 BOMBS = (Image.DecompressionBombError, Image.DecompressionBombWarning)  # the warning where warnings are errors
 FAULTS = (  # of damaged headers
     *(OSError, ValueError, ArithmeticError, LookupError, MemoryError, SyntaxError, TypeError, AttributeError),
-    *(RuntimeError, struct.error),
+    *(RuntimeError, struct.error, TiffFileError),
 )
 BOMB_PIXELS = 1 << 40  # reported for pictures that Pillow refuses by their size
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tifffile import TiffFile
+from tifffile import TiffFile, TiffFileError
 
 from sphereorient.errors import error_words
 from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, Grey, Movie, luma, mapped, refused
@@ -17,7 +17,7 @@ from sphereorient.movies.movie import COLOUR_REMARK, LARGEST_RATIO, Grey, Movie,
 # What tifffile and imagecodecs raise on damaged files, depending on the place of the damage.
 DAMAGE = (
     *(ValueError, TypeError, LookupError, ArithmeticError, AttributeError, OSError, EOFError, RuntimeError),
-    *(MemoryError, AssertionError, struct.error, zlib.error, lzma.LZMAError),
+    *(MemoryError, AssertionError, struct.error, zlib.error, lzma.LZMAError, TiffFileError),
 )
 WHITE_IS_ZERO, BLACK_IS_ZERO, RGB = 0, 1, 2  # PhotometricInterpretation
 UNCOMPRESSED = 1

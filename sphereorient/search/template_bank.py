@@ -160,7 +160,7 @@ class TemplateBank(DiskSearch):
             near = self._around @ at[:, None]  # (q, A, 3, 3)
             for pixels, keep in [*steps, (self._real, count)]:
                 template = self._rendered(near.flatten(0, 1), pixels).reshape(*near.shape[:2], int(pixels.sum()))
-                best = (template @ paint[of][:, pixels, None])[..., 0].topk(keep)
+                best = (template @ paint[of][:, pixels][..., None])[..., 0].topk(keep)
                 near = near[torch.arange(len(near))[:, None], best.indices]
             R.append(near.flatten(0, 1))
             match.append(best.values.flatten())

@@ -7,8 +7,8 @@ import pytest
 
 from sphereorient.search import crop_disk
 
-# Bilinear look-up is exact on a plane; OpenCV 4 rounds places to 1/32 px, which is 0.016 px of slope 5.
-EXACT = 0.09
+# Bilinear look-up is exact on a plane; OpenCV 4 rounds places to 1/32 px: up to 7/64 of slopes 3 and 4.
+EXACT = 0.12
 U, V = np.meshgrid(np.arange(90.0), np.arange(70.0))
 PLANE = 3 * U - 4 * V + 300
 
