@@ -38,9 +38,10 @@ def log(R: Tensor) -> Tensor:
     # Four times the products of the quaternion's components (w, x, y, z), row by row.
     products = torch.stack(
         [squares[0], x, y, z, x, squares[1], xy, xz, y, xy, squares[2], yz, z, xz, yz, squares[3]], dim=-1
-    ).unflatten(-1, (4, 4))
+    ).reshape(*R.shape[:-2], 4, 4)
     largest = torch.stack(squares, dim=-1).argmax(-1)[..., None, None]
-    w, axis = products.gather(-2, largest.expand(*R.shape[:-2], 1, 4))[..., 0, :].split([1, 3], dim=-1)
+    quat_wxyz = products.gather(-2, largest.expand(*R.shape[:-2], 1, 4))[..., 0, :]
+    w, axis = quat_wxyz[..., :1], quat_wxyz[..., 1:]
     axis = torch.where(w < 0, -axis, axis)
     length = torch.linalg.vector_norm(axis, dim=-1, keepdim=True)
     turned = ~(length <= torch.finfo(R.dtype).tiny ** 0.5)  # NaN stays NaN
@@ -149,7 +150,7 @@ def random_rotations(
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     ]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3)).to(dtype=dtype, device=device)
+    return torch.stack(rows, -1).reshape(*leading, 3, 3).to(dtype=dtype, device=device)
 
 
 def from_tait_bryan(theta: Tensor) -> Tensor:

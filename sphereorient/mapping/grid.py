@@ -132,7 +132,8 @@ class NormalMatrix:
 
 def texel_sums(jacobian: csr_matrix) -> NDArray[np.float64]:
     """Return the diagonal of J^T J, (T,): how well the samples determine each texel; J reads no texel twice."""
-    return np.bincount(jacobian.indices, jacobian.data.astype(np.float64) ** 2, minlength=jacobian.shape[1])
+    squares = jacobian.data.astype(np.float64) ** 2
+    return np.asarray(np.bincount(jacobian.indices, squares, minlength=jacobian.shape[1]), np.float64)
 
 
 def map_sums(
