@@ -47,8 +47,8 @@ def _chessboard(picture: NDArray[np.generic], board: targets.Chessboard, name: s
 
 def _charuco(picture: NDArray[np.generic], board: targets.CharucoBoard, name: str) -> PlateView:
     """Find the corners of a ChArUco board or a part of it."""
-    detector = cv2.aruco.CharucoDetector(board.opencv())
-    corners, ids, _, markers = detector.detectBoard(_eight_bits(picture))
+    detector, grey = cv2.aruco.CharucoDetector(board.opencv()), _eight_bits(picture)
+    corners, ids, _, markers = detector.detectBoard(grey)
     count = 0 if ids is None else len(ids)
     across, up = board.columns - 1, board.rows - 1
     index = np.zeros((0, 2), dtype=np.int64)
@@ -60,8 +60,10 @@ def _charuco(picture: NDArray[np.generic], board: targets.CharucoBoard, name: st
         got = f"{count} corners, {0 if markers is None else len(markers)} markers of {board.dictionary}"
         do = "show more of the board, or correct columns, rows, dictionary or legacy_pattern"
         return refused_view(name, expected, got, do)
-    # OpenCV has refined these already, in windows that keep clear of the markers.
-    return seen(board, index, np.asarray(corners).reshape(-1, 2).astype(np.float64), np.full(count, CORNER_SIGMA_PX))
+    # OpenCV 4 leaves these half a pixel off. The markers stay outside of the windows.
+    clear = min(WINDOW, (1 - board.marker_mm / board.pitch_mm) / 2)
+    uv_px = _refined(grey, np.asarray(corners).reshape(-1, 2).astype(np.float64), clear)
+    return seen(board, index, uv_px, np.full(count, CORNER_SIGMA_PX))
 
 
 def _circles(picture: NDArray[np.generic], grid: targets.CircleGrid, name: str) -> PlateView:
@@ -96,9 +98,9 @@ def _eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
     return np.asarray(np.clip((grey - low) * (255.0 / max(high - low, 1e-9)), 0, 255), dtype=np.uint8)
 
 
-def _refined(grey: NDArray[np.uint8], uv_px: Floats) -> Floats:
+def _refined(grey: NDArray[np.uint8], uv_px: Floats, window: float = WINDOW) -> Floats:
     away = np.linalg.norm(uv_px[:, None] - uv_px[None], axis=-1) + np.diag(np.full(len(uv_px), np.inf))
-    half = int(np.clip(WINDOW * away.min(), 2, 15))
+    half = int(np.clip(window * away.min(), 2, 15))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
     better = cv2.cornerSubPix(grey, uv_px.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), stop)
     return np.asarray(better, dtype=np.float64).reshape(-1, 2)
