@@ -54,7 +54,7 @@ class _Chunk:
 
     first: int
     last: int  # + 1
-    time_s: Sequence[float]  # of the batch's frames
+    time_s: Sequence[float] | Mapping[int, float]  # of the batch's frames
     past: deque[tuple[int, Poses]] = field(default_factory=lambda: deque(maxlen=3))
     turns: deque[Tensor] = field(default_factory=lambda: deque(maxlen=2))  # (3,), rad, from each of these to the next
 
@@ -395,6 +395,27 @@ class ChunkTracker:
             return poses
         reason = [Reason.OK if ok else why for ok, why in zip(usable, poses.reason, strict=True)]
         return poses_of(fit, order, usable, reason)
+
+
+class OnlineTracker:
+    """Follows frames one after the other, none ahead: each from those before it, else from a search without history.
+    `tracker` has one chunk at a time (setting `refine.chunks`). Memory does not grow.
+    """
+
+    def __init__(self, tracker: ChunkTracker) -> None:
+        self._tracker = tracker
+        self._time_s: dict[int, float] = {}  # of the last frames
+        self._chunk = _Chunk(0, 0, self._time_s)
+        self._number = 0
+
+    def next(self, time_s: float, shots: Sequence[Frame]) -> Poses:
+        """Return the poses of the frame of a time, later than that of the one before; a frame of each view."""
+        number, self._number = self._number, self._number + 1
+        self._time_s[number] = time_s
+        self._time_s.pop(number - 4, None)
+        (poses,) = self._tracker._step([self._chunk], number, {0: shots})
+        self._chunk.saw(number, poses, self._tracker._turns([self._chunk], [poses])[0])
+        return poses
 
 
 def _usable(shots: Sequence[Frame]) -> Tensor:

@@ -4,14 +4,13 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from sphereorient import so3
 from sphereorient.cameras import Camera
 from sphereorient.errors import OutputError, refusal
 from sphereorient.report.columns import package, to_xarray
 from sphereorient.trajectory import Trajectory, quaternions_wxyz
+from sphereorient.trajectory.walk import rotation_vectors
 
 Floats = NDArray[np.float64]
 TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")  # of VTK's poly data
@@ -37,8 +36,8 @@ def fictrac_table(track: Trajectory, camera: Camera) -> Floats:
         walk.turn_rad @ R_cam_lab.T,
         error,
         walk.turn_rad,
-        _log(R_cam),
-        _log(R_cam_lab.T @ R_cam),
+        rotation_vectors(R_cam),
+        rotation_vectors(R_cam_lab.T @ R_cam),
         walk.path,
         walk.heading_rad,
         np.mod(np.arctan2(right, ahead), 2 * np.pi),
@@ -55,12 +54,6 @@ def fictrac_table(track: Trajectory, camera: Camera) -> Floats:
     table[walk.start, 1:4] = table[walk.start, 5:8] = 0.0
     table[walk.start, 17:19] = 0.0
     return table
-
-
-def _log(R: Floats) -> Floats:
-    known = np.asarray(np.isfinite(R).all(axis=(1, 2)))
-    turn = so3.log(torch.from_numpy(np.where(known[:, None, None], R, np.eye(3)))).numpy()
-    return np.where(known[:, None], turn, np.nan)
 
 
 def _since(steps: Floats, begin: NDArray[np.int64]) -> Floats:

@@ -63,6 +63,13 @@ def walk_of(time_s: Floats, R_lab_body: Floats) -> Walk:
     )
 
 
+def rotation_vectors(R: Floats) -> Floats:
+    """Return the rotation vectors (N, 3), rad, of rotations (N, 3, 3); NaN of NaN."""
+    known = np.asarray(np.isfinite(R).all(axis=(1, 2)))
+    turn = so3.log(torch.from_numpy(np.where(known[:, None, None], R, np.eye(3)))).numpy()
+    return np.where(known[:, None], turn, np.nan)
+
+
 def _stretches(known: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return first and last + 1 of the stretches of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))

@@ -1,0 +1,124 @@
+"""`sphereorient live`."""
+
+import sys
+from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sphereorient.cli.app import app, echo_lines
+from sphereorient.cli.options import Cameras, ExperimentPath, Overrides, Quiet, SettingsPath, cameras_of, settings_of
+from sphereorient.errors import SettingsError, refusal
+
+if TYPE_CHECKING:
+    from sphereorient.experiment.recording import Recording
+    from sphereorient.live.feed import Arrival
+    from sphereorient.live.outputs import Output
+
+WAITING = 100  # frames of a camera that wait at most
+KEPT = 1000  # latencies
+
+
+@app.command()
+def live(
+    experiment: ExperimentPath,
+    source: Annotated[
+        str,
+        typer.Option(
+            help="movie: the experiment's, at its rate; movie-fast; -: raw pictures on standard input; camera:0."
+        ),
+    ] = "movie",
+    to: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="FicTrac's line to tcp:PORT (a server), udp:PORT, a new .dat file; JSON to a new .jsonl; repeatable."
+        ),
+    ] = None,
+    learnt: Annotated[
+        Path | None, typer.Option(help="What `track --save-learnt` kept of this set-up: begins without looking again.")
+    ] = None,
+    cameras: Cameras = None,
+    settings: SettingsPath = None,
+    set_: Overrides = None,
+    quiet: Quiet = False,
+) -> None:
+    """Track while the ball turns: each frame from those before it, and a line for each to sockets and files.
+
+    The experiment's movies, of the same set-up, show the empty scene and the light.
+    """
+    from sphereorient.live.feed import Feed
+    from sphereorient.live.lines import FicTracLines, json_line
+    from sphereorient.live.live import measured
+    from sphereorient.live.outputs import FileOutput
+    from sphereorient.live.prepare import opened
+
+    chosen, named = settings_of(settings, set_ or [], "precise"), cameras_of(cameras)
+    _check_source(source)
+    outputs = [_output(name) for name in to or []]
+    count = lost = 0
+    latency_ms: deque[float] = deque(maxlen=KEPT)
+    try:
+        with opened(experiment, chosen, named, learnt) as (recording, tracker, views):
+            lines = FicTracLines(views[0].camera)
+            feed = Feed(_frames(source, recording), WAITING, wait=source in ("movie-fast", "-"))
+            try:
+                with suppress(KeyboardInterrupt):
+                    for now in measured(tracker, views, feed):
+                        line, other = lines.line(now), json_line(now)
+                        for kind, output in outputs:
+                            output.send({"dat": line, "jsonl": other}.get(kind, f"FT, {line}"))
+                        count, lost = count + 1, lost + (not now.valid)
+                        latency_ms.append(1e3 * now.latency_s)
+            finally:
+                feed.close()
+    finally:
+        for _, output in outputs:
+            output.close()
+    faults = [output.fault for _, output in outputs if isinstance(output, FileOutput) and output.fault]
+    echo_lines(f"note: {fault}" for fault in faults)
+    if quiet:
+        return
+    order = sorted(latency_ms) or [0.0]
+    middle, slow = (order[int(share * (len(order) - 1))] for share in (0.5, 0.99))
+    typer.echo(f"{count} frames, {lost} without a pose, {feed.dropped} dropped")
+    typer.echo(f"latency of the last {len(order)}: {middle:.1f} ms (median), {slow:.1f} ms (99 %)")
+
+
+def _check_source(name: str) -> None:
+    kind, colon, number = name.partition(":")
+    if name not in ("movie", "movie-fast", "-") and (kind != "camera" or not colon or not number):
+        expected, do = "movie, movie-fast, - or camera:NUMBER", "choose one of these"
+        raise SettingsError(refusal("--source", expected=expected, got=name, do=do))
+
+
+def _frames(name: str, recording: "Recording") -> "Iterator[Arrival]":
+    from sphereorient.live.feed import camera_frames, movie_frames, rate_of, raw_frames
+
+    if name in ("movie", "movie-fast"):
+        return movie_frames(recording, paced=name == "movie")
+    if name == "-":
+        return raw_frames(sys.stdin.buffer, recording.streams, rate_of(recording))
+    if len(recording.streams) > 1:
+        do = "add --cameras with one name"
+        raise SettingsError(refusal("--source", expected="one camera", got=f"{len(recording.streams)}", do=do))
+    number = name.partition(":")[2]
+    return camera_frames(int(number) if number.isdigit() else number, recording.streams[0])
+
+
+def _output(name: str) -> "tuple[str, Output]":
+    from sphereorient.live.outputs import HOST, FileOutput, TcpOutput, UdpOutput
+
+    kind, colon, address = name.partition(":")
+    if kind in ("tcp", "udp") and colon:
+        host, between, port = address.rpartition(":")
+        if port.isdigit() and int(port) < 1 << 16:
+            where = host if between else HOST
+            return kind, (TcpOutput if kind == "tcp" else UdpOutput)(where, int(port))
+    suffix = Path(name).suffix.removeprefix(".")
+    if suffix in ("dat", "jsonl"):
+        return suffix, FileOutput(Path(name))
+    do = "choose one of these; another machine is tcp:HOST:PORT"
+    raise SettingsError(refusal("--to", expected="tcp:PORT, udp:PORT, NAME.dat or NAME.jsonl", got=name, do=do))

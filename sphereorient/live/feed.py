@@ -1,0 +1,155 @@
+"""Frames as they come: from movies, from raw bytes of another program, from a camera; in a thread of its own."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from threading import Condition, Thread
+from typing import BinaryIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.errors import MovieError, refusal
+from sphereorient.experiment.recording import Recording
+from sphereorient.experiment.stream import CameraStream
+from sphereorient.movies.movie import luma
+
+Picture = NDArray[np.generic]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Arrival:
+    """One instant: a picture of each camera, None where it could not be read."""
+
+    number: int  # counts all instants of the source, also those that were dropped
+    time_s: float
+    pictures: Sequence[Picture | None]
+    arrived_s: float  # by the clock of time.perf_counter
+
+
+def movie_frames(recording: Recording, paced: bool) -> Iterator[Arrival]:
+    """Yield the frames of an experiment's movies; `paced`: at the times of the recording."""
+    pictures = zip(*(stream.pictures() for stream in recording.streams), strict=True)
+    begun, first_s = time.perf_counter(), float(recording.timeline.time_s[0])
+    for number, (row, time_s) in enumerate(zip(pictures, recording.timeline.time_s.tolist(), strict=True)):
+        if paced:
+            time.sleep(max(0.0, begun + time_s - first_s - time.perf_counter()))
+        shown = [picture for picture, _ in row]
+        yield Arrival(number=number, time_s=time_s, pictures=shown, arrived_s=time.perf_counter())
+
+
+def rate_of(recording: Recording) -> float:
+    """Return the frame rate of an experiment, Hz."""
+    return float(1 / np.median(np.diff(recording.timeline.time_s)))
+
+
+def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float) -> Iterator[Arrival]:
+    """Yield frames of bytes without a header: the pictures of all cameras, row by row, of the movies' size and type.
+
+    Raises:
+        MovieError: the source ends within a frame.
+    """
+    kinds = [(stream.movie.frame_shape, stream.movie.dtype) for stream in streams]
+    sizes = [shape[0] * shape[1] * dtype.itemsize for shape, dtype in kinds]
+    number = 0
+    while content := source.read(sum(sizes)):
+        arrived_s = time.perf_counter()
+        if len(content) < sum(sizes):
+            expected, got = f"{sum(sizes)} bytes a frame", f"{len(content)} bytes at the end"
+            do = "write whole pictures of the size and type of the experiment's movies"
+            raise MovieError(refusal(f"frame {number}", expected=expected, got=got, do=do))
+        ends = np.cumsum([0, *sizes])
+        pictures = [
+            np.frombuffer(content, dtype, size // dtype.itemsize, int(begin)).reshape(shape)
+            for (shape, dtype), size, begin in zip(kinds, sizes, ends, strict=False)
+        ]
+        yield Arrival(number=number, time_s=number / rate_hz, pictures=pictures, arrived_s=arrived_s)
+        number += 1
+
+
+def camera_frames(
+    device: int | str, stream: CameraStream, open_device: Callable[..., cv2.VideoCapture] = cv2.VideoCapture
+) -> Iterator[Arrival]:
+    """Yield frames of a camera that OpenCV knows by number or address, with the time of their arrival.
+
+    Raises:
+        MovieError: no such camera, or pictures of another size than the experiment's movie.
+    """
+    capture = open_device(device)
+    height, width = stream.movie.frame_shape
+    try:
+        if not capture.isOpened():
+            do = "connect it, or name another number"
+            raise MovieError(refusal(f"camera {device}", expected="a camera", got="none that opens", do=do))
+        begun, number = time.perf_counter(), 0
+        while True:
+            there, picture = capture.read()
+            arrived_s = time.perf_counter()
+            if not there:
+                return
+            if picture.shape[:2] != (height, width):
+                got = f"{picture.shape[1]} x {picture.shape[0]} px"
+                do = "set the camera to the size of the movie that the experiment names"
+                raise MovieError(refusal(f"camera {device}", expected=f"{width} x {height} px", got=got, do=do))
+            grey = picture if picture.ndim == 2 else luma(*np.moveaxis(picture[..., ::-1], -1, 0))
+            yield Arrival(number=number, time_s=arrived_s - begun, pictures=[grey], arrived_s=arrived_s)
+            number += 1
+    finally:
+        capture.release()
+
+
+class Feed:
+    """Reads a source in a thread. `most` frames wait at most: then the oldest is dropped, or with `wait` the source
+    waits. Iterating yields what is there, in order, and raises what the source raised.
+    """
+
+    def __init__(self, source: Iterator[Arrival], most: int, *, wait: bool) -> None:
+        self.dropped = 0
+        self._source, self._most, self._wait = source, most, wait
+        self._waiting: deque[Arrival] = deque()
+        self._changed = Condition()
+        self._ended = self._closed = False
+        self._fault: Exception | None = None
+        self._thread = Thread(target=self._read, name="feed", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        try:
+            for arrival in self._source:
+                with self._changed:
+                    while self._wait and len(self._waiting) >= self._most and not self._closed:
+                        self._changed.wait()
+                    if len(self._waiting) >= self._most:
+                        self._waiting.popleft()
+                        self.dropped += 1
+                    self._waiting.append(arrival)
+                    self._changed.notify_all()
+                    if self._closed:
+                        return
+        except Exception as fault:  # goes on in the thread that iterates
+            self._fault = fault
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def close(self) -> None:
+        """Read no further frame."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def __iter__(self) -> Iterator[Arrival]:
+        while True:
+            with self._changed:
+                while not self._waiting and not self._ended:
+                    self._changed.wait()
+                if not self._waiting:
+                    break
+                arrival = self._waiting.popleft()
+                self._changed.notify_all()
+            yield arrival
+        if self._fault is not None:
+            raise self._fault

@@ -1,0 +1,99 @@
+"""A measured pose as a line of text: FicTrac's, and JSON."""
+
+import json
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.cameras import Camera
+from sphereorient.live.live import Measured
+from sphereorient.trajectory import quaternions_wxyz
+from sphereorient.trajectory.walk import rotation_vectors, walk_of
+
+Floats = NDArray[np.float64]
+DIGITS = 14
+
+
+class FicTracLines:
+    """The 25 columns of FicTrac's table frame by frame, as `export --to fictrac` writes them of a whole track: the lab
+    is the animal's frame. A frame without a pose is NaN; after it the sequence counter begins anew.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._R_cam_lab = camera.R_cam_lab.numpy()
+        self._before: Measured | None = None
+        self._first = np.eye(3)  # R_lab_body where this stretch begins
+        self._sequence = 0
+        self._heading, self._path, self._sums = 0.0, np.zeros(2), np.zeros(2)
+
+    def columns(self, now: Measured) -> Floats:
+        """Return the columns (25,) of the next frame."""
+        before, self._before = self._before, now
+        step_ms = math.nan if before is None else 1e3 * (now.time_s - before.time_s)
+        begins = before is None or not before.valid
+        turn, ahead, right = np.full(3, np.nan), math.nan, math.nan
+        if now.valid and begins:
+            self._first, self._sequence = now.R_lab_body, 0
+            self._heading, self._path, self._sums = 0.0, np.zeros(2), np.zeros(2)
+            turn, ahead, right = np.zeros(3), 0.0, 0.0
+        elif now.valid and before is not None:
+            times = np.array([before.time_s, now.time_s])
+            walk = walk_of(times, np.stack([before.R_lab_body, now.R_lab_body]))
+            turn = walk.turn_rad[1]
+            ahead, right = (1e-3 * step_ms * rate[1] for rate in (walk.forward_rad_s, walk.side_rad_s))
+            cosine, sine = math.cos(self._heading), math.sin(self._heading)
+            self._path = self._path + np.array([[cosine, -sine], [sine, cosine]]) @ walk.path[1]
+            self._heading = (self._heading + walk.heading_rad[1]) % (2 * math.pi)
+            self._sums = self._sums + np.array([ahead, right])
+        self._sequence += 1
+        nothing = np.nan if not now.valid else 0.0
+        R_cam = self._R_cam_lab @ now.R_lab_body @ self._first.T @ self._R_cam_lab.T
+        absolute = rotation_vectors(np.stack([R_cam, self._R_cam_lab.T @ R_cam]))
+        direction = math.nan if begins else math.atan2(right, ahead) % (2 * math.pi)
+        return np.array(
+            [
+                now.number + 1,
+                *(turn @ self._R_cam_lab.T),
+                now.error_rad,
+                *turn,
+                *absolute.ravel(),
+                *(self._path + nothing),
+                self._heading + nothing,
+                *((0.0, 0.0) if begins and now.valid else (direction, math.hypot(ahead, right))),
+                *(self._sums + nothing),
+                1e3 * now.time_s,
+                self._sequence,
+                step_ms,
+                1e3 * now.time_s,
+            ]
+        )
+
+    def line(self, now: Measured) -> str:
+        """Return the next frame as FicTrac writes it to a file."""
+        return ", ".join(f"{value:.{DIGITS}g}" for value in self.columns(now))
+
+
+def json_line(now: Measured) -> str:
+    """Return a frame as JSON on one line; null for what is not known."""
+    sigma = np.sqrt(np.diag(now.covariance))
+    content = {
+        "frame": now.number,
+        "time_s": now.time_s,
+        "valid": now.valid,
+        "position_lab_mm": now.position_lab_mm.tolist(),
+        "quaternion_wxyz": quaternions_wxyz(now.R_lab_body[None])[0].tolist(),
+        "sigma_rad": sigma[:3].tolist(),
+        "sigma_mm": sigma[3:].tolist(),
+        "found": now.found,
+        "dropped": now.dropped,
+        "reason": [str(why) for why in now.reason],
+        "latency_ms": 1e3 * now.latency_s,
+    }
+    return json.dumps({name: _known(value) for name, value in content.items()}, allow_nan=False)
+
+
+def _known(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return [_known(part) for part in value] if isinstance(value, list) else value

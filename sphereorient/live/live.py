@@ -1,0 +1,80 @@
+"""The loop: each frame of a feed is measured from those before it, and told."""
+
+import math
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sphereorient.follow.poses import Poses
+from sphereorient.follow.tracker import OnlineTracker, supported
+from sphereorient.live.feed import Arrival
+from sphereorient.locate import Frame, screened
+from sphereorient.pose import CameraView
+from sphereorient.trajectory import Reason
+
+Floats = NDArray[np.float64]
+LOST_COVARIANCE = np.full((6, 6), np.nan)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measured:
+    """Pose of one frame as it was measured, without frames that came later; NaN where there is none."""
+
+    number: int  # of the source, dropped frames included
+    time_s: float
+    position_lab_mm: Floats  # (3,)
+    R_lab_body: Floats  # (3, 3)
+    covariance: Floats  # (6, 6), of delta (rad, lab) and position (mm)
+    reason: tuple[Reason, ...]  # of each camera, `OK` where it counts
+    found: bool  # whether the frame before gave no prediction: the first one, or found again
+    dropped: int  # frames since the one before that came too late
+    latency_s: float  # from the picture's arrival to here
+
+    @property
+    def valid(self) -> bool:
+        """Whether there is a pose."""
+        return math.isfinite(self.position_lab_mm[0])
+
+    @property
+    def error_rad(self) -> float:
+        """Stated error of the orientation, root of the summed variances, rad."""
+        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+
+
+def measured(tracker: OnlineTracker, views: Sequence[CameraView], frames: Iterable[Arrival]) -> Iterator[Measured]:
+    """Yield the pose of each frame; frames of one source, in order."""
+    before: Sequence[Frame] | None = None
+    number, known = -1, False
+    for arrival in frames:
+        shots = [
+            _shot(picture, None if before is None else before[c], view)
+            for c, (picture, view) in enumerate(zip(arrival.pictures, views, strict=True))
+        ]
+        poses = tracker.next(arrival.time_s, shots)
+        there = supported(poses)
+        yield _told(arrival, poses if there else None, poses.reason, not known, arrival.number - number - 1)
+        before, number, known = shots, arrival.number, there
+
+
+def _shot(picture: NDArray[np.generic] | None, before: Frame | None, view: CameraView) -> Frame:
+    if picture is None:
+        height, width = view.camera.image_size[::-1]
+        return Frame(shown=np.zeros((height, width), np.uint8), read=Reason.UNDECODABLE)
+    return screened(picture, None if before is None else before.shown, view.background)
+
+
+def _told(arrival: Arrival, poses: Poses | None, reason: tuple[Reason, ...], found: bool, dropped: int) -> Measured:
+    return Measured(
+        number=arrival.number,
+        time_s=arrival.time_s,
+        position_lab_mm=np.full(3, np.nan) if poses is None else poses.position_lab_mm[0].numpy(),
+        R_lab_body=np.full((3, 3), np.nan) if poses is None else poses.R_lab_body[0].numpy(),
+        covariance=LOST_COVARIANCE if poses is None else poses.covariance[0].numpy(),
+        reason=reason,
+        found=found and poses is not None,
+        dropped=dropped,
+        latency_s=time.perf_counter() - arrival.arrived_s,
+    )
