@@ -3,6 +3,7 @@
 The server answers this machine alone, to who knows the random token of its address.
 """
 
+import base64
 import json
 import re
 import secrets
@@ -18,6 +19,7 @@ from urllib.parse import unquote
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, MovieError, SphereOrientError, refusal
@@ -29,6 +31,8 @@ from sphereorient.files.whole_file import read_text, write_text, writing
 from sphereorient.files.yaml_file import FAULTS, parse_yaml
 from sphereorient.movies import Movie, flipped_picture
 from sphereorient.preflight.first_look import FirstLook, look_at_movie
+from sphereorient.search import GreySearch, crop_disk
+from sphereorient.sphere import load_texture, orthographic_view
 
 HOST = "127.0.0.1"
 PAGE = Path(__file__).with_name("mark.html")
@@ -101,6 +105,50 @@ class Marking:
             return {"found": False}
         u, v, radius = look.outline.u_px, look.outline.v_px, look.outline.radius_px
         return {"found": True, "u": u, "v": v, "radius": radius, "stays": look.stays, "frame": look.frame}
+
+    def rendered(self, name: str) -> Json:
+        """Return the ball of `outline` as the texture map says it looks: a picture, and how much of it is explained.
+
+        Raises:
+            ExperimentError: no map, no ball, or none that the map explains.
+            TextureError: the map cannot be read.
+        """
+        ball = self.outline(name)
+        if not ball["found"]:
+            do = "draw what hides it, or choose another camera"
+            raise ExperimentError(refusal(name, expected="a ball", got="none in this movie", do=do))
+        with self.lock:
+            look, search = self.looks[name], self._search
+            u, v, radius = ball["u"], ball["v"], ball["radius"]
+            disk = torch.from_numpy(crop_disk(look.picture, u, v, radius, search.size_px))
+            found = search.propose(disk[None])
+            if not len(found.score):
+                do = "another ball, or the map of another one, looks like this"
+                raise ExperimentError(refusal(name, expected="a ball that the map explains", got="none", do=do))
+            size = max(2, round(2 * radius))
+            view = orthographic_view(size)
+            grey = view.render(self._texture, found.R_view_body[0].float()).clamp(0, 1).numpy()
+        height, width = look.movie.frame_shape
+        left, top = round(u - size / 2 + 0.5), round(v - size / 2 + 0.5)
+        picture = np.zeros((height + 2 * size, width + 2 * size, 4), np.uint8)  # wider: the ball may leave the picture
+        place = picture[top + size : top + 2 * size, left + size : left + 2 * size]
+        place[..., :3] = (255 * grey[..., None]).astype(np.uint8)
+        place[..., 3] = 255 * view.inside.numpy()
+        inside = picture[size : size + height, size : size + width]
+        content = base64.b64encode(_png(np.ascontiguousarray(inside))).decode()
+        return ball | {"explained": 100 * float(found.score[0]), "picture": f"data:image/png;base64,{content}"}
+
+    @cached_property
+    def _texture(self) -> torch.Tensor:
+        path = self.experiment.texture_path
+        if path is None or not path.exists():
+            do = f"learn it: `sphereorient map {self.path.name} --out texture.png`"
+            raise ExperimentError(refusal("sphere.texture", expected="a texture map", got=f"{path or 'none'}", do=do))
+        return load_texture(path)
+
+    @cached_property
+    def _search(self) -> GreySearch:
+        return GreySearch(self._texture)
 
     def save(self, name: str, shapes: Sequence[Mapping[str, Any]], *, keep: bool) -> Json:
         """Write the mask of a camera and name it in experiment.yaml; return what was done.
@@ -224,6 +272,8 @@ def serve(marking: Marking, port: int = 0) -> ThreadingHTTPServer:
                     self._picture(lambda: marking.mask(name))
                 case ["outline", name]:
                     self._json(lambda: marking.outline(name))
+                case ["rendered", name]:
+                    self._json(lambda: marking.rendered(name))
                 case _:
                     self.send_error(HTTPStatus.NOT_FOUND)
 

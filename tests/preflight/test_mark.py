@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import threading
 import urllib.error
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from preflight_examples import Example, clean_example, write
+from preflight_examples import PAINTED, Example, clean_example, write
 
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment import load_experiment
@@ -33,7 +34,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Example:
 
 @pytest.fixture
 def marking(clean: Example, tmp_path: Path) -> Marking:
-    return Marking(write(clean, tmp_path / "experiment"))
+    return Marking(write(clean, tmp_path / "experiment", sphere=PAINTED))
 
 
 @pytest.fixture
@@ -145,6 +146,25 @@ def test_the_server_answers_who_knows_the_token(marking, address):
     assert (status, json.loads(content)["hidden"]) == (200, pytest.approx(100 * 1250 / 240**2, rel=0.1))
 
 
+def test_the_map_is_laid_on_the_ball_as_it_lies_there(marking):
+    """The re-rendered ball looks like the picture, in its place."""
+    said = marking.rendered("cam1")
+    assert said["explained"] > 60
+    content = np.frombuffer(base64.b64decode(said["picture"].partition(",")[2]), np.uint8)
+    picture = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+    shown = marking.movies["cam1"].sample([said["frame"]])[0].astype(float)
+    assert picture.shape == (*shown.shape, 4)
+    inside = picture[..., 3] > 0
+    assert abs(inside.sum() / (np.pi * said["radius"] ** 2) - 1) < 0.05
+    assert np.corrcoef(picture[..., 0][inside], shown[inside])[0, 1] > 0.6
+
+
+def test_without_a_map_it_says_how_to_learn_one(marking):
+    marking.experiment.texture_path.unlink()
+    with pytest.raises(ExperimentError, match="learn it: `sphereorient map"):
+        marking.rendered("cam1")
+
+
 @pytest.mark.parametrize("path", ["/", "/state", "/wrong/state", "/{token}", "/{token}/nothing", "/{token}/../state"])
 def test_others_get_nothing(marking, address, path):
     assert ask(address + path.format(token=marking.token))[0] == 404
@@ -201,6 +221,8 @@ def test_a_person_draws_a_mask(marking, address, browser: Any, tmp_path: Path, r
     page.get_by_text("show only circle, 200 px across").wait_for()
     page.get_by_role("button", name="find the ball").click()
     page.get_by_text("which moves").wait_for()
+    page.get_by_role("button", name="lay the map on it").click()
+    page.get_by_text("The map explains").wait_for()
     page.screenshot(path=str(tmp_path / "mark.png"))
     page.get_by_role("button", name="save mask").click()
     page.get_by_text("of the picture is hidden").wait_for()
